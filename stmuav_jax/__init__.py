@@ -1,0 +1,59 @@
+"""Differentiable simulation of a UAV that carries a parallel-mechanism solar tracker.
+
+Conventions (frames, Euler parameters, signs, units): docs/conventions.md.
+"""
+
+from .algebra.rotation import (
+    angular_velocity,
+    conjugate,
+    euler_parameter_rate,
+    from_matrix,
+    from_rotation_vector,
+    matrix_g,
+    matrix_l,
+    normalise,
+    product,
+    rotation_matrix,
+    skew,
+    to_rotation_vector,
+)
+from .dynamics.analysis import Evaluation, evaluate
+from .dynamics.augmented import Augmented
+from .dynamics.energy import Energy, energy, momentum
+from .dynamics.formulation import Accelerations
+from .dynamics.initial import Assembly, Rank, assemble, rank
+from .dynamics.integrate import Method, Trajectory, integrate
+from .dynamics.reactions import Reactions, joint_reactions
+from .dynamics.run import Certificate, Run
+from .dynamics.scene import Scene
+from .dynamics.simulate import simulate
+from .dynamics.stabilisation import Baumgarte, Projection, Unstabilised
+from .mechanics.body import GROUND, Body
+from .mechanics.errors import ModelError, SettingError, SimulationError, StateError
+from .mechanics.force import (
+    AppliedForce,
+    AppliedMoment,
+    Gravity,
+    JointDamping,
+    LinearSpringDamper,
+    Load,
+    TorsionalSpringDamper,
+)
+from .mechanics.joint import (
+    Joint,
+    cylindrical,
+    distance,
+    drive,
+    revolute,
+    revolute_spherical,
+    spherical,
+    translational,
+    universal,
+    weld,
+)
+from .mechanics.state import Kinematics, State
+from .mechanics.system import System
+
+__version__ = "0.1.0"
+
+__all__ = [name for name in dir() if not name.startswith("_")]

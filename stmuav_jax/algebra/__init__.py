@@ -1,0 +1,1 @@
+"""Floor 0: rotations by Euler parameters, and the linear solves of constrained dynamics."""

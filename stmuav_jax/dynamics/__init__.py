@@ -1,0 +1,1 @@
+"""Floor 2: equations of motion, consistent starts, integration, reactions, certificates."""

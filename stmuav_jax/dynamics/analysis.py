@@ -1,0 +1,149 @@
+"""What is computed of a state besides its motion: accelerations, reactions, balances."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ..mechanics.force import Load
+from ..mechanics.state import State
+from ..mechanics.system import System, check_state
+from .augmented import Augmented, Model
+from .energy import energy, momentum
+from .formulation import Accelerations
+from .integrate import Method
+from .reactions import Frame, Reactions, joint_reactions
+from .stabilisation import Unstabilised
+
+
+class Snapshot(eqx.Module):
+    """Everything known of a system at one state and time.
+
+    Attributes:
+        accelerations: with the Lagrange multipliers.
+        reactions: at every joint, world axes.
+        kinetic, potential: energies [J].
+        momentum: linear and angular about the world's origin (6,).
+        residuals: scaled position residual of every row (m,) [m].
+        rates: scaled velocity residual of every row (m,) [m/s].
+        singular_values: of the constraint Jacobian in (v, omega'), descending.
+        acceleration_misfit: largest |J qddot - gamma|: non-zero for contradictory rows.
+        finite_loads: whether each force element's load is finite.
+    """
+
+    accelerations: Accelerations
+    reactions: Reactions
+    kinetic: Float[Array, ""]
+    potential: Float[Array, ""]
+    momentum: Float[Array, "6"]
+    residuals: Float[Array, " m"]
+    rates: Float[Array, " m"]
+    singular_values: Float[Array, " s"]
+    acceleration_misfit: Float[Array, ""]
+    finite_loads: Bool[Array, " forces"]
+
+
+def snapshot(
+    method: Method, model: Model, t: Float[Array, ""], state: State
+) -> Snapshot:
+    """Look at one state through the method's formulation, without stabilisation."""
+    system = model.system
+    result = method.formulation.accelerations(model, t, state, Unstabilised())
+    kin = system.kinematics(state)
+    eq = model.constraints.equations(t, kin)
+    scale = model.constraints.scales()
+    u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
+    u_rate = jnp.concatenate([result.v_rate, result.omega_rate], axis=1).reshape(-1)
+    loads = [force.load(t, kin) for force in system.forces]
+    finite = [jnp.all(jnp.isfinite(x.force)) & jnp.all(jnp.isfinite(x.moment)) for x in loads]
+    values = jnp.linalg.svd(eq.matrix, compute_uv=False) if eq.gamma.size else eq.gamma
+    now = energy(system, state, t)
+    return Snapshot(
+        accelerations=result,
+        reactions=joint_reactions(system, model.constraints, t, state, result.multipliers),
+        kinetic=now.kinetic,
+        potential=now.potential,
+        momentum=momentum(system, state),
+        residuals=scale * eq.value,
+        rates=scale * (eq.matrix @ u - eq.target),
+        singular_values=values,
+        acceleration_misfit=jnp.max(jnp.abs(eq.matrix @ u_rate - eq.gamma), initial=0.0),
+        finite_loads=jnp.stack(finite) if finite else jnp.zeros((0,), bool),
+    )
+
+
+@eqx.filter_jit
+def _snapshots(method: Method, model: Model, ts: Any, states: State) -> Snapshot:
+    return jax.lax.map(lambda at: snapshot(method, model, *at), (ts, states))
+
+
+# One block size for the first look and for all saved states: one compilation serves both.
+_BLOCK = 32
+
+
+def snapshots(method: Method, model: Model, ts: Float[Array, " k"], states: State) -> Snapshot:
+    """`snapshot` of k states, as NumPy arrays stacked along the first axis."""
+    k = len(ts)
+    blocks = []
+    for start in range(0, k, _BLOCK):
+        pick = np.minimum(np.arange(start, start + _BLOCK), k - 1)
+        take = lambda x, pick=pick: np.asarray(x)[pick]
+        block = _snapshots(method, model, take(ts), jax.tree.map(take, states))
+        keep = min(_BLOCK, k - start)
+        blocks.append(jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], block))
+    return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
+
+
+class Evaluation(eqx.Module):
+    """Accelerations, multipliers and joint reactions at one state; see `evaluate`."""
+
+    accelerations: Accelerations
+    reactions: Reactions
+
+
+def evaluate(
+    system: System,
+    state: State,
+    t: ArrayLike = 0.0,
+    *,
+    formulation: Augmented | None = None,
+    load: Load | None = None,
+    frame: Frame = "world",
+) -> Evaluation:
+    """Accelerations, Lagrange multipliers and joint reactions at one given state and load.
+
+    Pure: may be jitted, vmapped and differentiated.
+
+    Args:
+        state: consistent with the joints, unbatched.
+        t: [s].
+        load: added to the system's own forces; see `stmuav_jax.mechanics.force.Load`.
+        frame: axes of the reactions: "world", or "joint" for the joint's frame in body i.
+
+    Raises:
+        SettingError: shapes or precision of the state do not fit the system.
+    """
+    check_state(system, state)
+    if load is not None:
+        system = eqx.tree_at(lambda s: s.forces, system, (*system.forces, _Given(load)))
+    formulation = formulation if formulation is not None else Augmented()
+    model = formulation.prepare(system)
+    time = jnp.asarray(t, dtype=state.r.dtype)
+    result = formulation.accelerations(model, time, state, Unstabilised())
+    reactions = joint_reactions(
+        system, model.constraints, time, state, result.multipliers, frame
+    )
+    return Evaluation(result, reactions)
+
+
+class _Given(eqx.Module):
+    """A force element that is a given load."""
+
+    given: Load
+
+    def load(self, t: Array, kin: Any) -> Load:
+        del t, kin
+        return self.given

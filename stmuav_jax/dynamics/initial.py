@@ -1,0 +1,287 @@
+"""Consistent initial conditions: assemble positions, project velocities, rank the rows."""
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ..algebra.rotation import normalise
+from ..mechanics.errors import ModelError, StateError, concrete
+from ..mechanics.joint import drive
+from ..mechanics.state import State
+from ..mechanics.system import System, check_state
+from .augmented import Augmented, Model, displace
+
+Held = Literal["position", "orientation", "all"]
+
+
+class Assembly(eqx.Module):
+    """The outcome of `assemble`.
+
+    Attributes:
+        state: positions on the constraints, velocities compatible with them.
+        converged: whether the residuals are below the tolerance.
+        residuals: largest absolute position residual of each joint (joints,) [m] or [rad].
+        moved: largest displacement of a centre of mass [m].
+    """
+
+    state: State
+    converged: Bool[Array, ""]
+    residuals: Float[Array, " joints"]
+    moved: Float[Array, ""]
+
+
+def assemble(
+    system: System,
+    guess: State,
+    t: ArrayLike = 0.0,
+    *,
+    hold: Mapping[str, Held] | None = None,
+    hold_joints: tuple[str, ...] = (),
+    tolerance: float = 1e-11,
+    max_steps: int = 64,
+    throw: bool = True,
+) -> Assembly:
+    """The nearest state that satisfies the constraints.
+
+    Positions minimise the mass-weighted displacement from the guess,
+
+        sum_i m_i |dr_i|^2 + dtheta_i . J'_i dtheta_i,   subject to Phi = 0,
+
+    found by Newton's method on the Lagrange conditions; velocities are the mass-weighted
+    nearest with J qdot = target. Euler parameters of the guess are divided by their norms
+    first. May be jitted, vmapped and differentiated (implicit function theorem).
+
+    Args:
+        guess: a state near the wanted one.
+        t: time of the drivers [s].
+        hold: what must not move, by body: its "position", its "orientation" or "all".
+        hold_joints: translational or revolute joints whose coordinate keeps its value.
+        tolerance: of the position residuals [m].
+        throw: raise where it does not converge, if values are known (not inside `jit`).
+
+    Raises:
+        StateError: not converged; names the joint with the largest residual. Or a guess
+            that is not finite, or with Euler parameters that are all zero.
+        ModelError: unknown names.
+    """
+    check_state(system, guess)
+    _check_guess(system, guess)
+    free = _free_coordinates(system, hold or {})
+    normal = State(guess.r, jax.vmap(normalise)(guess.p), guess.v, guess.omega)
+    locked = _lock(system, normal, hold_joints)
+    time = jnp.asarray(t, dtype=guess.r.dtype)
+    state, residuals = _assembled(locked, time, normal, jnp.asarray(free), max_steps)
+    worst = jnp.max(residuals, initial=0.0)
+    converged = jnp.isfinite(worst) & (worst <= tolerance)
+    moved = jnp.max(jnp.sqrt(jnp.sum((jax.lax.stop_gradient(state.r) - guess.r) ** 2, axis=1)))
+    result = Assembly(state, converged, residuals[: len(system.joints)], moved)
+    if throw and concrete(result) and not bool(converged):
+        names = [joint.name for joint in locked.joints]
+        k = int(np.nanargmax(np.where(np.isfinite(residuals), residuals, np.inf)))
+        raise StateError(
+            f"The mechanism could not be assembled from this guess: after {max_steps} steps at the "
+            f"most, joint '{names[k]}' is still open by {float(residuals[k]):.3g} m (tolerance "
+            f"{tolerance:.3g}). Start nearer to a posture that closes, hold less, or check the "
+            "lengths."
+        )
+    return result
+
+
+@eqx.filter_jit
+def _assembled(
+    system: System, t: Float[Array, ""], guess: State, free: Bool[Array, " k"], max_steps: int
+) -> tuple[State, Float[Array, " joints"]]:
+    """The assembled state and the largest position residual of each joint."""
+    model = Augmented().prepare(system)
+    state = _velocities(model, t, _positions(model, t, guess, free, max_steps), free)
+    kin = system.kinematics(state)
+    value = jnp.abs(model.constraints.scales() * model.constraints.equations(t, kin).value)
+    owner = np.array(model.constraints.owner, dtype=int)
+    belongs = np.eye(len(system.joints))[owner].reshape(owner.size, len(system.joints))
+    return state, jnp.max(value[:, None] * belongs, axis=0, initial=0.0)
+
+
+def _check_guess(system: System, guess: State) -> None:
+    if not concrete(guess):
+        return
+    for k, name in enumerate(system.names):
+        parts = (guess.r[k], guess.p[k], guess.v[k], guess.omega[k])
+        if not all(np.all(np.isfinite(part)) for part in parts):
+            raise StateError(f"The guess for body '{name}' must be finite.")
+        if float(jnp.sum(guess.p[k] ** 2)) == 0:
+            raise StateError(f"The Euler parameters of body '{name}' are all zero.")
+
+
+def _free_coordinates(system: System, hold: Mapping[str, Held]) -> np.ndarray:
+    """True for every one of the 6 n coordinates that may move."""
+    free = np.ones((system.n_bodies, 6), dtype=bool)
+    columns = {"position": slice(0, 3), "orientation": slice(3, 6), "all": slice(0, 6)}
+    for name, what in hold.items():
+        if what not in columns:
+            raise ModelError(
+                f"What to hold of body '{name}' must be one of {', '.join(columns)}, not '{what}'."
+            )
+        free[system.index(name), columns[what]] = False
+    return free.reshape(-1)
+
+
+def _lock(system: System, state: State, names: tuple[str, ...]) -> System:
+    """The system with the coordinates of the named joints held at their present values."""
+    if not names:
+        return system
+    kin = system.kinematics(state)
+    locks = []
+    for name in names:
+        joint = system.joints[system.joint_index(name)]
+        kind = "shift" if joint.kind in ("translational", "cylindrical") else "angle"
+        i, j = kin.index(joint.body_i), kin.index(joint.body_j)
+        F_i, F_j = kin.R_wb[i] @ joint.frame_i, kin.R_wb[j] @ joint.frame_j
+        if kind == "shift":
+            apart = kin.point(joint.body_j, joint.point_j)[0] - kin.point(joint.body_i, joint.point_i)[0]
+            value = F_i[:, 2] @ apart
+        else:
+            value = jnp.arctan2(F_i[:, 1] @ F_j[:, 0], F_i[:, 0] @ F_j[:, 0])
+        locks.append(drive(f"hold {name}", joint, _Constant(value), coordinate=kind))
+    return eqx.tree_at(lambda s: s.joints, system, (*system.joints, *locks))
+
+
+class _Constant(eqx.Module):
+    value: Float[Array, ""]
+
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        del t
+        return self.value
+
+
+def _positions(
+    model: Model, t: Float[Array, ""], guess: State, free: Bool[Array, " k"], max_steps: int
+) -> State:
+    """Newton's method on M step - J^T multipliers = 0, Phi = 0 for the step from the guess."""
+    m = model.constraints.n_rows
+    if not m:
+        return guess
+    bodies = model.system.bodies
+
+    def moved(step: Array, base: State) -> State:
+        r, p = displace(base.r, base.p, step.reshape(-1, 6))
+        return State(r, p, guess.v, guess.omega)
+
+    def residual(unknown: tuple[Array, Array], args: tuple[Model, State]) -> tuple[Array, Array]:
+        step, multipliers = unknown
+        within, base = args
+        phi = lambda s: within.constraints.equations(  # noqa: E731
+            t, within.system.kinematics(moved(s, base))
+        ).value
+        value, pull = jax.vjp(phi, step)
+        by_body = step.reshape(-1, 6)
+        mass = within.system.bodies
+        weighed = jnp.concatenate(
+            [
+                mass.mass[:, None] * by_body[:, :3],
+                jnp.einsum("nab,nb->na", mass.inertia, by_body[:, 3:]),
+            ],
+            axis=1,
+        ).reshape(-1)
+        gradient = (weighed - pull(multipliers)[0]) / size
+        return jnp.where(free, gradient, step), value
+
+    # one scale for the gradient rows, so that both parts are lengths
+    size = jnp.sum(bodies.mass)
+    start = (jnp.zeros(6 * model.system.n_bodies, guess.r.dtype), jnp.zeros(m, guess.r.dtype))
+    solver = optx.Newton(rtol=1e-12, atol=1e-13, linear_solver=lx.SVD(rcond=1e-11))
+    adjoint = optx.ImplicitAdjoint(linear_solver=lx.SVD(rcond=1e-11))
+    solution = optx.root_find(
+        residual, solver, start, args=(model, guess), adjoint=adjoint, max_steps=max_steps, throw=False
+    )
+    return moved(solution.value[0], guess)
+
+
+def _velocities(model: Model, t: Float[Array, ""], state: State, free: Bool[Array, " k"]) -> State:
+    """The mass-weighted nearest velocities with J qdot = target."""
+    if not model.constraints.n_rows:
+        return state
+    eq = model.constraints.equations(t, model.system.kinematics(state))
+    weighed = model.weigh(eq.J * free.reshape(-1, 6)).reshape(eq.matrix.shape) * free
+    u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
+    S = lx.MatrixLinearOperator(weighed @ (eq.matrix * free).T)
+    off = lx.linear_solve(S, eq.matrix @ u - eq.target, lx.SVD(rcond=1e-11), throw=False).value
+    u = (u - weighed.T @ off).reshape(-1, 6)
+    return State(state.r, state.p, u[:, :3], u[:, 3:])
+
+
+class Rank(NamedTuple):
+    """Rank of the constraint Jacobian at one posture.
+
+    Attributes:
+        rows: number of constraint rows. rank: how many of them are independent.
+        dof: degrees of freedom, 6 n - rank.
+        smallest: the smallest non-zero singular value of the velocity Jacobian.
+        redundant: names of joints that own a dependent row, by pivoting.
+    """
+
+    rows: int
+    rank: int
+    dof: int
+    smallest: float
+    redundant: tuple[str, ...]
+
+
+def rank(system: System, state: State, t: float = 0.0) -> Rank:
+    """Rank and redundant rows of the constraint Jacobian in (v, omega'), on the host."""
+    return rank_of(system, Augmented().prepare(system), state, t)
+
+
+def rank_of(
+    system: System,
+    model: Model,
+    state: State,
+    t: float = 0.0,
+    values: np.ndarray | None = None,
+    *,
+    tolerance: float = 1e-9,
+) -> Rank:
+    """`rank`, of a prepared model and with the singular values if they are known.
+
+    Singular values below `tolerance` times the largest count as zero.
+    """
+    owner, columns = model.constraints.owner, 6 * system.n_bodies
+    if not owner:
+        return Rank(0, 0, columns, float("inf"), ())
+    if values is None:
+        values = np.linalg.svd(jacobian(model, state, t), compute_uv=False)
+    count = int(np.sum(values > tolerance * values[0]))
+    names: tuple[str, ...] = ()
+    if count < len(owner):
+        dependent = _dependent_rows(jacobian(model, state, t), count)
+        names = tuple(dict.fromkeys(system.joints[owner[k]].name for k in dependent))
+    return Rank(len(owner), count, columns - count, float(values[count - 1]), names)
+
+
+def _dependent_rows(J: np.ndarray, count: int) -> list[int]:
+    """Rows beyond the first `count` that Gram-Schmidt with row pivoting picks."""
+    rest = J.copy()
+    order = list(range(len(J)))
+    for k in range(count):
+        sizes = np.linalg.norm(rest[order[k:]], axis=1)
+        pick = k + int(np.argmax(sizes))
+        order[k], order[pick] = order[pick], order[k]
+        direction = rest[order[k]] / np.linalg.norm(rest[order[k]])
+        rest = rest - np.outer(rest @ direction, direction)
+    return sorted(order[count:])
+
+
+def jacobian(model: Model, state: State, t: float = 0.0) -> np.ndarray:
+    """The constraint Jacobian in (v, omega') as a NumPy matrix (m, 6 n)."""
+    return np.asarray(_jacobian(model, state, jnp.asarray(t, dtype=state.r.dtype)))
+
+
+@eqx.filter_jit
+def _jacobian(model: Model, state: State, t: Float[Array, ""]) -> Float[Array, "m k"]:
+    return model.constraints.equations(t, model.system.kinematics(state)).matrix

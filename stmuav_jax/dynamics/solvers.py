@@ -1,0 +1,176 @@
+"""Two wrappers around diffrax: a solver that holds the constraints, a remembered step size."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .formulation import Residuals
+
+Vector = Float[Array, " k"]
+
+
+@lru_cache(maxsize=None)
+def _landed(inner: type) -> type:
+    """Interpolation of a step whose end was moved after the step: the inner one, shifted."""
+
+    class Landed(diffrax.AbstractLocalInterpolation):
+        t0: Any
+        t1: Any
+        inner: Any
+        end: Vector
+        shift: Vector
+
+        def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Vector:
+            del left
+            if t1 is not None:
+                return self.evaluate(t1) - self.evaluate(t0)
+            within = inner(t0=self.t0, t1=self.t1, **self.inner).evaluate(t0)
+            width = jnp.where(self.t1 == self.t0, 1.0, self.t1 - self.t0)
+            moved = within + (t0 - self.t0) / width * self.shift
+            return jnp.where(t0 == self.t1, self.end, moved)
+
+    return Landed
+
+
+class Stabilised(diffrax.AbstractWrappedSolver):
+    """Any diffrax solver, each step followed by a projection, with the residuals watched.
+
+    A projected end is not where the step ended, so what the inner solver remembers of it is
+    not used: its first-same-as-last evaluation is made afresh (`made_jump`), and the
+    step's interpolation is shifted to meet the projected end.
+
+    Args:
+        solver: the diffrax solver, explicit or implicit.
+        project: (t, y, args) -> y, or None.
+        residuals: (t, y, args) -> `Residuals`; their maxima over all accepted steps are
+            kept in the solver state.
+    """
+
+    solver: diffrax.AbstractSolver
+    project: Callable[[Any, Vector, Any], Vector] | None
+    residuals: Callable[[Any, Vector, Any], Residuals]
+
+    @property
+    def scan_kind(self) -> str:
+        """Never None: `stage_loop` has chosen the inner solver's already."""
+        return "chosen"
+
+    @property
+    def term_structure(self) -> Any:
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return _landed(self.solver.interpolation_cls)
+
+    @property
+    def term_compatible_contr_kwargs(self) -> Any:
+        return self.solver.term_compatible_contr_kwargs
+
+    def order(self, terms: Any) -> int | None:
+        return self.solver.order(terms)
+
+    def strong_order(self, terms: Any) -> Any:
+        return self.solver.strong_order(terms)
+
+    def error_order(self, terms: Any) -> Any:
+        return self.solver.error_order(terms)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> Any:
+        return self.solver.init(terms, t0, t1, y0, args), self.residuals(t0, y0, args)
+
+    def step(
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Vector,
+        args: Any,
+        solver_state: Any,
+        made_jump: Any,
+    ) -> tuple[Vector, Any, Any, Any, diffrax.RESULTS]:
+        inner, worst = solver_state
+        jump = made_jump if self.project is None else True
+        y1, y_error, dense_info, inner, result = self.solver.step(
+            terms, t0, t1, y0, args, inner, jump
+        )
+        end = y1 if self.project is None else self.project(t1, y1, args)
+        now = self.residuals(t1, end, args)
+        worst = Residuals(
+            jnp.maximum(worst.position, now.position),
+            jnp.maximum(worst.velocity, now.velocity),
+            jnp.maximum(worst.norm, now.norm),
+        )
+        info = {"inner": dense_info, "end": end, "shift": end - y1}
+        return end, y_error, info, (inner, worst), result
+
+    def func(self, terms: Any, t0: Any, y0: Vector, args: Any) -> Any:
+        return self.solver.func(terms, t0, y0, args)
+
+
+def stage_loop(
+    solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint
+) -> diffrax.AbstractSolver:
+    """The solver with the loop over its stages that the adjoint can differentiate.
+
+    diffrax does this for its own solvers; it does not look inside a wrapped one.
+    """
+    kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
+    kind = kinds.get(type(adjoint))
+    if kind is None or not isinstance(solver, diffrax.AbstractRungeKutta):
+        return solver
+    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
+
+
+class Remembering(diffrax.AbstractStepSizeController):
+    """A step size controller that does not forget its step where one was cut short.
+
+    Landing on an output time cuts a step; without this the next step would start from the
+    short one and grow again by at most a factor of ten a step. The state holds the step
+    size to go on with, `step`.
+    """
+
+    controller: diffrax.AbstractStepSizeController
+
+    def wrap(self, direction: Any) -> "Remembering":
+        return Remembering(self.controller.wrap(direction))
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
+        end, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return end, (end - t0, inner)
+
+    def adapt_step_size(
+        self,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        y1_candidate: Any,
+        args: Any,
+        y_error: Any,
+        error_order: Any,
+        controller_state: Any,
+    ) -> Any:
+        step, inner = controller_state
+        keep, next_t0, next_t1, jump, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
+        )
+        proposed = next_t1 - next_t0
+        cut_short = keep & (t1 - t0 < step)
+        step = jnp.where(cut_short, jnp.maximum(step, proposed), proposed)
+        return keep, next_t0, next_t0 + step, jump, (step, inner), result
+
+
+def error_norm(n_state: int) -> Callable[[Vector], Float[Array, ""]]:
+    """Root mean square over the first `n_state` entries: quadratures do not steer the steps."""
+
+    def norm(error: Vector) -> Float[Array, ""]:
+        part = error[:n_state]
+        square = jnp.mean(part * part)
+        return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+    return norm

@@ -1,0 +1,1 @@
+"""Floor 1: states, bodies, constraint primitives, joints, forces, systems."""

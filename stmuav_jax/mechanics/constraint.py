@@ -1,0 +1,245 @@
+"""Constraint primitives: the rows that joints are made of, with exact derivatives.
+
+Every primitive is written once, in terms of body-fixed vectors s = A s' whose second
+derivative is linear in the body's rotational acceleration:
+
+    sddot = D alpha + c.
+
+Two choices of alpha give the report's two sets of tables from the same code:
+
+    form "omega":  alpha = d(omega')/dt,  D = -s~ A,      c = omega x (omega x s)
+    form "p":      alpha = pddot,         D = 2 G bar(s'), c = 2 Gdot Ldot^T s' = -h
+
+The rows then satisfy J_i (a_i, alpha_i) + J_j (a_j, alpha_j) = gamma, with a the
+acceleration of the centre of mass.
+
+Source: report Part I, Tables 3.1 and 4.1 (Part II, 4.1 and 4.2), corrected; Nikravesh
+(1988), ch. 7. `tests/mechanics/test_constraint.py` holds every row against the tables and
+against automatic differentiation. Derivation: docs/dynamics.md.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..algebra.rotation import bar, euler_parameter_rate, matrix_g, matrix_l, skew
+
+Form = Literal["omega", "p"]
+Kind = Literal["point", "n1", "n2", "p1", "p2", "distance", "angle", "shift"]
+
+# Rows of each primitive: s,3  n1,1  n2,1  p1,2  p2,2  s-s,1 and the two drivers.
+ROWS: dict[str, int] = {
+    "point": 3, "n1": 1, "n2": 1, "p1": 2, "p2": 2, "distance": 1, "angle": 1, "shift": 1,
+}  # fmt: skip
+
+
+class Data(eqx.Module):
+    """The body-fixed numbers of one primitive; a primitive reads those that it needs.
+
+    Attributes:
+        point_i, point_j: from the bodies' centres of mass, in body axes (3,) [m].
+        axis_i, axis_j: unit vectors in body axes (3,).
+        side_i: unit vector in body i, perpendicular to axis_i (3,); rotational drivers.
+        length: [m]; distance.
+    """
+
+    point_i: Float[Array, "3"]
+    point_j: Float[Array, "3"]
+    axis_i: Float[Array, "3"]
+    axis_j: Float[Array, "3"]
+    side_i: Float[Array, "3"]
+    length: Float[Array, ""]
+
+
+class Side(eqx.Module):
+    """One body as a constraint sees it: r, v (3,); p (4,); R_wb (3, 3); omega, omega_w (3,)."""
+
+    r: Float[Array, "3"]
+    v: Float[Array, "3"]
+    p: Float[Array, "4"]
+    R_wb: Float[Array, "3 3"]
+    omega: Float[Array, "3"]
+    omega_w: Float[Array, "3"]
+
+    def velocity(self, form: Form) -> Float[Array, " k"]:
+        """(v, omega') or (v, pdot), what J multiplies, shape (6,) or (7,)."""
+        if form == "omega":
+            return jnp.concatenate([self.v, self.omega])
+        return jnp.concatenate([self.v, euler_parameter_rate(self.p, self.omega)])
+
+
+class Jet(eqx.Module):
+    """A world vector with its derivatives: value s, rate, D and c of sddot = D alpha + c."""
+
+    s: Float[Array, "3"]
+    rate: Float[Array, "3"]
+    D: Float[Array, "3 k"]
+    c: Float[Array, "3"]
+
+
+class Row(eqx.Module):
+    """Rows of one primitive between bodies i and j.
+
+    Attributes:
+        value: Phi (k,).
+        target: the velocity-level right-hand side, J qdot = target (k,).
+        J_i, J_j: (k, 6) or (k, 7) for forms "omega" and "p".
+        gamma: the acceleration-level right-hand side (k,).
+    """
+
+    value: Float[Array, " k"]
+    target: Float[Array, " k"]
+    J_i: Float[Array, "k w"]
+    J_j: Float[Array, "k w"]
+    gamma: Float[Array, " k"]
+
+
+def jet(side: Side, fixed: Float[Array, "3"], form: Form) -> Jet:
+    """The jet of a vector fixed in a body, `fixed` in body axes (3,)."""
+    s = side.R_wb @ fixed
+    rate = jnp.cross(side.omega_w, s)
+    if form == "omega":
+        return Jet(s, rate, -skew(s) @ side.R_wb, jnp.cross(side.omega_w, rate))
+    G = matrix_g(side.p)
+    p_rate = euler_parameter_rate(side.p, side.omega)
+    c = 2 * matrix_g(p_rate) @ (matrix_l(p_rate).T @ fixed)
+    return Jet(s, rate, 2 * G @ bar(fixed), c)
+
+
+def _blocks(linear: Float[Array, "k 3"], angular: Float[Array, "k w"]) -> Float[Array, "k w+3"]:
+    return jnp.concatenate([linear, angular], axis=1)
+
+
+def _row(
+    value: Float[Array, " k"],
+    J_i: Float[Array, "k w"],
+    J_j: Float[Array, "k w"],
+    gamma: Float[Array, " k"],
+) -> Row:
+    return Row(value, jnp.zeros_like(value), J_i, J_j, gamma)
+
+
+def point(i: Side, j: Side, data: Data, form: Form) -> Row:
+    """s,3: r_i + s_i^P - r_j - s_j^P = 0."""
+    a, b = jet(i, data.point_i, form), jet(j, data.point_j, form)
+    eye = jnp.eye(3, dtype=a.s.dtype)
+    value = (i.r + a.s) - (j.r + b.s)
+    return _row(value, _blocks(eye, a.D), _blocks(-eye, -b.D), b.c - a.c)
+
+
+def n1(i: Side, j: Side, data: Data, form: Form) -> Row:
+    """n1,1: s_i . s_j = 0, both fixed."""
+    return _n1(jet(i, data.axis_i, form), jet(j, data.axis_j, form))
+
+
+def _n1(a: Jet, b: Jet) -> Row:
+    none = jnp.zeros((1, 3), a.s.dtype)
+    gamma = -(a.s @ b.c + b.s @ a.c + 2 * a.rate @ b.rate)
+    return _row(
+        (a.s @ b.s)[None],
+        _blocks(none, (b.s @ a.D)[None]),
+        _blocks(none, (a.s @ b.D)[None]),
+        gamma[None],
+    )
+
+
+def _between(i: Side, j: Side, data: Data, form: Form) -> tuple[Jet, Jet, tuple[Array, ...]]:
+    """Arms to both points, and d from the point on i to the point on j with rate and c."""
+    a, b = jet(i, data.point_i, form), jet(j, data.point_j, form)
+    d = (j.r + b.s) - (i.r + a.s)
+    d_rate = (j.v + b.rate) - (i.v + a.rate)
+    return a, b, (d, d_rate, b.c - a.c)
+
+
+def n2(i: Side, j: Side, data: Data, form: Form) -> Row:
+    """n2,1: s_i . d = 0, d from the point on i to the point on j."""
+    a = jet(i, data.axis_i, form)
+    arm_i, arm_j, (d, d_rate, d_c) = _between(i, j, data, form)
+    gamma = -(a.s @ d_c + d @ a.c + 2 * a.rate @ d_rate)
+    return _row(
+        (a.s @ d)[None],
+        _blocks(-a.s[None], (d @ a.D - a.s @ arm_i.D)[None]),
+        _blocks(a.s[None], (a.s @ arm_j.D)[None]),
+        gamma[None],
+    )
+
+
+def _two_of_three(row: Row, axis_w: Float[Array, "3"]) -> Row:
+    """Drop the row where the axis is largest (the report's rule; any of equal ones)."""
+    keep = jnp.array([[1, 2], [0, 2], [0, 1]])[jnp.argmax(jnp.abs(axis_w))]
+    return Row(row.value[keep], row.target[keep], row.J_i[keep], row.J_j[keep], row.gamma[keep])
+
+
+def p1_all(i: Side, j: Side, data: Data, form: Form) -> Row:
+    """All three rows of s_i x s_j = 0 (p1), of which two are independent."""
+    a, b = jet(i, data.axis_i, form), jet(j, data.axis_j, form)
+    A, B = skew(a.s), skew(b.s)
+    none = jnp.zeros((3, 3), a.s.dtype)
+    gamma = -(A @ b.c - B @ a.c + 2 * jnp.cross(a.rate, b.rate))
+    return _row(A @ b.s, _blocks(none, -B @ a.D), _blocks(none, A @ b.D), gamma)
+
+
+def p2_all(i: Side, j: Side, data: Data, form: Form) -> Row:
+    """All three rows of s_i x d = 0 (p2), of which two are independent."""
+    a = jet(i, data.axis_i, form)
+    arm_i, arm_j, (d, d_rate, d_c) = _between(i, j, data, form)
+    A, C = skew(a.s), skew(d)
+    gamma = -(A @ d_c - C @ a.c + 2 * jnp.cross(a.rate, d_rate))
+    return _row(A @ d, _blocks(-A, -A @ arm_i.D - C @ a.D), _blocks(A, A @ arm_j.D), gamma)
+
+
+def p1(i: Side, j: Side, data: Data, form: Form) -> Row:
+    """p1,2: s_i x s_j = 0, two rows chosen by the report's rule at the present posture."""
+    return _two_of_three(p1_all(i, j, data, form), i.R_wb @ data.axis_i)
+
+
+def p2(i: Side, j: Side, data: Data, form: Form) -> Row:
+    """p2,2: s_i x d = 0, two rows chosen by the report's rule at the present posture."""
+    return _two_of_three(p2_all(i, j, data, form), i.R_wb @ data.axis_i)
+
+
+def distance(i: Side, j: Side, data: Data, form: Form) -> Row:
+    """s-s,1: d . d - l^2 = 0."""
+    arm_i, arm_j, (d, d_rate, d_c) = _between(i, j, data, form)
+    gamma = -2 * (d @ d_c + d_rate @ d_rate)
+    return _row(
+        (d @ d - data.length**2)[None],
+        2 * _blocks(-d[None], (-d @ arm_i.D)[None]),
+        2 * _blocks(d[None], (d @ arm_j.D)[None]),
+        gamma[None],
+    )
+
+
+def shift(i: Side, j: Side, data: Data, form: Form) -> Row:
+    """The displacement s_i . d itself; a driver subtracts its motion."""
+    return n2(i, j, data, form)
+
+
+def angle(i: Side, j: Side, data: Data, form: Form) -> Row:
+    """The angle from s_i to s_j, positive towards side_i, in (-pi, pi]; a driver's row.
+
+    With a = s_i . s_j and b = side_i . s_j, both n1 rows: phi = atan2(b, a).
+    """
+    moving = jet(j, data.axis_j, form)
+    A = _n1(jet(i, data.axis_i, form), moving)
+    B = _n1(jet(i, data.side_i, form), moving)
+    u_i, u_j = i.velocity(form), j.velocity(form)
+    a, b = A.value, B.value
+    a_rate, b_rate = A.J_i @ u_i + A.J_j @ u_j, B.J_i @ u_i + B.J_j @ u_j
+    square = a * a + b * b
+    twist = 2 * (a * a_rate + b * b_rate) * (a * b_rate - b * a_rate) / square**2
+    return _row(
+        jnp.arctan2(b, a),
+        (a[:, None] * B.J_i - b[:, None] * A.J_i) / square[:, None],
+        (a[:, None] * B.J_j - b[:, None] * A.J_j) / square[:, None],
+        (a * B.gamma - b * A.gamma) / square + twist,
+    )
+
+
+PRIMITIVES: dict[str, Callable[[Side, Side, Data, Form], Row]] = {
+    "point": point, "n1": n1, "n2": n2, "p1": p1, "p2": p2,
+    "distance": distance, "angle": angle, "shift": shift,
+}  # fmt: skip

@@ -1,0 +1,58 @@
+"""The errors that bad input raises, and the small checks that raise them.
+
+Checks look at values only where there are values: inside `jax.jit`, `vmap` or `grad` an
+argument is a tracer, and the check is skipped there (build the model once outside to have
+it checked).
+"""
+
+import difflib
+from collections.abc import Iterable
+
+import jax
+import numpy as np
+
+
+class ModelError(ValueError):
+    """A model that is not physical or not connected; the message says what and where."""
+
+
+class StateError(ValueError):
+    """A state that does not fit its system: not unit, not finite, or not consistent."""
+
+
+class SettingError(ValueError):
+    """A setting (time span, tolerance, name of a solver, data type) that cannot be used."""
+
+
+class SimulationError(RuntimeError):
+    """A simulation that did not reach its end; `run` holds what was reached."""
+
+    run: object = None
+
+
+def concrete(*values: object) -> bool:
+    """Whether none of the values is a tracer, so that their numbers can be looked at."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def check_finite(value: object, what: str, unit: str, error: type[Exception] = ModelError) -> None:
+    """Raise `error` unless every number in `value` is finite."""
+    if not concrete(value):
+        return
+    array = np.asarray(value, dtype=float)
+    if not np.all(np.isfinite(array)):
+        raise error(f"{what} must be finite, but it is {array.tolist()} {unit}.".replace("  ", " "))
+
+
+def check_shape(value: object, shape: tuple[int, ...], what: str) -> None:
+    """Raise `ModelError` unless `value` has the given shape."""
+    if np.shape(value) != shape:  # pyright: ignore[reportArgumentType]
+        raise ModelError(f"{what} must have shape {shape}, but it has {np.shape(value)}.")  # pyright: ignore
+
+
+def nearest_names(name: str, known: Iterable[str]) -> str:
+    """' Did you mean ...? Known: ...' for error messages about unknown names."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f" Did you mean '{close[0]}'?" if close else ""
+    return f"{hint} Known names: {', '.join(known) if known else '(none)'}."

@@ -1,0 +1,369 @@
+"""Force elements: what acts on the bodies besides the joints.
+
+A force maps the kinematics of all bodies and the time to a `Load`: world force and
+body-frame moment about the centre of mass for every body, the potential energy it has (if
+any), and the power of its part that has none. Values may be numbers or functions of
+(t, kinematics); numbers are leaves of the pytree, so they can be differentiated.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .body import GROUND
+from .errors import ModelError, check_finite
+from .state import Kinematics
+
+Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Array, "..."]]
+
+
+def signal(value: "ArrayLike | Callable[..., object]", what: str) -> Signal:
+    """A constant as an array (checked to be finite), or the function itself."""
+    if callable(value):
+        return value  # pyright: ignore[reportReturnType]
+    check_finite(value, what, "")
+    return jnp.asarray(value, dtype=float)
+
+
+def evaluate(value: Signal, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "..."]:
+    """The signal's value at time t [s]."""
+    return jnp.asarray(value(t, kin), dtype=kin.r.dtype) if callable(value) else value
+
+
+class Load(eqx.Module):
+    """What a force does to all bodies, ground included as the last row.
+
+    Attributes:
+        force: world (n + 1, 3) [N], at the centres of mass.
+        moment: body axes (n + 1, 3) [N m], about the centres of mass.
+        potential: [J].
+        power: of the part of the force that has no potential [W].
+    """
+
+    force: Float[Array, "N 3"]
+    moment: Float[Array, "N 3"]
+    potential: Float[Array, ""]
+    power: Float[Array, ""]
+
+    def __add__(self, other: "Load") -> "Load":
+        return Load(
+            self.force + other.force,
+            self.moment + other.moment,
+            self.potential + other.potential,
+            self.power + other.power,
+        )
+
+
+def no_load(kin: Kinematics) -> Load:
+    """Zero load on every body."""
+    zero = jnp.zeros((), kin.r.dtype)
+    return Load(jnp.zeros_like(kin.r), jnp.zeros_like(kin.r), zero, zero)
+
+
+def push(
+    kin: Kinematics,
+    body: str,
+    force_w: Float[Array, "3"],
+    arm_w: Float[Array, "3"] | None = None,
+    moment_w: Float[Array, "3"] | None = None,
+) -> Load:
+    """A world force [N] at `arm_w` [m] from the body's centre of mass, and a moment [N m].
+
+    Its power is counted as that of a force without potential.
+    """
+    k = kin.index(body)
+    zero = jnp.zeros(3, kin.r.dtype)
+    total = zero if moment_w is None else moment_w
+    if arm_w is not None:
+        total = total + jnp.cross(arm_w, force_w)
+    row = np.eye(len(kin.names))[:, k, None]
+    power = force_w @ kin.v[k] + total @ kin.omega_w[k]
+    return Load(
+        row * force_w, row * (kin.R_wb[k].T @ total), jnp.zeros((), kin.r.dtype), power
+    )
+
+
+class AbstractForce(eqx.Module):
+    """A force element. Subclasses define `load` and the names of the bodies they act on."""
+
+    @abstractmethod
+    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+        """The load at time t [s] on all bodies."""
+
+    @abstractmethod
+    def bodies(self) -> tuple[str, ...]:
+        """The names that must be known bodies (or "ground") for this force to act."""
+
+    @abstractmethod
+    def joint_names(self) -> tuple[str, ...]:
+        """The names that must be known joints for this force to act."""
+
+
+class Gravity(AbstractForce):
+    """Uniform gravity, acceleration (3,) [m/s^2] in the world; potential -m a . r."""
+
+    acceleration: Float[Array, "3"]
+
+    def __init__(self, acceleration: ArrayLike = (0.0, 0.0, -9.81)) -> None:
+        check_finite(acceleration, "The acceleration of gravity", "m/s^2")
+        self.acceleration = jnp.asarray(acceleration, dtype=float)
+
+    def bodies(self) -> tuple[str, ...]:
+        return ()
+
+    def joint_names(self) -> tuple[str, ...]:
+        return ()
+
+    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+        force = kin.mass[:, None] * self.acceleration
+        return Load(force, jnp.zeros_like(force), -jnp.sum(force * kin.r), jnp.zeros_like(t))
+
+
+class AppliedForce(AbstractForce):
+    """A force on a body at one of its points.
+
+    Args:
+        body: its name.
+        force: (3,) [N], or a function of (t, kinematics) that returns it.
+        frame: the axes of `force`: "world" or "body".
+        point: in the body's reference frame (3,) [m]; by default the centre of mass.
+    """
+
+    body: str = eqx.field(static=True)
+    force: Signal
+    frame: Literal["world", "body"] = eqx.field(static=True)
+    point: Float[Array, "3"] | None
+
+    def __init__(
+        self,
+        body: str,
+        force: "ArrayLike | Callable[..., object]",
+        *,
+        frame: Literal["world", "body"] = "world",
+        point: ArrayLike | None = None,
+    ) -> None:
+        self.body = body
+        self.force = signal(force, f"The force on body '{body}'")
+        self.frame = _frame(frame)
+        self.point = None if point is None else jnp.asarray(point, dtype=float)
+
+    def bodies(self) -> tuple[str, ...]:
+        return (self.body,)
+
+    def joint_names(self) -> tuple[str, ...]:
+        return ()
+
+    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+        value = evaluate(self.force, t, kin)
+        force_w = kin.R_wb[kin.index(self.body)] @ value if self.frame == "body" else value
+        arm = None if self.point is None else kin.arm(self.body, self.point)
+        return push(kin, self.body, force_w, arm)
+
+
+class AppliedMoment(AbstractForce):
+    """A moment on a body: (3,) [N m] or a function of (t, kinematics), in `frame` axes."""
+
+    body: str = eqx.field(static=True)
+    moment: Signal
+    frame: Literal["world", "body"] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        body: str,
+        moment: "ArrayLike | Callable[..., object]",
+        *,
+        frame: Literal["world", "body"] = "world",
+    ) -> None:
+        self.body = body
+        self.moment = signal(moment, f"The moment on body '{body}'")
+        self.frame = _frame(frame)
+
+    def bodies(self) -> tuple[str, ...]:
+        return (self.body,)
+
+    def joint_names(self) -> tuple[str, ...]:
+        return ()
+
+    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+        value = evaluate(self.moment, t, kin)
+        moment_w = kin.R_wb[kin.index(self.body)] @ value if self.frame == "body" else value
+        return push(kin, self.body, jnp.zeros_like(moment_w), moment_w=moment_w)
+
+
+class LinearSpringDamper(AbstractForce):
+    """A spring and damper between a point of body i and a point of body j.
+
+    Args:
+        point_i, point_j: in the bodies' reference frames (3,) [m] (world for ground).
+        stiffness: [N/m]. damping: [N s/m]. length: at rest [m].
+
+    A spring of length zero pulls along no direction: it exerts no force there, and its
+    gradients stay finite.
+    """
+
+    body_i: str = eqx.field(static=True)
+    body_j: str = eqx.field(static=True)
+    point_i: Float[Array, "3"]
+    point_j: Float[Array, "3"]
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    length: Float[Array, ""]
+
+    def __init__(
+        self,
+        body_i: str,
+        body_j: str,
+        *,
+        point_i: ArrayLike = (0.0, 0.0, 0.0),
+        point_j: ArrayLike = (0.0, 0.0, 0.0),
+        stiffness: ArrayLike,
+        damping: ArrayLike = 0.0,
+        length: ArrayLike = 0.0,
+    ) -> None:
+        _two_bodies("A spring-damper", body_i, body_j)
+        self.body_i, self.body_j = body_i, body_j
+        self.point_i = jnp.asarray(point_i, dtype=float)
+        self.point_j = jnp.asarray(point_j, dtype=float)
+        for value, what in ((stiffness, "stiffness"), (damping, "damping"), (length, "length")):
+            check_finite(value, f"The {what} of the spring between '{body_i}' and '{body_j}'", "")
+        self.stiffness = jnp.asarray(stiffness, dtype=float)
+        self.damping = jnp.asarray(damping, dtype=float)
+        self.length = jnp.asarray(length, dtype=float)
+
+    def bodies(self) -> tuple[str, ...]:
+        return (self.body_i, self.body_j)
+
+    def joint_names(self) -> tuple[str, ...]:
+        return ()
+
+    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+        a, a_rate = kin.point(self.body_i, self.point_i)
+        b, b_rate = kin.point(self.body_j, self.point_j)
+        d, d_rate = b - a, b_rate - a_rate
+        square = d @ d
+        length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+        direction = jnp.where(square > 0, d / length, jnp.zeros_like(d))
+        stretch = jnp.where(square > 0, length, 0.0) - self.length
+        rate = direction @ d_rate
+        pull = (self.stiffness * stretch + self.damping * rate) * direction
+        load = push(kin, self.body_i, pull, kin.arm(self.body_i, self.point_i)) + push(
+            kin, self.body_j, -pull, kin.arm(self.body_j, self.point_j)
+        )
+        return Load(
+            load.force,
+            load.moment,
+            0.5 * self.stiffness * stretch**2,
+            -self.damping * rate**2,
+        )
+
+
+class TorsionalSpringDamper(AbstractForce):
+    """A torsional spring and damper about the z axis of a joint, from body i to body j.
+
+    Args:
+        joint: name of a revolute or cylindrical joint.
+        stiffness: [N m/rad]. damping: [N m s/rad]. angle: at rest [rad].
+
+    The angle is that of the joint's frames, in (-pi, pi]: a spring wound past half a turn
+    jumps back.
+    """
+
+    joint: str = eqx.field(static=True)
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    angle: Float[Array, ""]
+
+    def __init__(
+        self, joint: str, *, stiffness: ArrayLike, damping: ArrayLike = 0.0, angle: ArrayLike = 0.0
+    ) -> None:
+        self.joint = joint
+        for value, what in ((stiffness, "stiffness"), (damping, "damping"), (angle, "angle")):
+            check_finite(value, f"The {what} of the torsional spring in joint '{joint}'", "")
+        self.stiffness = jnp.asarray(stiffness, dtype=float)
+        self.damping = jnp.asarray(damping, dtype=float)
+        self.angle = jnp.asarray(angle, dtype=float)
+
+    def bodies(self) -> tuple[str, ...]:
+        return ()
+
+    def joint_names(self) -> tuple[str, ...]:
+        return (self.joint,)
+
+    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+        joint = kin.joint(self.joint)
+        i, j = kin.index(joint.body_i), kin.index(joint.body_j)
+        F_i, F_j = kin.R_wb[i] @ joint.frame_i, kin.R_wb[j] @ joint.frame_j
+        axis = F_i[:, 2]
+        turn = jnp.arctan2(F_i[:, 1] @ F_j[:, 0], F_i[:, 0] @ F_j[:, 0]) - self.angle
+        rate = axis @ (kin.omega_w[j] - kin.omega_w[i])
+        moment = (self.stiffness * turn + self.damping * rate) * axis
+        load = _couple(kin, joint.body_i, joint.body_j, moment)
+        return Load(
+            load.force, load.moment, 0.5 * self.stiffness * turn**2, -self.damping * rate**2
+        )
+
+
+class JointDamping(AbstractForce):
+    """Viscous damping in a joint.
+
+    Args:
+        joint: its name.
+        turning: [N m s/rad], on the relative angular velocity.
+        sliding: [N s/m], on the velocity of j's point along the joint's z axis.
+    """
+
+    joint: str = eqx.field(static=True)
+    turning: Float[Array, ""]
+    sliding: Float[Array, ""]
+
+    def __init__(self, joint: str, *, turning: ArrayLike = 0.0, sliding: ArrayLike = 0.0) -> None:
+        self.joint = joint
+        check_finite((turning, sliding), f"The damping of joint '{joint}'", "")
+        self.turning = jnp.asarray(turning, dtype=float)
+        self.sliding = jnp.asarray(sliding, dtype=float)
+
+    def bodies(self) -> tuple[str, ...]:
+        return ()
+
+    def joint_names(self) -> tuple[str, ...]:
+        return (self.joint,)
+
+    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+        joint = kin.joint(self.joint)
+        i, j = joint.body_i, joint.body_j
+        a, a_rate = kin.point(i, joint.point_i)
+        b, b_rate = kin.point(j, joint.point_j)
+        axis = kin.R_wb[kin.index(i)] @ joint.frame_i[:, 2]
+        slip = axis @ (b_rate - a_rate - jnp.cross(kin.omega_w[kin.index(i)], b - a))
+        drag = self.sliding * slip * axis
+        spin = self.turning * (kin.omega_w[kin.index(j)] - kin.omega_w[kin.index(i)])
+        # both forces act at j's point, so that they have no net moment
+        return (
+            push(kin, i, drag, b - kin.r[kin.index(i)])
+            + push(kin, j, -drag, b - kin.r[kin.index(j)])
+            + _couple(kin, i, j, spin)
+        )
+
+
+def _couple(kin: Kinematics, body_i: str, body_j: str, moment_w: Float[Array, "3"]) -> Load:
+    """`moment_w` [N m] on body i and its opposite on body j."""
+    none = jnp.zeros_like(moment_w)
+    return push(kin, body_i, none, moment_w=moment_w) + push(kin, body_j, none, moment_w=-moment_w)
+
+
+def _frame(frame: str) -> Literal["world", "body"]:
+    if frame not in ("world", "body"):
+        raise ModelError(f"The frame of a load must be 'world' or 'body', not '{frame}'.")
+    return frame  # pyright: ignore[reportReturnType]
+
+
+def _two_bodies(what: str, body_i: str, body_j: str) -> None:
+    if body_i == body_j:
+        raise ModelError(f"{what} joins body '{body_i}' to itself.")
+    if not body_i or not body_j:
+        raise ModelError(f"{what} needs two bodies; the fixed one is called '{GROUND}'.")

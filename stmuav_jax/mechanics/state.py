@@ -1,0 +1,119 @@
+"""The state of a system of rigid bodies, and what follows from it for every body."""
+
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..algebra.rotation import rotation_matrix
+from .body import GROUND
+from .errors import ModelError, nearest_names
+
+if TYPE_CHECKING:
+    from .joint import Joint
+
+
+class State(eqx.Module):
+    """Positions and velocities of the n moving bodies of a system.
+
+    Attributes:
+        r: centres of mass in the world (..., n, 3) [m].
+        p: Euler parameters, body to world (..., n, 4).
+        v: velocities of the centres of mass in the world (..., n, 3) [m/s].
+        omega: angular velocities in body axes (..., n, 3) [rad/s].
+    """
+
+    r: Float[Array, "*batch n 3"]
+    p: Float[Array, "*batch n 4"]
+    v: Float[Array, "*batch n 3"]
+    omega: Float[Array, "*batch n 3"]
+
+    @property
+    def n_bodies(self) -> int:
+        """Number of moving bodies."""
+        return self.r.shape[-2]
+
+
+class Kinematics(eqx.Module):
+    """What a state says of every body, ground included as the last row.
+
+    Attributes:
+        r, v: centre of mass and its velocity, world (n + 1, 3) [m], [m/s].
+        p: Euler parameters (n + 1, 4).
+        R_wb: body-to-world rotations (n + 1, 3, 3).
+        omega: angular velocities in body axes (n + 1, 3) [rad/s].
+        omega_w: angular velocities in world axes (n + 1, 3) [rad/s].
+        mass: (n + 1,) [kg], zero for ground.
+        com: centres of mass in the bodies' reference frames (n + 1, 3) [m].
+        names: the bodies' names, "ground" last.
+        joints: the system's joints, for forces that act in one.
+    """
+
+    r: Float[Array, "N 3"]
+    p: Float[Array, "N 4"]
+    v: Float[Array, "N 3"]
+    omega: Float[Array, "N 3"]
+    R_wb: Float[Array, "N 3 3"]
+    omega_w: Float[Array, "N 3"]
+    mass: Float[Array, " N"]
+    com: Float[Array, "N 3"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    joints: "tuple[Joint, ...]"
+
+    def index(self, name: str) -> int:
+        """Row of the named body; raises `ModelError` for an unknown name."""
+        if name not in self.names:
+            raise ModelError(f"There is no body '{name}'.{nearest_names(name, self.names)}")
+        return self.names.index(name)
+
+    def joint(self, name: str) -> "Joint":
+        """The named joint; raises `ModelError` for an unknown name."""
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        raise ModelError(
+            f"There is no joint '{name}'.{nearest_names(name, [j.name for j in self.joints])}"
+        )
+
+    def arm(self, name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        """World vector from the centre of mass to a point of the body's reference frame [m]."""
+        k = self.index(name)
+        return self.R_wb[k] @ (point - self.com[k])
+
+    def point(
+        self, name: str, point: Float[Array, "3"]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """World position [m] and velocity [m/s] of a point of the body's reference frame."""
+        k = self.index(name)
+        s = self.arm(name, point)
+        return self.r[k] + s, self.v[k] + jnp.cross(self.omega_w[k], s)
+
+
+def kinematics(
+    state: State,
+    *,
+    mass: Float[Array, " n"],
+    com: Float[Array, "n 3"],
+    names: tuple[str, ...],
+    joints: "tuple[Joint, ...]",
+) -> Kinematics:
+    """Kinematics of all bodies and of ground for one (unbatched) state."""
+    zero = jnp.zeros((1, 3), state.r.dtype)
+    unit = jnp.array([[1.0, 0.0, 0.0, 0.0]], state.p.dtype)
+    p = jnp.concatenate([state.p, unit])
+    omega = jnp.concatenate([state.omega, zero])
+    R_wb = jax.vmap(rotation_matrix)(p)
+    return Kinematics(
+        r=jnp.concatenate([state.r, zero]),
+        p=p,
+        v=jnp.concatenate([state.v, zero]),
+        omega=omega,
+        R_wb=R_wb,
+        omega_w=jnp.einsum("nab,nb->na", R_wb, omega),
+        mass=jnp.concatenate([mass, jnp.zeros(1, mass.dtype)]),
+        com=jnp.concatenate([com, zero]),
+        names=(*names, GROUND),
+        joints=joints,
+    )

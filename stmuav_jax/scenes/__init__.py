@@ -1,0 +1,1 @@
+"""Floor 4: the report's scenes, each modelling only what it needs."""

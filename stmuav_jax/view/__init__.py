@@ -1,0 +1,1 @@
+"""Floor 5: files, tables and figures; nothing below this floor touches them."""
