@@ -104,7 +104,9 @@ def from_rotation_vector(v: Vec3) -> Quat:
     small = square < _SMALL_SQUARE
     safe = jnp.where(small, 1.0, square)
     angle = jnp.sqrt(safe)
-    cosine = jnp.where(small, 1 - square / 8 + square**2 / 384 - square**3 / 46080, jnp.cos(angle / 2))
+    cosine = jnp.where(
+        small, 1 - square / 8 + square**2 / 384 - square**3 / 46080, jnp.cos(angle / 2)
+    )
     factor = jnp.where(small, 0.5 - square / 48 + square**2 / 3840, jnp.sin(angle / 2) / angle)
     return jnp.concatenate([cosine[None], factor * v])
 

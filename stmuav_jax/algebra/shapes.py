@@ -1,7 +1,10 @@
 """Names for the array shapes used throughout (jaxtyping aliases)."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Float, Shaped
 
 Scalar = Float[Array | np.ndarray, ""]
 Flag = Bool[Array | np.ndarray, ""]
@@ -15,3 +18,6 @@ Quats = Float[Array | np.ndarray, "... 4"]
 Vector = Float[Array | np.ndarray, " _"]
 Matrix = Float[Array | np.ndarray, "_ _"]
 AnyArray = Shaped[Array | np.ndarray, "..."]
+
+# What a user may write for an array: a number, an array, or a (nested) sequence.
+Numbers = ArrayLike | Sequence[Any]

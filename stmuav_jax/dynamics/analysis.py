@@ -6,8 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
+from ..algebra.shapes import Numbers
 from ..mechanics.force import Load
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
@@ -46,9 +47,7 @@ class Snapshot(eqx.Module):
     finite_loads: Bool[Array, " forces"]
 
 
-def snapshot(
-    method: Method, model: Model, t: Float[Array, ""], state: State
-) -> Snapshot:
+def snapshot(method: Method, model: Model, t: Float[Array, ""], state: State) -> Snapshot:
     """Look at one state through the method's formulation, without stabilisation."""
     system = model.system
     result = method.formulation.accelerations(model, t, state, Unstabilised())
@@ -84,13 +83,13 @@ def _snapshots(method: Method, model: Model, ts: Any, states: State) -> Snapshot
 _BLOCK = 32
 
 
-def snapshots(method: Method, model: Model, ts: Float[Array, " k"], states: State) -> Snapshot:
+def snapshots(method: Method, model: Model, ts: np.ndarray, states: State) -> Snapshot:
     """`snapshot` of k states, as NumPy arrays stacked along the first axis."""
     k = len(ts)
     blocks = []
     for start in range(0, k, _BLOCK):
         pick = np.minimum(np.arange(start, start + _BLOCK), k - 1)
-        take = lambda x, pick=pick: np.asarray(x)[pick]
+        take = lambda x, pick=pick: jnp.asarray(np.asarray(x)[pick])
         block = _snapshots(method, model, take(ts), jax.tree.map(take, states))
         keep = min(_BLOCK, k - start)
         blocks.append(jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], block))
@@ -107,7 +106,7 @@ class Evaluation(eqx.Module):
 def evaluate(
     system: System,
     state: State,
-    t: ArrayLike = 0.0,
+    t: Numbers = 0.0,
     *,
     formulation: Augmented | None = None,
     load: Load | None = None,
@@ -133,9 +132,7 @@ def evaluate(
     model = formulation.prepare(system)
     time = jnp.asarray(t, dtype=state.r.dtype)
     result = formulation.accelerations(model, time, state, Unstabilised())
-    reactions = joint_reactions(
-        system, model.constraints, time, state, result.multipliers, frame
-    )
+    reactions = joint_reactions(system, model.constraints, time, state, result.multipliers, frame)
     return Evaluation(result, reactions)
 
 

@@ -14,7 +14,7 @@ or, with W = diag(1/m_i, J'_i^-1) and g6 = (f_i, n'_i - omega' x J' omega'),
 """
 
 from functools import reduce
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -81,7 +81,9 @@ class Augmented(AbstractFormulation):
 
     def to_state(self, model: Model, x: Float[Array, " k"]) -> State:
         n = model.system.n_bodies
-        r, p, v, omega = (x[a * n : b * n].reshape(n, -1) for a, b in ((0, 3), (3, 7), (7, 10), (10, 13)))
+        r, p, v, omega = (
+            x[a * n : b * n].reshape(n, -1) for a, b in ((0, 3), (3, 7), (7, 10), (10, 13))
+        )
         return State(r, p, v, omega)
 
     def accelerations(
@@ -166,7 +168,9 @@ class Augmented(AbstractFormulation):
         turning = 2 * jnp.einsum("nab,nbp->nap", model.system.bodies.inertia, L)
         for k in range(n):
             row, column = 6 * k, 7 * k
-            K = K.at[row : row + 3, column : column + 3].set(model.system.bodies.mass[k] * jnp.eye(3))
+            K = K.at[row : row + 3, column : column + 3].set(
+                model.system.bodies.mass[k] * jnp.eye(3)
+            )
             K = K.at[row + 3 : row + 6, column + 3 : column + 7].set(turning[k])
             K = K.at[6 * n + k, column + 3 : column + 7].set(p[k])
         K = K.at[: 6 * n, 7 * n :].set(B.reshape(m, 6 * n).T)
@@ -194,7 +198,7 @@ class Augmented(AbstractFormulation):
         weighed = model.weigh(first.J).reshape(first.matrix.shape)
         factor = self._factor(first, weighed)
 
-        def closer(_: int, posture: tuple[Array, Array]) -> tuple[Array, Array]:
+        def closer(_: Any, posture: tuple[Array, Array]) -> tuple[Array, Array]:
             at = State(posture[0], posture[1], state.v, state.omega)
             value = model.constraints.equations(t, model.system.kinematics(at)).value
             step = -(weighed.T @ factor.solve(value)).reshape(-1, 6)

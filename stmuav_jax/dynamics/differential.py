@@ -36,7 +36,7 @@ class Group(eqx.Module):
         def one(i: Side, j: Side, data: Data) -> Row:
             return PRIMITIVES[self.kind](i, j, data, form)
 
-        take = lambda index: jax.tree.map(lambda x: x[np.array(index)], sides)  # noqa: E731
+        take = lambda index: jax.tree.map(lambda x: x[np.array(index)], sides)
         rows = jax.vmap(one)(take(self.i), take(self.j), self.data)
         if not self.motions:
             return rows
@@ -47,11 +47,13 @@ def _driven(rows: Row, motions: tuple[Motion, ...], t: Float[Array, ""], *, wrap
     """Subtract each row's prescribed motion, with its first and second derivatives."""
 
     def derivatives(motion: Motion) -> tuple[Array, Array, Array]:
-        f = lambda time: jnp.asarray(motion(time), dtype=time.dtype)  # noqa: E731
-        first = lambda time: jax.jvp(f, (time,), (jnp.ones_like(time),))[1]  # noqa: E731
+        f = lambda time: jnp.asarray(motion(time), dtype=time.dtype)
+        first = lambda time: jax.jvp(f, (time,), (jnp.ones_like(time),))[1]
         return f(t), *jax.jvp(first, (t,), (jnp.ones_like(t),))
 
-    value, rate, second = (jnp.stack(x)[:, None] for x in zip(*map(derivatives, motions), strict=True))
+    value, rate, second = (
+        jnp.stack(x)[:, None] for x in zip(*map(derivatives, motions), strict=True)
+    )
     off = rows.value - value
     if wrap:
         off = jnp.arctan2(jnp.sin(off), jnp.cos(off))
@@ -152,6 +154,8 @@ def constraints(system: System, rows: RowChoice = "body") -> Constraints:
     for kind in (k for k in PRIMITIVES if k in found):
         i, j, numbers, data, motions = zip(*found[kind], strict=True)
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *data)
-        groups.append(Group(kind, i, j, numbers, stacked, tuple(m for m in motions if m is not None)))
+        groups.append(
+            Group(kind, i, j, numbers, stacked, tuple(m for m in motions if m is not None))
+        )
         owner += [number for number in numbers for _ in range(ROWS[kind])]
     return Constraints(tuple(groups), tuple(owner), system.n_bodies)

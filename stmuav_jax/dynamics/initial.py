@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from ..algebra.rotation import normalise
+from ..algebra.shapes import Numbers
 from ..mechanics.errors import ModelError, StateError, concrete
 from ..mechanics.joint import drive
 from ..mechanics.state import State
@@ -40,7 +41,7 @@ class Assembly(eqx.Module):
 def assemble(
     system: System,
     guess: State,
-    t: ArrayLike = 0.0,
+    t: Numbers = 0.0,
     *,
     hold: Mapping[str, Held] | None = None,
     hold_joints: tuple[str, ...] = (),
@@ -144,7 +145,10 @@ def _lock(system: System, state: State, names: tuple[str, ...]) -> System:
         i, j = kin.index(joint.body_i), kin.index(joint.body_j)
         F_i, F_j = kin.R_wb[i] @ joint.frame_i, kin.R_wb[j] @ joint.frame_j
         if kind == "shift":
-            apart = kin.point(joint.body_j, joint.point_j)[0] - kin.point(joint.body_i, joint.point_i)[0]
+            apart = (
+                kin.point(joint.body_j, joint.point_j)[0]
+                - kin.point(joint.body_i, joint.point_i)[0]
+            )
             value = F_i[:, 2] @ apart
         else:
             value = jnp.arctan2(F_i[:, 1] @ F_j[:, 0], F_i[:, 0] @ F_j[:, 0])
@@ -176,9 +180,11 @@ def _positions(
     def residual(unknown: tuple[Array, Array], args: tuple[Model, State]) -> tuple[Array, Array]:
         step, multipliers = unknown
         within, base = args
-        phi = lambda s: within.constraints.equations(  # noqa: E731
-            t, within.system.kinematics(moved(s, base))
-        ).value
+        phi = lambda s: (
+            within.constraints.equations(
+                t, within.system.kinematics(moved(s, base))
+            ).value
+        )
         value, pull = jax.vjp(phi, step)
         by_body = step.reshape(-1, 6)
         mass = within.system.bodies
@@ -198,7 +204,13 @@ def _positions(
     solver = optx.Newton(rtol=1e-12, atol=1e-13, linear_solver=lx.SVD(rcond=1e-11))
     adjoint = optx.ImplicitAdjoint(linear_solver=lx.SVD(rcond=1e-11))
     solution = optx.root_find(
-        residual, solver, start, args=(model, guess), adjoint=adjoint, max_steps=max_steps, throw=False
+        residual,
+        solver,
+        start,
+        args=(model, guess),
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=False,
     )
     return moved(solution.value[0], guess)
 

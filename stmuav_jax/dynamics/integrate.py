@@ -14,8 +14,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
+from ..algebra.shapes import Numbers
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .augmented import Augmented
@@ -47,10 +48,10 @@ class Method(eqx.Module):
 
     formulation: AbstractFormulation = Augmented()
     solver: diffrax.AbstractSolver = diffrax.Dopri8()
-    rtol: ArrayLike = 1e-8
-    atol: ArrayLike = 1e-8
+    rtol: Numbers = 1e-8
+    atol: Numbers = 1e-8
     stabilisation: AbstractStabilisation = Projection()
-    first_step: ArrayLike = 1e-4
+    first_step: Numbers = 1e-4
     max_steps: int = eqx.field(static=True, default=100_000)
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint()
     event: Event | None = None
@@ -130,7 +131,9 @@ class Problem(eqx.Module):
     def field(self, t: Float[Array, ""], y: Float[Array, " k"], args: Any) -> Float[Array, " k"]:
         """y', the formulation's x' followed by the flows of energy and momentum."""
         how, formulation = self.method.stabilisation, self.method.formulation
-        rate, flows = _derivative(formulation, args, jnp.asarray(t, y.dtype), y[: self.n_state], how)
+        rate, flows = _derivative(
+            formulation, args, jnp.asarray(t, y.dtype), y[: self.n_state], how
+        )
         parts = [rate, flows.power[None]]
         if self.floating:
             parts += [flows.force, flows.moment]
@@ -150,9 +153,7 @@ class Problem(eqx.Module):
             return jax.lax.stop_gradient(now)
 
         inner = stage_loop(self.method.solver, self.method.adjoint)
-        return Stabilised(
-            inner, project if isinstance(how, Projection) else None, residuals
-        )
+        return Stabilised(inner, project if isinstance(how, Projection) else None, residuals)
 
     def controller(self) -> Remembering:
         """Step size control by the local error of the state."""
@@ -233,9 +234,14 @@ def advance(problem: Problem, carry: Carry, ts: Float[Array, " k"]) -> tuple[Car
         if problem.method.event is not None:
             # the event's time comes from interpolation; the state there from steps
             struck = result == diffrax.RESULTS.event_occurred
-            again = lambda: _segment(problem, carry, solution.ts[0], event=False)  # noqa: E731
-            solution = jax.lax.cond(struck, again, lambda: eqx.tree_at(
-                lambda s: s.event_mask, solution, None, is_leaf=lambda x: x is None))
+            again = lambda: _segment(problem, carry, solution.ts[0], event=False)
+            solution = jax.lax.cond(
+                struck,
+                again,
+                lambda: eqx.tree_at(
+                    lambda s: s.event_mask, solution, None, is_leaf=lambda x: x is None
+                ),
+            )
         counts = Counts(
             carry.counts.accepted + solution.stats["num_accepted_steps"],
             carry.counts.rejected + solution.stats["num_rejected_steps"],
@@ -253,7 +259,7 @@ def advance(problem: Problem, carry: Carry, ts: Float[Array, " k"]) -> tuple[Car
 
     end, (reached, ys, counts, worst) = jax.lax.scan(to_next, carry, ts)
     n = problem.n_state
-    to_state = lambda y: problem.method.formulation.to_state(problem.model, y[:n])  # noqa: E731
+    to_state = lambda y: problem.method.formulation.to_state(problem.model, y[:n])
     impulse = ys[:, n + 1 :] if problem.floating else jnp.zeros((ys.shape[0], 6), ys.dtype)
     states = jax.vmap(to_state)(ys)
     return end, Trajectory(reached, states, ys[:, n], impulse, counts, worst, end.result)

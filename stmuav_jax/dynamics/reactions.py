@@ -64,7 +64,7 @@ def joint_reactions(
     result = Reactions(-force, -moment)
     if frame == "world":
         return result
-    turn = lambda x: jnp.einsum("kba,kb->ka", axes, x)  # noqa: E731
+    turn = lambda x: jnp.einsum("kba,kb->ka", axes, x)
     return Reactions(turn(result.force), turn(result.moment))
 
 

@@ -106,15 +106,15 @@ def simulate(
     return run
 
 
-def _output_times(
-    scene: Scene, t1: float | None, save_every: float | None, ts: Any
-) -> np.ndarray:
+def _output_times(scene: Scene, t1: float | None, save_every: float | None, ts: Any) -> np.ndarray:
     if ts is not None:
         times = np.asarray(ts, dtype=float)
         if times.ndim != 1 or times.size < 1 or not np.all(np.isfinite(times)):
             raise SettingError("The output times ts must be a list of finite numbers.")
         if times[0] != scene.t0:
-            raise SettingError(f"The first output time must be the scene's t0 = {scene.t0} s, not {times[0]} s.")
+            raise SettingError(
+                f"The first output time must be the scene's t0 = {scene.t0} s, not {times[0]} s."
+            )
         if np.any(np.diff(times) <= 0):
             k = int(np.argmax(np.diff(times) <= 0))
             raise SettingError(
@@ -152,7 +152,11 @@ def _check_settings(method: Method) -> None:
 
 def _check_start(system: System, state: State) -> None:
     check_state(system, state)
-    units = (("r", "position", "m"), ("v", "velocity", "m/s"), ("omega", "angular velocity", "rad/s"))
+    units = (
+        ("r", "position", "m"),
+        ("v", "velocity", "m/s"),
+        ("omega", "angular velocity", "rad/s"),
+    )
     for k, name in enumerate(system.names):
         check_unit(state.p[k], f"body '{name}' in the initial state", StateError)
         for field, words, unit in units:
@@ -254,7 +258,9 @@ def _run(
         stopped = "interrupted"
     if not parts:
         raise KeyboardInterrupt
-    joined = jax.tree.map(lambda *x: np.concatenate(x), *(eqx.tree_at(_result, p, None) for p in parts))
+    joined = jax.tree.map(
+        lambda *x: np.concatenate(x), *(eqx.tree_at(_result, p, None) for p in parts)
+    )
     joined = eqx.tree_at(_result, joined, parts[-1].result, is_leaf=lambda x: x is None)
     return _until_stop(joined), (compiling, time.perf_counter() - clock), stopped
 

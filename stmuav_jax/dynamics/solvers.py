@@ -1,7 +1,7 @@
 """Two wrappers around diffrax: a solver that holds the constraints, a remembered step size."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import diffrax
@@ -14,7 +14,7 @@ from .formulation import Residuals
 Vector = Float[Array, " k"]
 
 
-@lru_cache(maxsize=None)
+@cache
 def _landed(inner: type) -> type:
     """Interpolation of a step whose end was moved after the step: the inner one, shifted."""
 
@@ -140,7 +140,17 @@ class Remembering(diffrax.AbstractStepSizeController):
     def wrap(self, direction: Any) -> "Remembering":
         return Remembering(self.controller.wrap(direction))
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
+    def init(
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        dt0: Any,
+        args: Any,
+        func: Any,
+        error_order: Any,
+    ) -> Any:
         end, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         return end, (end - t0, inner)
 

@@ -3,8 +3,9 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from ..algebra.shapes import Numbers
 from ..mechanics.errors import SettingError, concrete
 
 
@@ -31,9 +32,7 @@ class Baumgarte(AbstractStabilisation):
     beta: Float[Array, ""]
     norm: Float[Array, ""]
 
-    def __init__(
-        self, alpha: ArrayLike = 10.0, beta: ArrayLike = 10.0, norm: ArrayLike = 10.0
-    ) -> None:
+    def __init__(self, alpha: Numbers = 10.0, beta: Numbers = 10.0, norm: Numbers = 10.0) -> None:
         gains = {"alpha": alpha, "beta": beta, "norm": norm}
         for name, value in gains.items():
             if concrete(value) and not (np.isfinite(value) and value >= 0):  # pyright: ignore

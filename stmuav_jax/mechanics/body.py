@@ -3,9 +3,10 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from ..algebra.rotation import rotation_matrix
+from ..algebra.shapes import Numbers
 from .errors import ModelError, check_finite, check_shape, concrete
 
 GROUND = "ground"
@@ -52,12 +53,12 @@ class Body(eqx.Module):
     def __init__(
         self,
         name: str,
-        mass: ArrayLike,
-        inertia: ArrayLike,
+        mass: Numbers,
+        inertia: Numbers,
         *,
-        com: ArrayLike = (0.0, 0.0, 0.0),
-        position: ArrayLike = (0.0, 0.0, 0.0),
-        orientation: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        com: Numbers = (0.0, 0.0, 0.0),
+        position: Numbers = (0.0, 0.0, 0.0),
+        orientation: Numbers = (1.0, 0.0, 0.0, 0.0),
         free: bool = False,
         triangle_tolerance: float = 0.0,
     ) -> None:
@@ -89,22 +90,26 @@ class Body(eqx.Module):
         return self.position + rotation_matrix(self.orientation) @ self.com
 
 
-def check_mass(mass: ArrayLike, what: str) -> None:
+def check_mass(mass: Numbers, what: str) -> None:
     """Raise `ModelError` unless the mass [kg] is finite and positive."""
     if concrete(mass) and not (np.isfinite(mass) and float(mass) > 0):  # pyright: ignore
         raise ModelError(f"The mass of {what} must be finite and positive, but it is {mass} kg.")
 
 
-def check_inertia(inertia: ArrayLike, what: str, tolerance: float) -> None:
+def check_inertia(inertia: Numbers, what: str, tolerance: float) -> None:
     """Raise `ModelError` unless the tensor (3, 3) [kg m^2] is one that a rigid body can have."""
     if not concrete(inertia):
         return
     tensor = np.asarray(inertia, dtype=float)
     if not np.all(np.isfinite(tensor)):
-        raise ModelError(f"The inertia tensor of {what} must be finite, but it is {tensor.tolist()}.")
+        raise ModelError(
+            f"The inertia tensor of {what} must be finite, but it is {tensor.tolist()}."
+        )
     size = np.abs(tensor).max()
     if np.abs(tensor - tensor.T).max() > _ROUND_OFF * size:
-        raise ModelError(f"The inertia tensor of {what} must be symmetric, but it is {tensor.tolist()}.")
+        raise ModelError(
+            f"The inertia tensor of {what} must be symmetric, but it is {tensor.tolist()}."
+        )
     moments = np.linalg.eigvalsh(tensor)
     listed = ", ".join(f"{m:.6g}" for m in moments)
     if moments[0] <= 0:
@@ -123,13 +128,15 @@ def check_inertia(inertia: ArrayLike, what: str, tolerance: float) -> None:
         )
 
 
-def check_unit(p: ArrayLike, what: str, error: type[Exception]) -> None:
+def check_unit(p: Numbers, what: str, error: type[Exception]) -> None:
     """Raise `error` unless p (4,) is finite and |p| = 1 within `UNIT_TOLERANCE`."""
     if not concrete(p):
         return
     values = np.asarray(p, dtype=float)
     if not np.all(np.isfinite(values)):
-        raise error(f"The Euler parameters of {what} must be finite, but they are {values.tolist()}.")
+        raise error(
+            f"The Euler parameters of {what} must be finite, but they are {values.tolist()}."
+        )
     norm = float(np.sqrt(values @ values))
     if abs(norm - 1) <= UNIT_TOLERANCE:
         return

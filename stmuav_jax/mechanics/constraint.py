@@ -37,7 +37,7 @@ ROWS: dict[str, int] = {
 
 
 class Data(eqx.Module):
-    """The body-fixed numbers of one primitive; a primitive reads those that it needs.
+    """The body-fixed numbers of one primitive (or a stack); a primitive reads those that it needs.
 
     Attributes:
         point_i, point_j: from the bodies' centres of mass, in body axes (3,) [m].
@@ -46,23 +46,23 @@ class Data(eqx.Module):
         length: [m]; distance.
     """
 
-    point_i: Float[Array, "3"]
-    point_j: Float[Array, "3"]
-    axis_i: Float[Array, "3"]
-    axis_j: Float[Array, "3"]
-    side_i: Float[Array, "3"]
-    length: Float[Array, ""]
+    point_i: Float[Array, "*batch 3"]
+    point_j: Float[Array, "*batch 3"]
+    axis_i: Float[Array, "*batch 3"]
+    axis_j: Float[Array, "*batch 3"]
+    side_i: Float[Array, "*batch 3"]
+    length: Float[Array, "*batch"]
 
 
 class Side(eqx.Module):
-    """One body as a constraint sees it: r, v (3,); p (4,); R_wb (3, 3); omega, omega_w (3,)."""
+    """One body (or a stack) as a constraint sees it: r, v (3,); p (4,); R_wb (3, 3); omega, omega_w (3,)."""
 
-    r: Float[Array, "3"]
-    v: Float[Array, "3"]
-    p: Float[Array, "4"]
-    R_wb: Float[Array, "3 3"]
-    omega: Float[Array, "3"]
-    omega_w: Float[Array, "3"]
+    r: Float[Array, "*batch 3"]
+    v: Float[Array, "*batch 3"]
+    p: Float[Array, "*batch 4"]
+    R_wb: Float[Array, "*batch 3 3"]
+    omega: Float[Array, "*batch 3"]
+    omega_w: Float[Array, "*batch 3"]
 
     def velocity(self, form: Form) -> Float[Array, " k"]:
         """(v, omega') or (v, pdot), what J multiplies, shape (6,) or (7,)."""
@@ -90,11 +90,11 @@ class Row(eqx.Module):
         gamma: the acceleration-level right-hand side (k,).
     """
 
-    value: Float[Array, " k"]
-    target: Float[Array, " k"]
-    J_i: Float[Array, "k w"]
-    J_j: Float[Array, "k w"]
-    gamma: Float[Array, " k"]
+    value: Float[Array, "*batch k"]
+    target: Float[Array, "*batch k"]
+    J_i: Float[Array, "*batch k w"]
+    J_j: Float[Array, "*batch k w"]
+    gamma: Float[Array, "*batch k"]
 
 
 def jet(side: Side, fixed: Float[Array, "3"], form: Form) -> Jet:

@@ -13,8 +13,9 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from ..algebra.shapes import Numbers
 from .body import GROUND
 from .errors import ModelError, check_finite
 from .state import Kinematics
@@ -22,7 +23,7 @@ from .state import Kinematics
 Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Array, "..."]]
 
 
-def signal(value: "ArrayLike | Callable[..., object]", what: str) -> Signal:
+def signal(value: "Numbers | Callable[..., object]", what: str) -> Signal:
     """A constant as an array (checked to be finite), or the function itself."""
     if callable(value):
         return value  # pyright: ignore[reportReturnType]
@@ -83,9 +84,7 @@ def push(
         total = total + jnp.cross(arm_w, force_w)
     row = np.eye(len(kin.names))[:, k, None]
     power = force_w @ kin.v[k] + total @ kin.omega_w[k]
-    return Load(
-        row * force_w, row * (kin.R_wb[k].T @ total), jnp.zeros((), kin.r.dtype), power
-    )
+    return Load(row * force_w, row * (kin.R_wb[k].T @ total), jnp.zeros((), kin.r.dtype), power)
 
 
 class AbstractForce(eqx.Module):
@@ -109,7 +108,7 @@ class Gravity(AbstractForce):
 
     acceleration: Float[Array, "3"]
 
-    def __init__(self, acceleration: ArrayLike = (0.0, 0.0, -9.81)) -> None:
+    def __init__(self, acceleration: Numbers = (0.0, 0.0, -9.81)) -> None:
         check_finite(acceleration, "The acceleration of gravity", "m/s^2")
         self.acceleration = jnp.asarray(acceleration, dtype=float)
 
@@ -142,10 +141,10 @@ class AppliedForce(AbstractForce):
     def __init__(
         self,
         body: str,
-        force: "ArrayLike | Callable[..., object]",
+        force: "Numbers | Callable[..., object]",
         *,
         frame: Literal["world", "body"] = "world",
-        point: ArrayLike | None = None,
+        point: Numbers | None = None,
     ) -> None:
         self.body = body
         self.force = signal(force, f"The force on body '{body}'")
@@ -175,7 +174,7 @@ class AppliedMoment(AbstractForce):
     def __init__(
         self,
         body: str,
-        moment: "ArrayLike | Callable[..., object]",
+        moment: "Numbers | Callable[..., object]",
         *,
         frame: Literal["world", "body"] = "world",
     ) -> None:
@@ -219,11 +218,11 @@ class LinearSpringDamper(AbstractForce):
         body_i: str,
         body_j: str,
         *,
-        point_i: ArrayLike = (0.0, 0.0, 0.0),
-        point_j: ArrayLike = (0.0, 0.0, 0.0),
-        stiffness: ArrayLike,
-        damping: ArrayLike = 0.0,
-        length: ArrayLike = 0.0,
+        point_i: Numbers = (0.0, 0.0, 0.0),
+        point_j: Numbers = (0.0, 0.0, 0.0),
+        stiffness: Numbers,
+        damping: Numbers = 0.0,
+        length: Numbers = 0.0,
     ) -> None:
         _two_bodies("A spring-damper", body_i, body_j)
         self.body_i, self.body_j = body_i, body_j
@@ -279,7 +278,7 @@ class TorsionalSpringDamper(AbstractForce):
     angle: Float[Array, ""]
 
     def __init__(
-        self, joint: str, *, stiffness: ArrayLike, damping: ArrayLike = 0.0, angle: ArrayLike = 0.0
+        self, joint: str, *, stiffness: Numbers, damping: Numbers = 0.0, angle: Numbers = 0.0
     ) -> None:
         self.joint = joint
         for value, what in ((stiffness, "stiffness"), (damping, "damping"), (angle, "angle")):
@@ -321,7 +320,7 @@ class JointDamping(AbstractForce):
     turning: Float[Array, ""]
     sliding: Float[Array, ""]
 
-    def __init__(self, joint: str, *, turning: ArrayLike = 0.0, sliding: ArrayLike = 0.0) -> None:
+    def __init__(self, joint: str, *, turning: Numbers = 0.0, sliding: Numbers = 0.0) -> None:
         self.joint = joint
         check_finite((turning, sliding), f"The damping of joint '{joint}'", "")
         self.turning = jnp.asarray(turning, dtype=float)

@@ -16,9 +16,10 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from ..algebra.rotation import rotation_matrix
+from ..algebra.shapes import Numbers
 from .body import Body
 from .constraint import ROWS, Data
 from .errors import ModelError, check_finite, check_shape, concrete
@@ -94,9 +95,7 @@ class Joint(eqx.Module):
         """How many constraint rows the joint has."""
         return sum(ROWS[term.kind] for term in self.terms("body"))
 
-    def data(
-        self, term: Term, com_i: Float[Array, "3"], com_j: Float[Array, "3"]
-    ) -> Data:
+    def data(self, term: Term, com_i: Float[Array, "3"], com_j: Float[Array, "3"]) -> Data:
         """The numbers of one primitive, points taken from the centres of mass."""
         return Data(
             point_i=self.point_i - com_i,
@@ -126,7 +125,7 @@ def resolve(joint: Joint, i: Body | None, j: Body | None) -> Joint:
     )
 
 
-def _unit(axis: ArrayLike, what: str) -> Float[Array, "3"]:
+def _unit(axis: Numbers, what: str) -> Float[Array, "3"]:
     vector = jnp.asarray(axis, dtype=float)
     check_shape(vector, (3,), what)
     check_finite(vector, what, "")
@@ -149,10 +148,10 @@ def _joint(
     name: str,
     body_i: str,
     body_j: str,
-    point_i: ArrayLike,
-    point_j: ArrayLike,
+    point_i: Numbers,
+    point_j: Numbers,
     frame: Float[Array, "3 3"],
-    length: ArrayLike = 0.0,
+    length: Numbers = 0.0,
 ) -> Joint:
     points = jnp.asarray(point_i, dtype=float), jnp.asarray(point_j, dtype=float)
     for value in points:
@@ -177,18 +176,18 @@ def _joint(
 _ORIGIN = (0.0, 0.0, 0.0)
 
 
-def weld(name: str, body_i: str, body_j: str, *, point: ArrayLike = _ORIGIN) -> Joint:
+def weld(name: str, body_i: str, body_j: str, *, point: Numbers = _ORIGIN) -> Joint:
     """No relative motion; 6 rows. `point` (3,) [m]: where the reaction is reported."""
     return _joint("weld", name, body_i, body_j, point, point, jnp.eye(3))
 
 
-def spherical(name: str, body_i: str, body_j: str, *, point: ArrayLike) -> Joint:
+def spherical(name: str, body_i: str, body_j: str, *, point: Numbers) -> Joint:
     """A common point, world coordinates at the reference posture (3,) [m]; 3 rows."""
     return _joint("spherical", name, body_i, body_j, point, point, jnp.eye(3))
 
 
 def universal(
-    name: str, body_i: str, body_j: str, *, point: ArrayLike, axis_i: ArrayLike, axis_j: ArrayLike
+    name: str, body_i: str, body_j: str, *, point: Numbers, axis_i: Numbers, axis_j: Numbers
 ) -> Joint:
     """A common point and two perpendicular axes, one fixed in each body; 4 rows.
 
@@ -207,19 +206,19 @@ def universal(
             f"The axes of universal joint '{name}' must be perpendicular, but they are "
             f"{degrees:.6g} degrees apart."
         )
-    return _joint("universal", name, body_i, body_j, point, point, jnp.stack([x, y, jnp.cross(x, y)], 1))
+    return _joint(
+        "universal", name, body_i, body_j, point, point, jnp.stack([x, y, jnp.cross(x, y)], 1)
+    )
 
 
-def revolute(
-    name: str, body_i: str, body_j: str, *, point: ArrayLike, axis: ArrayLike
-) -> Joint:
+def revolute(name: str, body_i: str, body_j: str, *, point: Numbers, axis: Numbers) -> Joint:
     """Turning about one axis through `point` (3,) [m], world at reference; 5 rows."""
     frame = _frame_about(_unit(axis, f"The axis of joint '{name}'"))
     return _joint("revolute", name, body_i, body_j, point, point, frame)
 
 
 def translational(
-    name: str, body_i: str, body_j: str, *, axis: ArrayLike, point: ArrayLike = _ORIGIN
+    name: str, body_i: str, body_j: str, *, axis: Numbers, point: Numbers = _ORIGIN
 ) -> Joint:
     """Sliding along one axis through `point` (3,) [m], world at reference; 5 rows."""
     frame = _frame_about(_unit(axis, f"The axis of joint '{name}'"))
@@ -227,14 +226,14 @@ def translational(
 
 
 def cylindrical(
-    name: str, body_i: str, body_j: str, *, axis: ArrayLike, point: ArrayLike = _ORIGIN
+    name: str, body_i: str, body_j: str, *, axis: Numbers, point: Numbers = _ORIGIN
 ) -> Joint:
     """Sliding along and turning about one axis through `point` (3,) [m]; 4 rows."""
     frame = _frame_about(_unit(axis, f"The axis of joint '{name}'"))
     return _joint("cylindrical", name, body_i, body_j, point, point, frame)
 
 
-def _length(name: str, point_i: ArrayLike, point_j: ArrayLike, length: ArrayLike | None) -> ArrayLike:
+def _length(name: str, point_i: Numbers, point_j: Numbers, length: Numbers | None) -> Numbers:
     apart = jnp.asarray(point_j, dtype=float) - jnp.asarray(point_i, dtype=float)
     value = jnp.sqrt(apart @ apart) if length is None else jnp.asarray(length, dtype=float)
     if concrete(value) and not (np.isfinite(float(value)) and float(value) > 0):
@@ -247,9 +246,9 @@ def distance(
     body_i: str,
     body_j: str,
     *,
-    point_i: ArrayLike,
-    point_j: ArrayLike,
-    length: ArrayLike | None = None,
+    point_i: Numbers,
+    point_j: Numbers,
+    length: Numbers | None = None,
 ) -> Joint:
     """A massless rod with a ball at each end; 1 row.
 
@@ -266,10 +265,10 @@ def revolute_spherical(
     body_i: str,
     body_j: str,
     *,
-    point_i: ArrayLike,
-    axis: ArrayLike,
-    point_j: ArrayLike,
-    length: ArrayLike | None = None,
+    point_i: Numbers,
+    axis: Numbers,
+    point_j: Numbers,
+    length: Numbers | None = None,
 ) -> Joint:
     """A massless link that turns about an axis of body i and ends in a ball on body j; 2 rows.
 

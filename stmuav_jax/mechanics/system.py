@@ -55,7 +55,9 @@ class System(eqx.Module):
         _check_references(by_name, joints, forces)
         _check_connected(bodies, joints)
         self.bodies = stack_bodies(tuple(bodies))
-        self.joints = tuple(resolve(j, by_name.get(j.body_i), by_name.get(j.body_j)) for j in joints)
+        self.joints = tuple(
+            resolve(j, by_name.get(j.body_i), by_name.get(j.body_j)) for j in joints
+        )
         self.forces = tuple(forces)
         zero = jnp.zeros_like(self.bodies.com)
         self.reference = State(
@@ -140,7 +142,9 @@ def _check_names(bodies: Sequence[Body], joints: Sequence[Joint]) -> None:
     for kind, names in (("Body", [b.name for b in bodies]), ("Joint", [j.name for j in joints])):
         twice = [name for name, count in Counter(names).items() if count > 1]
         if twice:
-            raise ModelError(f"{kind} names must be unique, but these occur twice: {', '.join(twice)}.")
+            raise ModelError(
+                f"{kind} names must be unique, but these occur twice: {', '.join(twice)}."
+            )
 
 
 def _check_references(
