@@ -37,6 +37,7 @@ from .mechanics.force import (
     JointDamping,
     LinearSpringDamper,
     Load,
+    Sine,
     TorsionalSpringDamper,
 )
 from .mechanics.joint import (
@@ -53,6 +54,13 @@ from .mechanics.joint import (
 )
 from .mechanics.state import Kinematics, State
 from .mechanics.system import System
+from .scenes.registry import SCENES, make_scene
+from .scenes.spin import spin_exact
+from .vehicle.actuator import LinearActuator
+from .vehicle.airframe import PART_I, PART_II, PRINTED_ORIENTATIONS
+from .vehicle.parameters import Parameter, Parameters
+from .vehicle.rotor import Rotors, hover_speed_squared
+from .vehicle.tracker import tracker_bodies, tracker_joints
 
 __version__ = "0.1.0"
 

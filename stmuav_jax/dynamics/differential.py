@@ -78,7 +78,7 @@ class Equations(eqx.Module):
     @property
     def matrix(self) -> Float[Array, "m nw"]:
         """J as a matrix (m, n w)."""
-        return self.J.reshape(self.J.shape[0], -1)
+        return self.J.reshape(self.J.shape[0], self.J.shape[1] * self.J.shape[2])
 
 
 class Constraints(eqx.Module):

@@ -181,9 +181,7 @@ def _positions(
         step, multipliers = unknown
         within, base = args
         phi = lambda s: (
-            within.constraints.equations(
-                t, within.system.kinematics(moved(s, base))
-            ).value
+            within.constraints.equations(t, within.system.kinematics(moved(s, base))).value
         )
         value, pull = jax.vjp(phi, step)
         by_body = step.reshape(-1, 6)

@@ -39,9 +39,10 @@ def check_finite(value: object, what: str, unit: str, error: type[Exception] = M
     """Raise `error` unless every number in `value` is finite."""
     if not concrete(value):
         return
-    array = np.asarray(value, dtype=float)
-    if not np.all(np.isfinite(array)):
-        raise error(f"{what} must be finite, but it is {array.tolist()} {unit}.".replace("  ", " "))
+    for part in jax.tree.leaves(value):
+        if not np.all(np.isfinite(np.asarray(part, dtype=float))):
+            shown = np.asarray(part, dtype=float).tolist()
+            raise error(f"{what} must be finite, but it is {shown} {unit}".rstrip() + ".")
 
 
 def check_shape(value: object, shape: tuple[int, ...], what: str) -> None:

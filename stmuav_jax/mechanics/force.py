@@ -36,6 +36,26 @@ def evaluate(value: Signal, t: Float[Array, ""], kin: Kinematics) -> Float[Array
     return jnp.asarray(value(t, kin), dtype=kin.r.dtype) if callable(value) else value
 
 
+class Sine(eqx.Module):
+    """The signal amplitude sin(omega t), its numbers leaves like all others.
+
+    Args:
+        amplitude: of any shape. angular_frequency: omega [rad/s].
+    """
+
+    amplitude: Float[Array, "*shape"]
+    angular_frequency: Float[Array, ""]
+
+    def __init__(self, amplitude: Numbers, angular_frequency: Numbers) -> None:
+        check_finite((amplitude, angular_frequency), "A sine signal", "")
+        self.amplitude = jnp.asarray(amplitude, dtype=float)
+        self.angular_frequency = jnp.asarray(angular_frequency, dtype=float)
+
+    def __call__(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "*shape"]:
+        del kin
+        return self.amplitude * jnp.sin(self.angular_frequency * t)
+
+
 class Load(eqx.Module):
     """What a force does to all bodies, ground included as the last row.
 

@@ -1,0 +1,50 @@
+"""`hexacopter`: one free body and six rotors (report Part II, section 5.1)."""
+
+from ..dynamics.scene import Scene
+from ..mechanics.body import Body
+from ..mechanics.force import Gravity
+from ..mechanics.system import System
+from ..vehicle.airframe import PART_II
+from ..vehicle.parameters import Parameters
+from ..vehicle.rotor import Rotors, hover_speed_squared
+
+
+def rotors(body: str, parameters: Parameters, speed_squared: object) -> Rotors:
+    """The six rotors of the tables on a body."""
+    return Rotors(
+        body,
+        arms=parameters.value("rotor.arms"),
+        spin=parameters.value("rotor.spin"),
+        k_f=parameters.value("rotor.k_f"),
+        k_tau=parameters.value("rotor.k_tau"),
+        speed_squared=speed_squared,  # pyright: ignore[reportArgumentType]
+    )
+
+
+def hexacopter(parameters: Parameters = PART_II) -> Scene:
+    """The bare hexacopter rising with constant, equal rotor speeds; no joints at all.
+
+    The arms' centroid lies 1.1 mm off the centre of mass (Table 5.2), so equal speeds also
+    turn it slowly.
+    """
+    mass = parameters.value("bare.mass")
+    gravity = parameters.value("gravity")
+    hover = hover_speed_squared(mass, gravity, parameters.value("rotor.k_f"), 6)
+    lift = parameters.value("bare.lift_factor")
+    system = System(
+        [Body("hexacopter", mass, parameters.value("bare.inertia"), free=True)],
+        forces=[Gravity(gravity), rotors("hexacopter", parameters, lift * hover)],
+    )
+    keep = ("bare.", "rotor.", "gravity")
+    return Scene(
+        name="hexacopter",
+        title="Bare hexacopter, constant equal rotor speeds",
+        system=system,
+        state0=system.reference,
+        parameters={k: v for k, v in parameters.to_dict().items() if k.startswith(keep)},
+        notes=(
+            "The report prints no rotor speeds: 1.1 times the weight is chosen here.",
+            "J_zz of section 5.1 is printed ten times too large; corrected to 86.6e-3 kg m^2.",
+        ),
+        watch=("hexacopter",),
+    )

@@ -1,0 +1,106 @@
+"""Tables of physical numbers: each with its value, unit and source."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..mechanics.errors import ModelError, concrete, nearest_names
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One line of a table.
+
+    Attributes:
+        value: a number, or a nested tuple or array of numbers; may be traced by JAX.
+        unit: in SI units; "1" where there is none.
+        source: where the value comes from.
+        tolerance: relative, of the physical check that a rounded printed value fails; 0
+            where it fails none.
+    """
+
+    value: Any
+    unit: str
+    source: str
+    tolerance: float = 0.0
+
+
+class Parameters(Mapping[str, Parameter]):
+    """An immutable table of parameters, by names such as "mass.panel_7"."""
+
+    def __init__(self, name: str, entries: Mapping[str, Parameter]) -> None:
+        self.name = name
+        self._entries = dict(entries)
+
+    def __getitem__(self, key: str) -> Parameter:
+        if key not in self._entries:
+            raise ModelError(f"{self.name} has no parameter '{key}'.{self._hint(key)}")
+        return self._entries[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __repr__(self) -> str:
+        return f"Parameters({self.name!r}, {len(self)} entries)"
+
+    def _hint(self, key: str) -> str:
+        group = [k for k in self._entries if k.split(".")[0] == key.split(".")[0]]
+        return nearest_names(key, group or self._entries)
+
+    def value(self, key: str) -> Any:
+        """The value of a parameter."""
+        return self[key].value
+
+    def replaced(
+        self, values: Mapping[str, Any], source: str = "given by the user"
+    ) -> "Parameters":
+        """A table with some values replaced; units stay.
+
+        Args:
+            values: new values by name, of the shapes of the old.
+
+        Raises:
+            ModelError: an unknown name, a wrong shape, or a number that is not finite.
+        """
+        entries = dict(self._entries)
+        for key, value in values.items():
+            old = self[key]
+            _check(key, value, old)
+            entries[key] = replace(old, value=value, source=source, tolerance=0.0)
+        return Parameters(self.name, entries)
+
+    def to_dict(self) -> dict[str, dict[str, object]]:
+        """Plain numbers and strings, to be kept with results."""
+        return {
+            key: {
+                "value": np.asarray(p.value).tolist() if concrete(p.value) else "traced",
+                "unit": p.unit,
+                "source": p.source,
+            }
+            for key, p in self._entries.items()
+        }
+
+
+def _check(key: str, value: Any, old: Parameter) -> None:
+    if not concrete(value):
+        return
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"Parameter '{key}' must be numbers [{old.unit}], not {value!r}."
+        ) from None
+    shape = np.shape(old.value)
+    if array.shape != shape:
+        raise ModelError(
+            f"Parameter '{key}' must have shape {shape}, but {value!r} has {array.shape}."
+        )
+    if not np.all(np.isfinite(array)):
+        raise ModelError(
+            f"Parameter '{key}' must be finite, but it is {array.tolist()} {old.unit}."
+        )

@@ -1,0 +1,94 @@
+"""Rotors: thrust along the body's z axis and drag torque, both by speed squared."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..algebra.shapes import Numbers
+from ..mechanics.errors import ModelError, check_finite
+from ..mechanics.force import AbstractForce, Load, Signal, evaluate, push, signal
+from ..mechanics.state import Kinematics
+
+
+class Rotors(AbstractForce):
+    """The k rotors of a multicopter.
+
+        f = sum_k k_f u_k z,   tau = sum_k (k_f a_k x z - k_tau s_k z) u_k,   u_k = omega_k^2
+
+    Args:
+        body: its name.
+        arms: positions a_k of the rotors in the body's reference frame (k, 3) [m].
+        spin: +1 or -1 for every rotor (k,); u = omega^2 has lost the sign.
+        k_f: [N s^2/rad^2]. k_tau: [N m s^2/rad^2].
+        speed_squared: u (k,) [rad^2/s^2], or a function of (t, kinematics).
+
+    Source: report Part II, Eq. 4.4, 4.6, 4.24, corrected (no gravity in f).
+    """
+
+    body: str = eqx.field(static=True)
+    arms: Float[Array, "k 3"]
+    spin: Float[Array, " k"]
+    k_f: Float[Array, ""]
+    k_tau: Float[Array, ""]
+    speed_squared: Signal
+
+    def __init__(
+        self,
+        body: str,
+        *,
+        arms: Numbers,
+        spin: Numbers,
+        k_f: Numbers,
+        k_tau: Numbers,
+        speed_squared: Numbers | Callable[..., object],
+    ) -> None:
+        self.body = body
+        self.arms = jnp.asarray(arms, dtype=float)
+        self.spin = jnp.asarray(spin, dtype=float)
+        self.k_f = jnp.asarray(k_f, dtype=float)
+        self.k_tau = jnp.asarray(k_tau, dtype=float)
+        self.speed_squared = signal(speed_squared, f"The squared rotor speeds of body '{body}'")
+        count = self.spin.shape[0]
+        if self.arms.shape != (count, 3):
+            raise ModelError(
+                f"The rotors of body '{body}' need one arm (3,) per spin sign, but arms has shape "
+                f"{self.arms.shape} and spin {self.spin.shape}."
+            )
+        for value, what in ((self.arms, "arms"), (self.k_f, "k_f"), (self.k_tau, "k_tau")):
+            check_finite(value, f"{what} of the rotors of body '{body}'", "")
+
+    def bodies(self) -> tuple[str, ...]:
+        return (self.body,)
+
+    def joint_names(self) -> tuple[str, ...]:
+        return ()
+
+    def wrench(self, u: Float[Array, " k"], com: Float[Array, "3"]) -> Float[Array, "6"]:
+        """Body-frame force [N] and moment about `com` [N m] at squared speeds u, shape (6,)."""
+        thrust = self.k_f * u
+        zero = jnp.zeros_like(thrust)
+        forces = jnp.stack([zero, zero, thrust], axis=1)
+        drag = jnp.stack([zero, zero, -self.k_tau * self.spin * u], axis=1)
+        moment = jnp.cross(self.arms - com, forces) + drag
+        return jnp.concatenate([jnp.sum(forces, axis=0), jnp.sum(moment, axis=0)])
+
+    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+        k = kin.index(self.body)
+        wrench = self.wrench(evaluate(self.speed_squared, t, kin), kin.com[k])
+        R_wb = kin.R_wb[k]
+        return push(kin, self.body, R_wb @ wrench[:3], moment_w=R_wb @ wrench[3:])
+
+
+def hover_speed_squared(
+    mass: Numbers, gravity: Numbers, k_f: Numbers, count: int
+) -> Float[Array, " k"]:
+    """Equal squared speeds whose thrust carries the weight: m |g| / (k k_f), (k,) [rad^2/s^2].
+
+    Args:
+        mass: total [kg]. gravity: (3,) [m/s^2]. k_f: [N s^2/rad^2]. count: k.
+    """
+    g = jnp.asarray(gravity, dtype=float)
+    weight = jnp.asarray(mass, dtype=float) * jnp.sqrt(g @ g)
+    return jnp.full(count, 1.0) * weight / (count * jnp.asarray(k_f, dtype=float))
