@@ -155,15 +155,16 @@ class Problem(eqx.Module):
         inner = stage_loop(self.method.solver, self.method.adjoint)
         return Stabilised(inner, project if isinstance(how, Projection) else None, residuals)
 
-    def controller(self) -> Remembering:
-        """Step size control by the local error of the state."""
+    def controller(self, step: Float[Array, ""]) -> Remembering:
+        """Step size control by the local error of the state, to start with `step` [s]."""
         return Remembering(
             diffrax.PIDController(
                 rtol=self.method.rtol,
                 atol=self.method.atol,
                 dtmin=_SHORTEST,
                 norm=error_norm(self.n_state),
-            )
+            ),
+            step,
         )
 
 
@@ -178,12 +179,12 @@ def begin(problem: Problem, t0: Float[Array, ""], state0: State) -> Carry:
     """The start of an integration at t0 [s]."""
     x = problem.method.formulation.to_vector(problem.model, state0)
     y = jnp.concatenate([x, jnp.zeros(7 if problem.floating else 1, x.dtype)])
-    solver, controller = problem.solver(), problem.controller().wrap(1)
     step = jnp.asarray(problem.method.first_step, dtype=y.dtype)
+    solver, controller = problem.solver(), problem.controller(step).wrap(1)
     terms = diffrax.ODETerm(problem.field)
     solver_state = solver.init(terms, t0, t0 + step, y, problem.model)
     _, controller_state = controller.init(
-        terms, t0, t0 + step, y, step, problem.model, solver.func, solver.error_order(terms)
+        terms, t0, t0 + step, y, None, problem.model, solver.func, solver.error_order(terms)
     )
     # as arrays, so that the start and what it becomes have the same structure
     controller_state = jax.tree.map(jnp.asarray, controller_state)
@@ -209,11 +210,11 @@ def _segment(problem: Problem, carry: Carry, t1: Float[Array, ""], event: bool) 
         problem.solver(),
         carry.t,
         t1,
-        carry.step,
+        None,
         carry.y,
         problem.model,
         saveat=diffrax.SaveAt(t1=True, solver_state=True, controller_state=True),
-        stepsize_controller=problem.controller(),
+        stepsize_controller=problem.controller(carry.step),
         adjoint=method.adjoint,
         max_steps=method.max_steps,
         event=watch,

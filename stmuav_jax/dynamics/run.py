@@ -64,6 +64,7 @@ class Run:
         snapshot: accelerations, reactions, energies at the saved times.
         certificate: how accurate it was.
         settings: the method in words, kept with the results.
+        failure: why the end was not reached, in one paragraph; empty if it was.
     """
 
     scene: Scene
@@ -72,6 +73,7 @@ class Run:
     snapshot: Snapshot
     certificate: Certificate
     settings: dict[str, Any]
+    failure: str = ""
 
     @property
     def ts(self) -> np.ndarray:

@@ -99,10 +99,11 @@ def simulate(
     result = stopped or _words(trajectory)
     certificate = _certify(scene.system, trajectory, view, rank, result, (*seconds, looked))
     run = Run(scene, method, trajectory, view, certificate, _settings(method))
-    if throw and not run.successful and result != "interrupted":
-        error = SimulationError(_failure(run))
-        error.run = run
-        raise error
+    if run.successful or result == "interrupted":
+        return run
+    run = dataclasses.replace(run, failure=_failure(run))
+    if throw:
+        raise SimulationError(run.failure, run)
     return run
 
 
@@ -377,5 +378,5 @@ def _failure(run: Run) -> str:
     return (
         f"The simulation of {run.scene.name} stopped at t = {t:.9g} s of {run.scene.t1:.9g} s: {reason}. "
         f"{run.certificate.accepted_steps} steps were accepted, {run.certificate.rejected_steps} "
-        "rejected; the run up to there is in the error's .run."
+        "rejected."
     )

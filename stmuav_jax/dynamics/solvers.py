@@ -132,13 +132,20 @@ class Remembering(diffrax.AbstractStepSizeController):
 
     Landing on an output time cuts a step; without this the next step would start from the
     short one and grow again by at most a factor of ten a step. The state holds the step
-    size to go on with, `step`.
+    size to go on with.
+
+    Args:
+        controller: what decides on steps.
+        step: the first one [s]. It is given here and not to diffrax as dt0, which would add
+            a check by host callback, and code with callbacks is not kept in JAX's
+            compilation cache.
     """
 
     controller: diffrax.AbstractStepSizeController
+    step: Float[Array, ""]
 
     def wrap(self, direction: Any) -> "Remembering":
-        return Remembering(self.controller.wrap(direction))
+        return Remembering(self.controller.wrap(direction), self.step)
 
     def init(
         self,
@@ -151,8 +158,9 @@ class Remembering(diffrax.AbstractStepSizeController):
         func: Any,
         error_order: Any,
     ) -> Any:
-        end, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return end, (end - t0, inner)
+        del dt0
+        end, inner = self.controller.init(terms, t0, t1, y0, self.step, args, func, error_order)
+        return end, (self.step, inner)
 
     def adapt_step_size(
         self,

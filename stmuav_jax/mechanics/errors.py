@@ -27,7 +27,9 @@ class SettingError(ValueError):
 class SimulationError(RuntimeError):
     """A simulation that did not reach its end; `run` holds what was reached."""
 
-    run: object = None
+    def __init__(self, message: str, run: object = None) -> None:
+        super().__init__(message)
+        self.run = run
 
 
 def concrete(*values: object) -> bool:

@@ -1,0 +1,208 @@
+"""The command line: `stmuav list`, `stmuav simulate SCENE`."""
+
+import dataclasses
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import diffrax
+import jax
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from .dynamics.augmented import Augmented
+from .dynamics.run import Run
+from .dynamics.scene import Scene
+from .dynamics.simulate import simulate
+from .dynamics.stabilisation import Baumgarte, Projection, Unstabilised
+from .mechanics.errors import ModelError, SettingError, SimulationError, StateError
+from .scenes.registry import SCENES, make_scene
+from .view.io import FileError, load_parameters, save, save_certificate
+from .view.report import certificate_table
+
+SOLVERS = {
+    "dopri8": diffrax.Dopri8,
+    "tsit5": diffrax.Tsit5,
+    "kvaerno3": diffrax.Kvaerno3,
+    "kvaerno5": diffrax.Kvaerno5,
+}
+FORMULATIONS = {
+    "augmented": Augmented(),
+    "augmented-dense": Augmented(solve="dense"),
+    "report": Augmented(solve="dense", rows="report"),
+}
+STABILISATIONS = {"projection": Projection, "baumgarte": Baumgarte, "none": Unstabilised}
+
+
+@dataclasses.dataclass
+class List:
+    """List the scenes, their cases and where the report describes them."""
+
+
+@dataclasses.dataclass
+class Simulate:
+    """Simulate a scene; write run.nc, certificate.json and figures."""
+
+    scene: tyro.conf.Positional[Literal["spin", "tracker", "hexacopter", "uav_tracker"]]
+    """Which scene; see `stmuav list`."""
+    case: int | None = None
+    """Case of the report; default the scene's first choice."""
+    t1: float | None = None
+    """End [s]; default the scene's."""
+    rtol: float = 1e-8
+    """Relative tolerance of a step."""
+    atol: float = 1e-8
+    """Absolute tolerance of a step [m, m/s, rad/s]."""
+    solver: Literal["dopri8", "tsit5", "kvaerno3", "kvaerno5"] = "dopri8"
+    """Runge-Kutta method; kvaerno3 and kvaerno5 are implicit."""
+    formulation: Literal["augmented", "augmented-dense", "report"] = "augmented"
+    """Solve by structure; or as one large system; or that in the report's own rows."""
+    stabilisation: Literal["projection", "baumgarte", "none"] = "projection"
+    """What keeps the constraints from drifting."""
+    save_every: float | None = None
+    """Spacing of the saved times [s]; default the scene's."""
+    params: Path | None = None
+    """TOML file with values that replace the table's."""
+    actuators: Literal["consistent", "printed"] | None = None
+    """Couple of the actuators' force pair; uav_tracker only."""
+    out: Path | None = None
+    """Folder for the results; default runs/SCENE."""
+    figures: Literal["png", "pdf", "svg", "none"] = "png"
+    """Format of the figures."""
+    cache: bool = True
+    """Keep compiled code in the user's cache folder for the next run."""
+
+
+Command = (
+    Annotated[List, tyro.conf.subcommand(name="list")]
+    | Annotated[Simulate, tyro.conf.subcommand(name="simulate")]
+)
+
+
+def cache_folder() -> Path:
+    """Where compiled code is kept: $XDG_CACHE_HOME/stmuav_jax, else ~/.cache/stmuav_jax."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "stmuav_jax"
+
+
+def _configure(use_cache: bool) -> None:
+    jax.config.update("jax_enable_x64", True)
+    if use_cache:
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def list_scenes(console: Console) -> None:
+    """Print the scenes."""
+    table = Table("scene", "cases", "what it is", "report", "end [s]")
+    for name, entry in SCENES.items():
+        cases = ", ".join(map(str, entry.cases)) or "-"
+        table.add_row(name, cases, entry.summary, entry.source, f"{make_scene(name).t1:g}")
+    console.print(table)
+
+
+def _scene(command: Simulate) -> Scene:
+    entry = SCENES[command.scene]
+    table = entry.parameters
+    if command.params is not None:
+        table = load_parameters(command.params, table)
+    options: dict[str, Any] = {}
+    if command.actuators is not None:
+        if command.scene != "uav_tracker":
+            raise SettingError(f"--actuators is for uav_tracker; {command.scene} has no actuators.")
+        options["actuators"] = command.actuators
+    return make_scene(command.scene, command.case, table, **options)
+
+
+def run_scene(command: Simulate, console: Console) -> Run:
+    """Build and simulate the scene with a progress bar on stderr."""
+    scene = _scene(command)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(f"{scene.name}: compiling", total=1.0)
+
+        def report(done: float) -> None:
+            bar.update(task, completed=done, description=f"{scene.name}: {100 * done:.0f} %")
+
+        return simulate(
+            scene,
+            formulation=FORMULATIONS[command.formulation],
+            solver=SOLVERS[command.solver](),
+            stabilisation=STABILISATIONS[command.stabilisation](),
+            rtol=command.rtol,
+            atol=command.atol,
+            t1=command.t1,
+            save_every=command.save_every,
+            throw=False,
+            progress=report,
+        )
+
+
+def write_results(run: Run, command: Simulate) -> list[Path]:
+    """Write results, certificate and figures; their paths."""
+    folder = command.out if command.out is not None else Path("runs") / run.scene.name
+    paths = [save(run, folder / "run.nc"), save_certificate(run, folder / "certificate.json")]
+    if command.figures != "none":
+        # matplotlib is slow to import: only where figures are drawn
+        from .view.plot import save_figures
+
+        paths += save_figures(run, folder, command.figures)
+    return paths
+
+
+def _simulate(command: Simulate, console: Console, started: float) -> int:
+    run = run_scene(command, console)
+    clock = time.perf_counter()
+    paths = write_results(run, command)
+    writing = time.perf_counter() - clock
+    out = Console()
+    out.print(certificate_table(run))
+    for note in run.scene.notes:
+        out.print(f"Note: {note}", highlight=False)
+    out.print(
+        f"Imports {started:.2f} s, results and figures {writing:.2f} s. Written:", highlight=False
+    )
+    for path in paths:
+        out.print(f"  {path}", highlight=False, soft_wrap=True)
+    if run.certificate.result == "interrupted":
+        return 130
+    if not run.successful:
+        raise SimulationError(f"{run.failure} What was reached is in {paths[0].parent}.")
+    return 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point; returns the exit code: 0, 1 for a failed run, 2 for bad input."""
+    started = time.process_time()
+    command = tyro.cli(Command, args=arguments, prog="stmuav", description=__doc__)  # pyright: ignore
+    console = Console(stderr=True)
+    try:
+        if isinstance(command, List):
+            _configure(False)
+            list_scenes(Console())
+            return 0
+        _configure(command.cache)
+        return _simulate(command, console, started)
+    except SimulationError as error:
+        console.print(f"stmuav: {error}", style="red", markup=False, highlight=False)
+        return 1
+    except (ModelError, StateError, SettingError, FileError, OSError) as error:
+        console.print(f"stmuav: {error}", style="red", markup=False, highlight=False)
+        return 2
+    except KeyboardInterrupt:
+        console.print("stmuav: interrupted before anything was reached.", markup=False)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,203 @@
+"""Runs as labelled datasets and NetCDF files; parameter tables from TOML."""
+
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import tempfile
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+
+from ..dynamics.run import Run
+from ..mechanics.errors import ModelError
+from ..vehicle.parameters import Parameters
+
+FORMAT = "stmuav_jax run"
+FORMAT_VERSION = 1
+
+_PACKAGES = ("stmuav-jax", "jax", "jaxlib", "diffrax", "equinox", "lineax", "numpy", "xarray")
+
+
+class FileError(ValueError):
+    """A file that is missing, damaged or of another kind; the message names it."""
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes: the package, its libraries, Python and the device."""
+    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    device = jax.devices()[0]
+    return found | {"python": platform.python_version(), "device": device.device_kind}
+
+
+def to_dataset(run: Run) -> xr.Dataset:
+    """The run as a labelled dataset.
+
+    Dimensions: time, body, axis (x, y, z), component (e0 to e3), joint. Every variable has
+    `units` and `description`; attributes hold scene, parameters, settings, versions, date
+    and certificate (the mappings as JSON).
+    """
+    states, view = run.states, run.snapshot
+    system = run.scene.system
+    vector = ("time", "body", "axis")
+    wrench = ("time", "joint", "axis")
+    table: dict[str, tuple[tuple[str, ...], Any, str, str]] = {
+        "position": (vector, states.r, "m", "centre of mass, world axes"),
+        "euler_parameters": (("time", "body", "component"), states.p, "1", "body to world"),
+        "velocity": (vector, states.v, "m/s", "of the centre of mass, world axes"),
+        "angular_velocity": (vector, states.omega, "rad/s", "body axes"),
+        "acceleration": (vector, view.accelerations.v_rate, "m/s^2", "of the centre of mass"),
+        "angular_acceleration": (vector, view.accelerations.omega_rate, "rad/s^2", "body axes"),
+        "reaction_force": (wrench, view.reactions.force, "N", "of body i on body j, world axes"),
+        "reaction_moment": (
+            wrench, view.reactions.moment, "N m",
+            "of body i on body j about the joint's point on body j, world axes",
+        ),
+        "kinetic_energy": (("time",), view.kinetic, "J", "of all bodies"),
+        "potential_energy": (("time",), view.potential, "J", "of gravity and springs"),
+        "work": (("time",), run.trajectory.work, "J", "done by forces without potential"),
+    }  # fmt: skip
+    data = {
+        name: xr.Variable(dims, np.asarray(values), {"units": unit, "description": words})
+        for name, (dims, values, unit, words) in table.items()
+    }
+    coordinates = {
+        "time": xr.Variable(("time",), run.ts, {"units": "s", "description": "saved times"}),
+        "body": list(system.names),
+        "axis": ["x", "y", "z"],
+        "component": ["e0", "e1", "e2", "e3"],
+        "joint": [joint.name for joint in system.joints],
+        "joint_body_i": ("joint", [joint.body_i for joint in system.joints]),
+        "joint_body_j": ("joint", [joint.body_j for joint in system.joints]),
+    }
+    return xr.Dataset(data, coordinates, _attributes(run))
+
+
+def _attributes(run: Run) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "scene": run.scene.name,
+        "title": run.scene.title,
+        "notes": json.dumps(run.scene.notes),
+        "parameters": json.dumps(run.scene.parameters),
+        "settings": json.dumps(run.settings),
+        "certificate": json.dumps(run.certificate.to_dict()),
+        "versions": json.dumps(versions()),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+
+
+def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
+    """Write a file so that a reader sees the old content or the new, never a part."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(name, 0o644)
+        os.replace(name, target)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    return target
+
+
+def save(run: Run, path: str | os.PathLike[str]) -> Path:
+    """Save a run as NetCDF (HDF5), atomically; returns the path."""
+    content = to_dataset(run).to_netcdf(engine="h5netcdf")
+    return write_atomically(path, bytes(content))
+
+
+def load(path: str | os.PathLike[str]) -> xr.Dataset:
+    """Read a saved run whole into memory.
+
+    Raises:
+        FileError: the file is missing, truncated, damaged, or not a run of this package.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise FileError(f"There is no file {source}.")
+    try:
+        with xr.open_dataset(source, engine="h5netcdf") as dataset:
+            found = dataset.load()
+    except Exception as error:
+        raise FileError(
+            f"{source} cannot be read as a saved run: it is truncated, damaged or of another kind "
+            f"({type(error).__name__})."
+        ) from error
+    if found.attrs.get("format") != FORMAT:
+        raise FileError(f"{source} is a NetCDF file, but not a run saved by stmuav_jax.")
+    version = int(found.attrs.get("format_version", 0))
+    if version != FORMAT_VERSION:
+        raise FileError(
+            f"{source} has format version {version}; this package reads version {FORMAT_VERSION}."
+        )
+    return found
+
+
+def save_certificate(run: Run, path: str | os.PathLike[str]) -> Path:
+    """Save the certificate, settings and versions as JSON, atomically; returns the path."""
+    content = {
+        "scene": run.scene.name,
+        "settings": run.settings,
+        "certificate": run.certificate.to_dict(),
+        "versions": versions(),
+    }
+    return write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def load_parameters(path: str | os.PathLike[str], base: Parameters) -> Parameters:
+    """A parameter table with the values of a TOML file put over those of `base`.
+
+    The file's tables and dotted keys are the parameters' names; a value is a number or an
+    array, or a table {value = ..., unit = "..."} whose unit must be the parameter's:
+
+        [mass]
+        panel_7 = 0.95
+        [rotor]
+        k_f = {value = 6.6e-6, unit = "N s^2/rad^2"}
+
+    Raises:
+        FileError: the file is missing or not valid TOML.
+        ModelError: unknown names, wrong shapes or units.
+    """
+    source = Path(path)
+    try:
+        content = tomllib.loads(source.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileError(f"There is no file {source}.") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise FileError(f"{source} is not a readable TOML file: {error}.") from error
+    try:
+        return base.replaced(_flat(content, base), source=f"given in {source.name}")
+    except ModelError as error:
+        raise ModelError(f"{source}: {error}") from None
+
+
+def _flat(content: Mapping[str, Any], base: Parameters, prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in content.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and "value" in value:
+            extra = set(value) - {"value", "unit"}
+            if extra:
+                raise ModelError(f"'{name}' has unknown entries: {', '.join(sorted(extra))}.")
+            unit = value.get("unit", base[name].unit)
+            if unit != base[name].unit:
+                raise ModelError(f"'{name}' must be given in {base[name].unit}, not in {unit}.")
+            found[name] = value["value"]
+        elif isinstance(value, Mapping):
+            found |= _flat(value, base, f"{name}.")
+        else:
+            found[name] = value
+    return found
