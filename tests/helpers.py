@@ -121,9 +121,7 @@ def pendulum(
     return sj.System([body], [hinge], [pull, *forces])
 
 
-def swung(
-    system: sj.System, angle: Any, rate: Any = 0.0, length: Any = 0.5
-) -> sj.State:
+def swung(system: sj.System, angle: Any, rate: Any = 0.0, length: Any = 0.5) -> sj.State:
     """The pendulum at `angle` [rad] from hanging about y, turning at `rate` [rad/s]."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     zero = jnp.zeros_like(s)
@@ -134,9 +132,7 @@ def swung(
     return sj.State(r[None], p[None], jnp.cross(omega, r)[None], omega[None])
 
 
-FOUR_BAR_POINTS = np.array(
-    [[0.0, 0.0, 0.0], [0.1, 0.0, 0.25], [0.6, 0.0, 0.45], [0.7, 0.0, 0.0]]
-)
+FOUR_BAR_POINTS = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.25], [0.6, 0.0, 0.45], [0.7, 0.0, 0.0]])
 
 
 def four_bar(

@@ -15,40 +15,40 @@ are fixed by A = G L^T). Conventions: docs/conventions.md.
 
 import jax.numpy as jnp
 
-from .shapes import Mat3, Mat4, Mat34, Quat, Scalar, Vec3
+from .shapes import Mat3, Mat3Like, Mat4, Mat34, Quat, QuatLike, Scalar, Vec3, Vec3Like
 
 # Below this squared angle (or squared sine) the series replaces the quotient; the first
 # neglected term is then under 1e-16.
 _SMALL_SQUARE = 1e-5
 
 
-def skew(a: Vec3) -> Mat3:
+def skew(a: Vec3Like) -> Mat3:
     """Cross-product matrix: `skew(a) @ b == cross(a, b)`. Shape (3, 3)."""
     x, y, z = a[0], a[1], a[2]
     o = jnp.zeros_like(x)
     return jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
 
 
-def matrix_g(p: Quat) -> Mat34:
+def matrix_g(p: QuatLike) -> Mat34:
     """G = [-e, e~ + e0 I], shape (3, 4)."""
     e = p[1:]
     return jnp.concatenate([-e[:, None], skew(e) + p[0] * jnp.eye(3, dtype=e.dtype)], axis=1)
 
 
-def matrix_l(p: Quat) -> Mat34:
+def matrix_l(p: QuatLike) -> Mat34:
     """L = [-e, -e~ + e0 I], shape (3, 4)."""
     e = p[1:]
     return jnp.concatenate([-e[:, None], -skew(e) + p[0] * jnp.eye(3, dtype=e.dtype)], axis=1)
 
 
-def bar(a: Vec3) -> Mat4:
+def bar(a: Vec3Like) -> Mat4:
     """The 4x4 matrix of a body-fixed vector with L(p)^T a = bar(a) p, shape (4, 4)."""
     zero = jnp.zeros((1, 1), dtype=a.dtype)
     top = jnp.concatenate([zero, -a[None, :]], axis=1)
     return jnp.concatenate([top, jnp.concatenate([a[:, None], -skew(a)], axis=1)], axis=0)
 
 
-def rotation_matrix(p: Quat) -> Mat3:
+def rotation_matrix(p: QuatLike) -> Mat3:
     """Body-to-world rotation A = G L^T, shape (3, 3); |p|^2 times a rotation if |p| != 1.
 
     Source: report Part II, Eq. 6.10, corrected (its (1,1) entry is misprinted).
@@ -61,17 +61,17 @@ def rotation_matrix(p: Quat) -> Mat3:
     return jnp.stack([r0, r1, r2])
 
 
-def euler_parameter_rate(p: Quat, omega: Vec3) -> Quat:
+def euler_parameter_rate(p: QuatLike, omega: Vec3Like) -> Quat:
     """pdot = L^T omega / 2 for the body-frame angular velocity omega [rad/s], shape (4,)."""
     return 0.5 * product(p, jnp.concatenate([jnp.zeros_like(omega[:1]), omega]))
 
 
-def angular_velocity(p: Quat, p_rate: Quat) -> Vec3:
+def angular_velocity(p: QuatLike, p_rate: QuatLike) -> Vec3:
     """Body-frame angular velocity omega = 2 L pdot [rad/s], shape (3,)."""
     return 2.0 * matrix_l(p) @ p_rate
 
 
-def product(p: Quat, q: Quat) -> Quat:
+def product(p: QuatLike, q: QuatLike) -> Quat:
     """Composition: `rotation_matrix(product(p, q)) == A(p) @ A(q)`. Shape (4,)."""
     a, b, c, d = p[0], p[1], p[2], p[3]
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -85,17 +85,18 @@ def product(p: Quat, q: Quat) -> Quat:
     )
 
 
-def conjugate(p: Quat) -> Quat:
+def conjugate(p: QuatLike) -> Quat:
     """The inverse rotation (e0, -e), shape (4,)."""
     return jnp.concatenate([p[:1], -p[1:]])
 
 
-def normalise(p: Quat) -> Quat:
+def normalise(p: QuatLike) -> Quat:
     """p / |p|, shape (4,); called only where a user asks for it or a projection does."""
-    return p / jnp.sqrt(p @ p)
+    q = jnp.asarray(p)
+    return q / jnp.sqrt(q @ q)
 
 
-def from_rotation_vector(v: Vec3) -> Quat:
+def from_rotation_vector(v: Vec3Like) -> Quat:
     """Euler parameters of the rotation by |v| [rad] about v / |v|, shape (4,).
 
     Smooth everywhere; `from_rotation_vector(zeros)` is the identity.
@@ -111,7 +112,7 @@ def from_rotation_vector(v: Vec3) -> Quat:
     return jnp.concatenate([cosine[None], factor * v])
 
 
-def to_rotation_vector(p: Quat) -> Vec3:
+def to_rotation_vector(p: QuatLike) -> Vec3:
     """Rotation vector of unit p, its length in [0, pi] [rad], shape (3,).
 
     Inverse of `from_rotation_vector`. p and -p give the same vector, except at a half turn,
@@ -127,7 +128,7 @@ def to_rotation_vector(p: Quat) -> Vec3:
     return factor * q[1:]
 
 
-def from_matrix(A: Mat3) -> Quat:
+def from_matrix(A: Mat3Like) -> Quat:
     """Unit Euler parameters of a rotation matrix, largest component first and positive, (4,).
 
     4 p p^T is linear in A; its row with the largest diagonal entry is used, so none of the
@@ -149,6 +150,6 @@ def from_matrix(A: Mat3) -> Quat:
     return rows[k] / (2.0 * jnp.sqrt(squares[k]))
 
 
-def rotation_angle(p: Quat) -> Scalar:
+def rotation_angle(p: QuatLike) -> Scalar:
     """Angle of the rotation in [0, pi] [rad], shape (); not differentiable at the identity."""
     return 2 * jnp.arctan2(jnp.sqrt(p[1:] @ p[1:]), jnp.abs(p[0]))

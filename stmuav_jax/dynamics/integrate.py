@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from ..algebra.shapes import Numbers
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .augmented import Augmented
@@ -42,16 +41,16 @@ class Method(eqx.Module):
         first_step: [s].
         max_steps: accepted and rejected steps between two output times.
         adjoint: how reverse-mode derivatives are taken; see diffrax.
-        event: (t, state) -> a number whose change of sign, or a truth value whose turning
-            true, ends the integration.
+        event: (t, state) -> a number whose change of sign ends the integration, at that
+            time; or a truth value, which ends it after the first step that makes it true.
     """
 
     formulation: AbstractFormulation = Augmented()
     solver: diffrax.AbstractSolver = diffrax.Dopri8()
-    rtol: Numbers = 1e-8
-    atol: Numbers = 1e-8
+    rtol: float = 1e-8
+    atol: float = 1e-8
     stabilisation: AbstractStabilisation = Projection()
-    first_step: Numbers = 1e-4
+    first_step: float = 1e-4
     max_steps: int = eqx.field(static=True, default=100_000)
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint()
     event: Event | None = None
@@ -128,7 +127,7 @@ class Problem(eqx.Module):
     floating: bool = eqx.field(static=True)
     n_state: int = eqx.field(static=True)
 
-    def field(self, t: Float[Array, ""], y: Float[Array, " k"], args: Any) -> Float[Array, " k"]:
+    def field(self, t: Any, y: Any, args: Any) -> Float[Array, " k"]:
         """y', the formulation's x' followed by the flows of energy and momentum."""
         how, formulation = self.method.stabilisation, self.method.formulation
         rate, flows = _derivative(
@@ -204,7 +203,9 @@ def _segment(problem: Problem, carry: Carry, t1: Float[Array, ""], event: bool) 
         def cond_fn(t: Any, y: Any, args: Any, **_: Any) -> Array:
             return condition(t, method.formulation.to_state(args, y[: problem.n_state]))
 
-        watch = diffrax.Event(cond_fn, optx.Bisection(rtol=1e-12, atol=1e-14))
+        kind = jax.eval_shape(lambda: cond_fn(carry.t, carry.y, problem.model)).dtype
+        finder = None if kind == bool else optx.Bisection(rtol=1e-12, atol=1e-14)
+        watch = diffrax.Event(cond_fn, finder)
     return diffrax.diffeqsolve(
         diffrax.ODETerm(problem.field),
         problem.solver(),
@@ -224,6 +225,15 @@ def _segment(problem: Problem, carry: Carry, t1: Float[Array, ""], event: bool) 
     )
 
 
+def _outcome(solution: diffrax.Solution) -> tuple[Any, ...]:
+    """Time, y, solver and controller state, accepted and rejected steps at a segment's end."""
+    assert solution.ts is not None
+    assert solution.ys is not None
+    steps = (solution.stats["num_accepted_steps"], solution.stats["num_rejected_steps"])
+    states = (solution.solver_state, solution.controller_state)
+    return (solution.ts[0], solution.ys[0], *states, *steps)
+
+
 def advance(problem: Problem, carry: Carry, ts: Float[Array, " k"]) -> tuple[Carry, Trajectory]:
     """Go on to each of the times ts [s] in turn; after a failure or an event, stay there."""
 
@@ -231,30 +241,24 @@ def advance(problem: Problem, carry: Carry, ts: Float[Array, " k"]) -> tuple[Car
         fine = carry.result == diffrax.RESULTS.successful
         target = jnp.where(fine, t1, carry.t)
         solution = _segment(problem, carry, target, event=True)
-        result = solution.result
+        outcome = _outcome(solution)
         if problem.method.event is not None:
             # the event's time comes from interpolation; the state there from steps
-            struck = result == diffrax.RESULTS.event_occurred
-            again = lambda: _segment(problem, carry, solution.ts[0], event=False)
-            solution = jax.lax.cond(
-                struck,
-                again,
-                lambda: eqx.tree_at(
-                    lambda s: s.event_mask, solution, None, is_leaf=lambda x: x is None
-                ),
+            outcome = jax.lax.cond(
+                solution.result == diffrax.RESULTS.event_occurred,
+                lambda: _outcome(_segment(problem, carry, outcome[0], event=False)),
+                lambda: outcome,
             )
-        counts = Counts(
-            carry.counts.accepted + solution.stats["num_accepted_steps"],
-            carry.counts.rejected + solution.stats["num_rejected_steps"],
-        )
+        t, y, solver_state, controller_state, accepted, rejected = outcome
+        counts = Counts(carry.counts.accepted + accepted, carry.counts.rejected + rejected)
         after = Carry(
-            t=solution.ts[0],
-            y=solution.ys[0],
-            step=solution.controller_state[0],
-            solver_state=solution.solver_state,
-            controller_state=solution.controller_state,
+            t=t,
+            y=y,
+            step=controller_state[0],
+            solver_state=solver_state,
+            controller_state=controller_state,
             counts=counts,
-            result=diffrax.RESULTS.where(fine, result, carry.result),
+            result=diffrax.RESULTS.where(fine, solution.result, carry.result),
         )
         return after, (after.t, after.y, counts, after.worst)
 

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import ArrayLike
 
 from ..mechanics.state import State
 from .analysis import Snapshot
@@ -97,8 +98,8 @@ class Run:
         return State(s.r[:, k], s.p[:, k], s.v[:, k], s.omega[:, k])
 
 
-def relative(error: np.ndarray, *scales: np.ndarray) -> float:
+def relative(error: ArrayLike, *scales: ArrayLike) -> float:
     """Largest |error| over the largest of |scales|; zero for a system that does nothing."""
-    size = max((float(np.max(np.abs(s))) for s in scales), default=0.0)
-    worst = float(np.max(np.abs(error)))
+    size = max((float(np.max(np.abs(np.asarray(s)))) for s in scales), default=0.0)
+    worst = float(np.max(np.abs(np.asarray(error))))
     return worst / size if size > 0 else worst

@@ -19,7 +19,7 @@ from .analysis import Snapshot, snapshots
 from .augmented import Augmented, Model
 from .formulation import AbstractFormulation
 from .initial import Rank, rank_of
-from .integrate import Carry, Event, Method, Trajectory, advance, begin, prepare
+from .integrate import Event, Method, Trajectory, advance, begin, prepare
 from .run import Certificate, Run, relative
 from .scene import Scene
 from .stabilisation import AbstractStabilisation, Projection
@@ -94,7 +94,7 @@ def simulate(
     looked = time.perf_counter() - started
     trajectory, seconds, stopped = _run(scene, method, times, progress)
     started = time.perf_counter()
-    view = snapshots(method, model, trajectory.ts, trajectory.states)
+    view = snapshots(method, model, np.asarray(trajectory.ts), trajectory.states)
     looked += time.perf_counter() - started
     result = stopped or _words(trajectory)
     certificate = _certify(scene.system, trajectory, view, rank, result, (*seconds, looked))
@@ -174,9 +174,9 @@ def _inspect(scene: Scene, method: Method) -> tuple[Method, Model, Rank]:
     model = formulation.prepare(system)
     ts, states = _one(scene)
     first = snapshots(method, model, ts, states)
-    _check_loads(system, first.finite_loads[0], scene.t0)
+    _check_loads(system, np.asarray(first.finite_loads[0]), scene.t0)
     _check_consistent(system, model, first)
-    rank = rank_of(system, model, scene.state0, scene.t0, first.singular_values[0])
+    rank = rank_of(system, model, scene.state0, scene.t0, np.asarray(first.singular_values[0]))
     if rank.rank < rank.rows:
         if not isinstance(formulation, Augmented):
             raise ModelError(f"Dependent constraint rows in {', '.join(rank.redundant)}.")
@@ -227,9 +227,7 @@ def _check_consistent(system: System, model: Model, first: Snapshot) -> None:
         )
 
 
-@eqx.filter_jit
-def _advance(problem: Any, carry: Carry, ts: Any) -> tuple[Carry, Trajectory]:
-    return advance(problem, carry, ts)
+_advance: Any = eqx.filter_jit(advance)
 
 
 def _run(

@@ -51,7 +51,7 @@ class Stabilised(diffrax.AbstractWrappedSolver):
             kept in the solver state.
     """
 
-    solver: diffrax.AbstractSolver
+    solver: diffrax.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
     project: Callable[[Any, Vector, Any], Vector] | None
     residuals: Callable[[Any, Vector, Any], Residuals]
 
@@ -61,15 +61,17 @@ class Stabilised(diffrax.AbstractWrappedSolver):
         return "chosen"
 
     @property
-    def term_structure(self) -> Any:
+    def term_structure(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.solver.term_structure
 
     @property
-    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return _landed(self.solver.interpolation_cls)
 
     @property
-    def term_compatible_contr_kwargs(self) -> Any:
+    def term_compatible_contr_kwargs(  # pyright: ignore[reportIncompatibleVariableOverride]
+        self,
+    ) -> Any:
         return self.solver.term_compatible_contr_kwargs
 
     def order(self, terms: Any) -> int | None:

@@ -7,8 +7,10 @@ it checked).
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 import jax
+import jax.core
 import numpy as np
 
 
@@ -47,10 +49,10 @@ def check_finite(value: object, what: str, unit: str, error: type[Exception] = M
             raise error(f"{what} must be finite, but it is {shown} {unit}".rstrip() + ".")
 
 
-def check_shape(value: object, shape: tuple[int, ...], what: str) -> None:
+def check_shape(value: Any, shape: tuple[int, ...], what: str) -> None:
     """Raise `ModelError` unless `value` has the given shape."""
-    if np.shape(value) != shape:  # pyright: ignore[reportArgumentType]
-        raise ModelError(f"{what} must have shape {shape}, but it has {np.shape(value)}.")  # pyright: ignore
+    if np.shape(value) != shape:
+        raise ModelError(f"{what} must have shape {shape}, but it has {np.shape(value)}.")
 
 
 def nearest_names(name: str, known: Iterable[str]) -> str:

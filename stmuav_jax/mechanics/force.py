@@ -102,7 +102,7 @@ def push(
     total = zero if moment_w is None else moment_w
     if arm_w is not None:
         total = total + jnp.cross(arm_w, force_w)
-    row = np.eye(len(kin.names))[:, k, None]
+    row = jnp.asarray(np.eye(len(kin.names))[:, k, None])
     power = force_w @ kin.v[k] + total @ kin.omega_w[k]
     return Load(row * force_w, row * (kin.R_wb[k].T @ total), jnp.zeros((), kin.r.dtype), power)
 

@@ -14,10 +14,10 @@ from .io import write_atomically
 
 # Okabe and Ito's colours, each with its own dash, so that neither is needed alone.
 _STYLES = (
-    {"color": "#0072B2", "linestyle": "-"},
-    {"color": "#D55E00", "linestyle": "--"},
-    {"color": "#009E73", "linestyle": "-."},
-    {"color": "#000000", "linestyle": ":"},
+    ("#0072B2", "-"),
+    ("#D55E00", "--"),
+    ("#009E73", "-."),
+    ("#000000", ":"),
 )
 _WIDTH = 7.0  # [inch], a page's text width
 
@@ -34,7 +34,8 @@ def _figure(rows: int, columns: int, height: float) -> tuple[Figure, np.ndarray]
 
 def _curves(ax: Axes, ts: np.ndarray, values: np.ndarray, labels: tuple[str, ...]) -> None:
     for k, label in enumerate(labels):
-        ax.plot(ts, values[:, k], label=label, linewidth=1.4, **_STYLES[k])
+        color, dash = _STYLES[k]
+        ax.plot(ts, values[:, k], label=label, linewidth=1.4, color=color, linestyle=dash)
     ax.set_xlabel("time [s]", fontsize=9)
 
 
@@ -76,14 +77,13 @@ def euler_parameters(run: Run) -> Figure:
 
 def balances(run: Run) -> Figure:
     """Energies, and how well energy and constraints are kept."""
-    figure, axes = _figure(1, 2, 2.9)
+    figure, axes = _figure(1, 2, 3.3)
     view, trajectory = run.snapshot, run.trajectory
     energies = np.stack([view.kinetic, view.potential - view.potential[0], trajectory.work], axis=1)
     _curves(axes[0, 0], run.ts, energies, ("kinetic", "potential", "work done"))
     axes[0, 0].set_ylabel("energy [J]", fontsize=9)
-    axes[0, 0].legend(fontsize=8)
     total = view.kinetic + view.potential
-    drift = np.abs(total - total[0] - trajectory.work)
+    drift = np.maximum.accumulate(np.abs(total - total[0] - trajectory.work))
     errors = np.stack(
         [drift, trajectory.worst.position, trajectory.worst.velocity, trajectory.worst.norm], axis=1
     )
@@ -91,7 +91,8 @@ def balances(run: Run) -> Figure:
     _curves(axes[0, 1], run.ts, np.maximum(errors, 1e-18), labels)
     axes[0, 1].set_yscale("log")
     axes[0, 1].set_ylabel("error so far", fontsize=9)
-    axes[0, 1].legend(fontsize=8)
+    for ax in axes.flat:
+        ax.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     figure.suptitle(run.scene.title, fontsize=11)
     return figure
 

@@ -178,7 +178,9 @@ def test_gradient_of_log(where):
     if where != "identity":
         # e0 < 0 is the other vector of the same rotation: look along e0 = 0 and into e0 > 0
         directions = [d + 0.5 * IDENTITY for d in np.eye(4)]
-    check_derivatives(rot.to_rotation_vector, jnp.asarray(p), directions, inward=where != "identity")
+    check_derivatives(
+        rot.to_rotation_vector, jnp.asarray(p), directions, inward=where != "identity"
+    )
 
 
 @pytest.mark.parametrize("where", AT)

@@ -1,0 +1,153 @@
+"""What a body may be: every number that no rigid body has is refused, by name."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import np_rotation, random_quaternion, turn
+
+import stmuav_jax as sj
+
+# AFRL-AFOSR-JP-TR-2019-0058, Part II, section 5.1, as printed: "866e-3" breaks the triangle
+# inequality, 86.6e-3 does not. And Part I, Table 6.2, J'_7, rounded to 0.7 % too much.
+PRINTED_UAV = np.array([[57.2, 0.492, -0.201], [0.492, 58.8, 0.0056], [-0.201, 0.0056, 866]]) * 1e-3
+PRINTED_J7 = np.array([[0.0012, 0, 0.0001], [0, 0.0012, 0], [0.0001, 0, 0.0024]])
+
+
+def body(mass=1.0, inertia=(1.0, 1.0, 1.0), **more):
+    return sj.Body("wheel", mass, inertia, **more)
+
+
+@pytest.mark.parametrize("mass", [np.nan, 0.0, -1.0, np.inf, -np.inf])
+def test_mass_must_be_finite_and_positive(mass):
+    with pytest.raises(sj.ModelError, match="mass of body 'wheel' must be finite and positive"):
+        body(mass=mass)
+
+
+def test_mass_must_be_a_number():
+    with pytest.raises(sj.ModelError, match=r"mass of body 'wheel' must have shape \(\)"):
+        body(mass=[1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("tensor", "words"),
+    [
+        (np.diag([1, 1, np.nan]), "must be finite"),
+        ([1.0, np.inf, 1.0], "must be finite"),
+        ([[1, 0.1, 0], [0, 1, 0], [0, 0, 1]], "must be symmetric"),
+        ([[1, 1e-9, 0], [0, 1, 0], [0, 0, 1]], "must be symmetric"),
+        ([1.0, 1.0, 0.0], "must be positive definite"),
+        ([1.0, -1.0, 1.0], "must be positive definite"),
+        ([0.0, 0.0, 0.0], "must be positive definite"),
+        ([[1, 2, 0], [2, 1, 0], [0, 0, 1]], "must be positive definite"),
+        ([3e-2, 1e-3, 1e-1], "triangle inequality"),
+        ([1.0, 1.0, 2.0 + 1e-9], "triangle inequality"),
+        ([1.0, 1.0], r"must have shape \(3, 3\)"),
+        (np.ones((2, 2)), r"must have shape \(3, 3\)"),
+    ],
+)
+def test_inertia_that_no_body_has(tensor, words):
+    with pytest.raises(sj.ModelError, match=words) as error:
+        body(inertia=tensor)
+    assert "'wheel'" in str(error.value)
+
+
+def test_the_reports_printed_tensor_is_refused_and_its_correction_accepted():
+    with pytest.raises(sj.ModelError, match="triangle inequality") as error:
+        body(inertia=PRINTED_UAV)
+    assert "'wheel'" in str(error.value)
+    right = PRINTED_UAV.copy()
+    right[2, 2] = 86.6e-3
+    np.testing.assert_array_equal(body(inertia=right).inertia, right)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("moments", [(1, 2, 3), (1, 1, 1), (1, 1, 2), (2, 5, 4), (1e-9, 1, 1)])
+def test_equality_is_accepted_in_any_axes(moments, seed):
+    """A flat body has J_z = J_x + J_y exactly; round-off of a rotation must not matter."""
+    R = np_rotation(random_quaternion(np.random.default_rng(seed)))
+    tensor = R @ np.diag(np.array(moments, dtype=float)) @ R.T
+    assert body(inertia=0.5 * (tensor + tensor.T)).inertia.shape == (3, 3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_turned_tensors_are_judged_by_their_eigenvalues(seed):
+    """The diagonal of this turned tensor looks fine; the principal moments do not."""
+    R = np_rotation(random_quaternion(np.random.default_rng(10 + seed)))
+    tensor = R @ np.diag([0.5, 0.5, 1.2]) @ R.T
+    with pytest.raises(sj.ModelError, match="exceeds the sum of the other two by 20 %"):
+        body(inertia=0.5 * (tensor + tensor.T))
+
+
+def test_a_bad_tensor_with_a_good_diagonal_is_refused():
+    R = np_rotation(turn([1, 1, 0], np.pi / 4))
+    tensor = R @ np.diag([0.2, 1.0, 1.4]) @ R.T
+    tensor = 0.5 * (tensor + tensor.T)
+    a, b, c = np.sort(np.diag(tensor))
+    assert c < a + b
+    with pytest.raises(sj.ModelError, match="triangle"):
+        body(inertia=tensor)
+
+
+def test_triangle_tolerance_admits_a_rounded_table():
+    with pytest.raises(sj.ModelError, match=r"by 0\.69\d* %") as error:
+        body(inertia=PRINTED_J7)
+    advised = re.search(r"triangle_tolerance=([0-9.e+-]+)\.", str(error.value))
+    assert advised is not None
+    assert body(inertia=PRINTED_J7, triangle_tolerance=float(advised[1])).mass == 1
+    assert body(inertia=PRINTED_J7, triangle_tolerance=0.007).mass == 1
+    with pytest.raises(sj.ModelError, match="triangle"):
+        body(inertia=PRINTED_J7, triangle_tolerance=0.006)
+    with pytest.raises(sj.ModelError, match="triangle"):
+        body(inertia=PRINTED_UAV, triangle_tolerance=0.007)
+
+
+@pytest.mark.parametrize(
+    ("p", "words"),
+    [
+        ([0.0, 0, 0, 0], "all zero"),
+        ([1.0, 0, 0, np.nan], "must be finite"),
+        ([np.inf, 0, 0, 0], "must be finite"),
+        ([0.9768, -0.1317, -0.1524, 0.0188], "has norm 0.997528"),
+        ([2.0, 0, 0, 0], "has norm 2"),
+        ([1.0 + 1e-8, 0, 0, 0], "must have norm 1"),
+        ([1.0, 0, 0], r"must have shape \(4,\)"),
+    ],
+)
+def test_euler_parameters_must_be_unit(p, words):
+    with pytest.raises(sj.ModelError, match=words) as error:
+        body(orientation=p)
+    assert "'wheel'" in str(error.value)
+
+
+def test_euler_parameters_within_round_off_are_kept_as_given():
+    p = np.array([1 + 5e-10, 0, 0, 0])
+    np.testing.assert_array_equal(body(orientation=p).orientation, p)
+
+
+@pytest.mark.parametrize("field", ["com", "position"])
+@pytest.mark.parametrize("value", [[0.0, np.nan, 0.0], [np.inf, 0, 0], [0.0, 0.0]])
+def test_places_must_be_finite(field, value):
+    with pytest.raises(sj.ModelError, match="'wheel' must"):
+        body(**{field: value})
+
+
+@pytest.mark.parametrize("name", ["", "ground"])
+def test_reserved_names(name):
+    with pytest.raises(sj.ModelError, match="cannot be named"):
+        sj.Body(name, 1.0, [1, 1, 1])
+
+
+def test_centre_of_mass_in_the_world():
+    p = turn([0, 0, 1], np.pi / 2)
+    made = body(com=[1, 0, 0], position=[0, 0, 3], orientation=p)
+    np.testing.assert_allclose(made.com_position, [0, 1, 3], atol=1e-15)
+
+
+def test_checks_do_not_stop_a_trace():
+    """Inside a transformation values are unknown: no check, and gradients flow."""
+    moment = lambda m: jnp.sum(sj.Body("b", m, jnp.stack([m, m, m])).inertia)
+    assert float(jax.grad(moment)(2.0)) == 3
+    assert float(jax.jit(moment)(2.0)) == 6

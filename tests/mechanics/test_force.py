@@ -1,0 +1,303 @@
+"""Force elements: loads against hand formulas, potentials, balances, gradients."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import np_rotation, random_quaternion, relative_error, state_of
+
+import stmuav_jax as sj
+from stmuav_jax.mechanics.force import _frame
+
+COM = {"a": np.array([0.1, -0.2, 0.05]), "b": np.array([-0.3, 0.1, 0.2])}
+POINT_A, POINT_B = np.array([0.3, 0.1, -0.4]), np.array([0.2, -0.5, 0.6])
+HINGE = np.array([0.2, 0.3, -0.1])
+AXIS = np.array([1.0, 1.0, 0.5]) / 1.5
+
+
+def system_with(*forces, joint=None):
+    bodies = [
+        sj.Body(n, m, [0.1, 0.1, 0.1], com=COM[n], free=True) for n, m in (("a", 2), ("b", 3))
+    ]
+    joint = sj.revolute("J", "a", "b", point=HINGE, axis=AXIS) if joint is None else joint
+    return sj.System(bodies, [joint], forces)
+
+
+@pytest.fixture(scope="module")
+def state():
+    """Random places and velocities; the joint is not closed, which forces must not mind."""
+    rng = np.random.default_rng(3)
+    p = [random_quaternion(rng) for _ in range(2)]
+    return state_of(rng.normal(size=(2, 3)), p, rng.normal(size=(2, 3)), rng.normal(size=(2, 3)))
+
+
+@eqx.filter_jit
+def _load(system, t, state):
+    return system.forces[0].load(t, system.kinematics(state))
+
+
+def load_of(force, state, t=0.0, **more):
+    return _load(system_with(force, **more), jnp.asarray(t), state)
+
+
+class World:
+    """World quantities of a state, in NumPy: R, r, w, points and their velocities."""
+
+    def __init__(self, state):
+        self.R = [np_rotation(p) for p in np.asarray(state.p)]
+        self.r, self.v = np.asarray(state.r), np.asarray(state.v)
+        self.w = [R @ o for R, o in zip(self.R, np.asarray(state.omega), strict=True)]
+
+    def arm(self, name, point):
+        k = "ab".index(name)
+        return self.R[k] @ (point - COM[name])
+
+    def point(self, name, point):
+        k, s = "ab".index(name), self.arm(name, point)
+        return self.r[k] + s, self.v[k] + np.cross(self.w[k], s)
+
+    def net(self, load):
+        """Sum of forces, and of moments about the world's origin, without ground."""
+        force = np.asarray(load.force)[:2]
+        moment = np.array([R @ m for R, m in zip(self.R, np.asarray(load.moment), strict=False)])
+        return force.sum(0), (np.cross(self.r, force) + moment).sum(0)
+
+    def power(self, load):
+        """Power of a load on the moving bodies."""
+        w_body = [R.T @ w for R, w in zip(self.R, self.w, strict=True)]
+        return np.sum(np.asarray(load.force)[:2] * self.v) + np.sum(
+            np.asarray(load.moment)[:2] * w_body
+        )
+
+
+def check(load, force, moment, potential, power):
+    """Compare with world forces and world moments on a and b, given as (2, 3)."""
+    np.testing.assert_allclose(load.force[:2], force, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(load.moment[:2], moment, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(load.potential, potential, rtol=1e-13)
+    np.testing.assert_allclose(load.power, power, rtol=1e-12, atol=1e-14)
+
+
+def test_gravity(state):
+    a = np.array([0.5, -1.0, -9.0])
+    load = load_of(sj.Gravity(a), state)
+    check(load, [2 * a, 3 * a], np.zeros((2, 3)), -(2 * state.r[0] + 3 * state.r[1]) @ a, 0)
+    assert not np.any(load.force[2])
+
+
+@pytest.mark.parametrize("point", [None, POINT_A])
+@pytest.mark.parametrize("frame", ["world", "body"])
+def test_applied_force(state, frame, point):
+    world, value = World(state), np.array([1.0, -2.0, 0.5])
+    load = load_of(sj.AppliedForce("a", value, frame=frame, point=point), state)
+    force = world.R[0] @ value if frame == "body" else value
+    arm = np.zeros(3) if point is None else world.arm("a", point)
+    at = world.r[0] + arm
+    speed = world.v[0] + np.cross(world.w[0], at - world.r[0])
+    check(
+        load, [force, 0 * force], [world.R[0].T @ np.cross(arm, force), 0 * arm], 0, force @ speed
+    )
+
+
+@pytest.mark.parametrize("frame", ["world", "body"])
+def test_applied_moment(state, frame):
+    world, value = World(state), np.array([1.0, -2.0, 0.5])
+    load = load_of(sj.AppliedMoment("b", value, frame=frame), state)
+    inside = value if frame == "body" else world.R[1].T @ value
+    check(load, np.zeros((2, 3)), [0 * value, inside], 0, inside @ state.omega[1])
+
+
+def test_signals_see_time_and_kinematics(state):
+    value = lambda t, kin: t * kin.v[kin.index("b")]
+    load = load_of(sj.AppliedForce("a", value), state, t=2.5)
+    np.testing.assert_allclose(load.force[0], 2.5 * state.v[1])
+    moment = load_of(
+        sj.AppliedMoment("a", lambda t, kin: [t, 0.0, 2 * t], frame="body"), state, 3.0
+    )
+    np.testing.assert_allclose(moment.moment[0], [3, 0, 6], atol=1e-14)
+
+
+@pytest.mark.parametrize("damping", [0.0, 7.0])
+def test_spring_between_bodies(state, damping):
+    world = World(state)
+    (A, A1), (B, B1) = world.point("a", POINT_A), world.point("b", POINT_B)
+    spring = sj.LinearSpringDamper(
+        "a", "b", point_i=POINT_A, point_j=POINT_B, stiffness=50.0, damping=damping, length=0.4
+    )
+    load = load_of(spring, state)
+    length = np.linalg.norm(B - A)
+    u = (B - A) / length
+    rate = u @ (B1 - A1)
+    pull = (50 * (length - 0.4) + damping * rate) * u
+    moments = [
+        world.R[0].T @ np.cross(A - world.r[0], pull),
+        world.R[1].T @ np.cross(B - world.r[1], -pull),
+    ]
+    check(load, [pull, -pull], moments, 25 * (length - 0.4) ** 2, -damping * rate**2)
+
+
+def test_spring_to_ground(state):
+    world, anchor = World(state), np.array([1.0, 2.0, 3.0])
+    spring = sj.LinearSpringDamper("ground", "b", point_i=anchor, point_j=POINT_B, stiffness=9.0)
+    load = load_of(spring, state)
+    B = world.point("b", POINT_B)[0]
+    np.testing.assert_allclose(load.force[1], -9 * (B - anchor), atol=1e-13)
+    np.testing.assert_allclose(load.force[2], 9 * (B - anchor), atol=1e-13)
+    assert not np.any(load.force[0])
+
+
+def test_torsional_spring(state):
+    """On a closed joint: the moment on a is k (phi - phi_0) + c rate about the common axis."""
+    phi, rate = 2.0, -3.0
+    quarter = np.concatenate([[np.cos(phi / 2)], np.sin(phi / 2) * AXIS])
+    p = np.asarray(sj.product(state.p[0], jnp.asarray(quarter)))
+    R = np_rotation(p)
+    R_a = np_rotation(np.asarray(state.p[0]))
+    w_a = R_a @ np.asarray(state.omega[0])
+    closed = state_of(
+        state.r, [state.p[0], p], state.v, [state.omega[0], R.T @ (w_a + rate * R_a @ AXIS)]
+    )
+    spring = sj.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5)
+    load = load_of(spring, closed)
+    moment = (5 * (phi - 0.5) + 0.3 * rate) * (R_a @ AXIS)
+    check(
+        load, np.zeros((2, 3)), [R_a.T @ moment, -R.T @ moment], 2.5 * (phi - 0.5) ** 2, -0.3 * rate**2
+    )  # fmt: skip
+
+
+def test_joint_damping(state):
+    """Sliding acts on the velocity of b's point relative to a, along a's axis; turning on all."""
+    joint = sj.cylindrical("J", "a", "b", axis=AXIS, point=HINGE)
+    load = load_of(sj.JointDamping("J", turning=0.7, sliding=4.0), state, joint=joint)
+    world = World(state)
+    z = world.R[0] @ AXIS
+    (A, A1), (B, B1) = world.point("a", HINGE), world.point("b", HINGE)
+    slip = z @ (B1 - A1 - np.cross(world.w[0], B - A))
+    drag, spin = 4 * slip * z, 0.7 * (world.w[1] - world.w[0])
+    moments = [
+        world.R[0].T @ (np.cross(B - world.r[0], drag) + spin),
+        world.R[1].T @ (np.cross(B - world.r[1], -drag) - spin),
+    ]
+    loss = -4 * slip**2 - 0.7 * np.sum((world.w[1] - world.w[0]) ** 2)
+    check(load, [drag, -drag], moments, 0, loss)
+
+
+INTERNAL = {
+    "spring": sj.LinearSpringDamper(
+        "a", "b", point_i=POINT_A, point_j=POINT_B, stiffness=50.0, damping=7.0, length=0.4
+    ),
+    "torsional": sj.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5),
+    "damping": sj.JointDamping("J", turning=0.7, sliding=4.0),
+}
+
+
+@pytest.mark.parametrize("name", INTERNAL)
+def test_internal_forces_have_no_net_force_or_moment(state, name):
+    load, world = load_of(INTERNAL[name], state), World(state)
+    force, moment = world.net(load)
+    size = np.max(np.abs(load.force)) + np.max(np.abs(load.moment))
+    assert size > 0.1
+    assert np.max(np.abs([force, moment])) < 1e-13 * size
+
+
+CONSERVATIVE = {
+    "gravity": sj.Gravity([0.5, -1.0, -9.0]),
+    "spring": INTERNAL["spring"],
+    "to ground": sj.LinearSpringDamper("ground", "b", stiffness=9.0, damping=2.0, length=0.3),
+}
+
+
+@pytest.mark.parametrize("name", CONSERVATIVE)
+def test_power_is_minus_the_rate_of_the_potential(state, name):
+    force, world = CONSERVATIVE[name], World(state)
+    load = load_of(force, state)
+    p_rate = jax.vmap(sj.euler_parameter_rate)(state.p, state.omega)
+
+    def potential(h):
+        p = state.p + h * p_rate
+        p = p / jnp.sqrt(jnp.sum(p**2, axis=1, keepdims=True))
+        moved = sj.State(state.r + h * state.v, p, state.v, state.omega)
+        return float(load_of(force, moved).potential)
+
+    rate = (potential(1e-5) - potential(-1e-5)) / 2e-5
+    assert world.power(load) == pytest.approx(-rate + float(load.power), rel=1e-7)
+    assert abs(rate) > 0.1
+
+
+def test_power_of_a_torsional_spring():
+    """On a closed revolute joint that turns."""
+    rate, force = 1.7, sj.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5)
+    at = lambda phi: state_of(
+        [COM["a"], COM["b"]],
+        [[1, 0, 0, 0], np.concatenate([[np.cos(phi / 2)], np.sin(phi / 2) * AXIS])],
+        None,
+        [np.zeros(3), rate * AXIS],
+    )
+    load, h = load_of(force, at(0.9)), 1e-5
+    ahead, behind = (load_of(force, at(0.9 + k * rate * h)).potential for k in (1, -1))
+    expected = -float(ahead - behind) / (2 * h) + float(load.power)
+    assert World(at(0.9)).power(load) == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("length", [0.0, 0.3])
+def test_a_spring_of_no_length_has_finite_gradients(length):
+    spring = sj.LinearSpringDamper("a", "b", stiffness=50.0, damping=3.0, length=length)
+    system = system_with(spring)
+    R = np.eye(3)
+    same = state_of([R @ COM["a"], R @ COM["b"]], [[1.0, 0, 0, 0]] * 2, [[1.0, 0, 0], [0, 0, 0]])
+
+    def total(state, spring):
+        load = spring.load(jnp.zeros(()), system.kinematics(state))
+        return jnp.sum(load.force**2) + jnp.sum(load.moment**2) + load.potential + load.power
+
+    value, gradients = jax.value_and_grad(total, argnums=(0, 1))(same, spring)
+    assert float(value) == pytest.approx(25 * length**2)
+    assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradients))
+    rates = jax.jvp(total, (same, spring), jax.tree.map(jnp.ones_like, (same, spring)))[1]
+    assert np.isfinite(float(rates))
+
+
+def test_loads_add_up(state):
+    one, two = (load_of(f, state) for f in (INTERNAL["spring"], INTERNAL["damping"]))
+    total = one + two
+    assert relative_error(total, jax.tree.map(lambda a, b: a + b, one, two)) == 0
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: sj.Gravity([0, 0, np.nan]), "gravity must be finite"),
+        (lambda: sj.AppliedForce("a", [np.inf, 0, 0]), "force on body 'a' must be finite"),
+        (lambda: sj.AppliedMoment("a", [0, np.nan, 0]), "moment on body 'a' must be finite"),
+        # by itself: the type check that the tests switch on refuses the word earlier
+        (lambda: _frame("tool"), "must be 'world' or 'body', not 'tool'"),
+        (lambda: sj.LinearSpringDamper("a", "a", stiffness=1.0), "joins body 'a' to itself"),
+        (lambda: sj.LinearSpringDamper("a", "", stiffness=1.0), "needs two bodies"),
+        (lambda: sj.LinearSpringDamper("a", "b", stiffness=np.nan), "stiffness of the spring"),
+        (lambda: sj.LinearSpringDamper("a", "b", stiffness=1.0, length=np.inf), "length of the"),
+        (lambda: sj.TorsionalSpringDamper("J", stiffness=np.nan), "torsional spring in joint 'J'"),
+        (lambda: sj.JointDamping("J", turning=np.nan), "damping of joint 'J' must be finite"),
+    ],
+)
+def test_bad_input_is_refused(build, words):
+    with pytest.raises(sj.ModelError, match=words):
+        build()
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: sj.AppliedForce("a", [0, 0, 1], point=[0, np.nan, 0]),
+        lambda: sj.AppliedForce("a", [0, 1]),
+        lambda: sj.AppliedForce("a", [0, 0, 1], point=[0, 1]),
+        lambda: sj.AppliedMoment("a", [1.0]),
+        lambda: sj.Gravity([0, -9.81]),
+        lambda: sj.LinearSpringDamper("a", "b", point_i=[0, np.nan, 0], stiffness=1.0),
+        lambda: sj.LinearSpringDamper("a", "b", point_i=[0, 1], stiffness=1.0),
+        lambda: sj.LinearSpringDamper("a", "b", stiffness=[1.0, 2.0]),
+    ],
+)
+def test_bad_shapes_and_points_are_refused_in_the_users_words(build):
+    with pytest.raises(sj.ModelError, match=r"must (be finite|have shape)"):
+        build()
