@@ -1,8 +1,20 @@
 """Shared set-up of the tests: double precision, shapes checked as the code runs."""
 
 import jax
+import numpy as np
+import pytest
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
 
 install_import_hook("stmuav_jax", "beartype.beartype")
+
+
+@pytest.fixture(scope="session")
+def seven():
+    """The seven-body system and random consistent states of it, stacked (6, 7, .)."""
+    from helpers import random_seven, seven_bodies
+
+    system, rng = seven_bodies(), np.random.default_rng(11)
+    states = [random_seven(system, rng) for _ in range(6)]
+    return system, jax.tree.map(lambda *x: jax.numpy.stack(x), *states)

@@ -6,6 +6,7 @@ to 1e-12). Work and impulse are integrated beside the state for the energy and m
 balances; they do not steer the step size.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -47,10 +48,10 @@ class Method(eqx.Module):
 
     formulation: AbstractFormulation = Augmented()
     solver: diffrax.AbstractSolver = diffrax.Dopri8()
-    rtol: float = 1e-8
-    atol: float = 1e-8
+    rtol: float | Float[Array, ""] = 1e-8
+    atol: float | Float[Array, ""] = 1e-8
     stabilisation: AbstractStabilisation = Projection()
-    first_step: float = 1e-4
+    first_step: float | Float[Array, ""] = 1e-4
     max_steps: int = eqx.field(static=True, default=100_000)
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint()
     event: Event | None = None
@@ -169,6 +170,9 @@ class Problem(eqx.Module):
 
 def prepare(system: System, method: Method) -> Problem:
     """Gather what does not change with the state."""
+    # as arrays, so that other tolerances do not mean another compilation
+    numbers = {k: jnp.asarray(getattr(method, k), float) for k in ("rtol", "atol", "first_step")}
+    method = dataclasses.replace(method, **numbers)
     model = method.formulation.prepare(system)
     n_state = method.formulation.to_vector(model, system.reference).shape[0]
     return Problem(model, method, system.floating, n_state)
@@ -204,7 +208,7 @@ def _segment(problem: Problem, carry: Carry, t1: Float[Array, ""], event: bool) 
             return condition(t, method.formulation.to_state(args, y[: problem.n_state]))
 
         kind = jax.eval_shape(lambda: cond_fn(carry.t, carry.y, problem.model)).dtype
-        finder = None if kind == bool else optx.Bisection(rtol=1e-12, atol=1e-14)
+        finder = None if kind == jnp.bool_ else optx.Bisection(rtol=1e-12, atol=1e-14)
         watch = diffrax.Event(cond_fn, finder)
     return diffrax.diffeqsolve(
         diffrax.ODETerm(problem.field),

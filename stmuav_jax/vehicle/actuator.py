@@ -1,7 +1,6 @@
 """The linear actuators that push the tracker's sliders along the base's z axis."""
 
 from collections.abc import Callable
-from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -34,7 +33,7 @@ class LinearActuator(AbstractForce):
     slider: str = eqx.field(static=True)
     axis_point: Float[Array, "3"]
     force: Signal
-    couple: Literal["consistent", "printed"] = eqx.field(static=True)
+    couple: str = eqx.field(static=True)
 
     def __init__(
         self,
@@ -43,7 +42,7 @@ class LinearActuator(AbstractForce):
         *,
         axis_point: Numbers,
         force: Numbers | Callable[..., object],
-        couple: Literal["consistent", "printed"] = "consistent",
+        couple: str = "consistent",
     ) -> None:
         if couple not in ("consistent", "printed"):
             raise SettingError(

@@ -1,0 +1,31 @@
+"""`uav_tracker` case 2 at 1 s: two solvers, both solves, one answer."""
+
+import diffrax
+import numpy as np
+import pytest
+
+from stmuav_jax import Augmented, make_scene, simulate
+
+# Accuracy asked of all of them; errors grow 100 to 1000 times between 0.5 s and 1 s.
+TIGHT = {"rtol": 1e-12, "atol": 1e-12, "t1": 1.0, "save_every": 0.5}
+AGREEMENT = 1e-9  # [m]
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return simulate(make_scene("uav_tracker", 2), **TIGHT)
+
+
+@pytest.mark.parametrize(
+    ("solver", "formulation"),
+    [
+        (diffrax.Tsit5(), Augmented()),
+        (diffrax.Dopri8(), Augmented(solve="dense")),
+        (diffrax.Dopri8(), Augmented(solve="dense", rows="report")),
+    ],
+    ids=["tsit5", "dense", "report"],
+)
+def test_agrees_with_dopri8_structured(reference, solver, formulation):
+    run = simulate(make_scene("uav_tracker", 2), solver=solver, formulation=formulation, **TIGHT)
+    apart = np.abs(run.states.r[-1] - reference.states.r[-1]).max()
+    assert apart <= AGREEMENT
