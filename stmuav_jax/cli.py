@@ -65,6 +65,8 @@ class Simulate:
     """What keeps the constraints from drifting."""
     save_every: float | None = None
     """Spacing of the saved times [s]; default the scene's."""
+    max_steps: int = 100_000
+    """Steps allowed between two saved times."""
     params: Path | None = None
     """TOML file with values that replace the table's."""
     actuators: Literal["consistent", "printed"] | None = None
@@ -143,6 +145,7 @@ def run_scene(command: Simulate, console: Console) -> Run:
             atol=command.atol,
             t1=command.t1,
             save_every=command.save_every,
+            max_steps=command.max_steps,
             throw=False,
             progress=report,
         )

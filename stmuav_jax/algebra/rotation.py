@@ -29,6 +29,13 @@ def skew(a: Vec3Like) -> Mat3:
     return jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
 
 
+def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
+    """a x b, shape (3,)."""
+    x, y, z = a[0], a[1], a[2]
+    u, v, w = b[0], b[1], b[2]
+    return jnp.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
 def matrix_g(p: QuatLike) -> Mat34:
     """G = [-e, e~ + e0 I], shape (3, 4)."""
     e = p[1:]

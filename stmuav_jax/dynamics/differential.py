@@ -10,9 +10,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..mechanics.constraint import PRIMITIVES, ROWS, Data, Form, Row, Side
+from ..mechanics.constraint import PRIMITIVES, ROWS, Data, Form, Row, Side, side
 from ..mechanics.joint import Motion
 from ..mechanics.state import Kinematics
 from ..mechanics.system import System
@@ -32,15 +33,31 @@ class Group(eqx.Module):
 
     def rows(self, sides: Side, t: Float[Array, ""], form: Form) -> Row:
         """Rows of the group: value, target, gamma (k, c); J_i, J_j (k, c, 6 or 7)."""
+        # one gather for all that is known of a body
+        shape = jax.tree.map(lambda x: x[0], sides)
+        unpack = ravel_pytree(shape)[1]
+        table = jax.vmap(lambda body: ravel_pytree(body)[0])(sides)
 
-        def one(i: Side, j: Side, data: Data) -> Row:
-            return PRIMITIVES[self.kind](i, j, data, form)
+        def one(i: Array, j: Array, data: Data) -> Row:
+            return PRIMITIVES[self.kind](unpack(i), unpack(j), data, form)
 
-        take = lambda index: jax.tree.map(lambda x: x[np.array(index)], sides)
-        rows = jax.vmap(one)(take(self.i), take(self.j), self.data)
+        rows = jax.vmap(one)(_pick(table, self.i), _pick(table, self.j), self.data)
         if not self.motions:
             return rows
         return _driven(rows, self.motions, t, wrap=self.kind == "angle")
+
+
+def _pick(table: Float[Array, "N w"], index: tuple[int, ...]) -> Float[Array, "k w"]:
+    """The rows `index` of a table; they are known to lie inside it."""
+    rows = table.at[np.array(index)]
+    return rows.get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def kinematic_sides(kin: Kinematics, form: Form) -> Side:
+    """The sides of all bodies and ground, stacked."""
+    return jax.vmap(lambda r, v, p, omega: side(r, v, p, omega, form))(
+        kin.r, kin.v, kin.p, kin.omega
+    )
 
 
 def _driven(rows: Row, motions: tuple[Motion, ...], t: Float[Array, ""], *, wrap: bool) -> Row:
@@ -114,7 +131,7 @@ class Constraints(eqx.Module):
     def equations(self, t: Float[Array, ""], kin: Kinematics, form: Form = "omega") -> Equations:
         """Phi, targets, Jacobian and gamma at time t [s]."""
         n = self.n_bodies
-        sides = Side(kin.r, kin.v, kin.p, kin.R_wb, kin.omega, kin.omega_w)
+        sides = kinematic_sides(kin, form)
         width = 6 if form == "omega" else 7
         parts = [(group, group.rows(sides, t, form)) for group in self.groups]
         if not parts:

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..mechanics.constraint import ROWS, Side
+from ..mechanics.constraint import ROWS
 from ..mechanics.state import Kinematics, State
 from ..mechanics.system import System
-from .differential import Constraints
+from .differential import Constraints, kinematic_sides
 
 Frame = Literal["world", "joint"]
 
@@ -45,7 +45,7 @@ def joint_reactions(
         frame: "world", or "joint" for the axes of the joint's frame fixed in body i.
     """
     kin = system.kinematics(state)
-    sides = Side(kin.r, kin.v, kin.p, kin.R_wb, kin.omega, kin.omega_w)
+    sides = kinematic_sides(kin, "omega")
     names = list(kin.names)
     i = np.array([names.index(joint.body_i) for joint in system.joints], dtype=int)
     wrench_i = jnp.zeros((len(system.joints), 6), state.r.dtype)

@@ -3,6 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import ArrayLike
 
@@ -94,8 +95,7 @@ class Run:
     def body(self, name: str) -> State:
         """The saved states of one body, arrays (k, .)."""
         k = self.scene.system.index(name)
-        s = self.states
-        return State(s.r[:, k], s.p[:, k], s.v[:, k], s.omega[:, k])
+        return jax.tree.map(lambda x: np.asarray(x)[:, k], self.states)
 
 
 def relative(error: ArrayLike, *scales: ArrayLike) -> float:

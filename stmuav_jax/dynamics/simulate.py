@@ -137,6 +137,8 @@ def _output_times(scene: Scene, t1: float | None, save_every: float | None, ts: 
 
 
 def _check_settings(method: Method) -> None:
+    if method.max_steps < 1:
+        raise SettingError(f"max_steps must be at least 1, but it is {method.max_steps}.")
     for name in ("rtol", "atol"):
         value = float(getattr(method, name))
         if not (np.isfinite(value) and value >= 1e-15):

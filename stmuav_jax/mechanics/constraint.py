@@ -25,7 +25,15 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import bar, euler_parameter_rate, matrix_g, matrix_l, skew
+from ..algebra.rotation import (
+    bar,
+    cross,
+    euler_parameter_rate,
+    matrix_g,
+    matrix_l,
+    rotation_matrix,
+    skew,
+)
 
 Form = Literal["omega", "p"]
 Kind = Literal["point", "n1", "n2", "p1", "p2", "distance", "angle", "shift"]
@@ -55,20 +63,40 @@ class Data(eqx.Module):
 
 
 class Side(eqx.Module):
-    """One body (or a stack) as a constraint sees it: r, v (3,); p (4,); R_wb (3, 3); omega, omega_w (3,)."""
+    """One body (or a stack) as a constraint sees it; made by `side`.
+
+    Attributes:
+        r, v: centre of mass and its velocity (3,) [m], [m/s].
+        R_wb, R_rate: rotation and its time derivative (3, 3).
+        R_rest: the part of its second derivative without alpha (3, 3).
+        turn: what carries alpha into vectors: R_wb (3, 3), or 2 G (3, 4) for form "p".
+        velocity: (v, omega') or (v, pdot), what J multiplies (6,) or (7,).
+    """
 
     r: Float[Array, "*batch 3"]
     v: Float[Array, "*batch 3"]
-    p: Float[Array, "*batch 4"]
     R_wb: Float[Array, "*batch 3 3"]
-    omega: Float[Array, "*batch 3"]
-    omega_w: Float[Array, "*batch 3"]
+    R_rate: Float[Array, "*batch 3 3"]
+    R_rest: Float[Array, "*batch 3 3"]
+    turn: Float[Array, "*batch 3 k"]
+    velocity: Float[Array, "*batch w"]
 
-    def velocity(self, form: Form) -> Float[Array, " k"]:
-        """(v, omega') or (v, pdot), what J multiplies, shape (6,) or (7,)."""
-        if form == "omega":
-            return jnp.concatenate([self.v, self.omega])
-        return jnp.concatenate([self.v, euler_parameter_rate(self.p, self.omega)])
+
+def side(
+    r: Float[Array, "3"],
+    v: Float[Array, "3"],
+    p: Float[Array, "4"],
+    omega: Float[Array, "3"],
+    form: Form,
+) -> Side:
+    """A body's side of constraints, from its state (omega in body axes)."""
+    R_wb, spin = rotation_matrix(p), skew(omega)
+    R_rate = R_wb @ spin
+    if form == "omega":
+        return Side(r, v, R_wb, R_rate, R_rate @ spin, R_wb, jnp.concatenate([v, omega]))
+    p_rate = euler_parameter_rate(p, omega)
+    R_rest = 2 * matrix_g(p_rate) @ matrix_l(p_rate).T
+    return Side(r, v, R_wb, R_rate, R_rest, 2 * matrix_g(p), jnp.concatenate([v, p_rate]))
 
 
 class Jet(eqx.Module):
@@ -97,16 +125,10 @@ class Row(eqx.Module):
     gamma: Float[Array, "*batch k"]
 
 
-def jet(side: Side, fixed: Float[Array, "3"], form: Form) -> Jet:
+def jet(body: Side, fixed: Float[Array, "3"], form: Form) -> Jet:
     """The jet of a vector fixed in a body, `fixed` in body axes (3,)."""
-    s = side.R_wb @ fixed
-    rate = jnp.cross(side.omega_w, s)
-    if form == "omega":
-        return Jet(s, rate, -skew(s) @ side.R_wb, jnp.cross(side.omega_w, rate))
-    G = matrix_g(side.p)
-    p_rate = euler_parameter_rate(side.p, side.omega)
-    c = 2 * matrix_g(p_rate) @ (matrix_l(p_rate).T @ fixed)
-    return Jet(s, rate, 2 * G @ bar(fixed), c)
+    lever = -skew(fixed) if form == "omega" else bar(fixed)
+    return Jet(body.R_wb @ fixed, body.R_rate @ fixed, body.turn @ lever, body.R_rest @ fixed)
 
 
 def _blocks(linear: Float[Array, "k 3"], angular: Float[Array, "k w"]) -> Float[Array, "k w+3"]:
@@ -178,7 +200,7 @@ def p1_all(i: Side, j: Side, data: Data, form: Form) -> Row:
     a, b = jet(i, data.axis_i, form), jet(j, data.axis_j, form)
     A, B = skew(a.s), skew(b.s)
     none = jnp.zeros((3, 3), a.s.dtype)
-    gamma = -(A @ b.c - B @ a.c + 2 * jnp.cross(a.rate, b.rate))
+    gamma = -(A @ b.c - B @ a.c + 2 * cross(a.rate, b.rate))
     return _row(A @ b.s, _blocks(none, -B @ a.D), _blocks(none, A @ b.D), gamma)
 
 
@@ -187,7 +209,7 @@ def p2_all(i: Side, j: Side, data: Data, form: Form) -> Row:
     a = jet(i, data.axis_i, form)
     arm_i, arm_j, (d, d_rate, d_c) = _between(i, j, data, form)
     A, C = skew(a.s), skew(d)
-    gamma = -(A @ d_c - C @ a.c + 2 * jnp.cross(a.rate, d_rate))
+    gamma = -(A @ d_c - C @ a.c + 2 * cross(a.rate, d_rate))
     return _row(A @ d, _blocks(-A, -A @ arm_i.D - C @ a.D), _blocks(A, A @ arm_j.D), gamma)
 
 
@@ -226,7 +248,7 @@ def angle(i: Side, j: Side, data: Data, form: Form) -> Row:
     moving = jet(j, data.axis_j, form)
     A = _n1(jet(i, data.axis_i, form), moving)
     B = _n1(jet(i, data.side_i, form), moving)
-    u_i, u_j = i.velocity(form), j.velocity(form)
+    u_i, u_j = i.velocity, j.velocity
     a, b = A.value, B.value
     a_rate, b_rate = A.J_i @ u_i + A.J_j @ u_j, B.J_i @ u_i + B.J_j @ u_j
     square = a * a + b * b

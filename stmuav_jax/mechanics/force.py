@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.rotation import cross
 from ..algebra.shapes import Numbers
 from .body import GROUND
 from .errors import ModelError, check_finite
@@ -101,7 +102,7 @@ def push(
     zero = jnp.zeros(3, kin.r.dtype)
     total = zero if moment_w is None else moment_w
     if arm_w is not None:
-        total = total + jnp.cross(arm_w, force_w)
+        total = total + cross(arm_w, force_w)
     row = jnp.asarray(np.eye(len(kin.names))[:, k, None])
     power = force_w @ kin.v[k] + total @ kin.omega_w[k]
     return Load(row * force_w, row * (kin.R_wb[k].T @ total), jnp.zeros((), kin.r.dtype), power)
@@ -358,7 +359,7 @@ class JointDamping(AbstractForce):
         a, a_rate = kin.point(i, joint.point_i)
         b, b_rate = kin.point(j, joint.point_j)
         axis = kin.R_wb[kin.index(i)] @ joint.frame_i[:, 2]
-        slip = axis @ (b_rate - a_rate - jnp.cross(kin.omega_w[kin.index(i)], b - a))
+        slip = axis @ (b_rate - a_rate - cross(kin.omega_w[kin.index(i)], b - a))
         drag = self.sliding * slip * axis
         spin = self.turning * (kin.omega_w[kin.index(j)] - kin.omega_w[kin.index(i)])
         # both forces act at j's point, so that they have no net moment

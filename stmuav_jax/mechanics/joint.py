@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import rotation_matrix
+from ..algebra.rotation import cross, rotation_matrix
 from ..algebra.shapes import Numbers
 from .body import Body
 from .constraint import ROWS, Data
@@ -140,7 +140,7 @@ def _frame_about(z: Float[Array, "3"]) -> Float[Array, "3 3"]:
     other = jnp.eye(3, dtype=z.dtype)[jnp.argmin(jnp.abs(z))]
     x = other - (other @ z) * z
     x = x / jnp.sqrt(x @ x)
-    return jnp.stack([x, jnp.cross(z, x), z], axis=1)
+    return jnp.stack([x, cross(z, x), z], axis=1)
 
 
 def _joint(
@@ -207,7 +207,7 @@ def universal(
             f"{degrees:.6g} degrees apart."
         )
     return _joint(
-        "universal", name, body_i, body_j, point, point, jnp.stack([x, y, jnp.cross(x, y)], 1)
+        "universal", name, body_i, body_j, point, point, jnp.stack([x, y, cross(x, y)], 1)
     )
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import rotation_matrix
+from ..algebra.rotation import cross, rotation_matrix
 from .body import GROUND
 from .errors import ModelError, nearest_names
 
@@ -88,7 +88,7 @@ class Kinematics(eqx.Module):
         """World position [m] and velocity [m/s] of a point of the body's reference frame."""
         k = self.index(name)
         s = self.arm(name, point)
-        return self.r[k] + s, self.v[k] + jnp.cross(self.omega_w[k], s)
+        return self.r[k] + s, self.v[k] + cross(self.omega_w[k], s)
 
 
 def kinematics(

@@ -18,12 +18,16 @@ def loads():
     """Random loads on the seven bodies and ground, stacked."""
     rng = np.random.default_rng(12)
     scale = np.array([10, 0.5, 0.5, 0.1, 0.1, 0.1, 1.0, 0.0])[:, None]
-    return sj.Load(
-        force=jnp.asarray(scale * rng.normal(size=(COUNT, 8, 3))),
-        moment=jnp.asarray(0.02 * scale * rng.normal(size=(COUNT, 8, 3))),
-        potential=jnp.zeros(COUNT),
-        power=jnp.zeros(COUNT),
-    )
+    made = [
+        sj.Load(
+            force=jnp.asarray(scale * rng.normal(size=(8, 3))),
+            moment=jnp.asarray(0.02 * scale * rng.normal(size=(8, 3))),
+            potential=jnp.zeros(()),
+            power=jnp.zeros(()),
+        )
+        for _ in range(COUNT)
+    ]
+    return jax.tree.map(lambda *x: jnp.stack(x), *made)
 
 
 @pytest.fixture(scope="module")
@@ -183,13 +187,13 @@ def test_projection_of_a_vector(seven):
     residuals = jax.jit(lambda x: formulation.residuals(model, zero, x))
     x = project(formulation.to_vector(model, jax.tree.map(lambda x: x[0], states)))
     assert relative_error(project(x), x) < 1e-13
-    off = x + 1e-4 * jnp.asarray(np.random.default_rng(2).normal(size=x.shape))
+    off = x + 1e-6 * jnp.asarray(np.random.default_rng(2).normal(size=x.shape))
     before, after = residuals(off), residuals(project(off))
-    assert min(float(before.position), float(before.velocity), float(before.norm)) > 1e-5
+    assert min(float(before.position), float(before.velocity), float(before.norm)) > 1e-7
     assert float(after.position) < 1e-13
     assert float(after.velocity) < 1e-12
     assert float(after.norm) < 1e-15
-    assert 1e-5 < float(jnp.max(jnp.abs(project(off) - off))) < 1e-1
+    assert 1e-7 < float(jnp.max(jnp.abs(project(off) - off))) < 1e-3
 
 
 @pytest.mark.parametrize("gain", ["alpha", "beta", "norm"])

@@ -127,6 +127,7 @@ def driven(first, second):
     )
 
 
+@pytest.mark.slow
 def test_two_drivers_that_agree_are_allowed():
     system = driven(lambda t: t**2, lambda t: t * t)
     state = system.reference
@@ -146,7 +147,7 @@ def test_drivers_of_different_acceleration_contradict_each_other():
 def test_drivers_of_different_speed_contradict_each_other():
     system = driven(lambda t: 0.0 * t, lambda t: 3 * t)
     with pytest.raises(
-        sj.StateError, match="velocities do not fit the joints: joint '(motor|second)'"
+        sj.StateError, match=r"velocities do not fit the joints: joint '(motor|second)'"
     ):
         sj.simulate(scene_of(system), ts=[0.0, 0.1])
 
@@ -155,15 +156,13 @@ def test_drivers_of_different_angle_contradict_each_other():
     system = driven(lambda t: 0.0 * t, lambda t: 0.3 + 0.0 * t)
     with pytest.raises(sj.StateError, match="positions do not fit the joints: joint 'second'"):
         sj.simulate(scene_of(system), ts=[0.0, 0.1])
-    with pytest.raises(sj.StateError, match="could not be assembled"):
-        sj.assemble(system, system.reference)
 
 
 def test_a_rod_of_the_wrong_length_is_found_before_the_first_step():
-    A, B, C, _ = FOUR_BAR_POINTS
+    A, _, C, _ = FOUR_BAR_POINTS
     rod = sj.distance("rod", "ground", "coupler", point_i=A, point_j=C, length=3.0)
     system = four_bar(redundant=False, joints=[rod])
     with pytest.raises(sj.StateError, match="positions do not fit the joints: joint 'rod'"):
         sj.simulate(scene_of(system), ts=[0.0, 0.1])
-    with pytest.raises(sj.StateError, match="could not be assembled.*joint '"):
+    with pytest.raises(sj.StateError, match=r"could not be assembled.*joint '"):
         sj.assemble(system, system.reference)

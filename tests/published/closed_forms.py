@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipj
@@ -18,9 +19,7 @@ def scene(system: sj.System, state: sj.State | None = None, **span: Any) -> sj.S
 def moving(system: sj.System, v: Any, omega: Any) -> sj.State:
     """The reference posture with velocities v [m/s] and body-frame omega [rad/s], (n, 3) each."""
     rest = system.reference
-    return sj.State(
-        rest.r, rest.p, np.asarray(v, float) + 0 * rest.v, np.asarray(omega, float) + 0 * rest.omega
-    )
+    return sj.State(rest.r, rest.p, jnp.asarray(v, dtype=float), jnp.asarray(omega, dtype=float))
 
 
 def about_z(angle: float) -> tuple[float, float, float, float]:
@@ -48,38 +47,3 @@ def jacobi_negative(u: np.ndarray, n: float) -> tuple[np.ndarray, np.ndarray, np
     """sn, cn, dn of the negative parameter m = -n, n > 0 (Abramowitz & Stegun 16.10)."""
     sn, cn, dn, _ = ellipj(u * np.sqrt(1 + n), n / (1 + n))
     return sn / dn / np.sqrt(1 + n), cn / dn, 1 / dn
-
-
-def fixed_step_end(
-    system: sj.System, state0: sj.State, t1: float, solver: Any, counts: tuple[int, ...]
-) -> np.ndarray:
-    """Centre of mass of the first body at t1 [s] by `counts` equal steps each, (k, 3) [m]."""
-    import diffrax
-    import equinox as eqx
-    import jax.numpy as jnp
-
-    from stmuav_jax.dynamics.integrate import begin, prepare
-
-    method = sj.Method(solver=solver, adjoint=diffrax.ForwardMode())
-    problem = prepare(system, method)
-    y0 = begin(problem, jnp.zeros(()), state0).y
-
-    @eqx.filter_jit
-    def end(step: Any) -> Any:
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(problem.field),
-            problem.solver(),
-            0.0,
-            t1,
-            step,
-            y0,
-            problem.model,
-            saveat=diffrax.SaveAt(t1=True),
-            stepsize_controller=diffrax.ConstantStepSize(),
-            adjoint=method.adjoint,
-            max_steps=2 * max(counts),
-        )
-        x = solution.ys[0, : problem.n_state]  # pyright: ignore
-        return method.formulation.to_state(problem.model, x).r[0]
-
-    return np.stack([np.asarray(end(jnp.asarray(t1 / count))) for count in counts])

@@ -163,9 +163,7 @@ def test_gradient_is_the_closed_forms() -> None:
     Forward mode, through the minimum-norm solution of the dependent rows and the first
     singular postures; reverse mode would take minutes to compile for these 35 rows.
     """
-    method = sj.Method(
-        formulation=sj.Augmented(redundant=True), adjoint=diffrax.ForwardMode()
-    )
+    method = sj.Method(formulation=sj.Augmented(redundant=True), adjoint=diffrax.ForwardMode())
     ts = jnp.array([0.0, *GRADIENT])
 
     def tip_x(parameters: Any) -> Any:

@@ -7,12 +7,19 @@ kg m^2, centre of mass 1 m from the fixed point along the body's y axis, g = 9.8
 -z. A Lagrange top: the spin about y is constant exactly.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import diffrax
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_forms import fixed_step_end, moving, scene
+from closed_forms import moving, scene
+from jax import Array
 
 import stmuav_jax as sj
+from stmuav_jax.dynamics.integrate import begin, prepare
 
 MASS = 15.0  # kg
 INERTIA = (0.234375, 0.46875, 0.234375)  # kg m^2
@@ -51,17 +58,10 @@ def is_fast(run: sj.Run) -> bool:
 
 
 def test_position_is_the_converged_one(run: sj.Run) -> None:
-    """Solver class: 1e-5 m at 0.2 s at rtol 1e-8 (30 rad of spin); slow, against fixed steps.
-
-    The slow top has no figure to compare with; 64 fixed steps of the same method, whose
-    order is tested below, serve.
-    """
-    x = run.states.r[1:, 0]
-    if is_fast(run):
-        np.testing.assert_allclose(x, FAST_X, rtol=0, atol=1e-5)
-    else:
-        fine = fixed_step_end(run.scene.system, run.scene.state0, 0.2, diffrax.Dopri8(), (64,))
-        np.testing.assert_allclose(x[-1], fine[0], rtol=0, atol=1e-7)
+    """Solver class: 1e-5 m at 0.1 and 0.2 s at rtol 1e-8, after 30 rad of spin."""
+    if not is_fast(run):
+        pytest.skip("published for the fast top")
+    np.testing.assert_allclose(run.states.r[1:, 0], FAST_X, rtol=0, atol=1e-5)
 
 
 def test_attitude_is_the_published_one(run: sj.Run) -> None:
@@ -88,18 +88,79 @@ def test_invariants(run: sj.Run) -> None:
 
 def test_tip_force_is_the_motions(run: sj.Run) -> None:
     """Exact class: the tip carries m (a - g), to 1e-6 N of some 340 N; no moment."""
-    needed = MASS * (run.snapshot.accelerations.v_rate[:, 0] + [0.0, 0.0, 9.81])
+    needed = MASS * (np.asarray(run.snapshot.accelerations.v_rate)[:, 0] + [0.0, 0.0, 9.81])
     np.testing.assert_allclose(run.snapshot.reactions.force[:, 0], needed, rtol=0, atol=1e-6)
     np.testing.assert_allclose(run.snapshot.reactions.moment, 0, rtol=0, atol=1e-9)
 
 
-# Where the steps are so small that the order shows, and so large that round-off does not.
-ORDERS = {
-    "Tsit5": (diffrax.Tsit5(), 5, (8, 16, 32)),
-    "Dopri8": (diffrax.Dopri8(), 8, (4, 6, 8, 12, 16, 24)),
-}
+Steps = Callable[[float, int], np.ndarray]
 
 
-@pytest.mark.parametrize("name", ORDERS)
-def test_order_of_convergence(name: str) -> None:
-    pass
+def by_fixed_steps(omega: tuple[float, float, float], solver: Any) -> Steps:
+    """(t1 [s], count) -> centre of mass at t1 by that many equal steps, one compilation."""
+    system, state = top(omega)
+    method = sj.Method(solver=solver, adjoint=diffrax.ForwardMode())
+    problem = prepare(system, method)
+    y0 = begin(problem, jnp.zeros(()), state).y
+
+    @eqx.filter_jit
+    def end(t1: Array, step: Array) -> Array:
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(problem.field),
+            problem.solver(),
+            jnp.zeros(()),
+            t1,
+            step,
+            y0,
+            problem.model,
+            saveat=diffrax.SaveAt(t1=True),
+            stepsize_controller=diffrax.ConstantStepSize(),
+            adjoint=method.adjoint,
+        )
+        assert solution.ys is not None
+        return method.formulation.to_state(problem.model, solution.ys[0, : problem.n_state]).r[0]
+
+    return lambda t1, count: np.asarray(end(jnp.asarray(t1), jnp.asarray(t1 / count)))
+
+
+@pytest.fixture(scope="module")
+def fine() -> Steps:
+    """The slow top by fixed steps of Dopri8."""
+    return by_fixed_steps(SLOW, diffrax.Dopri8())
+
+
+def observed_order(steps: Steps, t1: float, exact: np.ndarray, counts: tuple[int, ...]) -> float:
+    """Slope of log(error) over log(step), by least squares."""
+    errors = [np.linalg.norm(steps(t1, count) - exact) for count in counts]
+    return -float(np.polyfit(np.log(counts), np.log(errors), 1)[0])
+
+
+def test_order_of_dopri8(fine: Steps) -> None:
+    """Statistical class: 8 within 0.3, projection and all, on the position of the slow top.
+
+    At 1 s: at 0.2 s six steps already leave nothing but round-off.
+    """
+    order = observed_order(fine, 1.0, fine(1.0, 100), (8, 12, 16, 24))
+    assert abs(order - 8) <= 0.3
+
+
+def test_order_of_tsit5(fine: Steps) -> None:
+    """Statistical class: 5 within 0.3 on x(0.2) of the slow top, against fine Dopri8."""
+    steps = by_fixed_steps(SLOW, diffrax.Tsit5())
+    order = observed_order(steps, 0.2, fine(0.2, 100), (8, 16, 32))
+    assert abs(order - 5) <= 0.3
+
+
+def test_slow_top_by_adaptive_steps(run: sj.Run, fine: Steps) -> None:
+    """Solver class: no figure is published for the slow top; 100 steps of Dopri8 serve."""
+    if is_fast(run):
+        pytest.skip("compared with published figures")
+    np.testing.assert_allclose(run.states.r[-1, 0], fine(0.2, 100), rtol=0, atol=1e-7)
+
+
+def test_slow_top_by_an_implicit_method(fine: Steps) -> None:
+    """Solver class: Kvaerno5 at rtol 1e-8 meets the same acceptance, 1e-5 m at 0.2 s."""
+    system, state = top(SLOW)
+    run = sj.simulate(scene(system, state), ts=TIMES, solver=diffrax.Kvaerno5())
+    np.testing.assert_allclose(run.states.r[-1, 0], fine(0.2, 100), rtol=0, atol=1e-5)
+    assert run.certificate.position_residual <= 1e-8

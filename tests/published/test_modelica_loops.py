@@ -114,9 +114,7 @@ def test_double_pendulum(double_pendulum: sj.Run) -> None:
         k = int(np.argmin(np.abs(run.ts - t)))
         got = (angles[k, 0], rates[k, 0])
         np.testing.assert_allclose(got, row, rtol=0, atol=1e-6, err_msg=f"t = {t} s")
-    other = solve_ivp(
-        minimal, (0.0, 3.0), np.zeros(4), "DOP853", run.ts, rtol=1e-12, atol=1e-12
-    )
+    other = solve_ivp(minimal, (0.0, 3.0), np.zeros(4), "DOP853", run.ts, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(angles, other.y[:2].T, rtol=0, atol=1e-6)
     np.testing.assert_allclose(rates, other.y[2:].T, rtol=0, atol=1e-5)
 

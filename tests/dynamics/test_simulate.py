@@ -1,0 +1,230 @@
+"""`simulate`: bad settings and starts, failures on the way, and what a run holds."""
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import pendulum, relative_error, scene_of, state_of, swung
+
+import stmuav_jax as sj
+
+SYSTEM = pendulum()
+START = swung(SYSTEM, 1.0, 0.5)
+SCENE = scene_of(SYSTEM, START, t1=0.4, save_every=0.02)
+NOTHING = (0.0, 0.0, 0.0)
+
+
+# --- settings: refused before anything is compiled
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"t1": -0.1}, r"t1 = -0.1 s must be finite and not before t0 = 0.0 s"),
+        ({"t1": np.nan}, "must be finite"),
+        ({"t1": np.inf}, "must be finite"),
+        ({"save_every": 0.0}, "save_every must be finite and positive"),
+        ({"save_every": -0.1}, "save_every must be finite and positive"),
+        ({"save_every": np.nan}, "save_every must be finite and positive"),
+        ({"ts": [0.0, 0.2, 0.1]}, r"must increase, but ts\[2\] = 0.1 s follows ts\[1\] = 0.2 s"),
+        ({"ts": [0.0, 0.1, 0.1]}, "must increase"),
+        ({"ts": [0.1, 0.2]}, "first output time must be the scene's t0 = 0.0 s, not 0.1 s"),
+        ({"ts": []}, "list of finite numbers"),
+        ({"ts": [0.0, np.nan]}, "list of finite numbers"),
+        ({"ts": np.array([[0.0, 1.0]])}, "list of finite numbers"),
+        ({"rtol": -1e-6}, "rtol must be finite and at least 1e-15.*-1e-06"),
+        ({"rtol": 1e-17}, "rtol must be finite and at least 1e-15"),
+        ({"rtol": np.nan}, "rtol must be finite"),
+        ({"atol": 0.0}, "atol must be finite and at least 1e-15"),
+        ({"atol": np.inf}, "atol must be finite"),
+        ({"solver": diffrax.Euler()}, "Euler has no error estimate.*Dopri8"),
+        ({"max_steps": 0}, "max_steps"),
+        ({"max_steps": -5}, "max_steps"),
+        ({"first_step": 0.0}, "first_step"),
+        ({"first_step": -1e-3}, "first_step"),
+        ({"first_step": np.nan}, "first_step"),
+    ],
+)
+def test_bad_settings_are_refused(settings, words):
+    with pytest.raises(sj.SettingError, match=words):
+        sj.simulate(SCENE, **settings)
+
+
+# --- starts
+
+
+def with_start(**changes):
+    parts = {name: getattr(START, name) for name in ("r", "p", "v", "omega")} | changes
+    return scene_of(SYSTEM, sj.State(**parts), t1=0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"r": START.r * jnp.nan}, "initial position of body 'bob' must be finite"),
+        ({"v": START.v.at[0, 1].set(jnp.inf)}, "initial velocity of body 'bob' must be finite"),
+        ({"omega": START.omega * jnp.nan}, "angular velocity of body 'bob' must be finite"),
+        ({"p": START.p * 0.9}, "body 'bob' in the initial state must have norm 1.*has norm 0.9"),
+        ({"p": START.p * 0.0}, "body 'bob' in the initial state are all zero"),
+        ({"p": START.p * jnp.nan}, "body 'bob' in the initial state must be finite"),
+        (
+            {"r": START.r + 1e-5},
+            "initial positions do not fit the joints: joint 'hinge' is off by 1e-05.*assemble",
+        ),
+        ({"r": START.r.at[0, 1].add(2e-8)}, "positions do not fit the joints: joint 'hinge'"),
+        (
+            {"v": START.v + 1e-3},
+            r"initial velocities do not fit the joints: joint 'hinge' is off by 0.001 m/s.*assemble",
+        ),
+    ],
+)
+def test_bad_starts_are_refused(changes, words):
+    with pytest.raises(sj.StateError, match=words):
+        sj.simulate(with_start(**changes))
+
+
+def test_states_of_another_size_are_refused():
+    two = state_of(np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    with pytest.raises(sj.SettingError, match=r"State.r must have shape \(..., 1, 3\)"):
+        sj.simulate(scene_of(SYSTEM, two))
+
+
+@pytest.mark.parametrize("kind", [sj.AppliedForce, sj.AppliedMoment])
+def test_a_load_that_is_not_finite_at_the_start(kind):
+    bad = kind("bob", lambda t, kin: jnp.asarray([jnp.nan, 0.0, 0.0]) * (1 + t))
+    system = pendulum(forces=(sj.JointDamping("hinge", turning=0.1), bad))
+    with pytest.raises(
+        sj.ModelError, match=rf"load of {kind.__name__} on bob is not finite at t = 0"
+    ):
+        sj.simulate(scene_of(system, START))
+
+
+# --- runs
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A plain run, with its progress."""
+    seen = []
+    found = sj.simulate(SCENE, rtol=1e-10, atol=1e-10, progress=seen.append)
+    return found, seen
+
+
+def test_a_run_and_its_certificate(run):
+    found, seen = run
+    c = found.certificate
+    assert found.successful
+    assert c.result == "successful"
+    assert c.t_end == 0.4
+    np.testing.assert_allclose(found.ts, np.linspace(0, 0.4, 21), atol=1e-15)
+    assert found.ts[-1] == 0.4
+    assert c.position_residual < 1e-14
+    assert c.velocity_residual < 1e-13
+    assert c.norm_error < 1e-15
+    assert c.relative_energy_error < 1e-9
+    assert (c.rows, c.rank, c.redundant) == (5, 5, ())
+    assert c.momentum_error is None
+    assert c.angular_momentum_error is None
+    assert 0.1 < c.smallest_singular_value < 10
+    assert c.accepted_steps > 20
+    assert seen[-1] == 1.0
+    assert seen == sorted(seen)
+    assert c.compile_seconds > 0
+    assert set(c.to_dict()) >= {"result", "energy_error", "rank"}
+
+
+def test_what_a_run_holds(run):
+    found, _ = run
+    assert found.states.r.shape == (21, 1, 3)
+    assert relative_error([x[0] for x in (found.states.r, found.states.p)], [START.r, START.p]) == 0
+    bob = found.body("bob")
+    np.testing.assert_array_equal(bob.r, found.states.r[:, 0])
+    with pytest.raises(sj.ModelError, match="Did you mean 'bob'"):
+        found.body("bobb")
+    snapshot = found.snapshot
+    total = snapshot.kinetic + snapshot.potential
+    assert np.max(np.abs(total - total[0])) < 1e-9 * np.max(np.abs(total))
+    # the hinge's force is m (a - g) at every saved time
+    a = snapshot.accelerations.v_rate[:, 0]
+    expected = 2.0 * (a + np.array([0, 0, 9.81]))
+    np.testing.assert_allclose(snapshot.reactions.force[:, 0], expected, atol=1e-9)
+
+
+def test_ctrl_c_keeps_what_was_reached(run):
+    def stop(fraction):
+        raise KeyboardInterrupt
+
+    found = sj.simulate(SCENE, rtol=1e-10, atol=1e-10, progress=stop)
+    assert found.certificate.result == "interrupted"
+    assert not found.successful
+    count = len(found.ts)
+    assert 1 < count < 21
+    assert found.certificate.t_end == found.ts[-1] < 0.4
+    full = run[0].states.r[:count]
+    np.testing.assert_allclose(found.states.r, full, rtol=0, atol=1e-12)
+
+
+def bursting():
+    """A pendulum whose load turns bad at 0.3 s."""
+    burst = lambda t, kin: jnp.where(t < 0.3, 1.0, jnp.nan) * jnp.asarray([0.0, 0.0, 1.0])
+    return scene_of(
+        pendulum(forces=(sj.AppliedForce("bob", burst),)), START, t1=0.5, save_every=0.1
+    )
+
+
+@pytest.fixture(scope="module")
+def failed():
+    """The error of such a run."""
+    with pytest.raises(sj.SimulationError) as error:
+        sj.simulate(bursting())
+    return error.value
+
+
+def test_a_load_that_turns_bad_is_named(failed):
+    assert "load of AppliedForce on bob is not finite" in str(failed)
+    assert "stopped at t = 0.3" in str(failed)
+
+
+def check_part(run):
+    """The part before 0.3 s, finite throughout."""
+    assert isinstance(run, sj.Run)
+    assert not run.successful
+    assert run.certificate.t_end == pytest.approx(0.3, abs=1e-6)
+    np.testing.assert_allclose(run.ts[:3], [0, 0.1, 0.2])
+    assert len(run.ts) == len(run.states.r) == 4
+    assert np.all(np.isfinite(run.states.r))
+    assert np.isfinite(run.certificate.energy_error)
+
+
+def test_the_failed_run_is_kept(failed):
+    check_part(failed.run)
+
+
+@pytest.mark.slow
+def test_without_throw_the_failed_run_is_returned():
+    check_part(sj.simulate(bursting(), throw=False))
+
+
+def test_too_few_steps():
+    run = sj.simulate(SCENE, max_steps=2, rtol=1e-12, atol=1e-12, throw=False)
+    assert run.certificate.result == "max_steps reached"
+    assert not run.successful
+    assert run.certificate.t_end < 0.4
+    assert np.all(np.isfinite(run.states.r))
+
+
+@pytest.mark.slow
+def test_an_event_ends_a_run():
+    run = sj.simulate(SCENE, event=lambda t, state: t > 0.11)
+    assert run.successful
+    assert run.certificate.result == "event occurred"
+    assert 0.11 <= run.certificate.t_end < 0.4
+    assert run.ts[-1] == run.certificate.t_end
+    assert np.all(np.diff(run.ts) > 0)
+
+
+def test_a_span_of_no_length_gives_the_start():
+    run = sj.simulate(SCENE, t1=0.0)
+    assert run.successful
+    np.testing.assert_array_equal(run.ts, [0.0])
+    np.testing.assert_array_equal(run.states.r[0], START.r)

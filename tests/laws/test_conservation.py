@@ -1,0 +1,228 @@
+"""What physics conserves, whatever the joints; and what keeps the constraints from drifting."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import inertia_of, np_rotation, pendulum, random_quaternion, scene_of, swung, unit
+
+import stmuav_jax as sj
+
+TOLERANCE = 1e-10
+X, Y, Z = np.eye(3)
+MIDDLE, FAR = np.array([0.0, 0.0, 0.2]), np.array([0.1, 0.3, 0.4])
+
+# joint between "a" at the origin and "b" near (0, 0, 0.4); names filled in below
+PAIRS = {
+    "weld": lambda *n, at: sj.weld(*n, point=at + MIDDLE),
+    "spherical": lambda *n, at: sj.spherical(*n, point=at + MIDDLE),
+    "universal": lambda *n, at: sj.universal(*n, point=at + MIDDLE, axis_i=X, axis_j=Y + Z),
+    "revolute": lambda *n, at: sj.revolute(*n, point=at + MIDDLE, axis=X + Y),
+    "translational": lambda *n, at: sj.translational(*n, point=at + MIDDLE, axis=X + 2 * Z),
+    "cylindrical": lambda *n, at: sj.cylindrical(*n, point=at + MIDDLE, axis=X + 2 * Z),
+    "distance": lambda *n, at: sj.distance(*n, point_i=at + MIDDLE, point_j=at + FAR),
+    "revolute_spherical": lambda *n, at: sj.revolute_spherical(
+        *n, point_i=at, axis=Z, point_j=at + 0.3 * unit(X - Y)
+    ),
+    "free": None,
+}
+KINDS = list(PAIRS)
+
+
+def pairs():
+    """One floating pair of bodies for every joint, all in one system (one compilation)."""
+    rng = np.random.default_rng(21)
+    bodies, joints = [], []
+    for k, (kind, build) in enumerate(PAIRS.items()):
+        at = np.array([2.0 * k, 0, 0])
+        for letter, place in (("a", at), ("b", at + 0.4 * Z)):
+            bodies.append(
+                sj.Body(
+                    letter + kind,
+                    1 + rng.random(),
+                    inertia_of(rng),
+                    com=0.05 * rng.normal(size=3),
+                    position=place,
+                    orientation=random_quaternion(rng),
+                    free=True,
+                )
+            )
+        if build is not None:
+            joints.append(build(kind, "a" + kind, "b" + kind, at=at))
+    system = sj.System(bodies, joints)
+    return system, consistent(system, rng)
+
+
+def consistent(system, rng):
+    """Random velocities, projected onto the joints in the mass metric."""
+    n = system.n_bodies
+    u = np.concatenate([rng.normal(size=(n, 3)), 4 * rng.normal(size=(n, 3))], axis=1).reshape(-1)
+    model = sj.Augmented().prepare(system)
+    eq = model.constraints.equations(jnp.zeros(()), system.kinematics(system.reference))
+    J = np.asarray(eq.matrix)
+    W = np.asarray(model.weigh(eq.J)).reshape(J.shape)
+    for _ in range(3):
+        u = u - W.T @ np.linalg.solve(W @ J.T, J @ u)
+    u = jnp.asarray(u.reshape(n, 6))
+    return sj.State(system.reference.r, system.reference.p, u[:, :3], u[:, 3:])
+
+
+def accounts(system, states):
+    """Momentum, angular momentum and kinetic energy of every body, in NumPy: (k, n, .)."""
+    r, p, v, omega = (np.asarray(x) for x in (states.r, states.p, states.v, states.omega))
+    mass, inertia = np.asarray(system.bodies.mass), np.asarray(system.bodies.inertia)
+    spin = np.einsum("nij,knj->kni", inertia, omega)
+    turned = np.array(
+        [
+            [np_rotation(q) @ s for q, s in zip(*both, strict=True)]
+            for both in zip(p, spin, strict=True)
+        ]
+    )
+    linear = mass[:, None] * v
+    kinetic = 0.5 * (mass * np.sum(v * v, axis=2) + np.sum(omega * spin, axis=2))
+    return linear, np.cross(r, linear) + turned, kinetic
+
+
+@pytest.fixture(scope="module")
+def floating():
+    """Per pair and saved time: momentum (k, pair, 3), angular momentum, kinetic energy."""
+    system, start = pairs()
+    method = sj.Method(rtol=TOLERANCE, atol=TOLERANCE, adjoint=diffrax.ForwardMode())
+    ts = jnp.linspace(0.0, 1.0, 5)
+    found = jax.jit(lambda s: sj.integrate(system, s, ts, method))(start)
+    assert found.result == diffrax.RESULTS.successful
+    assert float(found.worst.position[-1]) < 1e-13
+    per_body = accounts(system, found.states)
+    summed = [x.reshape(5, len(PAIRS), 2, *x.shape[2:]).sum(axis=2) for x in per_body]
+    moved = np.asarray(found.states.r)[-1] - np.asarray(start.r)
+    return summed, per_body, moved
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_momentum_of_a_floating_pair(floating, kind):
+    (linear, angular, _), (each, _, _), moved = floating
+    k = KINDS.index(kind)
+    assert np.max(np.abs(linear[:, k] - linear[0, k])) < 1e-10 * np.max(np.abs(linear[0, k]))
+    assert np.max(np.abs(angular[:, k] - angular[0, k])) < 1e-10 * np.max(np.abs(angular[0, k]))
+    assert np.linalg.norm(moved[2 * k]) > 0.1
+    exchanged = np.max(np.abs(each[:, 2 * k] - each[0, 2 * k]))
+    assert (exchanged > 1e-2) == (kind != "free")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_energy_of_a_floating_pair(floating, kind):
+    (_, _, kinetic), _, _ = floating
+    energy = kinetic[:, KINDS.index(kind)]
+    assert np.max(np.abs(energy - energy[0])) < 1e-8 * energy[0]
+
+
+def test_a_chain_under_gravity_with_a_spring():
+    """Three bodies on revolute, universal and ball joints: energy 1e-8; its certificate agrees."""
+    rng = np.random.default_rng(31)
+    bodies = [
+        sj.Body(f"b{k}", 1.0 + k, inertia_of(rng), position=[0.15 + 0.3 * k, 0, 0])
+        for k in range(3)
+    ]
+    joints = [
+        sj.revolute("A", "ground", "b0", point=[0, 0, 0], axis=[0, 1, 1]),
+        sj.universal("B", "b0", "b1", point=[0.3, 0, 0], axis_i=Y, axis_j=Z),
+        sj.spherical("C", "b1", "b2", point=[0.6, 0, 0]),
+    ]
+    spring = sj.LinearSpringDamper(
+        "ground", "b2", point_i=[0.5, 0.5, 0], stiffness=40.0, length=0.1
+    )
+    coil = sj.TorsionalSpringDamper("A", stiffness=3.0)
+    system = sj.System(bodies, joints, [sj.Gravity(), spring, coil])
+    run = sj.simulate(
+        scene_of(system, consistent(system, rng)), rtol=TOLERANCE, atol=TOLERANCE,
+        ts=np.linspace(0, 1, 9),
+    )  # fmt: skip
+    kinetic = accounts(system, run.states)[2].sum(axis=1)
+    np.testing.assert_allclose(kinetic, run.snapshot.kinetic, rtol=1e-12)
+    total = kinetic + run.snapshot.potential
+    size = np.max(np.abs(kinetic))
+    assert np.max(np.abs(total - total[0])) < 1e-8 * size
+    assert np.ptp(kinetic) > 0.1 * size
+    assert run.certificate.relative_energy_error < 1e-8
+
+
+def test_a_motor_pays_for_the_energy():
+    """Work of a driver and of dampers: T + V - work is constant; the motor's moment does it."""
+    body = sj.Body("bob", 2.0, [0.02, 0.02, 0.01], position=[0, 0, -0.5])
+    hinge = sj.revolute("hinge", "ground", "bob", point=[0, 0, 0], axis=Y)
+    swing = lambda t: 0.8 * t**2 * jnp.sin(3 * t)
+    motor = sj.drive("motor", hinge, swing, coordinate="angle")
+    drag = sj.JointDamping("hinge", turning=0.5)
+    system = sj.System([body], [hinge, motor], [sj.Gravity(), drag])
+    ts = np.linspace(0, 1, 201)
+    run = sj.simulate(scene_of(system), rtol=TOLERANCE, atol=TOLERANCE, ts=ts)
+    total = run.snapshot.kinetic + run.snapshot.potential
+    work = np.asarray(run.trajectory.work)
+    size = np.max(np.abs(run.snapshot.kinetic))
+    assert np.max(np.abs(total - total[0] - work)) < 1e-8 * size
+    assert np.ptp(work) > 0.5 * size
+    # by hand: the work of the motor's moment less that of the damper (Simpson's rule)
+    rate = np.asarray(run.states.omega)[:, 0, 1]
+    angle = jax.vmap(swing)(jnp.asarray(ts))
+    np.testing.assert_allclose(rate[-1], jax.grad(swing)(1.0), atol=1e-9)
+    np.testing.assert_allclose(run.states.r[:, 0, 0], -0.5 * np.sin(angle), atol=1e-9)
+    power = run.snapshot.reactions.moment[:, 1, 1] * rate - 0.5 * rate**2
+    weights = np.full(201, 2.0)
+    weights[1::2], weights[0], weights[-1] = 4.0, 1.0, 1.0
+    assert weights @ power / 600 == pytest.approx(work[-1], rel=1e-6)
+
+
+# --- drift
+
+
+def drift(how, tolerance=1e-6):
+    """Position residuals of a fast pendulum after 2 and 8 s."""
+    system = pendulum()
+    start = swung(system, 2.5, 1.0)
+    method = sj.Method(
+        rtol=tolerance, atol=tolerance, stabilisation=how, adjoint=diffrax.ForwardMode()
+    )
+    formulation = method.formulation
+
+    def run(state):
+        found = sj.integrate(system, state, jnp.asarray([0.0, 2.0, 8.0]), method)
+        model = formulation.prepare(system)
+        at = lambda k: jax.tree.map(lambda x: x[k], found.states)
+        left = lambda s: formulation.residuals(
+            model, jnp.zeros(()), formulation.to_vector(model, s)
+        )
+        return [(x.position, x.velocity, x.norm) for x in (left(at(1)), left(at(2)))], found.worst
+
+    return jax.tree.map(float, jax.jit(run)(start)[0])
+
+
+@pytest.fixture(scope="module")
+def drifts():
+    return {
+        "none": drift(sj.Unstabilised()),
+        "feedback": drift(sj.Baumgarte(20.0, 20.0, 20.0)),
+        "projection": drift(sj.Projection()),
+    }
+
+
+def test_without_stabilisation_it_drifts(drifts):
+    early, late = drifts["none"]
+    assert late[0] > 3 * early[0] > 1e-8
+    assert late[1] > 1e-8
+    assert late[2] > 1e-8
+
+
+def test_feedback_keeps_it_bounded(drifts):
+    early, late = drifts["feedback"]
+    for kind in range(3):
+        assert 1e-13 < late[kind] < 1.5 * early[kind]
+    assert late[0] < 0.01 * drifts["none"][1][0]
+    assert late[2] < 0.2 * drifts["none"][1][2]
+
+
+def test_projection_keeps_it_at_round_off(drifts):
+    for position, velocity, norm in drifts["projection"]:
+        assert position < 1e-14
+        assert velocity < 1e-13
+        assert norm < 1e-15

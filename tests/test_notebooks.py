@@ -1,0 +1,20 @@
+"""Every notebook runs, and its last cell asserts its claim."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_notebook(path):
+    notebook = nbformat.read(path, as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert "assert" in code[-1].source
+    assert all(len(cell.source.splitlines()) <= 25 for cell in code)
+    assert all(cell.outputs or cell is code[0] or "=" in cell.source for cell in code)
+    assert path.stat().st_size < 300_000
+    NotebookClient(notebook, timeout=900, kernel_name="python3").execute()

@@ -1,0 +1,123 @@
+"""Results on disk: labelled, whole or absent, and never another program's file."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from stmuav_jax import PART_II, ModelError
+from stmuav_jax.view.io import (
+    FileError,
+    load,
+    load_parameters,
+    save,
+    save_certificate,
+    to_dataset,
+    write_atomically,
+)
+
+
+def test_dataset_is_labelled(short_run):
+    data = to_dataset(short_run)
+    assert dict(data.sizes) == {"time": 6, "body": 7, "axis": 3, "component": 4, "joint": 8}
+    for name in ("position", "euler_parameters", "velocity", "angular_velocity"):
+        assert data[name].dims[:2] == ("time", "body")
+    for name in ("reaction_force", "reaction_moment"):
+        assert data[name].dims == ("time", "joint", "axis")
+    for name, variable in data.data_vars.items():
+        assert variable.attrs["units"], name
+        assert variable.attrs["description"], name
+    z = data["position"].sel(body="panel_7", axis="z").values
+    assert z == pytest.approx(np.asarray(short_run.body("panel_7").r[:, 2]))
+    assert data["joint_body_j"].sel(joint="S57").item() == "panel_7"
+
+
+def test_saved_and_loaded_runs_are_equal(short_run, tmp_path):
+    path = save(short_run, tmp_path / "deep" / "run.nc")
+    found = load(path)
+    xr.testing.assert_identical(found.drop_attrs(), to_dataset(short_run).drop_attrs())
+    assert found.attrs["scene"] == "uav_tracker_2"
+    assert json.loads(found.attrs["parameters"])["mass.panel_7"]["value"] == 0.89085
+    assert json.loads(found.attrs["settings"])["solver"] == "Dopri8"
+    assert "jax" in json.loads(found.attrs["versions"])
+    assert json.loads(found.attrs["certificate"])["result"] == "successful"
+    assert [p.name for p in path.parent.iterdir()] == ["run.nc"]
+
+
+def test_truncated_files_are_refused(short_run, tmp_path):
+    whole = save(short_run, tmp_path / "run.nc").read_bytes()
+    for part in range(1, 16):
+        broken = tmp_path / "broken.nc"
+        broken.write_bytes(whole[: len(whole) * part // 16])
+        with pytest.raises(FileError, match=r"broken\.nc cannot be read"):
+            load(broken)
+
+
+def test_foreign_and_missing_files_are_refused(tmp_path):
+    with pytest.raises(FileError, match="There is no file"):
+        load(tmp_path / "none.nc")
+    text = tmp_path / "text.nc"
+    text.write_text("not a dataset")
+    with pytest.raises(FileError, match="cannot be read"):
+        load(text)
+    foreign = tmp_path / "foreign.nc"
+    xr.Dataset({"x": ("t", [1.0])}).to_netcdf(foreign, engine="h5netcdf")
+    with pytest.raises(FileError, match="not a run saved by stmuav_jax"):
+        load(foreign)
+    xr.Dataset(attrs={"format": "stmuav_jax run", "format_version": 99}).to_netcdf(
+        foreign, engine="h5netcdf"
+    )
+    with pytest.raises(FileError, match="version 99"):
+        load(foreign)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = write_atomically(tmp_path / "a.txt", b"old")
+
+    def broken(source, target):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("stmuav_jax.view.io.os.replace", broken)
+    with pytest.raises(OSError, match="no space"):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_certificate_as_json(short_run, tmp_path):
+    content = json.loads(save_certificate(short_run, tmp_path / "c.json").read_text())
+    assert content["certificate"]["rank"] == 34
+    assert content["settings"]["rtol"] == 1e-8
+
+
+def test_parameters_from_toml(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        '[mass]\npanel_7 = 0.95\n[rotor]\nk_f = {value = 6.6e-6, unit = "N s^2/rad^2"}\n'
+        "lift_factor = 1.3\n".replace("lift_factor", "k_tau = 1.3e-7\n[actuator]\nforce")
+    )
+    table = load_parameters(path, PART_II)
+    assert table.value("mass.panel_7") == 0.95
+    assert table.value("rotor.k_f") == 6.6e-6
+    assert table.value("actuator.force") == 1.3
+    assert table["mass.panel_7"].source == "given in mine.toml"
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        ("[mass\n", FileError, "not a readable TOML"),
+        ("[mass]\npanel_9 = 1.0\n", ModelError, r"mine\.toml.*mass\.panel_9"),
+        ('[mass]\npanel_7 = {value = 890, unit = "g"}\n', ModelError, "given in kg, not in g"),
+        ("[mass]\npanel_7 = {value = 1.0, units = 2}\n", ModelError, "unknown entries: units"),
+        ("[mass]\npanel_7 = nan\n", ModelError, "finite"),
+    ],
+)
+def test_bad_parameter_files(tmp_path, text, error, words):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(error, match=words):
+        load_parameters(path, PART_II)
+    with pytest.raises(FileError, match="There is no file"):
+        load_parameters(tmp_path / "none.toml", PART_II)
