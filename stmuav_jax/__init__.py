@@ -36,8 +36,6 @@ from .mechanics.force import (
     Gravity,
     JointDamping,
     LinearSpringDamper,
-    Load,
-    Sine,
     TorsionalSpringDamper,
 )
 from .mechanics.joint import (
@@ -52,6 +50,7 @@ from .mechanics.joint import (
     universal,
     weld,
 )
+from .mechanics.load import Load, Sine
 from .mechanics.state import Kinematics, State
 from .mechanics.system import System
 from .scenes.registry import SCENES, make_scene

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..algebra.shapes import Numbers
-from ..mechanics.force import Load
+from ..mechanics.load import Load
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .augmented import Augmented, Model
@@ -119,7 +119,7 @@ def evaluate(
     Args:
         state: consistent with the joints, unbatched.
         t: [s].
-        load: added to the system's own forces; see `stmuav_jax.mechanics.force.Load`.
+        load: added to the system's own forces; see `stmuav_jax.Load`.
         frame: axes of the reactions: "world", or "joint" for the joint's frame in body i.
 
     Raises:

@@ -29,7 +29,7 @@ from ..algebra.rotation import (
     normalise,
     product,
 )
-from ..mechanics.force import Load, no_load
+from ..mechanics.load import Load, no_load
 from ..mechanics.state import Kinematics, State
 from ..mechanics.system import System
 from .differential import Constraints, Equations, RowChoice, constraints

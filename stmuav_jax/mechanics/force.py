@@ -1,127 +1,18 @@
-"""Force elements: what acts on the bodies besides the joints.
+"""Force elements: gravity, given forces and moments, springs and dampers."""
 
-A force maps the kinematics of all bodies and the time to a `Load`: world force and
-body-frame moment about the centre of mass for every body, the potential energy it has (if
-any), and the power of its part that has none. Values may be numbers or functions of
-(t, kinematics); numbers are leaves of the pytree, so they can be differentiated.
-"""
-
-from abc import abstractmethod
 from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import cross
 from ..algebra.shapes import Numbers
 from .body import GROUND
-from .errors import ModelError, check_finite
+from .errors import ModelError
+from .load import AbstractForce, Load, Signal, couple, evaluate, push, scalar, signal, vector
 from .state import Kinematics
-
-Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Array, "..."]]
-
-
-def signal(value: "Numbers | Callable[..., object]", what: str) -> Signal:
-    """A constant as an array (checked to be finite), or the function itself."""
-    if callable(value):
-        return value  # pyright: ignore[reportReturnType]
-    check_finite(value, what, "")
-    return jnp.asarray(value, dtype=float)
-
-
-def evaluate(value: Signal, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "..."]:
-    """The signal's value at time t [s]."""
-    return jnp.asarray(value(t, kin), dtype=kin.r.dtype) if callable(value) else value
-
-
-class Sine(eqx.Module):
-    """The signal amplitude sin(omega t), its numbers leaves like all others.
-
-    Args:
-        amplitude: of any shape. angular_frequency: omega [rad/s].
-    """
-
-    amplitude: Float[Array, "*shape"]
-    angular_frequency: Float[Array, ""]
-
-    def __init__(self, amplitude: Numbers, angular_frequency: Numbers) -> None:
-        check_finite((amplitude, angular_frequency), "A sine signal", "")
-        self.amplitude = jnp.asarray(amplitude, dtype=float)
-        self.angular_frequency = jnp.asarray(angular_frequency, dtype=float)
-
-    def __call__(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "*shape"]:
-        del kin
-        return self.amplitude * jnp.sin(self.angular_frequency * t)
-
-
-class Load(eqx.Module):
-    """What a force does to all bodies, ground included as the last row.
-
-    Attributes:
-        force: world (n + 1, 3) [N], at the centres of mass.
-        moment: body axes (n + 1, 3) [N m], about the centres of mass.
-        potential: [J].
-        power: of the part of the force that has no potential [W].
-    """
-
-    force: Float[Array, "N 3"]
-    moment: Float[Array, "N 3"]
-    potential: Float[Array, ""]
-    power: Float[Array, ""]
-
-    def __add__(self, other: "Load") -> "Load":
-        return Load(
-            self.force + other.force,
-            self.moment + other.moment,
-            self.potential + other.potential,
-            self.power + other.power,
-        )
-
-
-def no_load(kin: Kinematics) -> Load:
-    """Zero load on every body."""
-    zero = jnp.zeros((), kin.r.dtype)
-    return Load(jnp.zeros_like(kin.r), jnp.zeros_like(kin.r), zero, zero)
-
-
-def push(
-    kin: Kinematics,
-    body: str,
-    force_w: Float[Array, "3"],
-    arm_w: Float[Array, "3"] | None = None,
-    moment_w: Float[Array, "3"] | None = None,
-) -> Load:
-    """A world force [N] at `arm_w` [m] from the body's centre of mass, and a moment [N m].
-
-    Its power is counted as that of a force without potential.
-    """
-    k = kin.index(body)
-    zero = jnp.zeros(3, kin.r.dtype)
-    total = zero if moment_w is None else moment_w
-    if arm_w is not None:
-        total = total + cross(arm_w, force_w)
-    row = jnp.asarray(np.eye(len(kin.names))[:, k, None])
-    power = force_w @ kin.v[k] + total @ kin.omega_w[k]
-    return Load(row * force_w, row * (kin.R_wb[k].T @ total), jnp.zeros((), kin.r.dtype), power)
-
-
-class AbstractForce(eqx.Module):
-    """A force element. Subclasses define `load` and the names of the bodies they act on."""
-
-    @abstractmethod
-    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        """The load at time t [s] on all bodies."""
-
-    @abstractmethod
-    def bodies(self) -> tuple[str, ...]:
-        """The names that must be known bodies (or "ground") for this force to act."""
-
-    @abstractmethod
-    def joint_names(self) -> tuple[str, ...]:
-        """The names that must be known joints for this force to act."""
 
 
 class Gravity(AbstractForce):
@@ -130,8 +21,7 @@ class Gravity(AbstractForce):
     acceleration: Float[Array, "3"]
 
     def __init__(self, acceleration: Numbers = (0.0, 0.0, -9.81)) -> None:
-        check_finite(acceleration, "The acceleration of gravity", "m/s^2")
-        self.acceleration = jnp.asarray(acceleration, dtype=float)
+        self.acceleration = vector(acceleration, "The acceleration of gravity", "m/s^2")
 
     def bodies(self) -> tuple[str, ...]:
         return ()
@@ -168,9 +58,10 @@ class AppliedForce(AbstractForce):
         point: Numbers | None = None,
     ) -> None:
         self.body = body
-        self.force = signal(force, f"The force on body '{body}'")
+        self.force = signal(force, f"The force on body '{body}'", (3,), "N")
         self.frame = _frame(frame)
-        self.point = None if point is None else jnp.asarray(point, dtype=float)
+        what = f"The point of the force on body '{body}'"
+        self.point = None if point is None else vector(point, what, "m")
 
     def bodies(self) -> tuple[str, ...]:
         return (self.body,)
@@ -200,7 +91,7 @@ class AppliedMoment(AbstractForce):
         frame: Literal["world", "body"] = "world",
     ) -> None:
         self.body = body
-        self.moment = signal(moment, f"The moment on body '{body}'")
+        self.moment = signal(moment, f"The moment on body '{body}'", (3,), "N m")
         self.frame = _frame(frame)
 
     def bodies(self) -> tuple[str, ...]:
@@ -247,13 +138,12 @@ class LinearSpringDamper(AbstractForce):
     ) -> None:
         _two_bodies("A spring-damper", body_i, body_j)
         self.body_i, self.body_j = body_i, body_j
-        self.point_i = jnp.asarray(point_i, dtype=float)
-        self.point_j = jnp.asarray(point_j, dtype=float)
-        for value, what in ((stiffness, "stiffness"), (damping, "damping"), (length, "length")):
-            check_finite(value, f"The {what} of the spring between '{body_i}' and '{body_j}'", "")
-        self.stiffness = jnp.asarray(stiffness, dtype=float)
-        self.damping = jnp.asarray(damping, dtype=float)
-        self.length = jnp.asarray(length, dtype=float)
+        of = f"of the spring between '{body_i}' and '{body_j}'"
+        self.point_i = vector(point_i, f"The point on '{body_i}' {of}", "m")
+        self.point_j = vector(point_j, f"The point on '{body_j}' {of}", "m")
+        self.stiffness = scalar(stiffness, f"The stiffness {of}", "N/m")
+        self.damping = scalar(damping, f"The damping {of}", "N s/m")
+        self.length = scalar(length, f"The length {of}", "m")
 
     def bodies(self) -> tuple[str, ...]:
         return (self.body_i, self.body_j)
@@ -302,11 +192,10 @@ class TorsionalSpringDamper(AbstractForce):
         self, joint: str, *, stiffness: Numbers, damping: Numbers = 0.0, angle: Numbers = 0.0
     ) -> None:
         self.joint = joint
-        for value, what in ((stiffness, "stiffness"), (damping, "damping"), (angle, "angle")):
-            check_finite(value, f"The {what} of the torsional spring in joint '{joint}'", "")
-        self.stiffness = jnp.asarray(stiffness, dtype=float)
-        self.damping = jnp.asarray(damping, dtype=float)
-        self.angle = jnp.asarray(angle, dtype=float)
+        of = f"of the torsional spring in joint '{joint}'"
+        self.stiffness = scalar(stiffness, f"The stiffness {of}", "N m/rad")
+        self.damping = scalar(damping, f"The damping {of}", "N m s/rad")
+        self.angle = scalar(angle, f"The angle {of}", "rad")
 
     def bodies(self) -> tuple[str, ...]:
         return ()
@@ -322,7 +211,7 @@ class TorsionalSpringDamper(AbstractForce):
         turn = jnp.arctan2(F_i[:, 1] @ F_j[:, 0], F_i[:, 0] @ F_j[:, 0]) - self.angle
         rate = axis @ (kin.omega_w[j] - kin.omega_w[i])
         moment = (self.stiffness * turn + self.damping * rate) * axis
-        load = _couple(kin, joint.body_i, joint.body_j, moment)
+        load = couple(kin, joint.body_i, joint.body_j, moment)
         return Load(
             load.force, load.moment, 0.5 * self.stiffness * turn**2, -self.damping * rate**2
         )
@@ -343,9 +232,8 @@ class JointDamping(AbstractForce):
 
     def __init__(self, joint: str, *, turning: Numbers = 0.0, sliding: Numbers = 0.0) -> None:
         self.joint = joint
-        check_finite((turning, sliding), f"The damping of joint '{joint}'", "")
-        self.turning = jnp.asarray(turning, dtype=float)
-        self.sliding = jnp.asarray(sliding, dtype=float)
+        self.turning = scalar(turning, f"The turning damping of joint '{joint}'", "N m s/rad")
+        self.sliding = scalar(sliding, f"The sliding damping of joint '{joint}'", "N s/m")
 
     def bodies(self) -> tuple[str, ...]:
         return ()
@@ -366,14 +254,8 @@ class JointDamping(AbstractForce):
         return (
             push(kin, i, drag, b - kin.r[kin.index(i)])
             + push(kin, j, -drag, b - kin.r[kin.index(j)])
-            + _couple(kin, i, j, spin)
+            + couple(kin, i, j, spin)
         )
-
-
-def _couple(kin: Kinematics, body_i: str, body_j: str, moment_w: Float[Array, "3"]) -> Load:
-    """`moment_w` [N m] on body i and its opposite on body j."""
-    none = jnp.zeros_like(moment_w)
-    return push(kin, body_i, none, moment_w=moment_w) + push(kin, body_j, none, moment_w=-moment_w)
 
 
 def _frame(frame: str) -> Literal["world", "body"]:

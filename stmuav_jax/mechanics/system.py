@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 
 from .body import GROUND, Bodies, Body, stack_bodies
 from .errors import ModelError, SettingError, nearest_names
-from .force import AbstractForce
 from .joint import Joint, resolve
+from .load import AbstractForce
 from .state import Kinematics, State, kinematics
 
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from ..dynamics.scene import Scene
 from ..mechanics.body import GROUND
 from ..mechanics.errors import SettingError
-from ..mechanics.force import AbstractForce, AppliedForce, AppliedMoment, Sine
+from ..mechanics.force import AppliedForce, AppliedMoment
+from ..mechanics.load import AbstractForce, Sine
 from ..mechanics.system import System
 from ..vehicle.airframe import PART_I
 from ..vehicle.parameters import Parameters

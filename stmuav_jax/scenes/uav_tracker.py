@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from ..dynamics.scene import Scene
 from ..mechanics.body import Body
 from ..mechanics.errors import SettingError
-from ..mechanics.force import AbstractForce, Gravity, Sine
+from ..mechanics.force import Gravity
+from ..mechanics.load import AbstractForce, Sine
 from ..mechanics.system import System
 from ..vehicle.actuator import LinearActuator
 from ..vehicle.airframe import PART_II

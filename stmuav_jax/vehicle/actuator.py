@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.shapes import Numbers
 from ..mechanics.errors import SettingError
-from ..mechanics.force import AbstractForce, Load, Signal, evaluate, push, signal
+from ..mechanics.load import AbstractForce, Load, Signal, evaluate, push, signal
 from ..mechanics.state import Kinematics
 
 
@@ -50,7 +50,7 @@ class LinearActuator(AbstractForce):
             )
         self.base, self.slider, self.couple = base, slider, couple
         self.axis_point = jnp.asarray(axis_point, dtype=float)
-        self.force = signal(force, f"The actuator force on body '{slider}'")
+        self.force = signal(force, f"The actuator force on body '{slider}'", (), "N")
 
     def bodies(self) -> tuple[str, ...]:
         return (self.base, self.slider)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.shapes import Numbers
 from ..mechanics.errors import ModelError, check_finite
-from ..mechanics.force import AbstractForce, Load, Signal, evaluate, push, signal
+from ..mechanics.load import AbstractForce, Load, Signal, evaluate, push, signal
 from ..mechanics.state import Kinematics
 
 
@@ -49,8 +49,9 @@ class Rotors(AbstractForce):
         self.spin = jnp.asarray(spin, dtype=float)
         self.k_f = jnp.asarray(k_f, dtype=float)
         self.k_tau = jnp.asarray(k_tau, dtype=float)
-        self.speed_squared = signal(speed_squared, f"The squared rotor speeds of body '{body}'")
         count = self.spin.shape[0]
+        what = f"The squared rotor speeds of body '{body}'"
+        self.speed_squared = signal(speed_squared, what, (count,), "rad^2/s^2")
         if self.arms.shape != (count, 3):
             raise ModelError(
                 f"The rotors of body '{body}' need one arm (3,) per spin sign, but arms has shape "

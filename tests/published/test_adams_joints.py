@@ -67,7 +67,7 @@ CASES = [*ON_A_POINT, *ON_A_LINK]
 
 
 def on_a_point(name: str) -> tuple[sj.Body, sj.Joint]:
-    """A body 2 m from its joint; the joint from body to ground, so that it tells what acts there."""
+    """A body 2 m from its joint; the joint from body to ground, so it tells what acts there."""
     make, point, turned = ON_A_POINT[name]
     hangs = make is sj.universal
     arm, inertia = (-2.0 * Z, HANGING) if hangs else (2.0 * X, LYING)

@@ -28,8 +28,7 @@ SLOW = (0.0, 1.5, -0.0461538)
 TIMES = np.array([0.0, 0.1, 0.2])  # s
 ENERGY = 5435.696790865547  # J, fast, at the start
 
-# Converged, by independent integrations of Euler's equations that agree in these digits;
-# they lie between the figures that Exudyn publishes for RK4 and generalised alpha.
+# Converged, by independent code; they round to the figures that Exudyn publishes for RK4.
 FAST_X = ((0.421296658925, 0.894571974346, -0.149164700562),
           (0.605550561377, 0.598957681795, -0.52398302743))  # fmt: skip
 FAST_P = (-0.708279152974, 0.438781088127, 0.545728396145, 0.0893997528239)

@@ -57,7 +57,7 @@ def test_free_body(free_body: sj.Run) -> None:
 
 
 def test_free_body_balances(free_body: sj.Run) -> None:
-    """Energy to 1e-6 J of some 5 J; no turning about the body's x axis, in which both springs end."""
+    """Energy to 1e-6 J of some 5 J; no turning about the line of the springs' ends."""
     assert free_body.certificate.energy_error <= 1e-6
     assert free_body.certificate.momentum_error is not None
     assert free_body.certificate.momentum_error <= 1e-10

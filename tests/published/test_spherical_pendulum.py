@@ -22,7 +22,7 @@ TILT = np.pi / 3  # rad
 PERIOD = 1.0790207686476312  # s, of the height
 ADVANCE = 3.73623990009181172  # rad, of the azimuth in a period
 LOW, HIGH = -0.9152593181591549, -0.5  # m
-# Positions [m] at times [s], by independent integrations that agree in these digits.
+# Positions [m] at times [s], converged, by independent code.
 EXACT = {
     1.0: (-0.767090596619, -0.376783722019, -0.519236018974),
     5.0: (0.243333134186, -0.486776539937, -0.838950288142),

@@ -65,7 +65,7 @@ PSIDE_V = (
     -19.29337464421385,
     0.3231791658026955,
 )
-# The same by independent integrations in minimal coordinates that agree in these digits.
+# The same, converged further by independent code.
 CONVERGED_Q = (
     15.8107711951535,
     -15.7563710584116,
@@ -169,7 +169,7 @@ def test_rank(run: sj.Run) -> None:
 def test_initial_accelerations() -> None:
     """beta'' and Theta'' to 1e-9 relative, the others zero to 1e-9 of the largest.
 
-    Exact class, times the condition of the dynamics, about 1e5 for these small inertias.
+    Exact class, times the condition of the equations with such small inertias: 2e-11 is seen.
     """
     system = squeezer()
     look = eqx.filter_jit(lambda s: sj.evaluate(s, s.reference, formulation=REDUNDANT))
@@ -191,7 +191,7 @@ def test_angles_at_the_end(run: sj.Run) -> None:
 
 
 def test_rates_at_the_end(run: sj.Run) -> None:
-    """Solver class: PSIDE's angular velocities to 1e-6 relative; as printed they are good to 5e-8."""
+    """Solver class: PSIDE's rates to 1e-6 relative; printed, they are good to 5e-8."""
     got = relative(np.asarray(run.states.omega[-1, :, 2]))
     np.testing.assert_allclose(got, PSIDE_V, rtol=1e-6)
 

@@ -1,5 +1,7 @@
 """`uav_tracker` case 2 at 1 s: two solvers, both solves, one answer."""
 
+from typing import Any
+
 import diffrax
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import pytest
 from stmuav_jax import Augmented, make_scene, simulate
 
 # Accuracy asked of all of them; errors grow 100 to 1000 times between 0.5 s and 1 s.
-TIGHT = {"rtol": 1e-12, "atol": 1e-12, "t1": 1.0, "save_every": 0.5}
+TIGHT: Any = {"rtol": 1e-12, "atol": 1e-12, "t1": 1.0, "save_every": 0.5}
 AGREEMENT = 1e-9  # [m]
 
 

@@ -1,0 +1,145 @@
+"""What forces do: loads on bodies, and signals that say how large they are.
+
+A force maps the kinematics of all bodies and the time to a `Load`: world force and
+body-frame moment about the centre of mass for every body, the potential energy it has (if
+any), and the power of its part that has none. Values may be numbers or functions of
+(t, kinematics); numbers are leaves of the pytree, so they can be differentiated.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..algebra.rotation import cross
+from ..algebra.shapes import Numbers
+from .errors import check_finite, check_shape
+from .state import Kinematics
+
+Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Array, "..."]]
+
+
+def signal(
+    value: "Numbers | Callable[..., object]", what: str, shape: tuple[int, ...], unit: str
+) -> Signal:
+    """A constant as an array (checked), or the function itself."""
+    if callable(value):
+        return value  # pyright: ignore[reportReturnType]
+    check_shape(value, shape, what)
+    check_finite(value, what, unit)
+    return jnp.asarray(value, dtype=float)
+
+
+def evaluate(value: Signal, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "..."]:
+    """The signal's value at time t [s]."""
+    return jnp.asarray(value(t, kin), dtype=kin.r.dtype) if callable(value) else value
+
+
+class Sine(eqx.Module):
+    """The signal amplitude sin(omega t), its numbers leaves like all others.
+
+    Args:
+        amplitude: of any shape. angular_frequency: omega [rad/s].
+    """
+
+    amplitude: Float[Array, "*shape"]
+    angular_frequency: Float[Array, ""]
+
+    def __init__(self, amplitude: Numbers, angular_frequency: Numbers) -> None:
+        check_finite((amplitude, angular_frequency), "A sine signal", "")
+        self.amplitude = jnp.asarray(amplitude, dtype=float)
+        self.angular_frequency = jnp.asarray(angular_frequency, dtype=float)
+
+    def __call__(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "*shape"]:
+        del kin
+        return self.amplitude * jnp.sin(self.angular_frequency * t)
+
+
+class Load(eqx.Module):
+    """What a force does to all bodies, ground included as the last row.
+
+    Attributes:
+        force: world (n + 1, 3) [N], at the centres of mass.
+        moment: body axes (n + 1, 3) [N m], about the centres of mass.
+        potential: [J].
+        power: of the part of the force that has no potential [W].
+    """
+
+    force: Float[Array, "N 3"]
+    moment: Float[Array, "N 3"]
+    potential: Float[Array, ""]
+    power: Float[Array, ""]
+
+    def __add__(self, other: "Load") -> "Load":
+        return Load(
+            self.force + other.force,
+            self.moment + other.moment,
+            self.potential + other.potential,
+            self.power + other.power,
+        )
+
+
+def no_load(kin: Kinematics) -> Load:
+    """Zero load on every body."""
+    zero = jnp.zeros((), kin.r.dtype)
+    return Load(jnp.zeros_like(kin.r), jnp.zeros_like(kin.r), zero, zero)
+
+
+def push(
+    kin: Kinematics,
+    body: str,
+    force_w: Float[Array, "3"],
+    arm_w: Float[Array, "3"] | None = None,
+    moment_w: Float[Array, "3"] | None = None,
+) -> Load:
+    """A world force [N] at `arm_w` [m] from the body's centre of mass, and a moment [N m].
+
+    Its power is counted as that of a force without potential.
+    """
+    k = kin.index(body)
+    zero = jnp.zeros(3, kin.r.dtype)
+    total = zero if moment_w is None else moment_w
+    if arm_w is not None:
+        total = total + cross(arm_w, force_w)
+    row = jnp.asarray(np.eye(len(kin.names))[:, k, None])
+    power = force_w @ kin.v[k] + total @ kin.omega_w[k]
+    return Load(row * force_w, row * (kin.R_wb[k].T @ total), jnp.zeros((), kin.r.dtype), power)
+
+
+class AbstractForce(eqx.Module):
+    """A force element. Subclasses define `load` and the names of the bodies they act on."""
+
+    @abstractmethod
+    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+        """The load at time t [s] on all bodies."""
+
+    @abstractmethod
+    def bodies(self) -> tuple[str, ...]:
+        """The names that must be known bodies (or "ground") for this force to act."""
+
+    @abstractmethod
+    def joint_names(self) -> tuple[str, ...]:
+        """The names that must be known joints for this force to act."""
+
+
+def couple(kin: Kinematics, body_i: str, body_j: str, moment_w: Float[Array, "3"]) -> Load:
+    """`moment_w` [N m] on body i and its opposite on body j."""
+    none = jnp.zeros_like(moment_w)
+    return push(kin, body_i, none, moment_w=moment_w) + push(kin, body_j, none, moment_w=-moment_w)
+
+
+def vector(value: Numbers, what: str, unit: str) -> Float[Array, "3"]:
+    """A vector (3,) that a user gave; raises `ModelError` for a bad shape or number."""
+    check_shape(value, (3,), what)
+    check_finite(value, what, unit)
+    return jnp.asarray(value, dtype=float)
+
+
+def scalar(value: Numbers, what: str, unit: str) -> Float[Array, ""]:
+    """A number that a user gave; raises `ModelError` for a bad shape or number."""
+    check_shape(value, (), what)
+    check_finite(value, what, unit)
+    return jnp.asarray(value, dtype=float)
