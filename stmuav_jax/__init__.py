@@ -27,6 +27,7 @@ from .dynamics.reactions import Reactions, joint_reactions
 from .dynamics.run import Certificate, Run
 from .dynamics.scene import Scene
 from .dynamics.simulate import simulate
+from .dynamics.solvers import kvaerno3, kvaerno5
 from .dynamics.stabilisation import Baumgarte, Projection, Unstabilised
 from .mechanics.body import GROUND, Body
 from .mechanics.errors import ModelError, SettingError, SimulationError, StateError
@@ -119,6 +120,8 @@ __all__ = [
     "hover_speed_squared",
     "integrate",
     "joint_reactions",
+    "kvaerno3",
+    "kvaerno5",
     "make_scene",
     "matrix_g",
     "matrix_l",

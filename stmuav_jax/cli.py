@@ -18,6 +18,7 @@ from .dynamics.augmented import Augmented
 from .dynamics.run import Run
 from .dynamics.scene import Scene
 from .dynamics.simulate import simulate
+from .dynamics.solvers import kvaerno3, kvaerno5
 from .dynamics.stabilisation import Baumgarte, Projection, Unstabilised
 from .mechanics.errors import ModelError, SettingError, SimulationError, StateError
 from .scenes.registry import SCENES, make_scene
@@ -27,8 +28,8 @@ from .view.report import certificate_table
 SOLVERS = {
     "dopri8": diffrax.Dopri8,
     "tsit5": diffrax.Tsit5,
-    "kvaerno3": diffrax.Kvaerno3,
-    "kvaerno5": diffrax.Kvaerno5,
+    "kvaerno3": kvaerno3,
+    "kvaerno5": kvaerno5,
 }
 FORMULATIONS = {
     "augmented": Augmented(),

@@ -1,5 +1,10 @@
 """Shared set-up of the tests: double precision, shapes checked as the code runs."""
 
+import os
+
+# tests run side by side; small factorisations lose time to threads that wait for each other
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 import numpy as np
 import pytest

@@ -65,7 +65,7 @@ def random_quaternion(rng: np.random.Generator) -> np.ndarray:
 def inertia_of(rng: np.random.Generator, size: float = 0.02) -> np.ndarray:
     """A full tensor that a body can have: that of a few random point masses."""
     points = rng.normal(size=(6, 3)) * np.sqrt(size)
-    return sum(np.eye(3) * (x @ x) - np.outer(x, x) for x in points) / 6
+    return np.eye(3) * np.sum(points**2) / 6 - points.T @ points / 6
 
 
 def state_of(r: Any, p: Any, v: Any = None, omega: Any = None) -> sj.State:

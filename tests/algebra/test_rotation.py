@@ -96,7 +96,7 @@ def test_exp_and_log(angle, axis):
         exact = [mpmath.mpf(float(x)) for x in v]
         length = mpmath.sqrt(sum(x * x for x in exact))
         half = mpmath.sin(length / 2) / length if length else mpmath.mpf(0.5)
-        expected = [float(mpmath.cos(length / 2)), *(float(half * x) for x in exact)]
+        expected = [float(str(x)) for x in (mpmath.cos(length / 2), *(half * y for y in exact))]
     close(p, expected, 2e-16)
     close(rot.rotation_angle(p), angle, 1e-15 + 4e-16 * angle)
     # at a half turn v and -v are the same rotation

@@ -148,6 +148,7 @@ def test_observed_order_of_tsit5_with_projection():
             adjoint=diffrax.ForwardMode(),
             max_steps=400,
         )
+        assert solution.ys is not None
         return problem.method.formulation.to_state(problem.model, solution.ys[0][:-1])
 
     tight = jax.jit(
@@ -188,7 +189,8 @@ def test_quadratures_do_not_steer_the_steps():
 def test_a_step_cut_short_by_an_output_time_is_remembered():
     """After 0.1 cut to 0.001, the next step is 0.1 again and not ten times 0.001."""
     inner = diffrax.PIDController(rtol=1e-3, atol=1e-3)
-    controller = Remembering(inner, jnp.asarray(0.1)).wrap(1)
+    start = Remembering(inner, jnp.asarray(0.1))  # pyright: ignore[reportCallIssue]
+    controller = start.wrap(1)
     y = jnp.ones(2)
     terms, func = diffrax.ODETerm(lambda t, y, args: -y), diffrax.Tsit5().func
     _, state = controller.init(terms, 0.0, 1.0, y, None, None, func, 5)

@@ -1,6 +1,7 @@
 """What a body may be: every number that no rigid body has is refused, by name."""
 
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ PRINTED_UAV = np.array([[57.2, 0.492, -0.201], [0.492, 58.8, 0.0056], [-0.201, 0
 PRINTED_J7 = np.array([[0.0012, 0, 0.0001], [0, 0.0012, 0], [0.0001, 0, 0.0024]])
 
 
-def body(mass=1.0, inertia=(1.0, 1.0, 1.0), **more):
+def body(mass: Any = 1.0, inertia: Any = (1.0, 1.0, 1.0), **more: Any) -> sj.Body:
     return sj.Body("wheel", mass, inertia, **more)
 
 
