@@ -100,11 +100,13 @@ def balances(run: Run) -> Figure:
 FIGURES = {"positions": positions, "euler_parameters": euler_parameters, "balances": balances}
 
 
-def save_figures(run: Run, folder: str | os.PathLike[str], suffix: str = "png") -> list[Path]:
-    """Draw every figure of a run into `folder` (png at 200 dpi, or pdf, svg); their paths."""
+def save_figures(
+    run: Run, folder: str | os.PathLike[str], suffix: str = "png", dpi: int = 200
+) -> list[Path]:
+    """Draw every figure of a run into `folder` (png, pdf or svg); their paths."""
     paths = []
     for name, draw in FIGURES.items():
         buffer = io.BytesIO()
-        draw(run).savefig(buffer, format=suffix, dpi=200)
+        draw(run).savefig(buffer, format=suffix, dpi=dpi)
         paths.append(write_atomically(Path(folder) / f"{name}.{suffix}", buffer.getvalue()))
     return paths
