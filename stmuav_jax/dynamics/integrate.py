@@ -26,9 +26,6 @@ from .stabilisation import AbstractStabilisation, Projection
 
 Event = Callable[[Float[Array, ""], State], Array]
 
-# Steps shorter than this fraction of the times they lie at cannot be told from zero.
-_SHORTEST = 1e-14
-
 
 class Method(eqx.Module):
     """How to integrate: everything but the system, its state and the output times.
@@ -157,14 +154,13 @@ class Problem(eqx.Module):
 
     def controller(self, step: Float[Array, ""]) -> Remembering:
         """Step size control by the local error of the state, to start with `step` [s]."""
-        return Remembering(
-            diffrax.PIDController(
+        return Remembering(  # pyright: ignore[reportCallIssue]
+            controller=diffrax.PIDController(
                 rtol=self.method.rtol,
                 atol=self.method.atol,
-                dtmin=_SHORTEST,
                 norm=error_norm(self.n_state),
             ),
-            step,
+            step=step,
         )
 
 

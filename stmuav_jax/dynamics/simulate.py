@@ -137,6 +137,9 @@ def _output_times(scene: Scene, t1: float | None, save_every: float | None, ts: 
 
 
 def _check_settings(method: Method) -> None:
+    first = float(method.first_step)
+    if not (np.isfinite(first) and first > 0):
+        raise SettingError(f"first_step must be finite and positive, but it is {first} s.")
     if method.max_steps < 1:
         raise SettingError(f"max_steps must be at least 1, but it is {method.max_steps}.")
     for name in ("rtol", "atol"):
@@ -359,8 +362,7 @@ def _failure(run: Run) -> str:
     state = jax.tree.map(lambda x: jnp.asarray(x[-1]), run.states)
     reason = {
         "step size collapsed": (
-            f"the step size fell below {1e-14:.0e} s: the motion cannot be followed with these "
-            "tolerances"
+            "the step size fell to round-off: the motion cannot be followed with these tolerances"
         ),
         "max_steps reached": (
             f"{run.method.max_steps} steps did not reach the next saved time: allow more "

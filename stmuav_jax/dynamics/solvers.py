@@ -14,9 +14,12 @@ from .formulation import Residuals
 
 Vector = Float[Array, " k"]
 
+# A rejected step shorter than this, in seconds and relative to the time, has collapsed.
+_SHORTEST = 1e-14
+
 
 @cache
-def _landed(inner: type) -> type:
+def _landed(inner: Callable[..., Any]) -> type:
     """Interpolation of a step whose end was moved after the step: the inner one, shifted."""
 
     class Landed(diffrax.AbstractLocalInterpolation):
@@ -166,7 +169,9 @@ class Remembering(diffrax.AbstractAdaptiveStepSizeController):
         return self.controller.norm
 
     def wrap(self, direction: Any) -> "Remembering":
-        return Remembering(self.controller.wrap(direction), self.step)
+        return Remembering(  # pyright: ignore[reportCallIssue]
+            controller=self.controller.wrap(direction), step=self.step
+        )
 
     def init(
         self,
@@ -201,6 +206,8 @@ class Remembering(diffrax.AbstractAdaptiveStepSizeController):
         proposed = next_t1 - next_t0
         cut_short = keep & (t1 - t0 < step)
         step = jnp.where(cut_short, jnp.maximum(step, proposed), proposed)
+        collapsed = ~keep & (step < _SHORTEST * (1 + jnp.abs(t0)))
+        result = diffrax.RESULTS.where(collapsed, diffrax.RESULTS.dt_min_reached, result)
         return keep, next_t0, next_t0 + step, jump, (step, inner), result
 
 
@@ -228,6 +235,7 @@ def error_norm(n_state: int) -> Callable[[Vector], Float[Array, ""]]:
     def norm(error: Vector) -> Float[Array, ""]:
         part = error[:n_state]
         square = jnp.mean(part * part)
-        return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+        # safe to differentiate at zero; an error that is not a number stays one
+        return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), square)
 
     return norm

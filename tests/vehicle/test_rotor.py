@@ -69,7 +69,9 @@ def test_wrench_map_has_the_signs_of_the_idealised_mixing():
 
 def test_rotors_need_one_arm_per_spin():
     with pytest.raises(ModelError, match="one arm"):
-        Rotors("hull", arms=[[1.0, 0, 0]], spin=[1.0, -1.0], k_f=1, k_tau=1, speed_squared=[1.0, 1.0])
+        Rotors(
+            "hull", arms=[[1.0, 0, 0]], spin=[1.0, -1.0], k_f=1, k_tau=1, speed_squared=[1.0, 1.0]
+        )
 
 
 def two_bodies():
