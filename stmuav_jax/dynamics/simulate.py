@@ -322,9 +322,9 @@ def _certify(
     return Certificate(
         result=result,
         t_end=float(trajectory.ts[-1]),
-        position_residual=float(trajectory.worst.position[-1]),
-        velocity_residual=float(trajectory.worst.velocity[-1]),
-        norm_error=float(trajectory.worst.norm[-1]),
+        position_residual=_largest(trajectory.worst.position[-1], view.residuals[0]),
+        velocity_residual=_largest(trajectory.worst.velocity[-1], view.rates[0]),
+        norm_error=_largest(trajectory.worst.norm[-1], np.sum(trajectory.states.p[0] ** 2, -1) - 1),
         energy_error=float(np.max(np.abs(drift))),
         relative_energy_error=relative(drift, view.kinetic, view.potential, trajectory.work),
         momentum_error=momentum[0],
@@ -339,6 +339,11 @@ def _certify(
         run_seconds=seconds[1],
         analysis_seconds=seconds[2],
     )
+
+
+def _largest(on_the_way: Any, at_the_start: Any) -> float:
+    """The largest absolute value over the accepted steps and the start."""
+    return float(max(on_the_way, np.max(np.abs(at_the_start), initial=0.0)))
 
 
 def _settings(method: Method) -> dict[str, Any]:
