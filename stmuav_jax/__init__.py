@@ -19,6 +19,7 @@ from .algebra.rotation import (
 )
 from .dynamics.analysis import Evaluation, evaluate
 from .dynamics.augmented import Augmented
+from .dynamics.dense import states_at
 from .dynamics.energy import Energy, energy, momentum
 from .dynamics.formulation import Accelerations
 from .dynamics.initial import Assembly, Rank, assemble, rank
@@ -136,6 +137,7 @@ __all__ = [
     "skew",
     "spherical",
     "spin_exact",
+    "states_at",
     "to_rotation_vector",
     "tracker_bodies",
     "tracker_joints",

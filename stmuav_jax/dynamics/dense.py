@@ -1,0 +1,52 @@
+"""States between saved times, as accurate as the steps."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..algebra.shapes import Numbers
+from ..mechanics.errors import SettingError
+from ..mechanics.state import State
+from ..mechanics.system import System
+from .integrate import Method, integrate
+from .run import Run
+
+
+def states_at(run: Run, times: Numbers) -> State:
+    """States of a run at any times within it, arrays (k, n, .).
+
+    Each is integrated from the last saved state before it with the run's own method; a
+    polynomial between steps would be of lower order than the steps.
+
+    Args:
+        times: (k,) [s], in any order.
+
+    Raises:
+        SettingError: a time that is not finite or outside the run.
+    """
+    ts = np.atleast_1d(np.asarray(times, dtype=float))
+    first, last = run.ts[0], run.ts[-1]
+    inside = np.isfinite(ts) & (ts >= first) & (ts <= last)
+    if not np.all(inside):
+        raise SettingError(
+            f"The run covers {first:g} s to {last:g} s, but a state at {ts[~inside][0]:g} s is wanted."
+        )
+    before = np.searchsorted(run.ts, ts, side="right") - 1
+    starts = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[before]), run.states)
+    method = dataclasses.replace(run.method, event=None)
+    spans = jnp.asarray(np.stack([run.ts[before], ts], axis=1))
+    found = _ends(run.scene.system, method, starts, spans)
+    return jax.tree.map(np.asarray, found)
+
+
+@eqx.filter_jit
+def _ends(system: System, method: Method, starts: State, spans: Float[Array, "k 2"]) -> State:
+    def end(start: tuple[State, Array]) -> State:
+        path = integrate(system, start[0], start[1], method)
+        return jax.tree.map(lambda x: x[-1], path.states)
+
+    return jax.lax.map(end, (starts, spans))
