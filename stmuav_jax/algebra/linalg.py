@@ -11,8 +11,7 @@ class Factor(eqx.Module):
     """A symmetric matrix S factorised once, to be solved with many right-hand sides.
 
     A regular S is scaled to a unit diagonal first, which the mixed units of constraint rows
-    (m and rad) need: condition 3e6 becomes 6e3 for the seven-body UAV. A singular one is
-    not, since scaling would change which solution is the one of minimum norm.
+    (m and rad) need. A singular one is not, since scaling would change which solution is the one of minimum norm.
     """
 
     scaled: lx.AbstractLinearOperator

@@ -1,8 +1,7 @@
 """From a state to a trajectory: one pure function on top of diffrax.
 
 Output times are reached by steps, not by interpolation between them: diffrax's dense output
-is of lower order than its steps (on the report's spin test 5e-9 between steps that are good
-to 1e-12). Work and impulse are integrated beside the state for the energy and momentum
+is of lower order than its steps. Work and impulse are integrated beside the state for the energy and momentum
 balances; they do not steer the step size.
 """
 
@@ -101,7 +100,7 @@ class Trajectory(eqx.Module):
 
 
 # Traced once and called from several places; without this the same equations are traced
-# about ten times over by diffrax.
+# again at every place where diffrax calls them.
 @eqx.filter_jit
 def _derivative(formulation: AbstractFormulation, *args: Any) -> Any:
     return formulation.derivative(*args)

@@ -215,8 +215,8 @@ class Remembering(diffrax.AbstractAdaptiveStepSizeController):
 def kvaerno3() -> diffrax.Kvaerno3:
     """diffrax's implicit Kvaerno3 with a root finder that does not throttle the step.
 
-    diffrax's default takes few iterations and rejects the step when they do not converge; on
-    the seven-body UAV that is ten times as many steps as with the chord method used here.
+    diffrax's default takes few iterations and rejects the step when they do not converge,
+    which on the seven-body UAV means many more steps than the chord method used here.
     """
     return diffrax.Kvaerno3(root_finder=_chord())
 
