@@ -1,6 +1,7 @@
-"""The command line: `stmuav list`, `stmuav simulate SCENE`."""
+"""The command line: `stmuav list`, `simulate`, `sun`, `trim`, `linearize`, `tune`, `estimate`."""
 
 import dataclasses
+import math
 import os
 import sys
 import time
@@ -9,17 +10,23 @@ from typing import Annotated, Any, Literal
 
 import diffrax
 import jax
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from .commands.estimate import Estimate, run_estimate
+from .commands.flight import Linearize, Trim, run_linearize, run_trim
+from .commands.tune import Tune, run_tune
 from .dynamics.augmented import Augmented
+from .dynamics.rosenbrock import Rodas5P
 from .dynamics.run import Run
 from .dynamics.scene import Scene
 from .dynamics.simulate import simulate
 from .dynamics.solvers import kvaerno3, kvaerno5
 from .dynamics.stabilisation import Baumgarte, Projection, Unstabilised
+from .dynamics.tree import Tree
 from .mechanics.errors import ModelError, SettingError, SimulationError, StateError
 from .scenes.registry import SCENES, make_scene
 from .view.io import FileError, load_parameters, save, save_certificate
@@ -30,8 +37,11 @@ SOLVERS = {
     "tsit5": diffrax.Tsit5,
     "kvaerno3": kvaerno3,
     "kvaerno5": kvaerno5,
+    "rodas5p": Rodas5P,
+    "auto": lambda: "auto",
 }
 FORMULATIONS = {
+    "tree": Tree(),
     "augmented": Augmented(),
     "augmented-dense": Augmented(solve="dense"),
     "report": Augmented(solve="dense", rows="report"),
@@ -58,10 +68,10 @@ class Simulate:
     """Relative tolerance of a step."""
     atol: float = 1e-8
     """Absolute tolerance of a step [m, m/s, rad/s]."""
-    solver: Literal["dopri8", "tsit5", "kvaerno3", "kvaerno5"] = "dopri8"
-    """Runge-Kutta method; kvaerno3 and kvaerno5 are implicit."""
-    formulation: Literal["augmented", "augmented-dense", "report"] = "augmented"
-    """Solve by structure; or as one large system; or that in the report's own rows."""
+    solver: Literal["dopri8", "tsit5", "kvaerno3", "kvaerno5", "rodas5p", "auto"] = "dopri8"
+    """Explicit, or implicit for stiff scenes (kvaerno, rodas5p); auto looks at the start."""
+    formulation: Literal["tree", "augmented", "augmented-dense", "report"] = "tree"
+    """Relative coordinates; or all bodies' by structure, densely, in the report's rows."""
     stabilisation: Literal["projection", "baumgarte", "none"] = "projection"
     """What keeps the constraints from drifting."""
     save_every: float | None = None
@@ -76,6 +86,48 @@ class Simulate:
     """Folder for the results; default runs/SCENE."""
     figures: Literal["png", "pdf", "svg", "none"] = "png"
     """Format of the figures."""
+    loads: bool = False
+    """Also find the joints' reaction loads, peaks between saved times too; loads.csv, figure."""
+    cache: bool = True
+    """Keep compiled code in the user's cache folder for the next run."""
+
+
+@dataclasses.dataclass
+class SunDay:
+    """Point the panel at the sun for a day; write day.nc and figures."""
+
+    lat: float
+    """Latitude, north positive [degrees]."""
+    lon: float
+    """Longitude, east positive [degrees]."""
+    date: str
+    """Date at the place, as 2024-03-21."""
+    timezone: str | None = None
+    """Time zone such as Asia/Phnom_Penh or +07:00; default whole hours by the longitude."""
+    altitude: float = 0.0
+    """Above sea level [m]."""
+    roll: float = 0.0
+    """Attitude of the UAV [degrees]: turn about its x axis."""
+    pitch: float = 0.0
+    """Turn about its y axis [degrees]; positive lowers its x axis."""
+    yaw: float = 0.0
+    """Its x axis from east towards north [degrees]."""
+    attitude: Path | None = None
+    """CSV file with a history of the attitude instead: columns t [s], roll, pitch, yaw."""
+    step: float = 300.0
+    """Time between samples [s]."""
+    stroke_step: float = 0.0
+    """Smallest step of the linear actuators [m]."""
+    attitude_error: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation vector from the true attitude to the one believed, body axes [degrees]."""
+    turbidity: float | None = None
+    """Linke's turbidity of the air; default the month's mean at the place."""
+    params: Path | None = None
+    """TOML file with values that replace the table's."""
+    out: Path | None = None
+    """Folder for the results; default runs/sun_DATE."""
+    figures: Literal["png", "pdf", "svg", "none"] = "png"
+    """Format of the figures."""
     cache: bool = True
     """Keep compiled code in the user's cache folder for the next run."""
 
@@ -83,6 +135,11 @@ class Simulate:
 Command = (
     Annotated[List, tyro.conf.subcommand(name="list")]
     | Annotated[Simulate, tyro.conf.subcommand(name="simulate")]
+    | Annotated[SunDay, tyro.conf.subcommand(name="sun")]
+    | Annotated[Trim, tyro.conf.subcommand(name="trim")]
+    | Annotated[Linearize, tyro.conf.subcommand(name="linearize")]
+    | Annotated[Tune, tyro.conf.subcommand(name="tune")]
+    | Annotated[Estimate, tyro.conf.subcommand(name="estimate")]
 )
 
 
@@ -125,6 +182,8 @@ def _scene(command: Simulate) -> Scene:
 def run_scene(command: Simulate, console: Console) -> Run:
     """Build and simulate the scene with a progress bar on stderr."""
     scene = _scene(command)
+    if command.loads and not scene.system.joints:
+        raise SettingError(f"--loads is for scenes with joints; {command.scene} has none.")
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -164,6 +223,19 @@ def write_results(run: Run, command: Simulate) -> list[Path]:
     return paths
 
 
+def write_loads(run: Run, command: Simulate, folder: Path, out: Console) -> list[Path]:
+    """Write the joints' reaction loads, resolved between saved times; print their peaks."""
+    from .study.loads import resolved_loads
+    from .view.loads import loads_table, save_loads, save_loads_figure
+
+    loads = resolved_loads(run)
+    out.print(loads_table(run.scene, loads))
+    paths = [save_loads(run.scene, loads, folder / "loads.csv")]
+    if command.figures != "none":
+        paths.append(save_loads_figure(run.scene, loads, folder, command.figures))
+    return paths
+
+
 def _simulate(command: Simulate, console: Console, started: float) -> int:
     run = run_scene(command, console)
     clock = time.perf_counter()
@@ -171,6 +243,8 @@ def _simulate(command: Simulate, console: Console, started: float) -> int:
     writing = time.perf_counter() - clock
     out = Console()
     out.print(certificate_table(run))
+    if command.loads:
+        paths += write_loads(run, command, paths[0].parent, out)
     for note in run.scene.notes:
         out.print(f"Note: {note}", highlight=False)
     out.print(
@@ -185,6 +259,43 @@ def _simulate(command: Simulate, console: Console, started: float) -> int:
     return 0
 
 
+def _sun(command: SunDay) -> int:
+    # pvlib and matplotlib are slow to import: only here
+    from .study.day import Flaws, day_zone, parse_date, track_day
+    from .vehicle.airframe import PART_II
+    from .vehicle.ephemeris import Place
+    from .vehicle.sun import attitude
+    from .view.day import day_tables, load_attitude, save_day, save_day_figures
+
+    turned = (command.roll, command.pitch, command.yaw)
+    if command.attitude is not None and any(turned):
+        raise SettingError("Give --attitude or --roll, --pitch and --yaw, not both.")
+    table = PART_II if command.params is None else load_parameters(command.params, PART_II)
+    day = track_day(
+        Place.degrees(command.lat, command.lon, command.altitude),
+        parse_date(command.date),
+        day_zone(command.timezone, command.lon),
+        attitude(*(math.radians(angle) for angle in turned))
+        if command.attitude is None
+        else load_attitude(command.attitude),
+        step=command.step,
+        flaws=Flaws(command.stroke_step, math.radians(1) * np.array(command.attitude_error)),
+        parameters=table,
+        turbidity=command.turbidity,
+    )
+    folder = command.out if command.out is not None else Path("runs") / f"sun_{command.date}"
+    paths = [save_day(day, folder / "day.nc")]
+    if command.figures != "none":
+        paths += save_day_figures(day, folder, command.figures)
+    out = Console()
+    for each in day_tables(day):
+        out.print(each)
+    out.print("Written:", highlight=False)
+    for path in paths:
+        out.print(f"  {path}", highlight=False, soft_wrap=True)
+    return 0
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Entry point; returns the exit code: 0, 1 for a failed run, 2 for bad input."""
     started = time.process_time()
@@ -196,6 +307,16 @@ def main(arguments: list[str] | None = None) -> int:
             list_scenes(Console())
             return 0
         _configure(command.cache)
+        if isinstance(command, SunDay):
+            return _sun(command)
+        if isinstance(command, Trim):
+            return run_trim(command)
+        if isinstance(command, Linearize):
+            return run_linearize(command)
+        if isinstance(command, Tune):
+            return run_tune(command)
+        if isinstance(command, Estimate):
+            return run_estimate(command)
         return _simulate(command, console, started)
     except SimulationError as error:
         console.print(f"stmuav: {error}", style="red", markup=False, highlight=False)

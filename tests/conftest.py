@@ -1,6 +1,9 @@
 """Shared set-up of the tests: double precision, shapes checked as the code runs."""
 
+import atexit
 import os
+import shutil
+import tempfile
 
 # tests run side by side; small factorisations lose time to threads that wait for each other
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -11,6 +14,13 @@ import pytest
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
+
+# Compiled code is shared by all files and workers of one run, and lives no longer than that.
+if "STMUAV_TEST_CACHE" not in os.environ:
+    os.environ["STMUAV_TEST_CACHE"] = tempfile.mkdtemp(prefix="stmuav-tests-")
+    atexit.register(shutil.rmtree, os.environ["STMUAV_TEST_CACHE"], ignore_errors=True)
+jax.config.update("jax_compilation_cache_dir", os.environ["STMUAV_TEST_CACHE"])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 install_import_hook("stmuav_jax", "beartype.beartype")
 

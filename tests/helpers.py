@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import stmuav_jax as sj
+from stmuav_jax.dynamics.integrate import begin, prepare
 
 GRAVITY = 9.81
 
@@ -100,6 +101,23 @@ def relative_error(got: Any, expected: Any) -> float:
         size = max(size, float(np.max(np.abs(np.asarray(b)), initial=0.0)))
     assert np.isfinite(worst)
     return worst / size if size else worst
+
+
+def derivative_size(system: sj.System) -> tuple[int, int]:
+    """Equations of one derivative, those inside others included; size of what is integrated."""
+
+    def count(jaxpr: Any) -> int:
+        total = len(jaxpr.eqns)
+        for eqn in jaxpr.eqns:
+            for value in eqn.params.values():
+                if hasattr(value, "jaxpr") or hasattr(value, "eqns"):
+                    total += count(getattr(value, "jaxpr", value))
+        return total
+
+    problem = prepare(system, sj.Method())
+    y = begin(problem, jnp.zeros(()), system.reference).y
+    found = jax.make_jaxpr(lambda t, y: problem.field(t, y, problem.model))(0.0, y)
+    return count(found.jaxpr), y.shape[0]
 
 
 def central(f: Callable[[float], Any], step: float) -> np.ndarray:
@@ -258,3 +276,22 @@ def random_seven(system: sj.System, rng: np.random.Generator) -> sj.State:
     omega = 5 * rng.normal(size=(7, 3))
     guess = state_of(r @ R.T + rng.normal(size=3), p, v, omega)
     return sj.assemble(system, guess).state
+
+
+def forked(floating):
+    """A body that carries two, one of them on a ball; another body on its own slide."""
+    unit = [0.01, 0.02, 0.015]
+    at = {"hub": [0, 0, 0], "a": [0, 0, 0.3], "b": [0.1, 0.2, 0.3], "c": [0.1, -0.2, 0.3]}
+    at["d"] = [-0.3, 0, 0]
+    bodies = [
+        sj.Body(name, 1.0 + k, unit, position=r, free=name == "hub")
+        for k, (name, r) in enumerate(at.items())
+    ]
+    hub = "hub" if floating else sj.GROUND
+    joints = [
+        sj.revolute("ra", hub, "a", point=[0, 0, 0.1], axis=[1, 0, 0]),
+        sj.revolute("rb", "a", "b", point=[0, 0, 0.3], axis=[0, 1, 0]),
+        sj.spherical("sc", "a", "c", point=[0, -0.1, 0.3]),
+        sj.translational("td", hub, "d", point=[-0.3, 0, 0], axis=[0, 0, 1]),
+    ]
+    return sj.System(bodies[0 if floating else 1 :], joints, [sj.Gravity()])

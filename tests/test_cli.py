@@ -4,7 +4,9 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+import xarray as xr
 
 from stmuav_jax.cli import main
 from stmuav_jax.view.io import load
@@ -17,7 +19,8 @@ def private_cache(tmp_path_factory, monkeypatch):
 
 
 def run(*arguments):
-    return main([*arguments, "--no-cache"] if arguments[0] == "simulate" else list(arguments))
+    cached = arguments[0] in ("simulate", "sun", "estimate")
+    return main([*arguments, "--no-cache"] if cached else list(arguments))
 
 
 def test_list_names_every_scene_and_case(capsys):
@@ -37,6 +40,14 @@ def test_simulate_writes_results_and_prints_the_certificate(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "Energy balance" in printed
     assert "successful at t = 0.1 s" in printed
+
+
+@pytest.mark.slow
+def test_loads_are_written_if_asked_for(tmp_path, capsys):
+    arguments = ("simulate", "spin", "--t1", "0.1", "--loads", "--out", str(tmp_path))
+    assert run(*arguments) == 0
+    assert {"loads.csv", "loads.png"} <= {p.name for p in tmp_path.iterdir()}
+    assert "peak force [N]" in capsys.readouterr().out
 
 
 def test_parameters_and_solver_reach_the_run(tmp_path):
@@ -61,6 +72,7 @@ def test_parameters_and_solver_reach_the_run(tmp_path):
         (("tracker", "--rtol", "0"), "rtol must be"),
         (("tracker", "--actuators", "printed"), "tracker has no actuators"),
         (("tracker", "--params", "/none.toml"), "There is no file /none.toml"),
+        (("hexacopter", "--loads"), "hexacopter has none"),
     ],
 )
 def test_bad_input_is_one_paragraph_and_exit_code_two(arguments, words, capsys, tmp_path):
@@ -81,9 +93,153 @@ def test_a_run_that_cannot_go_on_keeps_what_was_reached(tmp_path, capsys):
     assert load(tmp_path / "run.nc").sizes["time"] >= 1
 
 
+SUN = ("sun", "--lat", "11.55", "--lon", "104.92", "--date", "2024-03-21")
+
+
+def test_sun_prints_draws_and_saves_a_day(tmp_path, capsys):
+    """With an attitude from a file that is the one of the options."""
+    code = run(*SUN, "--step", "900", "--yaw", "90", "--out", str(tmp_path / "a"))
+    assert code == 0
+    names = {"day.nc", "tracking.png", "sky.png", "light.png"}
+    assert {p.name for p in (tmp_path / "a").iterdir()} == names
+    printed = capsys.readouterr().out
+    for words in ("11.55° N, 104.92° E, 2024-03-21 (UTC+07:00)", "06:0", "tracker on the UAV",
+                  "more than level"):  # fmt: skip
+        assert words in printed
+    attitude = tmp_path / "attitude.csv"
+    attitude.write_text("t,roll,pitch,yaw\n0,0,0,90\n")
+    code = run(
+        *SUN, "--step", "900", "--attitude", str(attitude), "--figures", "none", "--timezone",
+        "Asia/Phnom_Penh", "--out", str(tmp_path / "b"),
+    )  # fmt: skip
+    assert code == 0
+    assert {p.name for p in (tmp_path / "b").iterdir()} == {"day.nc"}
+    days = [xr.load_dataset(tmp_path / k / "day.nc", engine="h5netcdf") for k in "ab"]
+    np.testing.assert_array_equal(days[0]["panel_angles"], days[1]["panel_angles"])
+    assert float(days[0]["energy"].sel(panel="tracker")) > 1.3 * float(
+        days[0]["energy"].sel(panel="flat")
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--lat", "91"), "latitude must lie within"),
+        (("--lat", "nan"), "latitude must be finite"),
+        (("--date", "yesterday"), "The date must be like 2024-03-21, not 'yesterday'"),
+        (("--date", "2024-12-21", "--lat", "80"), "The sun does not rise at 80 degrees north"),
+        (("--timezone", "Asia/Pnom_Penh"), "Did you mean 'Asia/Phnom_Penh'"),
+        (("--step", "0"), "step must lie within"),
+        (("--attitude", "/none.csv"), "There is no file /none.csv"),
+        (("--attitude", "/none.csv", "--yaw", "3"), "not both"),
+        (("--turbidity", "0"), "turbidity must be at least 1"),
+    ],
+)
+def test_sun_bad_input_is_one_paragraph_and_exit_code_two(arguments, words, capsys, tmp_path):
+    given = dict(zip(SUN[1::2], SUN[2::2], strict=True))
+    given |= dict(zip(arguments[::2], arguments[1::2], strict=True)) | {"--out": str(tmp_path)}
+    assert run("sun", *(word for pair in given.items() for word in pair)) == 2
+    error = capsys.readouterr().err
+    assert words in error.replace("\n", " ")
+    assert "Traceback" not in error
+    assert not list(tmp_path.iterdir())
+
+
 def test_installed_command_and_import_leave_jax_alone():
     """Importing the package sets no global configuration; the entry point exists."""
     code = "import stmuav_jax, jax; assert not jax.config.jax_enable_x64"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    # what few commands need and is slow to import waits for them
+    code = "import sys, stmuav_jax.cli; assert not {'pvlib', 'matplotlib'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
     code = "from importlib.metadata import entry_points as e; e(name='stmuav')['stmuav'].load()"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_trim_command(tmp_path, capsys):
+    """At the sun, with a sensitivity; then limits that cannot carry the weight."""
+    given = ["trim", "--sun", "150", "70", "--out", str(tmp_path), "--no-cache"]
+    assert main([*given, "--by", "mass.panel_7"]) == 0
+    found = json.loads((tmp_path / "trim.json").read_text())
+    assert found["residual"] < 1e-10
+    assert found["units"]["speed_1"] == "rad/s"
+    slopes = dict(zip(found["values"], found["sensitivities"]["mass.panel_7"], strict=True))
+    # more panel, more thrust
+    assert slopes["speed_1"] > 0
+    assert "Trim" in capsys.readouterr().out
+    assert main([*given, "--highest", "1300"]) == 2
+    assert "N are required" in " ".join(capsys.readouterr().err.split())
+    assert main([*given, "--phi", "3"]) == 2
+    assert "not both" in capsys.readouterr().err
+    assert main([*given, "--turn", "10"]) == 2
+    assert "no steady" in " ".join(capsys.readouterr().err.split())
+
+
+def test_linearize_command(tmp_path, capsys):
+    assert main(["linearize", "--out", str(tmp_path), "--no-cache", "--outputs", "phi"]) == 0
+    with np.load(tmp_path / "linear.npz") as found:
+        assert found["A"].shape == (16, 16)
+        assert list(found["outputs"]) == ["phi [rad]"]
+        assert found["C"].shape == (1, 16)
+    assert "Modes" in capsys.readouterr().out
+    assert main(["linearize", "--turn", "3"]) == 2
+    assert "straight flight" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_tune_commands(tmp_path, capsys):
+    """Hold, cut short and gone on with; another problem's checkpoint is refused."""
+    given = ["tune", "hold", "--duration", "0.3", "--segments", "1", "--out", str(tmp_path)]
+    assert main([*given, "--no-cache", "--steps", "2"]) == 0
+    assert "2 steps allowed" in capsys.readouterr().out
+    assert main([*given, "--no-cache", "--resume"]) == 0
+    assert "Converged" in capsys.readouterr().out
+    assert (tmp_path / "loss.png").stat().st_size > 5000
+    given[3] = "0.25"
+    assert main([*given, "--no-cache", "--resume"]) == 2
+    assert "search of another problem" in " ".join(capsys.readouterr().err.split())
+    assert main(["tune", "hold", "--force", "3"]) == 2
+    assert "limits of a slew" in capsys.readouterr().err
+
+
+def test_estimate_prints_draws_and_saves_a_case(tmp_path, capsys):
+    code = run("estimate", "--case", "4", "--seeds", "3", "--t1", "0.05", "--out", str(tmp_path))
+    assert code == 0
+    names = {"estimate.nc", "offset.png", "rates.png", "errors.png", "consistency.png"}
+    assert {p.name for p in tmp_path.iterdir()} == names
+    printed = capsys.readouterr().out
+    assert "consistent" in printed
+    data = xr.load_dataset(tmp_path / "estimate.nc", engine="h5netcdf")
+    assert data["estimate"].dims == ("tuning", "time", "component", "seed")
+    assert all(data[name].attrs["units"] for name in data.data_vars)
+    error = data["estimate"] - data["truth"]
+    last = error.sel(tuning="consistent", component="offset_x").isel(time=-1)
+    assert float(abs(last).max()) < 0.01
+    rows = json.loads(data.attrs["summaries"])
+    assert rows["report"]["case"] == 4
+
+
+@pytest.mark.slow
+def test_estimate_hovers(tmp_path, capsys):
+    code = run("estimate", "--hover", "--seeds", "2", "--t1", "0.05", "--out", str(tmp_path))
+    assert code == 0
+    assert {p.name for p in tmp_path.iterdir()} == {"hover.nc", "hover.png"}
+    assert "largest tilt" in capsys.readouterr().out.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--case", "9"), "cases 1 to 8, not 9"),
+        (("--case", "1", "--seeds", "0"), "At least one seed"),
+        (("--case", "1", "--t1", "0"), "between one step of 0.001 s"),
+        (("--params", "/none.toml"), "There is no file /none.toml"),
+        (("--hover", "--model", "printed"), "a model of its own"),
+    ],
+)
+def test_estimate_bad_input_is_one_paragraph_and_exit_code_two(arguments, words, capsys, tmp_path):
+    assert run("estimate", *arguments, "--out", str(tmp_path)) == 2
+    error = capsys.readouterr().err
+    assert words in error.replace("\n", " ")
+    assert "Traceback" not in error
+    assert not list(tmp_path.iterdir())

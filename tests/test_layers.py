@@ -19,7 +19,8 @@ FLOORS = {
     "estimation": 4,
     "study": 4,
     "view": 5,
-    "cli": 6,
+    "commands": 6,
+    "cli": 7,
 }
 LINES, STEPS = 400, 60
 

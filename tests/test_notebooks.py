@@ -6,10 +6,18 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+# What the notebook shows is tested otherwise by default; its own run takes minutes.
+LONG = (
+    "02_what_fails_at_half_a_second",
+    "07_inputs_by_gradients",
+)
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, id=p.stem, marks=[pytest.mark.slow] * (p.stem in LONG)) for p in NOTEBOOKS],
+)
 def test_notebook(path):
     notebook = nbformat.read(path, as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]

@@ -6,56 +6,83 @@ With e = (e1, e2, e3) and ~ the cross-product matrix,
 
 A maps body components to world components, omega' (body frame) = 2 L pdot and
 pdot = L^T omega' / 2. All functions here are smooth for unit p, the identity and half
-turns included, so that gradients stay finite there.
+turns included, so that gradients stay finite there. Those up to `from_rotation_vector` also
+take stacks, with the axes of the stack last.
 
 Source: P. E. Nikravesh, Computer-Aided Analysis of Mechanical Systems (1988), ch. 6;
 AFRL-AFOSR-JP-TR-2019-0058, Part II, Eq. 4.11 and 6.6-6.14 (G and L, undefined there,
 are fixed by A = G L^T). Conventions: docs/conventions.md.
 """
 
-import jax.numpy as jnp
+from typing import Any
 
-from .shapes import Mat3, Mat3Like, Mat4, Mat34, Quat, QuatLike, Scalar, Vec3, Vec3Like
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+from .shapes import Mat3Like, Quat, QuatLike, Quats, Scalar, Vec3, Vec3s
+from .stacked import apply, dot, eye
 
 # Below this squared angle (or squared sine) the series replaces the quotient; the first
 # neglected term is then under 1e-16.
 _SMALL_SQUARE = 1e-5
 
 
-def skew(a: Vec3Like) -> Mat3:
+def skew(a: Vec3s) -> Float[Array, "3 3 ..."]:
     """Cross-product matrix: `skew(a) @ b == cross(a, b)`. Shape (3, 3)."""
     x, y, z = a[0], a[1], a[2]
     o = jnp.zeros_like(x)
     return jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
 
 
-def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
+def cross(a: Vec3s, b: Vec3s) -> Float[Array, "3 ..."]:
     """a x b, shape (3,)."""
+    return _cross(a, b)
+
+
+@jax.custom_jvp
+def _cross(a: Array, b: Array) -> Array:
     x, y, z = a[0], a[1], a[2]
     u, v, w = b[0], b[1], b[2]
     return jnp.stack([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
-def matrix_g(p: QuatLike) -> Mat34:
+def _cross_jvp(primals: Any, tangents: Any) -> Any:
+    # by matrices: the transpose of taking components apart is one padded array for each
+    (a, b), (a_dot, b_dot) = primals, tangents
+    out = _cross(a, b)
+    change = jnp.zeros_like(out)
+    if not isinstance(b_dot, SymbolicZero):
+        change = change + apply(skew(a), b_dot)
+    if not isinstance(a_dot, SymbolicZero):
+        change = change - apply(skew(b), a_dot)
+    return out, change
+
+
+_cross.defjvp(_cross_jvp, symbolic_zeros=True)
+
+
+def matrix_g(p: Quats) -> Float[Array, "3 4 ..."]:
     """G = [-e, e~ + e0 I], shape (3, 4)."""
     e = p[1:]
-    return jnp.concatenate([-e[:, None], skew(e) + p[0] * jnp.eye(3, dtype=e.dtype)], axis=1)
+    return jnp.concatenate([-e[:, None], skew(e) + p[0] * eye(e)], axis=1)
 
 
-def matrix_l(p: QuatLike) -> Mat34:
+def matrix_l(p: Quats) -> Float[Array, "3 4 ..."]:
     """L = [-e, -e~ + e0 I], shape (3, 4)."""
     e = p[1:]
-    return jnp.concatenate([-e[:, None], -skew(e) + p[0] * jnp.eye(3, dtype=e.dtype)], axis=1)
+    return jnp.concatenate([-e[:, None], -skew(e) + p[0] * eye(e)], axis=1)
 
 
-def bar(a: Vec3Like) -> Mat4:
+def bar(a: Vec3s) -> Float[Array, "4 4 ..."]:
     """The 4x4 matrix of a body-fixed vector with L(p)^T a = bar(a) p, shape (4, 4)."""
-    zero = jnp.zeros((1, 1), dtype=a.dtype)
-    top = jnp.concatenate([zero, -a[None, :]], axis=1)
+    zero = jnp.zeros_like(a[:1])[None]
+    top = jnp.concatenate([zero, -a[None]], axis=1)
     return jnp.concatenate([top, jnp.concatenate([a[:, None], -skew(a)], axis=1)], axis=0)
 
 
-def rotation_matrix(p: QuatLike) -> Mat3:
+def rotation_matrix(p: Quats) -> Float[Array, "3 3 ..."]:
     """Body-to-world rotation A = G L^T, shape (3, 3); |p|^2 times a rotation if |p| != 1.
 
     Source: report Part II, Eq. 6.10, corrected (its (1,1) entry is misprinted).
@@ -68,7 +95,7 @@ def rotation_matrix(p: QuatLike) -> Mat3:
     return jnp.stack([r0, r1, r2])
 
 
-def euler_parameter_rate(p: QuatLike, omega: Vec3Like) -> Quat:
+def euler_parameter_rate(p: Quats, omega: Vec3s) -> Float[Array, "4 ..."]:
     """pdot = L^T omega / 2 for the body-frame angular velocity omega [rad/s], shape (4,)."""
     return 0.5 * product(p, jnp.concatenate([jnp.zeros_like(omega[:1]), omega]))
 
@@ -78,7 +105,7 @@ def angular_velocity(p: QuatLike, p_rate: QuatLike) -> Vec3:
     return 2.0 * matrix_l(p) @ p_rate
 
 
-def product(p: QuatLike, q: QuatLike) -> Quat:
+def product(p: Quats, q: Quats) -> Float[Array, "4 ..."]:
     """Composition: `rotation_matrix(product(p, q)) == A(p) @ A(q)`. Shape (4,)."""
     a, b, c, d = p[0], p[1], p[2], p[3]
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -92,23 +119,23 @@ def product(p: QuatLike, q: QuatLike) -> Quat:
     )
 
 
-def conjugate(p: QuatLike) -> Quat:
+def conjugate(p: Quats) -> Float[Array, "4 ..."]:
     """The inverse rotation (e0, -e), shape (4,)."""
     return jnp.concatenate([p[:1], -p[1:]])
 
 
-def normalise(p: QuatLike) -> Quat:
+def normalise(p: Quats) -> Float[Array, "4 ..."]:
     """p / |p|, shape (4,); called only where a user asks for it or a projection does."""
     q = jnp.asarray(p)
-    return q / jnp.sqrt(q @ q)
+    return q / jnp.sqrt(dot(q, q))
 
 
-def from_rotation_vector(v: Vec3Like) -> Quat:
+def from_rotation_vector(v: Vec3s) -> Float[Array, "4 ..."]:
     """Euler parameters of the rotation by |v| [rad] about v / |v|, shape (4,).
 
     Smooth everywhere; `from_rotation_vector(zeros)` is the identity.
     """
-    square = v @ v
+    square = dot(jnp.asarray(v), jnp.asarray(v))
     small = square < _SMALL_SQUARE
     safe = jnp.where(small, 1.0, square)
     angle = jnp.sqrt(safe)

@@ -16,6 +16,9 @@ Vector = Float[Array, " _"]
 Matrix = Float[Array, "_ _"]
 
 # The same as arguments, where NumPy arrays do as well.
+# (stacks of them have further axes at the end)
+Vec3s = Float[Array | np.ndarray, "3 *#s"]
+Quats = Float[Array | np.ndarray, "4 *#s"]
 Vec3Like = Float[Array | np.ndarray, "3"]
 QuatLike = Float[Array | np.ndarray, "4"]
 Mat3Like = Float[Array | np.ndarray, "3 3"]

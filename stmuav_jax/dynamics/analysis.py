@@ -14,9 +14,9 @@ from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .augmented import Augmented, Model
 from .energy import energy, momentum
-from .formulation import Accelerations
-from .integrate import Method
-from .reactions import Frame, Reactions, joint_reactions
+from .formulation import AbstractFormulation, Accelerations, Reactions
+from .integrate import at_internal
+from .reactions import Frame, in_joint_axes
 from .stabilisation import Unstabilised
 
 
@@ -47,13 +47,20 @@ class Snapshot(eqx.Module):
     finite_loads: Bool[Array, " forces"]
 
 
-def snapshot(method: Method, model: Model, t: Float[Array, ""], state: State) -> Snapshot:
-    """Look at one state through the method's formulation, without stabilisation."""
-    system = model.system
-    result = method.formulation.accelerations(model, t, state, Unstabilised())
+def snapshot(
+    formulation: AbstractFormulation, model: Any, rows: Model, t: Float[Array, ""], state: State
+) -> Snapshot:
+    """Look at one state through a formulation, without stabilisation.
+
+    Args:
+        model: the system prepared for the formulation. rows: for maximal coordinates, whose
+            rows are those of all joints.
+    """
+    system = rows.system
+    result = formulation.accelerations(model, t, state, Unstabilised())
     kin = system.kinematics(state)
-    eq = model.constraints.equations(t, kin)
-    scale = model.constraints.scales()
+    eq = rows.constraints.equations(t, kin)
+    scale = rows.constraints.scales()
     u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
     u_rate = jnp.concatenate([result.v_rate, result.omega_rate], axis=1).reshape(-1)
     loads = [force.load(t, kin) for force in system.forces]
@@ -62,7 +69,7 @@ def snapshot(method: Method, model: Model, t: Float[Array, ""], state: State) ->
     now = energy(system, state, t)
     return Snapshot(
         accelerations=result,
-        reactions=joint_reactions(system, model.constraints, t, state, result.multipliers),
+        reactions=formulation.reactions(model, t, state, result),
         kinetic=now.kinetic,
         potential=now.potential,
         momentum=momentum(system, state),
@@ -75,22 +82,42 @@ def snapshot(method: Method, model: Model, t: Float[Array, ""], state: State) ->
 
 
 @eqx.filter_jit
-def _snapshots(method: Method, model: Model, ts: Any, states: State) -> Snapshot:
-    return jax.lax.map(lambda at: snapshot(method, model, *at), (ts, states))
+def _snapshots(
+    formulation: AbstractFormulation, model: Any, rows: Model, ts: Any, states: State, own: Any
+) -> Snapshot:
+    def one(at: tuple[Array, State, Array]) -> Snapshot:
+        t, state, z = at
+        if not z.shape[0]:
+            return snapshot(formulation, model, rows, t, state)
+        return snapshot(formulation, at_internal(model, z), at_internal(rows, z), t, state)
+
+    return jax.lax.map(one, (ts, states, own))
 
 
 # One block size for the first look and for all saved states: one compilation serves both.
 _BLOCK = 32
 
 
-def snapshots(method: Method, model: Model, ts: np.ndarray, states: State) -> Snapshot:
-    """`snapshot` of k states, as NumPy arrays stacked along the first axis."""
+def snapshots(
+    formulation: AbstractFormulation,
+    model: Any,
+    rows: Model,
+    ts: np.ndarray,
+    states: State,
+    internal: np.ndarray,
+) -> Snapshot:
+    """`snapshot` of k states, as NumPy arrays stacked along the first axis.
+
+    Args:
+        internal: the forces' own states (k, m).
+    """
     k = len(ts)
     blocks = []
     for start in range(0, k, _BLOCK):
         pick = np.minimum(np.arange(start, start + _BLOCK), k - 1)
         take = lambda x, pick=pick: jnp.asarray(np.asarray(x)[pick])
-        block = _snapshots(method, model, take(ts), jax.tree.map(take, states))
+        at = jax.tree.map(take, (ts, states, internal))
+        block = _snapshots(formulation, model, rows, *at)
         keep = min(_BLOCK, k - start)
         blocks.append(jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], block))
     return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
@@ -108,7 +135,7 @@ def evaluate(
     state: State,
     t: Numbers = 0.0,
     *,
-    formulation: Augmented | None = None,
+    formulation: AbstractFormulation | None = None,
     load: Load | None = None,
     frame: Frame = "world",
 ) -> Evaluation:
@@ -119,6 +146,8 @@ def evaluate(
     Args:
         state: consistent with the joints, unbatched.
         t: [s].
+        formulation: default `Augmented()`, which has a multiplier for every constraint row;
+            `Tree()` has them for the cut joints' rows only.
         load: added to the system's own forces; see `stmuav_jax.Load`.
         frame: axes of the reactions: "world", or "joint" for the joint's frame in body i.
 
@@ -132,7 +161,9 @@ def evaluate(
     model = formulation.prepare(system)
     time = jnp.asarray(t, dtype=state.r.dtype)
     result = formulation.accelerations(model, time, state, Unstabilised())
-    reactions = joint_reactions(system, model.constraints, time, state, result.multipliers, frame)
+    reactions = formulation.reactions(model, time, state, result)
+    if frame == "joint":
+        reactions = in_joint_axes(system, state, reactions)
     return Evaluation(result, reactions)
 
 

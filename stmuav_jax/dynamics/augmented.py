@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.linalg import Factor, factorise, solve_general
+from ..algebra.linalg import Factor, MinimumNorm, factorise, solve_general
 from ..algebra.rotation import (
     euler_parameter_rate,
     from_rotation_vector,
@@ -33,7 +33,8 @@ from ..mechanics.load import Load, no_load
 from ..mechanics.state import Kinematics, State
 from ..mechanics.system import System
 from .differential import Constraints, Equations, RowChoice, constraints
-from .formulation import AbstractFormulation, Accelerations, Flows, Residuals
+from .formulation import AbstractFormulation, Accelerations, Flows, Reactions, Residuals
+from .reactions import joint_reactions
 from .stabilisation import AbstractStabilisation, Baumgarte
 
 
@@ -91,7 +92,12 @@ class Augmented(AbstractFormulation):
     ) -> Accelerations:
         kin = model.system.kinematics(state)
         load = model.load(t, kin)
-        return self._accelerate(model, t, kin, load, stabilisation)[0]
+        return self._accelerate(model, t, state.p, kin, load, stabilisation)[0]
+
+    def reactions(
+        self, model: Model, t: Float[Array, ""], state: State, result: Accelerations
+    ) -> Reactions:
+        return joint_reactions(model.system, model.constraints, t, state, result.multipliers)
 
     def derivative(
         self,
@@ -103,7 +109,7 @@ class Augmented(AbstractFormulation):
         state = self.to_state(model, x)
         kin = model.system.kinematics(state)
         load = model.load(t, kin)
-        result, target = self._accelerate(model, t, kin, load, stabilisation)
+        result, target = self._accelerate(model, t, state.p, kin, load, stabilisation)
         p_rate = jax.vmap(euler_parameter_rate)(state.p, state.omega)
         if isinstance(stabilisation, Baumgarte):
             excess = 1 - jnp.sum(state.p**2, axis=1, keepdims=True)
@@ -121,6 +127,7 @@ class Augmented(AbstractFormulation):
         self,
         model: Model,
         t: Float[Array, ""],
+        p: Float[Array, "n 4"],
         kin: Kinematics,
         load: Load,
         stabilisation: AbstractStabilisation,
@@ -129,13 +136,13 @@ class Augmented(AbstractFormulation):
         spin = jnp.einsum("nab,nb->na", inertia, omega)
         moment = load.moment[:-1] - jnp.cross(omega, spin)
         if self.solve == "dense":
-            return self._dense(model, t, kin, load.force[:-1], moment, stabilisation)
+            return self._dense(model, t, p, kin, load.force[:-1], moment, stabilisation)
         free_v = load.force[:-1] / model.system.bodies.mass[:, None]
         free_omega = jnp.einsum("nab,nb->na", model.inverse_inertia, moment)
         if not model.constraints.n_rows:
             none = jnp.zeros((0,), kin.r.dtype)
             return Accelerations(free_v, free_omega, none), none
-        eq = model.constraints.equations(t, kin, "omega")
+        eq = model.constraints.equations(t, kin)
         velocity = jnp.concatenate([kin.v[:-1], omega], axis=1).reshape(-1)
         free = jnp.concatenate([free_v, free_omega], axis=1)
         weighed = model.weigh(eq.J).reshape(eq.matrix.shape)
@@ -145,13 +152,14 @@ class Augmented(AbstractFormulation):
         total = free + (weighed.T @ multipliers).reshape(-1, 6)
         return Accelerations(total[:, :3], total[:, 3:], multipliers), eq.target
 
-    def _factor(self, eq: Equations, weighed: Float[Array, "m k"]) -> Factor:
+    def _factor(self, eq: Equations, weighed: Float[Array, "m k"]) -> Factor | MinimumNorm:
         return factorise(weighed @ eq.matrix.T, redundant=self.redundant, rcond=self.rcond)
 
     def _dense(
         self,
         model: Model,
         t: Float[Array, ""],
+        p: Float[Array, "n 4"],
         kin: Kinematics,
         force: Float[Array, "n 3"],
         moment: Float[Array, "n 3"],
@@ -159,8 +167,8 @@ class Augmented(AbstractFormulation):
     ) -> tuple[Accelerations, Float[Array, " m"]]:
         """The report's system, assembled and solved whole."""
         n, m = model.system.n_bodies, model.constraints.n_rows
-        eq = model.constraints.equations(t, kin, "p")
-        p, omega = kin.p[:-1], kin.omega[:-1]
+        eq = model.constraints.equations(t, kin, p)
+        omega = kin.omega[:-1]
         p_rate = jax.vmap(euler_parameter_rate)(p, omega)
         L = jax.vmap(matrix_l)(p)
         K = jnp.zeros((7 * n + m, 7 * n + m), kin.r.dtype)
@@ -188,12 +196,13 @@ class Augmented(AbstractFormulation):
 
     def project(
         self, model: Model, t: Float[Array, ""], x: Float[Array, " k"], iterations: int
-    ) -> Float[Array, " k"]:
+    ) -> tuple[Float[Array, " k"], Residuals]:
         state = self.to_state(model, x)
         p = jax.vmap(normalise)(state.p)
         state = State(state.r, p, state.v, state.omega)
         if not model.constraints.n_rows:
-            return self.to_vector(model, state)
+            x = self.to_vector(model, state)
+            return x, self.residuals(model, t, x)
         first = model.constraints.equations(t, model.system.kinematics(state))
         weighed = model.weigh(first.J).reshape(first.matrix.shape)
         factor = self._factor(first, weighed)
@@ -210,22 +219,27 @@ class Augmented(AbstractFormulation):
         u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
         for _ in range(2):
             u = u - weighed.T @ factor.solve(eq.matrix @ u - eq.target)
+        left = _left(model, eq, p, u)
         u = u.reshape(-1, 6)
-        return self.to_vector(model, State(r, p, u[:, :3], u[:, 3:]))
+        return self.to_vector(model, State(r, p, u[:, :3], u[:, 3:])), left
 
     def residuals(self, model: Model, t: Float[Array, ""], x: Float[Array, " k"]) -> Residuals:
         state = self.to_state(model, x)
-        norm = jnp.max(jnp.abs(jnp.sum(state.p**2, axis=1) - 1))
-        if not model.constraints.n_rows:
-            return Residuals(jnp.zeros_like(norm), jnp.zeros_like(norm), norm)
-        eq = model.constraints.equations(t, model.system.kinematics(state))
         u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
-        scale = model.constraints.scales()
-        return Residuals(
-            position=jnp.max(jnp.abs(scale * eq.value)),
-            velocity=jnp.max(jnp.abs(scale * (eq.matrix @ u - eq.target))),
-            norm=norm,
-        )
+        eq = model.constraints.equations(t, model.system.kinematics(state))
+        return _left(model, eq, state.p, u)
+
+
+def _left(model: Model, eq: Equations, p: Float[Array, "n 4"], u: Float[Array, " k"]) -> Residuals:
+    norm = jnp.max(jnp.abs(jnp.sum(p**2, axis=1) - 1))
+    if not model.constraints.n_rows:
+        return Residuals(jnp.zeros_like(norm), jnp.zeros_like(norm), norm)
+    scale = model.constraints.scales()
+    return Residuals(
+        position=jnp.max(jnp.abs(scale * eq.value)),
+        velocity=jnp.max(jnp.abs(scale * (eq.matrix @ u - eq.target))),
+        norm=norm,
+    )
 
 
 def displace(

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.shapes import Numbers
 from ..mechanics.errors import SettingError
+from ..mechanics.internal import with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .integrate import Method, integrate
@@ -28,6 +29,11 @@ def states_at(run: Run, times: Numbers) -> State:
     Raises:
         SettingError: a time that is not finite or outside the run.
     """
+    return between(run, times)[0]
+
+
+def between(run: Run, times: Numbers) -> tuple[State, np.ndarray]:
+    """The same, and the forces' own states (k, m)."""
     ts = np.atleast_1d(np.asarray(times, dtype=float))
     first, last = run.ts[0], run.ts[-1]
     inside = np.isfinite(ts) & (ts >= first) & (ts <= last)
@@ -36,7 +42,8 @@ def states_at(run: Run, times: Numbers) -> State:
             f"The run covers {first:g} s to {last:g} s, but a state at {ts[~inside][0]:g} s is wanted."
         )
     before = np.searchsorted(run.ts, ts, side="right") - 1
-    starts = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[before]), run.states)
+    saved = (run.states, run.trajectory.internal)
+    starts = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[before]), saved)
     method = dataclasses.replace(run.method, event=None)
     spans = jnp.asarray(np.stack([run.ts[before], ts], axis=1))
     found = _ends(run.scene.system, method, starts, spans)
@@ -44,9 +51,15 @@ def states_at(run: Run, times: Numbers) -> State:
 
 
 @eqx.filter_jit
-def _ends(system: System, method: Method, starts: State, spans: Float[Array, "k 2"]) -> State:
-    def end(start: tuple[State, Array]) -> State:
-        path = integrate(system, start[0], start[1], method)
-        return jax.tree.map(lambda x: x[-1], path.states)
+def _ends(
+    system: System, method: Method, starts: tuple[State, Array], spans: Float[Array, "k 2"]
+) -> tuple[State, Float[Array, "k m"]]:
+    def end(start: tuple[tuple[State, Array], Array]) -> tuple[State, Array]:
+        (state, z), span = start
+        path = integrate(with_internal(system, z), state, span, method)
+        # a saved state as it is, not by way of the formulation's coordinates
+        saved = span[0] == span[1]
+        reached = (path.states, path.internal)
+        return jax.tree.map(lambda x, y: jnp.where(saved, y, x[-1]), reached, (state, z))
 
     return jax.lax.map(end, (starts, spans))

@@ -4,16 +4,17 @@ Rows of a kind are evaluated together (`jax.vmap`), so that what is compiled gro
 number of kinds of primitive, not with the number of joints.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..mechanics.constraint import PRIMITIVES, ROWS, Data, Form, Row, Side, side
+from ..mechanics.errors import concrete
 from ..mechanics.joint import Motion
 from ..mechanics.state import Kinematics
 from ..mechanics.system import System
@@ -31,46 +32,58 @@ class Group(eqx.Module):
     data: Data
     motions: tuple[Motion, ...]
 
-    def rows(self, sides: Side, t: Float[Array, ""], form: Form) -> Row:
-        """Rows of the group: value, target, gamma (k, c); J_i, J_j (k, c, 6 or 7)."""
-        # one gather for all that is known of a body
-        shape = jax.tree.map(lambda x: x[0], sides)
-        unpack = ravel_pytree(shape)[1]
-        table = jax.vmap(lambda body: ravel_pytree(body)[0])(sides)
+    def rows(self, sides: Side, t: Float[Array, "*s"], form: Form) -> Row:
+        """Rows of the group: value, target, gamma (c, k, *s); J_i, J_j (c, 6 or 7, k, *s).
 
-        def one(i: Array, j: Array, data: Data) -> Row:
-            return PRIMITIVES[self.kind](unpack(i), unpack(j), data, form)
-
-        rows = jax.vmap(one)(_pick(table, self.i), _pick(table, self.j), self.data)
-        if not self.motions:
-            return rows
-        return _driven(rows, self.motions, t, wrap=self.kind == "angle")
+        Args:
+            sides: of all bodies and ground, their axis behind the components.
+            t: time [s]; the axes of a batch of states, if any, come last everywhere.
+        """
+        i, j = at_bodies(sides, self.i), at_bodies(sides, self.j)
+        rows = PRIMITIVES[self.kind](i, j, self.data, form)
+        return _driven(rows, self.motions, t, wrap=self.kind == "angle") if self.motions else rows
 
 
-def _pick(table: Float[Array, "N w"], index: tuple[int, ...]) -> Float[Array, "k w"]:
-    """The rows `index` of a table; they are known to lie inside it."""
-    rows = table.at[np.array(index)]
-    return rows.get(mode="promise_in_bounds", wrap_negative_indices=False)
+def at_bodies(sides: Side, index: Sequence[int]) -> Side:
+    """The sides of some bodies."""
+    vectors, matrices = ("r", "v", "omega_w", "velocity"), ("R_wb", "turn", "rest")
+    places = np.array(index)
+    picked = {
+        name: getattr(sides, name)
+        .at[(slice(None),) * axis + (places,)]
+        .get(mode="promise_in_bounds", wrap_negative_indices=False)
+        for names, axis in ((vectors, 1), (matrices, 2))
+        for name in names
+    }
+    return Side(**picked)
 
 
-def kinematic_sides(kin: Kinematics, form: Form) -> Side:
-    """The sides of all bodies and ground, stacked."""
-    return jax.vmap(lambda r, v, p, omega: side(r, v, p, omega, form))(
-        kin.r, kin.v, kin.p, kin.omega
-    )
+def kinematic_sides(kin: Kinematics) -> Side:
+    """The sides of all bodies and ground in form "omega", their axis last."""
+    R = jnp.moveaxis(kin.R_wb, 0, -1)
+    velocity = jnp.concatenate([kin.v, kin.omega], axis=1).T
+    return Side(kin.r.T, kin.v.T, R, kin.omega_w.T, R, R, velocity)
 
 
-def _driven(rows: Row, motions: tuple[Motion, ...], t: Float[Array, ""], *, wrap: bool) -> Row:
+def sides_in_p(kin: Kinematics, p: Float[Array, "n 4"]) -> Side:
+    """The same in form "p", which is about the Euler parameters themselves."""
+    unit = jnp.array([[1.0, 0.0, 0.0, 0.0]], p.dtype)
+    one = lambda r, v, p, omega: side(r, v, p, omega, "p")
+    return jax.vmap(one, out_axes=-1)(kin.r, kin.v, jnp.concatenate([p, unit]), kin.omega)
+
+
+def _driven(rows: Row, motions: tuple[Motion, ...], t: Float[Array, "*s"], *, wrap: bool) -> Row:
     """Subtract each row's prescribed motion, with its first and second derivatives."""
 
-    def derivatives(motion: Motion) -> tuple[Array, Array, Array]:
+    def derivatives(motion: Motion, at: Array) -> tuple[Array, Array, Array]:
         f = lambda time: jnp.asarray(motion(time), dtype=time.dtype)
         first = lambda time: jax.jvp(f, (time,), (jnp.ones_like(time),))[1]
-        return f(t), *jax.jvp(first, (t,), (jnp.ones_like(t),))
+        return f(at), *jax.jvp(first, (at,), (jnp.ones_like(at),))
 
-    value, rate, second = (
-        jnp.stack(x)[:, None] for x in zip(*map(derivatives, motions), strict=True)
-    )
+    def each(motion: Motion) -> tuple[Array, ...]:
+        return jax.vmap(lambda at: derivatives(motion, at))(t) if t.ndim else derivatives(motion, t)
+
+    value, rate, second = (jnp.stack(x)[None] for x in zip(*map(each, motions), strict=True))
     off = rows.value - value
     if wrap:
         off = jnp.arctan2(jnp.sin(off), jnp.cos(off))
@@ -116,43 +129,49 @@ class Constraints(eqx.Module):
         """Number of constraint rows m."""
         return len(self.owner)
 
-    def scales(self) -> Float[Array, " m"]:
+    def scales(self) -> Float[Array, "m *s"]:
         """Factors that turn row residuals into metres: 1 / (2 l) for distances, else 1."""
         if not self.groups:
             return jnp.zeros((0,))
-        ones = [jnp.ones(len(g.i) * ROWS[g.kind]) for g in self.groups]
+        lengths = [(g.kind, jnp.repeat(g.data.length, ROWS[g.kind], axis=0)) for g in self.groups]
         return jnp.concatenate(
-            [
-                0.5 / g.data.length if g.kind == "distance" else one
-                for g, one in zip(self.groups, ones, strict=True)
-            ]
+            [0.5 / x if kind == "distance" else jnp.ones_like(x) for kind, x in lengths]
         )
 
-    def equations(self, t: Float[Array, ""], kin: Kinematics, form: Form = "omega") -> Equations:
-        """Phi, targets, Jacobian and gamma at time t [s]."""
+    def equations(
+        self, t: Float[Array, ""], kin: Kinematics, p: Float[Array, "n 4"] | None = None
+    ) -> Equations:
+        """Phi, targets, Jacobian and gamma at time t [s].
+
+        In form "omega"; with the Euler parameters p of the bodies given, in form "p".
+        """
         n = self.n_bodies
-        sides = kinematic_sides(kin, form)
-        width = 6 if form == "omega" else 7
+        form: Form = "omega" if p is None else "p"
+        sides = kinematic_sides(kin) if p is None else sides_in_p(kin, p)
+        width = 6 if p is None else 7
         parts = [(group, group.rows(sides, t, form)) for group in self.groups]
         if not parts:
             none = jnp.zeros((0,), kin.r.dtype)
             return Equations(none, none, jnp.zeros((0, n, width), kin.r.dtype), none)
 
-        def flat(pick: str) -> Array:
-            return jnp.concatenate([getattr(rows, pick).reshape(-1) for _, rows in parts])
+        def flat(name: str) -> Array:
+            return jnp.concatenate([getattr(rows, name).T.reshape(-1) for _, rows in parts])
 
         blocks = []
         for group, rows in parts:
             # one-hot products fuse where a scatter would not; ground has no column
             at_i = np.eye(n + 1)[list(group.i)][:, None, :n, None]
             at_j = np.eye(n + 1)[list(group.j)][:, None, :n, None]
-            block = at_i * rows.J_i[:, :, None, :] + at_j * rows.J_j[:, :, None, :]
+            J_i, J_j = (jnp.moveaxis(J, -1, 0)[:, :, None, :] for J in (rows.J_i, rows.J_j))
+            block = at_i * J_i + at_j * J_j
             blocks.append(block.reshape(-1, n, width))
         return Equations(flat("value"), flat("target"), jnp.concatenate(blocks), flat("gamma"))
 
 
-def constraints(system: System, rows: RowChoice = "body") -> Constraints:
-    """Group the rows of all joints of a system by kind.
+def constraints(
+    system: System, rows: RowChoice = "body", joints: Sequence[int] | None = None
+) -> Constraints:
+    """Group the rows of all joints of a system, or of those numbered `joints`, by kind.
 
     `rows="report"` takes parallel axes as cross products with two of three rows kept by the
     report's rule; "body" the equivalent perpendicularity to two axes fixed in body i.
@@ -162,6 +181,8 @@ def constraints(system: System, rows: RowChoice = "body") -> Constraints:
     com = jnp.concatenate([system.bodies.com, jnp.zeros((1, 3), system.bodies.com.dtype)])
     found: dict[str, list[tuple[int, int, int, Data, Motion | None]]] = {}
     for number, joint in enumerate(system.joints):
+        if joints is not None and number not in joints:
+            continue
         i, j = place.get(joint.body_i, ground), place.get(joint.body_j, ground)
         for term in joint.terms(rows):
             entry = (i, j, number, joint.data(term, com[i], com[j]), joint.motion)
@@ -170,9 +191,16 @@ def constraints(system: System, rows: RowChoice = "body") -> Constraints:
     owner: list[int] = []
     for kind in (k for k in PRIMITIVES if k in found):
         i, j, numbers, data, motions = zip(*found[kind], strict=True)
-        stacked = jax.tree.map(lambda *x: jnp.stack(x), *data)
+        stacked = jax.tree.map(lambda *x: _stack(x), *data)
         groups.append(
             Group(kind, i, j, numbers, stacked, tuple(m for m in motions if m is not None))
         )
         owner += [number for number in numbers for _ in range(ROWS[kind])]
     return Constraints(tuple(groups), tuple(owner), system.n_bodies)
+
+
+def _stack(rows: Sequence[Array]) -> Array:
+    """Stacked along a last axis; by NumPy where all are known, which compiles nothing."""
+    if all(concrete(row) for row in rows):
+        return jnp.asarray(np.stack([np.asarray(row) for row in rows], axis=-1))
+    return jnp.stack(rows, axis=-1)

@@ -54,6 +54,18 @@ class Residuals(eqx.Module):
     norm: Float[Array, ""]
 
 
+class Reactions(eqx.Module):
+    """What body i of each joint exerts on its body j, about j's joint point.
+
+    Attributes:
+        force: (joints, 3) [N].
+        moment: (joints, 3) [N m].
+    """
+
+    force: Float[Array, "joints 3"]
+    moment: Float[Array, "joints 3"]
+
+
 class AbstractFormulation(eqx.Module):
     """Equations of motion of a `System` as an ordinary differential equation x' = f(t, x).
 
@@ -63,7 +75,7 @@ class AbstractFormulation(eqx.Module):
 
     @abstractmethod
     def prepare(self, system: System) -> Any:
-        """What the other methods need of the system."""
+        """What the other methods need of the system, with the system itself as `.system`."""
 
     @abstractmethod
     def to_vector(self, model: Any, state: State) -> Float[Array, " k"]:
@@ -80,6 +92,12 @@ class AbstractFormulation(eqx.Module):
         """Accelerations and multipliers at one state and time [s]."""
 
     @abstractmethod
+    def reactions(
+        self, model: Any, t: Float[Array, ""], state: State, result: Accelerations
+    ) -> Reactions:
+        """Reactions at all joints, world axes, from the accelerations at that state."""
+
+    @abstractmethod
     def derivative(
         self,
         model: Any,
@@ -92,8 +110,8 @@ class AbstractFormulation(eqx.Module):
     @abstractmethod
     def project(
         self, model: Any, t: Float[Array, ""], x: Float[Array, " k"], iterations: int
-    ) -> Float[Array, " k"]:
-        """The nearest x that satisfies the constraints at position and velocity level."""
+    ) -> tuple[Float[Array, " k"], Residuals]:
+        """The nearest x that satisfies the constraints at both levels, and what is left."""
 
     @abstractmethod
     def residuals(self, model: Any, t: Float[Array, ""], x: Float[Array, " k"]) -> Residuals:

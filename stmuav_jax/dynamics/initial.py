@@ -277,6 +277,29 @@ def rank_of(
     return Rank(len(owner), count, columns - count, float(values[count - 1]), names)
 
 
+def ranks(
+    system: System, states: State, t: float = 0.0, *, tolerance: float = 1e-9
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rank, and the smallest non-zero singular value, of the constraint Jacobian at k postures.
+
+    Args:
+        states: (k, n, .). tolerance: values below it times the largest count as zero.
+
+    Returns:
+        (k,) integers and (k,); the Jacobian is that in (v, omega'), its rows as they are.
+    """
+    model = Augmented().prepare(system)
+    values = np.asarray(_singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
+    count = np.sum(values > tolerance * values[:, :1], axis=1)
+    return count, np.take_along_axis(values, count[:, None] - 1, axis=1)[:, 0]
+
+
+@eqx.filter_jit
+def _singular_values(model: Model, states: State, t: Float[Array, ""]) -> Float[Array, "k m"]:
+    matrices = jax.vmap(lambda state: _jacobian(model, state, t))(states)
+    return jnp.linalg.svd(matrices, compute_uv=False)
+
+
 def _dependent_rows(J: np.ndarray, count: int) -> list[int]:
     """Rows beyond the first `count` that Gram-Schmidt with row pivoting picks."""
     rest = J.copy()

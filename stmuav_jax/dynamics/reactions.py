@@ -6,29 +6,19 @@ force Phi_r^T lambda and the body-frame moment L Phi_p^T lambda / 2 on it.
 
 from typing import Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..mechanics.constraint import ROWS
+from ..mechanics.load import Load
 from ..mechanics.state import Kinematics, State
 from ..mechanics.system import System
 from .differential import Constraints, kinematic_sides
+from .formulation import Accelerations, Reactions
+from .topology import SpanningTree
 
 Frame = Literal["world", "joint"]
-
-
-class Reactions(eqx.Module):
-    """What body i of each joint exerts on its body j, about j's joint point.
-
-    Attributes:
-        force: (joints, 3) [N].
-        moment: (joints, 3) [N m].
-    """
-
-    force: Float[Array, "joints 3"]
-    moment: Float[Array, "joints 3"]
 
 
 def joint_reactions(
@@ -37,15 +27,13 @@ def joint_reactions(
     t: Float[Array, ""],
     state: State,
     multipliers: Float[Array, " m"],
-    frame: Frame = "world",
 ) -> Reactions:
-    """Reaction force and moment at every joint, in the order of `system.joints`.
+    """Reaction force and moment at every joint in world axes, in the order of `system.joints`.
 
-    Args:
-        frame: "world", or "joint" for the axes of the joint's frame fixed in body i.
+    Zero for joints that own none of the rows.
     """
     kin = system.kinematics(state)
-    sides = kinematic_sides(kin, "omega")
+    sides = kinematic_sides(kin)
     names = list(kin.names)
     i = np.array([names.index(joint.body_i) for joint in system.joints], dtype=int)
     wrench_i = jnp.zeros((len(system.joints), 6), state.r.dtype)
@@ -53,19 +41,62 @@ def joint_reactions(
     for group in constraints.groups:
         rows = group.rows(sides, t, "omega")
         count = ROWS[group.kind] * len(group.i)
-        share = multipliers[start : start + count].reshape(rows.value.shape)
+        share = multipliers[start : start + count].reshape(-1, ROWS[group.kind])
         belongs = np.eye(len(system.joints))[list(group.joints)]
-        wrench_i = wrench_i + belongs.T @ jnp.einsum("kc,kcw->kw", share, rows.J_i)
+        wrench_i = wrench_i + belongs.T @ jnp.einsum("kc,cwk->kw", share, rows.J_i)
         start += count
     force = wrench_i[:, :3]
     moment = jnp.einsum("kab,kb->ka", kin.R_wb[i], wrench_i[:, 3:])
-    point_j, axes = _points(system, kin)
-    moment = moment + jnp.cross(kin.r[i] - point_j, force)
-    result = Reactions(-force, -moment)
-    if frame == "world":
-        return result
+    moment = moment + jnp.cross(kin.r[i] - _points(system, kin)[0], force)
+    return Reactions(-force, -moment)
+
+
+def in_joint_axes(system: System, state: State, found: Reactions) -> Reactions:
+    """The same in the axes of every joint's frame fixed in body i."""
+    axes = _points(system, system.kinematics(state))[1]
     turn = lambda x: jnp.einsum("kba,kb->ka", axes, x)
-    return Reactions(turn(result.force), turn(result.moment))
+    return Reactions(turn(found.force), turn(found.moment))
+
+
+def tree_reactions(
+    system: System,
+    tree: SpanningTree,
+    kin: Kinematics,
+    load: Load,
+    rates: Accelerations,
+    cut: Reactions,
+) -> Reactions:
+    """Reactions at all joints where only those of the cut joints are known.
+
+    A joint of the tree carries what the bodies behind it need for their accelerations and
+    do not get from loads and cut joints.
+
+    Args:
+        load: the sum of all force elements. cut: with zeros for the joints of the tree.
+    """
+    n = system.n_bodies
+    bodies = system.bodies
+    origin = kin.r[0]
+    R, omega = kin.R_wb[:-1], kin.omega[:-1]
+    spin = jnp.einsum("nab,nb->na", bodies.inertia, omega)
+    turning = jnp.einsum("nab,nb->na", bodies.inertia, rates.omega_rate) + jnp.cross(omega, spin)
+    force = bodies.mass[:, None] * rates.v_rate - load.force[:-1]
+    moment = jnp.einsum("nab,nb->na", R, turning - load.moment[:-1])
+    moment = moment + jnp.cross(kin.r[:-1] - origin, force)
+    points = _points(system, kin)[0] if system.joints else jnp.zeros((0, 3))
+    about = cut.moment + jnp.cross(points - origin, cut.force)
+    ends = np.zeros((n + 1, len(system.joints)))
+    names = list(kin.names)
+    for k, joint in enumerate(system.joints):
+        ends[names.index(joint.body_j), k] += 1.0
+        ends[names.index(joint.body_i), k] -= 1.0
+    force, moment = force - ends[:n] @ cut.force, moment - ends[:n] @ about
+    behind = np.zeros((len(system.joints), n))
+    for joint, sign, below in tree.behind():
+        behind[joint, list(below)] = sign
+    force, moment = behind @ force, behind @ moment
+    moment = moment - jnp.cross(points - origin, force)
+    return Reactions(cut.force + force, cut.moment + moment)
 
 
 def _points(system: System, kin: Kinematics) -> tuple[Array, Array]:

@@ -3,7 +3,8 @@
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import cache
+from typing import Any, Literal
 
 import diffrax
 import equinox as eqx
@@ -11,18 +12,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..algebra.compiler import outer_jit
 from ..mechanics.body import check_unit
 from ..mechanics.errors import ModelError, SettingError, SimulationError, StateError
+from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .analysis import Snapshot, snapshots
 from .augmented import Augmented, Model
+from .certify import certify
 from .formulation import AbstractFormulation
 from .initial import Rank, rank_of
 from .integrate import Event, Method, Trajectory, advance, begin, prepare
-from .run import Certificate, Run, relative
+from .run import Run
 from .scene import Scene
 from .stabilisation import AbstractStabilisation, Projection
+from .stiffness import choose_solver
+from .tree import Tree
 
 Progress = Callable[[float], None]
 
@@ -38,7 +44,7 @@ def simulate(
     scene: Scene,
     *,
     formulation: AbstractFormulation | None = None,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: diffrax.AbstractSolver | Literal["auto"] | None = None,
     rtol: float = 1e-8,
     atol: float = 1e-8,
     stabilisation: AbstractStabilisation | None = None,
@@ -54,8 +60,9 @@ def simulate(
     """Integrate a scene and certify the result.
 
     Args:
-        formulation: default `Augmented()`; dependent rows are found and allowed for.
-        solver: a diffrax solver with an error estimate; default `Dopri8()`.
+        formulation: default `Tree()`; dependent rows are found and allowed for.
+        solver: a diffrax solver with an error estimate; default `Dopri8()`. `Rodas5P()` is
+            for stiff scenes; "auto" chooses between these two by `choose_solver`.
         rtol, atol: tolerances of a step.
         stabilisation: default `Projection()`.
         t1: end [s]; default the scene's.
@@ -75,8 +82,12 @@ def simulate(
         ModelError: contradictory constraints, or a load that is not finite at the start.
         SimulationError: the end was not reached (with `throw`); its `run` holds the rest.
     """
+    formulation = formulation if formulation is not None else Tree()
+    if solver == "auto":
+        _check_start(scene.system, scene.state0)
+        solver = choose_solver(scene.system, scene.state0, scene.t0, formulation=formulation)
     method = Method(
-        formulation=formulation if formulation is not None else Augmented(),
+        formulation=formulation,
         solver=solver if solver is not None else diffrax.Dopri8(),
         rtol=rtol,
         atol=atol,
@@ -85,20 +96,22 @@ def simulate(
         max_steps=max_steps,
         adjoint=diffrax.ForwardMode(),
         event=event,
+        balances=True,
     )
     times = _output_times(scene, t1, save_every, ts)
     _check_settings(method)
     _check_start(scene.system, scene.state0)
     started = time.perf_counter()
-    method, model, rank = _inspect(scene, method)
+    method, models, rank = _inspect(scene, method)
     looked = time.perf_counter() - started
     trajectory, seconds, stopped = _run(scene, method, times, progress)
     started = time.perf_counter()
-    view = snapshots(method, model, np.asarray(trajectory.ts), trajectory.states)
+    saved = (np.asarray(trajectory.ts), trajectory.states, np.asarray(trajectory.internal))
+    view = snapshots(method.formulation, *models, *saved)
     looked += time.perf_counter() - started
     result = stopped or _words(trajectory)
-    certificate = _certify(scene.system, trajectory, view, rank, result, (*seconds, looked))
-    run = Run(scene, method, trajectory, view, certificate, _settings(method))
+    certificate = certify(scene.system, trajectory, view, rank, result, (*seconds, looked))
+    run = Run(scene, method, trajectory, view, certificate, _settings(scene.system, method))
     if run.successful or result == "interrupted":
         return run
     run = dataclasses.replace(run, failure=_failure(run))
@@ -152,7 +165,7 @@ def _check_settings(method: Method) -> None:
     if not isinstance(method.solver, diffrax.AbstractAdaptiveSolver):
         raise SettingError(
             f"{type(method.solver).__name__} has no error estimate and cannot adapt its steps; "
-            "choose Dopri8, Tsit5, Kvaerno3 or Kvaerno5, or wrap it in diffrax.HalfSolver."
+            "choose Dopri8, Tsit5 or Rodas5P, or wrap it in diffrax.HalfSolver."
         )
 
 
@@ -173,21 +186,23 @@ def _check_start(system: System, state: State) -> None:
                 )
 
 
-def _inspect(scene: Scene, method: Method) -> tuple[Method, Model, Rank]:
+def _inspect(scene: Scene, method: Method) -> tuple[Method, tuple[Any, Model], Rank]:
     """Look at the start: consistent, finite, of which rank; allow for dependent rows."""
     system, formulation = scene.system, method.formulation
+    rows = Augmented().prepare(system)
     model = formulation.prepare(system)
-    ts, states = _one(scene)
-    first = snapshots(method, model, ts, states)
+    start = _one(scene)
+    first = snapshots(formulation, model, rows, *start)
     _check_loads(system, np.asarray(first.finite_loads[0]), scene.t0)
-    _check_consistent(system, model, first)
-    rank = rank_of(system, model, scene.state0, scene.t0, np.asarray(first.singular_values[0]))
+    _check_consistent(system, rows, first)
+    rank = rank_of(system, rows, scene.state0, scene.t0, np.asarray(first.singular_values[0]))
     if rank.rank < rank.rows:
-        if not isinstance(formulation, Augmented):
+        if not isinstance(formulation, Augmented | Tree):
             raise ModelError(f"Dependent constraint rows in {', '.join(rank.redundant)}.")
         if not formulation.redundant:
-            method = dataclasses.replace(method, formulation=_allow(formulation))
-            first = snapshots(method, model, ts, states)
+            formulation = dataclasses.replace(formulation, redundant=True)
+            method = dataclasses.replace(method, formulation=formulation)
+            first = snapshots(formulation, model, rows, *start)
         size = 1 + np.max(np.abs(first.accelerations.v_rate), initial=0.0)
         if not first.acceleration_misfit[0] <= 1e-6 * size:
             raise ModelError(
@@ -195,15 +210,13 @@ def _inspect(scene: Scene, method: Method) -> tuple[Method, Model, Rank]:
                 f"(misfit {first.acceleration_misfit[0]:.3g}). Among the dependent rows are those of "
                 f"{', '.join(rank.redundant)}."
             )
-    return method, model, rank
+    return method, (model, rows), rank
 
 
-def _allow(formulation: Augmented) -> Augmented:
-    return dataclasses.replace(formulation, redundant=True)
-
-
-def _one(scene: Scene) -> tuple[np.ndarray, State]:
-    return np.array([scene.t0]), jax.tree.map(lambda x: np.asarray(x)[None], scene.state0)
+def _one(scene: Scene) -> tuple[np.ndarray, State, np.ndarray]:
+    row = lambda x: np.asarray(x)[None]
+    own = row(internal_states(scene.system))
+    return np.array([scene.t0]), jax.tree.map(row, scene.state0), own
 
 
 def _check_loads(system: System, finite: np.ndarray, t: float) -> None:
@@ -232,7 +245,12 @@ def _check_consistent(system: System, model: Model, first: Snapshot) -> None:
         )
 
 
-_advance: Any = eqx.filter_jit(advance)
+_begin: Any = eqx.filter_jit(begin)
+
+
+@cache
+def _advance() -> Any:
+    return outer_jit(advance)
 
 
 def _run(
@@ -240,10 +258,10 @@ def _run(
 ) -> tuple[Trajectory, tuple[float, float], str]:
     """Integrate in chunks; seconds to compile and to run; a word if it was interrupted."""
     problem = prepare(scene.system, method)
-    carry = begin(problem, jnp.asarray(times[0]), scene.state0)
     clock = time.perf_counter()
+    carry = _begin(problem, jnp.asarray(times[0]), scene.state0)
     chunk = np.full(_CHUNK, times[0])
-    compiled = _advance.lower(problem, carry, jnp.asarray(chunk)).compile()
+    compiled = _advance().lower(problem, carry, jnp.asarray(chunk)).compile()
     compiling = time.perf_counter() - clock
     clock = time.perf_counter()
     parts: list[Trajectory] = []
@@ -266,6 +284,11 @@ def _run(
         lambda *x: np.concatenate(x), *(eqx.tree_at(_result, p, None) for p in parts)
     )
     joined = eqx.tree_at(_result, joined, parts[-1].result, is_leaf=lambda x: x is None)
+    # the start as given, not by way of the formulation's coordinates
+    first = jax.tree.map(
+        lambda x, y: np.r_[np.asarray(y)[None], x[1:]], joined.states, scene.state0
+    )
+    joined = eqx.tree_at(lambda found: found.states, joined, first)
     return _until_stop(joined), (compiling, time.perf_counter() - clock), stopped
 
 
@@ -301,56 +324,15 @@ def _words(trajectory: Trajectory) -> str:
     return diffrax.RESULTS[trajectory.result].splitlines()[0]
 
 
-def _certify(
-    system: System,
-    trajectory: Trajectory,
-    view: Snapshot,
-    rank: Rank,
-    result: str,
-    seconds: tuple[float, float, float],
-) -> Certificate:
-    total = view.kinetic + view.potential
-    drift = total - total[0] - trajectory.work
-    momentum: tuple[float | None, float | None] = (None, None)
-    if system.floating:
-        change = view.momentum - view.momentum[0] - trajectory.impulse
-        momentum = tuple(
-            relative(change[:, part], view.momentum[:, part], trajectory.impulse[:, part])
-            for part in (slice(0, 3), slice(3, 6))
-        )  # pyright: ignore[reportAssignmentType]
-    values = view.singular_values
-    return Certificate(
-        result=result,
-        t_end=float(trajectory.ts[-1]),
-        position_residual=_largest(trajectory.worst.position[-1], view.residuals[0]),
-        velocity_residual=_largest(trajectory.worst.velocity[-1], view.rates[0]),
-        norm_error=_largest(trajectory.worst.norm[-1], np.sum(trajectory.states.p[0] ** 2, -1) - 1),
-        energy_error=float(np.max(np.abs(drift))),
-        relative_energy_error=relative(drift, view.kinetic, view.potential, trajectory.work),
-        momentum_error=momentum[0],
-        angular_momentum_error=momentum[1],
-        smallest_singular_value=float(np.min(values[:, rank.rank - 1])) if rank.rank else None,
-        rows=rank.rows,
-        rank=rank.rank,
-        redundant=rank.redundant,
-        accepted_steps=int(trajectory.counts.accepted[-1]),
-        rejected_steps=int(trajectory.counts.rejected[-1]),
-        compile_seconds=seconds[0],
-        run_seconds=seconds[1],
-        analysis_seconds=seconds[2],
-    )
-
-
-def _largest(on_the_way: Any, at_the_start: Any) -> float:
-    """The largest absolute value over the accepted steps and the start."""
-    return float(max(on_the_way, np.max(np.abs(at_the_start), initial=0.0)))
-
-
-def _settings(method: Method) -> dict[str, Any]:
+def _settings(system: System, method: Method) -> dict[str, Any]:
     formulation = method.formulation
     words = type(formulation).__name__
     if isinstance(formulation, Augmented):
         words += f"(solve={formulation.solve}, rows={formulation.rows}, redundant={formulation.redundant})"
+    elif isinstance(formulation, Tree):
+        words += (
+            f"(cut={', '.join(formulation.cut) or 'chosen'}, redundant={formulation.redundant})"
+        )
     return {
         "formulation": words,
         "solver": type(method.solver).__name__,
@@ -374,8 +356,9 @@ def _failure(run: Run) -> str:
             "(max_steps), save more often, or loosen the tolerances"
         ),
     }.get(run.certificate.result, run.certificate.result)
-    kin = run.scene.system.kinematics(state)
-    for force in run.scene.system.forces:
+    system = with_internal(run.scene.system, jnp.asarray(run.trajectory.internal[-1]))
+    kin = system.kinematics(state)
+    for force in system.forces:
         # a load may turn bad right after the last state that was still good
         for later in (0.0, 1e-12, 1e-9, 1e-6, 1e-4):
             load = force.load(jnp.asarray(t + later), kin)

@@ -50,13 +50,13 @@ class Stabilised(diffrax.AbstractWrappedSolver):
 
     Args:
         solver: the diffrax solver, explicit or implicit.
-        project: (t, y, args) -> y, or None.
+        project: (t, y, args) -> y and its `Residuals`, or None.
         residuals: (t, y, args) -> `Residuals`; their maxima over all accepted steps are
             kept in the solver state.
     """
 
     solver: diffrax.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
-    project: Callable[[Any, Vector, Any], Vector] | None
+    project: Callable[[Any, Vector, Any], tuple[Vector, Residuals]] | None
     residuals: Callable[[Any, Vector, Any], Residuals]
 
     @property
@@ -112,8 +112,10 @@ class Stabilised(diffrax.AbstractWrappedSolver):
         y1, y_error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, jump
         )
-        end = y1 if self.project is None else self.project(t1, y1, args)
-        now = self.residuals(t1, end, args)
+        if self.project is None:
+            end, now = y1, self.residuals(t1, y1, args)
+        else:
+            end, now = self.project(t1, y1, args)
         worst = Residuals(
             jnp.maximum(worst.position, now.position),
             jnp.maximum(worst.velocity, now.velocity),

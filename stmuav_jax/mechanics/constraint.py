@@ -5,10 +5,15 @@ derivative is linear in the body's rotational acceleration:
 
     sddot = D alpha + c.
 
-Two choices of alpha give the report's two sets of tables from the same code:
+The first two choices of alpha give the report's two sets of tables from the same code, the
+third is what relative coordinates use:
 
     form "omega":  alpha = d(omega')/dt,  D = -s~ A,      c = omega x (omega x s)
     form "p":      alpha = pddot,         D = 2 G bar(s'), c = 2 Gdot Ldot^T s' = -h
+    form "world":  alpha = d(omega)/dt,   D = -s~,        c = omega x (omega x s)
+
+Arrays have their components first; any further axes (primitives of a kind, states of a
+batch) come last and are carried along.
 
 The rows then satisfy J_i (a_i, alpha_i) + J_j (a_j, alpha_j) = gamma, with a the
 acceleration of the centre of mass.
@@ -34,8 +39,9 @@ from ..algebra.rotation import (
     rotation_matrix,
     skew,
 )
+from ..algebra.stacked import apply, dot, multiply
 
-Form = Literal["omega", "p"]
+Form = Literal["omega", "p", "world"]
 Kind = Literal["point", "n1", "n2", "p1", "p2", "distance", "angle", "shift"]
 
 # Rows of each primitive: s,3  n1,1  n2,1  p1,2  p2,2  s-s,1 and the two drivers.
@@ -54,32 +60,32 @@ class Data(eqx.Module):
         length: [m]; distance.
     """
 
-    point_i: Float[Array, "*batch 3"]
-    point_j: Float[Array, "*batch 3"]
-    axis_i: Float[Array, "*batch 3"]
-    axis_j: Float[Array, "*batch 3"]
-    side_i: Float[Array, "*batch 3"]
+    point_i: Float[Array, "3 *batch"]
+    point_j: Float[Array, "3 *batch"]
+    axis_i: Float[Array, "3 *batch"]
+    axis_j: Float[Array, "3 *batch"]
+    side_i: Float[Array, "3 *batch"]
     length: Float[Array, "*batch"]
 
 
 class Side(eqx.Module):
-    """One body (or a stack) as a constraint sees it; made by `side`.
+    """One body (or a stack) as a constraint sees it; made by `side` and `side_world`.
 
     Attributes:
         r, v: centre of mass and its velocity (3,) [m], [m/s].
-        R_wb, R_rate: rotation and its time derivative (3, 3).
-        R_rest: the part of its second derivative without alpha (3, 3).
-        turn: what carries alpha into vectors: R_wb (3, 3), or 2 G (3, 4) for form "p".
-        velocity: (v, omega') or (v, pdot), what J multiplies (6,) or (7,).
+        R_wb: rotation (3, 3). omega_w: angular velocity, world (3,) [rad/s].
+        turn: what carries alpha into vectors: R_wb (3, 3), 2 G (3, 4) for form "p".
+        rest: the part of R_wb's second derivative without alpha (3, 3), for form "p".
+        velocity: (v, alpha's integral): (v, omega'), (v, pdot) or (v, omega).
     """
 
-    r: Float[Array, "*batch 3"]
-    v: Float[Array, "*batch 3"]
-    R_wb: Float[Array, "*batch 3 3"]
-    R_rate: Float[Array, "*batch 3 3"]
-    R_rest: Float[Array, "*batch 3 3"]
-    turn: Float[Array, "*batch 3 k"]
-    velocity: Float[Array, "*batch w"]
+    r: Float[Array, "3 *batch"]
+    v: Float[Array, "3 *batch"]
+    R_wb: Float[Array, "3 3 *batch"]
+    omega_w: Float[Array, "3 *batch"]
+    turn: Float[Array, "3 k *batch"]
+    rest: Float[Array, "3 3 *batch"]
+    velocity: Float[Array, "w *batch"]
 
 
 def side(
@@ -89,23 +95,33 @@ def side(
     omega: Float[Array, "3"],
     form: Form,
 ) -> Side:
-    """A body's side of constraints, from its state (omega in body axes)."""
-    R_wb, spin = rotation_matrix(p), skew(omega)
-    R_rate = R_wb @ spin
+    """A body's side of constraints in form "omega" or "p", from its state (omega in body axes)."""
+    R_wb = rotation_matrix(p)
+    omega_w = R_wb @ omega
     if form == "omega":
-        return Side(r, v, R_wb, R_rate, R_rate @ spin, R_wb, jnp.concatenate([v, omega]))
+        return Side(r, v, R_wb, omega_w, R_wb, R_wb, jnp.concatenate([v, omega]))
     p_rate = euler_parameter_rate(p, omega)
-    R_rest = 2 * matrix_g(p_rate) @ matrix_l(p_rate).T
-    return Side(r, v, R_wb, R_rate, R_rest, 2 * matrix_g(p), jnp.concatenate([v, p_rate]))
+    rest = 2 * matrix_g(p_rate) @ matrix_l(p_rate).T
+    return Side(r, v, R_wb, omega_w, 2 * matrix_g(p), rest, jnp.concatenate([v, p_rate]))
+
+
+def side_world(
+    r: Float[Array, "3 *batch"],
+    v: Float[Array, "3 *batch"],
+    R_wb: Float[Array, "3 3 *batch"],
+    omega_w: Float[Array, "3 *batch"],
+) -> Side:
+    """Bodies' sides of constraints in form "world", the angular velocity in world axes."""
+    return Side(r, v, R_wb, omega_w, R_wb, R_wb, jnp.concatenate([v, omega_w]))
 
 
 class Jet(eqx.Module):
     """A world vector with its derivatives: value s, rate, D and c of sddot = D alpha + c."""
 
-    s: Float[Array, "3"]
-    rate: Float[Array, "3"]
-    D: Float[Array, "3 k"]
-    c: Float[Array, "3"]
+    s: Float[Array, "3 *batch"]
+    rate: Float[Array, "3 *batch"]
+    D: Float[Array, "3 k *batch"]
+    c: Float[Array, "3 *batch"]
 
 
 class Row(eqx.Module):
@@ -114,40 +130,53 @@ class Row(eqx.Module):
     Attributes:
         value: Phi (k,).
         target: the velocity-level right-hand side, J qdot = target (k,).
-        J_i, J_j: (k, 6) or (k, 7) for forms "omega" and "p".
+        J_i, J_j: (k, 6) or (k, 7), linear part first.
         gamma: the acceleration-level right-hand side (k,).
     """
 
-    value: Float[Array, "*batch k"]
-    target: Float[Array, "*batch k"]
-    J_i: Float[Array, "*batch k w"]
-    J_j: Float[Array, "*batch k w"]
-    gamma: Float[Array, "*batch k"]
+    value: Float[Array, "k *batch"]
+    target: Float[Array, "k *batch"]
+    J_i: Float[Array, "k w *batch"]
+    J_j: Float[Array, "k w *batch"]
+    gamma: Float[Array, "k *batch"]
 
 
-def jet(body: Side, fixed: Float[Array, "3"], form: Form) -> Jet:
+def jet(body: Side, fixed: Float[Array, "3 *batch"], form: Form) -> Jet:
     """The jet of a vector fixed in a body, `fixed` in body axes (3,)."""
-    lever = -skew(fixed) if form == "omega" else bar(fixed)
-    return Jet(body.R_wb @ fixed, body.R_rate @ fixed, body.turn @ lever, body.R_rest @ fixed)
+    s = apply(body.R_wb, fixed)
+    rate = cross(body.omega_w, s)
+    if form == "p":
+        return Jet(s, rate, multiply(body.turn, bar(fixed)), apply(body.rest, fixed))
+    D = -skew(s) if form == "world" else multiply(body.turn, -skew(fixed))
+    return Jet(s, rate, D, cross(body.omega_w, rate))
 
 
-def _blocks(linear: Float[Array, "k 3"], angular: Float[Array, "k w"]) -> Float[Array, "k w+3"]:
+def _blocks(
+    linear: Float[Array, "k 3 *batch"], angular: Float[Array, "k w *batch"]
+) -> Float[Array, "k w+3 *batch"]:
     return jnp.concatenate([linear, angular], axis=1)
 
 
 def _row(
-    value: Float[Array, " k"],
-    J_i: Float[Array, "k w"],
-    J_j: Float[Array, "k w"],
-    gamma: Float[Array, " k"],
+    value: Float[Array, "k *batch"],
+    J_i: Float[Array, "k w *batch"],
+    J_j: Float[Array, "k w *batch"],
+    gamma: Float[Array, "k *batch"],
 ) -> Row:
     return Row(value, jnp.zeros_like(value), J_i, J_j, gamma)
+
+
+def _times(s: Float[Array, "3 *batch"], D: Float[Array, "3 k *batch"]) -> Float[Array, "k *batch"]:
+    """s^T D."""
+    return jnp.sum(s[:, None] * D, axis=0)
 
 
 def point(i: Side, j: Side, data: Data, form: Form) -> Row:
     """s,3: r_i + s_i^P - r_j - s_j^P = 0."""
     a, b = jet(i, data.point_i, form), jet(j, data.point_j, form)
-    eye = jnp.eye(3, dtype=a.s.dtype)
+    eye = jnp.broadcast_to(
+        jnp.eye(3, dtype=a.s.dtype).reshape(3, 3, *(1,) * (a.s.ndim - 1)), (3, *a.s.shape)
+    )
     value = (i.r + a.s) - (j.r + b.s)
     return _row(value, _blocks(eye, a.D), _blocks(-eye, -b.D), b.c - a.c)
 
@@ -158,12 +187,12 @@ def n1(i: Side, j: Side, data: Data, form: Form) -> Row:
 
 
 def _n1(a: Jet, b: Jet) -> Row:
-    none = jnp.zeros((1, 3), a.s.dtype)
-    gamma = -(a.s @ b.c + b.s @ a.c + 2 * a.rate @ b.rate)
+    none = jnp.zeros_like(a.s)[None]
+    gamma = -(dot(a.s, b.c) + dot(b.s, a.c) + 2 * dot(a.rate, b.rate))
     return _row(
-        (a.s @ b.s)[None],
-        _blocks(none, (b.s @ a.D)[None]),
-        _blocks(none, (a.s @ b.D)[None]),
+        dot(a.s, b.s)[None],
+        _blocks(none, _times(b.s, a.D)[None]),
+        _blocks(none, _times(a.s, b.D)[None]),
         gamma[None],
     )
 
@@ -180,28 +209,39 @@ def n2(i: Side, j: Side, data: Data, form: Form) -> Row:
     """n2,1: s_i . d = 0, d from the point on i to the point on j."""
     a = jet(i, data.axis_i, form)
     arm_i, arm_j, (d, d_rate, d_c) = _between(i, j, data, form)
-    gamma = -(a.s @ d_c + d @ a.c + 2 * a.rate @ d_rate)
+    gamma = -(dot(a.s, d_c) + dot(d, a.c) + 2 * dot(a.rate, d_rate))
     return _row(
-        (a.s @ d)[None],
-        _blocks(-a.s[None], (d @ a.D - a.s @ arm_i.D)[None]),
-        _blocks(a.s[None], (a.s @ arm_j.D)[None]),
+        dot(a.s, d)[None],
+        _blocks(-a.s[None], (_times(d, a.D) - _times(a.s, arm_i.D))[None]),
+        _blocks(a.s[None], _times(a.s, arm_j.D)[None]),
         gamma[None],
     )
 
 
-def _two_of_three(row: Row, axis_w: Float[Array, "3"]) -> Row:
+def _two_of_three(row: Row, axis_w: Float[Array, "3 *batch"]) -> Row:
     """Drop the row where the axis is largest (the report's rule; any of equal ones)."""
-    keep = jnp.array([[1, 2], [0, 2], [0, 1]])[jnp.argmax(jnp.abs(axis_w))]
-    return Row(row.value[keep], row.target[keep], row.J_i[keep], row.J_j[keep], row.gamma[keep])
+    keep = jnp.array([[1, 2], [0, 2], [0, 1]])[jnp.argmax(jnp.abs(axis_w), axis=0)]
+    keep = jnp.moveaxis(keep, -1, 0)
+
+    def two(x: Array) -> Array:
+        index = keep if x.ndim == keep.ndim else keep[:, None]
+        return jnp.take_along_axis(x, index, axis=0)
+
+    return Row(two(row.value), two(row.target), two(row.J_i), two(row.J_j), two(row.gamma))
 
 
 def p1_all(i: Side, j: Side, data: Data, form: Form) -> Row:
     """All three rows of s_i x s_j = 0 (p1), of which two are independent."""
     a, b = jet(i, data.axis_i, form), jet(j, data.axis_j, form)
     A, B = skew(a.s), skew(b.s)
-    none = jnp.zeros((3, 3), a.s.dtype)
-    gamma = -(A @ b.c - B @ a.c + 2 * cross(a.rate, b.rate))
-    return _row(A @ b.s, _blocks(none, -B @ a.D), _blocks(none, A @ b.D), gamma)
+    gamma = -(cross(a.s, b.c) - cross(b.s, a.c) + 2 * cross(a.rate, b.rate))
+    none = jnp.zeros_like(A)
+    return _row(
+        cross(a.s, b.s),
+        _blocks(none, -multiply(B, a.D)),
+        _blocks(none, multiply(A, b.D)),
+        gamma,
+    )
 
 
 def p2_all(i: Side, j: Side, data: Data, form: Form) -> Row:
@@ -209,28 +249,33 @@ def p2_all(i: Side, j: Side, data: Data, form: Form) -> Row:
     a = jet(i, data.axis_i, form)
     arm_i, arm_j, (d, d_rate, d_c) = _between(i, j, data, form)
     A, C = skew(a.s), skew(d)
-    gamma = -(A @ d_c - C @ a.c + 2 * cross(a.rate, d_rate))
-    return _row(A @ d, _blocks(-A, -A @ arm_i.D - C @ a.D), _blocks(A, A @ arm_j.D), gamma)
+    gamma = -(cross(a.s, d_c) - cross(d, a.c) + 2 * cross(a.rate, d_rate))
+    return _row(
+        cross(a.s, d),
+        _blocks(-A, -multiply(A, arm_i.D) - multiply(C, a.D)),
+        _blocks(A, multiply(A, arm_j.D)),
+        gamma,
+    )
 
 
 def p1(i: Side, j: Side, data: Data, form: Form) -> Row:
     """p1,2: s_i x s_j = 0, two rows chosen by the report's rule at the present posture."""
-    return _two_of_three(p1_all(i, j, data, form), i.R_wb @ data.axis_i)
+    return _two_of_three(p1_all(i, j, data, form), apply(i.R_wb, data.axis_i))
 
 
 def p2(i: Side, j: Side, data: Data, form: Form) -> Row:
     """p2,2: s_i x d = 0, two rows chosen by the report's rule at the present posture."""
-    return _two_of_three(p2_all(i, j, data, form), i.R_wb @ data.axis_i)
+    return _two_of_three(p2_all(i, j, data, form), apply(i.R_wb, data.axis_i))
 
 
 def distance(i: Side, j: Side, data: Data, form: Form) -> Row:
     """s-s,1: d . d - l^2 = 0."""
     arm_i, arm_j, (d, d_rate, d_c) = _between(i, j, data, form)
-    gamma = -2 * (d @ d_c + d_rate @ d_rate)
+    gamma = -2 * (dot(d, d_c) + dot(d_rate, d_rate))
     return _row(
-        (d @ d - data.length**2)[None],
-        2 * _blocks(-d[None], (-d @ arm_i.D)[None]),
-        2 * _blocks(d[None], (d @ arm_j.D)[None]),
+        (dot(d, d) - data.length**2)[None],
+        2 * _blocks(-d[None], -_times(d, arm_i.D)[None]),
+        2 * _blocks(d[None], _times(d, arm_j.D)[None]),
         gamma[None],
     )
 
@@ -248,9 +293,9 @@ def angle(i: Side, j: Side, data: Data, form: Form) -> Row:
     moving = jet(j, data.axis_j, form)
     A = _n1(jet(i, data.axis_i, form), moving)
     B = _n1(jet(i, data.side_i, form), moving)
-    u_i, u_j = i.velocity, j.velocity
     a, b = A.value, B.value
-    a_rate, b_rate = A.J_i @ u_i + A.J_j @ u_j, B.J_i @ u_i + B.J_j @ u_j
+    rate = lambda row: apply(row.J_i, i.velocity) + apply(row.J_j, j.velocity)
+    a_rate, b_rate = rate(A), rate(B)
     square = a * a + b * b
     twist = 2 * (a * a_rate + b * b_rate) * (a * b_rate - b * a_rate) / square**2
     return _row(

@@ -7,10 +7,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import cross
 from ..algebra.shapes import Numbers
+from ..algebra.stacked import apply, dot
 from .body import GROUND
 from .errors import ModelError
+from .joint_coordinate import coordinate
+from .joint_force import AbstractJointForce
 from .load import AbstractForce, Load, Signal, couple, evaluate, push, scalar, signal, vector
 from .state import Kinematics
 
@@ -71,7 +73,7 @@ class AppliedForce(AbstractForce):
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
         value = evaluate(self.force, t, kin)
-        force_w = kin.R_wb[kin.index(self.body)] @ value if self.frame == "body" else value
+        force_w = apply(kin.R_wb[kin.index(self.body)], value) if self.frame == "body" else value
         arm = None if self.point is None else kin.arm(self.body, self.point)
         return push(kin, self.body, force_w, arm)
 
@@ -102,7 +104,7 @@ class AppliedMoment(AbstractForce):
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
         value = evaluate(self.moment, t, kin)
-        moment_w = kin.R_wb[kin.index(self.body)] @ value if self.frame == "body" else value
+        moment_w = apply(kin.R_wb[kin.index(self.body)], value) if self.frame == "body" else value
         return push(kin, self.body, jnp.zeros_like(moment_w), moment_w=moment_w)
 
 
@@ -155,11 +157,11 @@ class LinearSpringDamper(AbstractForce):
         a, a_rate = kin.point(self.body_i, self.point_i)
         b, b_rate = kin.point(self.body_j, self.point_j)
         d, d_rate = b - a, b_rate - a_rate
-        square = d @ d
+        square = dot(d, d)
         length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
         direction = jnp.where(square > 0, d / length, jnp.zeros_like(d))
         stretch = jnp.where(square > 0, length, 0.0) - self.length
-        rate = direction @ d_rate
+        rate = dot(direction, d_rate)
         pull = (self.stiffness * stretch + self.damping * rate) * direction
         load = push(kin, self.body_i, pull, kin.arm(self.body_i, self.point_i)) + push(
             kin, self.body_j, -pull, kin.arm(self.body_j, self.point_j)
@@ -172,18 +174,16 @@ class LinearSpringDamper(AbstractForce):
         )
 
 
-class TorsionalSpringDamper(AbstractForce):
+class TorsionalSpringDamper(AbstractJointForce):
     """A torsional spring and damper about the z axis of a joint, from body i to body j.
 
     Args:
         joint: name of a revolute or cylindrical joint.
         stiffness: [N m/rad]. damping: [N m s/rad]. angle: at rest [rad].
 
-    The angle is that of the joint's frames, in (-pi, pi]: a spring wound past half a turn
-    jumps back.
+    A spring wound past half a turn jumps back.
     """
 
-    joint: str = eqx.field(static=True)
     stiffness: Float[Array, ""]
     damping: Float[Array, ""]
     angle: Float[Array, ""]
@@ -191,30 +191,22 @@ class TorsionalSpringDamper(AbstractForce):
     def __init__(
         self, joint: str, *, stiffness: Numbers, damping: Numbers = 0.0, angle: Numbers = 0.0
     ) -> None:
-        self.joint = joint
+        self.joint, self.coordinate = joint, "angle"
         of = f"of the torsional spring in joint '{joint}'"
         self.stiffness = scalar(stiffness, f"The stiffness {of}", "N m/rad")
         self.damping = scalar(damping, f"The damping {of}", "N m s/rad")
         self.angle = scalar(angle, f"The angle {of}", "rad")
 
-    def bodies(self) -> tuple[str, ...]:
-        return ()
+    def law(
+        self, x: Float[Array, ""], x_rate: Float[Array, ""], t: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        return -self.stiffness * (x - self.angle) - self.damping * x_rate
 
-    def joint_names(self) -> tuple[str, ...]:
-        return (self.joint,)
+    def potential_energy(self, x: Float[Array, ""], t: Float[Array, ""]) -> Float[Array, ""]:
+        return 0.5 * self.stiffness * (x - self.angle) ** 2
 
-    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        joint = kin.joint(self.joint)
-        i, j = kin.index(joint.body_i), kin.index(joint.body_j)
-        F_i, F_j = kin.R_wb[i] @ joint.frame_i, kin.R_wb[j] @ joint.frame_j
-        axis = F_i[:, 2]
-        turn = jnp.arctan2(F_i[:, 1] @ F_j[:, 0], F_i[:, 0] @ F_j[:, 0]) - self.angle
-        rate = axis @ (kin.omega_w[j] - kin.omega_w[i])
-        moment = (self.stiffness * turn + self.damping * rate) * axis
-        load = couple(kin, joint.body_i, joint.body_j, moment)
-        return Load(
-            load.force, load.moment, 0.5 * self.stiffness * turn**2, -self.damping * rate**2
-        )
+    def centre(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        return self.angle
 
 
 class JointDamping(AbstractForce):
@@ -243,19 +235,11 @@ class JointDamping(AbstractForce):
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
         joint = kin.joint(self.joint)
-        i, j = joint.body_i, joint.body_j
-        a, a_rate = kin.point(i, joint.point_i)
-        b, b_rate = kin.point(j, joint.point_j)
-        axis = kin.R_wb[kin.index(i)] @ joint.frame_i[:, 2]
-        slip = axis @ (b_rate - a_rate - cross(kin.omega_w[kin.index(i)], b - a))
-        drag = self.sliding * slip * axis
-        spin = self.turning * (kin.omega_w[kin.index(j)] - kin.omega_w[kin.index(i)])
-        # both forces act at j's point, so that they have no net moment
-        return (
-            push(kin, i, drag, b - kin.r[kin.index(i)])
-            + push(kin, j, -drag, b - kin.r[kin.index(j)])
-            + couple(kin, i, j, spin)
-        )
+        i, j = kin.index(joint.body_i), kin.index(joint.body_j)
+        slide = coordinate(kin, joint, "shift")
+        drag = slide.load(kin, -self.sliding * slide.rate)
+        spin = self.turning * (kin.omega_w[j] - kin.omega_w[i])
+        return drag + couple(kin, joint.body_i, joint.body_j, spin)
 
 
 def _frame(frame: str) -> Literal["world", "body"]:

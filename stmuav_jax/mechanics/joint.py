@@ -2,9 +2,9 @@
 
 A joint carries a frame on each of its two bodies. The frames coincide when the joint is at
 its zero; z is the axis of motion where there is one. An entry of `CATALOGUE` lists the
-primitives between the frames' axes, and for the report's own rows (cross products with two
-of three rows kept) the same joint in those terms. A new joint is one entry, one function
-and one row of tests.
+primitives between the frames' axes, the same joint in the report's own rows (cross products
+with two of three rows kept), and the relative motion that the joint leaves. A new joint is
+one entry, one function and one row of tests.
 
 Source: report Part I, section 3.4 (Eq. 3.11 to 3.14).
 """
@@ -42,26 +42,55 @@ _PARALLEL = (Term("n1", X, Z), Term("n1", Y, Z))
 _ON_AXIS = (Term("n2", X), Term("n2", Y))
 
 
+class Coordinate(NamedTuple):
+    """One step of the relative motion that a joint leaves free, about or along a frame axis.
+
+    kind: "turn" or "slide" (one number), "ball" (Euler parameters), "shift" (three lengths).
+    """
+
+    kind: str
+    axis: int = Z
+
+
 class Entry(NamedTuple):
-    """A joint's primitives, and the same in the report's own rows."""
+    """What a joint constrains, and what motion it leaves.
+
+    Attributes:
+        terms: its primitives.
+        motion: the steps that lead from frame i to frame j, in turn; None for a joint that
+            has no such coordinates and can only close a loop.
+        report: the primitives in the report's own rows, where they are others.
+    """
 
     terms: tuple[Term, ...]
-    report: tuple[Term, ...]
+    motion: tuple[Coordinate, ...] | None = None
+    report: tuple[Term, ...] | None = None
 
+
+_POINT = Term("point")
+_TURN, _SLIDE, _BALL = Coordinate("turn"), Coordinate("slide"), Coordinate("ball")
 
 CATALOGUE: dict[str, Entry] = {
-    "weld": Entry(*2 * ((Term("point"), Term("n1", X, Y), Term("n1", Y, Z), Term("n1", Z, X)),)),
-    "spherical": Entry(*2 * ((Term("point"),),)),
-    "universal": Entry(*2 * ((Term("point"), Term("n1", X, Y)),)),
-    "revolute": Entry((Term("point"), *_PARALLEL), (Term("point"), Term("p1"))),
+    "weld": Entry((_POINT, Term("n1", X, Y), Term("n1", Y, Z), Term("n1", Z, X)), ()),
+    "spherical": Entry((_POINT,), (_BALL,)),
+    "universal": Entry((_POINT, Term("n1", X, Y)), (Coordinate("turn", X), Coordinate("turn", Y))),
+    "revolute": Entry((_POINT, *_PARALLEL), (_TURN,), (_POINT, Term("p1"))),
     "translational": Entry(
-        (*_PARALLEL, *_ON_AXIS, Term("n1", X, Y)), (Term("p1"), Term("p2"), Term("n1", X, Y))
+        (*_PARALLEL, *_ON_AXIS, Term("n1", X, Y)),
+        (_SLIDE,),
+        (Term("p1"), Term("p2"), Term("n1", X, Y)),
     ),
-    "cylindrical": Entry((*_PARALLEL, *_ON_AXIS), (Term("p1"), Term("p2"))),
-    "distance": Entry(*2 * ((Term("distance"),),)),
-    "revolute_spherical": Entry(*2 * ((Term("n2", Z), Term("distance")),)),
-    "drive_angle": Entry(*2 * ((Term("angle", X, X, Y),),)),
-    "drive_shift": Entry(*2 * ((Term("shift", Z),),)),
+    "cylindrical": Entry((*_PARALLEL, *_ON_AXIS), (_SLIDE, _TURN), (Term("p1"), Term("p2"))),
+    "distance": Entry((Term("distance"),)),
+    "revolute_spherical": Entry((Term("n2", Z), Term("distance"))),
+    "drive_angle": Entry((Term("angle", X, X, Y),)),
+    "drive_shift": Entry((Term("shift", Z),)),
+}
+
+# The joints that leave an angle about their z axis, or a shift along it, free.
+LEAVES_FREE: dict[str, tuple[str, ...]] = {
+    which: tuple(kind for kind, entry in CATALOGUE.items() if step in (entry.motion or ()))
+    for which, step in (("angle", _TURN), ("shift", _SLIDE))
 }
 
 
@@ -88,7 +117,7 @@ class Joint(eqx.Module):
     def terms(self, rows: Literal["body", "report"]) -> tuple[Term, ...]:
         """The primitives of this joint, in the chosen rows."""
         entry = CATALOGUE[self.kind]
-        return entry.terms if rows == "body" else entry.report
+        return entry.report if rows == "report" and entry.report is not None else entry.terms
 
     @property
     def n_rows(self) -> int:
@@ -297,11 +326,10 @@ def drive(
     Raises:
         ModelError: a joint that does not leave that coordinate free.
     """
-    allowed = {"angle": ("revolute", "cylindrical"), "shift": ("translational", "cylindrical")}
-    if joint.kind not in allowed[coordinate]:
+    if joint.kind not in LEAVES_FREE[coordinate]:
         raise ModelError(
             f"Driver '{name}' prescribes the {coordinate} of joint '{joint.name}', but a "
             f"{joint.kind} joint does not leave it free; {coordinate} needs one of: "
-            f"{', '.join(allowed[coordinate])}."
+            f"{', '.join(LEAVES_FREE[coordinate])}."
         )
     return dataclasses.replace(joint, name=name, kind=f"drive_{coordinate}", motion=motion)

@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 
 from ..algebra.rotation import cross
 from ..algebra.shapes import Numbers
-from .errors import check_finite, check_shape
+from ..algebra.stacked import apply_transposed, dot
+from .errors import ModelError, check_finite, check_shape, concrete
 from .state import Kinematics
 
 Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Array, "..."]]
@@ -105,8 +106,10 @@ def push(
     if arm_w is not None:
         total = total + cross(arm_w, force_w)
     row = jnp.asarray(np.eye(len(kin.names))[:, k, None])
-    power = force_w @ kin.v[k] + total @ kin.omega_w[k]
-    return Load(row * force_w, row * (kin.R_wb[k].T @ total), jnp.zeros((), kin.r.dtype), power)
+    power = dot(force_w, kin.v[k]) + dot(total, kin.omega_w[k])
+    return Load(
+        row * force_w, row * apply_transposed(kin.R_wb[k], total), jnp.zeros((), kin.r.dtype), power
+    )
 
 
 class AbstractForce(eqx.Module):
@@ -143,3 +146,19 @@ def scalar(value: Numbers, what: str, unit: str) -> Float[Array, ""]:
     check_shape(value, (), what)
     check_finite(value, what, unit)
     return jnp.asarray(value, dtype=float)
+
+
+def nonnegative(value: Numbers, what: str, unit: str) -> Float[Array, ""]:
+    """A number >= 0 that a user gave; raises `ModelError` for any other."""
+    number = scalar(value, what, unit)
+    if concrete(number) and float(number) < 0:
+        raise ModelError(f"{what} must not be negative, but it is {float(number):g} {unit}.")
+    return number
+
+
+def positive(value: Numbers, what: str, unit: str) -> Float[Array, ""]:
+    """A number > 0 that a user gave; raises `ModelError` for any other."""
+    number = scalar(value, what, unit)
+    if concrete(number) and float(number) <= 0:
+        raise ModelError(f"{what} must be positive, but it is {float(number):g} {unit}.")
+    return number

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import cross, rotation_matrix
+from ..algebra.stacked import apply
 from .body import GROUND
 from .errors import ModelError, nearest_names
 
@@ -41,7 +42,6 @@ class Kinematics(eqx.Module):
 
     Attributes:
         r, v: centre of mass and its velocity, world (n + 1, 3) [m], [m/s].
-        p: Euler parameters (n + 1, 4).
         R_wb: body-to-world rotations (n + 1, 3, 3).
         omega: angular velocities in body axes (n + 1, 3) [rad/s].
         omega_w: angular velocities in world axes (n + 1, 3) [rad/s].
@@ -52,7 +52,6 @@ class Kinematics(eqx.Module):
     """
 
     r: Float[Array, "N 3"]
-    p: Float[Array, "N 4"]
     v: Float[Array, "N 3"]
     omega: Float[Array, "N 3"]
     R_wb: Float[Array, "N 3 3"]
@@ -80,7 +79,7 @@ class Kinematics(eqx.Module):
     def arm(self, name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """World vector from the centre of mass to a point of the body's reference frame [m]."""
         k = self.index(name)
-        return self.R_wb[k] @ (point - self.com[k])
+        return apply(self.R_wb[k], point - self.com[k])
 
     def point(
         self, name: str, point: Float[Array, "3"]
@@ -107,11 +106,10 @@ def kinematics(
     R_wb = jax.vmap(rotation_matrix)(p)
     return Kinematics(
         r=jnp.concatenate([state.r, zero]),
-        p=p,
         v=jnp.concatenate([state.v, zero]),
         omega=omega,
         R_wb=R_wb,
-        omega_w=jnp.einsum("nab,nb->na", R_wb, omega),
+        omega_w=jnp.sum(R_wb * omega[:, None], axis=2),
         mass=jnp.concatenate([mass, jnp.zeros(1, mass.dtype)]),
         com=jnp.concatenate([com, zero]),
         names=(*names, GROUND),

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from .body import GROUND, Bodies, Body, stack_bodies
 from .errors import ModelError, SettingError, nearest_names
 from .joint import Joint, resolve
+from .joint_force import AbstractJointForce
 from .load import AbstractForce
 from .state import Kinematics, State, kinematics
 
@@ -21,7 +22,7 @@ class System(eqx.Module):
         bodies: the moving bodies; "ground" is there without being listed.
         joints: see `stmuav_jax.mechanics.joint`; geometry in the world at the bodies'
             reference posture.
-        forces: see `stmuav_jax.mechanics.force`.
+        forces: see `stmuav_jax.mechanics.force` and `stmuav_jax.mechanics.joint_force`.
         allow_float32: accept single precision, in which closed loops lose most digits.
 
     Attributes:
@@ -32,7 +33,7 @@ class System(eqx.Module):
 
     Raises:
         ModelError: unknown or duplicate names, a body joined to nothing that is not
-            declared free.
+            declared free, a force on a coordinate that its joint does not leave free.
         SettingError: single precision without `allow_float32`.
     """
 
@@ -170,6 +171,8 @@ def _check_references(
                 raise ModelError(
                     f"A {kind} names the unknown joint '{name}'.{nearest_names(name, joint_names)}"
                 )
+        if isinstance(force, AbstractJointForce):
+            force.choice(joints[joint_names.index(force.joint)])
 
 
 def _check_connected(bodies: Sequence[Body], joints: Sequence[Joint]) -> None:

@@ -1,10 +1,16 @@
 """`hexacopter`: one free body and six rotors (report Part II, section 5.1)."""
 
+from collections.abc import Callable
+
+import jax.numpy as jnp
+
+from ..algebra.shapes import Numbers
 from ..dynamics.scene import Scene
 from ..mechanics.body import Body
 from ..mechanics.force import Gravity
 from ..mechanics.system import System
 from ..vehicle.airframe import PART_II
+from ..vehicle.flight import Drag, Motor, Wind, flight
 from ..vehicle.parameters import Parameters
 from ..vehicle.rotor import Rotors, hover_speed_squared
 
@@ -21,30 +27,51 @@ def rotors(body: str, parameters: Parameters, speed_squared: object) -> Rotors:
     )
 
 
-def hexacopter(parameters: Parameters = PART_II) -> Scene:
+def hexacopter(
+    parameters: Parameters = PART_II,
+    *,
+    drag: Drag | None = None,
+    wind: Wind | Numbers | Callable[..., object] | None = None,
+    motor: Motor | None = None,
+) -> Scene:
     """The bare hexacopter rising with constant, equal rotor speeds; no joints at all.
 
     The arms' centroid lies 1.1 mm off the centre of mass (Table 5.2), so equal speeds also
     turn it slowly.
+
+    Args:
+        drag: of the airframe; the report has none. wind: a `Wind`, or the air's velocity,
+            world (3,) [m/s], or a function of (t, kinematics); needs drag.
+        motor: lag, inertia and limits of the rotors; the report has none.
+
+    Raises:
+        ModelError: numbers of the options that make no sense.
     """
     mass = parameters.value("bare.mass")
     gravity = parameters.value("gravity")
     hover = hover_speed_squared(mass, gravity, parameters.value("rotor.k_f"), 6)
     lift = parameters.value("bare.lift_factor")
+    weight = mass * jnp.linalg.norm(jnp.asarray(gravity, dtype=float))
+    air = flight(
+        rotors("hexacopter", parameters, lift * hover), weight, parameters,
+        drag=drag, wind=wind, motor=motor,
+    )  # fmt: skip
     system = System(
         [Body("hexacopter", mass, parameters.value("bare.inertia"), free=True)],
-        forces=[Gravity(gravity), rotors("hexacopter", parameters, lift * hover)],
+        forces=[Gravity(gravity), *air.forces],
     )
-    keep = ("bare.", "rotor.", "gravity")
+    options = tuple(g for g in ("drag.", "wind.", "gust.", "motor.") if g not in air.unused)
+    keep = ("bare.", "rotor.", "gravity", *options)
     return Scene(
         name="hexacopter",
         title="Bare hexacopter, constant equal rotor speeds",
         system=system,
         state0=system.reference,
-        parameters={k: v for k, v in parameters.to_dict().items() if k.startswith(keep)},
+        parameters={k: v for k, v in air.parameters.to_dict().items() if k.startswith(keep)},
         notes=(
             "The report prints no rotor speeds: 1.1 times the weight is chosen here.",
             "J_zz of section 5.1 is printed ten times too large; corrected to 86.6e-3 kg m^2.",
+            *air.notes,
         ),
         watch=("hexacopter",),
     )

@@ -8,9 +8,11 @@ from ..dynamics.scene import Scene
 from ..mechanics.body import GROUND
 from ..mechanics.errors import SettingError
 from ..mechanics.force import AppliedForce, AppliedMoment
+from ..mechanics.joint import Motion
 from ..mechanics.load import AbstractForce, Sine
 from ..mechanics.system import System
 from ..vehicle.airframe import PART_I
+from ..vehicle.drive import Friction, Servo, Stops, slider_drive, stroke_drivers
 from ..vehicle.parameters import Parameters
 from ..vehicle.tracker import tracker_bodies, tracker_joints
 
@@ -21,30 +23,51 @@ TITLES = {
 }
 
 
-def tracker(case: Literal[1, 2, 3] = 1, parameters: Parameters = PART_I) -> Scene:
+def tracker(
+    case: Literal[1, 2, 3] = 1,
+    parameters: Parameters = PART_I,
+    *,
+    servo: Servo | None = None,
+    stops: Stops | None = None,
+    friction: Friction | None = None,
+    strokes: tuple[Motion, Motion] | None = None,
+) -> Scene:
     """The report's tracker on ground; the base has no coordinates, and there is no gravity.
 
     Args:
         case: 1 slider forces, 2 panel force, 3 panel moment.
+        servo: holds both sliders, beside the case's forces; the report has none.
+        stops: at the ends of both sliders' strokes. friction: in both slider joints.
+        strokes: prescribe both sliders' displacements from the initial posture, functions of
+            t [s] to [m] (see `stmuav_jax.vehicle.drive.stroke_drivers`); the case's own
+            forces then only load the drivers.
 
     Raises:
         SettingError: another case.
+        ModelError: numbers of the options that make no sense.
     """
     if case not in TITLES:
         raise SettingError(f"tracker has cases 1, 2 and 3, not {case}.")
+    drive = slider_drive(parameters, servo=servo, stops=stops, friction=friction)
+    unused = ("spin.", "workspace.", *drive.unused)
+    joints = tracker_joints(parameters, GROUND)
     system = System(
-        tracker_bodies(parameters), tracker_joints(parameters, GROUND), _loads(case, parameters)
+        tracker_bodies(parameters),
+        (*joints, *stroke_drivers(joints, strokes)) if strokes is not None else joints,
+        (*_loads(case, parameters), *drive.forces),
     )
     return Scene(
         name=f"tracker_{case}",
         title=TITLES[case],
         system=system,
         state0=system.reference,
-        parameters={k: v for k, v in parameters.to_dict().items() if not k.startswith("spin.")},
+        parameters={
+            k: v for k, v in drive.parameters.to_dict().items() if not k.startswith(unused)
+        },
         notes=(
             "Joint positions are reconstructed, not printed (docs/geometry.md).",
             "J'_7 of Table 6.2 breaks the triangle inequality by 0.7 % through rounding; admitted.",
-            "Nothing holds the sliders: no friction, no stops, no servo. No gravity, as printed.",
+            f"{drive.note} No gravity, as printed.",
         ),
         watch=("slider_2", "slider_3", "panel_7"),
     )

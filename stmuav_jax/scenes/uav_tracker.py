@@ -1,17 +1,24 @@
 """`uav_tracker`: the hexacopter with the tracker, seven bodies (report Part II, section 5.2)."""
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import jax.numpy as jnp
 
+from ..algebra.shapes import Numbers
 from ..dynamics.scene import Scene
 from ..mechanics.body import Body
 from ..mechanics.errors import SettingError
 from ..mechanics.force import Gravity
+from ..mechanics.joint import Motion
 from ..mechanics.load import AbstractForce, Sine
 from ..mechanics.system import System
 from ..vehicle.actuator import LinearActuator
 from ..vehicle.airframe import PART_II
+from ..vehicle.drive import Friction, Servo, Stops, slider_drive, stroke_drivers
+from ..vehicle.flight import Drag, Flight, Motor, Wind, flight
+from ..vehicle.flyer import Flyer
+from ..vehicle.geometry import tracker_geometry
 from ..vehicle.parameters import Parameters
 from ..vehicle.rotor import hover_speed_squared
 from ..vehicle.tracker import TRACKER_BODIES, tracker_bodies, tracker_joints
@@ -31,6 +38,13 @@ def uav_tracker(
     parameters: Parameters = PART_II,
     *,
     actuators: Literal["consistent", "printed"] = "consistent",
+    servo: Servo | None = None,
+    stops: Stops | None = None,
+    friction: Friction | None = None,
+    strokes: tuple[Motion, Motion] | None = None,
+    drag: Drag | None = None,
+    wind: Wind | Numbers | Callable[..., object] | None = None,
+    motor: Motor | None = None,
 ) -> Scene:
     """The report's seven-body UAV.
 
@@ -39,9 +53,18 @@ def uav_tracker(
             the parameter "lift_factor" (the report gives no number).
         actuators: "consistent" puts each actuator's force pair on its axis; "printed" is
             the report's, which adds a net couple.
+        servo: holds both sliders, beside the actuators' forces; the report has none.
+        stops: at the ends of both sliders' strokes. friction: in both slider joints.
+        strokes: prescribe both sliders' displacements from the initial posture, functions of
+            t [s] to [m] (see `stmuav_jax.vehicle.drive.stroke_drivers`); the case's own
+            forces then only load the drivers.
+        drag: of the hexacopter's airframe; the report has none. wind: a `Wind`, or the air's
+            velocity, world (3,) [m/s], or a function of (t, kinematics); needs drag.
+        motor: lag, inertia and limits of the rotors; the report has none.
 
     Raises:
         SettingError: another case or couple.
+        ModelError: numbers of the options that make no sense.
     """
     if case not in TITLES:
         raise SettingError(f"uav_tracker has cases 1, 2 and 3, not {case}.")
@@ -49,34 +72,55 @@ def uav_tracker(
     base = Body(
         BASE, parameters.value(f"mass.{BASE}"), parameters.value(f"inertia.{BASE}"), free=True
     )
+    drive = slider_drive(parameters, servo=servo, stops=stops, friction=friction)
+    air = _flight(case, drive.parameters, drag=drag, wind=wind, motor=motor)
+    unused = ("bare.", "workspace.", *drive.unused, *air.unused)
+    joints = tracker_joints(parameters, BASE, shift)
     system = System(
         [base, *tracker_bodies(parameters, shift)],
-        tracker_joints(parameters, BASE, shift),
-        _forces(case, parameters, actuators),
+        (*joints, *stroke_drivers(joints, strokes)) if strokes is not None else joints,
+        (*_forces(case, air, actuators), *drive.forces),
     )
     return Scene(
         name=f"uav_tracker_{case}",
         title=TITLES[case],
         system=system,
         state0=system.reference,
-        parameters={k: v for k, v in parameters.to_dict().items() if not k.startswith("bare.")},
+        parameters={k: v for k, v in air.parameters.to_dict().items() if not k.startswith(unused)},
         notes=(
             "Joint positions are reconstructed, not printed (docs/geometry.md).",
             "J'_3 (1, 1) of Table 5.3 is corrected to the mirror of J'_2.",
             f"Actuator couple: {actuators}. Equal rotor speeds are not a trim.",
-            "Nothing holds the sliders: no friction, no stops, no servo.",
+            drive.note,
+            *air.notes,
         ),
         watch=(BASE, "slider_2", "slider_3", "panel_7"),
     )
 
 
-def _forces(case: int, parameters: Parameters, couple: Any) -> tuple[AbstractForce, ...]:
-    gravity = parameters.value("gravity")
+def uav_flyer(parameters: Parameters = PART_II, **options: Any) -> Flyer:
+    """The UAV in independent coordinates, for trim and linearisation.
+
+    Args:
+        options: of `uav_tracker`, such as friction or drag; its case is 2, which has actuators.
+    """
+    scene = uav_tracker(2, parameters, **options)
+    return Flyer(scene.system, tracker_geometry(parameters), parameters.value("mount.shift"))
+
+
+def _flight(case: int, parameters: Parameters, **options: Any) -> Flight:
     names = (BASE, *TRACKER_BODIES)
+    gravity = jnp.asarray(parameters.value("gravity"), dtype=float)
     total = sum(jnp.asarray(parameters.value(f"mass.{name}"), dtype=float) for name in names)
     hover = hover_speed_squared(total, gravity, parameters.value("rotor.k_f"), 6)
     lift = parameters.value("lift_factor") if case == 3 else 1.0
-    forces: list[AbstractForce] = [Gravity(gravity), rotors(BASE, parameters, lift * hover)]
+    weight = total * jnp.linalg.norm(gravity)
+    return flight(rotors(BASE, parameters, lift * hover), weight, parameters, **options)
+
+
+def _forces(case: int, air: Flight, couple: Any) -> tuple[AbstractForce, ...]:
+    parameters = air.parameters
+    forces: list[AbstractForce] = [Gravity(parameters.value("gravity")), *air.forces]
     if case == 1:
         return tuple(forces)
     push = Sine(parameters.value("actuator.force"), parameters.value("actuator.angular_frequency"))

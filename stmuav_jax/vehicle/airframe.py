@@ -1,13 +1,13 @@
 """The numbers of the report's machine: `PART_I` (tracker) and `PART_II` (hexacopter with it).
 
 The report prints masses, inertia tensors, centres of mass and initial Euler parameters, but
-the joints' positions were only in figures that are lost. The geometry here is reconstructed:
-lengths of a design that is symmetric about the plane y = -x through the post were fitted to
-the printed centres of mass (0.64 mm rms) and Euler parameters; the posture below closes
-exactly with them. What was decided, and why, is in docs/geometry.md.
+the joints' positions were only in figures that are lost. The lengths here ("geometry.") are
+reconstructed: those of a design that is symmetric about the plane y = -x through the post were
+fitted to the printed centres of mass (0.64 mm rms) and Euler parameters. Bodies and joints are
+made from them and from the panel's angles at the start ("posture."); see `geometry.py`. What
+was decided, and why, is in docs/geometry.md.
 
-Positions, points and axes are in the frame of Part I (tracker frame), at the initial
-posture; Part II adds "mount.shift".
+Lengths are in the frame of Part I (tracker frame); Part II adds "mount.shift".
 """
 
 from .parameters import Parameter, Parameters
@@ -31,40 +31,23 @@ def _tensor(
 
 
 # fmt: off
+# pairs are (leg 2, leg 3): slider 2 with rod 6, slider 3 with rod 5
 _GEOMETRY = {
-    "position.slider_2": Parameter((-0.12399, 0.015, 0.02486361528553466), "m", _FIT),
-    "orientation.slider_2": Parameter((1.0, 0.0, 0.0, 0.0), "1", _FIT),
-    "position.slider_3": Parameter((-0.015, 0.12399, 0.024232802219569794), "m", _FIT),
-    "orientation.slider_3": Parameter((1.0, 0.0, 0.0, 0.0), "1", _FIT),
-    "position.post_4": Parameter((-0.0115, 0.019015458663411464, 0.09907598210115556), "m", _FIT),
-    "orientation.post_4": Parameter(
-        (0.998447424263679, -0.055702252927731635, 0.0, -0.0), "1", _FIT),
-    "position.rod_5": Parameter(
-        (-0.012796611778260459, 0.09803685411661023, 0.06802740594379275), "m", _FIT),
-    "orientation.rod_5": Parameter(
-        (0.9952208296055652, 0.09474906850274095, 0.023518102204587072, -0.0022390189298188527), "1", _FIT),
-    "position.rod_6": Parameter((-0.09256978971462965, 0.015, 0.06731865954714147), "m", _FIT),
-    "orientation.rod_6": Parameter((0.9881138026382803, 0.0, 0.15372414590986588, 0.0), "1", _FIT),
-    "position.panel_7": Parameter(
-        (-0.03460921762067631, 0.04250553563552974, 0.1365230902354704), "m", _FIT),
-    "orientation.panel_7": Parameter(
-        (0.9792856087169373, -0.13171626247600568, -0.15241478421717697, 0.020500153933106842), "1", _FIT),
-    "axis.T12": Parameter((0.0, 0.0, 1.0), "1", _S31),
-    "axis.T13": Parameter((0.0, 0.0, 1.0), "1", _S31),
-    "point.R14": Parameter((-0.015, 0.015, 0.0632), "m", _FIT),
-    "axis.R14": Parameter((1.0, 0.0, 0.0), "1", _S31),
-    "point.R26": Parameter((-0.107, 0.015, 0.02206361528553466), "m", _FIT),
-    "axis.R26": Parameter((0.0, 1.0, 0.0), "1", _S31),
-    "point.U35": Parameter((-0.015, 0.107, 0.021432802219569794), "m", _FIT),
-    "axis_i.U35": Parameter((0.0, 1.0, 0.0), "1", _FIT),
-    "axis_j.U35": Parameter(
-        (0.9988837713258532, 2.4431537045853097e-19, -0.04723570028951592), "1", _FIT),
-    "point.U47": Parameter((-0.015, 0.02434344952151144, 0.1466787395151542), "m", _FIT),
-    "axis_i.U47": Parameter((1.0, 0.0, 0.0), "1", _FIT),
-    "axis_j.U47": Parameter((0.0, 0.9644611397761418, -0.264224733629737), "1", _FIT),
-    "point.S57": Parameter(
-        (-0.010593223556520917, 0.08907370823322044, 0.11462200966801572), "m", _FIT),
-    "point.S67": Parameter((-0.07813957942925931, 0.015, 0.11257370380874829), "m", _FIT),
+    "geometry.axis": Parameter((-0.015, 0.015), "m", _T61 + ": r_6y and r_5, the post's axis"),
+    "geometry.hinge": Parameter(0.0632, "m", _FIT),
+    "geometry.post": Parameter(0.084, "m", _FIT),
+    "geometry.arms": Parameter((0.092, 0.092), "m", _FIT),
+    "geometry.panel_arms": Parameter((0.0709, 0.0709), "m", _FIT),
+    "geometry.panel_depths": Parameter((0.0145, 0.0145), "m", _FIT),
+    "geometry.rods": Parameter((0.095, 0.095), "m", _FIT),
+    # r_2 and r_3 are 108.99 mm from the post's axis and 24.6 mm high
+    "geometry.slider_out": Parameter((0.01699, 0.01699), "m", _FIT),
+    "geometry.slider_up": Parameter((0.0028, 0.0028), "m", _FIT),
+    "geometry.post_com": Parameter((0.0035, 0.0, 0.0361), "m", _FIT),
+    "geometry.rod_com": Parameter((0.5, 0.5), "1", _CHOICE + " (the fit's weak prior)"),
+    "geometry.panel_com": Parameter((-0.0202, 0.0202, 0.0012), "m", _FIT),
+    "posture.phi": Parameter(-0.2674, "rad", _FIT),
+    "posture.theta": Parameter(-0.3088, "rad", _FIT),
 }
 
 _BODIES_I = {
@@ -154,6 +137,40 @@ _FLIGHT = {
     "lift_factor": Parameter(1.2, "1", _CHOICE + " (case 3 prints no thrust)"),
 }
 
+_AIR = {
+    # a plate of some 0.1 m^2 across, twice that from below; the linear part is the rotors'
+    "drag.linear": Parameter((0.3, 0.3, 0.2), "N s/m", _CHOICE),
+    "drag.quadratic": Parameter((0.06, 0.06, 0.12), "N s^2/m^2", _CHOICE),
+    "drag.centre": Parameter((0.0, 0.0, 0.05), "m", _CHOICE + ", near the rotors' plane"),
+    "wind.mean": Parameter((5.0, 0.0, 0.0), "m/s", _CHOICE),
+    "gust.height": Parameter(20.0, "m", _CHOICE),
+    "gust.speed_20ft": Parameter(7.7, "m/s", "MIL-F-8785C, light turbulence: 15 knots"),
+    "motor.time_constant": Parameter(0.05, "s", _CHOICE),
+    "motor.inertia": Parameter(1e-4, "kg m^2", _CHOICE + ", a rotor of about 0.3 m"),
+    "motor.lowest": Parameter(200.0, "rad/s", _CHOICE),
+    "motor.highest": Parameter(1900.0, "rad/s", _CHOICE + ", about twice the weight"),
+}
+
+# strokes of (slider 2, slider 3) from the initial posture; |phi|, |theta| <= 45 degrees need -15 to 75 and -37 to 103 mm
+_DRIVE = {
+    "servo.stiffness": Parameter(1e6, "N/m", _CHOICE),
+    "servo.damping": Parameter(900.0, "N s/m", _CHOICE),
+    "stop.lower": Parameter((-0.012, -0.035), "m", _CHOICE + ", within 45 degrees of panel tilt"),
+    "stop.upper": Parameter((0.075, 0.1), "m", _CHOICE + ", within 45 degrees of panel tilt"),
+    "stop.stiffness": Parameter(1e5, "N/m", _CHOICE),
+    "stop.damping": Parameter(100.0, "N s/m", _CHOICE),
+    "stop.width": Parameter(2e-4, "m", _CHOICE),
+    "friction.coulomb": Parameter(0.5, "N", _CHOICE),
+    "friction.viscous": Parameter(0.0, "N s/m", _CHOICE),
+    "friction.speed": Parameter(1e-3, "m/s", _CHOICE),
+}
+
+# with the lengths above, strokes determine the posture up to about 65 degrees of tilt
+_WORKSPACE = {
+    "workspace.tilt": Parameter(1.0471975511965976, "rad", _CHOICE + ", 60 degrees"),
+    "workspace.margin": Parameter(0.05, "1", _CHOICE + ", see stmuav_jax/vehicle/workspace.py"),
+}
+
 _HEXACOPTER = {
     "bare.mass": Parameter(5.407, "kg", "report Part II, section 5.1"),
     # J_zz is printed as 866e-3, which no body can have
@@ -165,9 +182,24 @@ _HEXACOPTER = {
 }
 # fmt: on
 
-PART_I = Parameters("PART_I", {**_BODIES_I, **_GEOMETRY, **_LOADS_I, **_SPIN})
+_SHARED = {**_GEOMETRY, **_DRIVE, **_WORKSPACE}
 
-PART_II = Parameters("PART_II", {**_BODIES_II, **_GEOMETRY, **_ROTORS, **_FLIGHT, **_HEXACOPTER})
+PART_I = Parameters("PART_I", {**_BODIES_I, **_LOADS_I, **_SPIN, **_SHARED})
+
+PART_II = Parameters(
+    "PART_II", {**_BODIES_II, **_ROTORS, **_FLIGHT, **_AIR, **_HEXACOPTER, **_SHARED}
+)
+
+# As printed in Table 6.1 [m]; body 1 is at (-0.06393, 0.06393, 0.03041). What the lengths were
+# fitted to (reconstruction.py).
+PRINTED_CENTRES = {
+    "slider_2": (-0.12399, 0.015, 0.0246),
+    "slider_3": (-0.015, 0.12399, 0.0246),
+    "post_4": (-0.0115, 0.01837, 0.09921),
+    "rod_5": (-0.01299, 0.09833, 0.06884),
+    "rod_6": (-0.09231, 0.015, 0.06627),
+    "panel_7": (-0.03428, 0.04289, 0.13656),
+}
 
 # As printed in Table 6.1: not unit (|p7| = 0.9974), and e1 of p4 has the wrong sign. Kept to
 # show what they do; no scene starts from them.

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..algebra.shapes import Numbers
+from ..algebra.stacked import apply
 from ..mechanics.errors import ModelError, check_finite
 from ..mechanics.load import AbstractForce, Load, Signal, evaluate, push, signal
 from ..mechanics.state import Kinematics
@@ -79,7 +80,7 @@ class Rotors(AbstractForce):
         k = kin.index(self.body)
         wrench = self.wrench(evaluate(self.speed_squared, t, kin), kin.com[k])
         R_wb = kin.R_wb[k]
-        return push(kin, self.body, R_wb @ wrench[:3], moment_w=R_wb @ wrench[3:])
+        return push(kin, self.body, apply(R_wb, wrench[:3]), moment_w=apply(R_wb, wrench[3:]))
 
 
 def hover_speed_squared(

@@ -2,90 +2,106 @@
 
     T 1-2, T 1-3 (z)   R 1-4 (x)   R 2-6 (y)   U 3-5   U 4-7   S 5-7   S 6-7
 
-Source: report Part II, section 3.1 (joints); docs/geometry.md (where they are).
+All places follow from a table's lengths ("geometry.") and the panel's angles at the start
+("posture."), so that a changed length moves every joint and the loops stay closed.
+
+Source: report Part II, section 3.1 (joints); docs/geometry.md (lengths).
 """
 
+from typing import Any, NamedTuple
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import rotation_matrix
 from ..algebra.shapes import Numbers
 from ..mechanics.body import Body
-from ..mechanics.errors import StateError, concrete
+from ..mechanics.errors import concrete
 from ..mechanics.joint import Joint, revolute, spherical, translational, universal
+from .geometry import TrackerGeometry, check_closure, initial_angles, tracker_geometry
 from .parameters import Parameters
+from .placement import TRACKER_BODIES, place
 
-TRACKER_BODIES = ("slider_2", "slider_3", "post_4", "rod_5", "rod_6", "panel_7")
 
-# Body, and the joints whose points lie along its z axis, lower one first.
-_LINKS = (("post_4", "R14", "U47"), ("rod_5", "U35", "S57"), ("rod_6", "R26", "S67"))
-_LINK_TOLERANCE = 1e-3  # [rad]
+class _Placed(NamedTuple):
+    """Poses by body, points and axes by joint, in the world."""
+
+    poses: dict[str, tuple[Any, Any]]
+    points: dict[str, Any]
+    axes: dict[str, Any]
+
+
+_POINTS = ("T12", "T13", "R14", "R26", "U35", "U47", "S57", "S67")
+_AXES = ("T12", "T13", "R14", "R26", "U35.i", "U35.j", "U47.i", "U47.j")
+
+
+@jax.jit
+def _place_all(
+    geometry: TrackerGeometry, angles: Float[Array, "2"], shift: Float[Array, "3"]
+) -> tuple[Array, ...]:
+    """Compiled as one, because each small operation alone would cost a compilation."""
+    at = place(geometry, angles)
+    points = jnp.stack([at.points[name] for name in _POINTS])
+    return at.r + shift, at.p, points + shift, jnp.stack([at.axes[name] for name in _AXES])
+
+
+def _placed(parameters: Parameters, shift: Numbers) -> _Placed:
+    geometry, angles = tracker_geometry(parameters), initial_angles(parameters)
+    arrays = _place_all(geometry, angles, jnp.asarray(shift, dtype=float))
+    if concrete(arrays):
+        arrays = tuple(np.asarray(array) for array in arrays)
+        if not np.all(np.isfinite(arrays[0])):
+            check_closure(geometry, angles)
+    r, p, points, axes = arrays
+    return _Placed(
+        {name: (r[k], p[k]) for k, name in enumerate(TRACKER_BODIES)},
+        {name: points[k] for k, name in enumerate(_POINTS)},
+        {name: axes[k] for k, name in enumerate(_AXES)},
+    )
 
 
 def tracker_bodies(parameters: Parameters, shift: Numbers = (0.0, 0.0, 0.0)) -> tuple[Body, ...]:
     """Bodies 2 to 7 at the initial posture, displaced by `shift` (3,) [m].
 
     Raises:
-        ModelError: numbers that no body can have.
-        StateError: Euler parameters that turn a link away from the line of its joints.
+        ModelError: numbers that no body can have, or lengths with which the tracker cannot
+            stand in that posture; the message says which leg, or the post, does not reach.
     """
-    offset = jnp.asarray(shift, dtype=float)
-    bodies = tuple(
+    placed = _placed(parameters, shift)
+    return tuple(
         Body(
             name,
             parameters.value(f"mass.{name}"),
             parameters.value(f"inertia.{name}"),
-            position=jnp.asarray(parameters.value(f"position.{name}"), dtype=float) + offset,
-            orientation=parameters.value(f"orientation.{name}"),
+            position=placed.poses[name][0],
+            orientation=placed.poses[name][1],
             triangle_tolerance=parameters[f"inertia.{name}"].tolerance,
         )
         for name in TRACKER_BODIES
     )
-    for body in bodies:
-        _check_link(body, parameters)
-    return bodies
-
-
-def _check_link(body: Body, parameters: Parameters) -> None:
-    for name, lower, upper in _LINKS:
-        if body.name != name:
-            continue
-        ends = parameters.value(f"point.{lower}"), parameters.value(f"point.{upper}")
-        if not concrete(ends, body.orientation):
-            return
-        along = np.asarray(ends[1], dtype=float) - np.asarray(ends[0], dtype=float)
-        axis = np.asarray(rotation_matrix(body.orientation))[:, 2]
-        angle = float(np.arctan2(np.linalg.norm(np.cross(axis, along)), axis @ along))
-        if angle > _LINK_TOLERANCE:
-            raise StateError(
-                f"The Euler parameters of '{name}' turn it {np.degrees(angle):.3g} degrees away from "
-                f"the line of its joints {lower} and {upper}. The report's Table 6.1 prints e1 of p4 "
-                "with the wrong sign and p5, p6, p7 with few digits: keep the table's posture, or "
-                "take the nearest one that closes from stmuav_jax.assemble."
-            )
 
 
 def tracker_joints(
     parameters: Parameters, base: str, shift: Numbers = (0.0, 0.0, 0.0)
 ) -> tuple[Joint, ...]:
-    """The eight joints on body `base` ("ground" for a fixed tracker), displaced by `shift` [m]."""
-    offset = jnp.asarray(shift, dtype=float)
+    """The eight joints on body `base` ("ground" for a fixed tracker), displaced by `shift` [m].
 
-    def point(name: str) -> Float[Array, "3"]:
-        return jnp.asarray(parameters.value(f"point.{name}"), dtype=float) + offset
+    Raises:
+        ModelError: lengths that cannot be assembled.
+    """
+    placed = _placed(parameters, shift)
+    points, axes = placed.points, placed.axes
 
     def slide(name: str, slider: str) -> Joint:
-        at = jnp.asarray(parameters.value(f"position.{slider}"), dtype=float) + offset
-        return translational(name, base, slider, axis=parameters.value(f"axis.{name}"), point=at)
+        return translational(name, base, slider, axis=axes[name], point=points[name])
 
     def hinge(name: str, i: str, j: str) -> Joint:
-        return revolute(name, i, j, point=point(name), axis=parameters.value(f"axis.{name}"))
+        return revolute(name, i, j, point=points[name], axis=axes[name])
 
     def cross(name: str, i: str, j: str) -> Joint:
-        axes = (parameters.value(f"axis_{side}.{name}") for side in "ij")
-        axis_i, axis_j = axes
-        return universal(name, i, j, point=point(name), axis_i=axis_i, axis_j=axis_j)
+        axis_i, axis_j = axes[f"{name}.i"], axes[f"{name}.j"]
+        return universal(name, i, j, point=points[name], axis_i=axis_i, axis_j=axis_j)
 
     return (
         slide("T12", "slider_2"),
@@ -94,6 +110,6 @@ def tracker_joints(
         hinge("R26", "slider_2", "rod_6"),
         cross("U35", "slider_3", "rod_5"),
         cross("U47", "post_4", "panel_7"),
-        spherical("S57", "rod_5", "panel_7", point=point("S57")),
-        spherical("S67", "rod_6", "panel_7", point=point("S67")),
+        spherical("S57", "rod_5", "panel_7", point=points["S57"]),
+        spherical("S67", "rod_6", "panel_7", point=points["S67"]),
     )

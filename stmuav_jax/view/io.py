@@ -17,6 +17,7 @@ import xarray as xr
 
 from ..dynamics.run import Run
 from ..mechanics.errors import ModelError
+from ..mechanics.internal import internal_names
 from ..vehicle.parameters import Parameters
 
 FORMAT = "stmuav_jax run"
@@ -67,6 +68,13 @@ def to_dataset(run: Run) -> xr.Dataset:
         name: xr.Variable(dims, np.asarray(values), {"units": unit, "description": words})
         for name, (dims, values, unit, words) in table.items()
     }
+    names = internal_names(system)
+    if names:
+        words = "states of forces, units in their names"
+        variable = (("time", "internal_state"), run.trajectory.internal)
+        data["internal"] = xr.Variable(
+            *variable, {"units": "see internal_state", "description": words}
+        )
     coordinates = {
         "time": xr.Variable(("time",), run.ts, {"units": "s", "description": "saved times"}),
         "body": list(system.names),
@@ -75,7 +83,7 @@ def to_dataset(run: Run) -> xr.Dataset:
         "joint": [joint.name for joint in system.joints],
         "joint_body_i": ("joint", [joint.body_i for joint in system.joints]),
         "joint_body_j": ("joint", [joint.body_j for joint in system.joints]),
-    }
+    } | ({"internal_state": list(names)} if names else {})
     return xr.Dataset(data, coordinates, _attributes(run))
 
 

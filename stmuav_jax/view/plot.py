@@ -2,7 +2,9 @@
 
 import io
 import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -104,9 +106,20 @@ def save_figures(
     run: Run, folder: str | os.PathLike[str], suffix: str = "png", dpi: int = 200
 ) -> list[Path]:
     """Draw every figure of a run into `folder` (png, pdf or svg); their paths."""
+    return save_all(FIGURES, run, folder, suffix, dpi)
+
+
+def save_all(
+    figures: Mapping[str, Callable[[Any], Figure]],
+    subject: Any,
+    folder: str | os.PathLike[str],
+    suffix: str = "png",
+    dpi: int = 200,
+) -> list[Path]:
+    """Draw figures of one subject, by their names, into `folder` (png, pdf or svg); their paths."""
     paths = []
-    for name, draw in FIGURES.items():
+    for name, draw in figures.items():
         buffer = io.BytesIO()
-        draw(run).savefig(buffer, format=suffix, dpi=dpi)
+        draw(subject).savefig(buffer, format=suffix, dpi=dpi)
         paths.append(write_atomically(Path(folder) / f"{name}.{suffix}", buffer.getvalue()))
     return paths

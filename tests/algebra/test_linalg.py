@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from helpers import central
 
-from stmuav_jax.algebra.linalg import factorise, solve_general
+from stmuav_jax.algebra.linalg import (
+    factorise,
+    proximal,
+    right_inverse,
+    solve_general,
+    solve_saddle,
+)
 
 N = 7
 
@@ -98,3 +104,42 @@ def test_gradients(rng, redundant, which):
     np.testing.assert_allclose(rate, expected, rtol=1e-6, atol=1e-7 * np.max(np.abs(expected)))
     gradient = jax.grad(lambda t: w @ solution(t))(0.0)
     assert float(gradient) == pytest.approx(float(w @ rate), rel=1e-9)
+
+
+@pytest.mark.parametrize("rank", [3, 6, 7])
+def test_proximal_solves_dependent_rows(rng, rank):
+    """B^T x, the effect of x, is determined even where x is not."""
+    B = rng.normal(size=(N, rank)) * np.logspace(0, 3, N)[:, None]
+    S = B @ B.T
+    b = S @ rng.normal(size=N)
+    x = np.asarray(proximal(jnp.asarray(S)).solve(jnp.asarray(b)))
+    effect, expected = B.T @ x, B.T @ (np.linalg.pinv(S, rcond=1e-13) @ b)
+    np.testing.assert_allclose(effect, expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("redundant", [False, "fast", "minimum norm"])
+def test_saddle(rng, redundant):
+    """Against the whole matrix, solved by NumPy."""
+    M, J = definite(rng), rng.normal(size=(3, N))
+    if redundant:
+        J = np.vstack([J, J[0] + 2 * J[1]])
+    f, g = rng.normal(size=N), J @ rng.normal(size=N)
+    args = (jnp.asarray(a) for a in (M, J, f, g))
+    x, y = solve_saddle(*args, redundant=redundant)
+    K = np.block([[M, -J.T], [J, np.zeros((len(J), len(J)))]])
+    expected = np.linalg.lstsq(K, np.concatenate([f, g]), rcond=1e-11)[0]
+    np.testing.assert_allclose(x, expected[:N], rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(J.T @ y, J.T @ expected[N:], rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("redundant", [False, True])
+def test_right_inverse_is_the_smallest_in_the_metric(rng, redundant):
+    M, J = definite(rng), rng.normal(size=(3, N))
+    if redundant:
+        J = np.vstack([J, J[0] - J[2]])
+    b = J @ rng.normal(size=N)
+    x = np.asarray(right_inverse(jnp.asarray(M), jnp.asarray(J), redundant=redundant)) @ b
+    np.testing.assert_allclose(J @ x, b, rtol=1e-8, atol=1e-9)
+    # M x lies in the range of J^T
+    rest = M @ x - J.T @ np.linalg.lstsq(J.T, M @ x, rcond=1e-11)[0]
+    assert np.max(np.abs(rest)) < 1e-8 * np.max(np.abs(M @ x))

@@ -183,7 +183,7 @@ def test_projection_of_a_vector(seven):
     formulation = sj.Augmented()
     model = formulation.prepare(system)
     zero = jnp.zeros(())
-    project = jax.jit(lambda x: formulation.project(model, zero, x, 3))
+    project = jax.jit(lambda x: formulation.project(model, zero, x, 3)[0])
     residuals = jax.jit(lambda x: formulation.residuals(model, zero, x))
     x = project(formulation.to_vector(model, jax.tree.map(lambda x: x[0], states)))
     assert relative_error(project(x), x) < 1e-13

@@ -38,6 +38,9 @@ def test_rank_and_names(bars):
     assert 1 <= len(found.redundant) <= 3
     assert set(found.redundant) <= set(JOINTS)
     assert found.smallest > 1e-3
+    many, smallest = sj.ranks(system, jax.tree.map(lambda x: jnp.stack([x, x]), state))
+    assert list(many) == [17, 17]
+    np.testing.assert_allclose(smallest, found.smallest, rtol=1e-9)
     assert sj.rank(other, state)[:3] == (17, 17, 1)
     assert sj.rank(other, state).redundant == ()
 

@@ -177,31 +177,39 @@ def test_a_motor_pays_for_the_energy():
 
 
 def drift(how, tolerance=1e-6):
-    """Position residuals of a fast pendulum after 2 and 8 s."""
+    """Largest residuals of a fast pendulum in maximal coordinates, up to 2 s and from 6 to 8 s."""
     system = pendulum()
     start = swung(system, 2.5, 1.0)
+    formulation = sj.Augmented()
     method = sj.Method(
-        rtol=tolerance, atol=tolerance, stabilisation=how, adjoint=diffrax.ForwardMode()
+        formulation=formulation,
+        rtol=tolerance,
+        atol=tolerance,
+        stabilisation=how,
+        adjoint=diffrax.ForwardMode(),
     )
-    formulation = method.formulation
 
     def run(state):
-        found = sj.integrate(system, state, jnp.asarray([0.0, 2.0, 8.0]), method)
+        # at many times: at one moment they depend on where in its swing the pendulum is
+        found = sj.integrate(system, state, jnp.linspace(0.0, 8.0, 81), method)
         model = formulation.prepare(system)
-        at = lambda k: jax.tree.map(lambda x: x[k], found.states)
-        left = lambda s: formulation.residuals(
-            model, jnp.zeros(()), formulation.to_vector(model, s)
-        )
-        return [(x.position, x.velocity, x.norm) for x in (left(at(1)), left(at(2)))], found.worst
+        left = jax.vmap(
+            lambda s: formulation.residuals(model, jnp.zeros(()), formulation.to_vector(model, s))
+        )(found.states)
+        spans = slice(0, 21), slice(60, 81)
+        return [
+            tuple(jnp.max(getattr(left, kind)[span]) for kind in ("position", "velocity", "norm"))
+            for span in spans
+        ]
 
-    return jax.tree.map(float, jax.jit(run)(start)[0])
+    return jax.tree.map(float, jax.jit(run)(start))
 
 
 @pytest.fixture(scope="module")
 def drifts():
     return {
         "none": drift(sj.Unstabilised()),
-        "feedback": drift(sj.Baumgarte(20.0, 20.0, 20.0)),
+        "feedback": drift(sj.Baumgarte(5.0, 5.0, 5.0)),
         "projection": drift(sj.Projection()),
     }
 
@@ -216,9 +224,11 @@ def test_without_stabilisation_it_drifts(drifts):
 def test_feedback_keeps_it_bounded(drifts):
     early, late = drifts["feedback"]
     for kind in range(3):
-        assert 1e-13 < late[kind] < 1.5 * early[kind]
-    assert late[0] < 0.1 * drifts["none"][1][0]
-    assert late[2] < 0.5 * drifts["none"][1][2]
+        # it settles at the errors of a few steps, whose sizes vary with the phase of the swing
+        assert 1e-13 < late[kind] < 2 * early[kind]
+        assert drifts["none"][1][kind] > 2 * drifts["none"][0][kind]
+    assert late[0] < 0.01 * drifts["none"][1][0]
+    assert late[2] < 0.6 * drifts["none"][1][2]
 
 
 def test_projection_keeps_it_at_round_off(drifts):

@@ -13,6 +13,7 @@ from stmuav_jax import (
     PRINTED_ORIENTATIONS,
     SCENES,
     Augmented,
+    ModelError,
     Rotors,
     SettingError,
     State,
@@ -159,11 +160,21 @@ def test_the_cure_works():
     assert float(found.moved) < 5e-3
 
 
-def test_a_posture_table_with_the_printed_sign_of_p4_is_refused():
-    p4 = np.array(PRINTED_ORIENTATIONS["post_4"])
-    table = PART_I.replaced({"orientation.post_4": p4 / np.linalg.norm(p4)})
-    with pytest.raises(StateError, match=r"post_4.*R14 and U47.*wrong sign"):
-        make_scene("tracker", 1, table)
+def test_a_scene_starts_from_another_posture():
+    """The panel level instead of tilted by 23 degrees; the loops close there as well."""
+    table = PART_I.replaced({"posture.phi": 0.0, "posture.theta": 0.0})
+    scene = make_scene("tracker", 1, table)
+    assert np.asarray(scene.state0.p[5]) == pytest.approx([1, 0, 0, 0], abs=1e-15)
+    found = assemble(scene.system, scene.state0)
+    assert float(jnp.max(found.residuals)) < 1e-15
+    assert float(found.moved) < 1e-15
+
+
+@pytest.mark.parametrize("name", ["tracker", "uav_tracker"])
+def test_lengths_that_cannot_be_assembled_name_the_leg(name):
+    table = SCENES[name].parameters.replaced({"geometry.rods": (0.095, 0.01)})
+    with pytest.raises(ModelError, match=r"Leg 3 cannot be assembled.*rod is 10 mm long.*arms"):
+        make_scene(name, 1, table)
 
 
 def test_unknown_scenes_and_cases_are_refused():

@@ -1,0 +1,94 @@
+"""What the suite asks of a program that it measures: ours and every peer alike.
+
+A peer is one module in `benchmarks/peers/` with one class derived from `Peer`. It gets the
+same `Scene` as we do and builds its own model from it, so that all solve the same problem.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from stmuav_jax import Scene
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One point of a work-precision curve: a tolerance of adaptive steps, or a fixed step [s]."""
+
+    solver: str
+    tolerance: float | None = None
+    step: float | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one run gives.
+
+    Attributes:
+        positions: centres of mass at the wanted times, world (k, n, 3) [m]; not finite from
+            where the run failed.
+        evaluations: of accelerations; None where the program does not count.
+        accepted, rejected: steps. residual: largest constraint violation [m].
+        seconds: timed by the program itself (a program of its own cannot be timed from
+            here without its start); None: the suite's timer counts.
+        failure: in words; empty if it reached the end.
+    """
+
+    positions: np.ndarray
+    evaluations: int | None = None
+    accepted: int | None = None
+    rejected: int | None = None
+    residual: float | None = None
+    seconds: list[float] | None = None
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A run that is ready to be timed: `run()` does the whole integration and waits for it."""
+
+    run: Callable[[], Outcome]
+    compile_seconds: float = 0.0
+
+
+class Peer(ABC):
+    """A program to compare with.
+
+    Attributes:
+        name: in tables and figures. packages: what pip installs for it.
+        caveats: what it leaves out or solves differently, one sentence each.
+    """
+
+    name: str
+    packages: tuple[str, ...] = ()
+    caveats: tuple[str, ...] = ()
+
+    @abstractmethod
+    def missing(self) -> str:
+        """Why it cannot run here (not installed, no compiler); empty if it can."""
+
+    def version(self) -> str:
+        """Version of the measured program."""
+        return ""
+
+    def unsupported(self, scene: Scene) -> str:
+        """Why it cannot model this scene; empty if it can."""
+        del scene
+        return ""
+
+    @abstractmethod
+    def settings(self) -> list[Setting]:
+        """From coarse to fine."""
+
+    @abstractmethod
+    def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
+        """Build the model and, where there is something to compile, compile it."""
+
+    def acceleration_seconds(self, scene: Scene) -> float | None:
+        """Cost of one evaluation of all accelerations at the start [s], in a tight loop."""
+        del scene
+        return None

@@ -1,0 +1,213 @@
+"""Exudyn: rigid bodies in redundant coordinates, joints, implicit generalised-alpha.
+
+Explicit methods refuse joints there, so the implicit one of second order is its only choice.
+"""
+
+import importlib.util
+import math
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+from adapter import Outcome, Peer, Prepared, Setting
+
+from stmuav_jax import Scene
+
+from .mujoco_c import whole_steps
+from .plain import Plain, Start, plain, start, why_not
+
+# Constrained axes (x, y, z, about x, about y, about z) of its generic joint.
+_AXES = {
+    "spherical": [1, 1, 1, 0, 0, 0],
+    "universal": [1, 1, 1, 0, 0, 1],
+    "revolute": [1, 1, 1, 1, 1, 0],
+    "translational": [1, 1, 0, 1, 1, 1],
+}
+
+
+class Mechanism:
+    """Exudyn's model of a scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        import exudyn  # pyright: ignore[reportMissingImports]
+        from exudyn import itemInterface  # pyright: ignore[reportMissingImports]
+
+        self.exu: Any = exudyn
+        self.items: Any = itemInterface
+        self.model, self.first = plain(scene), start(scene)
+        self.container = self.exu.SystemContainer()
+        self.mbs = self.container.AddSystem()
+        self.bodies = [self._body(k) for k in range(self.model.n)]
+        self.bodies.append(self.mbs.CreateGround())
+        for joint in self.model.joints:
+            ends = [
+                self._marker(joint.i, joint.point_i, joint.frame_i),
+                self._marker(joint.j, joint.point_j, joint.frame_j),
+            ]
+            axes = _AXES[joint.kind]
+            self.mbs.AddObject(self.items.GenericJoint(markerNumbers=ends, constrainedAxes=axes))
+        self._loads(self.model, self.first)
+        self.sensors = [
+            self._sensor(body, self.exu.OutputVariableType.Position) for body in self.bodies[:-1]
+        ]
+        self.mbs.Assemble()
+
+    def _body(self, k: int) -> Any:
+        from exudyn.rigidBodyUtilities import (  # pyright: ignore[reportMissingImports]
+            RigidBodyInertia,
+        )
+
+        s, R = self.first, self.first.R_wb[k]
+        return self.mbs.CreateRigidBody(
+            inertia=RigidBodyInertia(self.model.mass[k], self.model.inertia[k]),
+            referencePosition=s.r[k],
+            referenceRotationMatrix=R,
+            initialVelocity=s.v[k],
+            initialAngularVelocity=R @ s.omega[k],
+            gravity=self.model.gravity,
+            show=False,
+        )
+
+    def _marker(self, body: int, point: np.ndarray, frame: np.ndarray | None = None) -> Any:
+        place = self.exu.HT(rotation=np.eye(3) if frame is None else frame, translation=point)
+        return self.mbs.AddMarker(
+            self.items.MarkerBodyRigid(bodyNumber=self.bodies[body], localHT=place)
+        )
+
+    def _sensor(self, body: Any, quantity: Any) -> Any:
+        return self.mbs.AddSensor(
+            self.items.SensorBody(bodyNumber=body, outputVariableType=quantity, storeInternal=True)
+        )
+
+    def _loads(self, model: Plain, first: Start) -> None:
+        R = first.R_wb
+        zero = np.zeros(3)
+        for k, force, moment in model.wrenches:
+            at = self._marker(k, zero)
+            for make, vector in ((self.items.Force, force), (self.items.Torque, moment)):
+                self.mbs.AddLoad(make(markerNumber=at, loadVector=vector, bodyFixed=True))
+        for act in model.actuators:
+            b, s = act.base, act.slider
+            along = act.force.amplitude * np.eye(3)[2]
+            # the slider cannot turn on the base, so the actuator's axis is fixed in it as well
+            arm = R[s].T @ (first.r[b] + R[b] @ act.arm - first.r[s])
+            on_slider = R[s].T @ R[b] @ along
+            for body, point, force in ((b, act.arm, -along), (s, arm, on_slider)):
+                at = self._marker(body, point)
+                self._wave(at, force, act.force.rate, act.force.phase, body_fixed=True)
+        for k, force in model.forces:
+            at = self._marker(k, zero)
+            self._wave(at, force.amplitude, force.rate, force.phase, body_fixed=False)
+
+    def _wave(
+        self, marker: Any, amplitude: np.ndarray, rate: float, phase: float, *, body_fixed: bool
+    ) -> None:
+        x, y, z = (float(a) for a in amplitude)
+
+        def value(mbs: Any, t: float, load: Any) -> list[float]:
+            del mbs, load
+            now = math.sin(rate * t + phase)
+            return [x * now, y * now, z * now]
+
+        force = self.items.Force(
+            markerNumber=marker, loadVector=amplitude, bodyFixed=body_fixed,
+            loadVectorUserFunction=value,
+        )  # fmt: skip
+        self.mbs.AddLoad(force)
+
+    def settings(self, t0: float, end: float, steps: int, write_period: float) -> Any:
+        """Fixed steps, files and messages off."""
+        s = self.exu.SimulationSettings()
+        s.timeIntegration.startTime, s.timeIntegration.endTime = t0, end
+        s.timeIntegration.numberOfSteps = steps
+        # where Newton's method fails, shorter steps for a while; otherwise the step is fixed
+        s.timeIntegration.adaptiveStep = True
+        s.timeIntegration.verboseMode = 0
+        s.solution.file.write = False
+        s.solution.sensors.writePeriod = write_period
+        s.linearSolver.solverType = self.exu.LinearSolverType.EigenSparse
+        s.show.computationTime = s.show.statistics = False
+        return s
+
+    def solve(self, settings: Any) -> bool:
+        """One run from the start; whether it reached the end."""
+        try:
+            kind = self.exu.DynamicSolverType.GeneralizedAlpha
+            return bool(
+                self.mbs.SolveDynamic(
+                    settings, solverType=kind, showHints=False, showCausingItems=False
+                )
+            )
+        except (ValueError, RuntimeError):
+            return False
+
+    def stored(self, sensors: list[Any]) -> np.ndarray:
+        """Times and values of sensors (n, k, 4)."""
+        return np.stack([self.mbs.GetSensorStoredData(sensor) for sensor in sensors])
+
+
+class ExudynPeer(Peer):
+    """Exudyn with its default generalised-alpha (spectral radius 0.9, index 3)."""
+
+    name = "Exudyn, generalised-alpha"
+    packages = ("exudyn",)
+    caveats = (
+        "Actuator forces are Python functions, called at every step.",
+        "Joint residuals are not reported.",
+    )
+
+    def missing(self) -> str:
+        if importlib.util.find_spec("exudyn") is None:
+            return "The package exudyn is not installed."
+        return ""
+
+    def version(self) -> str:
+        return metadata.version("exudyn")
+
+    def unsupported(self, scene: Scene) -> str:
+        if reason := why_not(scene):
+            return reason
+        model = plain(scene)
+        slides = {frozenset((j.i, j.j)) for j in model.joints if j.kind == "translational"}
+        if any(frozenset((a.base, a.slider)) not in slides for a in model.actuators):
+            return "An actuator pushes a body that does not slide on its base."
+        return ""
+
+    def settings(self) -> list[Setting]:
+        steps = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5)
+        return [Setting("generalised-alpha", step=step) for step in steps]
+
+    def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
+        mechanism, step = Mechanism(scene), setting.step or 1e-3
+        counts = whole_steps(scene.t0, times, step)
+        # sensors write with a period, so that of all wanted times
+        stride = int(np.gcd.reduce(counts))
+        end = float(times[-1])
+        settings = mechanism.settings(scene.t0, end, int(counts[-1]), stride * step)
+
+        def run() -> Outcome:
+            done = mechanism.solve(settings)
+            stored = mechanism.stored(mechanism.sensors)
+            positions = np.full((len(times), mechanism.model.n, 3), np.nan)
+            for k, t in enumerate(times):
+                near = np.flatnonzero(np.abs(stored[0, :, 0] - t) < 0.1 * step)
+                if len(near):
+                    positions[k] = stored[:, near[0], 1:]
+            return Outcome(
+                positions,
+                accepted=int(counts[-1]) if done else None,
+                rejected=0,
+                failure="" if done else "Newton's method did not converge.",
+            )
+
+        return Prepared(run)
+
+    def start_accelerations(self, scene: Scene) -> np.ndarray:
+        """Of the centres of mass at the start, world (n, 3) [m/s^2]."""
+        mechanism = Mechanism(scene)
+        kind = mechanism.exu.OutputVariableType.Acceleration
+        sensors = [mechanism._sensor(body, kind) for body in mechanism.bodies[:-1]]
+        mechanism.mbs.Assemble()
+        step = 1e-6
+        mechanism.solve(mechanism.settings(scene.t0, scene.t0 + step, 1, step))
+        return mechanism.stored(sensors)[:, 0, 1:]

@@ -1,0 +1,279 @@
+"""MuJoCo: a tree with `connect` constraints, fourth-order Runge-Kutta at a fixed step.
+
+MuJoCo's constraints are soft. The hardest that it admits are used: impedance 0.9999 and a
+time constant of two steps. Whole runs go through `mujoco.rollout`, without Python in between.
+"""
+
+import importlib
+import importlib.util
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+from adapter import Outcome, Peer, Prepared, Setting
+
+from stmuav_jax import Scene, State
+
+from .pinocchio_model import LinkModel, link_model, why_no_joint_forces
+from .plain import Sinus, Start, loop_seconds, plain, start, starts
+from .tree import Tree, coordinates, span
+
+_AXES = {"turn": ("hinge", "z"), "slide": ("slide", "z"), "universal": ("hinge", "xy")}
+_UNIT = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+
+
+def mjcf(links: LinkModel, step: float, iterations: int = 100) -> str:
+    """The model in MuJoCo's own format, every body's frame being its link's."""
+    out = [
+        '<mujoco><compiler angle="radian" balanceinertia="false" boundmass="0" '
+        'inertiafromgeom="false" fusestatic="false"/>',
+        f'<option timestep="{step!r}" integrator="RK4" gravity="{_text(links.gravity)}" '
+        f'solver="Newton" iterations="{iterations}" tolerance="1e-14" jacobian="dense">',
+        '<flag contact="disable" autoreset="disable" warmstart="disable"/></option><worldbody>',
+        *_bodies(links, -1),
+        *_sites(links, -1),
+        "</worldbody><equality>",
+    ]
+    soft = f'solref="{2 * step!r} 1" solimp="0.9999 0.9999 0.001 0.5 2"'
+    out += [f'<connect site1="cut{k}a" site2="cut{k}b" {soft}/>' for k in range(len(links.cuts))]
+    out.append("</equality><actuator>")
+    for k, (_, force, moment) in enumerate(links.wrenches):
+        out.append(f'<motor site="wrench{k}" gear="{_text([*force, *moment])}"/>')
+    for slider, gain in _pushes(links):
+        out.append(f'<motor joint="joint{slider}z" gear="{gain!r}"/>')
+    return "\n".join([*out, "</actuator></mujoco>"])
+
+
+def _text(numbers: object) -> str:
+    return " ".join(repr(float(x)) for x in np.ravel(np.asarray(numbers)))
+
+
+def _bodies(links: LinkModel, parent: int) -> list[str]:
+    """The links behind `parent`, each with those behind it."""
+    out = []
+    for k, link in enumerate(links.links):
+        if link.parent != parent:
+            continue
+        F, J = link.placement, link.inertia
+        frame = " ".join([_text(F.R[:, 0]), _text(F.R[:, 1])])
+        out.append(f'<body name="link{k}" pos="{_text(F.x)}" xyaxes="{frame}">')
+        upper = (J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2])
+        out.append(
+            f'<inertial pos="{_text(link.com)}" mass="{link.mass!r}" fullinertia="{_text(upper)}"/>'
+        )
+        if link.kind == "free":
+            out.append("<freejoint/>")
+        else:
+            kind, axes = _AXES[link.kind]
+            out += [f'<joint name="joint{k}{a}" type="{kind}" axis="{_UNIT[a]}"/>' for a in axes]
+        out += [*_sites(links, k), *_bodies(links, k), "</body>"]
+    return out
+
+
+def _sites(links: LinkModel, link: int) -> list[str]:
+    """Where cut joints and constant wrenches hold on a link."""
+    out = []
+    for k, (a, x, b, y) in enumerate(links.cuts):
+        out += [f'<site name="cut{k}a" pos="{_text(x)}"/>'] if a == link else []
+        out += [f'<site name="cut{k}b" pos="{_text(y)}"/>'] if b == link else []
+    for k, (at, _, _) in enumerate(links.wrenches):
+        out += [f'<site name="wrench{k}"/>'] if at == link else []
+    return out
+
+
+def _pushes(links: LinkModel) -> list[tuple[int, float]]:
+    """Slides that are pushed, with the amplitude [N]; actuators first, then forces."""
+    pushes = []
+    for _, slider, _, axis, force in links.actuators:
+        along = links.links[slider].placement.R[:, 2] @ axis
+        pushes.append((slider, float(along * force.amplitude)))
+    for k, _, force in links.forces:
+        pushes.append((k, float(links.links[k].placement.R[:, 2] @ force.amplitude)))
+    return pushes
+
+
+def why_no_mujoco(scene: Scene) -> str:
+    """Why the models made here cannot hold a scene; empty if they can."""
+    # motors act in joint coordinates too
+    if reason := why_no_joint_forces(scene):
+        return reason
+    try:
+        World(scene, 1e-3)
+    except ValueError as error:
+        return " ".join(str(error).split())
+    return ""
+
+
+class World:
+    """MuJoCo's model of a scene at one step."""
+
+    def __init__(self, scene: Scene, step: float) -> None:
+        mujoco: Any = importlib.import_module("mujoco")
+        self.mujoco = mujoco
+        # or failures would be written into a file in the working directory
+        mujoco.set_mju_user_warning(lambda _: None)
+        numbers = plain(scene)
+        self.tree: Tree = span(numbers)
+        self.links = link_model(numbers, self.tree)
+        self.model = mujoco.MjModel.from_xml_string(mjcf(self.links, step))
+        self.data = mujoco.MjData(self.model)
+        self.step, self.t0 = step, scene.t0
+        self.order = [self.model.body(f"link{k}").id for k, _ in self.links.bodies]
+
+    def begin(self, state: Start) -> np.ndarray:
+        """Put the data at a start; returns MuJoCo's physics state."""
+        mujoco, steps = self.mujoco, coordinates(self.tree, state)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.time = self.t0
+        # links are in depth-first order, and so are MuJoCo's joints
+        self.data.qpos[:] = np.concatenate([q for q, _ in steps])
+        self.data.qvel[:] = np.concatenate([v for _, v in steps])
+        self.data.ctrl[:] = self.control(1)[0]
+        mujoco.mj_forward(self.model, self.data)
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        first = np.empty(mujoco.mj_stateSize(self.model, kind))
+        mujoco.mj_getState(self.model, self.data, first, kind)
+        return first
+
+    def waves(self) -> list[Sinus]:
+        """The forces that swing in time, in the order of the controls."""
+        return [force for *_, force in (*self.links.actuators, *self.links.forces)]
+
+    def control(self, count: int) -> np.ndarray:
+        """Controls of every step (count, m): the mean of each signal over the step."""
+        h = self.step
+        t = self.t0 + h * np.arange(count)
+        columns = [np.ones(count)] * len(self.links.wrenches)
+        for s in self.waves():
+            # sin(x) / x at half the angle of a step; NumPy's sinc has pi inside
+            mean = np.sinc(0.5 * s.rate * h / np.pi)
+            columns.append(mean * np.sin(s.rate * (t + 0.5 * h) + s.phase))
+        return np.stack(columns, axis=1) if columns else np.zeros((count, 0))
+
+    def positions(self, physics: np.ndarray) -> tuple[np.ndarray, float]:
+        """Centres of mass (n, 3) and the largest gap of a cut joint [m]."""
+        mujoco, model, data = self.mujoco, self.model, self.data
+        mujoco.mj_setState(model, data, physics, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_kinematics(model, data)
+        gaps = [
+            np.linalg.norm(data.site(f"cut{k}a").xpos - data.site(f"cut{k}b").xpos)
+            for k in range(len(self.links.cuts))
+        ]
+        return data.xipos[self.order].copy(), float(max(gaps, default=0.0))
+
+
+def whole_steps(t0: float, times: np.ndarray, step: float) -> np.ndarray:
+    """How many steps lead to each wanted time.
+
+    Raises:
+        ValueError: a time that the step does not divide.
+    """
+    counts = np.rint((np.asarray(times) - t0) / step).astype(int)
+    if np.any(np.abs(t0 + counts * step - times) > 1e-9):
+        raise ValueError(f"Steps of {step} s do not end at the wanted times {times} s.")
+    return counts
+
+
+class MujocoC(Peer):
+    """MuJoCo's C engine through its Python bindings."""
+
+    name = "MuJoCo (C), RK4"
+    packages = ("mujoco",)
+    caveats = (
+        "Loop constraints are soft; the hardest admitted setting is used.",
+        "Actuator forces are held at their mean over each step.",
+    )
+
+    def missing(self) -> str:
+        if importlib.util.find_spec("mujoco") is None:
+            return "The package mujoco is not installed."
+        return ""
+
+    def version(self) -> str:
+        return metadata.version("mujoco")
+
+    def unsupported(self, scene: Scene) -> str:
+        return why_no_mujoco(scene)
+
+    def settings(self) -> list[Setting]:
+        steps = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1.6e-5)
+        return [Setting("RK4", step=step) for step in steps]
+
+    def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
+        rollout: Any = importlib.import_module("mujoco.rollout")
+
+        world = World(scene, setting.step or 1e-3)
+        counts = whole_steps(scene.t0, times, world.step)
+        first, controls = world.begin(start(scene)), world.control(int(counts[-1]))
+
+        def run() -> Outcome:
+            states, _ = rollout.rollout(
+                world.model, world.data, first[None], controls[None], nstep=len(controls)
+            )
+            path = np.concatenate([first[None], states[0]])
+            positions, worst = np.full((len(times), len(world.order), 3), np.nan), 0.0
+            for k, count in enumerate(counts):
+                if np.all(np.isfinite(path[count])):
+                    positions[k], gap = world.positions(path[count])
+                    worst = max(worst, gap)
+            failed = not np.all(np.isfinite(positions))
+            return Outcome(
+                positions,
+                4 * len(controls),
+                len(controls),
+                0,
+                residual=worst,
+                failure="The state is not finite." if failed else "",
+            )
+
+        return Prepared(run)
+
+    def acceleration_seconds(self, scene: Scene) -> float | None:
+        world = World(scene, 1e-4)
+        world.begin(start(scene))
+        return loop_seconds(lambda: world.mujoco.mj_forward(world.model, world.data))
+
+    def start_accelerations(self, scene: Scene) -> np.ndarray:
+        """Of the centres of mass at the start, world (n, 3) [m/s^2]."""
+        world = World(scene, 1e-5)
+        world.begin(start(scene))
+        mujoco, model, data = world.mujoco, world.model, world.data
+        # forces at the very start, not their mean over the first step
+        data.ctrl[:] = [1.0] * len(world.links.wrenches) + [
+            np.sin(s.rate * scene.t0 + s.phase) for s in world.waves()
+        ]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_rnePostConstraint(model, data)
+        result, six = [], np.empty(6)
+        for body in world.order:
+            kind = mujoco.mjtObj.mjOBJ_BODY
+            mujoco.mj_objectAcceleration(model, data, kind, body, six, 0)
+            result.append(six[3:] + world.links.gravity)
+        return np.stack(result)
+
+    def throughput(
+        self, scene: Scene, states: State, t1: float, setting: Setting, threads: int = 1
+    ) -> tuple[float, np.ndarray]:
+        """Trajectories per second of a rollout on some threads, and where they end.
+
+        Args:
+            states: consistent starts, arrays (k, n, .). t1: end [s].
+
+        Returns:
+            The median rate of three [1/s]; centres of mass at t1 (k, n, 3) [m].
+        """
+        rollout: Any = importlib.import_module("mujoco.rollout")
+
+        world = World(scene, setting.step or 1e-3)
+        count = int(whole_steps(scene.t0, np.array([t1]), world.step)[0])
+        first = np.stack([world.begin(state) for state in starts(states)])
+        controls = np.broadcast_to(world.control(count), (len(first), count, world.model.nu))
+        datas = [world.mujoco.MjData(world.model) for _ in range(max(threads, 1))]
+        with rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
+
+            def call() -> np.ndarray:
+                return pool.rollout(world.model, datas, first, controls, nstep=count)[0]
+
+            seconds = loop_seconds(call, loops=1, repeats=3)
+            ends = call()[:, -1]
+        return len(first) / seconds, np.stack([world.positions(end)[0] for end in ends])

@@ -1,0 +1,212 @@
+"""Pinocchio in C++ with Boost's Runge-Kutta-Fehlberg 7(8); compiled on first use and kept.
+
+Only headers are needed: Pinocchio's, Boost's and Eigen's, as the wheels `pin` and
+`cmeel-eigen` (or the system) bring them. The compiler takes about two minutes.
+"""
+
+import functools
+import hashlib
+import importlib.util
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+from adapter import Outcome, Peer, Prepared, Setting
+
+from stmuav_jax import Scene, State
+
+from .pinocchio_model import link_model, model_text, start_vectors, starts_text
+from .plain import Start, plain, start, starts, why_not
+from .tree import span, why_no_tree
+
+SOURCE = Path(__file__).with_suffix(".cpp")
+# The limits are those that Pinocchio's own build files ask for.
+FLAGS = (
+    "-std=c++17",
+    "-O3",
+    "-march=native",
+    "-DNDEBUG",
+    "-w",
+    "-DBOOST_MPL_LIMIT_LIST_SIZE=30",
+    "-DBOOST_MPL_LIMIT_VECTOR_SIZE=30",
+    "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
+    "-DBOOST_FUSION_INVOKE_MAX_ARITY=12",
+)
+Words = dict[str, list[list[float]]]
+
+
+def include_folders() -> dict[str, Path | None]:
+    """Where the headers of Pinocchio, Boost and Eigen are; None for those not found."""
+    found = importlib.util.find_spec("cmeel")
+    roots = [Path("/usr/include"), Path("/usr/local/include")]
+    if found and found.origin:
+        roots.insert(0, Path(found.origin).parents[1] / "cmeel.prefix" / "include")
+    wanted = {
+        "Pinocchio": "pinocchio/algorithm/crba.hpp",
+        "Boost odeint": "boost/numeric/odeint.hpp",
+        "Eigen": "Eigen/Core",
+    }
+    folders = [*roots, *(root / "eigen3" for root in roots)]
+    return {
+        name: next((folder for folder in folders if (folder / file).exists()), None)
+        for name, file in wanted.items()
+    }
+
+
+def compiler() -> str | None:
+    """Path of the C++ compiler."""
+    return shutil.which(os.environ.get("CXX", "g++"))
+
+
+@functools.cache
+def program_path() -> Path:
+    """Where the compiled program of this source, compiler, headers and processor is kept."""
+    version = subprocess.run([str(compiler()), "--version"], capture_output=True, check=True).stdout
+    # -march=native: the program of one processor may not run on another
+    cpu = Path("/proc/cpuinfo")
+    flags = (
+        [x for x in cpu.read_text().splitlines() if x.startswith("flags")] if cpu.exists() else []
+    )
+    sources = b"".join(SOURCE.with_suffix(x).read_bytes() for x in (".hpp", ".cpp"))
+    key = hashlib.sha256(sources + version)
+    for text in (*FLAGS, *flags[:1], metadata.version("pin")):
+        key.update(text.encode())
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return cache / "stmuav-benchmarks" / f"pinocchio_cpp_{key.hexdigest()[:16]}"
+
+
+def compile_program() -> tuple[Path, float]:
+    """The program, compiled if it is not yet there, and the seconds that this took.
+
+    Raises:
+        RuntimeError: the compiler's message.
+    """
+    path = program_path()
+    if path.exists():
+        return path, 0.0
+    path.parent.mkdir(parents=True, exist_ok=True)
+    includes = [x for folder in set(include_folders().values()) for x in ("-isystem", str(folder))]
+    clock = time.perf_counter()
+    # under another name first, so that an interrupted build is not taken for the program
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        built = Path(folder) / "program"
+        command = [str(compiler()), *FLAGS, *includes, str(SOURCE), "-o", str(built)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"Compiling {SOURCE.name} failed:\n{done.stderr[-2000:]}")
+        built.rename(path)
+    return path, time.perf_counter() - clock
+
+
+class Texts:
+    """A scene's model and starts, as the program reads them from two files."""
+
+    def __init__(self, scene: Scene, states: list[Start] | None = None) -> None:
+        numbers = plain(scene)
+        tree = span(numbers)
+        states = states if states is not None else [start(scene)]
+        self.model = model_text(link_model(numbers, tree))
+        self.starts = starts_text([(scene.t0, *start_vectors(tree, state)) for state in states])
+        self.bodies = numbers.n
+
+    def call(self, program: Path, mode: str, *arguments: float) -> Words:
+        """Run the program in a mode; its lines by their first word.
+
+        Raises:
+            RuntimeError: what it wrote when it failed.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            names = Path(folder) / "model", Path(folder) / "starts"
+            names[0].write_text(self.model)
+            names[1].write_text(self.starts)
+            command = [str(x) for x in (program, mode, *names)]
+            command += [f"{x:.17g}" for x in arguments]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"{program.name} {mode} failed: {done.stderr.strip()}")
+        words: Words = {}
+        for line in done.stdout.splitlines():
+            name, *numbers = line.split()
+            words.setdefault(name, []).append([float(x) for x in numbers])
+        return words
+
+
+class PinocchioCpp(Peer):
+    """Pinocchio as a C++ user would write it; the program times itself."""
+
+    name = "Pinocchio (C++), Boost rkf78"
+    packages = ("pin", "cmeel-eigen")
+    caveats = ("Its compile time is the C++ compiler's, once for all scenes.",)
+    repeats = 5
+
+    def missing(self) -> str:
+        if importlib.util.find_spec("pinocchio") is None:
+            return "The package pin is not installed."
+        if compiler() is None:
+            return "There is no C++ compiler (g++, or what CXX names)."
+        lacking = [name for name, folder in include_folders().items() if folder is None]
+        return f"No headers of {', '.join(lacking)} were found." if lacking else ""
+
+    def version(self) -> str:
+        return metadata.version("pin")
+
+    def unsupported(self, scene: Scene) -> str:
+        return why_not(scene) or why_no_tree(plain(scene))
+
+    def settings(self) -> list[Setting]:
+        return [Setting("rkf78", tolerance=10.0**-k) for k in (4, 5, 6, 7, 8, 9, 10, 11, 12)]
+
+    def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
+        program, seconds = compile_program()
+        texts, tolerance = Texts(scene), setting.tolerance or 1e-6
+
+        def run() -> Outcome:
+            words = texts.call(program, "run", tolerance, self.repeats, *times)
+            positions = np.full((len(times), texts.bodies, 3), np.nan)
+            for k, row in enumerate(words.get("positions", [])):
+                positions[k] = np.reshape(row, (-1, 3))
+            failed = bool(words["failed"][0][0])
+            return Outcome(
+                positions,
+                int(words["evaluations"][0][0]),
+                int(words["accepted"][0][0]),
+                int(words["rejected"][0][0]),
+                residual=words["residual"][0][0],
+                seconds=[row[0] for row in words["seconds"]],
+                failure="The step became too small, or the state not finite." if failed else "",
+            )
+
+        return Prepared(run, seconds)
+
+    def acceleration_seconds(self, scene: Scene) -> float | None:
+        program, _ = compile_program()
+        words = Texts(scene).call(program, "cost", 20_000)
+        return float(np.median(words["seconds"]))
+
+    def start_accelerations(self, scene: Scene) -> np.ndarray:
+        """Of the centres of mass at the start, world (n, 3) [m/s^2]."""
+        program, _ = compile_program()
+        words = Texts(scene).call(program, "cost", 1)
+        return np.reshape(words["accelerations"][0], (-1, 3))
+
+    def throughput(
+        self, scene: Scene, states: State, t1: float, setting: Setting
+    ) -> tuple[float, np.ndarray]:
+        """Trajectories per second on one thread, one after the other, and where they end.
+
+        Args:
+            states: consistent starts, arrays (k, n, .). t1: end [s].
+
+        Returns:
+            The median rate [1/s]; centres of mass at t1 (k, n, 3) [m].
+        """
+        program, _ = compile_program()
+        texts, tolerance = Texts(scene, starts(states)), setting.tolerance or 1e-6
+        words = texts.call(program, "many", tolerance, self.repeats, t1)
+        ends = np.reshape(words["positions"], (-1, texts.bodies, 3))
+        return len(ends) / float(np.median(words["seconds"])), ends

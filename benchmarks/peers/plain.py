@@ -1,0 +1,215 @@
+"""A scene in plain NumPy numbers, from which every peer builds its own model.
+
+All is measured from the bodies' centres of mass, in body axes, so that a peer needs no
+reference frames. Ground is body n, at the origin.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stmuav_jax import (
+    AppliedForce,
+    AppliedMoment,
+    Gravity,
+    LinearActuator,
+    Rotors,
+    Scene,
+    Sine,
+    State,
+)
+
+# Rows that each joint removes; also the joints that a peer has to know.
+ROWS = {"translational": 5, "revolute": 5, "universal": 4, "spherical": 3}
+
+
+class UnsupportedError(Exception):
+    """A scene holds something that the peers' models do not know."""
+
+
+@dataclass(frozen=True)
+class Sinus:
+    """The signal amplitude * sin(rate * t + phase)."""
+
+    amplitude: np.ndarray
+    rate: float
+    phase: float
+
+    def __call__(self, t: float) -> np.ndarray:
+        return self.amplitude * np.sin(self.rate * t + self.phase)
+
+
+@dataclass(frozen=True)
+class PlainJoint:
+    """A joint: kind, bodies, and on each body a point (3,) [m] and a frame (3, 3)."""
+
+    kind: str
+    i: int
+    j: int
+    point_i: np.ndarray
+    point_j: np.ndarray
+    frame_i: np.ndarray
+    frame_j: np.ndarray
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """A force pair along the base's z axis through the point `arm` of the base."""
+
+    base: int
+    slider: int
+    arm: np.ndarray
+    force: Sinus
+
+
+@dataclass(frozen=True)
+class Plain:
+    """Bodies, joints and loads of a scene.
+
+    Attributes:
+        mass (n,) [kg], inertia (n, 3, 3) [kg m^2].
+        wrenches: (body, force, moment), constant in body axes.
+        forces: (body, force), at the centre of mass in world axes.
+    """
+
+    names: tuple[str, ...]
+    mass: np.ndarray
+    inertia: np.ndarray
+    joints: tuple[PlainJoint, ...]
+    gravity: np.ndarray
+    wrenches: tuple[tuple[int, np.ndarray, np.ndarray], ...]
+    actuators: tuple[Actuator, ...]
+    forces: tuple[tuple[int, Sinus], ...]
+
+    @property
+    def n(self) -> int:
+        """Number of moving bodies."""
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class Start:
+    """A consistent state: r, v (n, 3) world, R_wb (n, 3, 3), omega (n, 3) body axes."""
+
+    r: np.ndarray
+    p: np.ndarray
+    v: np.ndarray
+    omega: np.ndarray
+
+    @property
+    def R_wb(self) -> np.ndarray:
+        """Body-to-world rotations (n, 3, 3)."""
+        return np.stack([rotation(p) for p in self.p])
+
+
+def rotation(p: np.ndarray) -> np.ndarray:
+    """Body-to-world rotation of unit Euler parameters."""
+    e0, e1, e2, e3 = p / np.linalg.norm(p)
+    return np.array(
+        [
+            [1 - 2 * (e2 * e2 + e3 * e3), 2 * (e1 * e2 - e0 * e3), 2 * (e1 * e3 + e0 * e2)],
+            [2 * (e1 * e2 + e0 * e3), 1 - 2 * (e1 * e1 + e3 * e3), 2 * (e2 * e3 - e0 * e1)],
+            [2 * (e1 * e3 - e0 * e2), 2 * (e2 * e3 + e0 * e1), 1 - 2 * (e1 * e1 + e2 * e2)],
+        ]
+    )
+
+
+def start(scene: Scene) -> Start:
+    """The scene's initial state in NumPy."""
+    s = scene.state0
+    return Start(*(np.asarray(x, dtype=float) for x in (s.r, s.p, s.v, s.omega)))
+
+
+def plain(scene: Scene) -> Plain:
+    """The scene in plain numbers.
+
+    Raises:
+        UnsupportedError: a joint or force that the peers' models do not know.
+    """
+    system = scene.system
+    names = system.names
+    com = np.concatenate([np.asarray(system.bodies.com, dtype=float), np.zeros((1, 3))])
+    index = {name: k for k, name in enumerate((*names, "ground"))}
+    joints = []
+    for joint in system.joints:
+        if joint.kind not in ROWS:
+            raise UnsupportedError(f"Joint '{joint.name}' is of kind {joint.kind}.")
+        i, j = index[joint.body_i], index[joint.body_j]
+        points = np.asarray(joint.point_i) - com[i], np.asarray(joint.point_j) - com[j]
+        frames = np.asarray(joint.frame_i), np.asarray(joint.frame_j)
+        joints.append(PlainJoint(joint.kind, i, j, *points, *frames))
+    gravity, wrenches, actuators, forces = _loads(scene, index, com)
+    return Plain(
+        names,
+        np.asarray(system.bodies.mass, dtype=float),
+        np.asarray(system.bodies.inertia, dtype=float),
+        tuple(joints),
+        gravity,
+        tuple(wrenches),
+        tuple(actuators),
+        tuple(forces),
+    )
+
+
+def _loads(scene: Scene, index: dict[str, int], com: np.ndarray) -> tuple:
+    gravity, wrenches, actuators, forces = np.zeros(3), [], [], []
+    for force in scene.system.forces:
+        if isinstance(force, Gravity):
+            gravity = gravity + np.asarray(force.acceleration)
+        elif isinstance(force, Rotors) and not callable(force.speed_squared):
+            k = index[force.body]
+            wrench = np.asarray(force.wrench(force.speed_squared, scene.system.bodies.com[k]))
+            wrenches.append((k, wrench[:3], wrench[3:]))
+        elif isinstance(force, LinearActuator) and force.couple == "consistent":
+            base, slider = index[force.base], index[force.slider]
+            arm = np.asarray(force.axis_point) - com[base]
+            actuators.append(Actuator(base, slider, arm, _sinus(force.force)))
+        elif isinstance(force, AppliedForce) and force.frame == "world" and force.point is None:
+            forces.append((index[force.body], _sinus(force.force)))
+        elif (
+            isinstance(force, AppliedMoment)
+            and force.frame == "body"
+            and not callable(force.moment)
+        ):
+            wrenches.append((index[force.body], np.zeros(3), np.asarray(force.moment)))
+        else:
+            raise UnsupportedError(f"A force of kind {type(force).__name__} is not modelled.")
+    return gravity, wrenches, actuators, forces
+
+
+def _sinus(value: object) -> Sinus:
+    if isinstance(value, Sine):
+        return Sinus(np.asarray(value.amplitude), float(value.angular_frequency), 0.0)
+    if callable(value):
+        raise UnsupportedError("A force that is a function of the state is not modelled.")
+    return Sinus(np.asarray(value, dtype=float), 0.0, 0.5 * np.pi)
+
+
+def why_not(scene: Scene) -> str:
+    """Why the peers cannot model a scene; empty if they can."""
+    try:
+        plain(scene)
+    except UnsupportedError as error:
+        return str(error)
+    return ""
+
+
+def starts(states: State) -> list[Start]:
+    """Stacked states, arrays (k, n, .), as a list of starts."""
+    r, p, v, omega = (
+        np.asarray(x, dtype=float) for x in (states.r, states.p, states.v, states.omega)
+    )
+    return [Start(*one) for one in zip(r, p, v, omega, strict=True)]
+
+
+def loop_seconds(call: Callable[[], object], loops: int = 2000, repeats: int = 5) -> float:
+    """Median over repeats of the mean time of a call [s]."""
+    seconds = []
+    for _ in range(repeats):
+        clock = time.perf_counter()
+        for _ in range(loops):
+            call()
+        seconds.append((time.perf_counter() - clock) / loops)
+    return float(np.median(seconds))

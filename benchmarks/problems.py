@@ -1,0 +1,128 @@
+"""What the suite solves: the report's scenes, published problems, stiff variants, chains.
+
+The published problems are those of `tests/published`, built by the same functions, so that
+what is timed is what is tested.
+"""
+
+import importlib
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import stmuav_jax as sj
+
+PUBLISHED = Path(__file__).parents[1] / "tests" / "published"
+TRACKER_CASE = 2
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A scene, and where its error is looked at.
+
+    Attributes:
+        key: short, for files. horizons: ends of the runs, each a run of its own [s].
+        redundant: whether its joints have dependent rows.
+        stiff: whether implicit methods are compared on it.
+    """
+
+    key: str
+    title: str
+    scene: sj.Scene
+    horizons: tuple[float, ...]
+    redundant: bool = False
+    stiff: bool = False
+
+    def system_and_start(self) -> tuple[sj.System, sj.State]:
+        """What is integrated."""
+        return self.scene.system, self.scene.state0
+
+
+def tracker(horizons: tuple[float, ...]) -> Problem:
+    """The seven-body UAV with actuator forces, the report's case 2."""
+    scene = sj.make_scene("uav_tracker", TRACKER_CASE)
+    return Problem("uav_tracker_2", scene.title, scene, horizons)
+
+
+def stiff(horizon: float) -> list[Problem]:
+    """The same with both sliders held by servos: the table's, and a much stiffer one."""
+    variants = {
+        "servo": (sj.Servo(), "sliders held by the table's servos (1e6 N/m)"),
+        "stiff_servo": (
+            sj.Servo(stiffness=1e7, damping=6e4),
+            "sliders held at 1e7 N/m and 6e4 N s/m",
+        ),
+    }
+    return [
+        Problem(
+            f"uav_tracker_2_{key}",
+            f"uav_tracker case 2, {title}",
+            sj.make_scene("uav_tracker", TRACKER_CASE, servo=servo),
+            (horizon,),
+            stiff=True,
+        )
+        for key, (servo, title) in variants.items()
+    ]
+
+
+def _of_tests(module: str) -> Any:
+    """A module of `tests/published`; needs pytest and SciPy, as the tests do."""
+    if str(PUBLISHED) not in sys.path:
+        sys.path.append(str(PUBLISHED))
+    return importlib.import_module(module)
+
+
+def chain(loops: int) -> Problem:
+    """The N-four-bar mechanism: N closed loops with three dependent rows each."""
+    source = _of_tests("test_four_bar")
+    system = source.four_bar(loops)
+    scene = sj.Scene(f"four_bar_{loops}", "N-four-bar mechanism", system, source.start(system))
+    title = f"N-four-bar mechanism, N = {loops} (IFToMM A02)"
+    return Problem(scene.name, title, scene, (1.0,), redundant=True)
+
+
+def published() -> list[Problem]:
+    """Heavy top, squeezing mechanism, one four-bar loop."""
+    top, squeezer = _of_tests("test_heavy_top"), _of_tests("test_squeezer")
+    system, state = top.top(top.FAST)
+    spun = sj.Scene("heavy_top", "Heavy top, 150 rad/s", system, state)
+    system = squeezer.squeezer()
+    squeezed = sj.Scene("squeezer", "Andrews' squeezing mechanism", system, system.reference)
+    return [
+        Problem(spun.name, spun.title, spun, (0.2,)),
+        Problem(squeezed.name, squeezed.title, squeezed, (0.03,), redundant=True),
+        chain(1),
+    ]
+
+
+def disturbed(scene: sj.Scene, count: int, seed: int = 0) -> sj.State:
+    """Starts that differ in the base's velocities, arrays (count, n, .).
+
+    Normal, 0.1 m/s and 0.1 rad/s; projected, so that all are consistent with the joints.
+    """
+    tree = sj.Tree()
+    model = tree.prepare(scene.system)
+    x0 = tree.to_vector(model, scene.state0)
+    noise = 0.1 * np.random.default_rng(seed).normal(size=(count, 6))
+
+    def one(change: Any) -> sj.State:
+        moved = moving_base(model, x0, change[:3], change[3:])
+        x, _ = tree.project(model, jnp.asarray(scene.t0), moved, 3)
+        return tree.to_state(model, x)
+
+    return jax.jit(jax.vmap(one))(jnp.asarray(noise))
+
+
+def moving_base(model: Any, x: Any, v: Any, omega: Any) -> Any:
+    """Tree coordinates x with v [m/s] and omega [rad/s] added to the base's velocities.
+
+    The joints' own velocities stay, so a consistent state stays consistent.
+    """
+    from stmuav_jax.dynamics.coordinates import join, split
+
+    at = split(model.chain.tree, x)
+    return join(at._replace(v=at.v + v[:, None], omega=at.omega + omega[:, None]))

@@ -1,0 +1,125 @@
+"""The suite's page, from its JSON files alone: tables in Markdown and figures.
+
+python benchmarks/report.py
+"""
+
+import argparse
+import json
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from record import RESULTS
+from report_figures import draw
+from suite_tables import (
+    acceleration,
+    batch,
+    curves,
+    gradient,
+    hexacopter,
+    scaling,
+    scenes,
+    table,
+)
+
+from stmuav_jax.view.io import write_atomically
+
+PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
+
+Lines = list[str]
+# Section -> its title and what writes it, in the page's order.
+PARTS: dict[str, tuple[str, Callable[[dict[str, Any]], Lines]]] = {
+    "work_precision": ("Time against error, seven-body UAV", curves),
+    "acceleration": ("One acceleration", acceleration),
+    "batch": ("Many trajectories", batch),
+    "scaling": ("Chains of closed loops", scaling),
+    "gradient": ("Gradients", gradient),
+    "hexacopter": ("One free body against the same by hand", hexacopter),
+    "scenes": ("All scenes", scenes),
+    "published": ("Time against error, published problems", curves),
+    "stiff": ("Time against error, stiff variants", curves),
+}
+
+HEAD = """# Benchmarks
+
+Made by `python benchmarks/suite.py` from the files `suite_*.json` in `benchmarks/results/`; do not
+edit. Times are medians of repeated runs after a warm-up, in brackets the distance between their
+quartiles; runs longer than the time budget are timed once, without warm-up. Compilation, which for
+JAX includes tracing, is apart. Errors are the largest distance of any body's centre of mass from a
+converged reference at the end of the run. What failed or could not be run stays in the tables with
+its reason.
+"""
+
+
+def load(folder: Path) -> dict[str, dict[str, Any]]:
+    """The sections that have been run, in the page's order."""
+    files = {name: folder / f"suite_{name}.json" for name in PARTS}
+    return {name: json.loads(f.read_text()) for name, f in files.items() if f.exists()}
+
+
+def circumstances(results: dict[str, dict[str, Any]]) -> Lines:
+    """Where and on what every section was measured."""
+    rows = []
+    for name, result in results.items():
+        e = result["environment"]
+        commit = e["commit"][:10] + (" with changes" if e["dirty"] else "")
+        took = f"{result['took_seconds']:.0f}"
+        machine = result.get("machine", e["cpu"])
+        rows.append([name, e["date"], commit, machine, e["cores"], e["versions"]["device"], took])
+    head = ["section", "date", "commit", "processor", "cores", "device", "took [s]"]
+    versions = next(iter(results.values()))["environment"]["versions"]
+    listed = ", ".join(f"{k} {v}" for k, v in versions.items() if k != "device")
+    return [*table(head, rows), "", f"Versions (first section): {listed}."]
+
+
+def compared(results: dict[str, dict[str, Any]]) -> Lines:
+    """The peers, with versions and caveats, and those that were skipped."""
+
+    def unique(key: str) -> Iterable[dict[str, Any]]:
+        found = (row for result in results.values() for row in result[key])
+        return {row["method"]: row for row in found}.values()
+
+    there = [[p["method"], p["version"], " ".join(p["caveats"])] for p in unique("peers")]
+    absent = [[p["method"], p["reason"]] for p in unique("skipped")]
+    lines = table(["program", "version", "what it leaves out or does differently"], there)
+    if not there:
+        lines = ["No other program was run."]
+    if absent:
+        lines += ["", *table(["skipped", "why"], absent)]
+    return lines
+
+
+def build(results: Path, page: Path) -> Path:
+    """Write the page and, beside it in `figures/benchmarks`, its figures; returns its path."""
+    found = load(results)
+    if not found:
+        raise SystemExit(f"There are no results in {results}.")
+    folder = page.parent / "figures" / "benchmarks"
+    figures = draw(found, folder)
+    lines = [HEAD]
+    if any(result["size"] != "full" for result in found.values()):
+        lines += ["**Some sections were run at the smallest size: no measurements.**", ""]
+    lines += [*circumstances(found), "", "## Compared with", "", *compared(found)]
+    for name, result in found.items():
+        title, write = PARTS[name]
+        lines += ["", f"## {title}", "", f"{result['what'][0].upper()}{result['what'][1:]}.", ""]
+        for figure in figures.get(name, []):
+            place = os.path.relpath(figure, page.parent)
+            lines += [f"![{figure.stem.replace('_', ' ')}]({place})", ""]
+        lines += write(result)
+    text = "\n".join(lines).rstrip() + "\n"
+    return write_atomically(page, text.encode())
+
+
+def main() -> None:
+    """Make the page from the results that are there."""
+    parser = argparse.ArgumentParser(description="Write the benchmark page.")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--page", type=Path, default=PAGE)
+    options = parser.parse_args()
+    print(build(options.results, options.page))
+
+
+if __name__ == "__main__":
+    main()

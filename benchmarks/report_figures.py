@@ -1,0 +1,178 @@
+"""Figures of the suite's page, from its JSON files alone."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+MARKS = "osD^vP*X<>h8"
+Row = dict[str, Any]
+
+
+def draw(results: dict[str, Row], folder: Path) -> dict[str, list[Path]]:
+    """Write all figures as PNG; returns their paths by section."""
+    folder.mkdir(parents=True, exist_ok=True)
+    makers = {"batch": batch, "scaling": scaling, "acceleration": acceleration}
+    made: dict[str, list[Path]] = {}
+    for name, result in results.items():
+        figures: dict[str, Figure] = {}
+        if "curves" in result:
+            for curve in result["curves"]:
+                if curve["rows"]:
+                    figures[f"{name}_{curve['problem']}"] = work_precision(curve)
+        elif name in makers:
+            figures[name] = makers[name](result)
+        made[name] = []
+        for key, figure in figures.items():
+            made[name].append(folder / f"{key}.png")
+            FigureCanvasAgg(figure).print_png(str(made[name][-1]))
+    return made
+
+
+def _figure(columns: int, width: float, height: float) -> tuple[Figure, list[Any]]:
+    figure = Figure(figsize=(width, height), layout="constrained", dpi=110)
+    return figure, list(figure.subplots(1, columns, squeeze=False, sharey=True)[0])
+
+
+def _short(row: Row) -> str:
+    """A point's tolerance or step."""
+    if row["tolerance"] is not None:
+        return f"{row['tolerance']:.0e}".replace("e-0", "e-")
+    return f"{row['step']:g} s"
+
+
+def work_precision(curve: Row) -> Figure:
+    """Run time against error of every method; ends of each line labelled by its setting."""
+    ends = curve["horizons"]
+    figure, panels = _figure(len(ends), 1.5 + 4.6 * len(ends), 5.4)
+    methods = list(dict.fromkeys((row["method"], row["solver"]) for row in curve["rows"]))
+    for axes, end in zip(panels, ends, strict=True):
+        for k, (method, solver) in enumerate(methods):
+            rows = [
+                row
+                for row in curve["rows"]
+                if (row["method"], row["solver"], row["horizon"]) == (method, solver, end)
+                and row["error"]
+                and row["seconds"]
+            ]
+            # the plot of a failed run would be of the part before its end
+            rows = [row for row in rows if not row["failure"]]
+            if not rows:
+                continue
+            x = [row["error"] for row in rows]
+            y = [1e3 * row["seconds"]["median"] for row in rows]
+            ours = method.startswith("stmuav-jax")
+            style = {"lw": 2.0, "ls": "-"} if ours else {"lw": 1.0, "ls": "--"}
+            name = method if solver in method else f"{method}, {solver}"
+            color = f"C{k % 10}"
+            axes.loglog(x, y, marker=MARKS[k % len(MARKS)], ms=5, color=color, label=name, **style)
+            for row, a, b in {id(r): (r, a, b) for r, a, b in _ends(rows, x, y)}.values():
+                axes.annotate(
+                    _short(row), (a, b), xytext=(3, 4), textcoords="offset points",
+                    fontsize=6, color=color,
+                )  # fmt: skip
+        axes.set(xlabel="position error [m]", title=f"to {end:g} s")
+        axes.grid(alpha=0.3)
+        axes.invert_xaxis()
+    panels[0].set_ylabel("run time [ms]")
+    handles, labels = {}, []
+    for axes in panels:
+        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(text, handle)
+    labels = list(handles)
+    figure.legend(
+        handles.values(), labels, loc="outside lower center", fontsize=7.5,
+        ncols=3 if len(ends) > 1 else 2,
+    )  # fmt: skip
+    figure.suptitle(curve["title"], fontsize=10)
+    return figure
+
+
+def _ends(rows: list[Row], x: list[float], y: list[float]) -> list[tuple[Row, float, float]]:
+    """The first and the last point."""
+    return [(rows[0], x[0], y[0]), (rows[-1], x[-1], y[-1])]
+
+
+def _ours(rows: list[Row]) -> list[Row]:
+    return [row for row in rows if row["method"].startswith("stmuav-jax")]
+
+
+def batch(result: Row) -> Figure:
+    """Throughput against block size; one trajectory and peers as lines."""
+    figure, (axes,) = _figure(1, 7, 4.4)
+    rows = [row for row in _ours(result["rows"]) if row["per_second"] is not None]
+    for k, count in enumerate(dict.fromkeys(row["trajectories"] for row in rows)):
+        some = sorted((r for r in rows if r["trajectories"] == count), key=lambda r: r["block"])
+        x, y = [r["block"] for r in some], [r["per_second"] for r in some]
+        axes.semilogx(x, y, marker=MARKS[k], label=f"stmuav-jax, {count} trajectories", base=2)
+    axes.axhline(
+        result["single"]["per_second"], color="k", lw=1, ls=":", label="one after the other"
+    )
+    wanted = result["error_wanted"]
+    for k, row in enumerate(result["rows"]):
+        if row in rows or row["per_second"] is None:
+            continue
+        if row["largest_error"] is None or row["largest_error"] > wanted:
+            continue
+        axes.axhline(row["per_second"], color=f"C{5 + k % 5}", lw=1, ls="--", label=row["method"])
+    axes.set(xlabel="trajectories advanced together", ylabel="trajectories per second")
+    blocks = sorted({row["block"] for row in rows})
+    axes.set_xticks(blocks, [str(b) for b in blocks])
+    axes.minorticks_off()
+    axes.set_ylim(bottom=0)
+    axes.set_title(f"Each {result['horizon']:g} s, errors up to {wanted:g} m", fontsize=10)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return figure
+
+
+def scaling(result: Row) -> Figure:
+    """Cost against the number of loops."""
+    figure, (axes,) = _figure(1, 7, 4.4)
+    rows = [row for row in result["rows"] if "bodies" in row and not row["failure"]]
+    runs = [row for row in rows if row["run_seconds"]]
+    many = lambda rows: np.array([row["loops"] for row in rows], float)
+    series = {
+        "one acceleration": (rows, [row["acceleration_seconds"] for row in rows]),
+        "one simulated second": (runs, [row["run_seconds"]["median"] for row in runs]),
+        "its compilation": (runs, [row["run_compile_seconds"] for row in runs]),
+    }
+    for k, (name, (some, y)) in enumerate(series.items()):
+        axes.loglog(many(some), y, marker=MARKS[k], label=name, base=10)
+    n = many(rows)
+    if len(n) > 1:
+        last = series["one acceleration"][1][-1]
+        for power, style in ((1, ":"), (3, "-.")):
+            line = last * (n / n[-1]) ** power
+            axes.loglog(n, line, color="0.6", lw=1, ls=style, label=f"slope {power}")
+    axes.set_xticks(n, [f"{x:g}" for x in n])
+    axes.minorticks_off()
+    axes.set(xlabel="closed loops N", ylabel="seconds")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return figure
+
+
+def acceleration(result: Row) -> Figure:
+    """One acceleration, as bars."""
+    rows = [row for row in result["rows"] if row["seconds"] is not None]
+    figure, (axes,) = _figure(1, 7.5, 1.2 + 0.32 * len(rows))
+    values = [1e6 * row["seconds"] for row in rows]
+    names = [
+        row["method"] + (f", {row['batch']} at once" if row["batch"] > 1 else "") for row in rows
+    ]
+    ours = ["C0" if row in _ours(rows) else "0.6" for row in rows]
+    axes.barh(range(len(rows)), values, color=ours)
+    for k, value in enumerate(values):
+        axes.annotate(
+            f"{value:.3g}", (value, k), xytext=(3, 0), textcoords="offset points",
+            va="center", fontsize=8,
+        )  # fmt: skip
+    axes.set_yticks(range(len(rows)), names, fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xscale("log")
+    axes.margins(x=0.15)
+    axes.set_xlabel("microseconds per acceleration and state")
+    return figure

@@ -1,0 +1,85 @@
+"""The benchmark suite: problems x methods x tolerances x peers.
+
+    python benchmarks/suite.py                      everything, and the report page
+    python benchmarks/suite.py --only scaling batch only these sections
+    python benchmarks/suite.py --size one           the smallest run of each, for tests
+    python benchmarks/suite.py --no-peers           ours only
+
+Every section writes `results/suite_<section>.json` as soon as it is done, so that an
+interrupted run keeps what it has; `report.py` makes the page from these files.
+"""
+
+import argparse
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+# compile times are measured
+jax.config.update("jax_enable_compilation_cache", False)
+
+import report
+from adapter import Peer
+from methods import peers
+from record import RESULTS, write
+from suite_gradient import gradient
+from suite_precision import describe, published_problems, stiff_variants, work_precision
+from suite_scenes import hexacopter, scenes
+from suite_size import FULL, ONE, Size
+from suite_speed import acceleration, batch, scaling
+
+SECTIONS: dict[str, Callable[[Size, list[Peer]], dict[str, Any]]] = {
+    "work_precision": work_precision,
+    "acceleration": acceleration,
+    "batch": batch,
+    "scaling": scaling,
+    "gradient": gradient,
+    "hexacopter": hexacopter,
+    "scenes": scenes,
+    "published": published_problems,
+    "stiff": stiff_variants,
+}
+
+
+def machine() -> str:
+    """The processor's name."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = (x.split(":", 1)[1].strip() for x in lines if x.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())
+
+
+def main() -> None:
+    """Run what was asked for."""
+    parser = argparse.ArgumentParser(description="Run the benchmark suite.")
+    parser.add_argument("--only", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
+    parser.add_argument("--size", choices=("full", "one"), default="full")
+    parser.add_argument("--no-peers", action="store_true")
+    parser.add_argument("--no-report", action="store_true")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--page", type=Path, default=report.PAGE)
+    options = parser.parse_args()
+    size = FULL if options.size == "full" else ONE
+    there, absent = ([], []) if options.no_peers else peers()
+    for row in absent:
+        print(f"skipped: {row['method']}: {row['reason']}", flush=True)
+    options.results.mkdir(parents=True, exist_ok=True)
+    for name in options.only:
+        print(f"== {name}", flush=True)
+        clock = time.perf_counter()
+        content = SECTIONS[name](size, there)
+        took = time.perf_counter() - clock
+        head = {"section": name, "size": options.size, "took_seconds": took, "machine": machine()}
+        compared = {"peers": describe(there), "skipped": absent}
+        path = write(f"suite_{name}", {**head, **compared, **content}, options.results)
+        print(f"{path}, {took:.0f} s", flush=True)
+    if not options.no_report:
+        print(report.build(options.results, options.page))
+
+
+if __name__ == "__main__":
+    main()

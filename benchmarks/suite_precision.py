@@ -1,0 +1,227 @@
+"""Work against precision: problems x methods x tolerances, ours and the peers alike."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from adapter import Outcome, Peer, Setting
+from methods import Ours, explicit, for_stiff
+from problems import Problem, published, stiff, tracker
+from suite_size import Size
+from timer import Timing, measure, summary
+
+TARGETS = (1e-3, 1e-6, 1e-9)
+# A method whose run took longer than this is not tried with finer settings [s].
+PATIENCE = 3.0
+# Codes that share nothing with ours and converge far enough to check the reference.
+SECOND_CODES = ("Pinocchio", "NumPy")
+
+
+def reason(error: Exception) -> str:
+    """An exception as one short line."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0] if lines else ''}"[:160]
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float | None:
+    """Largest distance between the same bodies' centres of mass [m]; None if not finite."""
+    if a.shape != b.shape or not np.all(np.isfinite(a)):
+        return None
+    return float(np.max(np.linalg.norm(a - b, axis=-1)))
+
+
+def timed(run: Callable[[], Outcome], size: Size) -> tuple[Timing, Outcome]:
+    """Time a run; the first call is a warm-up unless it failed or took longer than the budget."""
+    first, outcome = measure(run, repeats=1, warm_up=0)
+    if outcome.seconds:
+        return summary(outcome.seconds), outcome
+    if outcome.failure or first.median > size.budget:
+        return first, outcome
+    return measure(run, repeats=size.repeats, warm_up=0, budget=size.budget)
+
+
+def point(
+    peer: Peer, problem: Problem, end: float, setting: Setting, exact: np.ndarray, size: Size
+) -> dict[str, Any]:
+    """One run: its cost, its error, or why it failed."""
+    row: dict[str, Any] = {
+        "method": peer.name,
+        "solver": setting.solver,
+        "tolerance": setting.tolerance,
+        "step": setting.step,
+        "horizon": end,
+        "error": None,
+        "seconds": None,
+        "failure": "",
+    }
+    try:
+        prepared = peer.prepare(problem.scene, np.array([end]), setting)
+        timing, outcome = timed(prepared.run, size)
+    except Exception as error:
+        return row | {"failure": reason(error)}
+    return row | {
+        "error": distance(np.asarray(outcome.positions)[-1], exact),
+        "seconds": timing.to_dict(),
+        "compile_seconds": prepared.compile_seconds,
+        "evaluations": outcome.evaluations,
+        "accepted": outcome.accepted,
+        "rejected": outcome.rejected,
+        "residual": outcome.residual,
+        "failure": outcome.failure,
+    }
+
+
+def line(
+    peer: Peer, problem: Problem, end: float, exact: np.ndarray, size: Size
+) -> list[dict[str, Any]]:
+    """A method's runs from coarse to fine; those left out are rows too."""
+    rows: list[dict[str, Any]] = []
+    slow = ""
+    for setting in peer.settings():
+        if slow:
+            empty = dict.fromkeys(("error", "seconds", "residual"))
+            rows.append(
+                {
+                    "method": peer.name,
+                    "solver": setting.solver,
+                    "tolerance": setting.tolerance,
+                    "step": setting.step,
+                    "horizon": end,
+                    **empty,
+                    "failure": slow,
+                }
+            )
+            continue
+        rows.append(point(peer, problem, end, setting, exact, size))
+        say(rows[-1])
+        seconds = rows[-1]["seconds"]
+        if seconds and seconds["median"] > PATIENCE:
+            slow = f"Left out: the coarser setting took {seconds['median']:.1f} s."
+    return rows
+
+
+def say(row: dict[str, Any]) -> None:
+    """One line of progress."""
+    seconds = row["seconds"]["median"] if row["seconds"] else float("nan")
+    error = float("nan") if row["error"] is None else row["error"]
+    size = row["tolerance"] if row["tolerance"] is not None else row["step"]
+    print(
+        f"  {row['method']:34s} {row['solver']:18s} {size:7.0e} {row['horizon']:5g} s: "
+        f"{1e3 * seconds:9.2f} ms, error {error:8.1e} m {row['failure']}",
+        flush=True,
+    )
+
+
+def reference(problem: Problem, ours: Ours, size: Size) -> dict[float, np.ndarray]:
+    """Positions at every horizon from one of our methods at its tightest, by horizon."""
+    # explicit steps on stiff problems are short because of stability, so errors stay small
+    tolerance = max(size.reference, 1e-11) if problem.stiff else size.reference
+    found = {}
+    for end in problem.horizons:
+        setting = Setting(ours.solver_name, tolerance=tolerance)
+        done = ours.prepare(problem.scene, np.array([end]), setting).run()
+        if done.failure:
+            raise RuntimeError(f"The reference run failed: {done.failure}")
+        found[end] = done.positions[-1]
+    return found
+
+
+def check(rows: list[dict[str, Any]], end: float) -> dict[str, Any]:
+    """How closely independent codes, and our other formulation, meet the reference."""
+    near = [row for row in rows if row["horizon"] == end and row["error"] is not None]
+
+    def best(wanted: Callable[[str], bool]) -> dict[str, Any] | None:
+        found = [row for row in near if wanted(row["method"]) and not row["failure"]]
+        if not found:
+            return None
+        row = min(found, key=lambda row: row["error"])
+        return {k: row[k] for k in ("method", "solver", "tolerance", "error")}
+
+    return {
+        "horizon": end,
+        "second_code": best(lambda name: name.startswith(SECOND_CODES)),
+        "other_formulation": best(lambda name: name.startswith("stmuav-jax, augmented")),
+    }
+
+
+def cheapest(rows: list[dict[str, Any]], end: float) -> list[dict[str, Any]]:
+    """For every method the least time that reaches each target, and the ratio to our best."""
+    good = [
+        row
+        for row in rows
+        if row["horizon"] == end and row["error"] is not None and not row["failure"]
+    ]
+    methods = dict.fromkeys((row["method"], row["solver"]) for row in rows)
+
+    def least(target: float, wanted: Callable[[dict[str, Any]], bool]) -> float | None:
+        fits = (row for row in good if wanted(row) and row["error"] <= target)
+        return min((row["seconds"]["median"] for row in fits), default=None)
+
+    table = []
+    for name, solver in methods:
+        entry: dict[str, Any] = {"method": name, "solver": solver, "horizon": end}
+        for target in TARGETS:
+            key = (name, solver)
+            mine = least(target, lambda row, key=key: (row["method"], row["solver"]) == key)
+            ours = least(target, lambda row: row["method"].startswith("stmuav-jax"))
+            ratio = mine / ours if mine is not None and ours is not None else None
+            entry[f"{target:.0e}"] = {"seconds": mine, "ratio_to_ours": ratio}
+        table.append(entry)
+    return table
+
+
+def curve(problem: Problem, ours: list[Ours], others: list[Peer], size: Size) -> dict[str, Any]:
+    """All methods on one problem; the first of ours, at its tightest, gives the reference."""
+    print(f"{problem.key}: {problem.title}", flush=True)
+    result: dict[str, Any] = {
+        "problem": problem.key,
+        "title": problem.title,
+        "horizons": problem.horizons,
+        "rows": [],
+        "unsupported": [],
+    }
+    try:
+        exact = reference(problem, ours[0], size)
+    except Exception as error:
+        return result | {"failure": reason(error), "references": [], "cheapest": []}
+    rows = result["rows"]
+    for method in (*ours[: size.methods], *others):
+        if why := method.unsupported(problem.scene):
+            result["unsupported"].append({"method": method.name, "reason": why})
+            continue
+        for end in problem.horizons:
+            rows += line(method, problem, end, exact[end], size)
+    result["references"] = [check(rows, end) for end in problem.horizons]
+    result["cheapest"] = [x for end in problem.horizons for x in cheapest(rows, end)]
+    return result | {"failure": ""}
+
+
+def describe(others: list[Peer]) -> list[dict[str, Any]]:
+    """Versions and caveats of what is compared with."""
+    return [
+        {"method": peer.name, "version": peer.version(), "caveats": list(peer.caveats)}
+        for peer in others
+    ]
+
+
+def work_precision(size: Size, others: list[Peer]) -> dict[str, Any]:
+    """The seven-body UAV, ours and all peers."""
+    curves = [curve(tracker(size.horizons), explicit(size.tolerances), others, size)]
+    return {"what": "time against error, uav_tracker case 2", "curves": curves}
+
+
+def published_problems(size: Size, others: list[Peer]) -> dict[str, Any]:
+    """Problems of the literature."""
+    curves = []
+    for problem in published()[: size.problems]:
+        # Dopri8 with both formulations; Tsit5 is compared on the seven bodies
+        ours = explicit(size.tolerances, redundant=problem.redundant)[::2]
+        curves.append(curve(problem, ours, others, size))
+    return {"what": "time against error, published problems", "curves": curves}
+
+
+def stiff_variants(size: Size, others: list[Peer]) -> dict[str, Any]:
+    """Sliders held by stiff servos, explicit and implicit methods."""
+    problems = stiff(size.horizons[-1])[-size.stiff_problems :]
+    curves = [curve(p, for_stiff(size.stiff_tolerances), others, size) for p in problems]
+    return {"what": "time against error, stiff variants", "curves": curves}

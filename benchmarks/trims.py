@@ -1,0 +1,101 @@
+"""Hover trims of the UAV over panel orientations: how many in a second, and how many are trims.
+
+Beside them SciPy's `root` (Powell's hybrid method, differences) on the same compiled residuals,
+one trim at a time. One core:
+
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 taskset -c 1 python benchmarks/trims.py
+"""
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from record import RESULTS, write
+from scipy.optimize import root
+from timer import measure
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+
+import stmuav_jax as sj
+from stmuav_jax.study.trim import residual
+
+# Panel angles are drawn up to this [rad] either way; some are out of the tracker's reach.
+REACH = 0.75
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is run: orientations, those of SciPy, in groups of, repeats."""
+
+    orientations: int = 10_000
+    peer: int = 50
+    group: int = 64
+    repeats: int = 5
+
+
+QUICK = Size(orientations=6, peer=1, group=2, repeats=1)
+
+
+def ours(size: Size, flyer: sj.Flyer, angles: Any) -> dict[str, Any]:
+    """All trims in one compiled call."""
+    one = lambda a: sj.trim(flyer, sj.hover(a), throw=False)
+    many = sj.outer_jit(lambda a: jax.lax.map(one, a, batch_size=size.group))
+    started = time.perf_counter()
+    found = jax.block_until_ready(many(angles))
+    first = time.perf_counter() - started
+    timing, found = measure(lambda: many(angles), repeats=size.repeats)
+    reason = np.asarray(found.reason)
+    fine = reason == sj.TrimReason.VALID
+    names, counts = np.unique(reason, return_counts=True)
+    return {
+        "seconds": timing.to_dict(),
+        "first_call_seconds": first,
+        "per_second": size.orientations / timing.median,
+        "reasons": {sj.TrimReason(int(k)).name: int(n) for k, n in zip(names, counts, strict=True)},
+        "largest_residual": float(np.max(np.asarray(found.residual)[fine])),
+        "largest_steps": int(np.max(np.asarray(found.steps)[fine])),
+    }
+
+
+def with_scipy(size: Size, flyer: sj.Flyer, angles: Any) -> dict[str, Any]:
+    """The same residuals by SciPy, from the same start; compilation left out."""
+    of = jax.jit(lambda z, a: residual(flyer, sj.hover(a), z))
+    mass = float(jnp.sum(flyer.system.bodies.mass))
+    start = np.zeros(8)
+    start[2] = 9.81 * mass
+    of(start, angles[0]).block_until_ready()
+    began = time.perf_counter()
+    found = [
+        root(lambda z, a=a: np.asarray(of(z, a)), start, tol=1e-12) for a in angles[: size.peer]
+    ]
+    seconds = time.perf_counter() - began
+    left = [float(np.max(np.abs(r.fun))) for r in found]
+    return {"per_second": size.peer / seconds, "median_residual": float(np.median(left))}
+
+
+def main() -> None:
+    """Run and write `trims.json`."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="the smallest size")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    size = QUICK if arguments.quick else Size()
+    flyer = sj.uav_flyer()
+    rng = np.random.default_rng(1)
+    angles = jnp.asarray(rng.uniform(-REACH, REACH, (size.orientations, 2)))
+    content: dict[str, Any] = {"ours": ours(size, flyer, angles)}
+    print(content["ours"], flush=True)
+    content["scipy"] = with_scipy(size, flyer, angles)
+    content["times_scipy"] = content["ours"]["per_second"] / content["scipy"]["per_second"]
+    print(content["scipy"], content["times_scipy"], flush=True)
+    print(write("trims", content, arguments.results))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+"""Figures and tables of docs/estimation.md; takes minutes.
+
+    python docs/make_estimation.py
+
+Writes docs/figures/estimation/*.png and numbers.json. The tables of the eight cases and of the
+hover are those of `stmuav estimate` and `stmuav estimate --hover`.
+"""
+
+import json
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+import stmuav_jax as stm
+from stmuav_jax.algebra.compiler import outer_jit
+from stmuav_jax.view.estimate import (
+    Machine,
+    hover_table,
+    save_case_figures,
+    save_hover_figure,
+    save_machine_figure,
+    summary_table,
+)
+
+FOLDER = Path(__file__).parent / "figures" / "estimation"
+
+
+def cases() -> tuple[list, dict]:
+    """All cases with both tunings, 50 seeds, 2 s; figures of case 8; RMSE of smoother and filter."""
+    report = stm.report_tuning()
+    consistent = {False: stm.consistent_tuning(1), True: stm.consistent_tuning(5)}
+    rows, smoothed = [], {}
+    for case in range(1, 9):
+        own = consistent[case > 4]
+        study = stm.study_case(case, [report, own])
+        rows += study.summaries.values()
+        if case in (1, 8):
+            late = stm.estimate_case(study.record, own, smoothed=True)
+            rmse = lambda e: np.sqrt(np.mean(np.asarray(e.error)[500:, 3:] ** 2, axis=(0, 2)))
+            smoothed[case] = [
+                (1e3 * rmse(e)).tolist() for e in (study.estimates["consistent"], late)
+            ]
+        if case == 8:
+            save_case_figures(study, FOLDER, dpi=120)
+    Console(width=110).print(summary_table(rows))
+    return [row._asdict() for row in rows], smoothed
+
+
+def hovers() -> None:
+    """Both tunings, 50 seeds, 2 s."""
+    flights = {name: stm.simulate_hover(1, name) for name in ("report", "consistent")}
+    Console(width=130).print(hover_table(flights))
+    save_hover_figure(flights, FOLDER, dpi=120)
+
+
+def loads() -> dict:
+    """What a filter with constant inertia makes of a load with mass: errors at the end [mm]."""
+    found = {}
+    for load, case, t1 in ((0.5, 1, 0.2), (1.0, 1, 0.2), (2.0, 1, 0.2), (1.0, 5, 1.0)):
+        record = stm.simulate_case(case, seeds=10, t1=t1, world=stm.World(load=load, walk=False))
+        start = {0.5: (0.07, 0.13), 1.0: (0.06, 0.13), 2.0: (0.07, 0.06)}[load]
+        swing = 4 * (case > 4)
+        mean = np.array([0.1, 0.2, 0.3, *start, *[0.0] * swing])
+        prior = stm.gaussian(mean, np.diag([0.1] * 3 + [0.04] * 2 + [0.05] * swing) ** 2)
+        for known in (False, True):
+            model = stm.extended_model(period=2.0 if swing else None, load=load if known else None)
+            run = lambda y, u, m=model, p=prior: stm.filter_bank(m, p, y, u=u, dt=1e-3).mean[-1]
+            last = np.asarray(outer_jit(run)(record.y, record.u))
+            offset = last[3:5] + (last[5:7] if swing else 0.0)
+            error = np.mean(offset - np.asarray(record.offset)[-1], axis=1)
+            found[f"{load} kg, case {case}, {'known' if known else 'neglected'}"] = (
+                1e3 * error
+            ).tolist()
+    return found
+
+
+def followed() -> dict:
+    """The random walk that makes case 5 most likely: variance per step of the offset [m^2]."""
+    record = stm.simulate_case(5, seeds=8, t1=1.0)
+    value = stm.PART_III.value
+    first, R = list(value("true.Q")[3:6]), value("true.R")
+    prior = stm.gaussian(
+        np.array([0.1, 0.2, 0.3, 0.05, 0.1]), np.diag([0.1, 0.1, 0.1, 0.01, 0.01]) ** 2
+    )
+
+    def model_of(v: dict) -> stm.StateSpaceModel:
+        Q = jnp.concatenate([jnp.asarray(first), v["walk"]])
+        return stm.observable_model(Q=Q, R=R)
+
+    found = stm.tune(
+        model_of, {"walk": np.array([1e-8, 1e-8])}, prior, record.y, u=record.u, dt=1e-3
+    )
+    return {"variance": found.values["walk"].tolist(), "reason": found.reason,
+            "gain of log-likelihood": found.log_likelihood - float(found.history[0])}  # fmt: skip
+
+
+def machine() -> dict:
+    """The seven-body UAV, its tracker moving; the filter with and without what that does."""
+    strokes = (
+        lambda t: 0.03 * (1 - jnp.cos(jnp.pi * t)),
+        lambda t: 0.04 * (1 - jnp.cos(1.5 * jnp.pi * t)),
+    )
+    scene = stm.make_scene("uav_tracker", 1, strokes=strokes)
+    flight = stm.sensed_flight(scene.system, scene.state0)
+    rotors = next(f for f in scene.system.forces if isinstance(f, stm.Rotors))
+    rng = np.random.default_rng(0)
+    y = np.asarray(flight.omega)[1:] + 1e-3 * rng.normal(size=(len(flight.squared), 3))
+    model = stm.rotorcraft_model(
+        rotors,
+        stm.inertia_about_centre(scene.system, scene.state0),
+        jnp.sum(scene.system.bodies.mass),
+        height=flight.centre[0, 2],
+        Q=[1e-8] * 3 + [4e-9] * 2,
+        R=[1e-6] * 3,
+    )
+    prior = stm.gaussian([0.0, 0.0, 0.0, 0.05, -0.05], np.diag([0.1] * 3 + [0.05] * 2) ** 2)
+    inputs = {
+        "one rigid body": flight.squared,
+        "motion of the parts known": stm.moved(
+            flight.squared, flight.J, flight.h, flight.centre[:, 2], 5e-3
+        ),
+    }
+    truth = np.asarray(flight.centre)[1:, :2]
+    found = {
+        words: np.asarray(stm.kalman_filter(model, prior, y, u=u, dt=5e-3).mean)[:, 3:]
+        for words, u in inputs.items()
+    }
+    save_machine_figure(Machine(np.asarray(flight.t)[1:], truth, found), FOLDER, dpi=120)
+    size = lambda e: {"rms mm": (1e3 * np.sqrt(np.mean(e[20:] ** 2, axis=0))).tolist(),
+                      "largest mm": float(1e3 * np.max(np.abs(e[20:])))}  # fmt: skip
+    return {words: size(values - truth) for words, values in found.items()}
+
+
+def main() -> None:
+    """Everything."""
+    numbers: dict = {"machine": machine(), "random walk": followed(), "loads": loads()}
+    print(json.dumps(numbers, indent=1), flush=True)
+    numbers["cases"], numbers["smoother"] = cases()
+    print(numbers["smoother"], flush=True)
+    hovers()
+    (FOLDER / "numbers.json").write_text(json.dumps(numbers, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""`stmuav estimate`: the report's eight cases, and the hover."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+from rich.table import Table
+
+
+@dataclasses.dataclass
+class Estimate:
+    """Estimate the centre of mass in the report's cases; write NetCDF files and figures."""
+
+    case: int | None = None
+    """Case of the report, 1 to 8; default all."""
+    tuning: Literal["both", "report", "consistent"] = "both"
+    """Table 2.4.2, or one whose covariances say what is known."""
+    model: Literal["default", "observable", "report", "printed", "attitude"] = "default"
+    """5 observable states; the report's 8 as corrected or as printed; 8 with SO(3).
+    Default: the report's tuning on the report's, the consistent one on the observable states."""
+    hover: bool = False
+    """Instead fly a hover whose controller sees only the estimate."""
+    seeds: int = 50
+    """How many runs with other noise."""
+    seed: int = 0
+    """The first of them."""
+    t1: float = 2.0
+    """End [s]."""
+    params: Path | None = None
+    """TOML file with values that replace the table's."""
+    out: Path | None = None
+    """Folder for the results; default runs/estimate_CASE or runs/hover."""
+    figures: Literal["png", "pdf", "svg", "none"] = "png"
+    """Format of the figures."""
+    cache: bool = True
+    """Keep compiled code in the user's cache folder for the next run."""
+
+
+def run_estimate(command: Estimate) -> int:
+    """Run the command, print its table; the exit code."""
+    from ..estimation.quadrotor import PART_III
+    from ..mechanics.errors import SettingError
+    from ..view.io import load_parameters
+
+    if command.case is not None and command.case not in range(1, 9):
+        raise SettingError(f"The report has cases 1 to 8, not {command.case}.")
+    table = PART_III if command.params is None else load_parameters(command.params, PART_III)
+    names = ("report", "consistent") if command.tuning == "both" else (command.tuning,)
+    work = _hover if command.hover else _cases
+    shown, paths, failed = work(command, names, table)
+    out = Console()
+    out.print(shown)
+    out.print("Written:", highlight=False)
+    for path in paths:
+        out.print(f"  {path}", highlight=False, soft_wrap=True)
+    if failed:
+        out.print(f"{failed} filters lost their covariance and are left out.", highlight=False)
+    return 1 if failed else 0
+
+
+def _cases(command: Estimate, names: tuple, table: Any) -> tuple[Table, list[Path], int]:
+    from ..estimation.assess import study_case
+    from ..estimation.tuning import consistent_tuning, report_tuning
+    from ..view.estimate import case_dataset, save_case_figures, save_dataset, summary_table
+
+    cases = range(1, 9) if command.case is None else (command.case,)
+    own: Any = command.model != "default"
+    kinds: dict[str, Any] = {
+        "report": command.model if own else "report",
+        "consistent": command.model if own else "observable",
+    }
+    made: dict[Any, Any] = {}
+    summaries, paths = [], []
+    for case in cases:
+        tunings = []
+        for name in names:
+            # compiled once for all cases that share it
+            key = name, name == "consistent" and case > 4
+            if key not in made:
+                kind = kinds[name]
+                made[key] = (
+                    report_tuning(kind, parameters=table)
+                    if name == "report"
+                    else consistent_tuning(case, kind, parameters=table)
+                )
+            tunings.append(made[key])
+        study = study_case(
+            case, tunings, seeds=command.seeds, t1=command.t1, seed=command.seed, parameters=table
+        )
+        summaries += study.summaries.values()
+        folder = Path("runs") / f"estimate_{case}"
+        if command.out is not None:
+            folder = command.out if len(cases) == 1 else command.out / f"case_{case}"
+        paths.append(save_dataset(case_dataset(study), folder / "estimate.nc"))
+        if command.figures != "none":
+            paths += save_case_figures(study, folder, command.figures)
+    return summary_table(summaries), paths, sum(s.failed for s in summaries)
+
+
+def _hover(command: Estimate, names: tuple, table: Any) -> tuple[Table, list[Path], int]:
+    from ..estimation.hover import simulate_hover
+    from ..mechanics.errors import SettingError
+    from ..view.estimate import hover_dataset, hover_table, save_dataset, save_hover_figure
+
+    if command.model != "default":
+        raise SettingError("--hover has a model of its own (14 states): leave --model out.")
+    flights = {
+        name: simulate_hover(
+            command.case or 1, name, seeds=command.seeds, t1=command.t1, seed=command.seed,
+            parameters=table,
+        )
+        for name in names
+    }  # fmt: skip
+    folder = command.out if command.out is not None else Path("runs") / "hover"
+    paths = [save_dataset(hover_dataset(flights), folder / "hover.nc")]
+    if command.figures != "none":
+        paths += save_hover_figure(flights, folder, command.figures)
+    failed = sum(int((~flight.ok[-1]).sum()) for flight in flights.values())
+    return hover_table(flights), paths, failed

@@ -1,0 +1,214 @@
+"""`stmuav tune`: hold still, turn the panel, or identify parameters from a simulated record."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import tyro
+from rich.console import Console
+from rich.progress import Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from ..mechanics.errors import SettingError
+from ..study.search import Search, SearchReason, search
+from ..vehicle.parameters import Parameters
+from .flight import table_of
+
+
+@dataclasses.dataclass
+class Tune:
+    """Tune by gradients through the flight; write inputs or parameters, history and figures."""
+
+    what: tyro.conf.Positional[Literal["hold", "slew", "identify"]]
+    """hold: constant inputs that keep the UAV level and its panel standing, from equal rotor
+    speeds and idle actuators. slew: histories of inputs that turn the panel. identify:
+    parameters and their uncertainty from a noisy record of a simulated flight."""
+    to: tuple[float, float] = (8.0, 0.0)
+    """slew: panel angles at the end [degrees]; at the start they are the initial ones."""
+    duration: float = 1.0
+    """slew: time for the turn [s]. hold: time over which departures count."""
+    force: float | None = None
+    """slew: limit of the actuators' forces [N]."""
+    reaction: float | None = None
+    """slew: limit of the force in any joint [N]."""
+    segments: int | None = None
+    """Segments of multiple shooting; default one in 0.2 s."""
+    knots: int = 8
+    """slew: knots of the cubic splines."""
+    seed: int = 0
+    """identify: of the record's noise and of the start."""
+    steps: int = 60
+    """Steps allowed."""
+    resume: bool = False
+    """Go on with search.npz in the folder of the results."""
+    params: Path | None = None
+    """TOML file with values that replace the table's."""
+    out: Path | None = None
+    """Folder for the results; default runs/tune_WHAT."""
+    figures: Literal["png", "pdf", "svg", "none"] = "png"
+    """Format of the figures."""
+    cache: bool = True
+    """Keep compiled code in the user's cache folder for the next run."""
+
+
+class _Watch:
+    """Progress on stderr, and a checkpoint after every step."""
+
+    def __init__(self, problem: str, path: Path, steps: int) -> None:
+        columns = (TextColumn("{task.description}"), TimeElapsedColumn())
+        self.bar = Progress(*columns, console=Console(stderr=True), transient=True)
+        self.task = self.bar.add_task("compiling")
+        self.problem, self.path, self.steps = problem, path, steps
+
+    def __call__(self, now: Search) -> None:
+        from ..view.tuning import save_search
+
+        words = f"step {now.steps} of {self.steps}: loss {now.history[-1]:.4g}, best {now.loss:.4g}"
+        self.bar.update(self.task, description=words)
+        save_search(now, self.problem, self.path)
+
+
+def _search(command: Tune, folder: Path, problem: str, residuals: Any, start: Any) -> Search:
+    from ..view.tuning import load_search
+
+    path = folder / "search.npz"
+    before = load_search(path, problem, start) if command.resume else None
+    watch = _Watch(problem, path, command.steps)
+    method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
+    with watch.bar:
+        return search(
+            residuals, start, method, steps=command.steps, report=watch, resume=before, patience=15
+        )
+
+
+def run_tune(command: Tune) -> int:
+    """Run the command; the exit code."""
+    table = table_of(command.params)
+    folder = command.out if command.out is not None else Path("runs") / f"tune_{command.what}"
+    if command.what != "slew" and (command.force is not None or command.reaction is not None):
+        raise SettingError("--force and --reaction are limits of a slew.")
+    work = {"hold": _hold, "slew": _slew, "identify": _identify}[command.what]
+    found, shown, paths = work(command, table, folder)
+    out = Console()
+    out.print(shown)
+    out.print(found.words(), highlight=False)
+    out.print("Written:", highlight=False)
+    for path in [folder / "search.npz", *paths]:
+        out.print(f"  {path}", highlight=False, soft_wrap=True)
+    if found.reason is SearchReason.INTERRUPTED:
+        return 130
+    return 1 if found.reason is SearchReason.NOT_FINITE else 0
+
+
+def _segments(command: Tune) -> int:
+    return command.segments or max(1, math.ceil(command.duration / 0.2))
+
+
+def _hold(command: Tune, table: Parameters, folder: Path) -> tuple[Search, Table, list[Path]]:
+    from ..scenes.uav_tracker import uav_flyer
+    from ..study.tuning import at_rest, hold, holding_time
+    from ..vehicle.flyer import Inputs
+    from ..vehicle.geometry import initial_angles
+    from ..vehicle.rotor import Rotors, hover_speed_squared
+
+    flyer = uav_flyer(table)
+    rotors = flyer.system.forces[flyer.rotors]
+    assert isinstance(rotors, Rotors)
+    mass = jnp.sum(flyer.system.bodies.mass)
+    count = rotors.spin.shape[0]
+    equal = hover_speed_squared(mass, table.value("gravity"), rotors.k_f, count)
+    untuned = Inputs(equal, jnp.zeros(2))
+    angles = initial_angles(table)
+    tuning = hold(flyer, angles, untuned, horizon=command.duration, segments=_segments(command))
+    found = _search(command, folder, tuning.name, tuning.residuals, tuning.start)
+    inputs = tuning.inputs(found.values)
+    start = at_rest(angles)
+    times = [holding_time(flyer, each, start) for each in (untuned, inputs)]
+    shown = Table("", "untuned", "tuned", title="Constant inputs that hold")
+    for k in range(count):
+        pair = (untuned.squared[k], inputs.squared[k])
+        shown.add_row(f"rotor {k + 1} [rad/s]", *(f"{math.sqrt(float(x)):.4f}" for x in pair))
+    for k in range(2):
+        pair = (untuned.forces[k], inputs.forces[k])
+        shown.add_row(f"actuator {k + 2} [N]", *(f"{float(x):.6f}" for x in pair))
+    shown.add_row("within 5 degrees until [s]", *(f"{t:.3f}" for t in times))
+    return found, shown, _figures(command, folder, found, {})
+
+
+def _slew(command: Tune, table: Parameters, folder: Path) -> tuple[Search, Table, list[Path]]:
+    from ..scenes.uav_tracker import uav_flyer
+    from ..study.tuning import SlewLimits, flown, peaks, slew
+    from ..vehicle.geometry import initial_angles
+    from ..vehicle.workspace import tracker_limits
+    from ..view.tuning import flight_figure
+
+    flyer = uav_flyer(table)
+    stops = tracker_limits(table)
+    force = math.inf if command.force is None else command.force
+    limits = SlewLimits(force, stops.home, stops.lower, stops.upper, command.reaction)
+    after = np.radians(command.to)
+    tuning = slew(
+        flyer, initial_angles(table), after, command.duration, limits,
+        knots=command.knots, segments=_segments(command),
+    )  # fmt: skip
+    found = _search(command, folder, tuning.name, tuning.residuals, tuning.start)
+    shown = Table("", "straight inputs", "tuned", "limit", title="Turn of the panel")
+    each = [peaks(tuning, values) for values in (tuning.start, found.values)]
+    mm = lambda x: ", ".join(f"{1e3 * float(v):.1f}" for v in x)
+    rows: list[tuple[str, Any, str]] = [
+        ("error at the end [mrad]", lambda p: f"{1e3 * float(p.error):.3f}", ""),
+        ("largest tilt [mrad]", lambda p: f"{1e3 * float(p.tilt):.2f}", ""),
+        ("largest drift [mm]", lambda p: f"{1e3 * float(p.drift):.2f}", ""),
+        ("force [N]", lambda p: f"{float(p.force):.3f}", f"{limits.force}"),
+        ("least shifts [mm]", lambda p: mm(p.lower), mm(limits.lower)),
+        ("largest shifts [mm]", lambda p: mm(p.upper), mm(limits.upper)),
+    ]
+    if command.reaction is not None:
+        rows.append(("reaction [N]", lambda p: f"{float(p.reaction):.2f}", f"{command.reaction}"))
+    for label, of, limit in rows:
+        shown.add_row(label, *(of(p) for p in each), limit)
+    ts, curves = flown(tuning, found.values)
+    marks = {"actuators [N]": [-command.force, command.force]} if command.force else {}
+    return (
+        found,
+        shown,
+        _figures(command, folder, found, {"flight": flight_figure(ts, curves, marks)}),
+    )
+
+
+def _identify(command: Tune, table: Parameters, folder: Path) -> tuple[Search, Table, list[Path]]:
+    from ..scenes.uav_tracker import uav_flyer
+    from ..study.experiment import experiment
+    from ..study.identify import identify
+    from ..vehicle.drive import Friction
+    from ..view.tuning import load_search
+
+    make = lambda table: uav_flyer(table, friction=Friction())
+    case = experiment(make, table, seed=command.seed)
+    path = folder / "search.npz"
+    problem = f"identify {case.name}"
+    before = load_search(path, problem, jnp.zeros(len(case.truth))) if command.resume else None
+    watch = _Watch(problem, path, command.steps)
+    with watch.bar:
+        found = identify(
+            case.predict, case.record, case.sigma, case.start, case.sizes,
+            labels=case.labels, weakest=0.5, steps=command.steps, report=watch, resume=before,
+        )  # fmt: skip
+    shown = Table("parameter", "true", "start", "found", "deviation", title="Identified")
+    for k, label in enumerate(case.labels):
+        numbers = (case.truth[k], case.start[k], found.values[k], found.deviations[k])
+        shown.add_row(label, *(f"{x:.5g}" for x in numbers))
+    return found.search, shown, _figures(command, folder, found.search, {})
+
+
+def _figures(command: Tune, folder: Path, found: Search, more: dict[str, Any]) -> list[Path]:
+    from ..view.tuning import loss_history, save_tuning_figures
+
+    if command.figures == "none":
+        return []
+    figures = {"loss": loss_history(found.history), **more}
+    return save_tuning_figures(figures, folder, command.figures)

@@ -1,0 +1,93 @@
+"""Explicit Runge-Kutta steps with nothing but the evaluations that the step needs."""
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+Vector = Float[Array, " k"]
+
+
+class Lean(diffrax.AbstractAdaptiveSolver):
+    """The steps of an explicit Runge-Kutta method of diffrax, without what dense output needs.
+
+    The same tableau and, but for round-off, the same steps: one loop over the stages, their
+    slopes in one array, stages that only serve interpolation left out. Between steps it
+    interpolates linearly, so it serves where steps end at the output times.
+
+    Args:
+        method: any of diffrax's explicit Runge-Kutta methods, such as `diffrax.Dopri8()`.
+    """
+
+    method: diffrax.AbstractERK
+
+    @property
+    def term_structure(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return diffrax.AbstractTerm
+
+    @property
+    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return diffrax.LocalLinearInterpolation
+
+    def order(self, terms: Any) -> int | None:
+        return self.method.order(terms)
+
+    def strong_order(self, terms: Any) -> Any:
+        return self.method.strong_order(terms)
+
+    def error_order(self, terms: Any) -> Any:
+        return self.method.error_order(terms)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> None:
+        return None
+
+    def func(self, terms: Any, t0: Any, y0: Vector, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def step(
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Vector,
+        args: Any,
+        solver_state: None,
+        made_jump: Any,
+    ) -> tuple[Vector, Vector, Any, None, diffrax.RESULTS]:
+        del solver_state, made_jump
+        A, b, b_error, c = coefficients(self.method)
+        h = terms.contr(t0, t1)
+
+        def stage(slopes: Float[Array, "s k"], at: tuple[Any, Any, Any]) -> tuple[Any, None]:
+            row, weight, number = at
+            y = y0 + h * jnp.sum(row[:, None] * slopes, axis=0)
+            slope = terms.vf(t0 + weight * h, y, args)
+            return jax.lax.dynamic_update_index_in_dim(slopes, slope, number, 0), None
+
+        stages = len(c)
+        start = jnp.zeros((stages, y0.shape[0]), y0.dtype)
+        table = (jnp.asarray(A), jnp.asarray(c), jnp.arange(stages))
+        slopes, _ = jax.lax.scan(stage, start, table)
+        y1 = y0 + h * jnp.sum(b[:, None] * slopes, axis=0)
+        error = h * jnp.sum(b_error[:, None] * slopes, axis=0)
+        dense_info = {"y0": y0, "y1": y1}
+        return y1, error, dense_info, None, diffrax.RESULTS.successful
+
+
+def coefficients(
+    method: diffrax.AbstractERK,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A (s, s), b, b of the error, c (s,); stages at the end that neither b needs left out."""
+    tableau: Any = method.tableau
+    count = len(tableau.b_sol)
+    A = np.zeros((count, count))
+    for i, row in enumerate(tableau.a_lower):
+        A[i + 1, : i + 1] = row
+    c = np.concatenate([[0.0], tableau.c])
+    b, b_error = np.asarray(tableau.b_sol), np.asarray(tableau.b_error)
+    used = np.flatnonzero((b != 0) | (b_error != 0))
+    last = int(used[-1]) + 1
+    return A[:last, :last], b[:last], b_error[:last], c[:last]

@@ -1,0 +1,67 @@
+"""How fast the fastest motions of a system are, and which solver that asks for."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..algebra.shapes import Numbers
+from ..mechanics.state import State
+from ..mechanics.system import System, check_state
+from .formulation import AbstractFormulation
+from .rosenbrock import Rodas5P
+from .stabilisation import Unstabilised
+from .tree import Tree
+
+# The crossover measured with servos lies between 430 and 1400 1/s: docs/stiff.md.
+EXPLICIT_LIMIT = 1e3  # [1/s]
+
+
+def spectrum(
+    system: System,
+    state: State,
+    t: Numbers = 0.0,
+    *,
+    formulation: AbstractFormulation | None = None,
+) -> np.ndarray:
+    """Eigenvalues [1/s] of the motion linearised at a state, largest magnitude first, (k,).
+
+    In the formulation's coordinates (default `Tree()`), so that the constraints, if any,
+    contribute zeros. An explicit method's steps cannot be longer than a few divided by the
+    first magnitude, whatever the tolerance; where that is far shorter than what the motion
+    itself needs, the scene is stiff.
+
+    Raises:
+        SettingError: shapes or precision of the state do not fit the system.
+    """
+    check_state(system, state)
+    how = formulation if formulation is not None else Tree()
+    values = np.linalg.eigvals(np.asarray(_jacobian(how, system, state, jnp.asarray(t, float))))
+    return values[np.argsort(-np.abs(values))]
+
+
+@eqx.filter_jit
+def _jacobian(
+    formulation: AbstractFormulation, system: System, state: State, t: Float[Array, ""]
+) -> Float[Array, "k k"]:
+    model = formulation.prepare(system)
+    x = formulation.to_vector(model, state)
+    return jax.jacfwd(lambda x: formulation.derivative(model, t, x, Unstabilised())[0])(x)
+
+
+def choose_solver(
+    system: System,
+    state: State,
+    t: Numbers = 0.0,
+    *,
+    formulation: AbstractFormulation | None = None,
+) -> diffrax.AbstractSolver:
+    """`Rodas5P` where the fastest motion at the state is above `EXPLICIT_LIMIT`, else Dopri8.
+
+    It looks at the start only, which misleads where something is stiff for moments: a stop
+    that is hit later is not seen, and friction is stiff at rest but not in motion.
+    """
+    fastest = np.abs(spectrum(system, state, t, formulation=formulation)[0])
+    return Rodas5P() if fastest > EXPLICIT_LIMIT else diffrax.Dopri8()

@@ -1,0 +1,351 @@
+"""Relative coordinates of a spanning tree, with the cut joints' rows as constraints.
+
+With the tree's velocities u, spatial axes S_k and frames' velocities V = sum S_k u_k,
+
+    [ M   -J^T ] [ du/dt  ]   [ -h    ]
+    [ J    0   ] [ lambda ] = [ gamma ],
+
+M from composite inertias, h from the velocity-product accelerations (exact, in closed form)
+and the loads, J from the cut joints' primitives and the axes S_k. All of it is written in
+the base's axes where the system floats, so that it does not depend on where the base is.
+
+Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 6 (composite inertias)
+and ch. 8 (closed loops). Derivation: docs/dynamics.md.
+"""
+
+from functools import reduce
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..algebra.linalg import right_inverse, solve_saddle
+from ..algebra.rotation import (
+    conjugate,
+    cross,
+    euler_parameter_rate,
+    from_rotation_vector,
+    normalise,
+    product,
+    rotation_matrix,
+)
+from ..algebra.stacked import apply, apply_transposed
+from ..mechanics.constraint import ROWS
+from ..mechanics.load import Load, no_load
+from ..mechanics.state import State
+from ..mechanics.system import System
+from .balance import balanced
+from .branches import right_inverse_branches, serves
+from .chain import Chain, chain, parameters
+from .coordinates import Coordinates, join, read, shapes, split
+from .cut import Placed, Rows, cut_rows, in_world, kinematics
+from .differential import Constraints, constraints
+from .formulation import AbstractFormulation, Accelerations, Flows, Residuals
+from .motion import (
+    Motion,
+    bias,
+    bias_of_base,
+    body_accelerations,
+    inertia,
+    mass_matrix,
+    motion,
+    wrenches_by_frame,
+)
+from .pose import kinds
+from .reactions import Reactions, joint_reactions, tree_reactions
+from .stabilisation import AbstractStabilisation, Baumgarte
+from .topology import SpanningTree, spanning_tree
+
+
+class TreeModel(eqx.Module):
+    """A system prepared for relative coordinates; `constraints` are those of the cut joints.
+
+    `inverse` is that of the mass matrix where it is constant: nothing but a base.
+    """
+
+    system: System
+    chain: Chain
+    constraints: Constraints
+    inverse: Float[Array, "6 6"] | None
+
+
+class Loads(NamedTuple):
+    """The sum of all loads, components first: force in the world, moment in body axes."""
+
+    force: Float[Array, "3 n"]
+    moment: Float[Array, "3 n"]
+    power: Float[Array, "*s"]
+
+
+class Solved(NamedTuple):
+    """Accelerations at one set of coordinates, with what they were made from."""
+
+    moving: Motion
+    placed: Placed
+    rows: Rows | None
+    loads: Loads
+    rate: Float[Array, "k"]
+    multipliers: Float[Array, "m"]
+
+
+class Tree(AbstractFormulation):
+    """Relative coordinates of a spanning tree; multipliers for the cut joints only.
+
+    Args:
+        cut: names of joints to cut; by default those with the fewest rows. See
+            `spanning_tree` for the tree that results.
+        redundant: allow dependent rows; multipliers are then those of minimum norm.
+
+    Its multipliers belong to the cut joints' rows in the axes of frame 0; the reactions at
+    all joints follow from them and from the bodies' accelerations.
+    """
+
+    cut: tuple[str, ...] = eqx.field(static=True, default=())
+    redundant: bool = eqx.field(static=True, default=False)
+
+    def prepare(self, system: System) -> TreeModel:
+        tree = spanning_tree(system, self.cut)
+        numbers = chain(system, tree)
+        alone = tree.floating and not tree.steps
+        inverse = _inverse_of_base(numbers) if alone else None
+        return TreeModel(system, numbers, constraints(system, joints=tree.cut), inverse)
+
+    def to_vector(self, model: TreeModel, state: State) -> Float[Array, " k"]:
+        return join(read(model.chain, state))
+
+    def to_state(self, model: TreeModel, x: Float[Array, " k"]) -> State:
+        at = split(model.chain.tree, x)
+        placed = in_world(model.chain, at, motion(model.chain, at))
+        p = parameters(model.chain, at.q1, at.balls)[:, :-1]
+        p = product(at.p, p) if model.chain.tree.floating else p
+        bodies = lambda x: x[:, :-1].T
+        return State(bodies(placed.r), p.T, bodies(placed.v), bodies(placed.omega))
+
+    def accelerations(
+        self,
+        model: TreeModel,
+        t: Float[Array, ""],
+        state: State,
+        stabilisation: AbstractStabilisation,
+    ) -> Accelerations:
+        at = read(model.chain, state)
+        solved = self._solve(model, t, at, stabilisation, dependent="minimum norm")
+        v_rate, omega_rate = body_accelerations(model.chain, at, solved.moving, solved.rate)
+        return Accelerations(v_rate.T, omega_rate.T, solved.multipliers)
+
+    def derivative(
+        self,
+        model: TreeModel,
+        t: Float[Array, ""],
+        x: Float[Array, " k"],
+        stabilisation: AbstractStabilisation,
+    ) -> tuple[Float[Array, " k"], Flows]:
+        tree, how = model.chain.tree, stabilisation
+        at = split(tree, x)
+        solved = self._solve(model, t, at, how)
+        rate = _rates(tree, at, solved.rate)
+        if isinstance(how, Baumgarte):
+            pull = lambda p: how.norm * (1 - jnp.sum(p**2, axis=0)) * p
+            rate = rate._replace(p=rate.p + pull(at.p), balls=rate.balls + pull(at.balls))
+        load, placed = solved.loads, solved.placed
+        moment = cross(placed.r, load.force) + apply(placed.R_wb, load.moment)
+        power = load.power
+        if solved.rows is not None:
+            power = power + jnp.sum(solved.multipliers * solved.rows.target, axis=0)
+        flows = Flows(power, jnp.sum(load.force[:, :-1], 1), jnp.sum(moment[:, :-1], 1))
+        return join(rate), flows
+
+    def reactions(
+        self, model: TreeModel, t: Float[Array, ""], state: State, result: Accelerations
+    ) -> Reactions:
+        system, tree = model.system, model.chain.tree
+        kin = system.kinematics(state)
+        cut = _cut_reactions(model, t, state, result.multipliers)
+        load = reduce(Load.__add__, [f.load(t, kin) for f in system.forces], no_load(kin))
+        return tree_reactions(system, tree, kin, load, result, cut)
+
+    def _solve(
+        self,
+        model: TreeModel,
+        t: Float[Array, ""],
+        at: Coordinates,
+        how: AbstractStabilisation,
+        *,
+        dependent: Literal["fast", "minimum norm"] = "fast",
+    ) -> Solved:
+        tree = model.chain.tree
+        moving = motion(model.chain, at)
+        placed = in_world(model.chain, at, moving)
+        load = _loads(model.system, t, placed)
+        force, moment = load.force[:, :-1], apply(moving.R[:, :, :-1], load.moment[:, :-1])
+        if tree.floating:
+            force = apply_transposed(rotation_matrix(at.p), force)
+        wrench = wrenches_by_frame(tree, moving, force, moment)
+        if model.inverse is not None:
+            rate = -apply(model.inverse, bias_of_base(model.chain, moving, wrench))
+            return Solved(moving, placed, None, load, rate, rate[:0])
+        rows = None
+        if model.constraints.groups:
+            rows = cut_rows(model.chain, model.constraints, t, moving)
+            if isinstance(how, Baumgarte):
+                off = jnp.sum(rows.J * at.u, axis=1) - rows.target
+                pull = 2 * how.alpha * off + how.beta**2 * rows.value
+                rows = rows._replace(gamma=rows.gamma - pull)
+        if self._small(model):
+            rate, multipliers = balanced(model.chain, model.constraints, moving, wrench, rows)
+            return Solved(moving, placed, rows, load, rate, multipliers)
+        total = inertia(model.chain, moving, wrench)
+        h = bias(tree, moving.S, total)
+        J, gamma = (jnp.zeros((0, len(at.u))), h[:0]) if rows is None else (rows.J, rows.gamma)
+        rate, multipliers = solve_saddle(
+            mass_matrix(tree, moving.S, total),
+            _all_columns(tree, J),
+            -h,
+            gamma,
+            redundant=dependent if self.redundant else False,
+        )
+        return Solved(moving, placed, rows, load, rate, multipliers)
+
+    def _small(self, model: TreeModel) -> bool:
+        """Whether the equations are solved branch by branch."""
+        rows = sum(ROWS[group.kind] * len(group.i) for group in model.constraints.groups)
+        return not self.redundant and serves(model.chain.tree, rows)
+
+    def project(
+        self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"], iterations: int
+    ) -> tuple[Float[Array, " k"], Residuals]:
+        tree = model.chain.tree
+        at = split(tree, x)
+        at = at._replace(p=normalise(at.p), balls=normalise(at.balls))
+        if not model.constraints.groups:
+            return join(at), _left(model, at, None)
+
+        def rows_of(moving: Motion) -> Rows:
+            return cut_rows(model.chain, model.constraints, t, moving)
+
+        # The derivative of a converged iteration is that of its last step with G held: what
+        # this leaves out is of the size of the residual that the step before has left.
+        near = jax.lax.stop_gradient(at)
+        moving = motion(model.chain, near)
+        rows = jax.lax.stop_gradient(rows_of(moving))
+        G = jax.lax.stop_gradient(self._closing(model, moving, rows.J))
+        by_rows = lambda b: jnp.sum(G * b[None], axis=1)
+
+        def closer(_: Any, now: Coordinates) -> Coordinates:
+            rows = jax.lax.stop_gradient(rows_of(motion(model.chain, now)))
+            return _moved(tree, now, -by_rows(rows.value))
+
+        near = _moved(tree, near, -by_rows(rows.value))
+        near = jax.lax.fori_loop(1, iterations, closer, near)
+        at = _carried(at, near)
+        rows = rows_of(motion(model.chain, at))
+        at = _carried(_moved(tree, at, -by_rows(rows.value)), near)
+        for _ in range(max(iterations, 2)):
+            off = jnp.sum(rows.J * at.u, axis=1) - rows.target
+            at = at._replace(u=at.u - by_rows(off))
+        return join(at), _left(model, at, rows)
+
+    def _closing(
+        self, model: TreeModel, moving: Motion, J: Float[Array, "m k *s"]
+    ) -> Float[Array, "k m *s"]:
+        """G: of all velocities u with J u = b, G b is the smallest in the mass metric."""
+        tree = model.chain.tree
+        total = inertia(model.chain, moving, jnp.zeros_like(moving.V))
+        if self._small(model):
+            return right_inverse_branches(tree, moving.S, total, J)
+        M = mass_matrix(tree, moving.S, total)
+        G = right_inverse(M, _all_columns(tree, J), redundant=self.redundant)
+        return G[6 * tree.floating :]
+
+    def residuals(self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"]) -> Residuals:
+        at = split(model.chain.tree, x)
+        if not model.constraints.groups:
+            return _left(model, at, None)
+        rows = cut_rows(model.chain, model.constraints, t, motion(model.chain, at))
+        return _left(model, at, rows)
+
+
+@eqx.filter_jit
+def _inverse_of_base(numbers: Chain) -> Float[Array, "6 6"]:
+    """The inverse mass matrix of a base without joints but welds."""
+    tree = numbers.tree
+    at = Coordinates(*(jnp.zeros(shape) for shape in shapes(tree)))
+    moving = motion(numbers, at._replace(p=at.p.at[0].set(1.0)))
+    total = inertia(numbers, moving, jnp.zeros_like(moving.V))
+    return jnp.linalg.inv(mass_matrix(tree, moving.S, total))
+
+
+def _cut_reactions(
+    model: TreeModel, t: Float[Array, ""], state: State, multipliers: Float[Array, " m"]
+) -> Reactions:
+    """Of the cut joints, world axes; the multipliers are those of rows in frame 0's axes."""
+    system, tree = model.system, model.chain.tree
+    if not tree.floating:
+        return joint_reactions(system, model.constraints, t, state, multipliers)
+    r, p = state.r[tree.root], state.p[tree.root]
+    R_w0 = rotation_matrix(p)
+    own = jax.vmap(product, in_axes=(None, 0))(conjugate(p), state.p)
+    seen = State((state.r - r) @ R_w0, own, state.v @ R_w0, state.omega)
+    found = joint_reactions(system, model.constraints, t, seen, multipliers)
+    return Reactions(found.force @ R_w0.T, found.moment @ R_w0.T)
+
+
+def _all_columns(tree: SpanningTree, J: Float[Array, "m k"]) -> Float[Array, "m l"]:
+    """Rows in all velocities: those of the base move no row that joins two bodies on it."""
+    if not tree.floating:
+        return J
+    return jnp.concatenate([jnp.zeros((J.shape[0], 6, *J.shape[2:]), J.dtype), J], axis=1)
+
+
+def _carried(at: Coordinates, to: Coordinates) -> Coordinates:
+    """The values of `to`, with the derivatives of `at`."""
+    stop = jax.lax.stop_gradient
+    return jax.tree.map(lambda x, y: stop(y) + (x - stop(x)), at, to)
+
+
+def _moved(tree: SpanningTree, at: Coordinates, step: Float[Array, "k"]) -> Coordinates:
+    """The tree's coordinates after a small motion along its velocities."""
+    q1, shift, balls = kinds(tree, step)
+    turned = product(at.balls, from_rotation_vector(balls)) if balls.shape[1] else at.balls
+    return at._replace(q1=at.q1 + q1, shift=at.shift + shift, balls=turned)
+
+
+def _left(model: TreeModel, at: Coordinates, rows: Rows | None) -> Residuals:
+    p = jnp.concatenate([at.p, at.balls], axis=1)
+    norm = jnp.max(jnp.abs(jnp.sum(p**2, axis=0) - 1), axis=0, initial=0.0)
+    if rows is None:
+        return Residuals(jnp.zeros_like(norm), jnp.zeros_like(norm), norm)
+    scale = model.constraints.scales()
+    off = jnp.sum(rows.J * at.u, axis=1) - rows.target
+    return Residuals(
+        position=jnp.max(jnp.abs(scale * rows.value), axis=0),
+        velocity=jnp.max(jnp.abs(scale * off), axis=0),
+        norm=norm,
+    )
+
+
+def _loads(system: System, t: Float[Array, ""], placed: Placed) -> Loads:
+    """The sum of all force elements."""
+    kin = kinematics(system, placed)
+    load = reduce(Load.__add__, [force.load(t, kin) for force in system.forces], no_load(kin))
+    return Loads(load.force.T, load.moment.T, load.power)
+
+
+def _rates(tree: SpanningTree, at: Coordinates, u_rate: Float[Array, "k"]) -> Coordinates:
+    """The rates of all coordinates at the given accelerations."""
+    q1, shift, balls = kinds(tree, at.u)
+    turning = euler_parameter_rate(at.balls, balls) if balls.shape[1] else at.balls
+    if not tree.floating:
+        return Coordinates(at.r, at.p, q1, shift, turning, at.v, at.omega, u_rate)
+    return Coordinates(
+        r=at.v,
+        p=euler_parameter_rate(at.p, at.omega),
+        q1=q1,
+        shift=shift,
+        balls=turning,
+        v=apply(rotation_matrix(at.p), u_rate[3:6, None]),
+        omega=u_rate[:3, None],
+        u=u_rate[6:],
+    )

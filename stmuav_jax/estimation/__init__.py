@@ -1,0 +1,1 @@
+"""State estimation: sigma-point Kalman filters, smoother, consistency, the report's quadrotor."""

@@ -1,0 +1,116 @@
+"""Is an estimator as good as it says: NEES, NIS, whiteness, and their chi-squared intervals.
+
+    NEES = e^T P^-1 e, e the error of the state;    NIS = nu^T S^-1 nu, nu the innovation
+
+Over N independent runs N times the mean NEES is chi-squared with N n degrees of freedom.
+
+Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with applications to tracking and
+navigation (2001), ch. 5.4.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.special import gammaincinv
+
+from ..mechanics.errors import SettingError
+from .factor import divide_lower, triangularise
+from .filter import Filtered
+from .space import AbstractSpace, Point
+
+
+def nees(
+    mean: Point,
+    factor: Float[Array, "n n *s"],
+    truth: Point,
+    space: AbstractSpace,
+    *,
+    only: slice | None = None,
+) -> Float[Array, "*s"]:
+    """Normalised estimation error squared, chi-squared with n degrees if the filter is right.
+
+    Args:
+        only: consecutive components of the error to look at (their marginal covariance).
+    """
+    error = space.difference(truth, mean)
+    if only is not None:
+        error = error[only]
+        factor = triangularise(jnp.swapaxes(factor[only], 0, 1))
+    scaled = divide_lower(factor, error[:, None])[:, 0]
+    return jnp.sum(scaled**2, axis=0)
+
+
+def path_nees(
+    filtered: Any, truth: Point, space: AbstractSpace, *, only: slice | None = None
+) -> Float[Array, "T *s"]:
+    """NEES at each time of a `Filtered` or `Smoothed` path, truth with T first; with any bank."""
+    # times become one more axis of the stack
+    last = lambda leaf: jnp.moveaxis(leaf, 0, -1)
+    mean, true = (
+        jnp.moveaxis(a, 0, -1)
+        if not isinstance(a, dict)
+        else {name: last(leaf) for name, leaf in a.items()}
+        for a in (filtered.mean, truth)
+    )
+    each = nees(mean, last(filtered.factor), true, space, only=only)
+    return jnp.moveaxis(each, -1, 0)
+
+
+def chi2_interval(degrees: int | float, level: float = 0.999) -> tuple[float, float]:
+    """The two-sided interval in which a chi-squared variable lies with probability `level`."""
+    if not 0 < level < 1 or degrees <= 0:
+        raise SettingError(f"A level in (0, 1) and degrees > 0, not {level} and {degrees}.")
+    tail = (1 - level) / 2
+    low, high = 2 * gammaincinv(degrees / 2, np.array([tail, 1 - tail]))
+    return float(low), float(high)
+
+
+def mean_interval(degrees: int, count: int, level: float = 0.999) -> tuple[float, float]:
+    """The interval for the mean of `count` independent chi-squared variables.
+
+    Args:
+        degrees: of each: n for NEES, m for NIS.
+    """
+    low, high = chi2_interval(degrees * count, level)
+    return low / count, high / count
+
+
+def autocorrelation(scaled: Float[Array, "T m *s"], lag: int) -> Float[Array, "*s"]:
+    """Mean of nu_k . nu_(k + lag) / m of scaled innovations: near zero if they are white.
+
+    Its standard deviation is 1 / sqrt(m T): |value| < 3.3 / sqrt(m T) holds with 99.9 %.
+
+    Raises:
+        SettingError: a lag outside 1 .. T - 1.
+    """
+    if not 0 < lag < scaled.shape[0]:
+        raise SettingError(f"The lag must be in 1 to {scaled.shape[0] - 1}, not {lag}.")
+    products = scaled[:-lag] * scaled[lag:]
+    return jnp.mean(products, axis=(0, 1))
+
+
+def inconsistent(filtered: Filtered, *, window: int = 50, level: float = 0.999) -> np.ndarray:
+    """Where the NIS over the last `window` measurements is larger than chance allows (T, *s).
+
+    True also from a failure on. A filter that has converged to something wrong, or diverges,
+    is seen here, from its measurements alone.
+    """
+    nis = np.asarray(filtered.nis)
+    m = filtered.innovations.error.shape[1]
+    there = m - np.asarray(filtered.innovations.missing)
+    shape = np.broadcast_shapes(nis.shape, there.shape)
+    total, degrees = (
+        _running(np.broadcast_to(a, shape).astype(float), window) for a in (nis, there)
+    )
+    limit = 2 * gammaincinv(np.maximum(degrees, 1e-9) / 2, (1 + level) / 2)
+    return (degrees > 0) & ~(total <= limit)
+
+
+def _running(values: np.ndarray, window: int) -> np.ndarray:
+    """Sums over the last `window` entries, fewer at the start."""
+    out = np.empty_like(values)
+    for k in range(len(values)):
+        out[k] = np.sum(values[max(k - window + 1, 0) : k + 1], axis=0)
+    return out

@@ -1,0 +1,267 @@
+"""How a Gaussian goes through a function: sigma-point rules, and linearisation.
+
+Every rule here has a central point and pairs at m + s_j and m - s_j, s_j = L d_j, with weight w_j
+each. With the values relative to the central one, o_j = (f+ - f-) / 2 and e_j = (f+ + f-) / 2:
+
+    mean = f0 + delta,   delta = sum 2 w_j e_j,   W = sum 2 w_j,   ebar = delta / W
+    P = sum 2 w_j [o_j o_j^T + (e_j - ebar)(e_j - ebar)^T] + (g - 1 + 1 / W) delta delta^T
+
+with g the central weight of the covariance less that of the mean. This is the usual weighted
+sum, rearranged. For the scaled unscented transform the last factor is beta + alpha^2 kappa / n:
+a central weight of -95 (the report's) needs no subtraction at all, and P is a sum of squares
+unless kappa or beta is negative. Then a square root needs a downdate.
+
+Source: S. J. Julier, The scaled unscented transformation, ACC (2002); I. Arasaratnam, S. Haykin,
+Cubature Kalman filters, IEEE TAC 54 (2009); fifth degree: B. Jia, M. Xin, Y. Cheng, High-degree
+cubature Kalman filter, Automatica 49 (2013).
+"""
+
+import itertools
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..mechanics.errors import SettingError
+from .gaussian import Gaussian
+from .space import AbstractSpace, Point, expanded
+
+Function = Callable[[Point], Point]
+
+# Relative error of a mean up to which a rule may be used in a given precision.
+_LOST = 2e-5
+
+
+class Transformed(NamedTuple):
+    """What a Gaussian became: rows whose Gram matrix is the covariance.
+
+    Attributes:
+        mean: a point of the target.
+        rows: (r, m, *s), added squares.
+        less: (m, *s), one square to take away, or None.
+        inputs: (q, n, *s): the input's deviations, along the first q rows: the cross
+            covariance is inputs^T rows[:q].
+        triangular: whether `inputs` is the transposed root of the input (q = n).
+    """
+
+    mean: Point
+    rows: Float[Array, "r m *s"]
+    less: Float[Array, "m *s"] | None
+    inputs: Float[Array, "q n *s"]
+    triangular: bool
+
+
+class Points(NamedTuple):
+    """Directions (q, n) for a unit covariance, weight of each of a pair (q,), and g."""
+
+    directions: np.ndarray
+    weights: np.ndarray
+    extra: float
+
+
+class AbstractRule(eqx.Module):
+    """A way to send a Gaussian through a function."""
+
+    @abstractmethod
+    def transform(
+        self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
+    ) -> Transformed:
+        """The Gaussian of function(x), x from `prior`; the function takes stacks of points."""
+
+    @abstractmethod
+    def check(self, n: int, dtype: jnp.dtype) -> None:
+        """Raise `SettingError` if the rule cannot serve n dimensions in this precision."""
+
+
+class Unscented(AbstractRule):
+    """The scaled unscented transform, c^2 = alpha^2 (n + kappa), points m +- c L e_j.
+
+    The report's parameters (Table 2.4.2) are alpha = 0.1, beta = 2, kappa = 0.1.
+
+    Attributes:
+        means: how often the mean on a manifold is improved; vectors need no improvement.
+    """
+
+    alpha: float = eqx.field(static=True, default=1.0)
+    beta: float = eqx.field(static=True, default=2.0)
+    kappa: float = eqx.field(static=True, default=0.0)
+    means: int = eqx.field(static=True, default=3)
+
+    def points(self, n: int) -> Points:
+        """Directions and weights for n dimensions."""
+        square = self.alpha**2 * (n + self.kappa)
+        weights = np.full(n, 0.5 / square)
+        return Points(math.sqrt(square) * np.eye(n), weights, 1 - self.alpha**2 + self.beta)
+
+    def transform(
+        self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
+    ) -> Transformed:
+        points = self.points(prior.factor.shape[0])
+        return _by_points(points, function, prior, source, target, means=self.means)
+
+    def check(self, n: int, dtype: jnp.dtype) -> None:
+        square = self.alpha**2 * (n + self.kappa)
+        if not (self.alpha > 0 and square > 0):
+            raise SettingError(
+                f"The unscented rule needs alpha > 0 and n + kappa > 0, but alpha = {self.alpha}, "
+                f"n = {n}, kappa = {self.kappa}."
+            )
+        lost = float(jnp.finfo(dtype).eps) / square
+        if lost > _LOST:
+            raise SettingError(
+                f"alpha = {self.alpha:g} cannot work in {jnp.dtype(dtype).name}: sigma points so "
+                f"close lose 1 / (alpha^2 (n + kappa)) = {1 / square:.3g} times the precision, a "
+                f"relative error of {lost:.1g} of every mean. Use alpha >= 0.1, the Cubature rule, "
+                "or double precision (jax_enable_x64)."
+            )
+
+
+class Cubature(AbstractRule):
+    """The spherical cubature rule of third degree: points m +- sqrt(n) L e_j, equal weights."""
+
+    means: int = eqx.field(static=True, default=3)
+
+    def points(self, n: int) -> Points:
+        """Directions and weights for n dimensions."""
+        return Points(math.sqrt(n) * np.eye(n), np.full(n, 0.5 / n), 0.0)
+
+    def transform(
+        self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
+    ) -> Transformed:
+        points = self.points(prior.factor.shape[0])
+        return _by_points(points, function, prior, source, target, means=self.means)
+
+    def check(self, n: int, dtype: jnp.dtype) -> None:
+        """Serves every n in every precision."""
+
+
+class Cubature5(AbstractRule):
+    """The symmetric rule of fifth degree, 2 n^2 + 1 points.
+
+    Exact for polynomials up to the fifth degree. From n = 5 on its axial weights are negative,
+    and the covariance may not be positive definite: it is refused there.
+    """
+
+    means: int = eqx.field(static=True, default=3)
+
+    def points(self, n: int) -> Points:
+        """Directions and weights for n dimensions."""
+        axes = math.sqrt(n + 2) * np.eye(n)
+        pairs = [
+            math.sqrt((n + 2) / 2) * (np.eye(n)[i] + sign * np.eye(n)[j])
+            for i, j in itertools.combinations(range(n), 2)
+            for sign in (1, -1)
+        ]
+        weights = [(4 - n) / (2 * (n + 2) ** 2)] * n + [1 / (n + 2) ** 2] * len(pairs)
+        return Points(np.concatenate([axes, *[p[None] for p in pairs]]), np.array(weights), 0.0)
+
+    def transform(
+        self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
+    ) -> Transformed:
+        points = self.points(prior.factor.shape[0])
+        return _by_points(points, function, prior, source, target, means=self.means)
+
+    def check(self, n: int, dtype: jnp.dtype) -> None:
+        if n > 4:
+            raise SettingError(
+                f"Cubature5 has negative weights for n = {n} > 4 dimensions, so that its "
+                "covariances need not be positive definite. Use Cubature or Unscented."
+            )
+
+
+class Linearised(AbstractRule):
+    """The first-order rule of the extended Kalman filter: the function's derivative along L."""
+
+    def transform(
+        self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
+    ) -> Transformed:
+        centre = function(prior.mean)
+
+        def error(v: Array) -> Array:
+            return target.difference(function(source.retract(prior.mean, v)), centre)
+
+        zero = jnp.zeros(prior.factor.shape[:1] + prior.factor.shape[2:], prior.factor.dtype)
+        along = lambda v: jax.jvp(error, (zero,), (v,))[1]
+        rows = jax.vmap(along, in_axes=1)(prior.factor)
+        return Transformed(centre, rows, None, jnp.swapaxes(prior.factor, 0, 1), True)
+
+    def check(self, n: int, dtype: jnp.dtype) -> None:
+        """Serves every n in every precision."""
+
+
+def _by_points(
+    points: Points,
+    function: Function,
+    prior: Gaussian,
+    source: AbstractSpace,
+    target: AbstractSpace,
+    *,
+    means: int,
+) -> Transformed:
+    """Send sigma points through the function."""
+    directions, weights, _ = points
+    L = prior.factor
+    n, q = L.shape[0], len(weights)
+    axial = q == n
+    lanes = (1,) * (L.ndim - 2)
+    if axial:
+        steps = L * float(directions[0, 0])
+    else:
+        D = jnp.asarray(directions.T, L.dtype).reshape(1, n, q, *lanes)
+        steps = jnp.sum(L[:, :, None] * D, axis=1)
+    moves = jnp.concatenate([jnp.zeros_like(L[:, :1]), steps, -steps], axis=1)
+    images = function(source.retract(expanded(prior.mean), moves))
+    mean, rows, less = _moments(images, points, target, means)
+    scale = np.sqrt(2 * weights)
+    inputs = jnp.swapaxes(L if axial else steps * _column(scale, steps), 0, 1)
+    return Transformed(mean, rows, less, inputs, axial)
+
+
+def _column(values: np.ndarray, like: Array) -> Array:
+    """Weights (q,) along the second axis of (n, q, *s)."""
+    return jnp.asarray(values, like.dtype).reshape(1, -1, *(1,) * (like.ndim - 2))
+
+
+def _moments(
+    images: Point, points: Points, target: AbstractSpace, means: int
+) -> tuple[Point, Array, Array | None]:
+    """Mean, rows and the square to take away, of the images (m, 1 + 2 q, *s)."""
+    _, weights, extra = points
+    reference = jax.tree.map(lambda leaf: leaf[:, 0], images)
+    odd, even, delta, centre = _parts(images, reference, weights, target)
+    if target.is_flat:
+        # the centre is the reference, and one round is exact
+        reference = target.retract(reference, delta)
+    else:
+        for _ in range(means):
+            reference = target.retract(reference, delta + centre)
+            odd, even, delta, centre = _parts(images, reference, weights, target)
+    total = float(np.sum(2 * weights))
+    scale = _column(np.sqrt(2 * weights), odd)
+    parts = [odd * scale, (even - delta[:, None] / total) * scale]
+    factor = extra - 1 + 1 / total
+    less: Array | None = None
+    if factor > 1e-14:
+        parts.append(math.sqrt(factor) * delta[:, None])
+    elif factor < -1e-14:
+        less = delta * math.sqrt(-factor)
+    return reference, jnp.swapaxes(jnp.concatenate(parts, axis=1), 0, 1), less
+
+
+def _parts(
+    images: Point, reference: Point, weights: np.ndarray, target: AbstractSpace
+) -> tuple[Array, Array, Array, Array]:
+    """o_j, e_j (m, q, *s), their weighted sum delta, and the central error, seen from a point."""
+    q = len(weights)
+    a = target.difference(images, expanded(reference))
+    centre = a[:, :1]
+    plus, minus = a[:, 1 : q + 1] - centre, a[:, q + 1 :] - centre
+    odd, even = 0.5 * (plus - minus), 0.5 * (plus + minus)
+    delta = jnp.sum(jnp.swapaxes(even * _column(2 * weights, even), 0, 1), axis=0)
+    return odd, even, delta, centre[:, 0]

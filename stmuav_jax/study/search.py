@@ -1,0 +1,226 @@
+"""Search for the values that make a loss small, step by step: with progress, kept bests, restarts.
+
+The methods are those of optimistix, and through `optimistix.OptaxMinimiser` those of optax. What
+is added is what long searches need: every step is seen, the best values are kept whatever comes
+after them, a loss that is not finite ends the search, and it can be interrupted and gone on with.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
+
+from ..mechanics.errors import SettingError
+
+Method = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
+
+
+class SearchReason(IntEnum):
+    """Why a search has ended."""
+
+    CONVERGED = 0
+    STEPS = 1
+    PATIENCE = 2
+    NOT_FINITE = 3
+    INTERRUPTED = 4
+
+
+@dataclass(frozen=True)
+class Search:
+    """Where a search stands.
+
+    Attributes:
+        values: the best so far. loss: there.
+        history: losses at the start and after every step. best: the step of the best.
+        reason: a `SearchReason`; what it was if the search goes on from here.
+    """
+
+    values: PyTree[Array]
+    loss: float
+    history: tuple[float, ...]
+    best: int
+    reason: SearchReason
+
+    @property
+    def steps(self) -> int:
+        """Steps taken, those before a restart among them."""
+        return len(self.history) - 1
+
+    def words(self) -> str:
+        """How it has ended, in one sentence."""
+        at = f"the best loss is {self.loss:.6g}, at step {self.best}"
+        return {
+            SearchReason.CONVERGED: f"Converged after {self.steps} steps; {at}.",
+            SearchReason.STEPS: f"Stopped after the {self.steps} steps allowed; {at}.",
+            SearchReason.PATIENCE: f"Stopped at step {self.steps}, no better for long; {at}.",
+            SearchReason.NOT_FINITE: (
+                f"The loss is not finite at step {self.steps}; what came before is kept: {at}."
+            ),
+            SearchReason.INTERRUPTED: f"Interrupted after {self.steps} steps; {at}.",
+        }[self.reason]
+
+
+def all_at_once(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """The same function, its derivative along anything by way of its whole Jacobian.
+
+    For methods that want the whole of it: one pass gives values and all columns, where
+    linearising first would have flights compiled, and flown, once more.
+    """
+
+    @jax.custom_jvp
+    def of(values: Any) -> Any:
+        return function(values)
+
+    @of.defjvp
+    def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+        flat, unravel = ravel_pytree(primals[0])
+        along = ravel_pytree(tangents[0])[0]
+        push = lambda e: jax.jvp(function, primals, (unravel(e),))
+        out, columns = jax.vmap(push, out_axes=(0, -1))(jnp.eye(flat.shape[0], dtype=flat.dtype))
+        return jax.tree.map(lambda x: x[0], out), jax.tree.map(lambda J: J @ along, columns)
+
+    return of
+
+
+class _Stepper(eqx.Module):
+    """A method and what it needs to make a step."""
+
+    function: Callable[[Any], Any]
+    method: Method
+    shape: Any = eqx.field(static=True)
+
+    def of(self, values: Any, _: Any) -> tuple[Any, None]:
+        squares = isinstance(self.method, optx.AbstractLeastSquaresSolver)
+        function = all_at_once(self.function) if squares else self.function
+        return function(values), None
+
+    @eqx.filter_jit
+    def begin(self, values: Any) -> tuple[Any, Any]:
+        """The method's state: its arrays, and all else, which no step changes."""
+        state = self.method.init(self.of, values, None, {}, self.shape, None, frozenset())
+        return eqx.partition(state, eqx.is_array)
+
+    @eqx.filter_jit
+    def step(self, values: Any, arrays: Any, rest: Any) -> tuple[Any, Any, Any, Array, Array]:
+        """Next values and state; values whose loss is known now, the loss, whether to end."""
+        state = eqx.combine(arrays, rest)
+        after, state, _ = self.method.step(self.of, values, None, {}, state, frozenset())
+        done, _ = self.method.terminate(self.of, after, None, {}, state, frozenset())
+        # a minimiser of optax looks at where it was, the others at where they are
+        behind = isinstance(self.method, optx.OptaxMinimiser)
+        known, loss = (values, state.f) if behind else (after, state.f_info.as_min())
+        return after, eqx.filter(state, eqx.is_array), known, loss, done
+
+
+def search(
+    function: Callable[[Any], Any],
+    start: PyTree[Any],
+    method: Method,
+    *,
+    steps: int = 100,
+    patience: int = 20,
+    gain: float = 1e-3,
+    report: Callable[[Search], None] | None = None,
+    resume: Search | None = None,
+) -> Search:
+    """Make a function of a pytree small.
+
+    Args:
+        function: values -> residuals (any pytree), for a least-squares method such as
+            `optimistix.LevenbergMarquardt`; or -> a loss (), for a minimiser such as
+            `optimistix.OptaxMinimiser(optax.adam(1e-2), rtol, atol)`.
+        steps: allowed in all. patience: steps without a gain of the fraction `gain`.
+        report: called at the start and after every step; a `KeyboardInterrupt` there or in a
+            step ends the search.
+        resume: an earlier search of the same function, of which the best is gone on from.
+
+    Raises:
+        SettingError: steps or patience that are not positive, a start whose loss is not
+            finite, or `resume` with values of another form.
+    """
+    for name, count in (("steps", steps), ("patience", patience)):
+        if count < 1:
+            raise SettingError(f"A search needs at least one of {name}, not {count}.")
+    values = jax.tree.map(lambda x: jnp.asarray(x, dtype=float), start)
+    if resume is not None:
+        _check_form(resume.values, values)
+        values = resume.values
+    shape = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), jax.eval_shape(function, values)
+    )
+    stepper = _Stepper(function, method, shape)
+    return _go(stepper, values, resume, steps, patience, gain, report)
+
+
+def _go(
+    stepper: _Stepper,
+    values: Any,
+    now: Search | None,
+    steps: int,
+    patience: int,
+    gain: float,
+    report: Callable[[Search], None] | None,
+) -> Search:
+    begun = now is not None
+    mark, mark_loss = (now.steps, now.loss) if now is not None else (0, np.inf)
+    reason = SearchReason.STEPS
+    try:
+        arrays, rest = stepper.begin(values)
+        while now is None or now.steps < steps:
+            values, arrays, known, loss, done = stepper.step(values, arrays, rest)
+            if begun:
+                # the first step only says what the loss is where the search goes on
+                begun = False
+                continue
+            now = _seen(now, known, float(loss))
+            if now.reason is SearchReason.NOT_FINITE:
+                return now
+            if report is not None:
+                report(now)
+            if now.loss < (1 - gain) * mark_loss:
+                mark, mark_loss = now.steps, now.loss
+            if bool(done):
+                reason = SearchReason.CONVERGED
+                break
+            if now.steps - mark >= patience:
+                reason = SearchReason.PATIENCE
+                break
+    except KeyboardInterrupt:
+        if now is None:
+            raise
+        reason = SearchReason.INTERRUPTED
+    assert now is not None
+    return Search(now.values, now.loss, now.history, now.best, reason)
+
+
+def _seen(now: Search | None, values: Any, loss: float) -> Search:
+    """The search after one more loss."""
+    if now is None:
+        if not np.isfinite(loss):
+            raise SettingError(
+                f"The loss at the start of the search is {loss}: choose another start."
+            )
+        return Search(values, loss, (loss,), 0, SearchReason.STEPS)
+    history = (*now.history, loss)
+    if not np.isfinite(loss):
+        return Search(now.values, now.loss, history, now.best, SearchReason.NOT_FINITE)
+    if loss < now.loss:
+        return Search(values, loss, history, len(history) - 1, SearchReason.STEPS)
+    return Search(now.values, now.loss, history, now.best, SearchReason.STEPS)
+
+
+def _check_form(found: Any, wanted: Any) -> None:
+    shapes = lambda tree: jax.tree.map(jnp.shape, tree)
+    if jax.tree.structure(found) != jax.tree.structure(wanted) or shapes(found) != shapes(wanted):
+        raise SettingError(
+            "The search to go on with has values of another form: "
+            f"{shapes(found)}, where {shapes(wanted)} is wanted."
+        )

@@ -1,0 +1,169 @@
+"""A flight of the seven-body UAV as its own sensors see it, the tracker moving all the while.
+
+The full dynamics are integrated from one sample to the next. At each sample a controller reads
+attitude and body rates (the true ones) and sets rotor speeds, which hold until the next:
+
+    thrust = m g / cos(tilt),    moment = J (-k_tilt turn - k_rate omega) about the centre of mass
+
+of the start: what the moving tracker does to the balance is left to be felt. The sensors sit at
+the base's origin: a gyroscope (omega) and an accelerometer (R_wb^T (a - g)).
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..algebra.rotation import rotation_matrix
+from ..dynamics.analysis import evaluate
+from ..dynamics.integrate import Method, integrate
+from ..dynamics.tree import Tree
+from ..mechanics.errors import ModelError, SettingError
+from ..mechanics.force import Gravity
+from ..mechanics.state import State
+from ..mechanics.system import System
+from ..vehicle.allocation import least, wrench_map
+from ..vehicle.rotor import Rotors
+
+
+class Flight(eqx.Module):
+    """T samples; the first row of what has T + 1 is the start.
+
+    Attributes:
+        t: (T + 1,) [s]. squared: of the rotors' speeds, held over the steps (T, k) [rad^2/s^2].
+        p: attitude of the base (T + 1, 4). omega: its body rates (T + 1, 3) [rad/s].
+        force: specific force at its origin, at the end of each step (T, 3) [m/s^2].
+        centre: centre of mass of the whole, in the base's frame (T + 1, 3) [m].
+        J: of the whole about its centre of mass, base axes (T + 1, 3, 3) [kg m^2].
+        h: angular momentum of the parts relative to the base, about the centre of mass, base axes
+            (T + 1, 3) [N m s].
+        residual: largest constraint residual of the position [m].
+    """
+
+    t: Float[Array, " t"]
+    squared: Float[Array, "T k"]
+    p: Float[Array, "t 4"]
+    omega: Float[Array, "t 3"]
+    force: Float[Array, "T 3"]
+    centre: Float[Array, "t 3"]
+    J: Float[Array, "t 3 3"]
+    h: Float[Array, "t 3"]
+    residual: Float[Array, ""]
+
+
+class Gains(eqx.Module):
+    """tilt [1/s^2] and rate [1/s] of the controller; yaw is held as tilt is."""
+
+    tilt: float = 40.0
+    rate: float = 12.0
+
+
+def centre_of_mass(system: System, state: State) -> Float[Array, "3"]:
+    """Of all bodies, from the first one's origin in its axes [m]."""
+    mass = system.bodies.mass
+    centre_w = mass @ state.r / jnp.sum(mass)
+    return rotation_matrix(state.p[0]).T @ (centre_w - state.r[0])
+
+
+def inertia_about_centre(system: System, state: State) -> Float[Array, "3 3"]:
+    """Of all bodies together, about their centre of mass, in the first one's axes [kg m^2]."""
+    mass = system.bodies.mass
+    R_0w = rotation_matrix(state.p[0]).T
+    arms = (state.r - mass @ state.r / jnp.sum(mass)) @ R_0w.T
+    R = jnp.einsum("ij,njk->nik", R_0w, jax.vmap(rotation_matrix)(state.p))
+    own = jnp.einsum("nij,njk,nlk->il", R, system.bodies.inertia, R)
+    square = jnp.sum(mass * jnp.sum(arms**2, axis=1))
+    return own + square * jnp.eye(3) - jnp.einsum("n,ni,nj->ij", mass, arms, arms)
+
+
+def inner_momentum(system: System, state: State) -> Float[Array, "3"]:
+    """Angular momentum of the bodies relative to the first, about the centre of mass, in the first
+    one's axes [N m s]."""
+    mass = system.bodies.mass
+    R_0w = rotation_matrix(state.p[0]).T
+    arms = (state.r - mass @ state.r / jnp.sum(mass)) @ R_0w.T
+    from_base = (state.r - state.r[0]) @ R_0w.T
+    v = (state.v - state.v[0]) @ R_0w.T - jnp.cross(state.omega[0], from_base)
+    R = jnp.einsum("ij,njk->nik", R_0w, jax.vmap(rotation_matrix)(state.p))
+    spin = jnp.einsum("nij,nj->ni", R, state.omega) - state.omega[0]
+    own = jnp.einsum("nij,njk,nlk,nl->i", R, system.bodies.inertia, R, spin)
+    return own + jnp.einsum("n,ni->i", mass, jnp.cross(arms, v))
+
+
+def sensed_flight(
+    system: System,
+    state0: State,
+    *,
+    t1: float = 2.0,
+    step: float = 5e-3,
+    gains: Gains | None = None,
+    method: Method | None = None,
+) -> Flight:
+    """Fly from a start at rest, rotors under control, everything else as the system has it.
+
+    Args:
+        system: its first body carries the rotors; drivers may move its joints.
+        t1: end [s]. step: between samples [s].
+
+    Raises:
+        ModelError: no rotors on the first body, or no gravity. SettingError: an end before the
+            first sample.
+    """
+    rotors = [k for k, f in enumerate(system.forces) if isinstance(f, Rotors)]
+    pull = [f.acceleration for f in system.forces if isinstance(f, Gravity)]
+    if len(rotors) != 1 or not pull:
+        raise ModelError("A sensed flight needs one set of rotors and gravity.")
+    if not 0 < step <= t1 < 1e4:
+        raise SettingError(
+            f"The end must lie between one step of {step:g} s and 1e4 s, not {t1:g} s."
+        )
+    t = step * np.arange(round(t1 / step) + 1)
+    method = Method(rtol=1e-9, atol=1e-9, first_step=step / 4) if method is None else method
+    gains = Gains() if gains is None else gains
+    return eqx.filter_jit(_fly)(system, state0, jnp.asarray(t), gains, method, rotors[0], pull[0])
+
+
+def _fly(
+    system: System, state0: State, t: Array, gains: Gains, method: Method, at: int, pull: Array
+) -> Flight:
+    rotors: Any = system.forces[at]
+    weight = jnp.sum(system.bodies.mass) * jnp.linalg.norm(pull)
+    B = wrench_map(rotors, centre_of_mass(system, state0))
+    J = inertia_about_centre(system, state0)
+    up = -pull / jnp.linalg.norm(pull)
+
+    def commanded(state: State) -> Array:
+        R = rotation_matrix(state.p[0])
+        up_b, ahead_b = R.T @ up, R.T @ jnp.array([1.0, 0.0, 0.0])
+        # sines of the turns that bring z to up, and x to ahead
+        turn = jnp.stack([up_b[1], -up_b[0], -ahead_b[1]])
+        moment = J @ (-gains.tilt * turn - gains.rate * state.omega[0])
+        return least(B, jnp.concatenate([(weight / R[2, 2])[None], moment]))
+
+    def step(state: State, span: tuple) -> tuple[State, tuple]:
+        before, after = span
+        squared = commanded(state)
+        now = eqx.tree_at(lambda s: s.forces[at].speed_squared, system, squared)
+        path = integrate(now, state, jnp.stack([before, after]), method)
+        end = jax.tree.map(lambda a: a[-1], path.states)
+        rate = evaluate(now, end, after, formulation=Tree()).accelerations.v_rate[0]
+        force = rotation_matrix(end.p[0]).T @ (rate - pull)
+        return end, (squared, force, _kept(system, end), path.worst.position[-1])
+
+    _, (squared, force, kept, worst) = jax.lax.scan(step, state0, (t[:-1], t[1:]))
+    start = _kept(system, state0)
+    p, omega, centre, J, h = (
+        jnp.concatenate([a[None], b]) for a, b in zip(start, kept, strict=True)
+    )
+    return Flight(t, squared, p, omega, force, centre, J, h, jnp.max(worst))
+
+
+def _kept(system: System, state: State) -> tuple[Array, ...]:
+    """Attitude, body rates, centre of mass, inertia, inner momentum."""
+    return (
+        state.p[0], state.omega[0], centre_of_mass(system, state),
+        inertia_about_centre(system, state), inner_momentum(system, state),
+    )  # fmt: skip

@@ -1,0 +1,351 @@
+"""The eight cases and the hover as tables, figures and NetCDF files."""
+
+import datetime
+import json
+import math
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from ..estimation.assess import SETTLED, CaseStudy, Estimates, Summary, last_beyond
+from ..estimation.consistency import mean_interval
+from ..estimation.hover import Hover
+from .io import versions, write_atomically
+from .plot import _STYLES, _figure, save_all
+
+FORMAT = "stmuav_jax estimate"
+FORMAT_VERSION = 1
+
+COMPONENTS = ("Omega_x", "Omega_y", "Omega_z", "offset_x", "offset_y")
+_LOOKS = {"truth": ("0.6", "-"), "report": _STYLES[1], "consistent": _STYLES[0]}
+
+
+# --- tables
+
+
+def summary_table(summaries: Iterable[Summary]) -> Table:
+    """Convergence, errors and consistency, a row per case and tuning."""
+    rows = list(summaries)
+    table = Table(title="Centre of mass: how fast, how well, how honestly", title_justify="left")
+    for name in ("case", "tuning"):
+        table.add_column(name)
+    for name in ("2 cm [s]", "5 mm [s]", "RMSE [mm]", "NEES 2", "NEES 5", "NIS 3", "lost"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(
+            str(row.case), row.tuning, _seconds(row.to_2cm), _seconds(row.to_5mm),
+            f"{1e3 * row.rmse[0]:.2f} {1e3 * row.rmse[1]:.2f}",
+            _mean(row.nees_offset, row.nees_offset_window), _mean(row.nees, row.nees_window),
+            _mean(row.nis, row.nis_window), str(row.failed),
+        )  # fmt: skip
+    table.caption = (
+        f"{rows[0].seeds} seeds. Times from which on the error is below 2 cm and 5 mm, medians; RMSE "
+        "(x, y), NEES of the offset (2 degrees) and with the rates (5) and NIS of the settled part. "
+        "* outside the interval of 99.9 % of a consistent filter. Lost: covariances."
+    )
+    return table
+
+
+def _seconds(value: float) -> str:
+    return "never" if math.isnan(value) else f"{value:.3f}"
+
+
+def _mean(value: float, window: tuple[float, float]) -> str:
+    inside = window[0] <= value <= window[1]
+    return f"{value:.3g}{'' if inside else '*'}"
+
+
+def hover_table(flights: dict[str, Hover]) -> Table:
+    """How hovers went, by tuning: largest tilt and distance, errors, consistency at the end."""
+    table = Table(title="Hover by a controller that sees the estimate", title_justify="left")
+    table.add_column("tuning")
+    for name in ("largest tilt [degrees]", "furthest [m]", "to 2 cm [s]", "RMSE x, y [mm]",
+                 "NEES offset (2)", "NEES (14)", "failed"):  # fmt: skip
+        table.add_column(name, justify="right")
+    for name, flight in flights.items():
+        t = np.asarray(flight.t)
+        error = np.asarray(flight.mean - flight.truth)[:, 3:]
+        seeds = error.shape[2]
+        settled = t[1:] > min(SETTLED, t[-1] / 2)
+        rmse = 1e3 * np.sqrt(np.mean(error[settled] ** 2, axis=(0, 2)))
+        table.add_row(
+            name, f"{np.degrees(np.max(np.asarray(flight.tilt))):.1f}",
+            f"{np.max(np.linalg.norm(np.asarray(flight.r), axis=1)):.3f}",
+            _seconds(float(np.median(last_beyond(error, t, 0.02)))),
+            f"{rmse[0]:.2f}, {rmse[1]:.2f}",
+            _mean(float(np.mean(flight.nees_offset[-1])), mean_interval(2, seeds)),
+            _mean(float(np.mean(flight.nees[-1])), mean_interval(14, seeds)),
+            f"{int(np.sum(~np.asarray(flight.ok)[-1]))} of {seeds}",
+        )  # fmt: skip
+    table.caption = "* outside the interval that holds 99.9 % of a consistent filter's means."
+    return table
+
+
+# --- figures
+
+
+def _line(ax: Axes, t: Any, values: Any, name: str, **more: Any) -> None:
+    color, dash = _LOOKS[name]
+    width = 3.0 if name == "truth" else 1.3
+    more = {"linewidth": width, "color": color, "linestyle": dash, "label": name} | more
+    ax.plot(t, values, **more)
+
+
+def _title(study: CaseStudy) -> str:
+    return f"Report Part III, case {study.record.case}"
+
+
+def offset(study: CaseStudy) -> Figure:
+    """The centre of mass over the whole time and at the start, estimate against truth.
+
+    Source: in the manner of report Part III, Fig. 3.1.3 to 3.1.18.
+    """
+    figure, axes = _figure(2, 2, 4.6)
+    t = np.asarray(study.record.t)
+    truth = np.asarray(study.record.offset)[..., 0]
+    for row, axis in enumerate("xy"):
+        for ax, count in zip(axes[row], (len(t) - 1, min(30, len(t) - 1)), strict=True):
+            _line(ax, t[: count + 1], truth[: count + 1, row], "truth")
+            for name, found in study.estimates.items():
+                values = np.asarray(found.mean)[:count, 3 + row, 0]
+                _line(ax, t[1 : count + 1], values, name)
+            ax.set_xlabel("time [s]", fontsize=9)
+        axes[row, 0].set_ylabel(f"centre of mass, {axis} [m]", fontsize=9)
+    axes[0, 0].legend(fontsize=8)
+    axes[0, 1].set_title("the first 30 steps", fontsize=9)
+    figure.suptitle(f"{_title(study)}: where is the centre of mass", fontsize=11)
+    return figure
+
+
+def rates(study: CaseStudy) -> Figure:
+    """Body rates over the first half second, estimate against truth."""
+    figure, axes = _figure(3, 1, 5.4)
+    t = np.asarray(study.record.t)
+    count = int(np.searchsorted(t, 0.5))
+    count = min(count, len(t) - 1)
+    truth = np.asarray(study.record.omega)[..., 0]
+    for row, axis in enumerate("xyz"):
+        ax = axes[row, 0]
+        _line(ax, t[: count + 1], truth[: count + 1, row], "truth")
+        for name, found in study.estimates.items():
+            _line(ax, t[1 : count + 1], np.asarray(found.mean)[:count, row, 0], name)
+        ax.set_ylabel(rf"$\Omega_{axis}$ [rad/s]", fontsize=9)
+    axes[0, 0].legend(fontsize=8)
+    axes[-1, 0].set_xlabel("time [s]", fontsize=9)
+    figure.suptitle(f"{_title(study)}: body rates", fontsize=11)
+    return figure
+
+
+def errors(study: CaseStudy) -> Figure:
+    """Errors of the centre of mass of all seeds with the filter's own 3-sigma band."""
+    names = list(study.estimates)
+    figure, axes = _figure(2, len(names), 4.6)
+    t = np.asarray(study.record.t)[1:]
+    for column, name in enumerate(names):
+        found: Estimates = study.estimates[name]
+        error, deviation = np.asarray(found.error), np.asarray(found.deviation)
+        for row, axis in enumerate("xy"):
+            ax = axes[row, column]
+            ax.plot(t, 1e3 * error[:, 3 + row, :20], color="0.65", linewidth=0.4)
+            band = 3e3 * deviation[:, 3 + row, 0]
+            for sign in (1, -1):
+                ax.plot(t, sign * band, color=_LOOKS[name][0], linewidth=1.3)
+            ax.set_ylim(-8, 8)
+            ax.set_ylabel(f"error, {axis} [mm]", fontsize=9)
+        axes[0, column].set_title(f"{name} tuning, band: 3 sigma", fontsize=9)
+        axes[1, column].set_xlabel("time [s]", fontsize=9)
+    figure.suptitle(f"{_title(study)}: errors of up to 20 seeds", fontsize=11)
+    return figure
+
+
+def consistency(study: CaseStudy) -> Figure:
+    """NEES and NIS, means over the seeds, with their 99.9 % intervals."""
+    figure, axes = _figure(2, 1, 4.8)
+    t = np.asarray(study.record.t)[1:]
+    seeds = study.record.seeds
+    for row, (words, degrees) in enumerate((("NEES of rates and offset", 5), ("NIS", 3))):
+        ax = axes[row, 0]
+        ax.axhspan(
+            *mean_interval(degrees, seeds), color="0.8", label="99.9 % of a consistent filter's"
+        )
+        for name, found in study.estimates.items():
+            values = np.asarray(found.nees if degrees == 5 else found.nis)
+            _line(ax, t, np.mean(values, axis=1), name, linewidth=0.8, linestyle="-")
+        ax.set_yscale("log")
+        ax.set_ylabel(f"{words}, mean", fontsize=9)
+    axes[0, 0].legend(fontsize=8)
+    axes[1, 0].set_xlabel("time [s]", fontsize=9)
+    figure.suptitle(f"{_title(study)}: {seeds} seeds", fontsize=11)
+    return figure
+
+
+CASE_FIGURES = {"offset": offset, "rates": rates, "errors": errors, "consistency": consistency}
+
+
+def save_case_figures(
+    study: CaseStudy, folder: str | os.PathLike[str], suffix: str = "png", dpi: int = 200
+) -> list[Path]:
+    """Draw every figure of a case into `folder` (png, pdf or svg); their paths."""
+    return save_all(CASE_FIGURES, study, folder, suffix, dpi)
+
+
+def hover(flights: dict[str, Hover]) -> Figure:
+    """Tilt, height and the estimated centre of mass of hovers, by tuning; first seed."""
+    figure, axes = _figure(2, 2, 4.8)
+    flight = next(iter(flights.values()))
+    for column, axis in enumerate("xy"):
+        ax, t = axes[1, column], np.asarray(flight.t)[1:]
+        _line(ax, t, np.asarray(flight.truth)[:, 3 + column, 0], "truth")
+        ax.set_ylabel(f"centre of mass, {axis} [m]", fontsize=9)
+        ax.set_xlabel("time [s]", fontsize=9)
+    for name, flight in flights.items():
+        t = np.asarray(flight.t)[1:]
+        _line(axes[0, 0], t, np.degrees(np.asarray(flight.tilt))[:, 0], name)
+        _line(axes[0, 1], t, np.asarray(flight.r)[:, 2, 0], name)
+        for column in range(2):
+            _line(axes[1, column], t, np.asarray(flight.mean)[:, 3 + column, 0], name)
+    axes[0, 0].set_ylabel("tilt [degrees]", fontsize=9)
+    axes[0, 1].set_ylabel("height [m]", fontsize=9)
+    axes[1, 0].legend(fontsize=8)
+    figure.suptitle("Hover by a controller that sees the estimate", fontsize=11)
+    return figure
+
+
+class Machine(NamedTuple):
+    """The centre of mass of a flight of the whole machine, and what filters say of it.
+
+    Attributes:
+        t: (T,) [s]. truth: (T, 2) [m]. found: estimates (T, 2) by the words of a legend.
+    """
+
+    t: np.ndarray
+    truth: np.ndarray
+    found: dict[str, np.ndarray]
+
+
+def machine(flight: Machine) -> Figure:
+    """The centre of mass of the UAV with its moving tracker, estimates against truth."""
+    figure, axes = _figure(2, 1, 4.6)
+    for row, axis in enumerate("xy"):
+        ax = axes[row, 0]
+        _line(ax, flight.t, 1e3 * flight.truth[:, row], "truth")
+        for (words, values), (color, dash) in zip(
+            flight.found.items(), _STYLES[1::-1], strict=False
+        ):
+            ax.plot(flight.t, 1e3 * values[:, row], color=color, linestyle=dash, linewidth=1.2,
+                    label=words)  # fmt: skip
+        middle = 1e3 * np.mean(flight.truth[:, row])
+        ax.set_ylim(middle - 6, middle + 6)
+        ax.set_ylabel(f"centre of mass, {axis} [mm]", fontsize=9)
+    axes[0, 0].legend(fontsize=8)
+    axes[1, 0].set_xlabel("time [s]", fontsize=9)
+    figure.suptitle("UAV with its tracker moving: from gyroscope and rotor speeds", fontsize=11)
+    return figure
+
+
+def save_machine_figure(
+    flight: Machine, folder: str | os.PathLike[str], suffix: str = "png", dpi: int = 200
+) -> list[Path]:
+    """Draw the flight into `folder`."""
+    return save_all({"machine": machine}, flight, folder, suffix, dpi)
+
+
+def save_hover_figure(
+    flights: dict[str, Hover], folder: str | os.PathLike[str], suffix: str = "png", dpi: int = 200
+) -> list[Path]:
+    """Draw the hover into `folder`."""
+    return save_all({"hover": hover}, flights, folder, suffix, dpi)
+
+
+# --- files
+
+
+def case_dataset(study: CaseStudy) -> xr.Dataset:
+    """A case as a labelled dataset: dimensions time, seed, tuning, component, rotor, axis.
+
+    Times are the ends of the steps; the thrusts are held over the step that ends there.
+    """
+    record, found = study.record, study.estimates
+    together = lambda pick: np.stack([np.asarray(pick(e)) for e in found.values()])
+    path = ("time", "component", "seed")
+    each = ("tuning", *path)
+    scalar = ("tuning", "time", "seed")
+    first = next(iter(found.values()))
+    table = {
+        "thrust": (("time", "rotor"), record.u, "N", "of each rotor, held over the step"),
+        "truth": (path, first.truth, "rad/s, m", "body rates and centre of mass"),
+        "euler_parameters": (("time", "e", "seed"), record.p[1:], "1", "true, body to world"),
+        "measured": (("time", "axis", "seed"), record.y[:, :3], "rad/s", "by the gyroscope"),
+        "estimate": (each, together(lambda e: e.mean), "rad/s, m", "means"),
+        "deviation": (each, together(lambda e: e.deviation), "rad/s, m", "the filter's own"),
+        "nees": (scalar, together(lambda e: e.nees), "1", "of rates and offset, 5 degrees"),
+        "nees_offset": (scalar, together(lambda e: e.nees_offset), "1", "2 degrees of freedom"),
+        "nis": (scalar, together(lambda e: e.nis), "1", "of the innovations, 3 degrees"),
+        "ok": (scalar, together(lambda e: e.ok), "1", "whether the filter still runs"),
+    }
+    return _dataset(
+        table,
+        {"time": _times(record.t), "tuning": list(found)},
+        _title(study),
+        {name: summary._asdict() for name, summary in study.summaries.items()},
+    )
+
+
+def hover_dataset(flights: dict[str, Hover]) -> xr.Dataset:
+    """Hovers as a labelled dataset, dimensions as `case_dataset`."""
+    together = lambda pick: np.stack([np.asarray(pick(h)) for h in flights.values()])
+    each = ("tuning", "time", "component", "seed")
+    scalar = ("tuning", "time", "seed")
+    table = {
+        "thrust": (("tuning", "time", "rotor", "seed"), together(lambda h: h.thrust), "N", ""),
+        "position": (
+            ("tuning", "time", "axis", "seed"), together(lambda h: h.r), "m",
+            "true, of the epicentre, world",
+        ),
+        "truth": (each, together(lambda h: h.truth), "rad/s, m", "body rates and centre of mass"),
+        "estimate": (each, together(lambda h: h.mean), "rad/s, m", "means"),
+        "deviation": (each, together(lambda h: h.deviation), "rad/s, m", "the filter's own"),
+        "tilt": (scalar, together(lambda h: h.tilt), "rad", "true, of the rotors' axis"),
+        "nees": (scalar, together(lambda h: h.nees), "1", "of all 14 error states"),
+        "nees_offset": (scalar, together(lambda h: h.nees_offset), "1", "2 degrees of freedom"),
+        "nis": (scalar, together(lambda h: h.nis), "1", "6 degrees of freedom"),
+        "ok": (scalar, together(lambda h: h.ok), "1", "whether the filter still runs"),
+    }  # fmt: skip
+    first = next(iter(flights.values()))
+    coordinates = {"time": _times(first.t), "tuning": list(flights)}
+    return _dataset(table, coordinates, "Hover by a controller that sees the estimate", {})
+
+
+def _times(t: Any) -> xr.Variable:
+    words = {"units": "s", "description": "ends of the steps"}
+    return xr.Variable(("time",), np.asarray(t)[1:], words)
+
+
+def _dataset(table: dict, coordinates: dict, title: str, summaries: dict) -> xr.Dataset:
+    data = {
+        name: xr.Variable(dims, np.asarray(values), {"units": unit, "description": words})
+        for name, (dims, values, unit, words) in table.items()
+    }
+    named = {"component": list(COMPONENTS), "axis": ["x", "y", "z"]}
+    attributes = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "title": title,
+        "summaries": json.dumps(summaries),
+        "versions": json.dumps(versions()),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+    used = {dim for variable in data.values() for dim in variable.dims}
+    return xr.Dataset(data, coordinates | {k: v for k, v in named.items() if k in used}, attributes)
+
+
+def save_dataset(dataset: xr.Dataset, path: str | os.PathLike[str]) -> Path:
+    """Save as NetCDF (HDF5), atomically; returns the path."""
+    return write_atomically(path, bytes(dataset.to_netcdf(engine="h5netcdf")))

@@ -1,0 +1,145 @@
+"""The failure benchmark: its NumPy model against the package, its integrators, its smoke test."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import stmuav_jax as stm
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+sys.path.append(str(FOLDER))
+
+from failure_geometry import adopted, geometry, sample, varied_scene  # noqa: E402
+from failure_model import Dense  # noqa: E402
+from failure_steps import Limits, Scheme, integrate  # noqa: E402
+from failure_tables import Variant, g_and_l  # noqa: E402
+
+MISPRINTS = [
+    Variant(lost_dots=True),
+    Variant(transposed_gamma=True),
+    Variant(transposed_jacobian=True),
+    Variant(shared_index=True),
+]
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """Case 2 with a consistent state that moves in all coordinates."""
+    scene = stm.make_scene("uav_tracker", 2)
+    rng = np.random.default_rng(5)
+    start = scene.state0
+    # sliders off their zero: there d = 0, and half of the misprints would not show
+    r = start.r.at[1, 2].add(4e-3).at[2, 2].add(-3e-3)
+    v, omega = jnp.asarray(rng.normal(size=(2, 7, 3)))
+    shaken = stm.State(r, start.p, v, omega)
+    return dataclasses.replace(scene, state0=stm.assemble(scene.system, shaken).state)
+
+
+def accelerations(scene, variant, t=0.1):
+    model = Dense(scene, variant)
+    y = model.start(scene)
+    q = model.accelerations(t, y)
+    L = g_and_l(np.asarray(scene.state0.p))[1]
+    return q[:, :3] * variant.metres, 2 * (L @ q[:, 3:, None])[..., 0]
+
+
+@pytest.mark.parametrize(
+    "variant",
+    [Variant(), Variant(frozen=True), Variant(inverse=True), Variant(metres=1e-3)],
+    ids=["corrected", "frozen", "inverse", "millimetres"],
+)
+@pytest.mark.parametrize("couple", ["consistent", "printed"])
+def test_accelerations_are_those_of_the_package(moving, variant, couple):
+    system = stm.make_scene("uav_tracker", 2, actuators=couple).system
+    scene = dataclasses.replace(moving, system=system)
+    want = stm.evaluate(system, scene.state0, 0.1).accelerations
+    v_rate, omega_rate = accelerations(scene, variant)
+    assert np.max(np.abs(v_rate - want.v_rate)) <= 1e-10 * np.max(np.abs(want.v_rate))
+    assert np.max(np.abs(omega_rate - want.omega_rate)) <= 1e-10 * np.max(np.abs(want.omega_rate))
+
+
+@pytest.mark.parametrize("variant", MISPRINTS)
+def test_misprints_change_the_accelerations(moving, variant):
+    right, wrong = accelerations(moving, Variant())[0], accelerations(moving, variant)[0]
+    assert np.max(np.abs(wrong - right)) > 1e-4 * np.max(np.abs(right))
+
+
+def test_energy_and_residuals_of_the_start(moving):
+    for metres in (1.0, 1e-3):
+        model = Dense(moving, Variant(metres=metres))
+        y = model.start(moving)
+        want = stm.energy(moving.system, moving.state0, jnp.zeros(())).total
+        assert abs(model.energy(y) - want) <= 1e-12 * abs(want)
+        assert model.violation(y) < 1e-10
+        assert model.norm_error(y) < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("scheme", "error"),
+    [
+        (Scheme("ode45", 1e-8, 1e-10), 1e-6),
+        (Scheme("rk45", 1e-8, 1e-10), 1e-6),
+        (Scheme("radau", 1e-8, 1e-10), 1e-6),
+        (Scheme("rk4", step=1e-2), 1e-6),
+        (Scheme("euler", step=1e-3), 2e-2),
+    ],
+    ids=lambda x: getattr(x, "method", ""),
+)
+def test_integrators_follow_an_oscillator(scheme, error):
+    field = lambda t, y: np.array([y[1], -y[0], 0.0])
+    times = np.linspace(0, 3, 31)
+    history = integrate(field, np.array([1.0, 0.0, 0.0]), times, scheme)
+    assert not history.failure
+    # values between steps come from interpolants of lower order
+    assert abs(history.states[-1, 0] - np.cos(3.0)) < error
+    assert np.max(np.abs(history.states[:, 0] - np.cos(times))) < 100 * error
+    assert abs(np.sum(history.sizes) - 3) < 1e-9
+
+
+def test_every_run_ends():
+    blow_up = lambda t, y: np.array([y[0] ** 2, 0.0])
+    times = np.linspace(0, 2, 21)
+    for scheme in (Scheme("ode45"), Scheme("rk45"), Scheme("rk4", step=0.01)):
+        history = integrate(blow_up, np.array([1.0, 0.0]), times, scheme)
+        assert history.failure
+        assert 0.8 < history.stopped_at < 1.2
+    few = integrate(lambda t, y: -y, np.ones(2), times, Scheme("ode45"), Limits(evaluations=8))
+    assert few.failure == "8 evaluations"
+
+
+def test_adopted_lengths_give_the_tables():
+    for key, value in geometry(jnp.asarray(adopted())).items():
+        np.testing.assert_allclose(value, stm.PART_II.value(key), atol=1e-12)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_varied_geometries_close(swapped):
+    for design in sample(3, seed=1):
+        scene = varied_scene("uav_tracker", 2, jnp.asarray(design), swapped=swapped)
+        assembly = stm.assemble(scene.system, scene.state0)
+        assert float(jnp.max(assembly.residuals)) < 1e-12
+        assert float(assembly.moved) < 1e-12
+
+
+@pytest.mark.slow
+def test_smallest_run(tmp_path):
+    subprocess.run(
+        [sys.executable, FOLDER / "failure.py", "--quick", "--results", tmp_path,
+         "--figures", tmp_path],
+        check=True, capture_output=True, timeout=900,
+    )  # fmt: skip
+    record = json.loads((tmp_path / "failure.json").read_text())
+    assert {"commit", "dirty", "versions", "cores", "date"} <= set(record["environment"])
+    assert {row["part"] for row in record["trials"]} == set("abcde")
+    assert all(row["steps"] > 0 for row in record["trials"])
+    corrected = next(row for row in record["trials"] if row["name"] == "corrected")
+    assert not corrected["failure"]
+    assert corrected["series"]["violation"][-1] < 1e-4
+    assert record["alignment"]["rows"][0]["finished"] == 2
+    assert len(list(tmp_path.glob("*.png"))) == 4

@@ -1,0 +1,142 @@
+"""Every competing program solves the same problem as we do: accelerations and motion.
+
+Programs that are not installed are skipped. The C++ program is tested once it has been
+compiled (two minutes, at its first use), MJX's motion among the slow tests.
+"""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import stmuav_jax as stm
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+sys.path.append(str(FOLDER))
+
+from adapter import Setting  # noqa: E402
+from peers import PEERS, MujocoC, PinocchioCpp  # noqa: E402
+from peers.pinocchio_cpp import program_path  # noqa: E402
+from peers.plain import plain, start  # noqa: E402
+from peers.tree import coordinates, span  # noqa: E402
+
+TIMES = np.array([0.02, 0.04])
+
+# Solver and its setting; error allowed in motion [m] and in accelerations [m/s^2], of which
+# the body with the largest has about 6 m/s^2. MuJoCo's constraints are soft.
+CASES = {
+    "PinocchioCpp": (Setting("rkf78", tolerance=1e-10), 1e-11, 1e-11),
+    "PinocchioPython": (Setting("DOP853", tolerance=1e-10), 1e-11, 1e-11),
+    "ScipyDense": (Setting("DOP853", tolerance=1e-8), 1e-9, 1e-11),
+    "MujocoC": (Setting("RK4", step=1e-4), 1e-6, 3e-3),
+    "MujocoMjx": (Setting("RK4", step=1e-3), 1e-3, None),
+    "ExudynPeer": (Setting("generalised-alpha", step=1e-4), 1e-6, 1e-11),
+}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return stm.make_scene("uav_tracker", 2)
+
+
+@pytest.fixture(scope="module")
+def reference(scene):
+    """Positions at `TIMES`, with far more digits than any program is asked for."""
+    return np.asarray(stm.simulate(scene, rtol=1e-12, atol=1e-12, ts=[0.0, *TIMES]).states.r)[1:]
+
+
+def ready(peer):
+    """A peer, or a skipped test."""
+    one = peer()
+    if reason := one.missing():
+        pytest.skip(reason)
+    if peer is PinocchioCpp and not program_path().exists():
+        pytest.skip("The C++ program is not compiled yet: benchmarks/peers/pinocchio_cpp.py.")
+    return one
+
+
+def some(*, slow):
+    """The peers as parameters; those in `slow` only with -m slow."""
+    return [
+        pytest.param(p, id=p.__name__, marks=[pytest.mark.slow] if p.__name__ in slow else [])
+        for p in PEERS
+        if slow or CASES[p.__name__][2] is not None
+    ]
+
+
+def test_every_peer_has_a_case_and_settings_from_coarse_to_fine():
+    assert {p.__name__ for p in PEERS} == set(CASES)
+    for peer in (p() for p in PEERS):
+        for solver in {s.solver for s in peer.settings()}:
+            size = [s.tolerance or s.step or 0.0 for s in peer.settings() if s.solver == solver]
+            assert size == sorted(size, reverse=True)
+
+
+@pytest.mark.parametrize("peer", some(slow=()))
+def test_accelerations_at_the_start(peer, scene):
+    one, expected = ready(peer), stm.evaluate(scene.system, scene.state0).accelerations.v_rate
+    assert one.unsupported(scene) == ""
+    difference = one.start_accelerations(scene) - np.asarray(expected)
+    assert np.abs(difference).max() <= CASES[peer.__name__][2]
+
+
+@pytest.mark.parametrize("peer", some(slow=("MujocoMjx",)))
+def test_motion(peer, scene, reference):
+    one, (setting, allowed, _) = ready(peer), CASES[peer.__name__]
+    outcome = one.prepare(scene, TIMES, setting).run()
+    assert outcome.failure == ""
+    assert np.abs(outcome.positions - reference).max() <= allowed
+    if outcome.residual is not None:
+        assert outcome.residual <= allowed
+
+
+@pytest.mark.parametrize("peer", some(slow=()))
+def test_scene_without_joints(peer):
+    scene = stm.make_scene("hexacopter")
+    one, expected = ready(peer), stm.evaluate(scene.system, scene.state0).accelerations.v_rate
+    assert one.unsupported(scene) == ""
+    np.testing.assert_allclose(one.start_accelerations(scene), expected, atol=1e-11)
+
+
+@pytest.mark.parametrize("peer", [PinocchioCpp, MujocoC])
+def test_throughput_ends_where_single_runs_do(peer, scene):
+    one, setting = ready(peer), CASES[peer.__name__][0]
+    # the same mechanism, thrown upwards at several speeds
+    speeds = jnp.array([0.0, 0.5])
+    lift = lambda speed: stm.State(
+        scene.state0.r,
+        scene.state0.p,
+        scene.state0.v + speed * jnp.array([0.0, 0.0, 1.0]),
+        scene.state0.omega,
+    )
+    rate, ends = one.throughput(scene, jax.vmap(lift)(speeds), TIMES[-1], setting)
+    alone = one.prepare(scene, TIMES, setting).run().positions[-1]
+    assert rate > 0
+    np.testing.assert_allclose(ends[0], alone, atol=1e-12)
+    rise = np.outer(np.ones(len(alone)), [0.0, 0.0, 0.5 * TIMES[-1]])
+    np.testing.assert_allclose(ends[1], alone + rise, atol=1e-9)
+
+
+def test_tree_coordinates_of_a_moved_mechanism(scene):
+    """Joint coordinates and rates do not see where the whole mechanism is or goes."""
+    state, tree = scene.state0, span(plain(scene))
+    w = np.array([0.3, -0.2, 0.5])
+    r, R = np.asarray(state.r), np.stack([stm.rotation_matrix(p) for p in state.p])
+    moved = type(start(scene))(
+        r=r + np.array([1.0, 2.0, 3.0]),
+        p=np.asarray(state.p),
+        v=np.cross(w, r - r[0]),
+        omega=np.einsum("nba,b->na", R, w),
+    )
+    before, after = coordinates(tree, start(scene)), coordinates(tree, moved)
+    for (q0, v0), (q1, v1) in zip(before[1:], after[1:], strict=True):
+        np.testing.assert_allclose(q0, q1, atol=1e-14)
+        np.testing.assert_allclose(v0, v1, atol=1e-14)
+
+
+def test_loads_that_no_peer_knows_are_refused():
+    scene = stm.make_scene("uav_tracker", 2, servo=stm.Servo(targets=(0.0, 0.0)))
+    assert all("JointServo" in peer().unsupported(scene) for peer in PEERS if not peer().missing())

@@ -1,0 +1,86 @@
+"""The stiff benchmark: its scenes, its reading of the crossover, its smoke test."""
+
+import json
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import stmuav_jax as sj
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+sys.path.append(str(FOLDER))
+
+import stiff  # noqa: E402
+from stiff_runs import as_given  # noqa: E402
+from stiff_scenes import FREE, SCENES  # noqa: E402
+
+
+def test_scenes_share_a_compilation():
+    """Exact class: the same structure, shapes and types; only numbers differ."""
+
+    def kind(held):
+        leaves, tree = jax.tree.flatten(as_given(held.uav()))
+        return tree, [(x.shape, x.dtype, x.weak_type) for x in leaves]
+
+    first = kind(FREE)
+    assert all(kind(held) == first for held in SCENES[1:])
+
+
+def test_elements_that_are_not_there_do_nothing():
+    """Exact class: with the sliders off their zero and in motion, no force at all."""
+    plain, free = sj.make_scene("uav_tracker", 2), FREE.uav()
+    start = plain.state0
+    rng = np.random.default_rng(3)
+    r, v = start.r + 1e-3 * rng.normal(size=(7, 3)), jnp.asarray(rng.normal(size=(7, 3)))
+    kin = free.system.kinematics(sj.State(r, start.p, v, start.omega))
+    added = free.system.forces[len(plain.system.forces) :]
+    assert len(added) == 6
+    for force in added:
+        load = force.load(jnp.asarray(0.1), kin)
+        assert not np.any(load.force)
+        assert not np.any(load.moment)
+
+
+def scene(stiffness, eigenvalue, ratio):
+    best = {"explicit_over_implicit": ratio}
+    return {"name": f"{stiffness:g}", "stiffness": stiffness, "damping": 0.0,
+            "eigenvalue": {"start": eigenvalue}, "cheapest": {"1e-06": best}}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("ratios", "up_to", "since"),
+    [
+        ((0.1, 0.5, 2.0), "20", "30"),
+        ((0.1, 0.5, 0.9), "30", None),
+        ((1.5, 2.0, 3.0), None, "10"),
+        ((0.1, 2.0, 0.5), "10", None),
+    ],
+)
+def test_crossover(ratios, up_to, since):
+    """Explicit up to the last before implicit first pays; implicit from where it always does."""
+    rows = [scene(10.0 * (i + 1), 100.0 * i, ratio) for i, ratio in enumerate(ratios)]
+    found = stiff.crossover([scene(0.0, 0.0, 5.0), *reversed(rows)], 1e-6)
+    assert (found["explicit_up_to"] or {}).get("name") == up_to
+    assert (found["implicit_from"] or {}).get("name") == since
+
+
+def test_smoke(tmp_path, monkeypatch):
+    """The script at its smallest size: a complete record and its figures."""
+    arguments = ["--quick", "--results", str(tmp_path), "--figures", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["stiff.py", *arguments])
+    stiff.main()
+    record = json.loads((tmp_path / "stiff.json").read_text())
+    assert {"commit", "dirty", "versions", "cores", "date"} <= set(record["environment"])
+    soft, hard = record["scenes"]
+    # one sliding body of m = 1 kg: |eigenvalue| = sqrt(k / m) where the damping is light
+    assert soft["eigenvalue"]["start"] == pytest.approx(np.sqrt(soft["stiffness"]), rel=1e-3)
+    assert hard["eigenvalue"]["start"] > soft["eigenvalue"]["start"]
+    for found in (soft, hard):
+        assert max(found["reference"]["dopri8_apart"]) <= 1e-10
+        assert all(row["completed"] and row["error"] <= 1e-6 for row in found["runs"])
+    assert record["crossover"]["1e-06"]
+    assert len(list(tmp_path.glob("*.png"))) == 2

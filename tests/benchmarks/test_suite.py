@@ -1,0 +1,68 @@
+"""The benchmark suite at its smallest size: every section leaves a record, and a page comes of it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+# Section -> keys of its record, and keys of its first row.
+WANTED = {
+    "acceleration": ({"rows"}, {"method", "batch", "seconds", "operations", "failure"}),
+    "hexacopter": ({"rows", "ratios"}, {"method", "tolerance", "seconds", "steps"}),
+    "work_precision": ({"curves"}, {"problem", "rows", "references", "cheapest", "failure"}),
+    "batch": ({"rows", "single", "tried"}, {"trajectories", "block", "per_second"}),
+    "scaling": ({"rows", "exponents"}, {"loops", "acceleration_seconds", "run_seconds"}),
+    "gradient": ({"rows", "differences"}, {"mode", "seconds", "cost_in_simulations"}),
+    "scenes": ({"rows"}, {"scene", "seconds", "accepted", "residual"}),
+    "published": ({"curves"}, {"problem", "rows", "references", "cheapest", "failure"}),
+    "stiff": ({"curves"}, {"problem", "rows", "references", "cheapest", "failure"}),
+}
+# compiled in seconds; the others in minutes
+QUICK = ("acceleration", "hexacopter")
+
+
+def run(folder: Path, sections: tuple[str, ...]) -> Path:
+    """Run sections and build the page in a folder; returns the page."""
+    page = folder / "docs" / "benchmarks.md"
+    subprocess.run(
+        [sys.executable, FOLDER / "suite.py", "--size", "one", "--no-peers", "--only", *sections,
+         "--results", folder, "--page", page],
+        check=True, capture_output=True, timeout=3000,
+    )  # fmt: skip
+    return page
+
+
+def check(folder: Path, sections: tuple[str, ...], page: Path) -> None:
+    """Every record is complete, nothing failed, every figure that the page shows is there."""
+    for name in sections:
+        record = json.loads((folder / f"suite_{name}.json").read_text())
+        assert {"commit", "dirty", "versions", "cores", "date"} <= set(record["environment"])
+        assert {"section", "size", "took_seconds", "machine", "peers", "skipped"} <= set(record)
+        keys, first = WANTED[name]
+        assert keys <= set(record)
+        rows = record["curves" if "curves" in keys else "rows"]
+        assert first <= set(rows[0])
+        for row in [*rows, *(point for curve in rows for point in curve.get("rows", []))]:
+            assert row["failure"] == ""
+    text = page.read_text()
+    assert text.count("\n## ") == 1 + len(sections)
+    assert "smallest size" in text
+    shown = [line.split("(")[1].rstrip(")") for line in text.splitlines() if line.startswith("![")]
+    assert all((page.parent / place).stat().st_size > 0 for place in shown)
+
+
+def test_quick_sections(tmp_path):
+    check(tmp_path, QUICK, run(tmp_path, QUICK))
+
+
+@pytest.mark.slow
+def test_all_sections(tmp_path):
+    sections = tuple(WANTED)
+    check(tmp_path, sections, run(tmp_path, sections))
+    gradient = json.loads((tmp_path / "suite_gradient.json").read_text())
+    errors = [row["error"] for row in gradient["rows"] if row["error"] is not None]
+    assert len(errors) == 2
+    assert max(errors) < 1e-5

@@ -1,0 +1,117 @@
+"""Gradients through half a second of the seven-body UAV, by every kind of number.
+
+Forward mode, reverse mode and differences are three routes; each group of numbers is moved
+along one random direction.
+"""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import stmuav_jax as sj
+from stmuav_jax.vehicle.rotor import Rotors
+
+END = 0.5
+GROUPS = ("start", "inputs", "masses", "inertias", "lengths", "joints", "rotors")
+
+
+def numbers(scene):
+    """The numbers of each group."""
+    system = scene.system
+    of = lambda kind: next(f for f in system.forces if isinstance(f, kind))
+    return {
+        "start": jnp.zeros(6),
+        "inputs": (of(Rotors).speed_squared, jnp.asarray(sj.PART_II.value("actuator.force"))),
+        "masses": system.bodies.mass,
+        "inertias": system.bodies.inertia,
+        "lengths": jnp.asarray(sj.PART_II.value("geometry.rods")),
+        "joints": [j.point_j for j in system.joints],
+        "rotors": (of(Rotors).k_f, of(Rotors).k_tau, of(Rotors).arms),
+    }
+
+
+def flight(values, adjoint, solver, tolerance):
+    """Position and angular velocity of the panel at the end, weighted to one number."""
+    amplitude = values["inputs"][1]
+    table = {"actuator.force": amplitude, "geometry.rods": values["lengths"]}
+    scene = sj.make_scene("uav_tracker", 2, sj.PART_II.replaced(table))
+    system = scene.system
+    place = next(k for k, f in enumerate(system.forces) if isinstance(f, Rotors))
+    where = lambda s: (
+        s.forces[place].speed_squared,
+        s.bodies.mass,
+        s.bodies.inertia,
+        s.forces[place].k_f,
+        s.forces[place].k_tau,
+        s.forces[place].arms,
+        *(j.point_j for j in s.joints),
+    )
+    # points of joints move by as much as they were moved from the table's
+    change = [p - q for p, q in zip(values["joints"], POINTS, strict=True)]
+    points = [j.point_j + d for j, d in zip(system.joints, change, strict=True)]
+    new = (values["inputs"][0], values["masses"], values["inertias"], *values["rotors"], *points)
+    system = eqx.tree_at(where, system, new)
+    v, omega = values["start"][:3], values["start"][3:]
+    arms = scene.state0.r - scene.state0.r[0]
+    turned = jax.vmap(lambda p: sj.rotation_matrix(p).T @ omega)(scene.state0.p)
+    state = scene.state0
+    start = sj.State(state.r, state.p, state.v + v + jnp.cross(omega, arms), state.omega + turned)
+    method = sj.Method(solver=solver, rtol=tolerance, atol=tolerance, adjoint=adjoint)
+    end = sj.integrate(system, start, jnp.array([0.0, END]), method).states
+    return (
+        jnp.array([1.0, -2.0, 0.5]) @ end.r[-1, 6] + jnp.array([0.1, 0.2, -0.1]) @ end.omega[-1, 6]
+    )
+
+
+POINTS = [j.point_j for j in sj.make_scene("uav_tracker", 2).system.joints]
+
+
+def directions(values):
+    """For each group one direction, of about a hundredth of the numbers' sizes; zero elsewhere."""
+    rng = np.random.default_rng(5)
+
+    def step(name, leaf):
+        size = 0.01 * (float(jnp.mean(jnp.abs(leaf))) if name != "start" else 1.0)
+        size = 1e-4 if name == "joints" else size
+        d = size * rng.normal(size=leaf.shape)
+        return jnp.asarray(d + np.swapaxes(d, -1, -2) if name == "inertias" else d)
+
+    own = {k: jax.tree.map(lambda leaf, k=k: step(k, leaf), v) for k, v in values.items()}
+    zero = jax.tree.map(jnp.zeros_like, values)
+    rows = [zero | {name: own[name]} for name in GROUPS]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *rows)
+
+
+def along(values, directions, h):
+    return jax.tree.map(lambda v, d: v + h * d, values, directions)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("solver", "tolerance", "same", "apart"),
+    [(diffrax.Dopri8(), 1e-11, 1e-9, 1e-6), (sj.kvaerno5(), 1e-10, 1e-8, 1e-5)],
+    ids=["explicit", "implicit"],
+)
+def test_forward_reverse_differences(solver, tolerance, same, apart):
+    """The implicit solver's stages are solved to its tolerance, which both modes feel apart."""
+    values = numbers(sj.make_scene("uav_tracker", 2))
+    ways = directions(values)
+    ahead = diffrax.ForwardMode()
+    of = lambda v: flight(v, ahead, solver, tolerance)
+    run = jax.jit(jax.vmap(lambda d, h: of(along(values, d, h)), in_axes=(0, None)))
+    forward = jax.jit(jax.vmap(lambda d: jax.jvp(of, (values,), (d,))[1]))(ways)
+    back = lambda v: flight(v, diffrax.RecursiveCheckpointAdjoint(), solver, tolerance)
+    gradient = jax.jit(jax.grad(back))(values)
+    reverse = [
+        sum(float(jnp.vdot(g, d[k])) for g, d in zip(*map(jax.tree.leaves, (gradient, ways)), strict=True))
+        for k in range(len(GROUPS))
+    ]  # fmt: skip
+    np.testing.assert_allclose(reverse, forward, rtol=same)
+    h = 0.02
+    values_at = {k: np.asarray(run(ways, k * h)) for k in (-2, -1, 1, 2)}
+    expected = (8 * (values_at[1] - values_at[-1]) - (values_at[2] - values_at[-2])) / (12 * h)
+    for name, found, right in zip(GROUPS, np.asarray(forward), expected, strict=True):
+        assert found == pytest.approx(right, rel=apart), name

@@ -1,0 +1,235 @@
+"""Trim and linearisation of the UAV: published figures, another formulation, differences."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import stmuav_jax as sj
+from stmuav_jax.scenes.uav_tracker import uav_flyer
+from stmuav_jax.study.linear import STATES, linearize, rates
+from stmuav_jax.study.trim import TrimLimits, TrimReason, climb, cruise, hover, steady_turn, trim
+from stmuav_jax.vehicle.allocation import RotorLimits, least, wrench_map
+from stmuav_jax.vehicle.flyer import Flyer, shifted
+
+START = sj.initial_angles(sj.PART_II)
+
+
+@pytest.fixture(scope="module")
+def flyer():
+    return uav_flyer()
+
+
+@pytest.fixture(scope="module")
+def many(flyer):
+    """Trims at several panel angles, the first the initial ones; the last out of reach."""
+    angles = np.random.default_rng(5).uniform(-0.5, 0.5, (16, 2))
+    angles[0] = START
+    angles[-1] = [0.2, -1.5]
+    both = jax.vmap(lambda a: trim(flyer, hover(a), throw=False))
+    return angles, sj.outer_jit(both)(jnp.asarray(angles))
+
+
+@pytest.fixture(scope="module")
+def start(many):
+    return jax.tree.map(lambda x: x[0], many[1])
+
+
+def test_hover_speeds(many):
+    """The trimmed speeds at the initial posture, by an independent program (docs/geometry.md)."""
+    angles, found = many
+    expected = [1361.0, 1359.7, 1355.0, 1351.7, 1353.0, 1357.6]
+    np.testing.assert_allclose(found.speeds[0], expected, atol=0.05)
+    assert list(np.asarray(found.reason)) == [0] * 15 + [TrimReason.POSTURE]
+    assert np.max(found.residual[:-1]) < 1e-10
+    assert np.all(np.isnan(found.speeds[-1]))
+    assert np.ptp(np.asarray(found.inputs.forces[:-1]), axis=0).min() > 1e-3
+    assert len(angles) == 16
+
+
+def test_thrust_carries_the_weight(flyer, start):
+    k_f = flyer.system.forces[flyer.rotors].k_f
+    weight = 9.81 * float(np.sum(flyer.system.bodies.mass))
+    assert float(k_f * jnp.sum(start.speeds**2)) == pytest.approx(weight, rel=1e-12)
+    np.testing.assert_allclose(start.coordinates.p, [1, 0, 0, 0], atol=1e-12)
+
+
+def test_nothing_accelerates_in_maximal_coordinates(flyer, start):
+    state = flyer.state(start.coordinates)
+    found = jax.jit(lambda s, i: sj.evaluate(flyer.with_inputs(i), s))(state, start.inputs)
+    assert np.max(np.abs(found.accelerations.v_rate)) < 1e-10
+    assert np.max(np.abs(found.accelerations.omega_rate)) < 1e-8
+
+
+@pytest.mark.slow
+def test_derivative_against_differences(flyer, start):
+    """By a mass, a length, the rotors' constant and the panel's angle, together and apart."""
+
+    def speeds(q):
+        mass, rod, k_f, angle = q
+        rods = jnp.asarray(sj.PART_II.value("geometry.rods")) + jnp.array([rod, 0.0])
+        new = {
+            "mass.panel_7": sj.PART_II.value("mass.panel_7") + mass,
+            "rotor.k_f": sj.PART_II.value("rotor.k_f") * (1 + k_f),
+            "geometry.rods": rods,
+        }
+        changed = uav_flyer(sj.PART_II.replaced(new))
+        found = trim(changed, hover(START + jnp.array([angle, 0.0])), throw=False)
+        return jnp.concatenate([found.speeds, found.inputs.forces])
+
+    run = sj.outer_jit(jax.vmap(speeds))
+    sizes = np.array([1e-3, 1e-4, 1e-3, 1e-3])
+    steps = np.concatenate(
+        [np.diag(sizes), -np.diag(sizes), np.diag(sizes) / 2, -np.diag(sizes) / 2]
+    )
+    values = np.asarray(run(jnp.asarray(steps))).reshape(4, 4, 8)
+    wide = (values[0] - values[1]) / (2 * sizes[:, None])
+    narrow = (values[2] - values[3]) / sizes[:, None]
+    expected = (4 * narrow - wide) / 3
+    exact = np.asarray(sj.outer_jit(jax.jacfwd(speeds))(jnp.zeros(4))).T
+    for row, right in zip(exact, expected, strict=True):
+        np.testing.assert_allclose(row, right, rtol=1e-7, atol=1e-7 * np.max(np.abs(right)))
+
+
+def test_refused(flyer):
+    slow = TrimLimits(RotorLimits(0.0, 1350.0))
+    with pytest.raises(sj.ModelError, match=r"72\.25 N are required, but within .* 71\.58 N"):
+        trim(flyer, hover(START), slow)
+    weak = TrimLimits(actuator=0.1)
+    with pytest.raises(sj.StateError, match=r"N, but the limit is 0\.1 N"):
+        trim(flyer, hover(START), weak)
+    with pytest.raises(sj.StateError, match="cannot take the panel angles"):
+        trim(flyer, hover([0.2, -1.5]))
+    with pytest.raises(sj.ModelError, match="either the panel's angles or the direction"):
+        hover(START, sun=[0, 0, 1.0])
+    with pytest.raises(sj.ModelError, match="sun's direction has 3 numbers"):
+        hover(sun=[0, 1.0])
+    bare = eqx.tree_at(lambda s: s.forces, flyer.system, flyer.system.forces[:2])
+    with pytest.raises(sj.ModelError, match="one LinearActuator for each slider"):
+        Flyer(bare, flyer.geometry, flyer.shift)
+
+
+def test_within_rotor_limits(flyer, start):
+    """Limits that the speeds of least norm break: others give the same wrench."""
+    highest = 0.5 * float(start.speeds[0] + start.speeds[1])
+    found = trim(flyer, hover(START), TrimLimits(RotorLimits(0.0, highest)))
+    assert np.max(found.speeds) <= highest * (1 + 1e-12)
+    assert float(found.residual) < 1e-10
+    assert found.choices == 2
+    B = wrench_map(flyer.system.forces[flyer.rotors], jnp.array([0.01, -0.02, 0.05]))
+    np.testing.assert_allclose(
+        B @ found.inputs.squared, B @ start.inputs.squared, rtol=1e-10, atol=1e-12
+    )
+
+
+def test_least_norm_allocation(flyer):
+    rotors = flyer.system.forces[flyer.rotors]
+    B = np.asarray(wrench_map(rotors, jnp.array([0.01, -0.02, 0.05])))
+    wrench = np.array([70.0, 0.3, -0.2, 0.05])
+    u = np.asarray(least(jnp.asarray(B), jnp.asarray(wrench)))
+    np.testing.assert_allclose(u, np.linalg.pinv(B) @ wrench, rtol=1e-10)
+    full = np.asarray(rotors.wrench(jnp.asarray(u), jnp.array([0.01, -0.02, 0.05])))
+    np.testing.assert_allclose(full, [0, 0, *wrench], atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def linear(flyer, start):
+    return linearize(flyer, start.coordinates, start.inputs)
+
+
+def test_linear_to_second_order(flyer, start, linear):
+    """What the linear equations miss falls with the square of the displacement."""
+    rng = np.random.default_rng(6)
+    x, du = rng.normal(size=16) * 0.05, rng.normal(size=8) * np.array([*[2e3] * 6, 0.05, 0.05])
+    of = jax.jit(lambda s: rates(flyer, start.coordinates, start.inputs, s * x, s * du))
+    missed = [np.asarray(of(s)) - s * (linear.A @ x + linear.B @ du) for s in (1.0, 0.5, 0.25)]
+    sizes = [np.linalg.norm(m) for m in missed]
+    assert 3.5 < sizes[0] / sizes[1] < 4.5
+    assert 3.7 < sizes[1] / sizes[2] < 4.3
+
+
+def test_linear_against_the_simulated_flight(flyer, start, linear):
+    """A small displacement's path over 0.1 s, in maximal coordinates, against expm(A t) x."""
+    x = np.zeros(16)
+    x[3:8], x[14:] = [1e-6, -2e-6, 1e-6, 2e-6, -1e-6], [1e-5, 2e-5]
+    system = flyer.with_inputs(start.inputs)
+    ends = []
+    run = jax.jit(
+        lambda s: sj.integrate(system, s, jnp.array([0.0, 0.1]), sj.Method(rtol=1e-11, atol=1e-13))
+    )
+    for sign in (1, -1):
+        ends.append(run(flyer.state(shifted(start.coordinates, jnp.asarray(sign * x)))).states)
+    later = expm(linear.A * 0.1) @ x
+    moved = (np.asarray(ends[0].r[-1, 0]) - np.asarray(ends[1].r[-1, 0])) / 2
+    spun = (np.asarray(ends[0].omega[-1, 0]) - np.asarray(ends[1].omega[-1, 0])) / 2
+    np.testing.assert_allclose(moved, later[:3], rtol=1e-6, atol=1e-6 * np.max(np.abs(later[:3])))
+    np.testing.assert_allclose(spun, later[11:14], rtol=1e-5, atol=1e-5 * np.max(np.abs(spun)))
+
+
+def test_modes_and_measures(linear):
+    """Two falling panel modes in pairs, twelve of a rigid body; all inputs together move them."""
+    modes = linear.modes()
+    real = np.array([m.s.real for m in modes])
+    assert real[0] == pytest.approx(-real[-1], rel=1e-6)
+    assert real[1] == pytest.approx(-real[-2], rel=1e-6)
+    assert 5 < real[1] < real[0] < 15
+    assert np.max(np.abs(real[2:-2])) < 1e-4
+    assert {name for name, _ in modes[0].states[:2]} == {"theta", "theta_rate"}
+    assert modes[0].doubling == pytest.approx(np.log(2) / real[0])
+    assert np.min(linear.controllability()) > 1e-3
+    deaf = replace(linear, B=np.zeros_like(linear.B))
+    assert np.max(deaf.controllability()) < 1e-6
+    assert len(linear.states) == len(STATES) == 16
+
+
+def test_outputs_by_name(flyer, start):
+    few = linearize(flyer, start.coordinates, start.inputs, outputs=["phi", "r_z"])
+    assert few.C.shape == (2, 16)
+    assert [name for name, _ in few.outputs] == ["phi", "r_z"]
+    assert np.min(few.observability()) < 1e-6
+    with pytest.raises(sj.SettingError, match="Did you mean 'omega_x'"):
+        linearize(flyer, start.coordinates, start.inputs, outputs=["omega_xx"])
+
+
+def test_acceleration_upwards(flyer):
+    """Thrust is m (g + a)."""
+    up = climb(2.0, START, 0.3)._replace(acceleration=jnp.array([0.0, 0.0, 1.5]))
+    found = trim(flyer, up)
+    k_f, mass = flyer.system.forces[flyer.rotors].k_f, float(np.sum(flyer.system.bodies.mass))
+    assert float(k_f * jnp.sum(found.speeds**2)) == pytest.approx(mass * 11.31, rel=1e-12)
+
+
+def test_panel_at_the_sun(flyer):
+    """In level hover the panel's angles are those of the inverse kinematics in the yawed base."""
+    s_w = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
+    found = trim(flyer, hover(sun=s_w, yaw=0.4))
+    c, s = np.cos(0.4), np.sin(0.4)
+    s_b = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]) @ s_w
+    np.testing.assert_allclose(sj.panel_normal(found.coordinates.angles), s_b, atol=1e-12)
+
+
+def test_steady_turn_stays_steady(flyer):
+    """Flown for half a second, the base moves on its circle; its attitude turns with it."""
+    speed, rate = 3.0, 0.8
+    found = trim(flyer, steady_turn(speed, rate, START))
+    bank = np.arctan(speed * rate / 9.81)
+    up = np.asarray(sj.rotation_matrix(found.coordinates.p))[:, 2]
+    assert np.arccos(up[2]) == pytest.approx(bank, rel=0.02)
+    system, state = flyer.with_inputs(found.inputs), flyer.state(found.coordinates)
+    run = jax.jit(lambda s: sj.integrate(system, s, jnp.array([0.0, 0.5]), sj.Method(rtol=1e-11)))
+    end = jax.tree.map(lambda x: np.asarray(x[-1, 0]), run(state).states)
+    angle, radius = rate * 0.5, speed / rate
+    # the centre of the circle lies to the left
+    expected = radius * np.array([np.sin(angle), 1 - np.cos(angle), 0])
+    np.testing.assert_allclose(end.r, expected, atol=1e-7)
+    np.testing.assert_allclose(end.omega, found.coordinates.omega, atol=1e-6)
+
+
+def test_cruise_without_drag_is_hover(flyer, start):
+    found = trim(flyer, cruise(4.0, 0.7, START))
+    np.testing.assert_allclose(found.speeds, start.speeds, rtol=1e-10)
+    assert 0 < float(found.conditioning) < 1

@@ -1,0 +1,197 @@
+"""Inputs and parameters found by gradients through the flight."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import stmuav_jax as sj
+from stmuav_jax.scenes.uav_tracker import uav_flyer
+from stmuav_jax.study.experiment import experiment
+from stmuav_jax.study.identify import (
+    IdentifiabilityError,
+    Unknown,
+    check_identifiable,
+    flight_model,
+    identify,
+)
+from stmuav_jax.study.search import search
+from stmuav_jax.study.shooting import growth, shooting, transition
+from stmuav_jax.study.trim import hover, trim
+from stmuav_jax.study.tuning import (
+    SlewLimits,
+    at_rest,
+    hold,
+    holding_time,
+    peaks,
+    slew,
+)
+from stmuav_jax.vehicle.drive import Friction
+from stmuav_jax.vehicle.flyer import Inputs, displacement, shifted
+from stmuav_jax.vehicle.rotor import hover_speed_squared
+from stmuav_jax.vehicle.workspace import tracker_limits
+
+START = sj.initial_angles(sj.PART_II)
+LM = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def flyer():
+    return uav_flyer()
+
+
+@pytest.fixture(scope="module")
+def untuned(flyer):
+    """The report's case 1: equal speeds that carry the weight, actuators idle."""
+    mass = float(np.sum(flyer.system.bodies.mass))
+    equal = hover_speed_squared(mass, sj.PART_II.value("gravity"), sj.PART_II.value("rotor.k_f"), 6)
+    return Inputs(equal, jnp.zeros(2))
+
+
+@pytest.fixture(scope="module")
+def held(flyer):
+    return trim(flyer, hover(START)).inputs
+
+
+def test_displacement_and_back(flyer):
+    rng = np.random.default_rng(3)
+    x = jnp.asarray(0.1 * rng.normal(size=16))
+    at = shifted(at_rest(START), jnp.asarray(0.1 * rng.normal(size=16)))
+    np.testing.assert_allclose(displacement(shifted(at, x), at), x, atol=1e-14)
+    back = jax.jit(lambda at: flyer.coordinates(flyer.state(at)))(at)
+    np.testing.assert_allclose(displacement(back, at), 0, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_growth_is_that_of_the_linear_system(flyer, held):
+    """At a trim the transition is expm(A t); its growth rate that of the fastest mode."""
+    from scipy.linalg import expm
+
+    from stmuav_jax.study.linear import linearize
+
+    ts, start = np.linspace(0.0, 0.4, 5), at_rest(START)
+    system = flyer.with_inputs(held)
+    method = sj.Method(rtol=1e-10, atol=1e-12)
+    found = np.asarray(transition(flyer, system, start, jnp.asarray(ts), method))
+    linear = linearize(flyer, start, held)
+    for t, Phi in zip(ts, found, strict=True):
+        exact = expm(linear.A * t)
+        np.testing.assert_allclose(Phi, exact, atol=2e-5 * np.max(np.abs(exact)))
+    seen = growth(flyer, system, start, ts, method)
+    assert seen.rate == pytest.approx(linear.modes()[0].s.real, rel=0.25)
+    assert seen.useful == 0.4
+    loose = growth(flyer, system, start, ts, sj.Method(rtol=1e-3, atol=1e-3))
+    assert loose.useful < 0.4
+    with pytest.raises(sj.SettingError, match="three times or more"):
+        growth(flyer, system, start, ts[:2])
+
+
+@pytest.mark.slow
+def test_hold(flyer, untuned, held):
+    """From the untuned case to the trim, by the gradients of the flight alone."""
+    start = at_rest(START)
+    before = holding_time(flyer, untuned, start)
+    tuning = hold(flyer, START, untuned, horizon=0.4)
+    found = search(tuning.residuals, tuning.start, LM, steps=60)
+    inputs = tuning.inputs(found.values)
+    np.testing.assert_allclose(np.sqrt(inputs.squared), np.sqrt(held.squared), rtol=1e-7)
+    np.testing.assert_allclose(inputs.forces, held.forces, rtol=1e-6)
+    after = holding_time(flyer, inputs, start)
+    assert before < 0.3
+    assert after > 5 * before
+
+
+@pytest.mark.slow
+def test_slew(flyer):
+    """The panel turns within limits, and the UAV is disturbed a hundred times less."""
+    after = np.asarray(START) + np.array([0.4, 0.3])
+    stops = tracker_limits(sj.PART_II)
+    limits = SlewLimits(6.2, stops.home, stops.lower, stops.upper, 30.0)
+    tuning = slew(flyer, START, after, 1.0, limits, segments=5, inside=6)
+    found = search(tuning.residuals, tuning.start, LM, steps=25)
+    before, now = peaks(tuning, tuning.start), peaks(tuning, found.values)
+    assert float(now.error) < 1e-4 < 0.1 < float(before.error)
+    assert float(now.tilt) < 0.01 * float(before.tilt)
+    assert float(now.drift) < 0.02 * float(before.drift)
+    assert float(now.force) < 6.2
+    assert now.reaction is not None
+    assert float(now.reaction) < 30.0
+    assert np.all((now.lower > stops.lower) & (now.upper < stops.upper))
+
+
+def test_slew_refused(flyer):
+    after = np.asarray(START) + np.array([0.4, 0.3])
+    with pytest.raises(sj.ModelError, match=r"before the turn needs an actuator force of 5\.958 N"):
+        slew(flyer, START, after, 1.0, SlewLimits(force=5.0))
+    with pytest.raises(sj.ModelError, match=r"shift of slider_2 before the turn is 22\.06 mm"):
+        slew(flyer, START, after, 1.0, SlewLimits(upper=(0.001, 0.1)))
+    with pytest.raises(sj.StateError, match="cannot take the panel angles"):
+        slew(flyer, START, [0.2, -1.5], 1.0)
+    with pytest.raises(sj.SettingError, match="must be positive, not -1 s"):
+        slew(flyer, START, after, -1.0)
+    with pytest.raises(sj.SettingError, match="four knots or more"):
+        slew(flyer, START, after, 1.0, knots=3)
+    with pytest.raises(sj.SettingError, match="two or more increasing times"):
+        shooting(flyer, lambda v: v, lambda *a: a, lambda t: at_rest(START), np.array([0.0, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def case():
+    return experiment(lambda table: uav_flyer(table, friction=Friction()), sj.PART_II, seed=1)
+
+
+@pytest.mark.slow
+def test_identification(case):
+    """Ten parameters from one record, with deviations that say how far off they are."""
+    found = identify(
+        case.predict, case.record, case.sigma, case.start, case.sizes, labels=case.labels,
+        weakest=0.5,
+    )  # fmt: skip
+    assert np.all(np.abs(found.values - case.truth) < 4 * found.deviations)
+    assert np.max(found.deviations / case.sizes) < 0.15
+    assert 0.8 < found.misfit < 1.2
+    assert found.search.loss < 1e-2 * found.search.history[0]
+
+
+def test_what_cannot_be_told_is_named():
+    J = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 5.0]])
+    with pytest.raises(IdentifiabilityError, match=r"[+-]0\.71 (a|b), [+-]0\.71 (a|b) \(singular"):
+        check_identifiable(J, ["a", "b", "c"])
+    assert check_identifiable(J[:, 1:], ["b", "c"])[0] == pytest.approx(5.0)
+    line = lambda q: (q[0] + q[1]) * jnp.linspace(0, 1, 5)[:, None]
+    with pytest.raises(IdentifiabilityError, match="leave one of the parameters out"):
+        identify(line, np.ones((5, 1)), [0.1], [0.0, 0.0], [1.0, 1.0])
+
+
+def test_a_straight_line():
+    """Values, deviations and misfit as those of linear regression."""
+    ts = np.linspace(0, 1, 30)
+    rng = np.random.default_rng(4)
+    record = (1.5 - 2.0 * ts + 0.1 * rng.normal(size=30))[:, None]
+    line = lambda q: (q[0] + q[1] * jnp.asarray(ts))[:, None]
+    found = identify(line, record, [0.1], {"offset": 0.0, "slope": 0.0}, [1.0, 1.0])
+    X = np.stack([np.ones(30), ts], axis=1)
+    exact = np.linalg.lstsq(X, record[:, 0], rcond=None)[0]
+    np.testing.assert_allclose(found.values, exact, atol=1e-8)
+    np.testing.assert_allclose(found.covariance, 0.01 * np.linalg.inv(X.T @ X), rtol=1e-8)
+    assert found.labels == ("offset", "slope")
+    left = record[:, 0] - X @ exact
+    assert found.misfit == pytest.approx(left @ left / 0.01 / 28)
+
+
+def test_records_refused():
+    line = lambda q: q[0] * jnp.ones((5, 1))
+    with pytest.raises(sj.ModelError, match=r"record has shape \(4, 1\), but predictions"):
+        identify(line, np.ones((4, 1)), [0.1], [0.0], [1.0])
+    with pytest.raises(sj.ModelError, match="record"):
+        identify(line, np.full((5, 1), np.nan), [0.1], [0.0], [1.0])
+    with pytest.raises(sj.SettingError, match="1 positive deviations"):
+        identify(line, np.ones((5, 1)), [0.0], [0.0], [1.0])
+    with pytest.raises(sj.SettingError, match="1 positive sizes"):
+        identify(line, np.ones((5, 1)), [0.1], [0.0], [-1.0])
+    with pytest.raises(sj.ModelError, match="has no entry"):
+        flight_model(
+            uav_flyer, sj.PART_II, [Unknown("mass.panel_7", 0.1, ((0,),))], at_rest(START),
+            Inputs(jnp.ones(6), jnp.zeros(2)), np.linspace(0, 1, 3),
+        )  # fmt: skip
