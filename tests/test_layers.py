@@ -18,9 +18,11 @@ FLOORS = {
     "scenes": 4,
     "estimation": 4,
     "study": 4,
-    "view": 5,
-    "commands": 6,
-    "cli": 7,
+    "montecarlo": 5,
+    "view": 6,
+    "jobs": 7,
+    "commands": 8,
+    "cli": 9,
 }
 LINES, STEPS = 400, 60
 

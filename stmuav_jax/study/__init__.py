@@ -1,1 +1,1 @@
-"""Floor 4: what one asks of the machine: a day of pointing at the sun."""
+"""Floor 4: what one asks of the machine: pointing, trim, linearisation, tuning, loads."""

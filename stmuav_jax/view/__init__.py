@@ -1,1 +1,1 @@
-"""Floor 5: files, tables and figures; nothing below this floor touches them."""
+"""Floor 6: files, tables and figures; nothing below this floor touches them."""

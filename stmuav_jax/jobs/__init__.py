@@ -1,0 +1,1 @@
+"""Floor 7: carries out studies, here or on a cluster, and keeps their results."""
