@@ -1,9 +1,11 @@
 """Shared set-up of the tests: double precision, shapes checked as the code runs."""
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
+from pathlib import Path
 
 # tests run side by side; small factorisations lose time to threads that wait for each other
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -23,6 +25,17 @@ jax.config.update("jax_compilation_cache_dir", os.environ["STMUAV_TEST_CACHE"])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 install_import_hook("stmuav_jax", "beartype.beartype")
+
+# Linux gives a process 65,530 memory maps, and a compiled program takes some twenty for as long as
+# it is kept: without this a worker dies after a thousand tests.
+MAPS, MOST_MAPS = Path("/proc/self/maps"), 20_000
+
+
+def pytest_runtest_teardown() -> None:
+    """Drop compiled programs when there are too many."""
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

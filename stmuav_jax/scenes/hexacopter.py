@@ -33,6 +33,7 @@ def hexacopter(
     drag: Drag | None = None,
     wind: Wind | Numbers | Callable[..., object] | None = None,
     motor: Motor | None = None,
+    allow_float32: bool = False,
 ) -> Scene:
     """The bare hexacopter rising with constant, equal rotor speeds; no joints at all.
 
@@ -43,6 +44,7 @@ def hexacopter(
         drag: of the airframe; the report has none. wind: a `Wind`, or the air's velocity,
             world (3,) [m/s], or a function of (t, kinematics); needs drag.
         motor: lag, inertia and limits of the rotors; the report has none.
+        allow_float32: see `System`.
 
     Raises:
         ModelError: numbers of the options that make no sense.
@@ -59,6 +61,7 @@ def hexacopter(
     system = System(
         [Body("hexacopter", mass, parameters.value("bare.inertia"), free=True)],
         forces=[Gravity(gravity), *air.forces],
+        allow_float32=allow_float32,
     )
     options = tuple(g for g in ("drag.", "wind.", "gust.", "motor.") if g not in air.unused)
     keep = ("bare.", "rotor.", "gravity", *options)

@@ -31,6 +31,7 @@ def tracker(
     stops: Stops | None = None,
     friction: Friction | None = None,
     strokes: tuple[Motion, Motion] | None = None,
+    allow_float32: bool = False,
 ) -> Scene:
     """The report's tracker on ground; the base has no coordinates, and there is no gravity.
 
@@ -41,6 +42,7 @@ def tracker(
         strokes: prescribe both sliders' displacements from the initial posture, functions of
             t [s] to [m] (see `stmuav_jax.vehicle.drive.stroke_drivers`); the case's own
             forces then only load the drivers.
+        allow_float32: see `System`.
 
     Raises:
         SettingError: another case.
@@ -55,6 +57,7 @@ def tracker(
         tracker_bodies(parameters),
         (*joints, *stroke_drivers(joints, strokes)) if strokes is not None else joints,
         (*_loads(case, parameters), *drive.forces),
+        allow_float32=allow_float32,
     )
     return Scene(
         name=f"tracker_{case}",

@@ -45,6 +45,7 @@ def uav_tracker(
     drag: Drag | None = None,
     wind: Wind | Numbers | Callable[..., object] | None = None,
     motor: Motor | None = None,
+    allow_float32: bool = False,
 ) -> Scene:
     """The report's seven-body UAV.
 
@@ -61,6 +62,7 @@ def uav_tracker(
         drag: of the hexacopter's airframe; the report has none. wind: a `Wind`, or the air's
             velocity, world (3,) [m/s], or a function of (t, kinematics); needs drag.
         motor: lag, inertia and limits of the rotors; the report has none.
+        allow_float32: see `System`.
 
     Raises:
         SettingError: another case or couple.
@@ -80,6 +82,7 @@ def uav_tracker(
         [base, *tracker_bodies(parameters, shift)],
         (*joints, *stroke_drivers(joints, strokes)) if strokes is not None else joints,
         (*_forces(case, air, actuators), *drive.forces),
+        allow_float32=allow_float32,
     )
     return Scene(
         name=f"uav_tracker_{case}",

@@ -128,16 +128,7 @@ class Flyer(eqx.Module):
 
     def state(self, at: Coordinates) -> State:
         """Positions and velocities of all bodies (7, .)."""
-        inside = posture(self.geometry, at.angles, at.rates)
-        R = rotation_matrix(at.p)
-        arms = inside.r + self.shift
-        turning = jax.vmap(rotation_matrix)(inside.p)
-        r = at.r + arms @ R.T
-        v = at.v + (inside.v + jnp.cross(at.omega, arms)) @ R.T
-        p = jax.vmap(product, in_axes=(None, 0))(at.p, inside.p)
-        omega = inside.omega + jnp.einsum("nji,j->ni", turning, at.omega)
-        first = lambda x, y: jnp.concatenate([x[None], y])
-        return State(first(at.r, r), first(at.p, p), first(at.v, v), first(at.omega, omega))
+        return whole_state(self.geometry, self.shift, at)
 
     def coordinates(self, state: State) -> Coordinates:
         """The independent coordinates of a state of all bodies (7, .) with closed loops."""
@@ -176,6 +167,26 @@ class Flyer(eqx.Module):
         J = stroke_jacobian(self.geometry, at.angles)
         moving = angle_motion(self.geometry, at.angles, J @ at.rates, slides)
         return Accelerations(found.v[:, 0], found.omega[:, 0], moving.acceleration)
+
+
+def whole_state(
+    geometry: TrackerGeometry, shift: Float[Array, "3"], at: Coordinates
+) -> State:
+    """Positions and velocities of base and tracker (7, .), base first.
+
+    Args:
+        shift: of the tracker in the base's frame [m].
+    """
+    inside = posture(geometry, at.angles, at.rates)
+    R = rotation_matrix(at.p)
+    arms = inside.r + shift
+    turning = jax.vmap(rotation_matrix)(inside.p)
+    r = at.r + arms @ R.T
+    v = at.v + (inside.v + jnp.cross(at.omega, arms)) @ R.T
+    p = jax.vmap(product, in_axes=(None, 0))(at.p, inside.p)
+    omega = inside.omega + jnp.einsum("nji,j->ni", turning, at.omega)
+    first = lambda x, y: jnp.concatenate([x[None], y])
+    return State(first(at.r, r), first(at.p, p), first(at.v, v), first(at.omega, omega))
 
 
 def shifted(at: Coordinates, x: Float[Array, "16"]) -> Coordinates:

@@ -1,0 +1,280 @@
+"""Many flights through few lanes: a finished flight's lane takes up the next one.
+
+A batch of adaptive integrations, run by `vmap` alone, lasts as long as its slowest. Here a fixed
+number of lanes take their steps together, every flight at its own step sizes; every few steps what
+has finished is put away, and the lane goes on with the next flight of the queue. Lanes idle at the
+end of a queue only.
+
+A flight's numbers depend on its own start and parameters, not on its lane or its neighbours: the
+compiled step is the same for all, whatever the length of the queue.
+"""
+
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ..dynamics.integrate import Problem, begin
+from ..mechanics.state import State
+from .monitor import Monitor, follow, start
+
+# Steps between two looks at which lanes have finished: a finished one waits half of these.
+ROUND = 8
+
+
+class Ending(IntEnum):
+    """How a flight ended; 0 while it goes on."""
+
+    RUNNING = 0
+    FINE = 1
+    NO_START = 2
+    MAX_STEPS = 3
+    COLLAPSED = 4
+
+
+REASONS = {
+    Ending.NO_START: "the start cannot be made: out of the mechanism's reach, or not finite",
+    Ending.MAX_STEPS: "the most steps allowed did not reach the end",
+    Ending.COLLAPSED: "the step size fell to round-off: the motion cannot be followed",
+}
+
+
+class Plan(NamedTuple):
+    """What is flown.
+
+    Attributes:
+        make: (numbers of one flight) -> prepared problem and consistent start.
+        times: where the state is kept (k,) [s], increasing; t0 comes before and is not among them
+            unless wanted; the last is the end.
+        t0: [s].
+        watch: (problem, t, y) -> signals to be watched between steps (q,).
+        rates: which of them have rates that are worth their cost (q,).
+        stops: which of them end the flight when they rise above zero (q,).
+        step: constant step [s], or None for adaptive ones.
+    """
+
+    make: Callable[[Any], tuple[Problem, State]]
+    times: Float[Array, " k"]
+    t0: float
+    watch: Callable[[Problem, Array, Array], Float[Array, " q"]]
+    rates: tuple[bool, ...]
+    stops: tuple[bool, ...]
+    step: float | None
+
+
+class Lane(eqx.Module):
+    """A flight under way.
+
+    Attributes:
+        t, y: now [s], (n,). next: end of the step to try [s].
+        solver_state, controller_state: diffrax's.
+        place: how many of the kept times have been reached. kept: states there (k, n).
+        monitor: of the watched signals. accepted, rejected: steps. ending: a code of `Ending`.
+    """
+
+    t: Float[Array, ""]
+    y: Float[Array, " n"]
+    next: Float[Array, ""]
+    solver_state: Any
+    controller_state: Any
+    place: Int[Array, ""]
+    kept: Float[Array, "k n"]
+    monitor: Monitor
+    accepted: Int[Array, ""]
+    rejected: Int[Array, ""]
+    ending: Int[Array, ""]
+
+
+class Flown(NamedTuple):
+    """What is left of a flight.
+
+    Attributes:
+        t: where it ended [s]. kept: states at the plan's times (k, n), NaN from its end on.
+        extreme: largest values of the watched signals (q,). when: when they first rose above zero
+            [s], infinite if never (q,).
+        residual: largest constraint residuals at any step: position [m], velocity, norm (3,).
+        accepted, rejected: steps. ending: a code of `Ending`.
+    """
+
+    t: Float[Array, ""]
+    kept: Float[Array, "k n"]
+    extreme: Float[Array, " q"]
+    when: Float[Array, " q"]
+    residual: Float[Array, "3"]
+    accepted: Int[Array, ""]
+    rejected: Int[Array, ""]
+    ending: Int[Array, ""]
+
+
+def _select(which: Any, yes: Any, no: Any) -> Any:
+    wide = lambda a: which.reshape(which.shape + (1,) * (a.ndim - which.ndim))
+    return jax.tree.map(lambda a, b: jnp.where(wide(a), a, b), yes, no)
+
+
+def _signals(plan: Plan, problem: Problem, t: Array, y: Array) -> tuple[Array, Array]:
+    """Watched signals and their rates, zero for those without."""
+    # rates by the chain rule along the motion; one evaluation for all of them
+    ahead = jnp.asarray(plan.rates)
+    of = lambda t, y: plan.watch(problem, t, y)
+    if not any(plan.rates):
+        g = of(t, y)
+        return g, jnp.zeros_like(g)
+    slope = problem.field(t, y, problem.model)
+    g, rate = jax.jvp(of, (t, y), (jnp.ones_like(t), slope))
+    return g, jnp.where(ahead, rate, 0.0)
+
+
+def _straight(plan: Plan, t0: Array, t1: Array, monitor: Monitor, g: Array, rate: Array) -> Any:
+    """Rates that make a straight line of signals without rates: those at both ends."""
+    ahead = jnp.asarray(plan.rates)
+    secant = (g - monitor.g) / jnp.where(t1 > t0, t1 - t0, 1.0)
+    return jnp.where(ahead, monitor.rate, secant), jnp.where(ahead, rate, secant)
+
+
+def launch(plan: Plan, numbers: Any) -> Lane:
+    """A flight before its first step."""
+    problem, state0 = plan.make(numbers)
+    t0 = jnp.asarray(plan.t0, state0.r.dtype)
+    carry = begin(problem, t0, state0)
+    fine = jnp.all(jnp.isfinite(carry.y))
+    step = carry.step if plan.step is None else jnp.asarray(plan.step, carry.y.dtype)
+    zero = jnp.zeros((), int)
+    kept = jnp.full((len(plan.times), carry.y.shape[0]), jnp.nan, carry.y.dtype)
+    monitor = start(t0, *_signals(plan, problem, t0, carry.y))
+    ending = jnp.where(fine, Ending.RUNNING, Ending.NO_START).astype(int)
+    return Lane(
+        carry.t, carry.y, carry.t + step, carry.solver_state, carry.controller_state,
+        zero, kept, monitor, zero, zero, ending,
+    )  # fmt: skip
+
+
+def attempt(plan: Plan, problem: Problem, lane: Lane) -> Lane:
+    """Try one step; a flight that has ended stays where it is."""
+    solver, terms = problem.solver(), diffrax.ODETerm(problem.field)
+    running = lane.ending == Ending.RUNNING
+    goal = plan.times[jnp.minimum(lane.place, len(plan.times) - 1)]
+    t0, t1 = lane.t, jnp.where(running, jnp.minimum(lane.next, goal), lane.t)
+    y1, error, _, solver_state, _ = solver.step(
+        terms, t0, t1, lane.y, problem.model, lane.solver_state, True
+    )
+    if plan.step is None:
+        controller = problem.controller(jnp.asarray(problem.method.first_step)).wrap(1)
+        order = solver.error_order(terms)
+        keep, _, _, _, controller_state, result = controller.adapt_step_size(
+            t0, t1, lane.y, y1, problem.model, error, order, lane.controller_state
+        )
+        step = controller_state[0]
+        collapsed = result != diffrax.RESULTS.successful
+    else:
+        # whole steps from the start, so that cutting one short does not shift the others
+        keep, controller_state = jnp.asarray(True), lane.controller_state
+        count = jnp.floor((t1 - plan.t0) / plan.step * (1 + 1e-12)) + 1
+        step = plan.t0 + count * plan.step - t1
+        collapsed = ~jnp.all(jnp.isfinite(y1))
+    taken = running & keep
+    t, y = jnp.where(taken, t1, t0), jnp.where(taken, y1, lane.y)
+    reached = taken & (t >= goal)
+    row = jnp.where(reached, lane.place, len(plan.times))
+    place = lane.place + reached
+    monitor = _watched(plan, problem, lane, taken, t0, t, y)
+    accepted = lane.accepted + taken
+    rejected = lane.rejected + (running & ~keep)
+    ended = (place >= len(plan.times)) | jnp.any(
+        monitor.crossings.found & jnp.asarray(plan.stops, bool)
+    )
+    most = accepted + rejected >= problem.method.max_steps
+    codes = [Ending.FINE, Ending.COLLAPSED, Ending.MAX_STEPS]
+    ending = jnp.select([ended, collapsed, most], codes, Ending.RUNNING)
+    return Lane(
+        t, y, jnp.where(running, t + step, lane.next),
+        _select(taken, solver_state, lane.solver_state),
+        _select(running, controller_state, lane.controller_state),
+        place, lane.kept.at[row].set(y, mode="drop"), monitor, accepted, rejected,
+        jnp.where(running, ending, lane.ending),
+    )  # fmt: skip
+
+
+def _watched(
+    plan: Plan, problem: Problem, lane: Lane, taken: Array, t0: Array, t1: Array, y: Array
+) -> Monitor:
+    """The monitor after the step, where it was taken."""
+    if not plan.rates:
+        return lane.monitor
+    g, rate = _signals(plan, problem, t1, y)
+    before, after = _straight(plan, t0, t1, lane.monitor, g, rate)
+    seen = eqx.tree_at(lambda m: m.rate, lane.monitor, before)
+    return _select(taken, follow(seen, t0, t1, g, after), lane.monitor)
+
+
+def _left(lane: Lane) -> Flown:
+    worst = lane.solver_state[1]
+    monitor = lane.monitor
+    failed = lane.ending != Ending.FINE
+    hide = lambda x: jnp.where(failed, jnp.nan, x)
+    return Flown(
+        lane.t, lane.kept, hide(monitor.extreme), hide(monitor.crossings.times()),
+        jnp.stack([worst.position, worst.velocity, worst.norm]),
+        lane.accepted, lane.rejected, lane.ending,
+    )  # fmt: skip
+
+
+class _Queue(NamedTuple):
+    """Lanes (b, .), their flights' numbers and places in the queue (b,), the next place, results."""
+
+    lanes: Lane
+    numbers: Any
+    flight: Int[Array, " b"]
+    next: Int[Array, ""]
+    results: Flown
+
+
+def fly(plan: Plan, numbers: Any, count: Int[Array, ""], lanes: int) -> Flown:
+    """Fly the first `count` of a queue of n flights; the results of the others are empty.
+
+    Args:
+        numbers: what `plan.make` takes, each with a leading axis (n, .).
+        lanes: how many flights go on together.
+    """
+    size = jax.tree.leaves(numbers)[0].shape[0]
+    launched = jax.vmap(lambda each: launch(plan, each))
+    take = lambda places: jax.tree.map(lambda x: x[jnp.clip(places, 0, size - 1)], numbers)
+
+    def whole(each: Any, lane: Lane) -> Lane:
+        problem, _ = plan.make(each)
+        return jax.lax.fori_loop(0, ROUND, lambda _, now: attempt(plan, problem, now), lane)
+
+    def rounds(queue: _Queue) -> _Queue:
+        now = jax.vmap(whole)(queue.numbers, queue.lanes)
+        done = (now.ending != Ending.RUNNING) & (queue.flight < count)
+        row = jnp.where(done, queue.flight, size)
+        results = jax.tree.map(
+            lambda all, new: all.at[row].set(new, mode="drop"),
+            queue.results,
+            jax.vmap(_left)(now),
+        )
+        place = jnp.where(done, queue.next + jnp.cumsum(done) - 1, queue.flight)
+        fresh = done & (place < count)
+        given = take(place)
+        lanes_now = jax.lax.cond(
+            jnp.any(fresh), lambda: _select(fresh, launched(given), now), lambda: now
+        )
+        flight = jnp.where(done & ~fresh, size, place)
+        kept = _select(fresh, given, queue.numbers)
+        return _Queue(lanes_now, kept, flight, queue.next + jnp.sum(done), results)
+
+    first = jnp.arange(lanes)
+    given = take(first)
+    begun = launched(given)
+    idle = first >= count
+    begun = eqx.tree_at(lambda l: l.ending, begun, jnp.where(idle, Ending.FINE, begun.ending))
+    one = jax.eval_shape(lambda lane: _left(lane), jax.tree.map(lambda x: x[0], begun))
+    empty = jax.tree.map(
+        lambda x: jnp.full((size, *x.shape), jnp.nan if x.dtype.kind == "f" else 0, x.dtype), one
+    )
+    queue = _Queue(begun, given, jnp.where(idle, size, first), jnp.asarray(lanes), empty)
+    return jax.lax.while_loop(lambda q: jnp.any(q.flight < count), rounds, queue).results

@@ -1,0 +1,268 @@
+"""Studies of many flights: what is drawn, what is flown, what is kept of each flight."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from ..mechanics.errors import SettingError, nearest_names
+from ..vehicle.parameters import Parameters
+from .distribution import Distribution, from_plain
+from .flights import Flights, flights
+from .sampling import Sampling, sampling_from_plain
+from .signal import Signal, signal
+
+TAKES = ("final", "largest", "smallest", "path", "when_above", "when_below")
+SOLVERS = ("dopri8", "tsit5")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number, or a history, that is kept of each flight.
+
+    Attributes:
+        signal: see `stmuav_jax.montecarlo.signal`.
+        take: "final" value; "largest", "smallest" over the flight; "path": values every
+            `Study.every` seconds; "when_above", "when_below": time at which it first crosses
+            `level` [s], infinite if it never does.
+        level: in the signal's unit.
+        stop: end the flight when it crosses; what is kept at the end is then of that moment's
+            step, and paths have no numbers from there on.
+
+    Raises:
+        SettingError: an unknown take, a level where none belongs or none where one does.
+    """
+
+    signal: str
+    take: str
+    level: float | None = None
+    stop: bool = False
+
+    def __post_init__(self) -> None:
+        if self.take not in TAKES:
+            raise SettingError(
+                f"Quantities take {', '.join(TAKES)}; not '{self.take}'.{nearest_names(self.take, TAKES)}"
+            )
+        crossing = self.take.startswith("when_")
+        if crossing != (self.level is not None):
+            words = "needs a level" if crossing else "has no level"
+            raise SettingError(f"'{self.take}' of signal '{self.signal}' {words}.")
+        if self.level is not None and not np.isfinite(self.level):
+            raise SettingError(f"The level of '{self.signal}' must be finite, not {self.level}.")
+        if self.stop and not crossing:
+            raise SettingError(f"Only a crossing can stop a flight, not '{self.take}'.")
+
+    def column(self, of: Signal) -> tuple[str, str]:
+        """Unit and words of the column that it fills."""
+        level = f"{self.level:g} {of.unit}" if self.level is not None else ""
+        words = {
+            "final": f"{of.words}, at the end",
+            "path": of.words,
+            "when_above": f"time at which {of.words} exceeds {level}",
+            "when_below": f"time at which {of.words} falls below {level}",
+        }.get(self.take, f"{of.words}, {self.take}")
+        return ("s" if self.take.startswith("when_") else of.unit), words
+
+
+@dataclass(frozen=True)
+class Study:
+    """Many flights of one scene.
+
+    Attributes:
+        name: short, for files.
+        flights: what they have in common: scene, case, parameters, inputs, wind.
+        sampling: how their factors are drawn.
+        quantities: by the names of their columns.
+        t1: end [s]. every: spacing of the kept times of paths [s]; default one thirtieth of t1.
+        rtol, atol: tolerances of a step. solver: one of `SOLVERS`.
+        step: constant step [s] instead of adaptive ones.
+        max_steps: of a flight, after which it has failed.
+
+    Raises:
+        SettingError: no quantities, names that clash, impossible numbers.
+    """
+
+    name: str
+    flights: Flights
+    sampling: Sampling
+    quantities: Mapping[str, Quantity]
+    t1: float = 1.0
+    every: float | None = None
+    rtol: float = 1e-8
+    atol: float = 1e-8
+    solver: Literal["dopri8", "tsit5"] = "dopri8"
+    step: float | None = None
+    max_steps: int = 20_000
+    direction: tuple[float, float, float] | None = field(default=None)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "quantities", dict(self.quantities))
+        if not self.quantities:
+            raise SettingError(f"Study '{self.name}' keeps nothing: give it quantities.")
+        for name in self.sampling.names:
+            self.flights.entry(name)
+        clash = sorted({*self.quantities} & {*self.sampling.names, "status", "sample", "time"})
+        if clash:
+            raise SettingError(f"These names are taken, so no quantity can have them: {clash}.")
+        _check_numbers(self)
+
+    @property
+    def times(self) -> np.ndarray:
+        """Of paths and of the end, after the start [s]."""
+        if not any(q.take == "path" for q in self.quantities.values()):
+            return np.array([self.t1])
+        every = self.t1 / 30 if self.every is None else self.every
+        count = int(np.floor(self.t1 / every * (1 + 1e-12)))
+        times = every * np.arange(count + 1)
+        times[-1] = self.t1 if self.t1 - times[-1] < 1e-9 * every else times[-1]
+        return times if times[-1] == self.t1 else np.append(times, self.t1)
+
+    def plain(self) -> dict[str, Any]:
+        """Everything that decides the numbers, as plain data."""
+        table = self.flights.table
+        numbers = {name: np.asarray(table.value(name)).tolist() for name in table}
+        text = json.dumps(numbers, sort_keys=True)
+        of = self.flights
+        return {
+            "kind": "flights",
+            "name": self.name,
+            "scene": of.scene,
+            "case": of.case,
+            "parameters": hashlib.sha256(text.encode()).hexdigest()[:16],
+            "relative": sorted(of.relative),
+            "inputs": of.inputs,
+            "drag": of.drag,
+            "gusts": of.gusts,
+            "precision": "float32" if of.float32 else "float64",
+            "sampling": self.sampling.plain(),
+            "quantities": {k: _plain(q) for k, q in self.quantities.items()},
+            "t1": self.t1,
+            "times": self.times.tolist(),
+            "rtol": self.rtol,
+            "atol": self.atol,
+            "solver": self.solver,
+            "step": self.step,
+            "max_steps": self.max_steps,
+            "direction": None if self.direction is None else list(self.direction),
+        }
+
+    def signals(self) -> dict[str, Signal]:
+        """The signal of each quantity."""
+        system, _ = self.flights.nominal()
+        return {name: signal(system, q.signal) for name, q in self.quantities.items()}
+
+
+def _plain(quantity: Quantity) -> dict[str, Any]:
+    found: dict[str, Any] = {"signal": quantity.signal, "take": quantity.take}
+    if quantity.level is not None:
+        found |= {"level": quantity.level, "stop": quantity.stop}
+    return found
+
+
+def _check_numbers(study: Study) -> None:
+    numbers = {"t1": study.t1, "rtol": study.rtol, "atol": study.atol}
+    optional = {"every": study.every, "step": study.step}
+    numbers |= {k: v for k, v in optional.items() if v is not None}
+    for name, value in numbers.items():
+        if not (np.isfinite(value) and value > 0):
+            raise SettingError(f"{name} must be finite and positive, but it is {value}.")
+    least = 1e-7 if study.flights.float32 else 1e-15
+    for name in ("rtol", "atol"):
+        if numbers[name] < least:
+            raise SettingError(
+                f"{name} must be at least {least:g}, the round-off of this precision, but it is "
+                f"{numbers[name]:g}."
+            )
+    if study.solver not in SOLVERS:
+        raise SettingError(f"Studies integrate by {' or '.join(SOLVERS)}, not '{study.solver}'.")
+    if study.max_steps < 1:
+        raise SettingError(f"max_steps must be at least 1, but it is {study.max_steps}.")
+    if study.step is not None and study.step > study.t1:
+        raise SettingError(f"A step of {study.step:g} s is longer than the flight of {study.t1:g} s.")
+    if study.every is not None and study.every > study.t1:
+        raise SettingError(
+            f"Times {study.every:g} s apart do not fit into a flight of {study.t1:g} s."
+        )
+    if study.direction is not None:
+        size = float(np.linalg.norm(study.direction))
+        if not abs(size - 1) <= 1e-9:
+            raise SettingError(f"The direction must be a unit vector, but its length is {size:.12g}.")
+
+
+def study_from_plain(
+    plain: Mapping[str, Any], table: Parameters | None = None, name: str = "study"
+) -> Study:
+    """A study from plain data, as a TOML file holds it (see docs/studies.md).
+
+    Args:
+        table: of the scene's parameters, where the user has changed some.
+
+    Raises:
+        SettingError: an unknown entry (with the nearest known one), or numbers that do not fit.
+    """
+    given = dict(plain)
+    known = {
+        "name", "scene", "case", "samples", "inputs", "drag", "gusts", "precision", "t1", "every",
+        "rtol", "atol", "solver", "step", "max_steps", "direction", "seed", "design", "stratum",
+        "correlation", "factors", "quantities", "chunk", "kind",
+    }  # fmt: skip
+    for key in given:
+        if key not in known:
+            raise SettingError(f"A study has no entry '{key}'.{nearest_names(key, known)}")
+    for key in ("scene", "factors", "quantities"):
+        if key not in given:
+            raise SettingError(f"A study needs '{key}'.")
+    if given.get("precision", "float64") not in ("float64", "float32"):
+        raise SettingError(f"precision is float64 or float32, not '{given['precision']}'.")
+    factors, relative = _factors(given["factors"])
+    t1 = float(given.get("t1", 1.0))
+    of = flights(
+        given["scene"], given.get("case"), table,
+        relative=relative, inputs=given.get("inputs", "case"), drag=given.get("drag", False),
+        gusts=given.get("gusts", False), duration=t1,
+        float32=given.get("precision") == "float32",
+    )  # fmt: skip
+    drawn = {k: given[k] for k in ("seed", "design", "stratum", "correlation") if k in given}
+    sampling = sampling_from_plain({"seed": 0, "factors": factors} | drawn)
+    keep = ("every", "rtol", "atol", "solver", "step", "max_steps")
+    options = {k: given[k] for k in keep if k in given}
+    if "direction" in given:
+        options["direction"] = tuple(float(x) for x in given["direction"])
+    quantities = {k: _quantity(k, q) for k, q in given["quantities"].items()}
+    return Study(given.get("name", name), of, sampling, quantities, t1=t1, **options)
+
+
+def _factors(given: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[str]]:
+    """Their distributions in plain form, and which are relative."""
+    found: dict[str, Any] = {}
+    relative = set()
+    for name, what in given.items():
+        if isinstance(what, Mapping):
+            what = dict(what)
+            if what.pop("relative", False):
+                relative.add(name)
+        found[name] = what
+    return found, frozenset(relative)
+
+
+def _quantity(name: str, given: Any) -> Quantity:
+    known = ("signal", "take", "level", "stop")
+    if not isinstance(given, Mapping) or not {"signal", "take"} <= set(given):
+        raise SettingError(f"Quantity '{name}' needs a signal and what to take of it.")
+    for key in given:
+        if key not in known:
+            raise SettingError(f"Quantity '{name}' has no '{key}'.{nearest_names(key, known)}")
+    return Quantity(**given)
+
+
+def with_precision(study: Study, float32: bool) -> Study:
+    """The same study in the other precision."""
+    return replace(study, flights=replace(study.flights, float32=float32))
+
+
+__all__ = [
+    "Distribution", "Quantity", "Study", "from_plain", "study_from_plain", "with_precision",
+]  # fmt: skip
