@@ -1,0 +1,375 @@
+"""Draws of a study's uncertain numbers: sample i depends on the seed and on i alone.
+
+Designs:
+- random: independent draws, from a counter-based generator (Philox).
+- latin: Latin hypercubes of a declared number of samples, one after the other.
+- sobol: a scrambled Sobol sequence; best in powers of two.
+- saltelli: base points of two independent draws A and B, each flown as A, B and A with one factor
+  after the other taken from B: d + 2 samples a point, for Sobol indices (`sensitivity.sobol`).
+- table: the rows of given columns, in order.
+
+Correlated factors are joined by a Gaussian copula: the matrix is that of the normal numbers behind
+the factors. Factors keep their distributions; their rank correlation is (6 / pi) asin(rho / 2). A
+hypercube or Sobol sequence is less even after it than before.
+
+Source: Owen (2020) arXiv:2008.08051 (why the first Sobol point stays in); Saltelli et al. (2010),
+Comput. Phys. Commun. 181, 259-270, the layout of A, B and AB.
+"""
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+
+from ..mechanics.errors import SettingError, nearest_names
+from .distribution import Distribution, Number, from_plain
+
+DESIGNS = ("random", "latin", "sobol", "saltelli", "table")
+
+# SciPy can go forward to a later point only in sequences of up to 32 bits.
+SOBOL_BITS = 31
+SOBOL_POINTS = 2**SOBOL_BITS
+
+# What a correlation matrix that was computed from data may lack in symmetry.
+_ROUND_OFF = 1e-12
+
+# Each design has random numbers of its own.
+_STREAM = {name: k for k, name in enumerate(DESIGNS)}
+
+Pairs = Sequence[tuple[str, str, Number]] | Mapping[tuple[str, str], Number] | np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampling:
+    """How the numbers of a study are drawn.
+
+    Attributes:
+        factors: distributions by name, d of them; in a table, empirical ones (its columns) or
+            constants.
+        seed: a whole number >= 0.
+        design: one of `DESIGNS`.
+        correlation: of the normal numbers behind the factors, as (name, name, rho), as a mapping
+            from pairs of names, or as a matrix (d, d); kept as the first.
+        stratum: samples of one Latin hypercube; only for that design.
+
+    Raises:
+        SettingError: no factors, an unknown design, a negative seed, a correlation that is not
+            positive definite or that the design cannot have, a stratum where none belongs.
+    """
+
+    factors: Mapping[str, Distribution]
+    seed: int
+    design: str = "random"
+    correlation: Pairs = ()
+    stratum: int | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "factors", dict(self.factors))
+        object.__setattr__(self, "correlation", _triples(self.correlation, self.names))
+        _check(self)
+        if self.correlation:
+            self._root()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The factors, in the order of the columns that are drawn."""
+        return tuple(self.factors)
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str, float], ...]:
+        """Correlations as (name, name, rho)."""
+        return cast(tuple[tuple[str, str, float], ...], self.correlation)
+
+    @property
+    def limit(self) -> int | None:
+        """How many samples there are at most; None where there is no end."""
+        if self.design == "table":
+            return _rows(self.factors)
+        if self.design in ("sobol", "saltelli"):
+            return SOBOL_POINTS * self.together
+        return None
+
+    @property
+    def together(self) -> int:
+        """How many neighbouring samples belong together: a study has a multiple of it."""
+        if self.design == "latin":
+            return self.stratum or 1
+        return len(self.factors) + 2 if self.design == "saltelli" else 1
+
+    def whole(self, count: int) -> int:
+        """The least number of samples >= count that breaks nothing that belongs together."""
+        return -(-count // self.together) * self.together
+
+    def draw(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
+        """The factors of samples first, ..., first + count - 1, in their own units.
+
+        Raises:
+            SettingError: a negative number, or samples beyond the design's end.
+        """
+        if first < 0 or count < 0:
+            raise SettingError(f"Samples count from 0, but {count} from {first} on were asked for.")
+        if self.limit is not None and first + count > self.limit:
+            what = f"table has {self.limit} rows" if self.design == "table" else (
+                f"design '{self.design}' has {self.limit} samples"
+            )  # fmt: skip
+            raise SettingError(f"The {what}, but samples up to {first + count} were asked for.")
+        if self.design == "table":
+            columns = [_column(one, first, count) for one in self.factors.values()]
+            return np.stack(columns, axis=1)
+        u = _UNIFORM[self.design](self, first, count)
+        if self.correlation:
+            u = _joined(self._root(), u)
+        columns = [
+            one.quantile(np.ascontiguousarray(u[:, j]))
+            for j, one in enumerate(self.factors.values())
+        ]
+        return np.stack(columns, axis=1)
+
+    def plain(self) -> dict[str, Any]:
+        """The plain form, which JSON and TOML can hold; `sampling_from_plain` reads it.
+
+        Factors are a list, as their order decides on the draws of a Sobol sequence.
+        """
+        factors = [{"name": name} | one.plain() for name, one in self.factors.items()]
+        found = {"design": self.design, "seed": self.seed, "factors": factors}
+        if self.correlation:
+            found["correlation"] = [list(triple) for triple in self.pairs]
+        return found if self.stratum is None else found | {"stratum": self.stratum}
+
+    def _root(self) -> np.ndarray:
+        """The Cholesky factor of the correlation matrix (d, d)."""
+        matrix = np.eye(len(self.factors))
+        place = {name: k for k, name in enumerate(self.names)}
+        for a, b, rho in self.pairs:
+            matrix[place[a], place[b]] = matrix[place[b], place[a]] = rho
+        least = float(np.linalg.eigvalsh(matrix)[0])
+        # below, round-off could hide a negative one
+        if least < len(matrix) * np.finfo(float).eps:
+            raise SettingError(
+                "The correlations must form a positive definite matrix, but its smallest eigenvalue is "
+                f"{least:.3g}; no numbers can be correlated in this way."
+            )
+        return np.linalg.cholesky(matrix)
+
+
+def sampling_from_plain(plain: Mapping[str, Any]) -> Sampling:
+    """A sampling from its plain form; factors may also be tables by name, as TOML has them.
+
+    Raises:
+        SettingError: unknown or missing entries, and as `Sampling`.
+    """
+    known = tuple(field.name for field in dataclasses.fields(Sampling))
+    for name in plain:
+        if name not in known:
+            raise SettingError(f"A sampling has no entry '{name}'.{nearest_names(name, known)}")
+    for name in ("factors", "seed"):
+        if name not in plain:
+            raise SettingError(f"A sampling needs an entry '{name}'.")
+    for name in ("seed", "stratum"):
+        value = plain.get(name, 0)
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise SettingError(
+                f"'{name}' of a sampling must be a whole number, but it is {value!r}."
+            )
+    given = plain["factors"]
+    if not isinstance(given, Mapping):
+        given = {one["name"]: {k: v for k, v in one.items() if k != "name"} for one in given}
+    factors = {name: from_plain(one, name) for name, one in given.items()}
+    pairs = [_pair(triple) for triple in plain.get("correlation", [])]
+    design = str(plain.get("design", "random"))
+    return Sampling(factors, plain["seed"], design, pairs, plain.get("stratum"))
+
+
+def _pair(given: Any) -> tuple[str, str, float]:
+    try:
+        a, b, rho = given
+        return str(a), str(b), float(rho)
+    except (TypeError, ValueError):
+        raise SettingError(
+            f"A correlation is given as [name, name, number], but there is {given!r}."
+        ) from None
+
+
+# --- uniform numbers of each design, in (0, 1), as functions of the sampling and the numbers
+
+
+def _random(sampling: Sampling, first: int, count: int) -> np.ndarray:
+    """Philox gives four numbers a count; each sample has counts of its own."""
+    d = len(sampling.factors)
+    counts = -(-d // 4)
+    seeds = np.random.SeedSequence([sampling.seed, _STREAM["random"]])
+    key = seeds.generate_state(2, np.uint64)
+    source = np.random.Philox(counter=first * counts, key=key)
+    raw = source.random_raw(count * counts * 4).reshape(count, counts * 4)[:, :d]
+    # centres of 2^52 cells, so that neither 0 nor 1 is among them
+    return ((raw >> np.uint64(12)) + 0.5) * 2.0**-52
+
+
+def _latin(sampling: Sampling, first: int, count: int) -> np.ndarray:
+    size = sampling.stratum or 1
+    d = len(sampling.factors)
+    parts = [np.empty((0, d))]
+    for b in range(first // size, -(-(first + count) // size)):
+        start, stop = max(first - b * size, 0), min(first + count - b * size, size)
+        parts.append(_hypercube(sampling.seed, b, size, d)[start:stop])
+    return np.concatenate(parts)
+
+
+@functools.lru_cache(maxsize=2)
+def _hypercube(seed: int, b: int, size: int, d: int) -> np.ndarray:
+    """Stratum b (size, d). Kept, since chunks of one stratum are drawn one after the other."""
+    from scipy.stats import qmc
+
+    rng = np.random.default_rng([seed, _STREAM["latin"], b])
+    points = qmc.LatinHypercube(d, rng=rng).random(size)
+    # SciPy's numbers are in (0, 1]; at 1 quantiles may be infinite
+    return np.minimum(points, np.nextafter(1.0, 0.0))
+
+
+def _sobol(sampling: Sampling, first: int, count: int) -> np.ndarray:
+    return _sequence(len(sampling.factors), sampling.seed, first, count, "sobol")
+
+
+def _sequence(d: int, seed: int, first: int, count: int, design: str) -> np.ndarray:
+    from scipy.stats import qmc
+
+    rng = np.random.default_rng([seed, _STREAM[design]])
+    engine = qmc.Sobol(d, scramble=True, bits=SOBOL_BITS, rng=rng)
+    if count == 0:
+        return np.empty((0, d))
+    if first == 0:
+        # apart from the rest, as SciPy warns of first draws that are not a power of two
+        points = np.concatenate([engine.random(1), engine.random(count - 1)])
+    else:
+        points = engine.fast_forward(first).random(count)
+    return points + 0.5 / SOBOL_POINTS  # centres of the cells
+
+
+def _saltelli(sampling: Sampling, first: int, count: int) -> np.ndarray:
+    d = len(sampling.factors)
+    k = first // (d + 2)
+    points = -(-(first + count) // (d + 2)) - k
+    base = _sequence(2 * d, sampling.seed, k, points, "saltelli")
+    a, b = base[:, :d], base[:, d:]
+    rows = np.repeat(a[:, None], d + 2, axis=1)
+    rows[:, 1] = b
+    for j in range(d):
+        rows[:, 2 + j, j] = b[:, j]
+    start = first - k * (d + 2)
+    return rows.reshape(-1, d)[start : start + count]
+
+
+_UNIFORM = {"random": _random, "latin": _latin, "sobol": _sobol, "saltelli": _saltelli}
+
+
+def _joined(root: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Uniform numbers (count, d) correlated by a Gaussian copula."""
+    from scipy.special import ndtr, ndtri
+
+    z = ndtri(u)
+    joined = np.zeros_like(z)
+    # term by term: a matrix product may round differently for another number of rows
+    for j in range(len(root)):
+        for k in range(j + 1):
+            joined[:, j] += root[j, k] * z[:, k]
+    # more than 8 deviations out doubles cannot tell the shares from 0 and 1
+    return np.clip(ndtr(joined), np.nextafter(0.0, 1.0), np.nextafter(1.0, 0.0))
+
+
+def _column(one: Distribution, first: int, count: int) -> np.ndarray:
+    if one.name == "constant":
+        return np.full(count, one.parameters["value"])
+    return np.asarray(one.parameters["values"][first : first + count])
+
+
+def _rows(factors: Mapping[str, Distribution]) -> int:
+    return max(len(one.parameters.get("values", ())) for one in factors.values())
+
+
+# --- checks
+
+
+def _triples(given: Pairs, names: tuple[str, ...]) -> tuple[tuple[str, str, float], ...]:
+    """Correlations as (name, name, rho), checked but for being positive definite."""
+    if isinstance(given, np.ndarray):
+        triples = _of_matrix(given, names)
+    elif isinstance(given, Mapping):
+        triples = [(a, b, rho) for (a, b), rho in given.items()]
+    else:
+        triples = [(a, b, rho) for a, b, rho in given]
+    seen = set()
+    for a, b, rho in triples:
+        for name in (a, b):
+            if name not in names:
+                raise SettingError(
+                    f"A correlation names '{name}', which is no factor.{nearest_names(name, names)}"
+                )
+        if a == b or frozenset((a, b)) in seen:
+            raise SettingError(f"The correlation of '{a}' with '{b}' is given twice or is its own.")
+        seen.add(frozenset((a, b)))
+        if not -1 < rho < 1:
+            raise SettingError(
+                f"The correlation of '{a}' with '{b}' must lie between -1 and 1, but it is {rho:g}."
+            )
+    return tuple((a, b, float(rho)) for a, b, rho in triples)
+
+
+def _of_matrix(matrix: np.ndarray, names: tuple[str, ...]) -> list[tuple[str, str, float]]:
+    d = len(names)
+    if matrix.shape != (d, d):
+        raise SettingError(
+            f"A correlation matrix of {d} factors has shape ({d}, {d}), not {matrix.shape}."
+        )
+    skew, off = np.max(np.abs(matrix - matrix.T)), np.max(np.abs(np.diag(matrix) - 1))
+    if not max(skew, off) < _ROUND_OFF:
+        raise SettingError(
+            "A correlation matrix must be symmetric with ones on its diagonal, but its diagonal is up to "
+            f"{off:g} away from 1, and it differs from its transpose by up to {skew:g}."
+        )
+    pairs = itertools.combinations(range(d), 2)
+    return [(names[i], names[j], float(matrix[i, j])) for i, j in pairs if matrix[i, j] != 0]
+
+
+def _check(s: Sampling) -> None:
+    if s.design not in DESIGNS:
+        raise SettingError(f"There is no design '{s.design}'.{nearest_names(s.design, DESIGNS)}")
+    if not s.factors:
+        raise SettingError("A sampling needs at least one factor.")
+    if s.seed < 0:
+        raise SettingError(f"The seed must be a whole number from 0 on, but it is {s.seed}.")
+    if (s.stratum is not None) != (s.design == "latin"):
+        raise SettingError(
+            "A design 'latin', and no other, needs 'stratum', the number of samples of one hypercube; "
+            f"here the design is '{s.design}' and the stratum {s.stratum}."
+        )
+    if s.stratum is not None and s.stratum < 1:
+        raise SettingError(f"The stratum must be at least 1 sample, but it is {s.stratum}.")
+    if s.correlation and s.design in ("saltelli", "table"):
+        why = "takes factors one by one" if s.design == "saltelli" else "has its rows as they are"
+        raise SettingError(f"The design '{s.design}' {why}: it cannot have correlations.")
+    for a, b, _ in s.pairs:
+        for name in (a, b):
+            if s.factors[name].name == "constant":
+                raise SettingError(f"Factor '{name}' is constant: it cannot be correlated.")
+    if s.design == "table":
+        _check_table(s.factors)
+
+
+def _check_table(factors: Mapping[str, Distribution]) -> None:
+    sizes: dict[str, int] = {}
+    for name, one in factors.items():
+        if one.name not in ("empirical", "constant"):
+            raise SettingError(
+                f"Factor '{name}': in a table factors are columns ('empirical') or constants, but it is "
+                f"'{one.name}'."
+            )
+        if one.name == "empirical":
+            sizes[name] = len(one.parameters["values"])
+    if len(set(sizes.values())) != 1:
+        raise SettingError(
+            f"The columns of a table must be equally long, but they have {sizes} rows."
+        )

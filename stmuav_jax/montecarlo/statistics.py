@@ -1,0 +1,325 @@
+"""What samples tell, with confidence intervals; failed samples are left out by the caller and counted.
+
+Intervals hold for independent samples. Latin hypercubes and Sobol sequences estimate means at least as
+well as those, as a rule much better: there the intervals are too wide rather than too narrow.
+
+Numbers that are infinite ("never") have an order, so they have quantiles, but no mean. Numbers that are
+not a number are left out and counted.
+
+Source: Student's t (mean); Bonett (2006), Comput. Stat. Data Anal. 50, 775-782 (deviation, not only of
+normal numbers); order statistics and the binomial distribution (quantiles, David and Nagaraja, Order
+Statistics, 3rd ed., section 7.1); Wilson (1927), J. Am. Stat. Assoc. 22, 209-212 (probabilities).
+"""
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from ..mechanics.errors import SettingError
+from .work import FINE, MISSING
+
+LEVEL = 0.95
+SHARES = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+Values = Shaped[np.ndarray, " n"]
+
+
+class Estimate(NamedTuple):
+    """A number with the ends of its confidence interval; None where there are too few samples."""
+
+    value: float
+    low: float | None
+    high: float | None
+
+
+class Outcomes(NamedTuple):
+    """How samples ended.
+
+    Attributes:
+        missing: not computed yet. fine, failed: number of each.
+        codes: number of failed samples by their code.
+        failure: probability that a sample fails; None if none is computed.
+        reasons: words and probability by code, for every code that has words or samples.
+    """
+
+    missing: int
+    fine: int
+    failed: int
+    codes: dict[int, int]
+    failure: Estimate | None
+    reasons: dict[int, tuple[str, Estimate | None]]
+
+
+class Summary(NamedTuple):
+    """One quantity over the fine samples.
+
+    Attributes:
+        values: how many are numbers, infinite ones included.
+        undefined: values that are not a number, left out of all else.
+        never, below: how many are +infinity and -infinity.
+        infinite: share of both; None if there are none.
+        least, most: None without values.
+        mean, deviation: None with infinite values, or with fewer than one or two values.
+        quantiles: by the share of samples at or below.
+    """
+
+    values: int
+    undefined: int
+    never: int
+    below: int
+    infinite: Estimate | None
+    least: float | None
+    most: float | None
+    mean: Estimate | None
+    deviation: Estimate | None
+    quantiles: dict[float, Estimate]
+
+
+class Bands(NamedTuple):
+    """Quantiles at every place of an axis, over the samples; each (q, k).
+
+    low and high, the ends of their intervals, are not a number where there are too few samples.
+    """
+
+    value: Float[np.ndarray, "q k"]
+    low: Float[np.ndarray, "q k"]
+    high: Float[np.ndarray, "q k"]
+
+
+class Convergence(NamedTuple):
+    """An estimate from the first 2, 4, 8, ... samples and from all; each (k,).
+
+    low and high are not a number where there are too few samples.
+    """
+
+    sizes: Int[np.ndarray, " k"]
+    value: Float[np.ndarray, " k"]
+    low: Float[np.ndarray, " k"]
+    high: Float[np.ndarray, " k"]
+
+
+def probability(hits: int, count: int, level: float = LEVEL) -> Estimate:
+    """Share of hits with Wilson's interval.
+
+    Raises:
+        SettingError: no samples, or a level outside (0, 1).
+    """
+    import scipy.stats
+
+    _check_level(level)
+    if count < 1:
+        raise SettingError("A probability needs at least one sample, but there is none.")
+    ends = scipy.stats.binomtest(hits, count).proportion_ci(level, method="wilson")
+    return Estimate(hits / count, float(ends.low), float(ends.high))
+
+
+def outcomes(
+    status: Int[np.ndarray, " n"], reasons: Mapping[int, str], level: float = LEVEL
+) -> Outcomes:
+    """Counts of the codes of a study's status, and probabilities among the computed samples."""
+    found, number = np.unique(status, return_counts=True)
+    counts = {int(code): int(k) for code, k in zip(found, number, strict=True)}
+    missing, fine = counts.pop(MISSING, 0), counts.pop(FINE, 0)
+    computed = len(status) - missing
+    share = lambda k: probability(k, computed, level) if computed else None
+    known = {code: reasons.get(code, "no reason known") for code in [*reasons, *counts]}
+    failed = sum(counts.values())
+    each = {code: (known[code], share(counts.get(code, 0))) for code in sorted(known)}
+    return Outcomes(missing, fine, failed, counts, share(failed), each)
+
+
+def mean(values: Values, level: float = LEVEL) -> Estimate:
+    """Mean with Student's interval.
+
+    Raises:
+        SettingError: no values, values that are not finite, a level outside (0, 1).
+    """
+    import scipy.stats
+
+    _check_level(level)
+    y, n = _finite(values, "A mean", 1), len(values)
+    middle = float(np.mean(y))
+    if n == 1:
+        return Estimate(middle, None, None)
+    half = scipy.stats.t.ppf(0.5 + level / 2, n - 1) * _spread(y) / math.sqrt(n)
+    return Estimate(middle, middle - float(half), middle + float(half))
+
+
+def deviation(values: Values, level: float = LEVEL) -> Estimate:
+    """Standard deviation (of n - 1) with Bonett's interval, from 5 values on.
+
+        s sqrt(c) exp(+-(z c / 2) sqrt((g - (n - 3) / n) / (n - 1))),  c = n / (n - z)
+
+    with z of the normal distribution and the kurtosis g about a mean trimmed by 1 / (2 sqrt(n - 4)).
+
+    Raises:
+        SettingError: fewer than 2 values, values that are not finite, a level outside (0, 1).
+    """
+    import scipy.stats
+
+    _check_level(level)
+    y, n = _finite(values, "A standard deviation", 2), len(values)
+    spread = _spread(y)
+    z = float(scipy.stats.norm.ppf(0.5 + level / 2))
+    if n < 5 or n <= z or np.ptp(y) == 0:
+        return Estimate(spread, None, None)
+    scaled = (y - np.mean(y)) / np.max(np.abs(y - np.mean(y)))
+    trimmed = scipy.stats.trim_mean(scaled, 0.5 / math.sqrt(n - 4))
+    kurtosis = n * np.sum((scaled - trimmed) ** 4) / np.sum(scaled**2) ** 2
+    c = n / (n - z)
+    half = z * c * math.sqrt((kurtosis - (n - 3) / n) / (n - 1)) / 2
+    middle = spread * math.sqrt(c)
+    return Estimate(spread, middle * math.exp(-half), middle * math.exp(half))
+
+
+def quantiles(
+    values: Values, shares: Sequence[float] = SHARES, level: float = LEVEL
+) -> dict[float, Estimate]:
+    """Quantiles by their shares, with intervals that hold for every distribution.
+
+    A quantile is the least value that at least this share of the values does not exceed; its interval
+    lies between two values by rank. Infinite values are values.
+
+    Raises:
+        SettingError: no values, one that is not a number, a share or level outside (0, 1).
+    """
+    found = bands(np.asarray(values, dtype=float)[:, None], shares, level)
+    if np.any(np.isnan(found.value)):
+        raise SettingError("Quantiles need values, but there are none, or some are not a number.")
+    optional = lambda x: None if math.isnan(x) else float(x)
+    return {
+        share: Estimate(
+            float(found.value[i, 0]), optional(found.low[i, 0]), optional(found.high[i, 0])
+        )
+        for i, share in enumerate(shares)
+    }
+
+
+def bands(
+    values: Float[np.ndarray, "n k"], shares: Sequence[float] = SHARES, level: float = LEVEL
+) -> Bands:
+    """Quantiles at each of k places; not a number where a value is not a number, or without values.
+
+    Intervals hold at each place, not at all places at once.
+
+    Raises:
+        SettingError: a share or level outside (0, 1).
+    """
+    n, k = values.shape
+    found = Bands(*np.full((3, len(shares), k), np.nan))
+    for share in shares:
+        if not 0 < share < 1:
+            raise SettingError(f"The share of a quantile must lie in (0, 1), but it is {share:g}.")
+    _check_level(level)
+    if n == 0:
+        return found
+    ranked = np.sort(values, axis=0)  # with what is not a number last
+    for i, share in enumerate(shares):
+        # the product may be rounded up over a whole number
+        found.value[i] = ranked[max(math.ceil(n * share * (1 - 1e-14)), 1) - 1]
+        low, high = _ranks(n, share, level)
+        if low >= 1:
+            found.low[i] = ranked[low - 1]
+        if high <= n:
+            found.high[i] = ranked[high - 1]
+    undefined = np.isnan(ranked[-1])
+    for part in found:
+        part[:, undefined] = np.nan
+    return found
+
+
+@functools.lru_cache(maxsize=256)
+def _ranks(n: int, share: float, level: float) -> tuple[int, int]:
+    """Ranks (from 1) whose values enclose the quantile with at least the level's probability.
+
+    The number of values below the quantile is binomial. Ranks 0 and n + 1 mean no end.
+    """
+    import scipy.stats
+
+    ends = scipy.stats.binom.ppf([(1 - level) / 2, (1 + level) / 2], n, share)
+    return int(ends[0]), int(ends[1]) + 1
+
+
+def summarise(values: Values, shares: Sequence[float] = SHARES, level: float = LEVEL) -> Summary:
+    """All of one quantity's statistics, as far as its values allow them."""
+    y = np.asarray(values, dtype=float)
+    known = y[~np.isnan(y)]
+    count, undefined = len(known), len(y) - len(known)
+    never, below = (int(np.sum(known == end)) for end in (np.inf, -np.inf))
+    finite = count > 0 and never + below == 0
+    return Summary(
+        count, undefined, never, below,
+        infinite=probability(never + below, count, level) if never + below else None,
+        least=float(np.min(known)) if count else None,
+        most=float(np.max(known)) if count else None,
+        mean=mean(known, level) if finite else None,
+        deviation=deviation(known, level) if finite and count > 1 else None,
+        quantiles=quantiles(known, shares, level) if count else {},
+    )  # fmt: skip
+
+
+def convergence(
+    values: Values,
+    of: Literal["mean", "probability"] | float = "mean",
+    level: float = LEVEL,
+) -> Convergence:
+    """How an estimate settles with the number of samples, taken in their order.
+
+    Args:
+        of: the mean; the probability of values that are true; or the share of a quantile.
+
+    Raises:
+        SettingError: as the estimates.
+    """
+    n = len(values)
+    sizes = sorted({2**k for k in range(n.bit_length()) if 2**k <= n} | ({n} if n else set()))
+    rows = []
+    for size in sizes:
+        part = values[:size]
+        if of == "mean":
+            found = mean(part, level)
+        elif of == "probability":
+            found = probability(int(np.count_nonzero(part)), size, level)
+        else:
+            found = quantiles(part, (of,), level)[of]
+        rows.append([math.nan if x is None else x for x in found])
+    table = np.asarray(rows, dtype=float).reshape(-1, 3)
+    return Convergence(np.asarray(sizes, dtype=int), *table.T)
+
+
+def independent(count: int, together: int, design: str) -> Bool[np.ndarray, " n"]:
+    """Which samples are draws of the distributions that do not share numbers with each other.
+
+    In the design "saltelli" these are A and B; the rest repeat their numbers. Elsewhere all are.
+    """
+    if design != "saltelli":
+        return np.ones(count, dtype=bool)
+    return np.arange(count) % together < 2
+
+
+def _spread(y: np.ndarray) -> float:
+    """Standard deviation (of n - 1), 0 for equal numbers; without overflow of the squares."""
+    away = y - np.mean(y)
+    scale = float(np.max(np.abs(away)))
+    if np.ptp(y) == 0 or scale == 0:
+        return 0.0
+    return scale * math.sqrt(float(np.sum((away / scale) ** 2)) / (len(y) - 1))
+
+
+def _finite(values: np.ndarray, what: str, least: int) -> np.ndarray:
+    y = np.asarray(values, dtype=float)
+    if len(y) < least:
+        raise SettingError(f"{what} needs at least {least} values, but there are {len(y)}.")
+    bad = int(np.sum(~np.isfinite(y)))
+    if bad:
+        raise SettingError(f"{what} needs finite values, but {bad} of {len(y)} are not.")
+    return y
+
+
+def _check_level(level: float) -> None:
+    if not 0 < level < 1:
+        raise SettingError(f"The level of confidence must lie in (0, 1), but it is {level:g}.")
