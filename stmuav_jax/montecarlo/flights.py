@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import rotation_matrix
+from ..algebra.rotation import product, rotation_matrix
 from ..mechanics.errors import SettingError, nearest_names
 from ..mechanics.state import State
 from ..mechanics.system import System
@@ -36,9 +36,8 @@ from ..vehicle.flyer import Coordinates, Inputs, whole_state
 from ..vehicle.geometry import initial_angles, tracker_geometry
 from ..vehicle.gust import dryden, low_altitude
 from ..vehicle.parameters import Parameters
-from ..vehicle.placement import posture
+from ..vehicle.placement import posture, turn_about
 from ..vehicle.rotor import Rotors
-from ..vehicle.sun import attitude
 
 SceneName = Literal["tracker", "hexacopter", "uav_tracker"]
 
@@ -226,7 +225,8 @@ class Flights:
         get = lambda name, default=0.0: jnp.asarray(values.get(name, default), dtype=float)
         three = lambda *names: jnp.stack([get(f"start.{n}") for n in names])
         r, v, omega = three("x", "y", "z"), three("vx", "vy", "vz"), three("p", "q", "r")
-        p = attitude(get("start.roll"), get("start.pitch"), get("start.yaw"))
+        turns = [turn_about(get(f"start.{n}"), k) for k, n in ((2, "yaw"), (1, "pitch"), (0, "roll"))]
+        p = product(product(turns[0], turns[1]), turns[2])
         if self.scene == "hexacopter":
             return State(r[None], p[None], v[None], omega[None])
         usual = initial_angles(table)
@@ -238,16 +238,16 @@ class Flights:
         shift = jnp.asarray(table.value("mount.shift"), dtype=float)
         return whole_state(geometry, shift, Coordinates(r, p, angles, v, omega, rates))
 
+    def nominal(self) -> tuple[System, State]:
+        """System and start without anything drawn."""
+        return self.build((), Drawn(np.zeros(0), np.zeros((), int)))
+
     def facing(self) -> np.ndarray:
         """The world direction that the table's panel faces at its start (3,)."""
         if self.scene == "hexacopter":
             return np.array([0.0, 0.0, 1.0])
         start = posture(tracker_geometry(self.table), initial_angles(self.table))
         return np.asarray(rotation_matrix(start.p[-1])[:, 2])
-
-    def in_float32(self) -> "Flights":
-        """The same in single precision."""
-        return replace(self, float32=True)
 
 
 def _hover_inputs(table: Parameters) -> Inputs:

@@ -52,8 +52,8 @@ class Plan(NamedTuple):
         times: where the state is kept (k,) [s], increasing; t0 comes before and is not among them
             unless wanted; the last is the end.
         t0: [s].
-        watch: (problem, t, y) -> signals to be watched between steps (q,).
-        rates: which of them have rates that are worth their cost (q,).
+        smooth, sharp: (problem, t, y) -> signals to be watched, (q1,) with rates and (q2,) without;
+            q = q1 + q2 signals in this order.
         stops: which of them end the flight when they rise above zero (q,).
         step: constant step [s], or None for adaptive ones.
     """
@@ -61,8 +61,8 @@ class Plan(NamedTuple):
     make: Callable[[Any], tuple[Problem, State]]
     times: Float[Array, " k"]
     t0: float
-    watch: Callable[[Problem, Array, Array], Float[Array, " q"]]
-    rates: tuple[bool, ...]
+    smooth: Callable[[Problem, Array, Array], Float[Array, " q1"]]
+    sharp: Callable[[Problem, Array, Array], Float[Array, " q2"]]
     stops: tuple[bool, ...]
     step: float | None
 
@@ -94,7 +94,8 @@ class Flown(NamedTuple):
     """What is left of a flight.
 
     Attributes:
-        t: where it ended [s]. kept: states at the plan's times (k, n), NaN from its end on.
+        t: where it ended [s]. last: state there (n,). kept: states at the plan's times (k, n), NaN
+            from its end on.
         extreme: largest values of the watched signals (q,). when: when they first rose above zero
             [s], infinite if never (q,).
         residual: largest constraint residuals at any step: position [m], velocity, norm (3,).
@@ -102,6 +103,7 @@ class Flown(NamedTuple):
     """
 
     t: Float[Array, ""]
+    last: Float[Array, " n"]
     kept: Float[Array, "k n"]
     extreme: Float[Array, " q"]
     when: Float[Array, " q"]
@@ -117,23 +119,14 @@ def _select(which: Any, yes: Any, no: Any) -> Any:
 
 
 def _signals(plan: Plan, problem: Problem, t: Array, y: Array) -> tuple[Array, Array]:
-    """Watched signals and their rates, zero for those without."""
-    # rates by the chain rule along the motion; one evaluation for all of them
-    ahead = jnp.asarray(plan.rates)
-    of = lambda t, y: plan.watch(problem, t, y)
-    if not any(plan.rates):
-        g = of(t, y)
-        return g, jnp.zeros_like(g)
+    """Watched signals (q,), and the rates of those that have some (q1,)."""
+    sharp = plan.sharp(problem, t, y)
+    if jax.eval_shape(plan.smooth, problem, t, y).shape == (0,):
+        return sharp, jnp.zeros(0, y.dtype)
     slope = problem.field(t, y, problem.model)
-    g, rate = jax.jvp(of, (t, y), (jnp.ones_like(t), slope))
-    return g, jnp.where(ahead, rate, 0.0)
-
-
-def _straight(plan: Plan, t0: Array, t1: Array, monitor: Monitor, g: Array, rate: Array) -> Any:
-    """Rates that make a straight line of signals without rates: those at both ends."""
-    ahead = jnp.asarray(plan.rates)
-    secant = (g - monitor.g) / jnp.where(t1 > t0, t1 - t0, 1.0)
-    return jnp.where(ahead, monitor.rate, secant), jnp.where(ahead, rate, secant)
+    along = lambda t, y: plan.smooth(problem, t, y)
+    smooth, rate = jax.jvp(along, (t, y), (jnp.ones_like(t), slope))
+    return jnp.concatenate([smooth, sharp]), rate
 
 
 def launch(plan: Plan, numbers: Any) -> Lane:
@@ -145,7 +138,8 @@ def launch(plan: Plan, numbers: Any) -> Lane:
     step = carry.step if plan.step is None else jnp.asarray(plan.step, carry.y.dtype)
     zero = jnp.zeros((), int)
     kept = jnp.full((len(plan.times), carry.y.shape[0]), jnp.nan, carry.y.dtype)
-    monitor = start(t0, *_signals(plan, problem, t0, carry.y))
+    g, rate = _signals(plan, problem, t0, carry.y)
+    monitor = start(t0, g, jnp.pad(rate, (0, g.shape[0] - rate.shape[0])))
     ending = jnp.where(fine, Ending.RUNNING, Ending.NO_START).astype(int)
     return Lane(
         carry.t, carry.y, carry.t + step, carry.solver_state, carry.controller_state,
@@ -157,7 +151,7 @@ def attempt(plan: Plan, problem: Problem, lane: Lane) -> Lane:
     """Try one step; a flight that has ended stays where it is."""
     solver, terms = problem.solver(), diffrax.ODETerm(problem.field)
     running = lane.ending == Ending.RUNNING
-    goal = plan.times[jnp.minimum(lane.place, len(plan.times) - 1)]
+    goal = jnp.asarray(plan.times, lane.t.dtype)[jnp.minimum(lane.place, len(plan.times) - 1)]
     t0, t1 = lane.t, jnp.where(running, jnp.minimum(lane.next, goal), lane.t)
     y1, error, _, solver_state, _ = solver.step(
         terms, t0, t1, lane.y, problem.model, lane.solver_state, True
@@ -203,12 +197,15 @@ def _watched(
     plan: Plan, problem: Problem, lane: Lane, taken: Array, t0: Array, t1: Array, y: Array
 ) -> Monitor:
     """The monitor after the step, where it was taken."""
-    if not plan.rates:
+    if not plan.stops:
         return lane.monitor
     g, rate = _signals(plan, problem, t1, y)
-    before, after = _straight(plan, t0, t1, lane.monitor, g, rate)
-    seen = eqx.tree_at(lambda m: m.rate, lane.monitor, before)
-    return _select(taken, follow(seen, t0, t1, g, after), lane.monitor)
+    # a signal without rates goes straight from step to step
+    before, count = lane.monitor, rate.shape[0]
+    secant = (g - before.g) / jnp.where(t1 > t0, t1 - t0, 1.0)
+    join = lambda rates: jnp.concatenate([rates[:count], secant[count:]])
+    seen = eqx.tree_at(lambda m: m.rate, before, join(before.rate))
+    return _select(taken, follow(seen, t0, t1, g, join(rate)), before)
 
 
 def _left(lane: Lane) -> Flown:
@@ -217,7 +214,7 @@ def _left(lane: Lane) -> Flown:
     failed = lane.ending != Ending.FINE
     hide = lambda x: jnp.where(failed, jnp.nan, x)
     return Flown(
-        lane.t, lane.kept, hide(monitor.extreme), hide(monitor.crossings.times()),
+        lane.t, lane.y, lane.kept, hide(monitor.extreme), hide(monitor.crossings.times()),
         jnp.stack([worst.position, worst.velocity, worst.norm]),
         lane.accepted, lane.rejected, lane.ending,
     )  # fmt: skip
@@ -241,40 +238,42 @@ def fly(plan: Plan, numbers: Any, count: Int[Array, ""], lanes: int) -> Flown:
         lanes: how many flights go on together.
     """
     size = jax.tree.leaves(numbers)[0].shape[0]
-    launched = jax.vmap(lambda each: launch(plan, each))
     take = lambda places: jax.tree.map(lambda x: x[jnp.clip(places, 0, size - 1)], numbers)
+    launched = jax.vmap(lambda each: launch(plan, each))
 
     def whole(each: Any, lane: Lane) -> Lane:
         problem, _ = plan.make(each)
         return jax.lax.fori_loop(0, ROUND, lambda _, now: attempt(plan, problem, now), lane)
 
     def rounds(queue: _Queue) -> _Queue:
-        now = jax.vmap(whole)(queue.numbers, queue.lanes)
-        done = (now.ending != Ending.RUNNING) & (queue.flight < count)
-        row = jnp.where(done, queue.flight, size)
+        idle = queue.flight >= size
+        place = jnp.where(idle, queue.next + jnp.cumsum(idle) - 1, queue.flight)
+        fresh = idle & (place < count)
+        flight = jnp.where(fresh, place, queue.flight)
+        given = _select(fresh, take(place), queue.numbers)
+        now = jax.lax.cond(
+            jnp.any(fresh), lambda: _select(fresh, launched(given), queue.lanes), lambda: queue.lanes
+        )
+        now = jax.vmap(whole)(given, now)
+        done = (now.ending != Ending.RUNNING) & (flight < size)
+        row = jnp.where(done, flight, size)
         results = jax.tree.map(
             lambda all, new: all.at[row].set(new, mode="drop"),
             queue.results,
             jax.vmap(_left)(now),
         )
-        place = jnp.where(done, queue.next + jnp.cumsum(done) - 1, queue.flight)
-        fresh = done & (place < count)
-        given = take(place)
-        lanes_now = jax.lax.cond(
-            jnp.any(fresh), lambda: _select(fresh, launched(given), now), lambda: now
-        )
-        flight = jnp.where(done & ~fresh, size, place)
-        kept = _select(fresh, given, queue.numbers)
-        return _Queue(lanes_now, kept, flight, queue.next + jnp.sum(done), results)
+        flight = jnp.where(done, size, flight)
+        return _Queue(now, given, flight, queue.next + jnp.sum(fresh), results)
 
-    first = jnp.arange(lanes)
-    given = take(first)
-    begun = launched(given)
-    idle = first >= count
-    begun = eqx.tree_at(lambda l: l.ending, begun, jnp.where(idle, Ending.FINE, begun.ending))
-    one = jax.eval_shape(lambda lane: _left(lane), jax.tree.map(lambda x: x[0], begun))
+    first = take(jnp.zeros(lanes, int))
+    shapes = jax.eval_shape(launched, first)
+    none = lambda shape: jnp.full(shape.shape, 0, shape.dtype)
+    begun = jax.tree.map(none, shapes)
+    begun = eqx.tree_at(lambda l: l.ending, begun, jnp.full(lanes, Ending.FINE, int))
+    one = jax.eval_shape(lambda lane: _left(jax.tree.map(lambda x: x[0], lane)), begun)
     empty = jax.tree.map(
         lambda x: jnp.full((size, *x.shape), jnp.nan if x.dtype.kind == "f" else 0, x.dtype), one
     )
-    queue = _Queue(begun, given, jnp.where(idle, size, first), jnp.asarray(lanes), empty)
-    return jax.lax.while_loop(lambda q: jnp.any(q.flight < count), rounds, queue).results
+    queue = _Queue(begun, first, jnp.full(lanes, size), jnp.zeros((), int), empty)
+    going = lambda q: jnp.any(q.flight < size) | (q.next < count)
+    return jax.lax.while_loop(going, rounds, queue).results

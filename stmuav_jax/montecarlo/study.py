@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import equinox as eqx
 import numpy as np
 
 from ..mechanics.errors import SettingError, nearest_names
 from ..vehicle.parameters import Parameters
-from .distribution import Distribution, from_plain
 from .flights import Flights, flights
 from .sampling import Sampling, sampling_from_plain
 from .signal import Signal, signal
@@ -151,7 +151,8 @@ class Study:
 
     def signals(self) -> dict[str, Signal]:
         """The signal of each quantity."""
-        system, _ = self.flights.nominal()
+        # names are all that is needed of the system
+        system, _ = eqx.filter_eval_shape(self.flights.nominal)
         return {name: signal(system, q.signal) for name, q in self.quantities.items()}
 
 
@@ -262,7 +263,3 @@ def with_precision(study: Study, float32: bool) -> Study:
     """The same study in the other precision."""
     return replace(study, flights=replace(study.flights, float32=float32))
 
-
-__all__ = [
-    "Distribution", "Quantity", "Study", "from_plain", "study_from_plain", "with_precision",
-]  # fmt: skip
