@@ -1,4 +1,5 @@
-"""The command line: `stmuav list`, `simulate`, `sun`, `trim`, `linearize`, `tune`, `estimate`."""
+"""The command line, `stmuav`: list, simulate, sun, trim, linearize, tune, estimate, montecarlo,
+report."""
 
 import dataclasses
 import math
@@ -18,6 +19,8 @@ from rich.table import Table
 
 from .commands.estimate import Estimate, run_estimate
 from .commands.flight import Linearize, Trim, run_linearize, run_trim
+from .commands.montecarlo import Montecarlo, Report, run_montecarlo, run_report
+from .commands.output import written
 from .commands.tune import Tune, run_tune
 from .dynamics.augmented import Augmented
 from .dynamics.rosenbrock import Rodas5P
@@ -140,6 +143,8 @@ Command = (
     | Annotated[Linearize, tyro.conf.subcommand(name="linearize")]
     | Annotated[Tune, tyro.conf.subcommand(name="tune")]
     | Annotated[Estimate, tyro.conf.subcommand(name="estimate")]
+    | Annotated[Montecarlo, tyro.conf.subcommand(name="montecarlo")]
+    | Annotated[Report, tyro.conf.subcommand(name="report")]
 )
 
 
@@ -168,9 +173,7 @@ def list_scenes(console: Console) -> None:
 
 def _scene(command: Simulate) -> Scene:
     entry = SCENES[command.scene]
-    table = entry.parameters
-    if command.params is not None:
-        table = load_parameters(command.params, table)
+    table = load_parameters(command.params, entry.parameters)
     options: dict[str, Any] = {}
     if command.actuators is not None:
         if command.scene != "uav_tracker":
@@ -247,11 +250,8 @@ def _simulate(command: Simulate, console: Console, started: float) -> int:
         paths += write_loads(run, command, paths[0].parent, out)
     for note in run.scene.notes:
         out.print(f"Note: {note}", highlight=False)
-    out.print(
-        f"Imports {started:.2f} s, results and figures {writing:.2f} s. Written:", highlight=False
-    )
-    for path in paths:
-        out.print(f"  {path}", highlight=False, soft_wrap=True)
+    out.print(f"Imports {started:.2f} s, results and figures {writing:.2f} s.", highlight=False)
+    written(out, paths)
     if run.certificate.result == "interrupted":
         return 130
     if not run.successful:
@@ -270,7 +270,7 @@ def _sun(command: SunDay) -> int:
     turned = (command.roll, command.pitch, command.yaw)
     if command.attitude is not None and any(turned):
         raise SettingError("Give --attitude or --roll, --pitch and --yaw, not both.")
-    table = PART_II if command.params is None else load_parameters(command.params, PART_II)
+    table = load_parameters(command.params, PART_II)
     day = track_day(
         Place.degrees(command.lat, command.lon, command.altitude),
         parse_date(command.date),
@@ -290,9 +290,7 @@ def _sun(command: SunDay) -> int:
     out = Console()
     for each in day_tables(day):
         out.print(each)
-    out.print("Written:", highlight=False)
-    for path in paths:
-        out.print(f"  {path}", highlight=False, soft_wrap=True)
+    written(out, paths)
     return 0
 
 
@@ -306,6 +304,8 @@ def main(arguments: list[str] | None = None) -> int:
             _configure(False)
             list_scenes(Console())
             return 0
+        if isinstance(command, Report):
+            return run_report(command)
         _configure(command.cache)
         if isinstance(command, SunDay):
             return _sun(command)
@@ -317,6 +317,8 @@ def main(arguments: list[str] | None = None) -> int:
             return run_tune(command)
         if isinstance(command, Estimate):
             return run_estimate(command)
+        if isinstance(command, Montecarlo):
+            return run_montecarlo(command)
         return _simulate(command, console, started)
     except SimulationError as error:
         console.print(f"stmuav: {error}", style="red", markup=False, highlight=False)

@@ -7,6 +7,8 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
+from .output import written
+
 
 @dataclasses.dataclass
 class Estimate:
@@ -45,15 +47,13 @@ def run_estimate(command: Estimate) -> int:
 
     if command.case is not None and command.case not in range(1, 9):
         raise SettingError(f"The report has cases 1 to 8, not {command.case}.")
-    table = PART_III if command.params is None else load_parameters(command.params, PART_III)
+    table = load_parameters(command.params, PART_III)
     names = ("report", "consistent") if command.tuning == "both" else (command.tuning,)
     work = _hover if command.hover else _cases
     shown, paths, failed = work(command, names, table)
     out = Console()
     out.print(shown)
-    out.print("Written:", highlight=False)
-    for path in paths:
-        out.print(f"  {path}", highlight=False, soft_wrap=True)
+    written(out, paths)
     if failed:
         out.print(f"{failed} filters lost their covariance and are left out.", highlight=False)
     return 1 if failed else 0

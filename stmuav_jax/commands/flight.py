@@ -71,7 +71,7 @@ def table_of(params: Path | None) -> Parameters:
     from ..vehicle.airframe import PART_II
     from ..view.io import load_parameters
 
-    return PART_II if params is None else load_parameters(params, PART_II)
+    return load_parameters(params, PART_II)
 
 
 def wanted_of(command: Flight, table: Parameters) -> Any:

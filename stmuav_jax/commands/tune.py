@@ -17,6 +17,7 @@ from ..mechanics.errors import SettingError
 from ..study.search import Search, SearchReason, search
 from ..vehicle.parameters import Parameters
 from .flight import table_of
+from .output import written
 
 
 @dataclasses.dataclass
@@ -72,17 +73,21 @@ class _Watch:
         save_search(now, self.problem, self.path)
 
 
-def _search(command: Tune, folder: Path, problem: str, residuals: Any, start: Any) -> Search:
+def _watched(command: Tune, folder: Path, problem: str, start: Any, run: Any) -> Any:
+    """run(steps=, report=, resume=) with progress, checkpoints and what --resume goes on with."""
     from ..view.tuning import load_search
 
     path = folder / "search.npz"
     before = load_search(path, problem, start) if command.resume else None
     watch = _Watch(problem, path, command.steps)
-    method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
     with watch.bar:
-        return search(
-            residuals, start, method, steps=command.steps, report=watch, resume=before, patience=15
-        )
+        return run(steps=command.steps, report=watch, resume=before)
+
+
+def _search(command: Tune, folder: Path, problem: str, residuals: Any, start: Any) -> Search:
+    method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
+    run = lambda **watched: search(residuals, start, method, patience=15, **watched)
+    return _watched(command, folder, problem, start, run)
 
 
 def run_tune(command: Tune) -> int:
@@ -96,9 +101,7 @@ def run_tune(command: Tune) -> int:
     out = Console()
     out.print(shown)
     out.print(found.words(), highlight=False)
-    out.print("Written:", highlight=False)
-    for path in [folder / "search.npz", *paths]:
-        out.print(f"  {path}", highlight=False, soft_wrap=True)
+    written(out, [folder / "search.npz", *paths])
     if found.reason is SearchReason.INTERRUPTED:
         return 130
     return 1 if found.reason is SearchReason.NOT_FINITE else 0
@@ -185,19 +188,14 @@ def _identify(command: Tune, table: Parameters, folder: Path) -> tuple[Search, T
     from ..study.experiment import experiment
     from ..study.identify import identify
     from ..vehicle.drive import Friction
-    from ..view.tuning import load_search
 
     make = lambda table: uav_flyer(table, friction=Friction())
     case = experiment(make, table, seed=command.seed)
-    path = folder / "search.npz"
-    problem = f"identify {case.name}"
-    before = load_search(path, problem, jnp.zeros(len(case.truth))) if command.resume else None
-    watch = _Watch(problem, path, command.steps)
-    with watch.bar:
-        found = identify(
-            case.predict, case.record, case.sigma, case.start, case.sizes,
-            labels=case.labels, weakest=0.5, steps=command.steps, report=watch, resume=before,
-        )  # fmt: skip
+    run = lambda **watched: identify(
+        case.predict, case.record, case.sigma, case.start, case.sizes,
+        labels=case.labels, weakest=0.5, **watched,
+    )  # fmt: skip
+    found = _watched(command, folder, f"identify {case.name}", jnp.zeros(len(case.truth)), run)
     shown = Table("parameter", "true", "start", "found", "deviation", title="Identified")
     for k, label in enumerate(case.labels):
         numbers = (case.truth[k], case.start[k], found.values[k], found.deviations[k])

@@ -142,8 +142,7 @@ class Flights:
         place = tuple(int(k) for k in match[2].split(",")) if match[2] else ()
         value = np.asarray(self.table.value(name), dtype=float)
         if place and (
-            len(place) != value.ndim
-            or any(k >= n for k, n in zip(place, value.shape, strict=True))
+            len(place) != value.ndim or any(k >= n for k, n in zip(place, value.shape, strict=True))
         ):
             raise SettingError(f"'{name}' has shape {value.shape}; it has no entry {list(place)}.")
         if not place and value.ndim and factor not in self.relative:
@@ -225,7 +224,9 @@ class Flights:
         get = lambda name, default=0.0: jnp.asarray(values.get(name, default), dtype=float)
         three = lambda *names: jnp.stack([get(f"start.{n}") for n in names])
         r, v, omega = three("x", "y", "z"), three("vx", "vy", "vz"), three("p", "q", "r")
-        turns = [turn_about(get(f"start.{n}"), k) for k, n in ((2, "yaw"), (1, "pitch"), (0, "roll"))]
+        turns = [
+            turn_about(get(f"start.{n}"), k) for k, n in ((2, "yaw"), (1, "pitch"), (0, "roll"))
+        ]
         p = product(product(turns[0], turns[1]), turns[2])
         if self.scene == "hexacopter":
             return State(r[None], p[None], v[None], omega[None])

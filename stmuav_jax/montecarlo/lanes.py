@@ -252,7 +252,9 @@ def fly(plan: Plan, numbers: Any, count: Int[Array, ""], lanes: int) -> Flown:
         flight = jnp.where(fresh, place, queue.flight)
         given = _select(fresh, take(place), queue.numbers)
         now = jax.lax.cond(
-            jnp.any(fresh), lambda: _select(fresh, launched(given), queue.lanes), lambda: queue.lanes
+            jnp.any(fresh),
+            lambda: _select(fresh, launched(given), queue.lanes),
+            lambda: queue.lanes,
         )
         now = jax.vmap(whole)(given, now)
         done = (now.ending != Ending.RUNNING) & (flight < size)
@@ -269,7 +271,7 @@ def fly(plan: Plan, numbers: Any, count: Int[Array, ""], lanes: int) -> Flown:
     shapes = jax.eval_shape(launched, first)
     none = lambda shape: jnp.full(shape.shape, 0, shape.dtype)
     begun = jax.tree.map(none, shapes)
-    begun = eqx.tree_at(lambda l: l.ending, begun, jnp.full(lanes, Ending.FINE, int))
+    begun = eqx.tree_at(lambda lane: lane.ending, begun, jnp.full(lanes, Ending.FINE, int))
     one = jax.eval_shape(lambda lane: _left(jax.tree.map(lambda x: x[0], lane)), begun)
     empty = jax.tree.map(
         lambda x: jnp.full((size, *x.shape), jnp.nan if x.dtype.kind == "f" else 0, x.dtype), one

@@ -182,7 +182,9 @@ def _check_numbers(study: Study) -> None:
     if study.max_steps < 1:
         raise SettingError(f"max_steps must be at least 1, but it is {study.max_steps}.")
     if study.step is not None and study.step > study.t1:
-        raise SettingError(f"A step of {study.step:g} s is longer than the flight of {study.t1:g} s.")
+        raise SettingError(
+            f"A step of {study.step:g} s is longer than the flight of {study.t1:g} s."
+        )
     if study.every is not None and study.every > study.t1:
         raise SettingError(
             f"Times {study.every:g} s apart do not fit into a flight of {study.t1:g} s."
@@ -190,7 +192,9 @@ def _check_numbers(study: Study) -> None:
     if study.direction is not None:
         size = float(np.linalg.norm(study.direction))
         if not abs(size - 1) <= 1e-9:
-            raise SettingError(f"The direction must be a unit vector, but its length is {size:.12g}.")
+            raise SettingError(
+                f"The direction must be a unit vector, but its length is {size:.12g}."
+            )
 
 
 def study_from_plain(
@@ -259,7 +263,6 @@ def _quantity(name: str, given: Any) -> Quantity:
     return Quantity(**given)
 
 
-def with_precision(study: Study, float32: bool) -> Study:
-    """The same study in the other precision."""
-    return replace(study, flights=replace(study.flights, float32=float32))
-
+def with_precision(study: Study, *, float32: bool, **tolerances: float) -> Study:
+    """The same study in the given precision, with other tolerances if there are some."""
+    return replace(study, flights=replace(study.flights, float32=float32), **tolerances)

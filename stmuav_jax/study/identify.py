@@ -30,7 +30,7 @@ from ..mechanics.errors import ModelError, SettingError, check_finite
 from ..vehicle.flyer import Coordinates, Flyer, Inputs
 from ..vehicle.kinematics import strokes
 from ..vehicle.parameters import Parameters
-from .search import Search, SearchReason, all_at_once, search
+from .search import Search, all_at_once, search
 
 Predict = Callable[[Float[Array, " p"]], Float[Array, "k m"]]
 
@@ -280,8 +280,3 @@ def _check(
         raise SettingError(f"There must be {len(q0)} positive sizes, not {sizes}.")
     if len(names) != len(q0):
         raise SettingError(f"There are {len(q0)} parameters, but {len(names)} names.")
-
-
-def converged(found: Identified) -> bool:
-    """Whether the search for it has converged."""
-    return found.search.reason is SearchReason.CONVERGED

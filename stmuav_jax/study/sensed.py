@@ -63,16 +63,14 @@ class Gains(eqx.Module):
 
 def centre_of_mass(system: System, state: State) -> Float[Array, "3"]:
     """Of all bodies, from the first one's origin in its axes [m]."""
-    mass = system.bodies.mass
-    centre_w = mass @ state.r / jnp.sum(mass)
-    return rotation_matrix(state.p[0]).T @ (centre_w - state.r[0])
+    return rotation_matrix(state.p[0]).T @ (system.com(state) - state.r[0])
 
 
 def inertia_about_centre(system: System, state: State) -> Float[Array, "3 3"]:
     """Of all bodies together, about their centre of mass, in the first one's axes [kg m^2]."""
     mass = system.bodies.mass
     R_0w = rotation_matrix(state.p[0]).T
-    arms = (state.r - mass @ state.r / jnp.sum(mass)) @ R_0w.T
+    arms = (state.r - system.com(state)) @ R_0w.T
     R = jnp.einsum("ij,njk->nik", R_0w, jax.vmap(rotation_matrix)(state.p))
     own = jnp.einsum("nij,njk,nlk->il", R, system.bodies.inertia, R)
     square = jnp.sum(mass * jnp.sum(arms**2, axis=1))
@@ -84,7 +82,7 @@ def inner_momentum(system: System, state: State) -> Float[Array, "3"]:
     one's axes [N m s]."""
     mass = system.bodies.mass
     R_0w = rotation_matrix(state.p[0]).T
-    arms = (state.r - mass @ state.r / jnp.sum(mass)) @ R_0w.T
+    arms = (state.r - system.com(state)) @ R_0w.T
     from_base = (state.r - state.r[0]) @ R_0w.T
     v = (state.v - state.v[0]) @ R_0w.T - jnp.cross(state.omega[0], from_base)
     R = jnp.einsum("ij,njk->nik", R_0w, jax.vmap(rotation_matrix)(state.p))

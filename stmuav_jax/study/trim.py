@@ -27,7 +27,6 @@ from ..dynamics.tree import TreeModel
 from ..mechanics.errors import ModelError, StateError, check_finite, concrete
 from ..mechanics.force import Gravity
 from ..mechanics.reason import first_reason
-from ..mechanics.state import State
 from ..vehicle.allocation import (
     AllocationReason,
     RotorLimits,
@@ -173,12 +172,6 @@ class _Setting(NamedTuple):
     wanted: Wanted
 
 
-def _centre(flyer: Flyer, state: State) -> Float[Array, "3"]:
-    """The system's centre of mass, world [m]."""
-    mass = flyer.system.bodies.mass
-    return mass @ state.r / jnp.sum(mass)
-
-
 def _point(tilt: Float[Array, "2"], wanted: Wanted) -> Coordinates:
     p = _attitude(tilt, wanted.yaw)
     R_wb = rotation_matrix(p)
@@ -194,7 +187,7 @@ def _map(flyer: Flyer, at: Coordinates) -> Float[Array, "4 k"]:
     """B about the system's centre of mass, in the base's axes: thrust and moments do not mix."""
     rotors = flyer.system.forces[flyer.rotors]
     assert isinstance(rotors, Rotors)
-    com = rotation_matrix(at.p).T @ _centre(flyer, flyer.state(at))
+    com = rotation_matrix(at.p).T @ flyer.system.com(flyer.state(at))
     return wrench_map(rotors, com)
 
 

@@ -156,9 +156,12 @@ class SlewLimits(NamedTuple):
 
 
 class Peaks(NamedTuple):
-    """What a history needs: force [N], least and largest shifts (2,) [m], reaction [N] or None;
+    """What a history needs, and how it disturbs.
 
-    and how it disturbs: largest tilt [rad], drift [m], and the panel's error at the end [rad].
+    Attributes:
+        force: largest of an actuator [N]. lower, upper: least and largest shifts (2,) [m].
+        reaction: largest force in a joint [N], or None where it has no limit.
+        tilt: largest [rad]. drift: largest [m]. error: of the panel at the end [rad].
     """
 
     force: Float[Array, ""]

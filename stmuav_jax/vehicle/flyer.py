@@ -169,9 +169,7 @@ class Flyer(eqx.Module):
         return Accelerations(found.v[:, 0], found.omega[:, 0], moving.acceleration)
 
 
-def whole_state(
-    geometry: TrackerGeometry, shift: Float[Array, "3"], at: Coordinates
-) -> State:
+def whole_state(geometry: TrackerGeometry, shift: Float[Array, "3"], at: Coordinates) -> State:
     """Positions and velocities of base and tracker (7, .), base first.
 
     Args:

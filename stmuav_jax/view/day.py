@@ -24,7 +24,7 @@ from ..vehicle.kinematics import Reason, panel_angles, panel_normal
 from ..vehicle.sun import SunReason, attitude
 from ..vehicle.workspace import direction_grid, survey
 from .io import FileError, versions, write_atomically
-from .plot import _STYLES, _WIDTH, _figure, save_all
+from .plot import STYLES, WIDTH, grid, save_all
 
 FORMAT = "stmuav_jax day"
 FORMAT_VERSION = 1
@@ -248,7 +248,7 @@ def _shade(ax: Axes, day: Day) -> None:
 
 def tracking(day: Day) -> Figure:
     """Sun, panel angles, strokes and pointing error over the day."""
-    figure, axes = _figure(2, 2, 5.2)
+    figure, axes = grid(2, 2, 5.2)
     curves = {
         (0, 0): ("sun", "elevation [°]", [("elevation", np.degrees(np.asarray(day.sun.elevation)))]),
         (0, 1): ("panel angles", "angle [°]",
@@ -261,7 +261,7 @@ def tracking(day: Day) -> Figure:
     for place, (name, label, lines) in curves.items():
         ax = axes[place]
         _shade(ax, day)
-        for (words, values), (color, dash) in zip(lines, _STYLES, strict=False):
+        for (words, values), (color, dash) in zip(lines, STYLES, strict=False):
             ax.plot(day.hours, values, label=words, color=color, linestyle=dash, linewidth=1.4)
         ax.set_title(name, fontsize=10)
         ax.set_ylabel(label, fontsize=9)
@@ -278,7 +278,7 @@ def tracking(day: Day) -> Figure:
 
 def sky(day: Day) -> Figure:
     """Where the sun and the panel go in the UAV's axes, and what the tracker reaches."""
-    figure = Figure(figsize=(_WIDTH, 5.2), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
     ax: Any = figure.add_subplot(projection="polar")
     turn, tilt = np.radians(np.arange(0, 361, 1.0)), np.radians(np.arange(0, 90.1, 0.5))
@@ -289,7 +289,7 @@ def sky(day: Day) -> Figure:
     up = day.is_up
     panel_b = np.asarray(panel_normal(jnp.asarray(day.angles)))
     for way, words, (color, dash) in zip(
-        (day.s_b, panel_b), ("sun", "panel's normal"), _STYLES, strict=False
+        (day.s_b, panel_b), ("sun", "panel's normal"), STYLES, strict=False
     ):
         around = np.full(len(up), np.nan)
         around[up] = np.unwrap(np.arctan2(way[1, up], way[0, up]))
@@ -327,19 +327,19 @@ def _mark_hours(ax: Axes, day: Day) -> None:
         k = int(np.argmin(np.abs(day.hours - hour)))
         if day.is_up[k] and day.s_b[2, k] > 0:
             at = math.atan2(day.s_b[1, k], day.s_b[0, k]), math.degrees(math.acos(day.s_b[2, k]))
-            ax.plot(*at, "o", color=_STYLES[0][0], markersize=3)
+            ax.plot(*at, "o", color=STYLES[0][0], markersize=3)
             if hour % 2 == 0:
                 ax.annotate(f"{hour} h", at, (4, 4), textcoords="offset points", fontsize=8)
 
 
 def light(day: Day) -> Figure:
     """Irradiance on the panels over the day, and their energies."""
-    figure = Figure(figsize=(_WIDTH, 3.4), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     shown = [p for p in PANELS if p != "airframe" or abs(day.gain("airframe")) > 1e-6]
     own: tuple[str, Any] = ("#CC79A7", (0, (5, 1, 1, 1)))
-    looks = (_STYLES[0], _STYLES[3], _STYLES[1], own, _STYLES[2])
+    looks = (STYLES[0], STYLES[3], STYLES[1], own, STYLES[2])
     styles: dict[str, tuple[str, Any]] = dict(zip(PANELS, looks, strict=True))
     for panel in shown:
         color, dash = styles[panel]

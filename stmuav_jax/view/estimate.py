@@ -18,13 +18,13 @@ from ..estimation.assess import SETTLED, CaseStudy, Estimates, Summary, last_bey
 from ..estimation.consistency import mean_interval
 from ..estimation.hover import Hover
 from .io import versions, write_atomically
-from .plot import _STYLES, _figure, save_all
+from .plot import STYLES, grid, save_all
 
 FORMAT = "stmuav_jax estimate"
 FORMAT_VERSION = 1
 
 COMPONENTS = ("Omega_x", "Omega_y", "Omega_z", "offset_x", "offset_y")
-_LOOKS = {"truth": ("0.6", "-"), "report": _STYLES[1], "consistent": _STYLES[0]}
+_LOOKS = {"truth": ("0.6", "-"), "report": STYLES[1], "consistent": STYLES[0]}
 
 
 # --- tables
@@ -107,7 +107,7 @@ def offset(study: CaseStudy) -> Figure:
 
     Source: in the manner of report Part III, Fig. 3.1.3 to 3.1.18.
     """
-    figure, axes = _figure(2, 2, 4.6)
+    figure, axes = grid(2, 2, 4.6)
     t = np.asarray(study.record.t)
     truth = np.asarray(study.record.offset)[..., 0]
     for row, axis in enumerate("xy"):
@@ -126,7 +126,7 @@ def offset(study: CaseStudy) -> Figure:
 
 def rates(study: CaseStudy) -> Figure:
     """Body rates over the first half second, estimate against truth."""
-    figure, axes = _figure(3, 1, 5.4)
+    figure, axes = grid(3, 1, 5.4)
     t = np.asarray(study.record.t)
     count = int(np.searchsorted(t, 0.5))
     count = min(count, len(t) - 1)
@@ -146,7 +146,7 @@ def rates(study: CaseStudy) -> Figure:
 def errors(study: CaseStudy) -> Figure:
     """Errors of the centre of mass of all seeds with the filter's own 3-sigma band."""
     names = list(study.estimates)
-    figure, axes = _figure(2, len(names), 4.6)
+    figure, axes = grid(2, len(names), 4.6)
     t = np.asarray(study.record.t)[1:]
     for column, name in enumerate(names):
         found: Estimates = study.estimates[name]
@@ -167,7 +167,7 @@ def errors(study: CaseStudy) -> Figure:
 
 def consistency(study: CaseStudy) -> Figure:
     """NEES and NIS, means over the seeds, with their 99.9 % intervals."""
-    figure, axes = _figure(2, 1, 4.8)
+    figure, axes = grid(2, 1, 4.8)
     t = np.asarray(study.record.t)[1:]
     seeds = study.record.seeds
     for row, (words, degrees) in enumerate((("NEES of rates and offset", 5), ("NIS", 3))):
@@ -198,7 +198,7 @@ def save_case_figures(
 
 def hover(flights: dict[str, Hover]) -> Figure:
     """Tilt, height and the estimated centre of mass of hovers, by tuning; first seed."""
-    figure, axes = _figure(2, 2, 4.8)
+    figure, axes = grid(2, 2, 4.8)
     flight = next(iter(flights.values()))
     for column, axis in enumerate("xy"):
         ax, t = axes[1, column], np.asarray(flight.t)[1:]
@@ -232,12 +232,12 @@ class Machine(NamedTuple):
 
 def machine(flight: Machine) -> Figure:
     """The centre of mass of the UAV with its moving tracker, estimates against truth."""
-    figure, axes = _figure(2, 1, 4.6)
+    figure, axes = grid(2, 1, 4.6)
     for row, axis in enumerate("xy"):
         ax = axes[row, 0]
         _line(ax, flight.t, 1e3 * flight.truth[:, row], "truth")
         for (words, values), (color, dash) in zip(
-            flight.found.items(), _STYLES[1::-1], strict=False
+            flight.found.items(), STYLES[1::-1], strict=False
         ):
             ax.plot(flight.t, 1e3 * values[:, row], color=color, linestyle=dash, linewidth=1.2,
                     label=words)  # fmt: skip

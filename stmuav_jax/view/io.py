@@ -164,8 +164,22 @@ def save_certificate(run: Run, path: str | os.PathLike[str]) -> Path:
     return write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
-def load_parameters(path: str | os.PathLike[str], base: Parameters) -> Parameters:
-    """A parameter table with the values of a TOML file put over those of `base`.
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The content of a TOML file.
+
+    Raises:
+        FileError: the file is missing or not valid TOML.
+    """
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileError(f"There is no file {path}.") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise FileError(f"{path} is not a readable TOML file: {error}.") from error
+
+
+def load_parameters(path: str | os.PathLike[str] | None, base: Parameters) -> Parameters:
+    """A parameter table with the values of a TOML file put over those of `base`, if there is one.
 
     The file's tables and dotted keys are the parameters' names; a value is a number or an
     array, or a table {value = ..., unit = "..."} whose unit must be the parameter's:
@@ -179,13 +193,9 @@ def load_parameters(path: str | os.PathLike[str], base: Parameters) -> Parameter
         FileError: the file is missing or not valid TOML.
         ModelError: unknown names, wrong shapes or units.
     """
-    source = Path(path)
-    try:
-        content = tomllib.loads(source.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FileError(f"There is no file {source}.") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise FileError(f"{source} is not a readable TOML file: {error}.") from error
+    if path is None:
+        return base
+    source, content = Path(path), read_toml(path)
     try:
         return base.replaced(_flat(content, base), source=f"given in {source.name}")
     except ModelError as error:

@@ -13,7 +13,7 @@ from ..dynamics.scene import Scene
 from ..mechanics.system import System
 from ..study.loads import COMPONENTS, UNITS, Envelope, JointLoads, envelope
 from .io import write_atomically
-from .plot import _curves, _figure
+from .plot import curves, grid, save_all
 
 HEADER = (
     "joint", "type", "body_i", "body_j", "component", "unit", "min", "t_min_s", "max", "t_max_s",
@@ -66,7 +66,7 @@ def loads_table(scene: Scene, loads: JointLoads) -> Table:
 def loads_figure(scene: Scene, found: JointLoads) -> Figure:
     """Histories of force and moment at every joint, one row a joint, in joint axes."""
     joints = scene.system.joints
-    figure, axes = _figure(max(len(joints), 1), 2, 0.9 + 1.35 * max(len(joints), 1))
+    figure, axes = grid(max(len(joints), 1), 2, 0.9 + 1.35 * max(len(joints), 1))
     for k, joint in enumerate(joints):
         _history(found, k, axes[k])
         axes[k, 0].set_ylabel(f"{joint.name}", fontsize=9, fontweight="bold")
@@ -89,7 +89,7 @@ def loads_figure(scene: Scene, found: JointLoads) -> Figure:
 def _history(found: JointLoads, k: int, axes: np.ndarray) -> None:
     values = np.asarray(found.components)[:, k]
     for ax, part in zip(axes, (slice(0, 4), slice(4, 8)), strict=True):
-        _curves(ax, np.asarray(found.ts), values[:, part], ("x", "y", "z", "magnitude"))
+        curves(ax, np.asarray(found.ts), values[:, part], ("x", "y", "z", "magnitude"))
         if not np.any(np.abs(values[:, part]) > _NOTHING):
             ax.set_ylim(-1.0, 1.0)
 
@@ -102,6 +102,5 @@ def save_loads_figure(
     dpi: int = 200,
 ) -> Path:
     """Draw the histories into `folder`/loads.`suffix` (png, pdf or svg); the path."""
-    buffer = io.BytesIO()
-    loads_figure(scene, loads).savefig(buffer, format=suffix, dpi=dpi)
-    return write_atomically(Path(folder) / f"loads.{suffix}", buffer.getvalue())
+    draw = lambda found: loads_figure(scene, found)
+    return save_all({"loads": draw}, loads, folder, suffix, dpi)[0]

@@ -15,17 +15,18 @@ from ..dynamics.run import Run
 from .io import write_atomically
 
 # Okabe and Ito's colours, each with its own dash, so that neither is needed alone.
-_STYLES = (
+STYLES = (
     ("#0072B2", "-"),
     ("#D55E00", "--"),
     ("#009E73", "-."),
     ("#000000", ":"),
 )
-_WIDTH = 7.0  # [inch], a page's text width
+WIDTH = 7.0  # [inch], a page's text width
 
 
-def _figure(rows: int, columns: int, height: float) -> tuple[Figure, np.ndarray]:
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+def grid(rows: int, columns: int, height: float) -> tuple[Figure, np.ndarray]:
+    """A figure of the text's width with axes (rows, columns); height [inch]."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False)
     for ax in axes.flat:
@@ -34,9 +35,10 @@ def _figure(rows: int, columns: int, height: float) -> tuple[Figure, np.ndarray]
     return figure, axes
 
 
-def _curves(ax: Axes, ts: np.ndarray, values: np.ndarray, labels: tuple[str, ...]) -> None:
+def curves(ax: Axes, ts: np.ndarray, values: np.ndarray, labels: tuple[str, ...]) -> None:
+    """Histories (k, labels) over times (k,) [s], each in its own style."""
     for k, label in enumerate(labels):
-        color, dash = _STYLES[k]
+        color, dash = STYLES[k]
         ax.plot(ts, values[:, k], label=label, linewidth=1.4, color=color, linestyle=dash)
     ax.set_xlabel("time [s]", fontsize=9)
 
@@ -49,9 +51,9 @@ def positions(run: Run) -> Figure:
     names = run.scene.watch or run.scene.system.names
     columns = 1 if len(names) == 1 else 2
     rows = -(-len(names) // columns)
-    figure, axes = _figure(rows, columns, 0.6 + 2.4 * rows)
+    figure, axes = grid(rows, columns, 0.6 + 2.4 * rows)
     for ax, name in zip(axes.flat, names, strict=False):
-        _curves(ax, run.ts, np.asarray(run.body(name).r), ("x", "y", "z"))
+        curves(ax, run.ts, np.asarray(run.body(name).r), ("x", "y", "z"))
         ax.set_title(name.replace("_", " "), fontsize=10)
         ax.set_ylabel("position [m]", fontsize=9)
     for ax in axes.flat[len(names) :]:
@@ -67,9 +69,9 @@ def euler_parameters(run: Run) -> Figure:
     Source: in the manner of report Part I, Fig. 5.1 to 5.3.
     """
     name = (run.scene.watch or run.scene.system.names)[-1]
-    figure, axes = _figure(1, 1, 3.2)
+    figure, axes = grid(1, 1, 3.2)
     ax = axes[0, 0]
-    _curves(ax, run.ts, np.asarray(run.body(name).p), ("$e_0$", "$e_1$", "$e_2$", "$e_3$"))
+    curves(ax, run.ts, np.asarray(run.body(name).p), ("$e_0$", "$e_1$", "$e_2$", "$e_3$"))
     ax.set_ylim(-1.05, 1.05)
     ax.set_ylabel("Euler parameters [1]", fontsize=9)
     ax.legend(fontsize=9, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.18))
@@ -79,10 +81,10 @@ def euler_parameters(run: Run) -> Figure:
 
 def balances(run: Run) -> Figure:
     """Energies, and how well energy and constraints are kept."""
-    figure, axes = _figure(1, 2, 3.3)
+    figure, axes = grid(1, 2, 3.3)
     view, trajectory = run.snapshot, run.trajectory
     energies = np.stack([view.kinetic, view.potential - view.potential[0], trajectory.work], axis=1)
-    _curves(axes[0, 0], run.ts, energies, ("kinetic", "potential", "work done"))
+    curves(axes[0, 0], run.ts, energies, ("kinetic", "potential", "work done"))
     axes[0, 0].set_ylabel("energy [J]", fontsize=9)
     total = view.kinetic + view.potential
     drift = np.maximum.accumulate(np.abs(total - total[0] - trajectory.work))
@@ -90,7 +92,7 @@ def balances(run: Run) -> Figure:
         [drift, trajectory.worst.position, trajectory.worst.velocity, trajectory.worst.norm], axis=1
     )
     labels = ("energy [J]", "position [m]", "velocity [m/s]", "norm [1]")
-    _curves(axes[0, 1], run.ts, np.maximum(errors, 1e-18), labels)
+    curves(axes[0, 1], run.ts, np.maximum(errors, 1e-18), labels)
     axes[0, 1].set_yscale("log")
     axes[0, 1].set_ylabel("error so far", fontsize=9)
     for ax in axes.flat:

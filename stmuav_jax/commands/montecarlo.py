@@ -1,0 +1,166 @@
+"""`stmuav montecarlo` and `stmuav report`: many flights, and what they say."""
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+from rich.console import Console
+
+from ..mechanics.errors import SettingError
+from .output import written
+
+
+@dataclasses.dataclass
+class Montecarlo:
+    """Fly a study: a TOML file, or the name of a ready one; write a store and a report.
+
+    Ready studies: collapse, hover, case_1 to case_3, estimate_1 to estimate_8.
+    """
+
+    study: tyro.conf.Positional[str]
+    """TOML file (see docs/studies.md), or a ready study."""
+    samples: int | None = None
+    """How many; default the study's. More than a finished store has extend it."""
+    seed: int | None = None
+    """Seed of the draws; default the study's."""
+    resume: bool = False
+    """Go on with the store in the folder of the results."""
+    chunk: int | None = None
+    """Samples written together; default some seconds' worth."""
+    devices: int | None = None
+    """Cores (or GPUs) to use; default all."""
+    lanes: int | None = None
+    """Flights that go on together on a device; default by measurement."""
+    precision: Literal["float64", "float32"] | None = None
+    """float32 is an experiment: its error is measured on the first samples and printed."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler, such as tcp://10.0.0.1:8786."""
+    workers: int | None = None
+    """Instead start a Dask cluster of so many processes here."""
+    params: Path | None = None
+    """TOML file with values that replace the scene's table's."""
+    out: Path | None = None
+    """Folder for the results; default runs/STUDY."""
+    figures: Literal["png", "pdf", "svg", "none"] = "png"
+    """Format of the report's figures; none leaves the report out."""
+    cache: bool = True
+    """Keep compiled code in the user's cache folder for the next run."""
+
+
+@dataclasses.dataclass
+class Report:
+    """Make figures, tables and a page from the store of a study."""
+
+    store: tyro.conf.Positional[Path]
+    """Folder of the store."""
+    out: Path | None = None
+    """Folder for the report; default beside the store."""
+    figures: Literal["png", "pdf", "svg"] = "png"
+    """Format of the figures."""
+
+
+def cores() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def plain_of(command: Montecarlo) -> dict[str, Any]:
+    """The study's plain data with what the options change."""
+    from ..montecarlo.ready import READY, ready
+    from ..view.study_file import load_study
+
+    if command.study in READY:
+        plain = ready(command.study)
+    elif command.study.endswith(".toml") or os.sep in command.study:
+        plain = load_study(command.study)
+    else:
+        plain = ready(command.study)
+    for name in ("seed", "precision"):
+        value = getattr(command, name)
+        if value is not None:
+            plain[name] = value
+    return plain
+
+
+def _table(command: Montecarlo, plain: Mapping[str, Any]) -> Any:
+    from ..scenes.registry import SCENES
+    from ..view.io import load_parameters
+
+    if command.params is None:
+        return None
+    if plain.get("scene") not in SCENES:
+        raise SettingError("--params replaces values of a scene's table; this study has no scene.")
+    return load_parameters(command.params, SCENES[plain["scene"]].parameters)
+
+
+def run_montecarlo(command: Montecarlo) -> int:
+    """Run the command; the exit code."""
+    import jax
+
+    if command.scheduler is None and command.workers is None:
+        # before the first array: JAX counts its devices once
+        jax.config.update("jax_num_cpu_devices", command.devices or cores())
+    elif command.scheduler is not None and command.workers is not None:
+        raise SettingError("Give --scheduler or --workers, not both.")
+    from ..jobs.cluster import run_on_cluster
+    from ..jobs.local import run_study
+    from ..jobs.watch import Watch
+    from ..montecarlo.ready import make_work
+
+    plain = plain_of(command)
+    options = {k: getattr(command, k) for k in ("lanes", "devices") if getattr(command, k)}
+    work = make_work(plain, _table(command, plain), **options)
+    total = command.samples or plain.get("samples", 1024)
+    folder = command.out if command.out is not None else Path("runs") / str(plain["name"])
+    store = folder / "study.zarr"
+    settings: dict[str, Any] = {
+        "chunk": command.chunk or plain.get("chunk"), "resume": command.resume,
+    }  # fmt: skip
+    with Watch("flights") as watch:
+        if command.scheduler is not None or command.workers is not None:
+            outcome = run_on_cluster(
+                work, store, total, scheduler=command.scheduler, workers=command.workers,
+                progress=watch, **settings,
+            )  # fmt: skip
+        else:
+            outcome = run_study(work, store, total, progress=watch, **settings)
+    out = Console()
+    out.print(outcome.words(), highlight=False)
+    if command.precision == "float32":
+        out.print(_precision(work, min(64, total)), highlight=False)
+    paths = [store]
+    if command.figures != "none":
+        paths += _report(store, folder, command.figures, out)
+    written(out, paths)
+    return 130 if outcome.interrupted else 0
+
+
+def _precision(work: Any, count: int) -> str:
+    from ..montecarlo.batch import FlightWork
+    from ..montecarlo.precision import precision_error
+
+    if not isinstance(work, FlightWork):
+        raise SettingError("Only studies of flights can be flown in single precision.")
+    rows = precision_error(work, count)
+    words = "; ".join(f"{name} {error:.2g} {unit}" for name, (error, unit) in rows.items())
+    return f"Largest error of single precision in the first {count} flights: {words}."
+
+
+def _report(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]:
+    from ..view.store import open_store
+    from ..view.study_report import write_report
+
+    with open_store(store) as opened:
+        paths = write_report(opened.dataset(), folder, figures)
+    return paths
+
+
+def run_report(command: Report) -> int:
+    """Run the command; the exit code."""
+    out = Console()
+    folder = command.out if command.out is not None else command.store.resolve().parent
+    written(out, _report(command.store, folder, command.figures, out))
+    return 0

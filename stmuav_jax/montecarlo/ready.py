@@ -1,0 +1,149 @@
+"""Ready studies: the report's cases from disturbed starts, hover with tolerances, estimation.
+
+A study's plain data are what a TOML file holds; docs/studies.md describes its entries.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..mechanics.errors import SettingError, nearest_names
+from ..vehicle.parameters import Parameters
+from .batch import FlightWork
+from .estimates import EstimationStudy, EstimationWork
+from .study import study_from_plain
+from .work import AbstractWork
+
+
+def _normal(deviation: float, **more: Any) -> dict[str, Any]:
+    return {"distribution": "normal", "mean": 0.0, "deviation": deviation} | more
+
+
+def _share(deviation: float) -> dict[str, Any]:
+    return {
+        "distribution": "truncated_normal", "mean": 1.0, "deviation": deviation,
+        "low": 1.0 - 4 * deviation, "high": 1.0 + 4 * deviation, "relative": True,
+    }  # fmt: skip
+
+
+def _start(spread: float) -> dict[str, Any]:
+    """Posture and rates about those of the tables; angles of the panel within its reach."""
+    around = lambda middle: {
+        "distribution": "uniform", "low": middle - spread, "high": middle + spread,
+    }  # fmt: skip
+    return {
+        "start.phi": around(-0.2674), "start.theta": around(-0.3088),
+        "start.phi_rate": _normal(2 * spread), "start.theta_rate": _normal(2 * spread),
+        "start.roll": _normal(spread / 2), "start.pitch": _normal(spread / 2),
+        "start.p": _normal(spread), "start.q": _normal(spread), "start.r": _normal(spread),
+    }  # fmt: skip
+
+
+_UAV = {
+    "collapse": {"signal": "pointing", "take": "when_above", "level": 0.5},
+    "tilt": {"signal": "tilt", "take": "largest"},
+    "distance": {"signal": "distance", "take": "final"},
+    "pointing": {"signal": "pointing", "take": "largest"},
+    "panel_spin": {"signal": "panel_spin", "take": "largest"},
+    "reaction_top": {"signal": "force.U47", "take": "largest"},
+    "energy": {"signal": "energy", "take": "final"},
+    "phi": {"signal": "phi", "take": "path"},
+    "theta": {"signal": "theta", "take": "path"},
+}
+
+_COLLAPSE = {
+    "collapse": {"signal": "pointing", "take": "when_above", "level": 0.5},
+    "phi_end": {"signal": "phi", "take": "final"},
+    "theta_end": {"signal": "theta", "take": "final"},
+    "spin": {"signal": "panel_spin", "take": "largest"},
+    "tilt": {"signal": "tilt", "take": "largest"},
+    "phi": {"signal": "phi", "take": "path"},
+    "theta": {"signal": "theta", "take": "path"},
+}
+
+_HOVER = {
+    "lost": {"signal": "tilt", "take": "when_above", "level": 0.0873},
+    "tilt": {"signal": "tilt", "take": "final"},
+    "distance": {"signal": "distance", "take": "final"},
+    "pointing": {"signal": "pointing", "take": "largest"},
+    "tilt_path": {"signal": "tilt", "take": "path"},
+}
+
+_TOLERANCES = {
+    "mass.hexacopter_1": _share(0.005),
+    "mass.panel_7": _share(0.01),
+    "geometry.rods": _share(0.001),
+    "geometry.arms": _share(0.001),
+    "geometry.panel_com[2]": {"distribution": "normal", "mean": 0.0012, "deviation": 2e-4},
+} | {
+    f"input.rotor_{k}": {"distribution": "normal", "mean": 1.0, "deviation": 0.005}
+    for k in range(1, 7)
+}  # fmt: skip
+
+READY: dict[str, dict[str, Any]] = {
+    f"case_{case}": {
+        "scene": "uav_tracker", "case": case, "t1": 1.0, "samples": 10_000, "design": "sobol",
+        "every": 0.02, "factors": _start(0.1), "quantities": _UAV,
+    }
+    for case in (1, 2, 3)
+}  # fmt: skip
+READY["collapse"] = {
+    "scene": "uav_tracker", "case": 1, "t1": 0.3, "samples": 10_000, "design": "sobol",
+    "every": 0.01, "factors": _start(0.1), "quantities": _COLLAPSE,
+}  # fmt: skip
+READY["hover"] = {
+    "scene": "uav_tracker", "inputs": "trim", "t1": 1.0, "samples": 4096, "design": "sobol",
+    "every": 0.02, "factors": _TOLERANCES, "quantities": _HOVER,
+}  # fmt: skip
+READY |= {
+    f"estimate_{case}": {"kind": "estimation", "case": case, "samples": 1024}
+    for case in range(1, 9)
+}
+
+SUMMARIES = {
+    "case_1": "the report's case 1 from disturbed postures and rates",
+    "case_2": "the report's case 2 from disturbed postures and rates",
+    "case_3": "the report's case 3 from disturbed postures and rates",
+    "collapse": "how the idle tracker falls over, in its first 0.3 s",
+    "hover": "inputs of the nominal hover on machines with tolerances",
+} | {f"estimate_{k}": f"centre of mass, case {k} of Part III, over seeds" for k in range(1, 9)}
+
+
+def ready(name: str) -> dict[str, Any]:
+    """The plain data of a ready study.
+
+    Raises:
+        SettingError: there is none of that name.
+    """
+    if name not in READY:
+        raise SettingError(f"There is no ready study '{name}'.{nearest_names(name, READY)}")
+    return {"name": name} | READY[name]
+
+
+def make_work(
+    plain: Mapping[str, Any], table: Parameters | None = None, **options: Any
+) -> AbstractWork:
+    """A study's work from its plain data.
+
+    Args:
+        table: of the scene's parameters, where the user has changed some.
+        options: of `FlightWork`.
+
+    Raises:
+        SettingError: entries that are unknown, missing or impossible.
+    """
+    if plain.get("kind", "flights") == "flights":
+        return FlightWork(study_from_plain(plain, table), **options)
+    known = ("kind", "name", "case", "tuning", "t1", "seed", "samples", "chunk")
+    for key in plain:
+        if key not in known:
+            raise SettingError(
+                f"A study of estimation has no entry '{key}'.{nearest_names(key, known)}"
+            )
+    if plain["kind"] != "estimation":
+        raise SettingError(f"A study's kind is flights or estimation, not '{plain['kind']}'.")
+    if table is not None:
+        raise SettingError("Studies of estimation take no other parameters yet.")
+    if "case" not in plain:
+        raise SettingError("A study of estimation needs a case, 1 to 8.")
+    given = {k: plain[k] for k in ("case", "tuning", "t1", "seed") if k in plain}
+    return EstimationWork(EstimationStudy(plain.get("name", "estimation"), **given))

@@ -1,0 +1,75 @@
+"""Studies from TOML files, and columns of numbers that they name from CSV files.
+
+A factor {file = "rates.csv", column = "p"} has the numbers of that column: drawn at random, or in
+order where the design is "table". The numbers themselves become part of the study, so that a store
+does not depend on the file any more.
+"""
+
+import csv
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..mechanics.errors import SettingError, nearest_names
+from .io import FileError, read_toml
+
+
+def load_study(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The plain data of a study's TOML file; its name is the file's unless it has one.
+
+    Raises:
+        FileError: the file, or one that it names, is missing or cannot be read.
+        SettingError: a column that its file does not have.
+    """
+    source, content = Path(path), read_toml(path)
+    factors = content.get("factors", {})
+    if isinstance(factors, Mapping):
+        content["factors"] = {
+            name: _filled(one, source.parent) if isinstance(one, Mapping) else one
+            for name, one in factors.items()
+        }
+    return {"name": source.stem} | content
+
+
+def _filled(given: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A factor with the numbers of the file it names, if it names one."""
+    if "file" not in given:
+        return dict(given)
+    extra = set(given) - {"file", "column", "relative"}
+    if extra or "column" not in given:
+        raise SettingError("A factor from a file has a file and a column, and nothing else.")
+    values = column(folder / given["file"], given["column"])
+    more = {"relative": given["relative"]} if "relative" in given else {}
+    return {"distribution": "empirical", "values": values} | more
+
+
+def column(path: str | os.PathLike[str], name: str) -> list[float]:
+    """A named column of a CSV file with a header line.
+
+    Raises:
+        FileError: the file is missing or not text. SettingError: no such column, or an entry in it
+            that is not a finite number.
+    """
+    source = Path(path)
+    try:
+        with source.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except FileNotFoundError:
+        raise FileError(f"There is no file {source}.") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FileError(f"{source} is not a readable CSV file: {error}.") from error
+    if not rows:
+        raise FileError(f"{source} has no rows below its header.")
+    if name not in rows[0]:
+        known = [key for key in rows[0] if key]
+        raise SettingError(f"{source} has no column '{name}'.{nearest_names(name, known)}")
+    values = []
+    for line, row in enumerate(rows, start=2):
+        try:
+            values.append(float(row[name]))
+        except (TypeError, ValueError):
+            raise SettingError(
+                f"{source}, line {line}: '{row[name]}' in column '{name}' is not a number."
+            ) from None
+    return values
