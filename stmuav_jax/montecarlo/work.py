@@ -61,6 +61,11 @@ class AbstractWork(abc.ABC):
     def reasons(self) -> Mapping[int, str]:
         """What codes of "status" from 2 on mean: why a sample failed."""
 
+    @property
+    @abc.abstractmethod
+    def unit(self) -> int:
+        """Samples best computed together, 1 or more; `run` is quickest for multiples of it."""
+
     @abc.abstractmethod
     def run(self, first: int, count: int) -> dict[str, np.ndarray]:
         """Columns (count, ...) of the samples first, first + 1, ...

@@ -1,0 +1,221 @@
+"""Carries out a study on a cluster of Dask distributed, its own or one that is there.
+
+The work goes once to each worker; a task is a chunk's number. Results come back to this process,
+which alone writes the store, with two chunks for each worker on the way at a time: that bounds
+memory, and a worker that dies loses only what it was computing, which another computes again.
+"""
+
+import contextlib
+import os
+import uuid
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+
+from ..mechanics.errors import SettingError, SimulationError
+from ..montecarlo.work import AbstractWork
+from ..view.store import Store
+from .compute import MEMORY, Piece, chunk_size
+from .keep import Keeper, New, Report, begin
+from .progress import Outcome, Standing
+
+# Chunks on the way for each thread of a worker: one computed, one waiting.
+_AHEAD = 2
+# Times that a chunk is tried again when it fails on a worker.
+_RETRIES = 2
+
+
+def run_on_cluster(
+    work: AbstractWork,
+    path: str | os.PathLike[str],
+    total: int,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    chunk: int | None = None,
+    resume: bool = False,
+    progress: Report | None = None,
+    memory: int = MEMORY,
+    patience: float = 10.0,
+) -> Outcome:
+    """`run_study` on the workers of a cluster; the store is the same, file by file.
+
+    A script that has its own cluster started needs `if __name__ == "__main__":`, since new
+    processes import it.
+
+    Args:
+        scheduler: address of a Dask scheduler, such as "tcp://10.0.0.1:8786"; None starts
+            `workers` processes with a thread each on this machine, default one for each core.
+        patience: seconds for the scheduler to answer. Workers may join and leave at any time.
+        work, path, total, chunk, resume, progress, memory: as in `run_study`. A work of a module
+            of yours needs that module on the workers.
+
+    Raises:
+        FileError, SettingError: as in `run_study`; also no `distributed` here, no scheduler at the
+            address, or a worker with other versions than the store's.
+        SimulationError: the scheduler was lost, a chunk's workers died again and again, or a
+            single sample does not fit in memory. What was written is kept.
+    """
+    interrupted = False
+    with (
+        _client(scheduler, workers, patience) as client,
+        _shipped(client, work) as name,
+    ):
+
+        def new() -> New:
+            if not client.nthreads() and progress is not None:
+                note = f"Waiting for a worker of {client.scheduler.address}."
+                progress(Standing(0, total, 0.0, float("inf"), note))
+            seconds, versions = _surveyed(client, name, total if chunk is None else None)
+            return New(
+                chunk_size(work, total, seconds, memory) if chunk is None else chunk, versions
+            )
+
+        with (
+            begin(work, path, total, chunk=chunk, resume=resume, new=new, elsewhere=True) as store,
+            Keeper(store, progress) as keeper,
+        ):
+            try:
+                _carry_out(client, name, store, keeper)
+                keeper.settle()
+            except KeyboardInterrupt:
+                interrupted = True
+                keeper.settle()
+            return keeper.outcome(interrupted=interrupted)
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ImportError as error:
+        raise SettingError(
+            f"A cluster needs Dask distributed: pip install 'stmuav-jax[cluster]' ({error})."
+        ) from None
+    return distributed
+
+
+@contextlib.contextmanager
+def _client(scheduler: str | None, workers: int | None, patience: float) -> Iterator[Any]:
+    distributed = _distributed()
+    if scheduler is None:
+        with (
+            _local_cluster(workers) as cluster,
+            distributed.Client(cluster, set_as_default=False) as client,
+        ):
+            yield client
+        return
+    if workers is not None:
+        raise SettingError(
+            f"The scheduler {scheduler} has its own workers; their number ({workers}) is not given."
+        )
+    try:
+        client = distributed.Client(scheduler, timeout=patience, set_as_default=False)
+    except (OSError, ValueError, ImportError) as error:
+        raise SettingError(
+            f"No Dask scheduler answers at {scheduler} within {patience:g} s ({error})."
+        ) from error
+    with client:
+        yield client
+
+
+def _local_cluster(workers: int | None) -> Any:
+    distributed = _distributed()
+    count = len(os.sched_getaffinity(0)) if workers is None else workers
+    if count < 1:
+        raise SettingError(f"A cluster needs 1 worker or more, not {count}.")
+    one = dict.fromkeys(
+        ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"), "1"
+    )
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=1"
+    cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    kept = {"JAX_COMPILATION_CACHE_DIR": cache} if cache else {}
+    return distributed.LocalCluster(
+        n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1",
+        # a study's memory is bounded by its chunks; limits would have workers killed for JAX's own
+        dashboard_address=None, memory_limit=None, silence_logs="ERROR",
+        env=one | kept | {"XLA_FLAGS": flags.strip()},
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _shipped(client: Any, work: AbstractWork) -> Iterator[str]:
+    """The work on all workers, those that join later among them; the name it has there."""
+    from .shipped import Shipped
+
+    name = f"stmuav-{uuid.uuid4().hex}"
+    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        client.register_plugin(Shipped(work, x64=x64), name=name)
+    except Exception as error:
+        raise SettingError(
+            f"The workers of {client.scheduler.address} cannot take the study; do they have "
+            f"stmuav-jax? {type(error).__name__}: {error}"
+        ) from error
+    try:
+        yield name
+    finally:
+        # a scheduler that is gone has nothing left to forget
+        with contextlib.suppress(Exception):
+            client.unregister_worker_plugin(name)
+
+
+def _surveyed(client: Any, name: str, total: int | None) -> tuple[float, dict[str, str]]:
+    from .shipped import surveyed
+
+    with _explained(client):
+        return client.submit(
+            surveyed, name, total, key=f"{name}-survey", pure=False, retries=_RETRIES
+        ).result()
+
+
+def _carry_out(client: Any, name: str, store: Store, keeper: Keeper) -> None:
+    """Compute the chunks that are missing, a bounded number at a time."""
+    from distributed import as_completed
+
+    from .shipped import computed
+
+    waiting = iter(store.pending)
+    versions = dict(store.layout.versions)
+    running = as_completed(loop=client.loop)
+    chunks: dict[str, int] = {}
+
+    def feed() -> None:
+        ahead = max(_AHEAD * sum(client.nthreads().values()), 1)
+        while len(chunks) < ahead and (chunk := next(waiting, None)) is not None:
+            future = client.submit(
+                computed, name, *store.todo(chunk), versions,
+                key=f"{name}-{chunk}", pure=False, retries=_RETRIES,
+            )  # fmt: skip
+            chunks[future.key] = chunk
+            running.add(future)
+
+    with _explained(client):
+        feed()
+        for future in running:
+            piece: Piece = future.result()
+            keeper.keep(chunks.pop(future.key), piece)
+            # its numbers on the worker are let go with it
+            del future, piece
+            feed()
+
+
+@contextlib.contextmanager
+def _explained(client: Any) -> Iterator[None]:
+    """Say in our own words what may befall a cluster."""
+    from distributed import CancelledError, KilledWorker
+    from distributed.comm.core import CommClosedError
+
+    address = client.scheduler.address if client.scheduler else "the scheduler"
+    try:
+        yield
+    except KilledWorker as error:
+        raise SimulationError(
+            "The workers that computed the same chunk died, one after another, perhaps for want "
+            f"of memory: {error}. What was stored is kept; go on with the study where it stands."
+        ) from error
+    except (CommClosedError, CancelledError, TimeoutError) as error:
+        raise SimulationError(
+            f"Lost the Dask scheduler at {address} ({type(error).__name__}). What was stored is "
+            "kept; go on with the study where it stands."
+        ) from error

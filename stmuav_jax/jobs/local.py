@@ -1,0 +1,65 @@
+"""Carries out a study in this process."""
+
+import os
+
+from ..montecarlo.work import AbstractWork
+from ..view.layout import computing_versions
+from .compute import MEMORY, Pieces, chunk_size
+from .keep import Keeper, New, Report, begin
+from .progress import Outcome
+
+
+def run_study(
+    work: AbstractWork,
+    path: str | os.PathLike[str],
+    total: int,
+    *,
+    chunk: int | None = None,
+    resume: bool = False,
+    progress: Report | None = None,
+    memory: int = MEMORY,
+) -> Outcome:
+    """Compute the samples of a study that its store does not have yet, chunk by chunk.
+
+    Each chunk is written while the next is computed, and is there whole or not at all: a run that
+    is killed loses at most the two chunks at hand, and one that goes on with it ends with the same
+    files. Ctrl-C ends the run after the chunk that is being written; a second one does not wait
+    for progress to be told.
+
+    Args:
+        path: folder of the store. total: samples; more than the store has extend it.
+        chunk: samples computed and written together, settled when a store is made; default some
+            seconds' worth, measured, whose results fit in `memory` [bytes].
+        resume: go on with the store if there is one.
+        progress: called with a `Standing` at the start, after each chunk and with each note.
+
+    Returns:
+        what came of it; `interrupted` if Ctrl-C has ended it.
+
+    Raises:
+        FileError: the store exists and `resume` is not set, or it is damaged, of another study or
+            of other versions; or the disk is full (what was written is kept).
+        SettingError: settings that cannot be; columns that are not what the work says.
+        SimulationError: not even a single sample fits in memory.
+    """
+    pieces = Pieces(work)
+
+    def new() -> New:
+        if chunk is not None:
+            return New(chunk, computing_versions())
+        size = chunk_size(work, total, pieces.seconds(total), memory)
+        return New(size, computing_versions())
+
+    interrupted = False
+    with (
+        begin(work, path, total, chunk=chunk, resume=resume, new=new) as store,
+        Keeper(store, progress) as keeper,
+    ):
+        try:
+            for number in store.pending:
+                keeper.keep(number, pieces(*store.todo(number)))
+            keeper.settle()
+        except KeyboardInterrupt:
+            interrupted = True
+            keeper.settle()
+        return keeper.outcome(interrupted=interrupted)

@@ -1,0 +1,140 @@
+"""Chunks on disk: their files, what is in them, and the records that say which are complete.
+
+A record is the description of an empty Zarr group, records/<chunk>/zarr.json: how many of the
+chunk's samples are in its files, and for each column the SHA-256 of these samples' bytes. It is put
+in place in one step and after the files, so that a chunk either has its record and is complete, or
+counts as missing. The bytes of samples never change once recorded, only more may come behind them:
+a record stays true while a chunk that was the last is filled up, whenever that is broken off.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from .io import FileError, write_atomically
+from .layout import RECORDS, Layout, read_node
+
+_AGAIN = "To have the chunk computed again, delete {folder} and go on with the study."
+
+
+class Record(NamedTuple):
+    """What is complete of a chunk: its first samples, and the SHA-256 of each column's."""
+
+    samples: int
+    sums: Mapping[str, str]
+
+
+def chunk_file(path: Path, layout: Layout, name: str, chunk: int) -> Path:
+    """Where a column's numbers of a chunk lie."""
+    return path.joinpath(name, "c", str(chunk), *("0" for _ in layout.columns[name].dims))
+
+
+def write_record(path: Path, chunk: int, record: Record) -> None:
+    """Say that a chunk is complete, atomically."""
+    node = {
+        "attributes": {"samples": record.samples, "sha256": dict(record.sums)},
+        "zarr_format": 3,
+        "node_type": "group",
+    }
+    content = (json.dumps(node, indent=2) + "\n").encode()
+    write_atomically(path / RECORDS / str(chunk) / "zarr.json", content)
+
+
+def read_records(path: Path, layout: Layout) -> dict[int, Record]:
+    """The records of complete chunks, by number.
+
+    Raises:
+        FileError: one is damaged, or does not belong to this store.
+    """
+    found: dict[int, Record] = {}
+    for file in (path / RECORDS).glob("*/zarr.json"):
+        attributes = read_node(file.parent)["attributes"]
+        samples, sums = attributes.get("samples"), attributes.get("sha256")
+        name = file.parent.name
+        chunk = int(name) if name.isdecimal() else -1
+        fits = (
+            0 <= chunk < layout.chunks
+            and isinstance(samples, int)
+            and 1 <= samples <= size(layout, chunk)
+            and isinstance(sums, dict)
+            and set(sums) == set(layout.columns)
+        )
+        if not fits:
+            again = _AGAIN.format(folder=file.parent)
+            raise FileError(f"{file} is damaged or not of this store. {again}")
+        found[chunk] = Record(samples, sums)
+    return dict(sorted(found.items()))
+
+
+def size(layout: Layout, chunk: int) -> int:
+    """Samples of a chunk; the last may have fewer."""
+    return min(layout.chunk, layout.total - chunk * layout.chunk)
+
+
+def read_samples(path: Path, layout: Layout, name: str, chunk: int, samples: int) -> bytes:
+    """The bytes of a chunk's first samples, if the file is whole.
+
+    Raises:
+        FileError: the file is missing, truncated or altered.
+    """
+    import google_crc32c
+
+    file = chunk_file(path, layout, name, chunk)
+    again = _AGAIN.format(folder=path / RECORDS / str(chunk))
+    try:
+        content = file.read_bytes()
+    except FileNotFoundError:
+        raise FileError(
+            f"There is no file {file}, though its chunk was complete. {again}"
+        ) from None
+    item = np.dtype(layout.columns[name].dtype).itemsize * int(np.prod(layout.row(name), dtype=int))
+    wanted = layout.chunk * item + 4
+    if len(content) != wanted:
+        raise FileError(f"{file} has {len(content)} bytes instead of {wanted}. {again}")
+    if google_crc32c.value(content[:-4]) != int.from_bytes(content[-4:], "little"):
+        raise FileError(f"{file} was altered: its CRC-32C is another. {again}")
+    return content[: samples * item]
+
+
+def verify(path: Path, layout: Layout, records: Mapping[int, Record], names: Iterable[str]) -> None:
+    """Compare files of complete chunks with their records.
+
+    Raises:
+        FileError: names the first that is missing, truncated or altered.
+    """
+    names = tuple(names)
+    for chunk, record in records.items():
+        for name in names:
+            content = read_samples(path, layout, name, chunk, record.samples)
+            if hashlib.sha256(content).hexdigest() != record.sums[name]:
+                file, folder = chunk_file(path, layout, name, chunk), path / RECORDS / str(chunk)
+                again = _AGAIN.format(folder=folder)
+                raise FileError(
+                    f"{file} or {folder / 'zarr.json'} was altered: the SHA-256 differs. {again}"
+                )
+
+
+def flush(files: Iterable[Path]) -> None:
+    """Wait until files are on the disk, so that no record can be there before them."""
+
+    def one(file: Path) -> None:
+        with open(file, "rb+") as opened:
+            os.fsync(opened.fileno())
+
+    # side by side, since a disk serves many waits at once
+    with ThreadPoolExecutor(8) as pool:
+        for _ in pool.map(one, files):
+            pass
+
+
+def clean(path: Path) -> None:
+    """Remove what writes that were broken off have left beside the files they were to replace."""
+    for file in path.rglob("*"):
+        if file.name.endswith(".partial") or file.name.startswith(".zarr.json."):
+            file.unlink()

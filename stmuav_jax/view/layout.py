@@ -1,0 +1,312 @@
+"""What a store says of its study: identity, versions, columns, axes, and how long its arrays are.
+
+A store is a Zarr folder (format 3). The root's attributes and those of each array hold all that is
+read here. An array's chunk is the plain numbers in little-endian order and a CRC-32C behind them,
+nothing compressed and no Python objects; arrays stored in any other way are refused unread.
+"""
+
+import importlib.metadata
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..mechanics.errors import SettingError
+from ..montecarlo.work import FINE, MISSING, AbstractWork, Axis, Column
+from .io import FileError
+from .io import versions as _versions
+
+FORMAT = "stmuav_jax study"
+FORMAT_VERSION = 1
+SAMPLE = "sample"
+RECORDS = "records"
+
+_TYPES = {f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
+_TYPES |= {"float32", "float64", "complex64", "complex128", "bool"}
+
+
+class Layout(NamedTuple):
+    """A study as its store describes it.
+
+    Attributes:
+        total: samples. chunk: samples that are written together.
+        identity: what decides the numbers. versions: of what computes them.
+        columns, axes, reasons: as in `AbstractWork`.
+    """
+
+    total: int
+    chunk: int
+    identity: Mapping[str, Any]
+    versions: Mapping[str, str]
+    columns: Mapping[str, Column]
+    axes: Mapping[str, Axis]
+    reasons: Mapping[int, str]
+
+    @property
+    def chunks(self) -> int:
+        """How many there are."""
+        return -(-self.total // self.chunk)
+
+    def row(self, name: str) -> tuple[int, ...]:
+        """A column's shape in one sample."""
+        return tuple(len(self.axes[dim].values) for dim in self.columns[name].dims)
+
+    @property
+    def sample_bytes(self) -> int:
+        """Of all columns in one sample."""
+        return sum(
+            np.dtype(column.dtype).itemsize * int(np.prod(self.row(name), dtype=int))
+            for name, column in self.columns.items()
+        )
+
+
+def computing_versions() -> dict[str, str]:
+    """Versions that numbers may depend on: the package, its numerical libraries, the device."""
+    found = _versions() | {"scipy": importlib.metadata.version("scipy")}
+    return {name: version for name, version in found.items() if name not in ("python", "xarray")}
+
+
+def layout_of(
+    work: AbstractWork, total: int, chunk: int, versions: Mapping[str, str] | None = None
+) -> Layout:
+    """The layout of a work's store.
+
+    Raises:
+        SettingError: numbers of samples below 1, or columns that a store cannot hold.
+    """
+    for what, count in (("A study's samples", total), ("A chunk's samples", chunk)):
+        if count < 1:
+            raise SettingError(f"{what} must be 1 or more, not {count}.")
+    _check_columns(work.columns, work.axes)
+    try:
+        identity = json.loads(json.dumps(dict(work.identity)))
+    except (TypeError, ValueError) as error:
+        raise SettingError(f"A study's identity must be plain data for JSON: {error}.") from None
+    return Layout(
+        total, chunk, identity, dict(computing_versions() if versions is None else versions),
+        dict(work.columns), dict(work.axes), dict(work.reasons),
+    )  # fmt: skip
+
+
+def _check_columns(columns: Mapping[str, Column], axes: Mapping[str, Axis]) -> None:
+    status = columns.get("status")
+    if status is None or status[0] != "int8" or status.role != "status" or status.dims:
+        raise SettingError("A study needs a column 'status' of type int8, that role and no axes.")
+    for name in (*columns, *axes):
+        if (
+            not name.isidentifier()
+            or name in (SAMPLE, RECORDS)
+            or (name in columns) & (name in axes)
+        ):
+            raise SettingError(
+                f"'{name}' cannot name a column or an axis: letters, digits and _ can, "
+                f"except '{SAMPLE}' and '{RECORDS}', and each once."
+            )
+    for name, column in columns.items():
+        if column.dtype not in _TYPES:
+            raise SettingError(f"Column '{name}' has type {column.dtype}; numbers can be stored.")
+        unknown = [dim for dim in column.dims if dim not in axes]
+        if unknown:
+            raise SettingError(f"Column '{name}' has axes that are not given: {unknown}.")
+    for name, axis in axes.items():
+        values = np.asarray(axis.values)
+        if values.ndim != 1 or not values.size or values.dtype.name not in _TYPES:
+            raise SettingError(
+                f"Axis '{name}' needs numbers (k,), not {values.dtype} {values.shape}."
+            )
+
+
+def _missing(column: Column) -> Any:
+    """The number that stands where there is none."""
+    kind = np.dtype(column.dtype).kind
+    if column.role == "status":
+        return MISSING
+    if kind in "fc":
+        return np.nan
+    if kind == "b":
+        return False
+    limits = np.iinfo(column.dtype)
+    return limits.min if kind == "i" else limits.max
+
+
+def write_layout(folder: Path, layout: Layout) -> None:
+    """Make the store's root and its empty arrays in a folder that does not exist yet."""
+    import zarr
+    from zarr.codecs import Crc32cCodec
+
+    attributes = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "total": layout.total,
+        "chunk": layout.chunk,
+        "columns": list(layout.columns),
+        "axes": list(layout.axes),
+        "identity": json.dumps(layout.identity),
+        "versions": json.dumps(layout.versions),
+        "reasons": json.dumps({str(code): words for code, words in layout.reasons.items()}),
+    }
+    group = zarr.create_group(str(folder), zarr_format=3, attributes=attributes)
+    group.create_group(RECORDS, attributes={"long_name": "what has been written whole, by chunk"})
+    plain: dict[str, Any] = {"filters": None, "compressors": [Crc32cCodec()]}
+    for name, column in layout.columns.items():
+        row = layout.row(name)
+        about: dict[str, Any] = {
+            "units": column.unit,
+            "long_name": column.words,
+            "role": column.role,
+        }
+        if column.role == "status":
+            codes = {MISSING: "missing", FINE: "fine"} | dict(layout.reasons)
+            about["meanings"] = json.dumps({str(code): words for code, words in codes.items()})
+        group.create_array(
+            name, shape=(layout.total, *row), chunks=(layout.chunk, *row), dtype=column.dtype,
+            fill_value=_missing(column), dimension_names=[SAMPLE, *column.dims],
+            attributes=about, **plain,
+        )  # fmt: skip
+    for name, axis in layout.axes.items():
+        values = np.asarray(axis.values)
+        about: dict[str, Any] = {"units": axis.unit, "long_name": name}
+        array = group.create_array(
+            name, shape=values.shape, chunks=values.shape, dtype=values.dtype.name,
+            dimension_names=[name], attributes=about, config={"write_empty_chunks": True}, **plain,
+        )  # fmt: skip
+        array[:] = values
+
+
+def read_node(folder: Path) -> dict[str, Any]:
+    """What a folder's zarr.json says.
+
+    Raises:
+        FileError: there is none, or it is not whole.
+    """
+    file = folder / "zarr.json"
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileError(f"There is no file {file}.") from None
+    except (OSError, ValueError) as error:
+        raise FileError(f"{file} is truncated, damaged or of another kind: {error}.") from None
+    if not isinstance(found, dict) or not isinstance(found.get("attributes"), dict):
+        raise FileError(f"{file} is not the description of a Zarr array or group.")
+    return found
+
+
+def read_layout(path: Path) -> tuple[Layout, dict[str, int]]:
+    """The layout of the store in a folder, and the length of each column's array.
+
+    Raises:
+        FileError: no store of a study, one of another format, or damaged descriptions.
+    """
+    if not (path / "zarr.json").is_file():
+        what = "holds no store of a study" if path.is_dir() else "does not exist"
+        raise FileError(f"{path} {what}.")
+    head = read_node(path)["attributes"]
+    if head.get("format") != FORMAT:
+        raise FileError(f"{path} is a Zarr folder, but not a study's store.")
+    if head.get("format_version") != FORMAT_VERSION:
+        raise FileError(
+            f"{path} has format version {head.get('format_version')}; this package reads version "
+            f"{FORMAT_VERSION}."
+        )
+    read_node(path / RECORDS)
+    try:
+        total, chunk = int(head["total"]), int(head["chunk"])
+        texts = {key: json.loads(head[key]) for key in ("identity", "versions", "reasons")}
+        reasons = {int(code): str(words) for code, words in texts["reasons"].items()}
+        # all descriptions are looked at before a number is read
+        nodes = {str(n): _plain_array(path, str(n)) for n in (*head["axes"], *head["columns"])}
+        axes = {name: _read_axis(path, name, nodes[name]) for name in head["axes"]}
+        found = {n: _read_column(path, n, nodes[n], chunk, axes) for n in head["columns"]}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(f"{path / 'zarr.json'} is damaged: {error!r}.") from None
+    columns = {name: column for name, (column, _) in found.items()}
+    layout = Layout(total, chunk, texts["identity"], texts["versions"], columns, axes, reasons)
+    return layout, {name: length for name, (_, length) in found.items()}
+
+
+def _plain_array(path: Path, name: str) -> dict[str, Any]:
+    """An array's description, if its chunks are plain numbers."""
+    if not name.isidentifier():
+        raise FileError(f"{path / 'zarr.json'} is damaged: '{name}' names no array of a study.")
+    node = read_node(path / name)
+    codecs = node.get("codecs")
+    simple = (
+        isinstance(codecs, list)
+        and [codec.get("name") for codec in codecs] == ["bytes", "crc32c"]
+        and codecs[0].get("configuration", {}).get("endian", "little") == "little"
+    )
+    if str(node.get("data_type")) not in _TYPES or not simple:
+        raise FileError(
+            f"{path / name / 'zarr.json'} describes {node.get('data_type')} stored by {codecs}, "
+            "which no store of a study holds; it was altered, and nothing of it was read."
+        )
+    return node
+
+
+def _read_column(
+    path: Path, name: str, node: Mapping[str, Any], chunk: int, axes: Mapping[str, Axis]
+) -> tuple[Column, int]:
+    about, dims = node["attributes"], tuple(node["dimension_names"][1:])
+    column = Column(node["data_type"], about["units"], about["long_name"], about["role"], dims)
+    row = [len(axes[dim].values) for dim in dims]
+    fine = node["shape"][1:] == row
+    if not fine or node["chunk_grid"]["configuration"]["chunk_shape"] != [chunk, *row]:
+        raise FileError(f"{path / name / 'zarr.json'} does not fit {path / 'zarr.json'}.")
+    return column, int(node["shape"][0])
+
+
+def _read_axis(path: Path, name: str, node: Mapping[str, Any]) -> Axis:
+    import zarr
+
+    file = path / name / "c" / "0"
+    if not file.is_file():
+        # zarr would take it for a chunk without numbers
+        raise FileError(f"There is no file {file}; the store was altered.")
+    try:
+        values = np.asarray(zarr.open_array(str(path / name), mode="r")[:])
+    except (OSError, ValueError) as error:
+        raise FileError(f"{file} is truncated or altered: {error}.") from None
+    return Axis(values, node["attributes"]["units"])
+
+
+def _flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping) and value:
+        for key, inner in value.items():
+            yield from _flat(inner, f"{prefix}.{key}" if prefix else str(key))
+    else:
+        yield prefix, value
+
+
+def _deciding(layout: Layout) -> dict[str, Any]:
+    """All that must agree between two parts of one study, by dotted names."""
+    columns = {
+        name: {"dtype": c.dtype, "unit": c.unit, "role": c.role, "axes": list(c.dims)}
+        for name, c in layout.columns.items()
+    }
+    axes = {
+        name: {"values": np.asarray(axis.values).tolist(), "unit": axis.unit}
+        for name, axis in layout.axes.items()
+    }
+    more = {"column": columns, "axis": axes, "reason": layout.reasons, "version": layout.versions}
+    return dict(_flat(layout.identity, "")) | dict(_flat(more, ""))
+
+
+def differences(there: Layout, here: Layout) -> list[str]:
+    """What differs between a store and a study, as 'seed is 1 there and 2 here'."""
+    one, two = _deciding(there), _deciding(here)
+    show = lambda side, key: _short(side[key]) if key in side else "not given"
+    return [
+        f"{key} is {show(one, key)} there and {show(two, key)} here"
+        for key in dict.fromkeys([*one, *two])
+        # as text, so that numbers that are not finite equal themselves
+        if json.dumps(one.get(key)) != json.dumps(two.get(key)) or (key in one) != (key in two)
+    ]
+
+
+def _short(value: Any) -> str:
+    words = json.dumps(value)
+    return words if len(words) <= 60 else f"{words[:57]}..."

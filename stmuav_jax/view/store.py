@@ -1,0 +1,341 @@
+"""A study's results on disk, chunk by chunk, so that a run can be broken off and gone on with.
+
+The folder is a Zarr group (format 3) that xarray reads:
+`xarray.open_zarr(path, consolidated=False)`. Samples that are not there yet show as NaN, and as 0
+in the column "status". Nothing in it depends on time, or on the order or the process in which
+chunks were computed.
+"""
+
+import contextlib
+import errno
+import hashlib
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from ..mechanics.errors import SettingError, nearest_names
+from ..montecarlo.work import AbstractWork
+from .chunks import (
+    Record,
+    chunk_file,
+    clean,
+    flush,
+    read_records,
+    read_samples,
+    size,
+    verify,
+    write_record,
+)
+from .io import FileError
+from .layout import SAMPLE, Layout, differences, layout_of, read_layout, write_layout
+
+
+class Store:
+    """The store of a study; made by `create`, `resume_store` (to write) or `open_store` (to read).
+
+    Attributes:
+        path: the folder.
+        layout: samples, identity, versions, columns, axes and reasons.
+    """
+
+    def __init__(
+        self, path: Path, layout: Layout, records: Mapping[int, Record], lock: int | None = None
+    ) -> None:
+        self.path, self.layout = path, layout
+        self._records, self._lock = dict(records), lock
+        self._arrays: dict[str, Any] = {}
+
+    def __enter__(self) -> "Store":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let another run write the store."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    @property
+    def total(self) -> int:
+        """Samples of the study."""
+        return self.layout.total
+
+    @property
+    def finished(self) -> int:
+        """Samples that are stored."""
+        return sum(record.samples for record in self._records.values())
+
+    @property
+    def pending(self) -> tuple[int, ...]:
+        """Chunks of which samples are missing."""
+        return tuple(chunk for chunk in range(self.layout.chunks) if self.todo(chunk)[1])
+
+    def todo(self, chunk: int) -> tuple[int, int]:
+        """The first of a chunk's samples that are missing, and how many they are."""
+        if not 0 <= chunk < self.layout.chunks:
+            raise SettingError(f"There is no chunk {chunk} among {self.layout.chunks}.")
+        record = self._records.get(chunk)
+        done = 0 if record is None else record.samples
+        return chunk * self.layout.chunk + done, size(self.layout, chunk) - done
+
+    def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Store the samples of `todo(chunk)`; all of them are there afterwards, or none.
+
+        Args:
+            arrays: columns (count, ...).
+
+        Raises:
+            SettingError: columns of other names, shapes or types, or a chunk that is complete.
+            FileError: the disk is full or fails; chunks written before are kept.
+        """
+        first, count = self.todo(chunk)
+        done = first - chunk * self.layout.chunk
+        values = self._fitting(arrays, first, count)
+        try:
+            sums = {}
+            # the status comes last: where it is there, what it speaks of is there too
+            for name in sorted(values, key="status".__eq__):
+                digest = hashlib.sha256()
+                if done:
+                    digest.update(read_samples(self.path, self.layout, name, chunk, done))
+                else:
+                    # of a write that was broken off; zarr would read it to fill up a last chunk
+                    chunk_file(self.path, self.layout, name, chunk).unlink(missing_ok=True)
+                self._array(name)[first : first + count] = values[name]
+                digest.update(values[name].astype(values[name].dtype.newbyteorder("<")).tobytes())
+                sums[name] = digest.hexdigest()
+            flush(chunk_file(self.path, self.layout, name, chunk) for name in values)
+            record = Record(done + count, sums)
+            write_record(self.path, chunk, record)
+        except OSError as error:
+            raise self._failed(error) from error
+        self._records[chunk] = record
+
+    def _fitting(
+        self, arrays: Mapping[str, np.ndarray], first: int, count: int
+    ) -> dict[str, np.ndarray]:
+        if self._lock is None:
+            raise SettingError(f"{self.path} was opened to read, not to write.")
+        if not count:
+            raise SettingError(f"The chunk that ends before sample {first} is complete.")
+        columns = self.layout.columns
+        if set(arrays) != set(columns):
+            raise SettingError(
+                f"A study gave columns {sorted(arrays)} where it says {sorted(columns)}."
+            )
+        for name, column in columns.items():
+            have = arrays[name].dtype.name, arrays[name].shape
+            want = column.dtype, (count, *self.layout.row(name))
+            if have != want:
+                raise SettingError(
+                    f"Samples {first} to {first + count - 1}: column '{name}' is {have[0]} "
+                    f"{have[1]} where the study says {want[0]} {want[1]}."
+                )
+        return {name: arrays[name] for name in columns}
+
+    def _array(self, name: str) -> Any:
+        import zarr
+
+        if name not in self._arrays:
+            array = zarr.open_array(str(self.path / name), mode="r+", zarr_format=3)
+            # else a chunk in which all is missing would have no file
+            self._arrays[name] = array.with_config({"write_empty_chunks": True})
+        return self._arrays[name]
+
+    def _failed(self, error: OSError) -> FileError:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        why = "The disk is full" if full else f"The disk fails ({error})"
+        return FileError(
+            f"{why}: {self.path} keeps {self.finished} of {self.total} samples. "
+            f"{'Make room' if full else 'Repair it'} and go on with the study where it stands."
+        )
+
+    def extend(self, total: int) -> None:
+        """Make room for more samples; those stored stay as they are.
+
+        Raises:
+            SettingError: fewer samples than now.
+            FileError: the disk is full or fails.
+        """
+        import zarr
+
+        if total < self.total:
+            raise SettingError(
+                f"{self.path} has {self.total} samples; a study can grow, not shrink to {total}."
+            )
+        if self._lock is None:
+            raise SettingError(f"{self.path} was opened to read, not to write.")
+        try:
+            # first what is meant, so that a run that goes on with this one completes it
+            zarr.open_group(str(self.path), mode="r+").attrs["total"] = total
+            for name in self.layout.columns:
+                array = self._array(name)
+                if array.shape[0] < total:
+                    array.resize((total, *array.shape[1:]))
+        except OSError as error:
+            raise self._failed(error) from error
+        self.layout = self.layout._replace(total=total)
+
+    def verify(self, columns: Iterable[str] | None = None) -> None:
+        """Compare what is stored with the sums taken when it was written.
+
+        Raises:
+            FileError: names a file that is missing, truncated or altered.
+        """
+        verify(self.path, self.layout, self._records, self._known(columns))
+
+    def _known(self, columns: Iterable[str] | None) -> tuple[str, ...]:
+        known = tuple(self.layout.columns)
+        chosen = known if columns is None else tuple(columns)
+        for name in chosen:
+            if name not in known:
+                near = nearest_names(name, known)
+                raise SettingError(f"{self.path} has no column '{name}'.{near}")
+        return chosen
+
+    def dataset(self, columns: Iterable[str] | None = None) -> xr.Dataset:
+        """The finished samples, lazily, with their numbers as the coordinate "sample".
+
+        Attributes `total` and `finished` say how many there are to be and are. Nothing is read
+        before it is asked for; `dataset(...).load()` reads all, `load` verifies it too.
+
+        Args:
+            columns: the names of those wanted; default all.
+        """
+        chosen = self._known(columns)
+        others = [name for name in self.layout.columns if name not in chosen]
+        whole = xr.open_zarr(
+            self.path, consolidated=False, chunks=None, decode_cf=False, drop_variables=others
+        )
+        begins = self.layout.chunk * np.fromiter(self._records, dtype=np.int64)
+        spans = [
+            np.arange(begin, begin + record.samples)
+            for begin, record in zip(begins, self._records.values(), strict=True)
+        ]
+        numbers = np.sort(np.concatenate(spans)) if spans else np.zeros(0, np.int64)
+        gapless = not numbers.size or numbers[-1] + 1 == numbers.size
+        # a slice reads whole chunks; so long as all from the first are there it says the same
+        kept = whole.isel({SAMPLE: slice(0, numbers.size) if gapless else numbers})
+        words = {"long_name": "number of the sample", "units": "1"}
+        return kept.assign_coords({SAMPLE: (SAMPLE, numbers, words)}).assign_attrs(
+            total=self.total, finished=int(numbers.size)
+        )
+
+    def load(self, columns: Iterable[str] | None = None) -> xr.Dataset:
+        """The finished samples in memory, after `verify` of the columns chosen."""
+        chosen = self._known(columns)
+        self.verify(chosen)
+        return self.dataset(chosen).load()
+
+
+def create(
+    path: str | os.PathLike[str],
+    work: AbstractWork,
+    total: int,
+    chunk: int,
+    versions: Mapping[str, str] | None = None,
+) -> Store:
+    """Make the empty store of a study, to write.
+
+    Args:
+        total: samples. chunk: samples written together, which stays as it is.
+        versions: of what computes the numbers; default this process's `computing_versions`.
+
+    Raises:
+        SettingError: numbers below 1, or columns that cannot be stored.
+        FileError: there is something at `path` already, or it cannot be written.
+    """
+    target = Path(path)
+    layout = layout_of(work, total, chunk, versions)
+    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
+        raise FileError(f"{target} exists; go on with it (resume), or give another name.")
+    partial = target.parent / f".{target.name}.partial"
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_layout(partial, layout)
+        os.replace(partial, target)
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise FileError(f"{target} cannot be made: {error}.") from error
+    return resume_store(target, work, versions)
+
+
+def open_store(path: str | os.PathLike[str]) -> Store:
+    """Open a store to read it, whatever study it is of; its samples may still be coming.
+
+    Raises:
+        FileError: no store of a study, one of another format, or damaged descriptions.
+    """
+    source = Path(path)
+    layout, lengths = read_layout(source)
+    if set(lengths.values()) != {layout.total}:
+        raise FileError(
+            f"{source} is being extended to {layout.total} samples, or that was broken off; go on "
+            "with the study first."
+        )
+    return Store(source, layout, read_records(source, layout))
+
+
+def resume_store(
+    path: str | os.PathLike[str], work: AbstractWork, versions: Mapping[str, str] | None = None
+) -> Store:
+    """Open the store of a work to go on writing it; all that is there is verified.
+
+    Raises:
+        FileError: no store, one of another study, format or version (it says what differs), one
+            that another run is writing, or files that are missing, truncated or altered.
+    """
+    source = Path(path)
+    read_layout(source)
+    lock = _locked(source)
+    try:
+        layout, lengths = read_layout(source)
+        unlike = differences(layout, layout_of(work, layout.total, layout.chunk, versions))
+        if unlike:
+            more = f"; and {len(unlike) - 8} more" if len(unlike) > 8 else ""
+            raise FileError(f"{source} is of another study: {'; '.join(unlike[:8])}{more}.")
+        clean(source)
+        store = Store(source, layout, read_records(source, layout), lock)
+        for name, length in lengths.items():
+            if length > layout.total:
+                raise FileError(
+                    f"{source / name / 'zarr.json'} was altered: it has {length} samples."
+                )
+        if min(lengths.values()) < layout.total:
+            store.extend(layout.total)
+        store.verify()
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.close(lock)
+        raise
+    return store
+
+
+def _locked(path: Path) -> int:
+    """A handle that keeps other runs from writing until it is closed or the process ends."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise FileError(f"{path} is being written by another run.") from None
+    except (ImportError, OSError):
+        # there are file systems without locks; two runs would do the same work, no more
+        pass
+    return handle
