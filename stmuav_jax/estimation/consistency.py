@@ -13,7 +13,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.special import gammaincinv
 
 from ..mechanics.errors import SettingError
 from .factor import divide_lower, triangularise
@@ -58,12 +57,20 @@ def path_nees(
     return jnp.moveaxis(each, -1, 0)
 
 
+def _quantile(degrees: Any, level: Any) -> np.ndarray:
+    """Of the chi-squared distribution."""
+    # slow to import: only where it is needed
+    from scipy.special import gammaincinv
+
+    return 2 * gammaincinv(np.asarray(degrees) / 2, level)
+
+
 def chi2_interval(degrees: int | float, level: float = 0.999) -> tuple[float, float]:
     """The two-sided interval in which a chi-squared variable lies with probability `level`."""
     if not 0 < level < 1 or degrees <= 0:
         raise SettingError(f"A level in (0, 1) and degrees > 0, not {level} and {degrees}.")
     tail = (1 - level) / 2
-    low, high = 2 * gammaincinv(degrees / 2, np.array([tail, 1 - tail]))
+    low, high = _quantile(degrees, np.array([tail, 1 - tail]))
     return float(low), float(high)
 
 
@@ -104,7 +111,7 @@ def inconsistent(filtered: Filtered, *, window: int = 50, level: float = 0.999) 
     total, degrees = (
         _running(np.broadcast_to(a, shape).astype(float), window) for a in (nis, there)
     )
-    limit = 2 * gammaincinv(np.maximum(degrees, 1e-9) / 2, (1 + level) / 2)
+    limit = _quantile(np.maximum(degrees, 1e-9), (1 + level) / 2)
     return (degrees > 0) & ~(total <= limit)
 
 

@@ -4,7 +4,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.interpolate import PPoly, make_interp_spline
 
 from ..algebra.shapes import Numbers
 from .errors import ModelError, concrete
@@ -49,6 +48,9 @@ class Sampled(eqx.Module):
             raise ModelError(
                 f"The times of samples must increase, but after {t[at]} s comes {t[at + 1]} s."
             )
+        # slow to import: only where it is needed
+        from scipy.interpolate import PPoly, make_interp_spline
+
         # splines are linear in their values: traced ones weigh those through unit samples
         table = np.reshape(np.asarray(y) if known else np.eye(len(t)), (len(t), -1))
         pieces = [PPoly.from_spline(make_interp_spline(t, column, k=degree)) for column in table.T]

@@ -18,7 +18,7 @@ from ..mechanics.state import State
 from .flights import Drawn
 from .lanes import REASONS, Ending, Flown, Plan, fly
 from .signal import Signal, View
-from .study import Quantity, Study
+from .study import Quantity, Study, column_name
 from .work import AbstractWork, Axis, Column
 
 # Flights that go on together on one device: on a CPU as many as fit its cache, by measurement
@@ -81,7 +81,7 @@ class FlightWork(AbstractWork):
         for name in study.sampling.names:
             entry = study.flights.entry(name)
             words = f"{name}, share of the table's" if name in study.flights.relative else name
-            found[name] = Column(real, entry.unit, words, "input")
+            found[column_name(name)] = Column(real, entry.unit, words, "input")
         for name, of in self._signals.items():
             quantity = study.quantities[name]
             unit, words = quantity.column(of)
@@ -121,7 +121,7 @@ class FlightWork(AbstractWork):
                 part = drawn[start : start + self._block]
                 parts.append(self._fly(part, first + start))
         joined = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]} if parts else {}
-        inputs = {name: drawn[:, k] for k, name in enumerate(study.sampling.names)}
+        inputs = {column_name(name): drawn[:, k] for k, name in enumerate(study.sampling.names)}
         found = inputs | joined
         return {k: np.asarray(found[k], c.dtype) for k, c in self.columns.items()} if parts else {
             k: np.zeros((0, *(len(self.axes[d].values) for d in c.dims)), c.dtype)

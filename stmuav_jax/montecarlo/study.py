@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -17,6 +18,8 @@ from .signal import Signal, signal
 
 TAKES = ("final", "largest", "smallest", "path", "when_above", "when_below")
 SOLVERS = ("dopri8", "tsit5")
+# Columns that every study has.
+OWN = {"status", "sample", "time", "end", "steps", "rejected", "residual", "records"}
 
 
 @dataclass(frozen=True)
@@ -104,9 +107,11 @@ class Study:
             raise SettingError(f"Study '{self.name}' keeps nothing: give it quantities.")
         for name in self.sampling.names:
             self.flights.entry(name)
-        clash = sorted({*self.quantities} & {*self.sampling.names, "status", "sample", "time"})
+        inputs = {column_name(name) for name in self.sampling.names}
+        clash = sorted({*self.quantities} & (inputs | OWN))
         if clash:
-            raise SettingError(f"These names are taken, so no quantity can have them: {clash}.")
+            words = ", ".join(clash)
+            raise SettingError(f"Other columns have these names, which quantities cannot: {words}.")
         _check_numbers(self)
 
     @property
@@ -195,6 +200,11 @@ def _check_numbers(study: Study) -> None:
             raise SettingError(
                 f"The direction must be a unit vector, but its length is {size:.12g}."
             )
+
+
+def column_name(factor: str) -> str:
+    """A factor's name as that of a column: "inertia.hexacopter_1[0, 1]" has no dots and brackets."""
+    return re.sub(r"\W+", "_", factor).strip("_")
 
 
 def study_from_plain(

@@ -1,0 +1,197 @@
+"""Flights through lanes: against flights one by one, whatever the block, lane and device."""
+
+import pickle
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from stmuav_jax import Method, SettingError, integrate, rotation_matrix
+from stmuav_jax.montecarlo.batch import FlightWork
+from stmuav_jax.montecarlo.flights import Drawn
+from stmuav_jax.montecarlo.precision import precision_error
+from stmuav_jax.montecarlo.study import study_from_plain
+from stmuav_jax.montecarlo.work import FINE
+
+NORMAL = {"distribution": "normal", "mean": 0.0, "deviation": 0.3}
+TURNING = {
+    "name": "turning",
+    "scene": "hexacopter",
+    "t1": 0.4,
+    "every": 0.1,
+    "rtol": 1e-10,
+    "atol": 1e-10,
+    "seed": 4,
+    "factors": {
+        "start.p": NORMAL,
+        "start.q": NORMAL | {"deviation": 3.0},
+        "bare.mass": {"distribution": "normal", "mean": 1.0, "deviation": 0.1, "relative": True},
+    },
+    "quantities": {
+        "tilt": {"signal": "tilt", "take": "largest"},
+        "over": {"signal": "tilt", "take": "when_above", "level": 0.5},
+        "low": {"signal": "z", "take": "smallest"},
+        "path": {"signal": "z", "take": "path"},
+        "end_x": {"signal": "x", "take": "final"},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def turning():
+    work = FlightWork(study_from_plain(TURNING), block=32, lanes=8)
+    return work, work.run(0, 32)
+
+
+def one_by_one(work, k, ts, **options):
+    """Sample k by `integrate` alone."""
+    study = work.study
+    drawn = study.sampling.draw(k, 1)[0]
+    system, state = study.flights.build(
+        study.sampling.names, Drawn(jnp.asarray(drawn), jnp.zeros((), jnp.uint32))
+    )
+    method = Method(adjoint=diffrax.ForwardMode(), **options)
+    return system, integrate(system, state, jnp.asarray(ts), method)
+
+
+def test_as_flights_one_by_one(turning):
+    work, found = turning
+    assert np.all(found["status"] == FINE)
+    ts = np.linspace(0.0, 0.4, 401)
+    for k in (0, 5, 31):
+        _, run = one_by_one(work, k, ts, rtol=1e-12, atol=1e-12)
+        z = np.asarray(run.states.r[:, 0, 2])
+        assert found["path"][k] == pytest.approx(z[::100], abs=1e-9)
+        assert found["end_x"][k] == pytest.approx(float(run.states.r[-1, 0, 0]), abs=1e-9)
+        up = np.stack([np.asarray(rotation_matrix(p))[:, 2] for p in run.states.p[:, 0]])
+        tilt = np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2])
+        assert found["tilt"][k] == pytest.approx(tilt.max(), abs=1e-7)
+        assert found["low"][k] == pytest.approx(z.min(), abs=1e-8)
+        above = np.flatnonzero(tilt > 0.5)
+        if len(above):
+            first = above[0]
+            between = np.interp(0.5, tilt[first - 1 : first + 1], ts[first - 1 : first + 1])
+            assert found["over"][k] == pytest.approx(between, abs=1e-6)
+        else:
+            assert np.isinf(found["over"][k])
+    assert 0 < np.isinf(found["over"]).sum() < 32
+
+
+def test_any_range_gives_the_same_numbers(turning):
+    work, whole = turning
+    for first, count in ((0, 1), (7, 13), (30, 20)):
+        part = work.run(first, count)
+        upto = min(32 - first, count)
+        for name, values in whole.items():
+            same = part[name][:upto] == values[first : first + upto]
+            both = np.isnan(part[name][:upto]) & np.isnan(values[first : first + upto])
+            assert np.all(same | both), name
+
+
+def test_a_pickle_is_small_and_gives_the_same(turning):
+    work, whole = turning
+    content = pickle.dumps(work)
+    assert len(content) < 30_000
+    again = pickle.loads(content)
+    assert again.identity == work.identity
+    assert np.array_equal(again.run(3, 2)["tilt"], whole["tilt"][3:5])
+
+
+@pytest.mark.parametrize("lanes", [3, 16])
+def test_fixed_steps_are_the_same_for_any_block_and_lanes(lanes):
+    plain = TURNING | {"step": 0.005}
+    narrow = FlightWork(study_from_plain(plain), block=8, lanes=lanes).run(0, 20)
+    wide = FlightWork(study_from_plain(plain), block=32, lanes=8).run(0, 20)
+    assert np.all(narrow["steps"] == 80)
+    for name, values in wide.items():
+        assert np.array_equal(narrow[name], values, equal_nan=True), name
+
+
+def test_what_fails_is_data():
+    plain = {
+        "scene": "tracker", "case": 1, "t1": 0.05, "max_steps": 12,
+        "factors": {"start.phi": {"distribution": "choice", "values": [-0.2674, 2.5]},
+                    "start.phi_rate": {"distribution": "choice", "values": [0.0, 60.0]}},
+        "quantities": {"phi": {"signal": "phi", "take": "final"},
+                       "stroke": {"signal": "stroke_2", "take": "largest"}},
+    }  # fmt: skip
+    found = FlightWork(study_from_plain(plain), block=16, lanes=8).run(0, 16)
+    far = found["start_phi"] == 2.5
+    assert np.all((found["status"] == 2) == far)
+    fast = ~far & (found["start_phi_rate"] == 60.0)
+    assert np.all(found["status"][fast] == 3)
+    fine = found["status"] == FINE
+    assert fine.any()
+    assert np.all(np.isnan(found["phi"][~fine]))
+    assert np.all(np.isfinite(found["phi"][fine]))
+    assert np.all(np.isnan(found["stroke"][~fine]))
+
+
+def test_a_crossing_can_stop_a_flight():
+    quantities = {"over": {"signal": "tilt", "take": "when_above", "level": 0.5, "stop": True}}
+    plain = TURNING | {"quantities": TURNING["quantities"] | quantities}
+    found = FlightWork(study_from_plain(plain), block=32, lanes=8).run(0, 32)
+    crossed = np.isfinite(found["over"])
+    assert np.all(found["status"] == FINE)
+    assert np.all(found["end"][~crossed] == 0.4)
+    assert np.all(found["end"][crossed] >= found["over"][crossed])
+    assert np.all(found["end"][crossed] < 0.4)
+
+
+@pytest.mark.slow
+def test_the_uav_as_flights_one_by_one():
+    plain = {
+        "scene": "uav_tracker", "case": 2, "t1": 0.5, "rtol": 1e-9, "atol": 1e-9,
+        "factors": {"start.p": NORMAL, "start.phi": {
+            "distribution": "uniform", "low": -0.35, "high": -0.2}},
+        "quantities": {"x": {"signal": "x", "take": "final"},
+                       "phi": {"signal": "phi", "take": "final"},
+                       "fall": {"signal": "pointing", "take": "when_above", "level": 0.5},
+                       "load": {"signal": "force.U47", "take": "largest"}},
+    }  # fmt: skip
+    work = FlightWork(study_from_plain(plain), block=16)
+    found = work.run(0, 16)
+    assert np.all(found["status"] == FINE)
+    facing = jnp.asarray(work.study.flights.facing())
+
+    def fallen(t, state):
+        normal = rotation_matrix(state.p[-1])[:, 2]
+        return jnp.arctan2(jnp.linalg.norm(jnp.cross(normal, facing)), normal @ facing) - 0.5
+
+    for k in (0, 9):
+        _, run = one_by_one(work, k, [0.0, 0.5], rtol=1e-12, atol=1e-12)
+        assert found["x"][k] == pytest.approx(float(run.states.r[-1, 0, 0]), abs=1e-8)
+        _, run = one_by_one(work, k, [0.0, 0.5], rtol=1e-12, atol=1e-12, event=fallen)
+        assert found["fall"][k] == pytest.approx(float(run.ts[-1]), abs=1e-6)
+
+
+def test_single_precision_is_measured():
+    plain = TURNING | {"precision": "float32", "rtol": 1e-5, "atol": 1e-5}
+    work = FlightWork(study_from_plain(plain), block=8, lanes=8)
+    errors = precision_error(work, 8)
+    error, unit = errors["path"]
+    assert unit == "m"
+    assert 1e-9 < error < 1e-4
+    assert work.identity["precision"] == "float32"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"scen": "x"}, "Did you mean 'scene'"),
+        ({"quantities": {}}, "keeps nothing"),
+        ({"quantities": {"a": {"signal": "tlt", "take": "final"}}}, "Did you mean 'tilt'"),
+        ({"quantities": {"a": {"signal": "tilt", "take": "final", "level": 1.0}}}, "no level"),
+        ({"quantities": {"a": {"signal": "tilt", "take": "when_above"}}}, "needs a level"),
+        ({"quantities": {"steps": {"signal": "tilt", "take": "final"}}}, "Other columns"),
+        ({"rtol": 0.0}, "finite and positive"),
+        ({"step": 2.0}, "longer than the flight"),
+        ({"direction": [0.0, 0.0, 2.0]}, "unit vector"),
+        ({"precision": "float16"}, "float64 or float32"),
+        ({"precision": "float32"}, "round-off of this precision"),
+    ],
+)
+def test_bad_studies(change, words):
+    with pytest.raises(SettingError, match=words):
+        _ = FlightWork(study_from_plain(TURNING | change)).columns

@@ -1,0 +1,68 @@
+"""Extremes and crossings between steps, against functions whose own are known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from stmuav_jax.montecarlo.monitor import Span, cubic, follow, highest, peak, start
+
+RNG = np.random.default_rng(5)
+
+
+def watched(f, ts):
+    """The monitor after steps to each of ts, of signals f with exact rates."""
+    rate = jax.jacfwd(f)
+    ts = jnp.asarray(ts)
+    monitor = start(ts[0], f(ts[0]), rate(ts[0]))
+    for t0, t1 in zip(ts[:-1], ts[1:], strict=True):
+        monitor = follow(monitor, t0, t1, f(t1), rate(t1))
+    return monitor
+
+
+def test_a_cubic_is_met_exactly():
+    coefficients = RNG.normal(size=(50, 4))
+    f = lambda t: jnp.asarray(coefficients) @ jnp.stack([t**0, t, t**2, t**3])
+    rate = jax.jacfwd(f)
+    t0, t1 = jnp.asarray(-0.3), jnp.asarray(0.9)
+    span = Span(t0, t1, f(t0), f(t1), rate(t0), rate(t1))
+    fine = np.linspace(-0.3, 0.9, 20_001)
+    values = np.polynomial.polynomial.polyval(fine, coefficients.T)
+    top = np.asarray(highest(span))
+    assert np.all(top >= values.max(axis=1) - 1e-12)
+    assert np.max(top - values.max(axis=1)) < 1e-6
+    inside = values.argmax(axis=1)
+    s = np.asarray(peak(cubic(span)))
+    interior = (inside > 0) & (inside < 20_000)
+    assert interior.sum() > 10
+    assert np.max(np.abs(-0.3 + 1.2 * s - fine[inside])[interior]) < 1e-3
+
+
+@pytest.mark.parametrize("count", [20, 40])
+def test_peaks_and_crossings_of_sines(count):
+    """Fourth order in the step: halving it divides the error by about 16."""
+    phases = jnp.asarray([0.3, 1.0, 2.2])
+    f = lambda t: jnp.sin(t + phases) - 0.7
+    monitor = watched(f, np.linspace(0.0, 6.0, count + 1))
+    bound = (6.0 / count) ** 4 / 384
+    assert np.max(np.abs(np.asarray(monitor.extreme) - 0.3)) < 1.2 * bound
+    exact = (np.arcsin(0.7) - np.asarray(phases)) % (2 * np.pi)
+    exact[1] = 0.0  # above from the start on
+    assert np.sin(1.0) > 0.7 > np.sin(0.3)
+    slope = np.cos(np.arcsin(0.7))
+    assert np.max(np.abs(np.asarray(monitor.crossings.times()) - exact)) < 1.5 * bound / slope
+
+
+def test_never_and_first():
+    f = lambda t: jnp.stack([jnp.sin(t) - 1.5, jnp.sin(3 * t) - 0.5])
+    times = watched(f, np.linspace(0.0, 8.0, 200)).crossings.times()
+    assert np.isinf(times[0])
+    assert times[1] == pytest.approx(np.arcsin(0.5) / 3, abs=1e-6)
+
+
+def test_a_crossing_within_a_step_is_seen():
+    """Up and down again between two steps that both lie below."""
+    f = lambda t: jnp.stack([0.2 - (t - 0.5) ** 2])
+    monitor = watched(f, [0.0, 1.0])
+    assert monitor.crossings.times()[0] == pytest.approx(0.5 - np.sqrt(0.2), abs=1e-12)
+    assert monitor.extreme[0] == pytest.approx(0.2, abs=1e-12)
