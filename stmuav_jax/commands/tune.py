@@ -134,12 +134,17 @@ def _hold(command: Tune, table: Parameters, folder: Path) -> tuple[Search, Table
     shown = Table("", "untuned", "tuned", title="Constant inputs that hold")
     for k in range(count):
         pair = (untuned.squared[k], inputs.squared[k])
-        shown.add_row(f"rotor {k + 1} [rad/s]", *(f"{math.sqrt(float(x)):.4f}" for x in pair))
+        shown.add_row(f"rotor {k + 1} [rad/s]", *(_speed(float(x)) for x in pair))
     for k in range(2):
         pair = (untuned.forces[k], inputs.forces[k])
         shown.add_row(f"actuator {k + 2} [N]", *(f"{float(x):.6f}" for x in pair))
     shown.add_row("within 5 degrees until [s]", *(f"{t:.3f}" for t in times))
     return found, shown, _figures(command, folder, found, {})
+
+
+def _speed(squared: float) -> str:
+    # a search that was cut short may not have come back to speeds yet
+    return f"{math.sqrt(squared):.4f}" if squared >= 0 else f"none: square {squared:.3g}"
 
 
 def _slew(command: Tune, table: Parameters, folder: Path) -> tuple[Search, Table, list[Path]]:

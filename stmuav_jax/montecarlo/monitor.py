@@ -10,7 +10,7 @@ A signal without rates (reactions, whose rates cost more than the flight) is wat
 alone, as a straight line between them.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -82,7 +82,7 @@ class Crossings(eqx.Module):
         low, high = jnp.zeros_like(curve.a), peak(curve)
         high = jnp.where(curve(high) > 0, high, 1.0)
 
-        def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        def halve(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
             low, high = ends
             middle = 0.5 * (low + high)
             above = curve(middle) > 0

@@ -70,8 +70,8 @@ def test_inputs():
     rotors = lambda forces: next(f for f in forces if hasattr(f, "speed_squared"))
     ratio = rotors(system.forces).speed_squared / rotors(plain).speed_squared
     assert np.asarray(ratio) == pytest.approx([1, 1.1, 1, 1, 1, 1], abs=1e-15)
-    push = [f for f in system.forces if getattr(f, "slider", "") == "slider_3"][0].force
-    before = [f for f in plain if getattr(f, "slider", "") == "slider_3"][0].force
+    push = next(f for f in system.forces if getattr(f, "slider", "") == "slider_3").force
+    before = next(f for f in plain if getattr(f, "slider", "") == "slider_3").force
     t = jnp.asarray(0.03)
     assert float(push(t, None) - before(t, None)) == pytest.approx(0.5)
 

@@ -1,5 +1,7 @@
 """Extremes and crossings between steps, against functions whose own are known."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,7 @@ def watched(f, ts):
     rate = jax.jacfwd(f)
     ts = jnp.asarray(ts)
     monitor = start(ts[0], f(ts[0]), rate(ts[0]))
-    for t0, t1 in zip(ts[:-1], ts[1:], strict=True):
+    for t0, t1 in itertools.pairwise(ts):
         monitor = follow(monitor, t0, t1, f(t1), rate(t1))
     return monitor
 
