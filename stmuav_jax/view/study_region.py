@@ -225,7 +225,7 @@ def _sobol_bars(ax: Axes, one: Finding, names: list[str]) -> None:
         ends = np.maximum([value - part.low[picked], part.high[picked] - value], 0.0)
         ax.barh(np.arange(len(names)) + shift, value, 0.38, xerr=ends, color=colour, label=words,
                 error_kw={"elinewidth": 0.8, "capsize": 1.5})  # fmt: skip
-    ax.set_xlim(left=min(0.0, float(np.min(found.first.low[picked])), -0.02))
+    ax.set_xlim(left=min(1.1 * float(np.min(found.first.low[picked])), -0.02))
     ax.set_xlabel("share of the variance", fontsize=8)
 
 
