@@ -208,7 +208,7 @@ def spearman(
     n = len(values)
     if n < 4:
         raise SettingError(f"A rank correlation needs at least 4 samples, but there are {n}.")
-    ranks = [_varying(scipy.stats.rankdata(x), "A rank correlation") for x in (*inputs.T, values)]
+    ranks = [_varying(scipy.stats.rankdata(x), "Rank correlations") for x in (*inputs.T, values)]
     r = np.clip(np.corrcoef(np.stack(ranks))[-1, :-1], -1.0, 1.0)  # round-off
     half = scipy.stats.norm.ppf(0.5 + level / 2) * np.sqrt((1 + r**2 / 2) / (n - 3))
     # whole correlations have infinite arctanh, and no interval but themselves
@@ -238,7 +238,7 @@ def regression(
     columns = [*inputs.T, values]
     if ranks:
         columns = [scipy.stats.rankdata(x) for x in columns]
-    checked = [_varying(x, "A linear fit") for x in columns]
+    checked = [_varying(x, "Linear fits") for x in columns]
     scaled = np.stack([(x - np.mean(x)) / np.std(x) for x in checked], axis=1)
     solution, _, rank, _ = np.linalg.lstsq(scaled[:, :-1], scaled[:, -1])
     if rank < d:

@@ -44,7 +44,7 @@ def test_intervals_of_mean_and_deviation_cover_the_truth(name):
     """Nominally 95 %; skew distributions lose a few per cent at n = 300."""
     draw, middle, spread = DRAWS[name]
     rng = np.random.default_rng(1)
-    tries = [draw(rng, 300) for _ in range(1500)]
+    tries = [draw(rng, 300) for _ in range(800)]
     covered(np.array([inside(mean(y), middle) for y in tries]), 0.94, 0.96)
     least = 0.93 if name == "exponential" else 0.94
     covered(np.array([inside(deviation(y), spread) for y in tries]), least, 0.965)
