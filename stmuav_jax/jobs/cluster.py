@@ -5,10 +5,12 @@ which alone writes the store, with two chunks for each worker on the way at a ti
 memory, and a worker that dies loses only what it was computing, which another computes again.
 """
 
+import asyncio
 import contextlib
 import os
 import uuid
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -17,11 +19,16 @@ from ..mechanics.errors import SettingError, SimulationError
 from ..montecarlo.work import AbstractWork
 from ..view.store import Store
 from .compute import MEMORY, Piece, chunk_size
-from .keep import Keeper, New, Report, begin
+from .keep import Keeper, New, Report, begin, there
 from .progress import Outcome, Standing
 
 # Chunks on the way for each thread of a worker: one computed, one waiting.
 _AHEAD = 2
+_CACHE = (
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)
 # Times that a chunk is tried again when it fails on a worker.
 _RETRIES = 2
 
@@ -57,10 +64,11 @@ def run_on_cluster(
         SimulationError: the scheduler was lost, a chunk's workers died again and again, or a
             single sample does not fit in memory. What was written is kept.
     """
+    there(path, resume=resume)
     interrupted = False
     with (
         _client(scheduler, workers, patience) as client,
-        _shipped(client, work) as name,
+        _shipped(client, work, ours=scheduler is None) as name,
     ):
 
         def new() -> New:
@@ -109,44 +117,70 @@ def _client(scheduler: str | None, workers: int | None, patience: float) -> Iter
         raise SettingError(
             f"The scheduler {scheduler} has its own workers; their number ({workers}) is not given."
         )
-    try:
-        client = distributed.Client(scheduler, timeout=patience, set_as_default=False)
-    except (OSError, ValueError, ImportError) as error:
-        raise SettingError(
-            f"No Dask scheduler answers at {scheduler} within {patience:g} s ({error})."
-        ) from error
-    with client:
+    with _reached(scheduler, patience) as client:
         yield client
+
+
+def _reached(scheduler: str, patience: float) -> Any:
+    """A client of a scheduler that is there."""
+    distributed = _distributed()
+    try:
+        kind = _kind_at(scheduler, patience)
+        if kind == "Scheduler":
+            return distributed.Client(scheduler, timeout=patience, set_as_default=False)
+    # whatever answers there may answer anything
+    except Exception as error:
+        why = f"{type(error).__name__} {error}".strip()
+        raise SettingError(
+            f"No Dask scheduler answers at '{scheduler}' within {patience:g} s ({why})."
+        ) from error
+    raise SettingError(f"At '{scheduler}' is a Dask {kind}; a scheduler's address is wanted.")
+
+
+def _kind_at(address: str, patience: float) -> str:
+    """What answers at an address; a Client would wait for ever for one that says nothing."""
+    distributed = _distributed()
+
+    async def identify() -> str:
+        security = distributed.Security().get_connection_args("client")
+        async with distributed.rpc(address, connection_args=security) as remote:
+            return str((await remote.identity())["type"])
+
+    # in a thread of its own, since that of a notebook has a loop already
+    with ThreadPoolExecutor(1) as aside:
+        return aside.submit(asyncio.run, asyncio.wait_for(identify(), patience)).result()
 
 
 def _local_cluster(workers: int | None) -> Any:
     distributed = _distributed()
-    count = len(os.sched_getaffinity(0)) if workers is None else workers
+    from dask.system import CPU_COUNT
+
+    count = CPU_COUNT if workers is None else workers
     if count < 1:
         raise SettingError(f"A cluster needs 1 worker or more, not {count}.")
     one = dict.fromkeys(
         ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"), "1"
     )
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=1"
-    cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    kept = {"JAX_COMPILATION_CACHE_DIR": cache} if cache else {}
+    # what one worker compiles others find, where this process keeps compiled code
+    kept = {name.upper(): str(value) for name in _CACHE if (value := getattr(jax.config, name))}
     return distributed.LocalCluster(
         n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1",
         # a study's memory is bounded by its chunks; limits would have workers killed for JAX's own
-        dashboard_address=None, memory_limit=None, silence_logs="ERROR",
+        memory_limit=None, dashboard_address="127.0.0.1:0", silence_logs="ERROR",
         env=one | kept | {"XLA_FLAGS": flags.strip()},
     )  # fmt: skip
 
 
 @contextlib.contextmanager
-def _shipped(client: Any, work: AbstractWork) -> Iterator[str]:
+def _shipped(client: Any, work: AbstractWork, *, ours: bool) -> Iterator[str]:
     """The work on all workers, those that join later among them; the name it has there."""
     from .shipped import Shipped
 
     name = f"stmuav-{uuid.uuid4().hex}"
     x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
     try:
-        client.register_plugin(Shipped(work, x64=x64), name=name)
+        client.register_plugin(Shipped(work, x64=x64, ours=ours), name=name)
     except Exception as error:
         raise SettingError(
             f"The workers of {client.scheduler.address} cannot take the study; do they have "

@@ -26,6 +26,19 @@ class New(NamedTuple):
     versions: Mapping[str, str]
 
 
+def there(path: str | os.PathLike[str], *, resume: bool) -> bool:
+    """Whether there is a store, or something else.
+
+    Raises:
+        FileError: there is, and `resume` is not set.
+    """
+    target = Path(path)
+    found = target.exists() and not (target.is_dir() and not any(target.iterdir()))
+    if found and not resume:
+        raise FileError(f"{target} exists; go on with it (resume), or give another name.")
+    return found
+
+
 def begin(
     work: AbstractWork,
     path: str | os.PathLike[str],
@@ -47,10 +60,8 @@ def begin(
         SettingError: a chunk other than the store's, or fewer samples than it has.
     """
     target = Path(path)
-    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+    if not there(target, resume=resume):
         return create(target, work, total, *new())
-    if not resume:
-        raise FileError(f"{target} exists; go on with it (resume), or give another name.")
     versions = read_layout(target)[0].versions if elsewhere else None
     store = resume_store(target, work, versions)
     try:

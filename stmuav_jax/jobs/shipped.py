@@ -2,12 +2,13 @@
 
 import functools
 import hashlib
+import signal
 import threading
 from collections.abc import Mapping
 
 import cloudpickle
 import jax
-from distributed import get_worker
+from distributed import Worker, get_worker
 from distributed.diagnostics.plugin import WorkerPlugin
 
 from ..mechanics.errors import SettingError
@@ -39,12 +40,22 @@ class _Made:
 
 
 class Shipped(WorkerPlugin):
-    """A study's work, sent once to each worker there is, and to each that joins later."""
+    """A study's work, sent once to each worker there is, and to each that joins later.
 
-    def __init__(self, work: AbstractWork, *, x64: bool) -> None:
+    Attributes:
+        x64: whether JAX computes in double precision. ours: whether we have started the workers.
+    """
+
+    def __init__(self, work: AbstractWork, *, x64: bool, ours: bool) -> None:
         self.content = cloudpickle.dumps(work)
         self.key = hashlib.sha256(self.content).hexdigest()
-        self.x64 = x64
+        self.x64, self.ours = x64, ours
+
+    def setup(self, worker: Worker) -> None:
+        """On a worker, as it is told of the study."""
+        if self.ours and threading.current_thread() is threading.main_thread():
+            # Ctrl-C reaches all processes of a terminal; the one that owns the workers ends them
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def made(self) -> _Made:
         """The work in this process, made when it is first asked for."""

@@ -10,7 +10,7 @@ a record stays true while a chunk that was the last is filled up, whenever that 
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -46,14 +46,13 @@ def write_record(path: Path, chunk: int, record: Record) -> None:
     write_atomically(path / RECORDS / str(chunk) / "zarr.json", content)
 
 
-def read_records(path: Path, layout: Layout) -> dict[int, Record]:
-    """The records of complete chunks, by number.
+def read_records(path: Path, layout: Layout) -> Iterator[tuple[int, Record]]:
+    """The numbers and records of complete chunks, one after another.
 
     Raises:
         FileError: one is damaged, or does not belong to this store.
     """
-    found: dict[int, Record] = {}
-    for file in (path / RECORDS).glob("*/zarr.json"):
+    for file in sorted((path / RECORDS).glob("*/zarr.json")):
         attributes = read_node(file.parent)["attributes"]
         samples, sums = attributes.get("samples"), attributes.get("sha256")
         name = file.parent.name
@@ -68,8 +67,7 @@ def read_records(path: Path, layout: Layout) -> dict[int, Record]:
         if not fits:
             again = _AGAIN.format(folder=file.parent)
             raise FileError(f"{file} is damaged or not of this store. {again}")
-        found[chunk] = Record(samples, sums)
-    return dict(sorted(found.items()))
+        yield chunk, Record(samples, sums)
 
 
 def size(layout: Layout, chunk: int) -> int:
@@ -102,14 +100,14 @@ def read_samples(path: Path, layout: Layout, name: str, chunk: int, samples: int
     return content[: samples * item]
 
 
-def verify(path: Path, layout: Layout, records: Mapping[int, Record], names: Iterable[str]) -> None:
+def verify(path: Path, layout: Layout, names: Iterable[str]) -> None:
     """Compare files of complete chunks with their records.
 
     Raises:
         FileError: names the first that is missing, truncated or altered.
     """
     names = tuple(names)
-    for chunk, record in records.items():
+    for chunk, record in read_records(path, layout):
         for name in names:
             content = read_samples(path, layout, name, chunk, record.samples)
             if hashlib.sha256(content).hexdigest() != record.sums[name]:

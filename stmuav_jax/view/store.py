@@ -44,11 +44,12 @@ class Store:
         layout: samples, identity, versions, columns, axes and reasons.
     """
 
-    def __init__(
-        self, path: Path, layout: Layout, records: Mapping[int, Record], lock: int | None = None
-    ) -> None:
+    def __init__(self, path: Path, layout: Layout, lock: int | None = None) -> None:
         self.path, self.layout = path, layout
-        self._records, self._lock = dict(records), lock
+        self._lock = lock
+        # samples of each chunk; the sums are on disk, else memory would grow with the study
+        self._stored = {chunk: record.samples for chunk, record in read_records(path, layout)}
+        self._finished = sum(self._stored.values())
         self._arrays: dict[str, Any] = {}
 
     def __enter__(self) -> "Store":
@@ -76,7 +77,7 @@ class Store:
     @property
     def finished(self) -> int:
         """Samples that are stored."""
-        return sum(record.samples for record in self._records.values())
+        return self._finished
 
     @property
     def pending(self) -> tuple[int, ...]:
@@ -87,8 +88,7 @@ class Store:
         """The first of a chunk's samples that are missing, and how many they are."""
         if not 0 <= chunk < self.layout.chunks:
             raise SettingError(f"There is no chunk {chunk} among {self.layout.chunks}.")
-        record = self._records.get(chunk)
-        done = 0 if record is None else record.samples
+        done = self._stored.get(chunk, 0)
         return chunk * self.layout.chunk + done, size(self.layout, chunk) - done
 
     def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
@@ -118,11 +118,11 @@ class Store:
                 digest.update(values[name].astype(values[name].dtype.newbyteorder("<")).tobytes())
                 sums[name] = digest.hexdigest()
             flush(chunk_file(self.path, self.layout, name, chunk) for name in values)
-            record = Record(done + count, sums)
-            write_record(self.path, chunk, record)
+            write_record(self.path, chunk, Record(done + count, sums))
         except OSError as error:
             raise self._failed(error) from error
-        self._records[chunk] = record
+        self._stored[chunk] = done + count
+        self._finished += count
 
     def _fitting(
         self, arrays: Mapping[str, np.ndarray], first: int, count: int
@@ -195,7 +195,7 @@ class Store:
         Raises:
             FileError: names a file that is missing, truncated or altered.
         """
-        verify(self.path, self.layout, self._records, self._known(columns))
+        verify(self.path, self.layout, self._known(columns))
 
     def _known(self, columns: Iterable[str] | None) -> tuple[str, ...]:
         known = tuple(self.layout.columns)
@@ -220,12 +220,9 @@ class Store:
         whole = xr.open_zarr(
             self.path, consolidated=False, chunks=None, decode_cf=False, drop_variables=others
         )
-        begins = self.layout.chunk * np.fromiter(self._records, dtype=np.int64)
-        spans = [
-            np.arange(begin, begin + record.samples)
-            for begin, record in zip(begins, self._records.values(), strict=True)
-        ]
-        numbers = np.sort(np.concatenate(spans)) if spans else np.zeros(0, np.int64)
+        begins = [self.layout.chunk * chunk for chunk in sorted(self._stored)]
+        spans = [np.arange(k, k + self._stored[k // self.layout.chunk]) for k in begins]
+        numbers = np.concatenate([np.zeros(0, np.int64), *spans])
         gapless = not numbers.size or numbers[-1] + 1 == numbers.size
         # a slice reads whole chunks; so long as all from the first are there it says the same
         kept = whole.isel({SAMPLE: slice(0, numbers.size) if gapless else numbers})
@@ -287,7 +284,7 @@ def open_store(path: str | os.PathLike[str]) -> Store:
             f"{source} is being extended to {layout.total} samples, or that was broken off; go on "
             "with the study first."
         )
-    return Store(source, layout, read_records(source, layout))
+    return Store(source, layout)
 
 
 def resume_store(
@@ -309,7 +306,7 @@ def resume_store(
             more = f"; and {len(unlike) - 8} more" if len(unlike) > 8 else ""
             raise FileError(f"{source} is of another study: {'; '.join(unlike[:8])}{more}.")
         clean(source)
-        store = Store(source, layout, read_records(source, layout), lock)
+        store = Store(source, layout, lock)
         for name, length in lengths.items():
             if length > layout.total:
                 raise FileError(

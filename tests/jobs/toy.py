@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from stmuav_jax.montecarlo.work import FINE, AbstractWork, Axis, Column
@@ -38,7 +39,7 @@ class Toy(AbstractWork):
     rounds: int = 0  # of products of 64 x 64 matrices, for each 16 samples
     most: int | None = None  # more at once do not fit in memory
     words: str = "Out of memory"
-    fall: tuple[int, str] | None = None  # sample whose process dies while this file is there
+    fall: tuple[int, str] | None = None  # sample whose process dies if this file is there
     together: int = 1
     log: str | None = None  # file that gets a line for each call
 
@@ -73,13 +74,16 @@ class Toy(AbstractWork):
     def run(self, first: int, count: int) -> dict[str, np.ndarray]:
         if self.log is not None:
             with open(self.log, "a") as file:
-                file.write(f"{os.getpid()} {first} {count}\n")
+                threads = os.environ.get("NPROC", "0")
+                file.write(f"{os.getpid()} {first} {count} {threads}\n")
         if self.most is not None and count > self.most:
             raise (MemoryError if self.words == "" else RuntimeError)(self.words)
         if self.fall is not None and first <= self.fall[0] < first + count:
             marker = Path(self.fall[1])
             if marker.exists():
-                marker.unlink()
+                # once, or with something in it always
+                if not marker.read_text():
+                    marker.unlink()
                 os.kill(os.getpid(), signal.SIGKILL)
         if self.pause:
             time.sleep(self.pause)
@@ -103,3 +107,45 @@ def contents(folder: str | os.PathLike[str]) -> dict[str, bytes]:
     """All files of a folder by name."""
     root = Path(folder)
     return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+class Precise(AbstractWork):
+    """x = a third, times the number, in JAX's precision, which the column demands to be double."""
+
+    def __init__(self, log: str | None = None) -> None:
+        self.log = log
+        self.third = jnp.asarray(1.0) / 3.0
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self.log is not None:
+            with open(self.log, "a") as file:
+                file.write(f"made {os.getpid()}\n")
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        return {"what": "thirds"}
+
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        return {
+            "x": Column("float64", "1", "a third of the number"),
+            "status": Column("int8", "1", "how it ended", "status"),
+        }
+
+    @property
+    def axes(self) -> Mapping[str, Axis]:
+        return {}
+
+    @property
+    def reasons(self) -> Mapping[int, str]:
+        return {}
+
+    @property
+    def unit(self) -> int:
+        return 1
+
+    def run(self, first: int, count: int) -> dict[str, np.ndarray]:
+        numbers = jnp.arange(first, first + count) * self.third
+        assert self.third.dtype == numbers.dtype == jnp.float64
+        return {"x": np.asarray(numbers), "status": np.full(count, FINE, np.int8)}
