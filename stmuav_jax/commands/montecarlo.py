@@ -98,12 +98,7 @@ def _table(command: Montecarlo, plain: Mapping[str, Any]) -> Any:
 
 def run_montecarlo(command: Montecarlo) -> int:
     """Run the command; the exit code."""
-    import jax
-
-    if command.scheduler is None and command.workers is None:
-        # before the first array: JAX counts its devices once
-        jax.config.update("jax_num_cpu_devices", command.devices or cores())
-    elif command.scheduler is not None and command.workers is not None:
+    if command.scheduler is not None and command.workers is not None:
         raise SettingError("Give --scheduler or --workers, not both.")
     from ..jobs.cluster import run_on_cluster
     from ..jobs.local import run_study

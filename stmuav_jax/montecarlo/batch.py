@@ -160,10 +160,13 @@ class FlightWork(AbstractWork):
     @cached_property
     def _program(self) -> Any:
         """Blocks (devices, flights of each, .) -> columns of the same shape."""
-        kind = self._mesh.devices.flat[0].platform
+        kind, single = self._mesh.devices.flat[0].platform, self.study.flights.float32
         size = self._block // self._mesh.size
         lanes = self._lanes or LANES.get(kind, LANES_ELSEWHERE)
-        plan = self._plan
+        if single:
+            # JAX keeps NumPy's constants of a trace in the precision of the first that had them
+            jax.clear_caches()
+        plan = self.plan
 
         def share(values: Any, seeds: Any, count: Any) -> dict[str, Any]:
             queue = Drawn(values[0], seeds[0])
@@ -175,7 +178,14 @@ class FlightWork(AbstractWork):
         spread = jax.shard_map(
             share, mesh=self._mesh, in_specs=(over, over, over), out_specs=over, check_vma=False
         )
-        return jax.jit(spread, compiler_options=compiler_options())
+        program = jax.jit(spread, compiler_options=compiler_options())
+        if not single:
+            return program
+        of = lambda dtype, *more: jax.ShapeDtypeStruct((self._mesh.size, *more), dtype)
+        values = of(jnp.float32, size, len(self.study.sampling.names))
+        compiled = program.lower(values, of(jnp.uint32, size), of(jnp.int32)).compile()
+        jax.clear_caches()
+        return compiled
 
     @cached_property
     def _direction(self) -> np.ndarray:
@@ -188,7 +198,8 @@ class FlightWork(AbstractWork):
         return self.study.signals()
 
     @cached_property
-    def _plan(self) -> Plan:
+    def plan(self) -> Plan:
+        """What `lanes.fly` flies, for programs that want its bare results."""
         study, direction = self.study, self._direction
         method = Method(
             formulation=Tree(), solver=_SOLVERS[study.solver](), rtol=study.rtol, atol=study.atol,
@@ -198,7 +209,9 @@ class FlightWork(AbstractWork):
 
         def make(drawn: Drawn) -> tuple[Problem, State]:
             system, state0 = study.flights.build(names, drawn)
-            return prepare(system, method), state0
+            # NumPy's arrays stay in double precision, whatever JAX is set to
+            plain = lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x
+            return jax.tree.map(plain, prepare(system, method)), state0
 
         watched, of = self._watched, self._signals
 
@@ -225,7 +238,7 @@ class FlightWork(AbstractWork):
     def _kept(self, drawn: Drawn, flown: Flown) -> dict[str, Any]:
         """What the store keeps of one flight."""
         study, real = self.study, flown.last.dtype
-        problem, _ = self._plan.make(drawn)
+        problem, _ = self.plan.make(drawn)
         direction = jnp.asarray(self._direction, real)
         watched = list(self._watched)
         fine = flown.ending == Ending.FINE

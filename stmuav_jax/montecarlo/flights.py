@@ -132,7 +132,7 @@ class Flights:
                 raise SettingError(f"'{factor}' has no value in the table that it could multiply.")
             return Entry(factor, (), own[factor])
         match = re.fullmatch(r"([\w.]+)(?:\[([\d, ]+)\])?", factor)
-        if match is None or match[1] not in self.table:
+        if match is None or match[1] not in set(self.table):
             known = [*own, *self.table]
             hint = nearest_names(match[1] if match else factor, known)
             raise SettingError(

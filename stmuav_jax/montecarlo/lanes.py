@@ -49,8 +49,7 @@ class Plan(NamedTuple):
 
     Attributes:
         make: (numbers of one flight) -> prepared problem and consistent start.
-        times: where the state is kept (k,) [s], increasing; t0 comes before and is not among them
-            unless wanted; the last is the end.
+        times: where the state is kept (k,) [s], increasing, from t0 on; the last is the end.
         t0: [s].
         smooth, sharp: (problem, t, y) -> signals to be watched, (q1,) with rates and (q2,) without;
             q = q1 + q2 signals in this order.
@@ -137,13 +136,16 @@ def launch(plan: Plan, numbers: Any) -> Lane:
     fine = jnp.all(jnp.isfinite(carry.y))
     step = carry.step if plan.step is None else jnp.asarray(plan.step, carry.y.dtype)
     zero = jnp.zeros((), int)
+    # a kept time that is the start has been reached
+    reached = sum(bool(t <= plan.t0) for t in plan.times)
     kept = jnp.full((len(plan.times), carry.y.shape[0]), jnp.nan, carry.y.dtype)
+    kept = kept.at[:reached].set(carry.y)
     g, rate = _signals(plan, problem, t0, carry.y)
     monitor = start(t0, g, jnp.pad(rate, (0, g.shape[0] - rate.shape[0])))
     ending = jnp.where(fine, Ending.RUNNING, Ending.NO_START).astype(int)
     return Lane(
         carry.t, carry.y, carry.t + step, carry.solver_state, carry.controller_state,
-        zero, kept, monitor, zero, zero, ending,
+        zero + reached, kept, monitor, zero, zero, ending,
     )  # fmt: skip
 
 
@@ -152,7 +154,10 @@ def attempt(plan: Plan, problem: Problem, lane: Lane) -> Lane:
     solver, terms = problem.solver(), diffrax.ODETerm(problem.field)
     running = lane.ending == Ending.RUNNING
     goal = jnp.asarray(plan.times, lane.t.dtype)[jnp.minimum(lane.place, len(plan.times) - 1)]
-    t0, t1 = lane.t, jnp.where(running, jnp.minimum(lane.next, goal), lane.t)
+    # a constant step that ends at the goal but for round-off ends there
+    near = 0.0 if plan.step is None else 1e-9 * plan.step
+    t0, t1 = lane.t, jnp.where(running & (lane.next < goal - near), lane.next, goal)
+    t1 = jnp.where(running, t1, t0)
     y1, error, _, solver_state, _ = solver.step(
         terms, t0, t1, lane.y, problem.model, lane.solver_state, True
     )

@@ -18,7 +18,8 @@ def precision_error(work: FlightWork, count: int) -> dict[str, tuple[float, str]
     study = work.study
     exact = with_precision(study, float32=False, rtol=1e-10, atol=1e-10)
     single = FlightWork(with_precision(study, float32=True), block=count)
-    low, high = single.run(0, count), FlightWork(exact, block=count).run(0, count)
+    high = FlightWork(exact, block=count).run(0, count)
+    low = single.run(0, count)
     fine = (low["status"] == 1) & (high["status"] == 1)
     found = {}
     for name in study.quantities:

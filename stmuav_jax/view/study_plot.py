@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..montecarlo.statistics import Summary, bands
-from .plot import _STYLES, _figure
+from .plot import STYLES, grid
 from .study_analysis import Analysis, Finding, is_event
 from .study_data import Curve, Quantity, StudyData, label
 
-BLUE, ORANGE, GREEN, BLACK = (colour for colour, _ in _STYLES)
+BLUE, ORANGE, GREEN, BLACK = (colour for colour, _ in STYLES)
 
 # What one figure holds at most.
 PANELS, ROWS, COLUMNS = 18, 4, 5
@@ -38,7 +38,7 @@ def panels(count: int, height: float, columns: int = 2) -> tuple[Figure, list[Ax
     """A figure with `count` panels, in columns; panels that are over are hidden."""
     columns = min(columns, count)
     rows = -(-count // columns)
-    figure, axes = _figure(rows, columns, 0.7 + height * rows)
+    figure, axes = grid(rows, columns, 0.7 + height * rows)
     for ax in axes.flat[count:]:
         ax.set_axis_off()
     return figure, list(axes.flat[:count])
@@ -193,7 +193,7 @@ def scatter(data: StudyData, analysis: Analysis) -> Figure | None:
     strongest = sorted(findings, key=lambda f: -np.max(strength(f), initial=0.0))[:ROWS]
     rows = [f for f in findings if f in strongest]
     names = [name for name in ordered(rows) if name in keys][:COLUMNS] or list(keys)[:COLUMNS]
-    figure, axes = _figure(len(rows), len(names), 1.0 + 1.75 * len(rows))
+    figure, axes = grid(len(rows), len(names), 1.0 + 1.75 * len(rows))
     picked = thinned(len(data.fine), POINTS)
     columns = {name: data.values(keys[name])[picked] for name in names}
     for i, one in enumerate(rows):

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from ..montecarlo.sensitivity import separation
 from ..montecarlo.statistics import convergence, probability
-from .plot import _figure
+from .plot import grid
 from .study_analysis import ROWS, Analysis, Finding, is_event
 from .study_data import Quantity, StudyData
 from .study_plot import (
@@ -68,11 +68,11 @@ def _region(
             f"The 2 of {len(varying)} inputs in whose distribution these samples differ most."
         )
     if len(most) == 1:
-        figure, axes = _figure(1, 1, 3.0)
+        figure, axes = grid(1, 1, 3.0)
         _along(axes[0, 0], x, hits, analysis.level)
     else:
         y, second = columns[most[1]], varying[most[1]]
-        figure, axes = _figure(1, 2, 3.9)
+        figure, axes = grid(1, 2, 3.9)
         notes.append(_sides(axes[0, 0], x, y, hits, words[0]))
         notes[-1] += " In the cells: how many samples there are."
         _map(figure, axes[0, 1], x, y, hits)

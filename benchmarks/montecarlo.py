@@ -1,0 +1,262 @@
+"""Many flights: throughput by lanes, on one core and all, against peers; what store and study cost.
+
+    OPENBLAS_NUM_THREADS=1 python benchmarks/montecarlo.py             writes results/montecarlo.json
+    python benchmarks/montecarlo.py --size one                         the smallest run, for tests
+
+Flights of uav_tracker case 2, 1 s, from starts that differ in the base's velocities (normal, 0.1 m/s
+and 0.1 rad/s). Errors are those of any body's position at the end, over the first flights, against
+runs at a tighter tolerance.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+import numpy as np
+from methods import peers
+from montecarlo_page import write_page
+from record import RESULTS, write
+from timer import measure
+
+import stmuav_jax as sj
+from stmuav_jax.jobs.local import run_study
+from stmuav_jax.montecarlo.batch import FlightWork
+from stmuav_jax.montecarlo.flights import Drawn
+from stmuav_jax.montecarlo.lanes import fly
+from stmuav_jax.montecarlo.study import study_from_plain
+
+# Largest error that counts [m]; peers get finer settings until they reach it.
+WANTED = 1e-6
+
+
+@dataclass(frozen=True)
+class Size:
+    """flights: of a throughput; lanes: tried; checked: with an error; t1 [s]; repeats."""
+
+    flights: int = 1024
+    lanes: tuple[int, ...] = (4, 8, 16, 32, 64, 128)
+    checked: int = 64
+    t1: float = 1.0
+    tolerances: tuple[float, ...] = (1e-7, 3e-8, 1e-8, 3e-9)
+    tight: float = 1e-12
+    repeats: int = 3
+
+
+FULL = Size()
+ONE = Size(flights=4, lanes=(2,), checked=2, t1=0.02, tolerances=(1e-6,), tight=1e-9, repeats=1)
+
+
+def study(size: Size, tolerance: float) -> sj.Study:
+    """The flights, with what a study of them would keep."""
+    normal = {"distribution": "normal", "mean": 0.0, "deviation": 0.1}
+    names = ("vx", "vy", "vz", "p", "q", "r")
+    return study_from_plain(
+        {
+            "name": "throughput", "scene": "uav_tracker", "case": 2, "t1": size.t1, "seed": 1,
+            "rtol": tolerance, "atol": tolerance,
+            "factors": {f"start.{name}": normal for name in names},
+            "quantities": {name: {"signal": name, "take": "final"} for name in "xyz"},
+        }
+    )  # fmt: skip
+
+
+class Bare:
+    """Flights through lanes alone, without a study's columns."""
+
+    def __init__(self, size: Size, tolerance: float, lanes: int) -> None:
+        work = FlightWork(study(size, tolerance))
+        plan, of = work.plan, work.study
+        drawn = of.sampling.draw(0, size.flights)
+        queue = Drawn(jnp.asarray(drawn), jnp.zeros(len(drawn), jnp.uint32))
+        run = lambda queue, count: fly(plan, queue, count, lanes)
+        started = time.perf_counter()
+        self.program = sj.outer_jit(run).lower(queue, jnp.asarray(1)).compile()
+        self.compile_seconds = time.perf_counter() - started
+        self.queue, self.plan = queue, plan
+
+    def fly(self, count: int) -> Any:
+        """The first flights."""
+        return jax.block_until_ready(self.program(self.queue, jnp.asarray(count)))
+
+    def ends(self, count: int) -> np.ndarray:
+        """Positions of all bodies at the end (count, n, 3) [m]."""
+        last = self.fly(count).last[:count]
+
+        def positions(drawn: Drawn, y: Any) -> Any:
+            problem, _ = self.plan.make(drawn)
+            method = problem.method
+            return method.formulation.to_state(problem.model, y[: problem.n_state]).r
+
+        first = jax.tree.map(lambda x: x[:count], self.queue)
+        return np.asarray(jax.jit(jax.vmap(positions))(first, last))
+
+    def starts(self, count: int) -> sj.State:
+        """Consistent starts (count, n, .)."""
+        first = jax.tree.map(lambda x: x[:count], self.queue)
+        return jax.jit(jax.vmap(lambda drawn: self.plan.make(drawn)[1]))(first)
+
+
+def errors(ends: np.ndarray, exact: np.ndarray) -> dict[str, float]:
+    """Median and largest error [m]."""
+    off = np.linalg.norm(ends[: len(exact)] - exact[: len(ends)], axis=-1).max(-1)
+    return {"median_error": float(np.median(off)), "largest_error": float(np.max(off))}
+
+
+def tolerance_for(size: Size, exact: np.ndarray) -> tuple[float, list[dict[str, Any]]]:
+    """The loosest tolerance whose largest error is small enough; and what was tried."""
+    tried = []
+    for tolerance in size.tolerances:
+        ends = Bare(size, tolerance, 16).ends(len(exact))
+        tried.append({"tolerance": tolerance, **errors(ends, exact)})
+        print(f"  tolerance {tolerance:g}: {tried[-1]}", flush=True)
+        if tried[-1]["largest_error"] <= WANTED:
+            break
+    return tried[-1]["tolerance"], tried
+
+
+def by_lanes(size: Size, tolerance: float) -> list[dict[str, Any]]:
+    """Flights per second for numbers of lanes."""
+    rows = []
+    for lanes in size.lanes:
+        bare = Bare(size, tolerance, lanes)
+        timing, flown = measure(lambda b=bare: b.fly(size.flights), repeats=size.repeats, warm_up=1)
+        attempts = int(np.sum(flown.accepted) + np.sum(flown.rejected))
+        rows.append(
+            {
+                "lanes": lanes,
+                "per_second": size.flights / timing.median,
+                "seconds": timing.to_dict(),
+                "compile_seconds": bare.compile_seconds,
+                "microseconds_per_step": 1e6 * timing.median / attempts,
+                "failed": int(np.sum(np.asarray(flown.ending) != 1)),
+            }
+        )
+        print(f"  {lanes} lanes: {rows[-1]['per_second']:.1f} per second", flush=True)
+    return rows
+
+
+def of_peers(size: Size, bare: Bare, exact: np.ndarray) -> list[dict[str, Any]]:
+    """Throughput of peers that offer it, by their settings."""
+    rows: list[dict[str, Any]] = []
+    states, scene = bare.starts(size.checked), sj.make_scene("uav_tracker", 2)
+    for peer in peers()[0]:
+        offered = getattr(peer, "throughput", None)
+        if offered is None:
+            continue
+        for setting in peer.settings():
+            try:
+                rate, ends = offered(scene, states, size.t1, setting)
+            except Exception as error:
+                rows.append({"method": peer.name, "failure": str(error).splitlines()[0]})
+                break
+            found = errors(ends, exact)
+            rows.append(
+                {
+                    "method": peer.name, "solver": setting.solver, "step": setting.step,
+                    "tolerance": setting.tolerance, "per_second": rate, "failure": "", **found,
+                }
+            )  # fmt: skip
+            print(
+                f"  {peer.name} {setting.tolerance or setting.step}: {rate:.1f}, {found}",
+                flush=True,
+            )
+            if found["largest_error"] <= WANTED or len(exact) / rate > 30:
+                break
+    return rows
+
+
+def on_devices(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
+    """A study's flights per second on so many cores, bare and with the store, in a new process."""
+    given = [sys.executable, __file__, "--devices", str(devices), "--tolerance", str(tolerance)]
+    given += ["--size", "full" if size == FULL else "one"]
+    done = subprocess.run(given, capture_output=True, text=True, check=True)
+    row = json.loads(done.stdout.splitlines()[-1])
+    print(f"  {devices} cores: {row}", flush=True)
+    return row
+
+
+def child(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
+    """What `on_devices` runs: the same flights by bare calls, and as a study with its store."""
+    jax.config.update("jax_num_cpu_devices", devices)
+    count = size.flights * devices
+    work = FlightWork(study(size, tolerance), block=count)
+    work.run(0, 2)
+    bare, stored = [], []
+    for repeat in range(size.repeats):
+        started = time.perf_counter()
+        work.run(0, count)
+        bare.append(time.perf_counter() - started)
+        with tempfile.TemporaryDirectory() as folder:
+            started = time.perf_counter()
+            run_study(work, Path(folder) / "study.zarr", count, chunk=count)
+            stored.append(time.perf_counter() - started)
+        del repeat
+    return {
+        "devices": devices,
+        "flights": count,
+        "per_second": count / float(np.median(bare)),
+        "per_second_stored": count / float(np.median(stored)),
+        "overhead": float(np.median(np.array(stored) / np.array(bare))) - 1,
+    }
+
+
+def run(size: Size) -> dict[str, Any]:
+    """Everything."""
+    tight = Bare(size, size.tight, 16)
+    exact = tight.ends(size.checked)
+    tolerance, tried = tolerance_for(size, exact)
+    rows = by_lanes(size, tolerance)
+    best = max(rows, key=lambda row: row["per_second"])
+    alone = Bare(size, tolerance, 1)
+    few = min(64, size.flights)
+    single, _ = measure(lambda: alone.fly(few), repeats=size.repeats)
+    cores = sorted({1, os.cpu_count() or 1})
+    return {
+        "what": "flights per second, uav_tracker case 2",
+        "t1": size.t1,
+        "flights": size.flights,
+        "wanted_error": WANTED,
+        "tolerance": tolerance,
+        "tried": tried,
+        "rows": rows,
+        "best_lanes": best["lanes"],
+        "one_lane_per_second": few / single.median,
+        "peers": of_peers(size, tight, exact),
+        "cores": [on_devices(size, tolerance, count) for count in cores],
+    }
+
+
+def main() -> None:
+    """Run what was asked for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--size", choices=("full", "one"), default="full")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--page", type=Path)
+    parser.add_argument("--devices", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--tolerance", type=float, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    size = FULL if options.size == "full" else ONE
+    if options.devices:
+        print(json.dumps(child(size, options.tolerance, options.devices)))
+        return
+    path = write("montecarlo", run(size), options.results)
+    print(path)
+    page = options.page or (Path(__file__).parents[1] / "docs" / "throughput.md")
+    if size == FULL or options.page:
+        print(write_page(path, page))
+
+
+if __name__ == "__main__":
+    main()
