@@ -99,6 +99,16 @@ from .mechanics.load import Load, Sine
 from .mechanics.sampled import Sampled
 from .mechanics.state import Kinematics, State
 from .mechanics.system import System
+from .montecarlo.batch import FlightWork
+from .montecarlo.distribution import Distribution
+from .montecarlo.distribution import from_plain as distribution_from_plain
+from .montecarlo.estimates import EstimationStudy, EstimationWork
+from .montecarlo.flights import Flights, flights
+from .montecarlo.precision import precision_error
+from .montecarlo.ready import READY, make_work, ready
+from .montecarlo.sampling import Sampling, sampling_from_plain
+from .montecarlo.study import Quantity, Study, study_from_plain
+from .montecarlo.work import AbstractWork, Axis, Column
 from .scenes.registry import SCENES, make_scene
 from .scenes.spin import spin_exact
 from .scenes.uav_tracker import uav_flyer
@@ -171,45 +181,47 @@ __version__ = "0.1.0"
 
 # fmt: off
 __all__ = [
-    "GROUND", "PART_I", "PART_II", "PART_III", "PRINTED_ORIENTATIONS", "SCENES",
-    "AbstractInternalForce", "Accelerations", "Air", "AirframeDrag", "Allocation",
-    "AllocationReason", "Angle", "AppliedForce", "AppliedMoment", "Assembly", "Augmented",
-    "Baumgarte", "Body", "CaseStudy", "Certificate", "Composite", "Coordinates", "Cubature",
-    "Cubature5", "Day", "Drag", "EndStop", "Energy", "Envelope", "Estimate", "EstimationError",
-    "Evaluation", "Filtered", "Flaws", "Flight", "Flyer", "Friction", "Gaussian", "Gravity",
+    "GROUND", "PART_I", "PART_II", "PART_III", "PRINTED_ORIENTATIONS", "READY", "SCENES",
+    "AbstractInternalForce", "AbstractWork", "Accelerations", "Air", "AirframeDrag", "Allocation",
+    "AllocationReason", "Angle", "AppliedForce", "AppliedMoment", "Assembly", "Augmented", "Axis",
+    "Baumgarte", "Body", "CaseStudy", "Certificate", "Column", "Composite", "Coordinates",
+    "Cubature", "Cubature5", "Day", "Distribution", "Drag", "EndStop", "Energy", "Envelope",
+    "Estimate", "EstimationError", "EstimationStudy", "EstimationWork", "Evaluation", "Filtered",
+    "Flaws", "Flight", "FlightWork", "Flights", "Flyer", "Friction", "Gaussian", "Gravity",
     "Gusts", "IdentifiabilityError", "Identified", "Innovation", "Inputs", "Joint",
     "JointDamping", "JointEffort", "JointFriction", "JointLoads", "JointServo", "KinematicPath",
     "Kinematics", "Limits", "Linear", "LinearActuator", "LinearSpringDamper", "Linearised",
     "Load", "Loop", "Method", "ModelError", "Motor", "MotorRotors", "Moved", "Observability",
-    "OnlineFilter", "Parameter", "Parameters", "PathReason", "Place", "Projection", "Rank",
-    "Reactions", "Reason", "Rodas5P", "Rotation", "RotorLimits", "Rotors", "Run", "Sampled",
-    "Scene", "Search", "SearchReason", "Sensor", "Servo", "SettingError", "SimulationError",
-    "Sine", "SlewLimits", "Smoothed", "SpanningTree", "State", "StateError", "StateSpaceModel",
-    "Stops", "Sun", "SunReason", "System", "TorsionalSpringDamper", "TrackerGeometry",
-    "Trajectory", "Tree", "Trim", "TrimLimits", "TrimReason", "Tuned", "Tuning", "Turbulence",
-    "Unknown", "Unscented", "Unstabilised", "Vector", "Wind", "World", "aim", "allocate",
-    "angles_from_strokes", "angular_velocity", "assemble", "at_rest", "attitude",
-    "attitude_model", "attitude_space", "autocorrelation", "centre_of_mass", "check_lift",
-    "chi2_interval", "choose_solver", "climb", "compiler_options", "conjugate",
-    "consistent_tuning", "cruise", "cylindrical", "distance", "drive", "driven",
-    "driver_efforts", "dryden", "energy", "envelope", "estimate_case", "euler",
+    "OnlineFilter", "Parameter", "Parameters", "PathReason", "Place", "Projection", "Quantity",
+    "Rank", "Reactions", "Reason", "Rodas5P", "Rotation", "RotorLimits", "Rotors", "Run",
+    "Sampled", "Sampling", "Scene", "Search", "SearchReason", "Sensor", "Servo", "SettingError",
+    "SimulationError", "Sine", "SlewLimits", "Smoothed", "SpanningTree", "State", "StateError",
+    "StateSpaceModel", "Stops", "Study", "Sun", "SunReason", "System", "TorsionalSpringDamper",
+    "TrackerGeometry", "Trajectory", "Tree", "Trim", "TrimLimits", "TrimReason", "Tuned",
+    "Tuning", "Turbulence", "Unknown", "Unscented", "Unstabilised", "Vector", "Wind", "World",
+    "aim", "allocate", "angles_from_strokes", "angular_velocity", "assemble", "at_rest",
+    "attitude", "attitude_model", "attitude_space", "autocorrelation", "centre_of_mass",
+    "check_lift", "chi2_interval", "choose_solver", "climb", "compiler_options", "conjugate",
+    "consistent_tuning", "cruise", "cylindrical", "distance", "distribution_from_plain", "drive",
+    "driven", "driver_efforts", "dryden", "energy", "envelope", "estimate_case", "euler",
     "euler_parameter_rate", "evaluate", "extended_model", "extended_noise", "filter_bank",
-    "flight_model", "follow", "from_matrix", "from_rotation_vector", "gaussian", "growth",
-    "hold", "holding_time", "hover", "hover_model", "hover_speed_squared", "identify",
+    "flight_model", "flights", "follow", "from_matrix", "from_rotation_vector", "gaussian",
+    "growth", "hold", "holding_time", "hover", "hover_model", "hover_speed_squared", "identify",
     "identify_many", "inconsistent", "inertia_about_centre", "inertia_matrix", "inertia_states",
     "initial_angles", "integrate", "internal_names", "joint_loads", "joint_reactions",
     "kalman_filter", "kinematic_path", "kvaerno3", "kvaerno5", "linearize", "low_altitude",
-    "make_scene", "matrix_g", "matrix_l", "mean_interval", "momentum", "moved", "nees",
-    "normalise", "observability", "observable_model", "outer_jit", "panel_angles",
-    "panel_normal", "path_nees", "peaks", "posture", "predict", "product", "rank", "ranks",
-    "report_model", "report_prior", "report_tuning", "resolved_loads", "revolute",
-    "revolute_spherical", "rk4", "rotation_matrix", "rotorcraft_model", "run_loads", "search",
-    "sensed_flight", "sensed_sun", "shooting", "simulate", "simulate_case", "simulate_hover",
-    "skew", "slew", "smooth", "smooth_peaks", "spanning_tree", "spectrum", "spherical",
-    "spin_exact", "standard_errors", "states_at", "steady_turn", "strokes", "study_case",
-    "summarise", "sun_at", "sun_direction", "sun_in_body", "sun_position", "survey",
-    "to_rotation_vector", "track_day", "tracker_bodies", "tracker_geometry", "tracker_joints",
-    "tracker_limits", "transition", "translational", "trim", "tune", "uav_flyer", "universal",
-    "unix_time", "update", "weld", "with_internal", "wrench_map",
+    "make_scene", "make_work", "matrix_g", "matrix_l", "mean_interval", "momentum", "moved",
+    "nees", "normalise", "observability", "observable_model", "outer_jit", "panel_angles",
+    "panel_normal", "path_nees", "peaks", "posture", "precision_error", "predict", "product",
+    "rank", "ranks", "ready", "report_model", "report_prior", "report_tuning", "resolved_loads",
+    "revolute", "revolute_spherical", "rk4", "rotation_matrix", "rotorcraft_model", "run_loads",
+    "sampling_from_plain", "search", "sensed_flight", "sensed_sun", "shooting", "simulate",
+    "simulate_case", "simulate_hover", "skew", "slew", "smooth", "smooth_peaks", "spanning_tree",
+    "spectrum", "spherical", "spin_exact", "standard_errors", "states_at", "steady_turn",
+    "strokes", "study_case", "study_from_plain", "summarise", "sun_at", "sun_direction",
+    "sun_in_body", "sun_position", "survey", "to_rotation_vector", "track_day", "tracker_bodies",
+    "tracker_geometry", "tracker_joints", "tracker_limits", "transition", "translational", "trim",
+    "tune", "uav_flyer", "universal", "unix_time", "update", "weld", "with_internal",
+    "wrench_map",
 ]
 # fmt: on

@@ -10,6 +10,7 @@ from nbclient import NotebookClient
 LONG = (
     "02_what_fails_at_half_a_second",
     "07_inputs_by_gradients",
+    "08_parameters_from_a_record",
 )
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 

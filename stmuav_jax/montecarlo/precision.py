@@ -24,7 +24,8 @@ def precision_error(work: FlightWork, count: int) -> dict[str, tuple[float, str]
     found = {}
     for name in study.quantities:
         both = np.isfinite(low[name]) & np.isfinite(high[name])
-        off = np.abs(low[name] - high[name])[fine & both.reshape(len(fine), -1).any(axis=1)]
-        worst = float(np.nanmax(off)) if off.size else float("nan")
+        both[~fine] = False
+        off = np.abs(low[name][both] - high[name][both])
+        worst = float(np.max(off)) if off.size else float("nan")
         found[name] = (worst, single.columns[name].unit)
     return found
