@@ -73,9 +73,13 @@ class FlightWork(AbstractWork):
         """Flights of one compiled call: chunks of a store are best multiples of it."""
         return self._block
 
-    @cached_property
+    @property
     def columns(self) -> Mapping[str, Column]:
         """Drawn numbers, quantities, what the integration says, and the status."""
+        return self._columns
+
+    @cached_property
+    def _columns(self) -> Mapping[str, Column]:
         study, found = self.study, {}
         real = "float64"
         for name in study.sampling.names:
@@ -226,7 +230,8 @@ class FlightWork(AbstractWork):
             return signals
 
         stops = tuple(q.stop for q in watched.values())
-        return Plan(make, study.times, 0.0, watch(True), watch(False), stops, study.step)
+        times: Any = study.times
+        return Plan(make, times, 0.0, watch(True), watch(False), stops, study.step)
 
     @cached_property
     def _watched(self) -> dict[str, Quantity]:

@@ -78,7 +78,7 @@ class _Shift(eqx.Module):
     more: Array
 
     def __call__(self, t: Any, kin: Any) -> Array:
-        first = self.of(t, kin) if callable(self.of) else self.of
+        first: Any = self.of(t, kin) if callable(self.of) else self.of
         return first + self.more
 
 
@@ -207,7 +207,7 @@ class Flights:
         held = self.held
         for k, force in enumerate(forces):
             if isinstance(force, Rotors):
-                squared = force.speed_squared if held is None else held.squared
+                squared: Any = force.speed_squared if held is None else held.squared
                 if held is not None or any(name in values for name in _ROTORS):
                     forces[k] = eqx.tree_at(lambda f: f.speed_squared, force, squared * share)
             elif isinstance(force, LinearActuator):
@@ -221,7 +221,9 @@ class Flights:
         return eqx.tree_at(lambda s: s.forces, system, tuple(forces))
 
     def _start(self, table: Parameters, values: Mapping[str, Array]) -> State:
-        get = lambda name, default=0.0: jnp.asarray(values.get(name, default), dtype=float)
+        def get(name: str, default: Any = 0.0) -> Array:
+            return jnp.asarray(values.get(name, default), dtype=float)
+
         three = lambda *names: jnp.stack([get(f"start.{n}") for n in names])
         r, v, omega = three("x", "y", "z"), three("vx", "vy", "vz"), three("p", "q", "r")
         turns = [
@@ -241,7 +243,7 @@ class Flights:
 
     def nominal(self) -> tuple[System, State]:
         """System and start without anything drawn."""
-        return self.build((), Drawn(np.zeros(0), np.zeros((), int)))
+        return self.build((), Drawn(jnp.zeros(0), jnp.zeros((), jnp.uint32)))
 
     def facing(self) -> np.ndarray:
         """The world direction that the table's panel faces at its start (3,)."""

@@ -1,5 +1,7 @@
 """From drawn numbers to systems and starts."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,11 +69,13 @@ def test_inputs():
     of = flights("uav_tracker", 2)
     plain = of.nominal()[0].forces
     system, state = build(of, input__rotor_2=1.1, input__actuator_3=0.5)
-    rotors = lambda forces: next(f for f in forces if hasattr(f, "speed_squared"))
+    rotors: Any = lambda forces: next(f for f in forces if hasattr(f, "speed_squared"))
     ratio = rotors(system.forces).speed_squared / rotors(plain).speed_squared
     assert np.asarray(ratio) == pytest.approx([1, 1.1, 1, 1, 1, 1], abs=1e-15)
-    push = next(f for f in system.forces if getattr(f, "slider", "") == "slider_3").force
-    before = next(f for f in plain if getattr(f, "slider", "") == "slider_3").force
+    force: Any = lambda forces: (
+        next(f for f in forces if getattr(f, "slider", "") == "slider_3").force
+    )
+    push, before = force(system.forces), force(plain)
     t, kin = jnp.asarray(0.03), system.kinematics(state)
     assert float(push(t, kin) - before(t, kin)) == pytest.approx(0.5)
 
