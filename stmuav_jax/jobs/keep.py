@@ -131,7 +131,9 @@ class Keeper:
         self.tell()
 
     def outcome(self, *, interrupted: bool) -> Outcome:
-        """What the run came to."""
+        """What the run came to; nothing can be kept after it."""
+        # Ctrl-C may have come before a chunk that was handed over could be noted as such
+        self._thread.shutdown(wait=True)
         done = self.store.finished
         return Outcome(
             self.store.path, done, self.store.total, done - self._before,

@@ -150,9 +150,9 @@ class Store:
         import zarr
 
         if name not in self._arrays:
-            array = zarr.open_array(str(self.path / name), mode="r+", zarr_format=3)
             # else a chunk in which all is missing would have no file
-            self._arrays[name] = array.with_config({"write_empty_chunks": True})
+            with zarr.config.set({"array.write_empty_chunks": True}):
+                self._arrays[name] = zarr.open_array(str(self.path / name), mode="r+")
         return self._arrays[name]
 
     def _failed(self, error: OSError) -> FileError:
@@ -265,9 +265,11 @@ def create(
         target.parent.mkdir(parents=True, exist_ok=True)
         write_layout(partial, layout)
         os.replace(partial, target)
-    except OSError as error:
+    except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
-        raise FileError(f"{target} cannot be made: {error}.") from error
+        if isinstance(error, OSError):
+            raise FileError(f"{target} cannot be made: {error}.") from error
+        raise
     return resume_store(target, work, versions)
 
 

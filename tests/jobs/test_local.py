@@ -8,6 +8,7 @@ import threading
 import time
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jobs.toy import Toy, contents
@@ -135,6 +136,20 @@ def test_chunks_that_do_not_fit(tmp_path, whole, words, most, limits):
     assert [now.note for now in seen if now.note] == list(outcome.notes)
     calls = [int(line.split()[2]) for line in (tmp_path / "log").read_text().splitlines()]
     assert [count for count in calls if count > most] == [150, *limits[:-1]]
+
+
+def test_what_jax_says_of_memory(tmp_path):
+    """JAX itself, asked for 800 TB for more than 10 samples."""
+
+    class Large(Toy):
+        def run(self, first, count):
+            if count > 10:
+                jnp.zeros(10**14).block_until_ready()
+            return Toy.run(self, first, count)
+
+    outcome = run_study(Large(), tmp_path / "study.zarr", 80, chunk=40)
+    assert outcome.done == 80
+    assert "20 samples at once do not fit in memory; going on with 10" in outcome.notes[0]
 
 
 def test_a_sample_that_does_not_fit(tmp_path):

@@ -21,6 +21,7 @@ from jobs.toy import Toy, contents
 from stmuav_jax.mechanics.errors import SettingError
 from stmuav_jax.montecarlo.work import AbstractWork, Axis, Column
 from stmuav_jax.view import chunks as chunks_module
+from stmuav_jax.view import layout as layout_module
 from stmuav_jax.view import store as store_module
 from stmuav_jax.view.io import FileError
 from stmuav_jax.view.store import create, open_store, resume_store
@@ -443,6 +444,26 @@ def test_a_full_disk_is_said_and_survived(whole, tmp_path, monkeypatch):
                     store.write(chunk, WORK.run(*store.todo(chunk)))
             fill(store, order=(chunk,))
     assert contents(path) == contents(whole)
+
+
+def test_a_store_that_cannot_be_made(tmp_path, monkeypatch):
+    def interrupted(folder, layout):
+        layout_module.write_layout(folder, layout)
+        raise KeyboardInterrupt
+
+    cases = (
+        (zarr.storage.LocalStore, "set", _full, FileError),
+        (store_module, "write_layout", interrupted, KeyboardInterrupt),
+    )
+    for where, name, what, seen in cases:
+        with monkeypatch.context() as patch:
+            patch.setattr(where, name, what)
+            with pytest.raises(seen):
+                create(tmp_path / "study.zarr", WORK, 10, 5)
+        assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").touch()
+    with pytest.raises(FileError, match=r"file/study\.zarr cannot be made"):
+        create(tmp_path / "file" / "study.zarr", WORK, 10, 5)
 
 
 def _full(*_, **__):
