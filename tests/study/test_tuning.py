@@ -151,7 +151,8 @@ def test_identification(case):
     assert np.all(np.abs(found.values - case.truth) < 4 * found.deviations)
     assert np.max(found.deviations / case.sizes) < 0.15
     assert 0.8 < found.misfit < 1.2
-    assert found.search.loss < 1e-2 * found.search.history[0]
+    # what is left is the record's noise
+    assert 30 * found.search.loss < found.search.history[0]
 
 
 def test_what_cannot_be_told_is_named():
