@@ -104,6 +104,7 @@ from .montecarlo.distribution import Distribution
 from .montecarlo.distribution import from_plain as distribution_from_plain
 from .montecarlo.estimates import EstimationStudy, EstimationWork
 from .montecarlo.flights import Flights, flights
+from .montecarlo.gradient import final_gradients
 from .montecarlo.precision import precision_error
 from .montecarlo.ready import READY, make_work, ready
 from .montecarlo.sampling import Sampling, sampling_from_plain
@@ -204,7 +205,7 @@ __all__ = [
     "check_lift", "chi2_interval", "choose_solver", "climb", "compiler_options", "conjugate",
     "consistent_tuning", "cruise", "cylindrical", "distance", "distribution_from_plain", "drive",
     "driven", "driver_efforts", "dryden", "energy", "envelope", "estimate_case", "euler",
-    "euler_parameter_rate", "evaluate", "extended_model", "extended_noise", "filter_bank",
+    "euler_parameter_rate", "evaluate", "extended_model", "extended_noise", "filter_bank", "final_gradients",
     "flight_model", "flights", "follow", "from_matrix", "from_rotation_vector", "gaussian",
     "growth", "hold", "holding_time", "hover", "hover_model", "hover_speed_squared", "identify",
     "identify_many", "inconsistent", "inertia_about_centre", "inertia_matrix", "inertia_states",

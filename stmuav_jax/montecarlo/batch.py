@@ -136,11 +136,7 @@ class FlightWork(AbstractWork):
         """One block, filled up to its size by flights that are not flown."""
         count, size = len(drawn), self._block
         values = np.concatenate([drawn, np.zeros((size - count, drawn.shape[1]))])
-        seeds = np.zeros(size, np.uint32)
-        seeds[:count] = [
-            np.random.SeedSequence((self.study.sampling.seed, first + k)).generate_state(1)[0]
-            for k in range(count if self.study.flights.gusts else 0)
-        ] or 0
+        seeds = np.concatenate([self.seeds(first, count), np.zeros(size - count, np.uint32)])
         devices = self._mesh.size
         shares = np.array([len(range(d, count, devices)) for d in range(devices)], np.int32)
         # flights go to the devices in turn, so that all have as many
@@ -153,6 +149,13 @@ class FlightWork(AbstractWork):
         )
         gather = lambda x: np.asarray(x).swapaxes(0, 1).reshape(size, *x.shape[2:])[:count]
         return {k: gather(v) for k, v in flown.items()}
+
+    def seeds(self, first: int, count: int) -> np.ndarray:
+        """Of the flights' own noise (count,): zeros where they have none."""
+        if not self.study.flights.gusts:
+            return np.zeros(count, np.uint32)
+        own = lambda k: np.random.SeedSequence((self.study.sampling.seed, k)).generate_state(1)[0]
+        return np.array([own(first + k) for k in range(count)], np.uint32)
 
     @cached_property
     def _mesh(self) -> Mesh:
@@ -192,7 +195,7 @@ class FlightWork(AbstractWork):
         return compiled
 
     @cached_property
-    def _direction(self) -> np.ndarray:
+    def direction(self) -> np.ndarray:
         """That the panel should face, world (3,)."""
         of = self.study
         return np.asarray(of.flights.facing() if of.direction is None else of.direction)
@@ -204,7 +207,7 @@ class FlightWork(AbstractWork):
     @cached_property
     def plan(self) -> Plan:
         """What `lanes.fly` flies, for programs that want its bare results."""
-        study, direction = self.study, self._direction
+        study, direction = self.study, self.direction
         method = Method(
             formulation=Tree(), solver=_SOLVERS[study.solver](), rtol=study.rtol, atol=study.atol,
             max_steps=study.max_steps, adjoint=diffrax.ForwardMode(),
@@ -244,7 +247,7 @@ class FlightWork(AbstractWork):
         """What the store keeps of one flight."""
         study, real = self.study, flown.last.dtype
         problem, _ = self.plan.make(drawn)
-        direction = jnp.asarray(self._direction, real)
+        direction = jnp.asarray(self.direction, real)
         watched = list(self._watched)
         fine = flown.ending == Ending.FINE
         value = lambda name, t, y: self._signals[name].of(View(problem, t, y, direction))
