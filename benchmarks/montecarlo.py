@@ -45,11 +45,11 @@ WANTED = 1e-6
 class Size:
     """flights: of a throughput; lanes: tried; checked: with an error; t1 [s]; repeats."""
 
-    flights: int = 1024
-    lanes: tuple[int, ...] = (4, 8, 16, 32, 64, 128)
+    flights: int = 512
+    lanes: tuple[int, ...] = (8, 16, 32, 64)
     checked: int = 64
     t1: float = 1.0
-    tolerances: tuple[float, ...] = (1e-7, 3e-8, 1e-8, 3e-9)
+    tolerances: tuple[float, ...] = (1e-8, 3e-9, 1e-9)
     tight: float = 1e-12
     repeats: int = 3
 
