@@ -91,10 +91,11 @@ class FlightWork(AbstractWork):
             unit, words = quantity.column(of)
             dims = ("time",) if quantity.take == "path" else ()
             found[name] = Column(real, unit, words, "quantity", dims)
-        found["end"] = Column(real, "s", "where the flight ended")
-        found["steps"] = Column("int32", "1", "steps accepted")
-        found["rejected"] = Column("int32", "1", "steps rejected")
-        found["residual"] = Column(real, "m", "largest constraint residual at any step")
+        note: Any = "diagnostic"
+        found["end"] = Column(real, "s", "where the flight ended", note)
+        found["steps"] = Column("int32", "1", "steps accepted", note)
+        found["rejected"] = Column("int32", "1", "steps rejected", note)
+        found["residual"] = Column(real, "m", "largest constraint residual at any step", note)
         found["status"] = Column("int8", "1", "how the flight ended", "status")
         return found
 

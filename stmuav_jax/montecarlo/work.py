@@ -16,14 +16,15 @@ class Column(NamedTuple):
     Attributes:
         dtype: of its numbers, such as "float64" or "int8".
         unit: in SI units; "1" where there is none. words: what it is, for tables and figures.
-        role: "input" was drawn, "quantity" was computed, "status" says how the sample ended.
+        role: "input" was drawn, "quantity" was computed, "diagnostic" is kept but not reported,
+            "status" says how the sample ended.
         dims: names of further axes after the samples', which `Axis` gives.
     """
 
     dtype: str
     unit: str
     words: str
-    role: Literal["input", "quantity", "status"] = "quantity"
+    role: Literal["input", "quantity", "diagnostic", "status"] = "quantity"
     dims: tuple[str, ...] = ()
 
 
