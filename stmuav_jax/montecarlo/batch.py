@@ -22,7 +22,7 @@ from .study import Quantity, Study, column_name
 from .work import AbstractWork, Axis, Column
 
 # Flights that go on together on one device: on a CPU as many as fit its cache, by measurement
-# (docs/benchmarks.md); a GPU wants thousands.
+# (docs/throughput.md); a GPU wants thousands.
 LANES = {"cpu": 16}
 LANES_ELSEWHERE = 4096
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..mechanics.errors import SettingError, nearest_names
+from ..vehicle.airframe import PART_II
 from ..vehicle.parameters import Parameters
 from .batch import FlightWork
 from .estimates import EstimationStudy, EstimationWork
@@ -31,7 +32,8 @@ def _start(spread: float) -> dict[str, Any]:
         "distribution": "uniform", "low": middle - spread, "high": middle + spread,
     }  # fmt: skip
     return {
-        "start.phi": around(-0.2674), "start.theta": around(-0.3088),
+        "start.phi": around(PART_II.value("posture.phi")),
+        "start.theta": around(PART_II.value("posture.theta")),
         "start.phi_rate": _normal(2 * spread), "start.theta_rate": _normal(2 * spread),
         "start.roll": _normal(spread / 2), "start.pitch": _normal(spread / 2),
         "start.p": _normal(spread), "start.q": _normal(spread), "start.r": _normal(spread),
@@ -73,7 +75,7 @@ _TOLERANCES = {
     "mass.panel_7": _share(0.01),
     "geometry.rods": _share(0.001),
     "geometry.arms": _share(0.001),
-    "geometry.panel_com[2]": {"distribution": "normal", "mean": 0.0012, "deviation": 2e-4},
+    "geometry.panel_com[2]": _normal(2e-4, mean=PART_II.value("geometry.panel_com")[2]),
 } | {
     f"input.rotor_{k}": {"distribution": "normal", "mean": 1.0, "deviation": 0.005}
     for k in range(1, 7)
