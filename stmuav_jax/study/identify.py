@@ -11,7 +11,7 @@ not fitted.
 Source: L. Ljung, System Identification (1999), ch. 9.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ from ..mechanics.errors import ModelError, SettingError, check_finite
 from ..vehicle.flyer import Coordinates, Flyer, Inputs
 from ..vehicle.kinematics import strokes
 from ..vehicle.parameters import Parameters
-from .search import Search, all_at_once, search
+from .search import Search, search
 
 Predict = Callable[[Float[Array, " p"]], Float[Array, "k m"]]
 
@@ -75,6 +75,10 @@ class Identified:
     strengths: Float[np.ndarray, " p"]
     misfit: float
     search: Search
+
+    def within(self, truth: Numbers, deviations: float = 3.0) -> bool:
+        """Whether every value lies within so many deviations of a known truth (p,)."""
+        return bool(np.all(np.abs(self.values - np.asarray(truth)) <= deviations * self.deviations))
 
 
 def table_with(table: Parameters, unknowns: Sequence[Unknown], q: Float[Array, " p"]) -> Parameters:
@@ -145,21 +149,27 @@ def flight_model(
     return predict
 
 
-def whitened(
-    predict: Predict,
-    record: Float[Array, "k m"],
-    sigma: Float[Array, " m"],
-    start: Float[Array, " p"],
-    sizes: Float[Array, " p"],
-) -> Callable[[Float[Array, " p"]], Float[Array, "k m"]]:
-    """Residuals in deviations, as a function of changes from the start in units of the sizes."""
-    return lambda z: (predict(start + sizes * z) - record) / sigma
+class Misfit(eqx.Module):
+    """Residuals (k, m) of a record in deviations, as a function of z (p,), q = start + sizes z.
+
+    One compiled search serves all records of a flight: only `predict` is compiled in.
+    """
+
+    predict: Predict
+    record: Float[Array, "k m"]
+    sigma: Float[Array, " m"]
+    start: Float[Array, " p"]
+    sizes: Float[Array, " p"]
+
+    def __call__(self, z: Float[Array, " p"]) -> Float[Array, "k m"]:
+        return (self.predict(self.start + self.sizes * z) - self.record) / self.sigma
 
 
 @eqx.filter_jit
-def _at(residuals: Callable[[Any], Any], z: Array) -> tuple[Array, Array]:
-    """Residuals (n,) and their Jacobian (n, p)."""
-    r, J = residuals(z), jax.jacfwd(residuals)(z)
+def _at(residuals: Misfit, z: Float[Array, " p"]) -> tuple[Float[Array, " n"], Float[Array, "n p"]]:
+    """Residuals and their Jacobian."""
+    push = lambda e: jax.jvp(residuals, (z,), (e,))
+    r, J = jax.vmap(push, out_axes=(None, -1))(jnp.eye(z.shape[0], dtype=z.dtype))
     return r.reshape(-1), J.reshape(-1, z.shape[0])
 
 
@@ -220,50 +230,68 @@ def identify(
     if isinstance(start, Mapping):
         labels, start = tuple(start), list(start.values())
     q0 = jnp.asarray(start, dtype=float)
-    names = tuple(labels) if labels is not None else tuple(f"q_{k}" for k in range(len(q0)))
+    names = tuple(labels) if labels is not None else _numbered(len(q0))
     _check(predict, record, sigma, q0, sizes, names)
-    scale = jnp.asarray(sizes, dtype=float)
-    residuals = whitened(predict, jnp.asarray(record), jnp.asarray(sigma), q0, scale)
-    zero = jnp.zeros_like(q0)
-    check_identifiable(np.asarray(_at(residuals, zero)[1]), names, weakest)
+    numbers = (jnp.asarray(x, dtype=float) for x in (record, sigma, q0, sizes))
+    residuals = Misfit(predict, *numbers)
+    check_identifiable(np.asarray(_at(residuals, jnp.zeros_like(q0))[1]), names, weakest)
+    return _fitted(residuals, names, weakest, steps, report, resume)
+
+
+def identify_many(
+    predict: Predict,
+    records: Float[Array, "s k m"],
+    sigma: Numbers,
+    starts: Numbers,
+    sizes: Numbers,
+    *,
+    labels: Sequence[str] | None = None,
+    weakest: float = 1.0,
+    steps: int = 50,
+) -> Iterator[Identified]:
+    """`identify` for many records of one flight, one after another; compiled once.
+
+    Args:
+        starts: where the searches start, (p,) for all or (s, p).
+
+    Raises:
+        As `identify`; what came before the record that raises has been yielded.
+    """
+    starts = jnp.asarray(starts, dtype=float)
+    starts = jnp.broadcast_to(starts, (len(records), starts.shape[-1]))
+    names = tuple(labels) if labels is not None else _numbered(starts.shape[-1])
+    if not len(records):
+        return
+    _check(predict, records[0], sigma, starts[0], sizes, names)
+    for k, record in enumerate(records):
+        check_finite(record, f"Record {k}", "")
+        numbers = (jnp.asarray(x, dtype=float) for x in (record, sigma, starts[k], sizes))
+        yield _fitted(Misfit(predict, *numbers), names, weakest, steps, None, None)
+
+
+def _fitted(
+    residuals: Misfit,
+    names: tuple[str, ...],
+    weakest: float,
+    steps: int,
+    report: Callable[[Search], None] | None,
+    resume: Search | None,
+) -> Identified:
+    zero = jnp.zeros_like(residuals.start)
     method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
     found = search(residuals, zero, method, steps=steps, report=report, resume=resume)
     r, J = (np.asarray(x) for x in _at(residuals, found.values))
     strengths = check_identifiable(J, names, weakest)
-    inner = np.linalg.inv(J.T @ J)
-    covariance = np.asarray(scale)[:, None] * inner * np.asarray(scale)
-    misfit = float(r @ r) / max(r.size - len(q0), 1)
-    values = np.asarray(q0 + scale * found.values)
+    scale = np.asarray(residuals.sizes)
+    covariance = scale[:, None] * np.linalg.inv(J.T @ J) * scale
+    misfit = float(r @ r) / max(r.size - len(scale), 1)
+    values = np.asarray(residuals.start + scale * found.values)
     deviations = np.sqrt(np.diag(covariance))
     return Identified(names, values, covariance, deviations, strengths, misfit, found)
 
 
-@eqx.filter_jit
-def identify_many(
-    predict: Predict,
-    records: Float[Array, "s k m"],
-    sigma: Float[Array, " m"],
-    start: Float[Array, " p"],
-    sizes: Float[Array, " p"],
-    steps: int = 15,
-) -> tuple[Float[Array, "s p"], Float[Array, "s p"], Float[Array, " s"]]:
-    """Values and deviations for many records of one flight, and whether each search converged."""
-    method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
-
-    def one(record: Array) -> tuple[Array, Array, Array]:
-        residuals = all_at_once(whitened(predict, record, sigma, start, sizes))
-        solution = optx.least_squares(
-            lambda z, _: residuals(z), method, jnp.zeros_like(start), max_steps=steps, throw=False
-        )
-        J = jax.jacfwd(residuals)(solution.value).reshape(-1, start.shape[0])
-        deviations = sizes * jnp.sqrt(jnp.diagonal(jnp.linalg.inv(J.T @ J)))
-        return (
-            start + sizes * solution.value,
-            deviations,
-            solution.result == optx.RESULTS.successful,
-        )
-
-    return jax.vmap(one)(records)
+def _numbered(count: int) -> tuple[str, ...]:
+    return tuple(f"q_{k}" for k in range(count))
 
 
 def _check(

@@ -120,6 +120,12 @@ class _Stepper(eqx.Module):
         return after, eqx.filter(state, eqx.is_array), known, loss, done
 
 
+# Jitted, so that a second search of a function of the same form does not trace it again.
+@eqx.filter_jit
+def _called(function: Callable[[Any], Any], values: Any) -> Any:
+    return function(values)
+
+
 def search(
     function: Callable[[Any], Any],
     start: PyTree[Any],
@@ -154,7 +160,8 @@ def search(
         _check_form(resume.values, values)
         values = resume.values
     shape = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), jax.eval_shape(function, values)
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype),
+        eqx.filter_eval_shape(_called, function, values),
     )
     stepper = _Stepper(function, method, shape)
     return _go(stepper, values, resume, steps, patience, gain, report)

@@ -40,6 +40,7 @@ from ..vehicle.geometry import close_loops, turn_by_angles
 from ..vehicle.kinematics import panel_angles, parallel_margin, strokes
 from ..vehicle.placement import turn_about
 from ..vehicle.rotor import Rotors
+from .newton import Newton
 
 # Largest residual that counts as a trim [m/s^2], [rad/s^2].
 TOLERANCE = 1e-10
@@ -254,15 +255,18 @@ def _found(setting: _Setting, limits: TrimLimits) -> Trim:
     flyer = setting.flyer
     weight = _weight(flyer)
     start = jnp.zeros(8).at[2].set(weight)
-    solver = optx.Newton(rtol=1e-12, atol=1e-12)
     solution = optx.root_find(
-        _residual, solver, start, args=setting, max_steps=_MOST_STEPS, throw=False
+        _residual,
+        Newton(atol=0.1 * TOLERANCE),
+        start,
+        args=setting,
+        max_steps=_MOST_STEPS,
+        throw=False,
     )
-    z = solution.value
-    r, J = _with_jacobian(*jax.lax.stop_gradient((z, setting)))
+    z, last = solution.value, jax.lax.stop_gradient(solution.state)
     # in units of a radian, the weight, and the weight times a metre
     sizes = jnp.where(jnp.arange(8) < 2, 1.0, jax.lax.stop_gradient(weight))
-    values = jnp.linalg.svd(J * sizes, compute_uv=False)
+    values = jnp.linalg.svd(last.J * sizes, compute_uv=False)
     at = _point(z[:2], setting.wanted)
     B = _map(flyer, at)
     squared = least(B, z[2:6])
@@ -271,7 +275,7 @@ def _found(setting: _Setting, limits: TrimLimits) -> Trim:
         # the same wrench, so the same accelerations
         given = allocate(B, z[2:6], limits.rotors)
         squared, missed = given.squared, given.reason != AllocationReason.VALID
-    inputs, left = Inputs(squared, z[6:]), jnp.max(jnp.abs(r))
+    inputs, left = Inputs(squared, z[6:]), last.size
     reason = first_reason(
         (~(_margin(flyer, at.angles) > 0), TrimReason.POSTURE),
         (missed, TrimReason.ROTOR_LIMIT),
@@ -283,15 +287,6 @@ def _found(setting: _Setting, limits: TrimLimits) -> Trim:
     speeds = jnp.where(turning, jnp.sqrt(jnp.where(turning, squared, 1.0)), 0.0)
     steps = solution.stats["num_steps"]
     return Trim(at, inputs, speeds, left, values[-1] / values[0], reason, steps)
-
-
-def _with_jacobian(
-    z: Float[Array, "8"], setting: _Setting
-) -> tuple[Float[Array, "8"], Float[Array, "8 8"]]:
-    """Residuals and their Jacobian, in one pass."""
-    push = lambda e: jax.jvp(lambda z: _residual(z, setting), (z,), (e,))
-    r, J = jax.vmap(push, out_axes=(0, -1))(jnp.eye(8))
-    return r[0], J
 
 
 def _margin(flyer: Flyer, angles: Float[Array, "2"]) -> Float[Array, ""]:

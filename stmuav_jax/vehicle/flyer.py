@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import (
@@ -22,7 +23,7 @@ from ..algebra.rotation import (
     rotation_matrix,
     to_rotation_vector,
 )
-from ..dynamics.coordinates import split
+from ..dynamics.coordinates import join, split
 from ..dynamics.stabilisation import Unstabilised
 from ..dynamics.tree import Tree, TreeModel
 from ..mechanics.errors import ModelError
@@ -34,6 +35,10 @@ from .geometry import TrackerGeometry
 from .kinematics import angle_motion, panel_angles, stroke_jacobian
 from .placement import posture
 from .rotor import Rotors
+
+
+# Euler parameters of the world's axes.
+_LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 class Coordinates(NamedTuple):
@@ -157,12 +162,16 @@ class Flyer(eqx.Module):
         """
         model = self.model() if model is None else model
         model = replace(model, system=self.with_inputs(inputs))
-        tree = Tree()
-        x = tree.to_vector(model, self.state(at))
+        tree, spanned = Tree(), model.chain.tree
+        # the joints' coordinates are the same wherever the base is and however it moves
+        still = at._replace(p=jnp.asarray(_LEVEL), v=jnp.zeros(3), omega=jnp.zeros(3))
+        inside = split(spanned, tree.to_vector(model, self.state(still)))
+        column = lambda x: x[:, None]
+        x = join(inside._replace(p=column(at.p), v=column(at.v), omega=column(at.omega)))
         rate, _ = tree.derivative(model, jnp.asarray(t, x.dtype), x, Unstabilised())
-        found = split(model.chain.tree, rate)
+        found = split(spanned, rate)
         joints = [self.system.joint_index(name) for name in SLIDER_JOINTS]
-        place = {s.joint: k for k, s in enumerate(model.chain.tree.steps)}
+        place = {s.joint: k for k, s in enumerate(spanned.steps)}
         slides = jnp.stack([found.u[place[j]] for j in joints])
         J = stroke_jacobian(self.geometry, at.angles)
         moving = angle_motion(self.geometry, at.angles, J @ at.rates, slides)
