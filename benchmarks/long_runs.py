@@ -14,7 +14,7 @@ from trial import compiled, ready, rounded, timed
 
 import stmuav_jax as sj
 from stmuav_jax.dynamics.explicit import coefficients
-from stmuav_jax.dynamics.integrate import prepare
+from stmuav_jax.dynamics.problem import prepare
 
 GAIN = 10.0  # 1/s, of Baumgarte's feedback: the package's default
 

@@ -24,7 +24,7 @@ from .dynamics.dense import states_at
 from .dynamics.energy import Energy, energy, momentum
 from .dynamics.formulation import Accelerations, Reactions
 from .dynamics.initial import Assembly, Rank, assemble, rank, ranks
-from .dynamics.integrate import Method, Trajectory, integrate
+from .dynamics.integrate import Trajectory, integrate
 from .dynamics.prescribed import (
     KinematicPath,
     PathReason,
@@ -32,6 +32,7 @@ from .dynamics.prescribed import (
     driver_efforts,
     kinematic_path,
 )
+from .dynamics.problem import Method
 from .dynamics.reactions import joint_reactions
 from .dynamics.rosenbrock import Rodas5P
 from .dynamics.run import Certificate, Run

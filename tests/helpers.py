@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import stmuav_jax as sj
-from stmuav_jax.dynamics.integrate import begin, prepare
+from stmuav_jax.dynamics.problem import begin, prepare
 
 GRAVITY = 9.81
 

@@ -15,7 +15,7 @@ from ..mechanics.system import System, check_state
 from .augmented import Augmented, Model
 from .energy import energy, momentum
 from .formulation import AbstractFormulation, Accelerations, Reactions
-from .integrate import at_internal
+from .problem import at_internal
 from .reactions import Frame, in_joint_axes
 from .stabilisation import Unstabilised
 

@@ -13,7 +13,8 @@ from ..mechanics.errors import SettingError
 from ..mechanics.internal import with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .integrate import Method, integrate
+from .integrate import integrate
+from .problem import Method
 from .run import Run
 
 

@@ -11,6 +11,12 @@ from jaxtyping import Array, Float
 Vector = Float[Array, " k"]
 
 
+class Recorded(diffrax.LocalLinearInterpolation):
+    """Linear interpolation of a step that is kept with the slopes of its stages (s, k)."""
+
+    slopes: Array
+
+
 class Lean(diffrax.AbstractAdaptiveSolver):
     """The steps of an explicit Runge-Kutta method of diffrax, without what dense output needs.
 
@@ -30,7 +36,7 @@ class Lean(diffrax.AbstractAdaptiveSolver):
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return diffrax.LocalLinearInterpolation
+        return Recorded
 
     def order(self, terms: Any) -> int | None:
         return self.method.order(terms)
@@ -73,7 +79,7 @@ class Lean(diffrax.AbstractAdaptiveSolver):
         slopes, _ = jax.lax.scan(stage, start, table)
         y1 = y0 + h * jnp.sum(b[:, None] * slopes, axis=0)
         error = h * jnp.sum(b_error[:, None] * slopes, axis=0)
-        dense_info = {"y0": y0, "y1": y1}
+        dense_info = {"y0": y0, "y1": y1, "slopes": slopes}
         return y1, error, dense_info, None, diffrax.RESULTS.successful
 
 

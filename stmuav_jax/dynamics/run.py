@@ -9,7 +9,8 @@ from jaxtyping import ArrayLike
 
 from ..mechanics.state import State
 from .analysis import Snapshot
-from .integrate import Method, Trajectory
+from .integrate import Trajectory
+from .problem import Method
 from .scene import Scene
 
 

@@ -23,7 +23,8 @@ from .augmented import Augmented, Model
 from .certify import certify
 from .formulation import AbstractFormulation
 from .initial import Rank, rank_of
-from .integrate import Event, Method, Trajectory, advance, begin, prepare
+from .integrate import Trajectory, advance
+from .problem import Event, Method, begin, prepare
 from .run import Run
 from .scene import Scene
 from .stabilisation import AbstractStabilisation, Projection

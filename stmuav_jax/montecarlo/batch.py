@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from ..algebra.compiler import compiler_options
-from ..dynamics.integrate import Method, Problem, prepare
+from ..dynamics.problem import Method, Problem, prepare
 from ..dynamics.tree import Tree
 from ..mechanics.errors import SettingError, SimulationError
 from ..mechanics.state import State

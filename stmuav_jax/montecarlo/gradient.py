@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..dynamics.integrate import begin, integrate
+from ..dynamics.integrate import integrate
+from ..dynamics.problem import begin
 from ..mechanics.errors import SettingError
 from .batch import FlightWork
 from .flights import Drawn

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..dynamics.integrate import Problem, begin
+from ..dynamics.problem import Problem, begin
 from ..mechanics.state import State
 from .monitor import Monitor, follow, start
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ..algebra.rotation import rotation_matrix
 from ..dynamics.energy import energy
 from ..dynamics.formulation import Reactions
-from ..dynamics.integrate import Problem, at_internal
+from ..dynamics.problem import Problem, at_internal
 from ..mechanics.errors import SettingError, nearest_names
 from ..mechanics.state import State
 from ..mechanics.system import System

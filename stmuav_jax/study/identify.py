@@ -25,7 +25,8 @@ from jaxtyping import Array, Float
 
 from ..algebra.rotation import conjugate, product, to_rotation_vector
 from ..algebra.shapes import Numbers
-from ..dynamics.integrate import Method, integrate
+from ..dynamics.integrate import integrate
+from ..dynamics.problem import Method
 from ..mechanics.errors import ModelError, SettingError, check_finite
 from ..vehicle.flyer import Coordinates, Flyer, Inputs
 from ..vehicle.kinematics import strokes

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from ..algebra.shapes import Numbers
 from ..dynamics.dense import between
 from ..dynamics.formulation import AbstractFormulation, Reactions
-from ..dynamics.integrate import at_internal
+from ..dynamics.problem import at_internal
 from ..dynamics.reactions import in_joint_axes
 from ..dynamics.run import Run
 from ..dynamics.stabilisation import Unstabilised

@@ -44,7 +44,9 @@ class Newton(optx.AbstractRootFinder):
         del fn, args, options, f_struct, aux_struct, tags
         n = y.shape[0]
         J = jnp.zeros((n, n), y.dtype)
-        return NewtonState(y, jnp.zeros_like(y), J, jnp.full((), jnp.inf, y.dtype), jnp.array(False))
+        return NewtonState(
+            y, jnp.zeros_like(y), J, jnp.full((), jnp.inf, y.dtype), jnp.array(False)
+        )
 
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: NewtonState, tags: Any

@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 
 from ..algebra.rotation import rotation_matrix
 from ..dynamics.analysis import evaluate
-from ..dynamics.integrate import Method, integrate
+from ..dynamics.integrate import integrate
+from ..dynamics.problem import Method
 from ..dynamics.tree import Tree
 from ..mechanics.errors import ModelError, SettingError
 from ..mechanics.force import Gravity

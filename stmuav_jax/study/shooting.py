@@ -24,7 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..dynamics.integrate import Method, integrate
+from ..dynamics.integrate import integrate
+from ..dynamics.problem import Method
 from ..mechanics.errors import SettingError
 from ..mechanics.system import System
 from ..vehicle.flyer import Coordinates, Flyer, displacement, shifted

@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 
 from ..algebra.rotation import to_rotation_vector
 from ..algebra.shapes import Numbers
-from ..dynamics.integrate import Method, integrate
+from ..dynamics.integrate import integrate
+from ..dynamics.problem import Method
 from ..dynamics.reactions import in_joint_axes
 from ..dynamics.stabilisation import Unstabilised
 from ..dynamics.tree import Tree

@@ -36,7 +36,6 @@ from .kinematics import angle_motion, panel_angles, stroke_jacobian
 from .placement import posture
 from .rotor import Rotors
 
-
 # Euler parameters of the world's axes.
 _LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -10,7 +10,7 @@ import pytest
 from helpers import pendulum, relative_error, swung
 
 import stmuav_jax as sj
-from stmuav_jax.dynamics.integrate import prepare
+from stmuav_jax.dynamics.problem import prepare
 from stmuav_jax.dynamics.solvers import Remembering, error_norm
 
 SYSTEM = pendulum()

@@ -19,7 +19,7 @@ from closed_forms import moving, scene
 from jax import Array
 
 import stmuav_jax as sj
-from stmuav_jax.dynamics.integrate import begin, prepare
+from stmuav_jax.dynamics.problem import begin, prepare
 
 MASS = 15.0  # kg
 INERTIA = (0.234375, 0.46875, 0.234375)  # kg m^2

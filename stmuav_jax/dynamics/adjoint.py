@@ -1,0 +1,164 @@
+"""Reverse mode through an explicit method: steps kept on the way, gone through backwards.
+
+With slopes k_i = f(t_i, y_i), y_i = y + h sum_j a_ij k_j of a step from y to y1 = y + h sum b_i k_i,
+and l the derivative of what is wanted by y1, the derivatives by the slopes follow from the last
+stage to the first,
+
+    K_i = h (b_i l + sum_j a_ji L_j),    L_i = (df/dy)^T K_i,    derivative by y: l + sum_i L_i.
+
+Accepted steps are kept with their slopes, so nothing is done again but the right-hand side that
+each derivative starts from, and rejected steps cost nothing. Step sizes count as given: by the end
+and the start of an integration it is differentiated as the flow is.
+
+Source: E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006), ch. VI.10.2
+(adjoint equations of Runge-Kutta methods).
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .explicit import Lean, coefficients
+from .problem import Carry, Counts, Landing, Problem, landing
+
+
+def recordable(problem: Problem) -> bool:
+    """Whether `recorded` serves: explicit methods, no event."""
+    return isinstance(problem.solver().solver, Lean)
+
+
+def recorded(problem: Problem, carry: Carry, t1: Float[Array, ""], kept: int) -> Landing:
+    """Integrate to t1 [s]; differentiated in reverse by its steps, at most `kept` of them."""
+    bare = eqx.tree_at(lambda p: p.model, problem, None)
+    start = _Start(problem.model, carry.y, carry.t, t1)
+    memory = (carry.step, carry.solver_state, carry.controller_state)
+    found = _recorded(start, _still(bare), _still(memory), kept)
+    y = found.y
+    # the time reached moves with that of the end, and with nothing else
+    found, stop = _still(found._replace(y=None)), jax.lax.stop_gradient
+    return found._replace(y=y, t=found.t + (t1 - stop(t1)))
+
+
+def _still(tree: Any) -> Any:
+    """All arrays held still; truth values too, which in a loop have a derivative of their own."""
+    still = lambda x: jax.lax.stop_gradient(x.astype(float)).astype(x.dtype)
+    return jax.tree.map(lambda x: still(x) if eqx.is_array(x) else x, tree)
+
+
+class _Start(NamedTuple):
+    """What a landing is differentiated by."""
+
+    model: Any
+    y: Float[Array, " k"]
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
+
+
+class _Steps(NamedTuple):
+    """Accepted steps, the first `count` of n rows: from ts[i] and ys[i] to ts[i + 1]."""
+
+    count: Int[Array, ""]
+    ts: Float[Array, " n+1"]
+    ys: Float[Array, "n k"]
+    slopes: Float[Array, "n s k"]
+    end: Float[Array, " k"]
+
+
+def _begun(start: _Start, problem: Problem, memory: Any) -> tuple[Problem, Carry]:
+    problem = eqx.tree_at(lambda p: p.model, problem, start.model, is_leaf=lambda x: x is None)
+    none = jnp.zeros((), int)
+    carry = Carry(start.t0, start.y, *memory, Counts(none, none), diffrax.RESULTS.successful)
+    return problem, carry
+
+
+@eqx.filter_custom_vjp
+def _recorded(start: _Start, problem: Problem, memory: Any, kept: int) -> Landing:
+    del kept
+    problem, carry = _begun(start, problem, memory)
+    return landing(problem.solve(carry, start.t1, diffrax.ForwardMode()))
+
+
+@_recorded.def_fwd
+def _forward(
+    perturbed: Any, start: _Start, problem: Problem, memory: Any, kept: int
+) -> tuple[Landing, _Steps]:
+    del perturbed
+    problem, carry = _begun(start, problem, memory)
+    solution = problem.solve(carry, start.t1, diffrax.ForwardMode(), max_steps=kept, dense=True)
+    found: Any = solution.interpolation
+    inner = found.infos["inner"]
+    end = landing(solution)
+    if kept < problem.method.max_steps:
+        # derivatives of part of the way would be wrong: not a number says so
+        over = end.result == diffrax.RESULTS.max_steps_reached
+        end = end._replace(y=jnp.where(over, jnp.nan, end.y))
+    return end, _Steps(end.accepted, found.ts, inner["y0"], inner["slopes"], end.y)
+
+
+@_recorded.def_bwd
+def _backward(
+    steps: _Steps,
+    wanted: Landing,
+    perturbed: Any,
+    start: _Start,
+    problem: Problem,
+    memory: Any,
+    kept: int,
+) -> _Start:
+    del memory, kept
+    arrays, rest = eqx.partition(start.model, eqx.is_inexact_array)
+    field = lambda t, y, args: problem.field(t, y, eqx.combine(args, rest))
+    last = jnp.zeros_like(steps.end) if wanted.y is None else wanted.y
+    last = jnp.where(jnp.isnan(steps.end), jnp.nan, last)
+    zero = jax.tree.map(jnp.zeros_like, arrays)
+
+    def back(at: tuple[Any, ...]) -> tuple[Any, ...]:
+        i, by_end, by_model = at
+        by_start, more = _step_back(problem, arrays, rest, steps, i, by_end)
+        return i - 1, by_start, jax.tree.map(jnp.add, by_model, more)
+
+    begin = (steps.count - 1, last, zero)
+    _, first, by_model = jax.lax.while_loop(lambda at: at[0] >= 0, back, begin)
+    by_t0, by_t1 = None, None
+    if perturbed.t0:
+        by_t0 = -jnp.vdot(first, field(start.t0, start.y, arrays))
+    if perturbed.t1:
+        by_t1 = jnp.vdot(last, field(start.t1, steps.end, arrays))
+    none = jax.tree.map(lambda _: None, rest)
+    return _Start(eqx.combine(by_model, none), first, by_t0, by_t1)  # pyright: ignore
+
+
+def _step_back(
+    problem: Problem, arrays: Any, rest: Any, steps: _Steps, i: Int[Array, ""], by_end: Array
+) -> tuple[Array, Any]:
+    """Derivatives by the start of step i and by the model's numbers, from those by its end."""
+    solver = problem.solver()
+    A, b, _, c = coefficients(solver.solver.method)  # pyright: ignore
+    t, y, slopes = steps.ts[i], steps.ys[i], steps.slopes[i]
+    t1 = steps.ts[i + 1]
+    h = t1 - t
+    by_model = jax.tree.map(jnp.zeros_like, arrays)
+    if solver.project is not None:
+        y1 = y + h * jnp.sum(b[:, None] * slopes, axis=0)
+        project = lambda y, args: solver.project(t1, y, eqx.combine(args, rest))[0]  # pyright: ignore
+        _, pull = jax.vjp(project, y1, arrays)
+        by_end, by_model = pull(by_end)
+
+    def stage(now: tuple[Any, Any], at: tuple[Any, ...]) -> tuple[Any, None]:
+        by_slopes, by_model = now
+        row, column, weight, share, number = at
+        y_i = y + h * jnp.sum(row[:, None] * slopes, axis=0)
+        field = lambda y, args: problem.field(t + share * h, y, eqx.combine(args, rest))
+        _, pull = jax.vjp(field, y_i, arrays)
+        by_y, more = pull(h * (weight * by_end + jnp.sum(column[:, None] * by_slopes, axis=0)))
+        by_slopes = jax.lax.dynamic_update_index_in_dim(by_slopes, by_y, number, 0)
+        return (by_slopes, jax.tree.map(jnp.add, by_model, more)), None
+
+    table = (*(jnp.asarray(x) for x in (A, A.T, b, c)), jnp.arange(len(b)))
+    begin = (jnp.zeros_like(slopes), by_model)
+    (by_slopes, by_model), _ = jax.lax.scan(stage, begin, table, reverse=True)
+    return by_end + jnp.sum(by_slopes, axis=0), by_model
