@@ -76,22 +76,28 @@ def differences(of: Callable[[Any], Any], count: int) -> tuple[np.ndarray, float
     return twice, float(np.max(np.abs(twice - once[1])) / np.max(np.abs(twice)))
 
 
-def modes(scene: sj.Scene, size: Size) -> dict[str, tuple[Callable[..., Any], int]]:
-    """Name -> (changes, tolerance) -> rows of the Jacobian, and how many rows these are."""
+# What a mode's value is to be, of the whole Jacobian (3, count); None for the simulation itself.
+Wanted = Callable[[np.ndarray], np.ndarray] | None
+
+
+def modes(scene: sj.Scene, size: Size) -> dict[str, tuple[Callable[..., Any], Wanted]]:
+    """Name -> (changes, tolerance) -> value, and what that is to be."""
     n, end = size.parameters, size.gradient_horizon
     ahead = functional(scene, end, n, diffrax.ForwardMode(), 100_000)
     back = functional(scene, end, n, diffrax.RecursiveCheckpointAdjoint(), 100_000)
     height = lambda change, tolerance: back(change, tolerance)[2]
+    one = jnp.ones(n)
+    along = lambda change, tolerance: jax.jvp(lambda c: ahead(c, tolerance), (change,), (one,))[1]
     return {
-        "simulation": (ahead, 0),
-        "forward (jacfwd), all three components": (jax.jacfwd(ahead), 3),
-        "reverse (grad), height": (jax.grad(height), 1),
+        "simulation": (ahead, None),
+        "forward (jvp), one direction": (along, lambda exact: exact.sum(axis=1)),
+        "forward (jacfwd), all three components": (jax.jacfwd(ahead), lambda exact: exact),
+        "reverse (grad), height": (jax.grad(height), lambda exact: exact[2]),
     }
 
 
-def compared(value: Any, rows: int, exact: np.ndarray) -> float:
-    """Largest difference over the largest entry of the same rows."""
-    want = exact if rows == 3 else exact[2]
+def compared(value: Any, want: np.ndarray) -> float:
+    """Largest difference over the largest entry."""
     return float(np.max(np.abs(np.asarray(value) - want)) / np.max(np.abs(want)))
 
 
@@ -103,13 +109,13 @@ def gradient(size: Size, others: list[Peer]) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     exact, own = np.zeros((3, size.parameters)), float("nan")
     base: dict[float, float] = {}
-    for name, (of, count) in modes(scene, size).items():
+    for name, (of, wanted) in modes(scene, size).items():
         try:
             program, seconds = compiled(of, zero, tight)
         except Exception as error:
             rows.append({"mode": name, "failure": reason(error)})
             continue
-        if count == 0:
+        if wanted is None:
             exact, own = differences(lambda c, p=program: p(c, tight), size.parameters)
         for tolerance in size.gradient_tolerances:
             at = jnp.asarray(tolerance)
@@ -123,7 +129,7 @@ def gradient(size: Size, others: list[Peer]) -> dict[str, Any]:
                 "seconds": timing.to_dict(),
                 "compile_seconds": seconds,
                 "cost_in_simulations": timing.median / base[tolerance],
-                "error": compared(value, count, exact) if count else None,
+                "error": None if wanted is None else compared(value, wanted(exact)),
                 "failure": "" if np.all(np.isfinite(value)) else "The gradient is not finite.",
             }
             rows.append(row)

@@ -132,37 +132,36 @@ def _labels(count: int) -> list[tuple[str, str]]:
     return [*names, ("force_2", "N"), ("force_3", "N")]
 
 
-def sensitivities(command: Trim, table: Parameters, limits: Any) -> dict[str, Any]:
-    """Derivatives of the trim by parameters of the table, by name: (unknowns, shape of it)."""
+def _solved(command: Trim, table: Parameters, limits: Any) -> tuple[Any, dict[str, np.ndarray]]:
+    """The trim, and its derivatives by parameters of the table, by name: (unknowns, shape of it)."""
     import jax.numpy as jnp
 
     from ..algebra.compiler import outer_jit
     from ..scenes.uav_tracker import uav_flyer
-    from ..study.trim import trim
+    from ..study.trim import TrimReason, trim
 
+    wanted = wanted_of(command, table)
     values = {name: jnp.asarray(table.value(name), dtype=float) for name in command.by}
 
     def of(values: Any) -> Any:
-        changed = table.replaced(values)
-        found = trim(uav_flyer(changed), wanted_of(command, table), limits, throw=False)
-        return _unknowns(found)
+        found = trim(uav_flyer(table.replaced(values)), wanted, limits, throw=False)
+        return _unknowns(found), found
 
-    return {k: np.asarray(v) for k, v in outer_jit(jax.jacfwd(of))(values).items()}
+    if values:
+        slopes, found = outer_jit(jax.jacfwd(of, has_aux=True))(values)
+        if found.reason == TrimReason.VALID:
+            return found, {k: np.asarray(v) for k, v in slopes.items()}
+    return trim(uav_flyer(table), wanted, limits), {}
 
 
 def run_trim(command: Trim) -> int:
     """Find the trim, print it, write trim.json; the exit code."""
     import json
 
-    from ..scenes.uav_tracker import uav_flyer
-    from ..study.trim import trim
     from ..view.io import versions, write_atomically
 
     table = table_of(command.params)
-    for name in command.by:
-        table.value(name)
-    limits = _limits(command)
-    found = trim(uav_flyer(table), wanted_of(command, table), limits)
+    found, slopes = _solved(command, table, _limits(command))
     unknowns = np.asarray(_unknowns(found))
     labels = _labels(len(found.speeds))
     out = Console()
@@ -181,8 +180,7 @@ def run_trim(command: Trim) -> int:
         "conditioning": float(found.conditioning),
         "versions": versions(),
     }
-    if command.by:
-        slopes = sensitivities(command, table, limits)
+    if slopes:
         content["sensitivities"] = {k: v.tolist() for k, v in slopes.items()}
         for name, slope in slopes.items():
             out.print(_slope_table(name, table, slope, labels))

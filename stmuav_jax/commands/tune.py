@@ -116,11 +116,10 @@ def _hold(command: Tune, table: Parameters, folder: Path) -> tuple[Search, Table
     from ..study.tuning import at_rest, hold, holding_time
     from ..vehicle.flyer import Inputs
     from ..vehicle.geometry import initial_angles
-    from ..vehicle.rotor import Rotors, hover_speed_squared
+    from ..vehicle.rotor import hover_speed_squared
 
     flyer = uav_flyer(table)
-    rotors = flyer.system.forces[flyer.rotors]
-    assert isinstance(rotors, Rotors)
+    rotors = flyer.propellers
     mass = jnp.sum(flyer.system.bodies.mass)
     count = rotors.spin.shape[0]
     equal = hover_speed_squared(mass, table.value("gravity"), rotors.k_f, count)

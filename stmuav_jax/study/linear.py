@@ -5,6 +5,8 @@ small turn in the base's axes, p = p0 (1, dtheta / 2), and the panel's angles:
 
     x = (dr, dtheta, d(phi, theta), dv, domega, d(rates)),   x' = A x + B du,   y = C x + D du.
 
+Motors that lag add the rotors' speeds: k more states.
+
 Source: B. L. Stevens, F. L. Lewis, E. N. Johnson, Aircraft Control and Simulation (2016),
 ch. 3.7 (linearisation), 1.2 (modes, controllability).
 """
@@ -22,6 +24,7 @@ from ..algebra.rotation import from_rotation_vector, rotation_matrix
 from ..dynamics.tree import TreeModel
 from ..mechanics.errors import SettingError, nearest_names
 from ..vehicle.flyer import Coordinates, Flyer, Inputs, shifted
+from ..vehicle.motor import MotorRotors
 
 _XYZ = ("x", "y", "z")
 STATES = (
@@ -58,7 +61,7 @@ class Linear:
     """x' = A x + B u, y = C x + D u, as NumPy arrays that python-control takes as they are.
 
     Attributes:
-        A: (16, 16). B: (16, m). C: (p, 16). D: (p, m).
+        A: (n, n), n = 16 or, with motors that lag, 16 + k. B: (n, m). C: (p, n). D: (p, m).
         states, inputs, outputs: (name, unit) of every row or column.
     """
 
@@ -115,27 +118,36 @@ def rates(
     flyer: Flyer,
     at: Coordinates,
     inputs: Inputs,
-    x: Float[Array, "16"],
+    x: Float[Array, " n"],
     du: Float[Array, " m"],
     model: TreeModel | None = None,
-) -> Float[Array, "16"]:
+) -> Float[Array, " n"]:
     """x' at a small x: what the linear equations approximate, to second order in x and du.
 
     The turn obeys dtheta' = omega - R(dtheta)^T omega0 up to second order.
     """
-    now = shifted(at, x)
+    now = shifted(at, x[:16])
     count = inputs.squared.shape[0]
     push = Inputs(inputs.squared + du[:count], inputs.forces + du[count:])
-    found = flyer.accelerations(now, push, model=model)
+    own, speeds, lag = flyer.propulsion, None, []
+    if isinstance(own, MotorRotors) and own.time_constant is not None:
+        speeds = own.speeds_of(inputs.squared) + x[16:]
+        lag = [(own.speeds_of(push.squared) - speeds) / own.time_constant]
+    found = flyer.accelerations(now, push, model=model, speeds=speeds)
     turned = rotation_matrix(from_rotation_vector(x[3:6])).T @ at.omega
     return jnp.concatenate(
-        [now.v - at.v, now.omega - turned, now.rates, found.v, found.omega, found.angles]
+        [now.v - at.v, now.omega - turned, now.rates, found.v, found.omega, found.angles, *lag]
     )
+
+
+def _states(flyer: Flyer) -> tuple[tuple[str, str], ...]:
+    count = flyer.propellers.spin.shape[0] if flyer.lagging else 0
+    return (*STATES, *((f"speed_{k + 1}", "rad/s") for k in range(count)))
 
 
 def matrices(
     flyer: Flyer, at: Coordinates, inputs: Inputs
-) -> tuple[Float[Array, "16 16"], Float[Array, "16 m"]]:
+) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
     """A and B by forward derivatives; may be differentiated and vmapped."""
     return _matrices(flyer, flyer.model(), at, inputs)
 
@@ -143,11 +155,11 @@ def matrices(
 @eqx.filter_jit
 def _matrices(
     flyer: Flyer, model: TreeModel, at: Coordinates, inputs: Inputs
-) -> tuple[Float[Array, "16 16"], Float[Array, "16 m"]]:
-    count = inputs.squared.shape[0] + 2
-    both = lambda z: rates(flyer, at, inputs, z[:16], z[16:], model)
-    J = jax.jacfwd(both)(jnp.zeros(16 + count))
-    return J[:, :16], J[:, 16:]
+) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
+    count, n = inputs.squared.shape[0] + 2, len(_states(flyer))
+    both = lambda z: rates(flyer, at, inputs, z[:n], z[n:], model)
+    J = jax.jacfwd(both)(jnp.zeros(n + count))
+    return J[:, :n], J[:, n:]
 
 
 def linearize(flyer: Flyer, at: Coordinates, inputs: Inputs, outputs: Any = None) -> Linear:
@@ -160,7 +172,8 @@ def linearize(flyer: Flyer, at: Coordinates, inputs: Inputs, outputs: Any = None
         SettingError: an unknown name.
     """
     A, B = (np.asarray(m) for m in matrices(flyer, at, inputs))
-    names = [name for name, _ in STATES]
+    states = _states(flyer)
+    names = [name for name, _ in states]
     chosen = names if outputs is None else list(outputs)
     for name in chosen:
         if name not in names:
@@ -172,6 +185,6 @@ def linearize(flyer: Flyer, at: Coordinates, inputs: Inputs, outputs: Any = None
     given = [(f"speed_squared_{k + 1}", "rad^2/s^2") for k in range(count)]
     given += [("force_2", "N"), ("force_3", "N")]
     return Linear(
-        A, B, C, np.zeros((len(chosen), B.shape[1])), STATES, tuple(given),
-        tuple(STATES[names.index(name)] for name in chosen),
+        A, B, C, np.zeros((len(chosen), B.shape[1])), states, tuple(given),
+        tuple(states[names.index(name)] for name in chosen),
     )  # fmt: skip

@@ -38,8 +38,8 @@ from ..vehicle.allocation import (
 from ..vehicle.flyer import Coordinates, Flyer, Inputs
 from ..vehicle.geometry import close_loops, turn_by_angles
 from ..vehicle.kinematics import panel_angles, parallel_margin, strokes
+from ..vehicle.motor import MotorRotors
 from ..vehicle.placement import turn_about
-from ..vehicle.rotor import Rotors
 from .newton import Newton
 
 # Largest residual that counts as a trim [m/s^2], [rad/s^2].
@@ -56,6 +56,7 @@ class TrimReason(IntEnum):
     ROTOR_STOPPED = 3
     ROTOR_LIMIT = 4
     ACTUATOR_LIMIT = 5
+    ROTOR_MOMENTUM = 6
 
 
 class Wanted(NamedTuple):
@@ -186,10 +187,8 @@ def _point(tilt: Float[Array, "2"], wanted: Wanted) -> Coordinates:
 
 def _map(flyer: Flyer, at: Coordinates) -> Float[Array, "4 k"]:
     """B about the system's centre of mass, in the base's axes: thrust and moments do not mix."""
-    rotors = flyer.system.forces[flyer.rotors]
-    assert isinstance(rotors, Rotors)
     com = rotation_matrix(at.p).T @ flyer.system.com(flyer.state(at))
-    return wrench_map(rotors, com)
+    return wrench_map(flyer.propellers, com)
 
 
 def _left(at: Coordinates, inputs: Inputs, setting: _Setting) -> Float[Array, "8"]:
@@ -222,7 +221,7 @@ def trim(
 
     Args:
         wanted: see `hover`, `climb`, `cruise` and `steady_turn`.
-        limits: of rotors and actuators; default none.
+        limits: of rotors and actuators; by default those of the motors, if there are any.
         throw: raise where there is no trim, if values are known.
 
     Raises:
@@ -230,10 +229,15 @@ def trim(
         ModelError: limits that make no sense, or within which the rotors cannot carry the weight.
     """
     limits = TrimLimits() if limits is None else limits
-    if throw and limits.rotors is not None:
-        rotors = flyer.system.forces[flyer.rotors]
-        assert isinstance(rotors, Rotors)
-        check_lift(rotors, limits.rotors, _weight(flyer))
+    if limits.rotors is None and isinstance(flyer.propulsion, MotorRotors):
+        limits = limits._replace(rotors=flyer.propulsion.limits)
+    flyer = flyer.steady()
+    if limits.rotors is not None:
+        limits.rotors.squared(flyer.propellers.spin.shape[0])
+        if throw:
+            check_lift(flyer.propellers, limits.rotors, _weight(flyer))
+    # as arrays, so that other limits do not mean another compilation
+    limits = jax.tree.map(lambda x: jnp.asarray(x, dtype=float), limits)
     found = _found(_Setting(flyer, flyer.model(), wanted), limits)
     if throw and concrete(found.reason):
         _raise(TrimReason(int(found.reason)), found, limits)
@@ -276,9 +280,15 @@ def _found(setting: _Setting, limits: TrimLimits) -> Trim:
         given = allocate(B, z[2:6], limits.rotors)
         squared, missed = given.squared, given.reason != AllocationReason.VALID
     inputs, left = Inputs(squared, z[6:]), last.size
+    spun = jnp.zeros((), bool)
+    if limits.rotors is not None and isinstance(flyer.propulsion, MotorRotors):
+        # ... unless the speeds have a momentum of their own
+        again = jnp.max(jnp.abs(jax.lax.stop_gradient(_left(at, inputs, setting))))
+        spun, left = (left <= TOLERANCE) & ~(again <= TOLERANCE), jnp.maximum(left, again)
     reason = first_reason(
         (~(_margin(flyer, at.angles) > 0), TrimReason.POSTURE),
         (missed, TrimReason.ROTOR_LIMIT),
+        (spun, TrimReason.ROTOR_MOMENTUM),
         (~(left <= TOLERANCE), TrimReason.NOT_CONVERGED),
         (jnp.min(squared) < 0, TrimReason.ROTOR_STOPPED),
         (jnp.max(jnp.abs(inputs.forces)) > limits.actuator, TrimReason.ACTUATOR_LIMIT),
@@ -312,6 +322,10 @@ def _raise(reason: TrimReason, found: Trim, limits: TrimLimits) -> None:
         TrimReason.ROTOR_LIMIT: (
             "the rotors cannot give the thrust and moments that it needs within their limits of "
             f"{_span(limits.rotors)} rad/s"
+        ),
+        TrimReason.ROTOR_MOMENTUM: (
+            "within the rotors' limits their angular momentum is another than without, and leaves "
+            f"accelerations of {float(found.residual):.3g} in the turn"
         ),
         TrimReason.ACTUATOR_LIMIT: (
             f"an actuator would have to push with {strongest:.4g} N, but the limit is "

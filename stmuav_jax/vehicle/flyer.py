@@ -27,12 +27,14 @@ from ..dynamics.coordinates import join, split
 from ..dynamics.stabilisation import Unstabilised
 from ..dynamics.tree import Tree, TreeModel
 from ..mechanics.errors import ModelError
+from ..mechanics.sampled import Sampled
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .actuator import LinearActuator
 from .drive import SLIDER_JOINTS
 from .geometry import TrackerGeometry
 from .kinematics import angle_motion, panel_angles, stroke_jacobian
+from .motor import MotorRotors
 from .placement import posture
 from .rotor import Rotors
 
@@ -90,8 +92,8 @@ class Flyer(eqx.Module):
     """A system of base and tracker, with rotors and actuators, prepared for coordinates.
 
     Args:
-        system: the seven bodies, base first, with one `Rotors` and forces in the sliders: one
-            `LinearActuator` each. Other forces stay as they are.
+        system: the seven bodies, base first, with one `Rotors` or `MotorRotors` and forces in the
+            sliders: one `LinearActuator` each. Other forces stay as they are.
         geometry: of its tracker. shift: of the tracker in the base's frame (3,) [m].
 
     Raises:
@@ -105,7 +107,7 @@ class Flyer(eqx.Module):
     actuators: tuple[int, int] = eqx.field(static=True)
 
     def __init__(self, system: System, geometry: TrackerGeometry, shift: Any) -> None:
-        rotors = [k for k, f in enumerate(system.forces) if isinstance(f, Rotors)]
+        rotors = [k for k, f in enumerate(system.forces) if isinstance(f, Rotors | MotorRotors)]
         pushers = {
             f.slider: k for k, f in enumerate(system.forces) if isinstance(f, LinearActuator)
         }
@@ -119,16 +121,62 @@ class Flyer(eqx.Module):
         self.rotors = rotors[0]
         self.actuators = (pushers["slider_2"], pushers["slider_3"])
 
-    def with_inputs(self, inputs: Inputs) -> System:
-        """The system with its rotors and actuators set, to numbers or to histories."""
+    @property
+    def propulsion(self) -> Rotors | MotorRotors:
+        """The force element of the rotors, with their motors if they have any."""
+        return self.system.forces[self.rotors]  # pyright: ignore[reportReturnType]
+
+    @property
+    def propellers(self) -> Rotors:
+        """The rotors themselves."""
+        own = self.propulsion
+        return own.rotors if isinstance(own, MotorRotors) else own
+
+    @property
+    def lagging(self) -> bool:
+        """Whether the rotors' speeds are states of their own: motors with a time constant."""
+        own = self.propulsion
+        return isinstance(own, MotorRotors) and own.time_constant is not None
+
+    def steady(self) -> "Flyer":
+        """The same with motors at steady speeds, see `MotorRotors.steady`."""
+        own = self.propulsion
+        if isinstance(own, Rotors):
+            return self
+        forces = list(self.system.forces)
+        forces[self.rotors] = own.steady()
+        system = eqx.tree_at(lambda s: s.forces, self.system, tuple(forces))
+        return Flyer(system, self.geometry, self.shift)
+
+    def with_inputs(self, inputs: Inputs, speeds: Float[Array, " k"] | None = None) -> System:
+        """The system with its rotors and actuators set, to numbers or to histories.
+
+        Args:
+            speeds: of rotors that lag, at the start [rad/s]; by default what is commanded where
+                that is a number or a `Sampled` history, and else what they have.
+        """
+        forces = inputs.forces
+        each = [_Part(forces, k) if callable(forces) else forces[k] for k in range(2)]
         where = lambda s: (
-            s.forces[self.rotors].speed_squared,
+            self._commands(s),
             s.forces[self.actuators[0]].force,
             s.forces[self.actuators[1]].force,
         )
-        forces = inputs.forces
-        each = [_Part(forces, k) if callable(forces) else forces[k] for k in range(2)]
-        return eqx.tree_at(where, self.system, (inputs.squared, *each))
+        system = eqx.tree_at(where, self.system, (inputs.squared, *each))
+        if not self.lagging:
+            return system
+        if speeds is None:
+            first = inputs.squared
+            first = first(first.breaks[0]) if isinstance(first, Sampled) else first
+            if callable(first):
+                return system
+            own: Any = self.propulsion
+            speeds = own.speeds_of(jnp.asarray(first, dtype=float))
+        return eqx.tree_at(lambda s: s.forces[self.rotors].internal, system, speeds)
+
+    def _commands(self, system: Any) -> Any:
+        own = system.forces[self.rotors]
+        return own.rotors.speed_squared if isinstance(own, MotorRotors) else own.speed_squared
 
     def state(self, at: Coordinates) -> State:
         """Positions and velocities of all bodies (7, .)."""
@@ -153,14 +201,16 @@ class Flyer(eqx.Module):
         inputs: Inputs,
         t: Float[Array, ""] | float = 0.0,
         model: TreeModel | None = None,
+        speeds: Float[Array, " k"] | None = None,
     ) -> Accelerations:
         """Of the independent coordinates, from the tree's equations.
 
         Args:
             model: what `model` gives, if it is there already.
+            speeds: of rotors that lag [rad/s]; default as commanded.
         """
         model = self.model() if model is None else model
-        model = replace(model, system=self.with_inputs(inputs))
+        model = replace(model, system=self.with_inputs(inputs, speeds))
         tree, spanned = Tree(), model.chain.tree
         # the joints' coordinates are the same wherever the base is and however it moves
         still = at._replace(p=jnp.asarray(_LEVEL), v=jnp.zeros(3), omega=jnp.zeros(3))

@@ -78,11 +78,25 @@ class MotorRotors(AbstractInternalForce):
         elif start is not None:
             self.internal = _each(start, count, f"The starting speeds {of}", "rad/s")
         elif constant:
-            self.internal = self._commanded(jnp.asarray(rotors.speed_squared))
+            self.internal = self.speeds_of(jnp.asarray(rotors.speed_squared))
         else:
             raise ModelError(
                 f"The starting speeds {of} must be given, because their commands are a function."
             )
+
+    def steady(self) -> "Rotors | MotorRotors":
+        """The same at steady speeds, without limits: plain rotors where they have no inertia."""
+        if self.inertia is None:
+            return self.rotors
+        return MotorRotors(self.rotors, inertia=self.inertia)
+
+    @property
+    def limits(self) -> RotorLimits | None:
+        """Of the speeds [rad/s], if there are any."""
+        if self.squared_limits is None:
+            return None
+        lowest, highest = self.squared_limits
+        return RotorLimits(jnp.sqrt(lowest), jnp.sqrt(highest))
 
     def bodies(self) -> tuple[str, ...]:
         return self.rotors.bodies()
@@ -94,7 +108,7 @@ class MotorRotors(AbstractInternalForce):
         count = self.internal.shape[0]
         return tuple(f"{self.rotors.body}: speed of rotor {k + 1} [rad/s]" for k in range(count))
 
-    def _commanded(self, squared: Float[Array, " k"]) -> Float[Array, " k"]:
+    def speeds_of(self, squared: Float[Array, " k"]) -> Float[Array, " k"]:
         """omega_c [rad/s] of commanded squares; not a number for a negative one without limits."""
         if self.squared_limits is not None:
             squared = jnp.clip(squared, *self.squared_limits)
@@ -103,7 +117,7 @@ class MotorRotors(AbstractInternalForce):
 
     def command(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " k"]:
         """omega_c at time t [s] (k,) [rad/s]."""
-        return self._commanded(evaluate(self.rotors.speed_squared, t, kin))
+        return self.speeds_of(evaluate(self.rotors.speed_squared, t, kin))
 
     def speeds(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " k"]:
         """omega at time t [s] (k,) [rad/s]."""

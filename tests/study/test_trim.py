@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from scipy.linalg import expm
 
 import stmuav_jax as sj
@@ -66,33 +67,52 @@ def test_nothing_accelerates_in_maximal_coordinates(flyer, start):
 
 
 @pytest.mark.slow
-def test_derivative_against_differences(flyer, start):
-    """By a mass, a length, the rotors' constant and the panel's angle, together and apart."""
+def test_derivative_by_every_parameter():
+    """Of a turn through the air, where all of them count, against differences of trims.
 
-    def speeds(q):
-        mass, rod, k_f, angle = q
-        rods = jnp.asarray(sj.PART_II.value("geometry.rods")) + jnp.array([rod, 0.0])
-        new = {
-            "mass.panel_7": sj.PART_II.value("mass.panel_7") + mass,
-            "rotor.k_f": sj.PART_II.value("rotor.k_f") * (1 + k_f),
-            "geometry.rods": rods,
-        }
-        changed = uav_flyer(sj.PART_II.replaced(new))
-        found = trim(changed, hover(START + jnp.array([angle, 0.0])), throw=False)
-        return jnp.concatenate([found.speeds, found.inputs.forces])
-
-    run = sj.outer_jit(jax.vmap(speeds))
-    sizes = np.array([1e-3, 1e-4, 1e-3, 1e-3])
-    steps = np.concatenate(
-        [np.diag(sizes), -np.diag(sizes), np.diag(sizes) / 2, -np.diag(sizes) / 2]
+    Derivatives are by relative changes, or by changes of a parameter's largest entry.
+    """
+    groups = (
+        "mass.",
+        "inertia.",
+        "rotor.",
+        "gravity",
+        "mount.",
+        "actuator.axis",
+        "geometry.",
+        "drag.",
     )
-    values = np.asarray(run(jnp.asarray(steps))).reshape(4, 4, 8)
-    wide = (values[0] - values[1]) / (2 * sizes[:, None])
-    narrow = (values[2] - values[3]) / sizes[:, None]
+    names = [k for k in sj.PART_II if k.startswith(groups) and k != "rotor.spin"]
+    table = {k: jnp.asarray(sj.PART_II.value(k), dtype=float) for k in names}
+    sizes = jax.tree.map(lambda x: jnp.full_like(x, jnp.max(jnp.abs(x))), table)
+    flat, unravel = ravel_pytree((table, START))
+    scale, _ = ravel_pytree((sizes, jnp.full(2, 0.3)))
+
+    def solved(change):
+        values, angles = unravel(flat + scale * change)
+        changed = uav_flyer(sj.PART_II.replaced(values), drag=sj.Drag())
+        found = trim(changed, steady_turn(3.0, 0.8, angles), throw=False)
+        turned = sj.to_rotation_vector(found.coordinates.p)
+        return jnp.concatenate([found.speeds / 1350.0, found.inputs.forces, turned])
+
+    def by_all(h):
+        """Second-order differences by every parameter, one column each."""
+        steps = h * jnp.eye(len(flat))
+        ahead, behind = run(jnp.concatenate([steps, -steps])).reshape(2, len(flat), -1)
+        return np.asarray(ahead - behind).T / (2 * h)
+
+    run = sj.outer_jit(lambda steps: jax.lax.map(solved, steps, batch_size=32))
+    wide, narrow = by_all(2e-3), by_all(1e-3)
     expected = (4 * narrow - wide) / 3
-    exact = np.asarray(sj.outer_jit(jax.jacfwd(speeds))(jnp.zeros(4))).T
-    for row, right in zip(exact, expected, strict=True):
-        np.testing.assert_allclose(row, right, rtol=1e-7, atol=1e-7 * np.max(np.abs(right)))
+    assert np.all(np.isfinite(expected))
+    push = lambda e: jax.jvp(solved, (jnp.zeros_like(flat),), (e,))[1]
+    ways = jnp.eye(len(flat))
+    exact = np.asarray(sj.outer_jit(lambda e: jax.lax.map(push, e, batch_size=32))(ways)).T
+    reached = np.max(np.abs(exact), axis=0)
+    # all but the direction of gravity's sideways parts, the arms' heights and the like count
+    assert np.sum(reached > 1e-4) > 0.8 * len(flat)
+    for k, (column, right) in enumerate(zip(exact.T, expected.T, strict=True)):
+        np.testing.assert_allclose(column, right, rtol=1e-7, atol=1e-7 * reached[k] + 1e-10)
 
 
 def test_refused(flyer):
