@@ -109,8 +109,8 @@ def test_derivative_by_every_parameter():
     ways = jnp.eye(len(flat))
     exact = np.asarray(sj.outer_jit(lambda e: jax.lax.map(push, e, batch_size=32))(ways)).T
     reached = np.max(np.abs(exact), axis=0)
-    # all but the direction of gravity's sideways parts, the arms' heights and the like count
-    assert np.sum(reached > 1e-4) > 0.8 * len(flat)
+    # products of inertia and the places of the actuators' couples hardly count
+    assert np.sum(reached > 1e-4) > 0.5 * len(flat)
     for k, (column, right) in enumerate(zip(exact.T, expected.T, strict=True)):
         np.testing.assert_allclose(column, right, rtol=1e-7, atol=1e-7 * reached[k] + 1e-10)
 

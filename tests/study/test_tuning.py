@@ -103,6 +103,19 @@ def test_hold(flyer, untuned, held):
 
 
 @pytest.mark.slow
+def test_segments_where_one_flight_is_too_long(flyer, untuned, held):
+    """Over 1.2 s differences grow by e^13: in one piece the search is stuck, in eight it arrives."""
+    ends = {}
+    for segments in (1, 8):
+        tuning = hold(flyer, START, untuned, horizon=1.2, segments=segments)
+        found = search(tuning.residuals, tuning.start, LM, steps=60)
+        ends[segments] = tuning.inputs(found.values)
+    off = {k: float(np.max(np.abs(end.forces - held.forces))) for k, end in ends.items()}
+    assert off[1] > 1.0
+    assert off[8] < 1e-4
+
+
+@pytest.mark.slow
 def test_slew(flyer):
     """The panel turns within limits, and the UAV is disturbed a hundred times less."""
     after = np.asarray(START) + np.array([0.4, 0.3])
@@ -153,6 +166,27 @@ def test_identification(case):
     assert 0.8 < found.misfit < 1.2
     # what is left is the record's noise
     assert 30 * found.search.loss < found.search.history[0]
+
+
+@pytest.mark.slow
+def test_a_hundred_records(case):
+    """Of a hundred noise seeds and starts, 95 or more leave all ten parameters within 3 sigma."""
+    records, starts = [], []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        records.append(case.clean + case.sigma * rng.normal(size=case.clean.shape))
+        starts.append(case.truth + 0.5 * case.sizes * rng.uniform(-1.0, 1.0, len(case.truth)))
+    found = list(
+        sj.identify_many(
+            case.predict, np.array(records), case.sigma, np.array(starts), case.sizes,
+            labels=case.labels, weakest=0.5,
+        )
+    )  # fmt: skip
+    assert sum(one.within(case.truth) for one in found) >= 95
+    # deviations are honest both ways: normal errors are within one of them in 68 of 100
+    inside = np.mean([np.abs(one.values - case.truth) < one.deviations for one in found])
+    assert 0.62 < inside < 0.74
+    assert 0.97 < np.mean([one.misfit for one in found]) < 1.03
 
 
 def test_what_cannot_be_told_is_named():
