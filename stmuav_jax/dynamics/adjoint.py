@@ -59,9 +59,9 @@ class _Start(NamedTuple):
 
 
 class _Steps(NamedTuple):
-    """Accepted steps, the first `count` of n rows: from ts[i] and ys[i] to ts[i + 1]."""
+    """Accepted steps, the first `taken` of n rows: from ts[i] and ys[i] to ts[i + 1]."""
 
-    count: Int[Array, ""]
+    taken: Int[Array, ""]
     ts: Float[Array, " n+1"]
     ys: Float[Array, "n k"]
     slopes: Float[Array, "n s k"]
@@ -71,7 +71,9 @@ class _Steps(NamedTuple):
 def _begun(start: _Start, problem: Problem, memory: Any) -> tuple[Problem, Carry]:
     problem = eqx.tree_at(lambda p: p.model, problem, start.model, is_leaf=lambda x: x is None)
     none = jnp.zeros((), int)
-    carry = Carry(start.t0, start.y, *memory, Counts(none, none), diffrax.RESULTS.successful)
+    step, solver_state, controller_state = memory
+    counts, fine = Counts(none, none), diffrax.RESULTS.successful
+    carry = Carry(start.t0, start.y, step, solver_state, controller_state, counts, fine)
     return problem, carry
 
 
@@ -121,7 +123,7 @@ def _backward(
         by_start, more = _step_back(problem, arrays, rest, steps, i, by_end)
         return i - 1, by_start, jax.tree.map(jnp.add, by_model, more)
 
-    begin = (steps.count - 1, last, zero)
+    begin = (steps.taken - 1, last, zero)
     _, first, by_model = jax.lax.while_loop(lambda at: at[0] >= 0, back, begin)
     by_t0, by_t1 = None, None
     if perturbed.t0:

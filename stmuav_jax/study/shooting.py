@@ -22,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from ..dynamics.integrate import integrate
@@ -93,6 +94,43 @@ def growth(
     return Growth(np.asarray(ts), factor, rate, float(ts[last]))
 
 
+class _Piece(NamedTuple):
+    """Of one segment, what is not looked for."""
+
+    flyer: Flyer
+    inputs: Callable[[Any], Any]
+    origin: Coordinates
+    ts: Float[Array, " m"]
+    method: Method
+
+
+def _segment(unknowns: tuple[Any, Float[Array, "16"]], how: _Piece) -> Coordinates:
+    """One segment, as a function of its values and its start's displacement."""
+    values, step = unknowns
+    system = how.flyer.with_inputs(how.inputs(values))
+    return fly(how.flyer, system, shifted(how.origin, step), how.ts, how.method)
+
+
+@eqx.filter_custom_jvp
+def _flown(unknowns: tuple[Any, Float[Array, "16"]], how: _Piece) -> Coordinates:
+    """`_segment` with derivatives by way of its whole Jacobian."""
+    return _segment(unknowns, how)
+
+
+@_flown.def_jvp
+def _flown_jvp(primals: Any, tangents: Any) -> tuple[Coordinates, Coordinates]:
+    # A segment knows only its own start. By way of its own Jacobian, the derivatives by the starts
+    # of all n segments cost as much as those by one.
+    (unknowns, how), (moves, _) = primals, tangents
+    flat, unravel = ravel_pytree(unknowns)
+    push = lambda e: jax.jvp(lambda u: _segment(u, how), (unknowns,), (unravel(e),))
+    out, columns = jax.vmap(push, out_axes=(0, -1))(jnp.eye(flat.shape[0], dtype=flat.dtype))
+    given = lambda x, move: jnp.zeros_like(x) if move is None else move
+    along = ravel_pytree(jax.tree.map(given, unknowns, moves, is_leaf=lambda x: x is None))[0]
+    first = jax.tree.map(lambda x: x[0], out)
+    return first, jax.tree.map(lambda J: J @ along, columns)
+
+
 class Shooting(eqx.Module):
     """A flight in segments, as residuals for `search`.
 
@@ -121,13 +159,18 @@ class Shooting(eqx.Module):
     def path(self, unknowns: Any) -> tuple[Float[Array, " m"], Coordinates, Float[Array, "n 16"]]:
         """Output times, coordinates there, and what is left at the cuts."""
         nodes = jax.vmap(shifted)(self.guess, unknowns["nodes"])
-        starts = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), self.start, nodes)
-        system = self.flyer.with_inputs(self.inputs(unknowns["values"]))
+        joined = lambda a, b: jnp.concatenate([a[None], b])
+        origins = jax.tree.map(joined, self.start, self.guess)
+        steps = joined(jnp.zeros(16), unknowns["nodes"])
         share = jnp.linspace(0.0, 1.0, self.inside + 1)
         first, last = self.edges[:-1, None], self.edges[1:, None]
         ts = first + share * (last - first)
-        one = lambda start, ts: fly(self.flyer, system, start, ts, self.method)
-        found = jax.vmap(one)(starts, ts)
+
+        def one(step: Array, origin: Coordinates, ts: Array) -> Coordinates:
+            how = _Piece(self.flyer, self.inputs, origin, ts, self.method)
+            return _flown((unknowns["values"], step), how)
+
+        found = jax.vmap(one)(steps, origins, ts)
         ends = jax.tree.map(lambda x: x[:-1, -1], found)
         gaps = jax.vmap(displacement)(ends, nodes)
         flat = lambda x: x[:, 1:].reshape(-1, *x.shape[2:])

@@ -237,8 +237,8 @@ def trim(
         if throw:
             check_lift(flyer.propellers, limits.rotors, _weight(flyer))
     # as arrays, so that other limits do not mean another compilation
-    limits = jax.tree.map(lambda x: jnp.asarray(x, dtype=float), limits)
-    found = _found(_Setting(flyer, flyer.model(), wanted), limits)
+    bounds: Any = jax.tree.map(lambda x: jnp.asarray(x, dtype=float), limits)
+    found = _found(_Setting(flyer, flyer.model(), wanted), bounds)
     if throw and concrete(found.reason):
         _raise(TrimReason(int(found.reason)), found, limits)
     fine = found.reason == TrimReason.VALID

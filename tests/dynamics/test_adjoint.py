@@ -1,5 +1,7 @@
 """Reverse mode by kept steps: against diffrax's own, forward mode, and differences."""
 
+from dataclasses import replace
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -10,10 +12,9 @@ from helpers import pendulum, swung
 import stmuav_jax as sj
 from stmuav_jax.dynamics import integrate as module
 
-STEPS = {"rtol": 1e-10, "atol": 1e-10}
-KEEPING = sj.Method(**STEPS)
-AGAIN = sj.Method(**STEPS, adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=500))
-AHEAD = sj.Method(**STEPS, adjoint=diffrax.ForwardMode())
+KEEPING = sj.Method(rtol=1e-10, atol=1e-10)
+AGAIN = replace(KEEPING, adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=500))
+AHEAD = replace(KEEPING, adjoint=diffrax.ForwardMode())
 # mass, length, first angle, first rate, start and length of the flight
 Q = jnp.array([2.0, 0.5, 1.1, -0.3, 0.2, 1.5])
 
