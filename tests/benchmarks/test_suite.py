@@ -64,5 +64,5 @@ def test_all_sections(tmp_path):
     check(tmp_path, sections, run(tmp_path, sections))
     gradient = json.loads((tmp_path / "suite_gradient.json").read_text())
     errors = [row["error"] for row in gradient["rows"] if row["error"] is not None]
-    assert len(errors) == 2
+    assert len(errors) == 3
     assert max(errors) < 1e-5

@@ -174,6 +174,17 @@ def test_linear_to_second_order(flyer, start, linear):
     assert 3.7 < sizes[1] / sizes[2] < 4.3
 
 
+def test_matrices_against_differences(flyer, start, linear):
+    """Of fourth order, of the nonlinear rates: every column of A and B."""
+    sizes = np.array([1e-3] * 16 + [1e3] * 6 + [1e-2] * 2)
+    of = lambda z: rates(flyer, start.coordinates, start.inputs, z[:16], z[16:])
+    run = jax.jit(jax.vmap(of))
+    step = lambda k: np.asarray(run(jnp.asarray(k * np.diag(sizes))))
+    J = ((8 * (step(1) - step(-1)) - (step(2) - step(-2))) / 12).T / sizes
+    for found, right in zip(np.hstack([linear.A, linear.B]).T, J.T, strict=True):
+        np.testing.assert_allclose(found, right, atol=1e-8 * max(1e-6, np.max(np.abs(right))))
+
+
 def test_linear_against_the_simulated_flight(flyer, start, linear):
     """A small displacement's path over 0.1 s, in maximal coordinates, against expm(A t) x."""
     x = np.zeros(16)
