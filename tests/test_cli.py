@@ -156,6 +156,7 @@ def test_installed_command_and_import_leave_jax_alone():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
+@pytest.mark.slow
 def test_trim_command(tmp_path, capsys):
     """At the sun, with a sensitivity; then limits that cannot carry the weight."""
     given = ["trim", "--sun", "150", "70", "--out", str(tmp_path), "--no-cache"]

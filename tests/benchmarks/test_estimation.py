@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 
 
+@pytest.mark.slow
 def test_estimation(tmp_path):
     subprocess.run(
         [sys.executable, FOLDER / "estimation.py", "--quick", "--results", tmp_path],

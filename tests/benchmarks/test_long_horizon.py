@@ -108,6 +108,7 @@ def test_problems_start_consistent(make):
     np.testing.assert_allclose(found.state.omega, problem.state.omega, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_smoke(tmp_path, monkeypatch):
     """The script at its smallest size: a complete record and its figures."""
     arguments = ["--quick", "--results", str(tmp_path), "--figures", str(tmp_path)]

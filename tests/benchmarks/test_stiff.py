@@ -68,6 +68,7 @@ def test_crossover(ratios, up_to, since):
     assert (found["implicit_from"] or {}).get("name") == since
 
 
+@pytest.mark.slow
 def test_smoke(tmp_path, monkeypatch):
     """The script at its smallest size: a complete record and its figures."""
     arguments = ["--quick", "--results", str(tmp_path), "--figures", str(tmp_path)]

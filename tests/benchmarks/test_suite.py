@@ -54,6 +54,7 @@ def check(folder: Path, sections: tuple[str, ...], page: Path) -> None:
     assert all((page.parent / place).stat().st_size > 0 for place in shown)
 
 
+@pytest.mark.slow
 def test_quick_sections(tmp_path):
     check(tmp_path, QUICK, run(tmp_path, QUICK))
 

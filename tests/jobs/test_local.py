@@ -289,7 +289,7 @@ sys.path.insert(0, {tests!r})
 from jobs.toy import Toy
 from stmuav_jax.jobs.local import run_study
 outcome = run_study(
-    Toy(seed=7, pause=0.05), {path!r}, 1000, chunk=10, progress=lambda now: print(now.done, flush=True)
+    Toy(seed=7, pause=0.2), {path!r}, 1000, chunk=10, progress=lambda now: print(now.done, flush=True)
 )
 print(outcome.words())
 """

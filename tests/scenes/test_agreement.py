@@ -22,7 +22,7 @@ def reference():
     ("solver", "formulation"),
     [
         (diffrax.Tsit5(), Augmented()),
-        (diffrax.Dopri8(), Augmented(solve="dense")),
+        pytest.param(diffrax.Dopri8(), Augmented(solve="dense"), marks=pytest.mark.slow),
         (diffrax.Dopri8(), Augmented(solve="dense", rows="report")),
     ],
     ids=["tsit5", "dense", "report"],

@@ -236,6 +236,7 @@ def test_acceleration_upwards(flyer):
     assert float(k_f * jnp.sum(found.speeds**2)) == pytest.approx(mass * 11.31, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_panel_at_the_sun(flyer):
     """In level hover the panel's angles are those of the inverse kinematics in the yawed base."""
     s_w = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
