@@ -183,8 +183,8 @@ def test_matrices_against_differences(flyer, start, linear):
     J = ((8 * (step(1) - step(-1)) - (step(2) - step(-2))) / 12).T / sizes
     # columns of zeros carry round-off over the step
     floor = 1e-13 / sizes
-    for found, right, least in zip(np.hstack([linear.A, linear.B]).T, J.T, floor, strict=True):
-        np.testing.assert_allclose(found, right, atol=1e-6 * np.max(np.abs(right)) + least)
+    for found, right, rest in zip(np.hstack([linear.A, linear.B]).T, J.T, floor, strict=True):
+        np.testing.assert_allclose(found, right, atol=1e-6 * np.max(np.abs(right)) + rest)
 
 
 def test_linear_against_the_simulated_flight(flyer, start, linear):
