@@ -17,12 +17,17 @@ from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
 
-# Compiled code is shared by all files and workers of one run, and lives no longer than that.
+# Compiled code is shared by all tests, workers, notebooks and commands of one run, and lives no
+# longer than that, unless STMUAV_TEST_CACHE names a folder that is to be kept.
 if "STMUAV_TEST_CACHE" not in os.environ:
     os.environ["STMUAV_TEST_CACHE"] = tempfile.mkdtemp(prefix="stmuav-tests-")
     atexit.register(shutil.rmtree, os.environ["STMUAV_TEST_CACHE"], ignore_errors=True)
-jax.config.update("jax_compilation_cache_dir", os.environ["STMUAV_TEST_CACHE"])
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+CACHE = Path(os.environ["STMUAV_TEST_CACHE"])
+os.environ["XDG_CACHE_HOME"] = str(CACHE)
+os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE / "stmuav_jax")
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+jax.config.update("jax_compilation_cache_dir", str(CACHE / "stmuav_jax"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 install_import_hook("stmuav_jax", "beartype.beartype")
 
