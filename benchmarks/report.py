@@ -12,6 +12,7 @@ from typing import Any
 
 from record import RESULTS
 from report_figures import draw
+from report_state import state
 from suite_tables import (
     acceleration,
     batch,
@@ -80,9 +81,13 @@ def compared(results: dict[str, dict[str, Any]]) -> Lines:
         found = (row for result in results.values() for row in result[key])
         return {row["method"]: row for row in found}.values()
 
-    there = [[p["method"], p["version"], " ".join(p["caveats"])] for p in unique("peers")]
+    there = [
+        [p["method"], p["version"], p.get("how", "not recorded"), " ".join(p["caveats"])]
+        for p in unique("peers")
+    ]
     absent = [[p["method"], p["reason"]] for p in unique("skipped")]
-    lines = table(["program", "version", "what it leaves out or does differently"], there)
+    head = ["program", "version", "how it is run", "what is left out or done differently"]
+    lines = table(head, there)
     if not there:
         lines = ["No other program was run."]
     if absent:
@@ -100,7 +105,8 @@ def build(results: Path, page: Path) -> Path:
     lines = [HEAD]
     if any(result["size"] != "full" for result in found.values()):
         lines += ["**Some sections were run at the smallest size: no measurements.**", ""]
-    lines += [*circumstances(found), "", "## Compared with", "", *compared(found)]
+    lines += [*circumstances(found), "", *state(results), ""]
+    lines += ["## Compared with", "", *compared(found)]
     for name, result in found.items():
         title, write = PARTS[name]
         lines += ["", f"## {title}", "", f"{result['what'][0].upper()}{result['what'][1:]}.", ""]

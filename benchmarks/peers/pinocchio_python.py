@@ -3,6 +3,7 @@
 import importlib.util
 import math
 from collections.abc import Callable
+from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -133,7 +134,7 @@ class PinocchioPython(Peer):
     def version(self) -> str:
         import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
-        return str(pin.__version__)
+        return f"{pin.__version__}, SciPy {metadata.version('scipy')}"
 
     def unsupported(self, scene: Scene) -> str:
         return why_no_joint_forces(scene)

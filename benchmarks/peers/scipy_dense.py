@@ -262,6 +262,10 @@ class ScipyDense(Peer):
 
     name = "NumPy, the report's dense system"
     packages = ("scipy",)
+    how = (
+        "One dense system per evaluation by numpy.linalg.solve; SciPy's solvers, "
+        "rtol = atol = tolerance."
+    )
     caveats = ("Not stabilised: violations of the constraints stay and grow.",)
 
     def missing(self) -> str:
@@ -270,7 +274,7 @@ class ScipyDense(Peer):
     def version(self) -> str:
         import scipy
 
-        return f"{scipy.__version__}, NumPy {np.__version__}"
+        return f"NumPy {np.__version__}, SciPy {scipy.__version__}"
 
     def unsupported(self, scene: Scene) -> str:
         return why_not(scene)
