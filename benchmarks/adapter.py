@@ -86,6 +86,11 @@ class Peer(ABC):
     def settings(self) -> list[Setting]:
         """From coarse to fine."""
 
+    def settings_for(self, scene: Scene) -> list[Setting]:
+        """Those for a scene, where that makes a difference."""
+        del scene
+        return self.settings()
+
     @abstractmethod
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         """Build the model and, where there is something to compile, compile it."""

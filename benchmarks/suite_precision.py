@@ -76,9 +76,9 @@ def line(
 ) -> list[dict[str, Any]]:
     """A method's runs from coarse to fine; those left out are rows too."""
     rows: list[dict[str, Any]] = []
-    slow = ""
-    for setting in peer.settings():
-        if slow:
+    slow: dict[str, str] = {}
+    for setting in peer.settings_for(problem.scene):
+        if setting.solver in slow:
             empty = dict.fromkeys(("error", "seconds", "residual"))
             rows.append(
                 {
@@ -88,15 +88,16 @@ def line(
                     "step": setting.step,
                     "horizon": end,
                     **empty,
-                    "failure": slow,
+                    "failure": slow[setting.solver],
                 }
             )
             continue
         rows.append(point(peer, problem, end, setting, exact, size))
         say(rows[-1])
         seconds = rows[-1]["seconds"]
+        solver = setting.solver
         if seconds and seconds["median"] > PATIENCE:
-            slow = f"Left out: the coarser setting took {seconds['median']:.1f} s."
+            slow[solver] = f"Left out: the coarser setting took {seconds['median']:.1f} s."
     return rows
 
 
