@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from peers import PEERS
 from record import RESULTS
 from report_figures import draw
 from report_state import state
@@ -74,6 +75,18 @@ def circumstances(results: dict[str, dict[str, Any]]) -> Lines:
     return [*table(head, rows), "", f"Versions (first section): {listed}."]
 
 
+def version(peer: dict[str, Any]) -> str:
+    """A program's version; old records put SciPy's in front of NumPy's without a name."""
+    number = peer["version"]
+    return f"SciPy {number}" if ", NumPy" in number and number[0].isdigit() else number
+
+
+def as_now(method: str) -> str:
+    """How a program is run now, for records that do not say it."""
+    how = next((peer.how for peer in PEERS if peer.name == method), "")
+    return f"(not recorded; as the adapter is now) {how}" if how else "not recorded"
+
+
 def compared(results: dict[str, dict[str, Any]]) -> Lines:
     """The peers, with versions and caveats, and those that were skipped."""
 
@@ -82,7 +95,7 @@ def compared(results: dict[str, dict[str, Any]]) -> Lines:
         return {row["method"]: row for row in found}.values()
 
     there = [
-        [p["method"], p["version"], p.get("how", "not recorded"), " ".join(p["caveats"])]
+        [p["method"], version(p), p.get("how") or as_now(p["method"]), " ".join(p["caveats"])]
         for p in unique("peers")
     ]
     absent = [[p["method"], p["reason"]] for p in unique("skipped")]
