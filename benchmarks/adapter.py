@@ -60,11 +60,13 @@ class Peer(ABC):
 
     Attributes:
         name: in tables and figures. packages: what pip installs for it.
-        caveats: what it leaves out or solves differently, one sentence each.
+        how: its settings that are not in the tables, for those who know the program.
+        caveats: what it, or our adapter, leaves out or does differently, one sentence each.
     """
 
     name: str
     packages: tuple[str, ...] = ()
+    how: str = ""
     caveats: tuple[str, ...] = ()
 
     @abstractmethod
@@ -76,13 +78,18 @@ class Peer(ABC):
         return ""
 
     def unsupported(self, scene: Scene) -> str:
-        """Why it cannot model this scene; empty if it can."""
+        """What our adapter lacks for this scene; empty if it can be run."""
         del scene
         return ""
 
     @abstractmethod
     def settings(self) -> list[Setting]:
         """From coarse to fine."""
+
+    def settings_for(self, scene: Scene) -> list[Setting]:
+        """Those for a scene, where that makes a difference."""
+        del scene
+        return self.settings()
 
     @abstractmethod
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:

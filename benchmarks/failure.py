@@ -36,7 +36,7 @@ from failure_setup import ALL_MISPRINTS, DEFAULT, FIXED, MAIN_CASE, QUICK, TIGHT
 from failure_steps import Scheme
 from failure_tables import Variant
 from failure_variations import alignment, alignment_methods, collapses, nature
-from record import RESULTS, environment, write
+from record import add_options, begin, environment, write
 
 from stmuav_jax import (
     PRINTED_ORIENTATIONS,
@@ -206,11 +206,13 @@ def _start_at(model: Dense, ref: Reference, k: int) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="the smallest size, for a smoke test")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    add_options(parser)
     parser.add_argument("--figures", type=Path, default=FIGURES)
     parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
     parser.add_argument("--redraw", action="store_true", help="figures from a complete result")
     options = parser.parse_args()
+    if not options.redraw:
+        begin(options)
     jax.config.update("jax_enable_x64", True)
     path = options.results / "failure.json"
     size = QUICK if options.quick else Size()

@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from record import RESULTS, write
+from record import add_options, begin, write
 
 
 def one(cache: Path, out: Path, t1: float) -> dict[str, float]:
@@ -51,8 +51,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--t1", type=float, default=2.0)
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    add_options(parser)
     options = parser.parse_args()
+    begin(options)
     cold, warm = [], []
     for _ in range(options.repeats):
         with tempfile.TemporaryDirectory() as folder:

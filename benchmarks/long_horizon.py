@@ -22,7 +22,7 @@ from long_figures import draw
 from long_problems import PROBLEMS, Problem, simple_pendulum
 from long_runs import FAMILIES, Family, Runner
 from long_tables import tables
-from record import RESULTS, write
+from record import add_options, begin, write
 from trial import rounded
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures" / "benchmarks"
@@ -177,9 +177,10 @@ def answer(runs: list[dict[str, Any]], cost: str) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one problem, a few runs")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    add_options(parser)
     parser.add_argument("--figures", type=Path, default=FIGURES)
     options = parser.parse_args()
+    begin(options)
     size = QUICK if options.quick else Size()
     jax.config.update("jax_enable_x64", True)
     ts = np.linspace(0.0, size.horizon, round(size.horizon / size.every) + 1)

@@ -162,10 +162,13 @@ def of_peers(size: Size, bare: Bare, exact: np.ndarray) -> list[dict[str, Any]]:
                 rows.append({"method": peer.name, "failure": str(error).splitlines()[0]})
                 break
             found = errors(ends, exact)
+            lost = int(np.sum(~np.isfinite(ends).all((1, 2))))
+            failure = f"{lost} of {len(ends)} flights ended with a state that is not finite."
             rows.append(
                 {
                     "method": peer.name, "solver": setting.solver, "step": setting.step,
-                    "tolerance": setting.tolerance, "per_second": rate, "failure": "", **found,
+                    "tolerance": setting.tolerance, "per_second": rate, "not_finite": lost,
+                    "failure": failure if lost else "", **found,
                 }
             )  # fmt: skip
             print(

@@ -6,6 +6,7 @@ what is timed is what is tested.
 
 import importlib
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ class Problem:
         key: short, for files. horizons: ends of the runs, each a run of its own [s].
         redundant: whether its joints have dependent rows.
         stiff: whether implicit methods are compared on it.
+        exact: centres of mass (n, 3) [m] at a time [s] in closed form, where there is one.
     """
 
     key: str
@@ -36,6 +38,7 @@ class Problem:
     horizons: tuple[float, ...]
     redundant: bool = False
     stiff: bool = False
+    exact: Callable[[float], np.ndarray] | None = None
 
     def system_and_start(self) -> tuple[sj.System, sj.State]:
         """What is integrated."""
@@ -82,7 +85,16 @@ def chain(loops: int) -> Problem:
     system = source.four_bar(loops)
     scene = sj.Scene(f"four_bar_{loops}", "N-four-bar mechanism", system, source.start(system))
     title = f"N-four-bar mechanism, N = {loops} (IFToMM A02)"
-    return Problem(scene.name, title, scene, (1.0,), redundant=True)
+
+    def exact(t: float) -> np.ndarray:
+        # all cranks stay parallel, so that B_0 gives every place
+        tip = np.append(source.closed_form(loops, np.array([t]))[0, :2], 0.0)
+        feet = np.zeros((2 * loops + 1, 3))
+        feet[:, 0] = [*range(loops + 1), *(k + 0.5 for k in range(loops))]
+        share = np.array([0.5] * (loops + 1) + [1.0] * loops)
+        return feet + share[:, None] * tip
+
+    return Problem(scene.name, title, scene, (1.0,), redundant=True, exact=exact)
 
 
 def published() -> list[Problem]:

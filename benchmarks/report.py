@@ -10,8 +10,10 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from peers import PEERS
 from record import RESULTS
 from report_figures import draw
+from report_state import state
 from suite_tables import (
     acceleration,
     batch,
@@ -73,6 +75,18 @@ def circumstances(results: dict[str, dict[str, Any]]) -> Lines:
     return [*table(head, rows), "", f"Versions (first section): {listed}."]
 
 
+def version(peer: dict[str, Any]) -> str:
+    """A program's version; old records put SciPy's in front of NumPy's without a name."""
+    number = peer["version"]
+    return f"SciPy {number}" if ", NumPy" in number and number[0].isdigit() else number
+
+
+def as_now(method: str) -> str:
+    """How a program is run now, for records that do not say it."""
+    how = next((peer.how for peer in PEERS if peer.name == method), "")
+    return f"(not recorded; as the adapter is now) {how}" if how else "not recorded"
+
+
 def compared(results: dict[str, dict[str, Any]]) -> Lines:
     """The peers, with versions and caveats, and those that were skipped."""
 
@@ -80,9 +94,13 @@ def compared(results: dict[str, dict[str, Any]]) -> Lines:
         found = (row for result in results.values() for row in result[key])
         return {row["method"]: row for row in found}.values()
 
-    there = [[p["method"], p["version"], " ".join(p["caveats"])] for p in unique("peers")]
+    there = [
+        [p["method"], version(p), p.get("how") or as_now(p["method"]), " ".join(p["caveats"])]
+        for p in unique("peers")
+    ]
     absent = [[p["method"], p["reason"]] for p in unique("skipped")]
-    lines = table(["program", "version", "what it leaves out or does differently"], there)
+    head = ["program", "version", "how it is run", "what is left out or done differently"]
+    lines = table(head, there)
     if not there:
         lines = ["No other program was run."]
     if absent:
@@ -100,7 +118,8 @@ def build(results: Path, page: Path) -> Path:
     lines = [HEAD]
     if any(result["size"] != "full" for result in found.values()):
         lines += ["**Some sections were run at the smallest size: no measurements.**", ""]
-    lines += [*circumstances(found), "", "## Compared with", "", *compared(found)]
+    lines += [*circumstances(found), "", *state(results), ""]
+    lines += ["## Compared with", "", *compared(found)]
     for name, result in found.items():
         title, write = PARTS[name]
         lines += ["", f"## {title}", "", f"{result['what'][0].upper()}{result['what'][1:]}.", ""]

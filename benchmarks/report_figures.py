@@ -1,5 +1,6 @@
 """Figures of the suite's page, from its JSON files alone."""
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 MARKS = "osD^vP*X<>h8"
+# Twelve colours that stay apart for the colour-blind, those of Okabe and Ito first.
+COLORS = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00",
+    "#56B4E9", "#882255", "#999933", "#666666", "#44AA99", "#332288",
+)  # fmt: skip
 Row = dict[str, Any]
 
 
@@ -66,7 +72,7 @@ def work_precision(curve: Row) -> Figure:
             ours = method.startswith("stmuav-jax")
             style = {"lw": 2.0, "ls": "-"} if ours else {"lw": 1.0, "ls": "--"}
             name = method if solver in method else f"{method}, {solver}"
-            color = f"C{k % 10}"
+            color = COLORS[k % len(COLORS)]
             axes.loglog(x, y, marker=MARKS[k % len(MARKS)], ms=5, color=color, label=name, **style)
             for row, a, b in {id(r): (r, a, b) for r, a, b in _ends(rows, x, y)}.values():
                 axes.annotate(
@@ -87,7 +93,29 @@ def work_precision(curve: Row) -> Figure:
         ncols=3 if len(ends) > 1 else 2,
     )  # fmt: skip
     figure.suptitle(curve["title"], fontsize=10)
+    _note(figure, not_drawn(curve), 70 * len(ends) + 30)
     return figure
+
+
+def not_drawn(curve: Row) -> list[tuple[str, str]]:
+    """Methods without a point in the figure, each with the reason."""
+    absent = [(x["method"], f"not in our adapter: {x['reason']}") for x in curve["unsupported"]]
+    drawn = {r["method"] for r in curve["rows"] if r["error"] and r["seconds"] and not r["failure"]}
+    for row in curve["rows"]:
+        name = row["method"]
+        if name not in drawn and name not in dict(absent):
+            absent.append((name, row["failure"] or "the error could not be measured"))
+    return absent
+
+
+def _note(figure: Figure, absent: list[tuple[str, str]], width: int) -> None:
+    """Who is missing from a figure, and why, below it; programs with one reason together."""
+    together: dict[str, list[str]] = {}
+    for name, reason in absent:
+        together.setdefault(reason.rstrip("."), []).append(name)
+    if together:
+        text = "; ".join(f"{', '.join(names)} ({why})" for why, names in together.items())
+        figure.supxlabel("\n".join(textwrap.wrap(f"Not shown: {text}.", width)), fontsize=6.5)
 
 
 def _ends(rows: list[Row], x: list[float], y: list[float]) -> list[tuple[Row, float, float]]:
@@ -136,8 +164,8 @@ def scaling(result: Row) -> Figure:
     many = lambda rows: np.array([row["loops"] for row in rows], float)
     series = {
         "one acceleration": (rows, [row["acceleration_seconds"] for row in rows]),
-        "one simulated second": (runs, [row["run_seconds"]["median"] for row in runs]),
-        "its compilation": (runs, [row["run_compile_seconds"] for row in runs]),
+        "run of one simulated second": (runs, [row["run_seconds"]["median"] for row in runs]),
+        "compilation of that run": (runs, [row["run_compile_seconds"] for row in runs]),
     }
     for k, (name, (some, y)) in enumerate(series.items()):
         axes.loglog(many(some), y, marker=MARKS[k], label=name, base=10)
@@ -175,4 +203,6 @@ def acceleration(result: Row) -> Figure:
     axes.set_xscale("log")
     axes.margins(x=0.15)
     axes.set_xlabel("microseconds per acceleration and state")
+    absent = [(r["method"], r["failure"]) for r in result["rows"] if r["seconds"] is None]
+    _note(figure, absent, 100)
     return figure

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from record import RESULTS, write
+from record import add_options, begin, write
 from stiff_figures import draw
 from stiff_runs import EXPLICIT, IMPLICIT, TIGHT, Runner
 from stiff_scenes import SCENES, SERVOS, Build, StiffScene
@@ -143,9 +143,10 @@ def record(size: Size) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a stand-in of one body, few runs")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    add_options(parser)
     parser.add_argument("--figures", type=Path, default=FIGURES)
     options = parser.parse_args()
+    begin(options)
     path = write("stiff", record(QUICK if options.quick else Size()), options.results)
     print(tables(path))
     print(path, *draw(path, options.figures))

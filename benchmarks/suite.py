@@ -25,7 +25,7 @@ jax.config.update("jax_enable_compilation_cache", False)
 import report
 from adapter import Peer
 from methods import peers
-from record import RESULTS, write
+from record import add_options, begin, write
 from suite_gradient import gradient
 from suite_precision import describe, published_problems, stiff_variants, work_precision
 from suite_scenes import hexacopter, scenes
@@ -60,9 +60,10 @@ def main() -> None:
     parser.add_argument("--size", choices=("full", "one"), default="full")
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--no-report", action="store_true")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    add_options(parser)
     parser.add_argument("--page", type=Path, default=report.PAGE)
     options = parser.parse_args()
+    begin(options)
     size = FULL if options.size == "full" else ONE
     there, absent = ([], []) if options.no_peers else peers()
     for row in absent:

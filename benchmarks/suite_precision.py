@@ -76,9 +76,9 @@ def line(
 ) -> list[dict[str, Any]]:
     """A method's runs from coarse to fine; those left out are rows too."""
     rows: list[dict[str, Any]] = []
-    slow = ""
-    for setting in peer.settings():
-        if slow:
+    slow: dict[str, str] = {}
+    for setting in peer.settings_for(problem.scene):
+        if setting.solver in slow:
             empty = dict.fromkeys(("error", "seconds", "residual"))
             rows.append(
                 {
@@ -88,15 +88,16 @@ def line(
                     "step": setting.step,
                     "horizon": end,
                     **empty,
-                    "failure": slow,
+                    "failure": slow[setting.solver],
                 }
             )
             continue
         rows.append(point(peer, problem, end, setting, exact, size))
         say(rows[-1])
         seconds = rows[-1]["seconds"]
+        solver = setting.solver
         if seconds and seconds["median"] > PATIENCE:
-            slow = f"Left out: the coarser setting took {seconds['median']:.1f} s."
+            slow[solver] = f"Left out: the coarser setting took {seconds['median']:.1f} s."
     return rows
 
 
@@ -113,7 +114,9 @@ def say(row: dict[str, Any]) -> None:
 
 
 def reference(problem: Problem, ours: Ours, size: Size) -> dict[float, np.ndarray]:
-    """Positions at every horizon from one of our methods at its tightest, by horizon."""
+    """Positions at every horizon: the closed form, or one of our methods at its tightest."""
+    if problem.exact is not None:
+        return {end: problem.exact(end) for end in problem.horizons}
     # explicit steps on stiff problems are short because of stability, so errors stay small
     tolerance = max(size.reference, 1e-11) if problem.stiff else size.reference
     found = {}
@@ -171,12 +174,13 @@ def cheapest(rows: list[dict[str, Any]], end: float) -> list[dict[str, Any]]:
 
 
 def curve(problem: Problem, ours: list[Ours], others: list[Peer], size: Size) -> dict[str, Any]:
-    """All methods on one problem; the first of ours, at its tightest, gives the reference."""
+    """All methods on one problem, against `reference`."""
     print(f"{problem.key}: {problem.title}", flush=True)
     result: dict[str, Any] = {
         "problem": problem.key,
         "title": problem.title,
         "horizons": problem.horizons,
+        "closed_form": problem.exact is not None,
         "rows": [],
         "unsupported": [],
     }
@@ -197,9 +201,14 @@ def curve(problem: Problem, ours: list[Ours], others: list[Peer], size: Size) ->
 
 
 def describe(others: list[Peer]) -> list[dict[str, Any]]:
-    """Versions and caveats of what is compared with."""
+    """Versions, settings and caveats of what is compared with."""
     return [
-        {"method": peer.name, "version": peer.version(), "caveats": list(peer.caveats)}
+        {
+            "method": peer.name,
+            "version": peer.version(),
+            "how": peer.how,
+            "caveats": list(peer.caveats),
+        }
         for peer in others
     ]
 

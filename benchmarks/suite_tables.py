@@ -45,36 +45,47 @@ def setting(row: Row) -> str:
     return f"h = {row['step']:g} s" if row.get("step") is not None else "-"
 
 
+# What our adapters lack says nothing about what the programs can do.
+NOT_WRITTEN = ("not written in our adapter", "what the adapter lacks")
+OF_ADAPTERS = (
+    "These rows are about the adapters in `benchmarks/peers/`, which hand our scenes to the other "
+    "programs, and not about the programs, which may well model the scene."
+)
+
+
 def curves(result: Row) -> Lines:
     """Work-precision: per problem who reaches what in which time, then every run."""
     lines: Lines = []
     for curve in result["curves"]:
         lines += [f"### {curve['title']}", ""]
         if curve["failure"]:
-            lines += [f"Not run: {curve['failure']}", ""]
+            lines += [f"Nothing was measured here: {curve['failure']}", ""]
             continue
         for end, check in zip(curve["horizons"], curve["references"], strict=True):
-            lines += [*_reference(check), "", *_cheapest(curve, end), ""]
+            closed = curve.get("closed_form", False)
+            lines += [*_reference(check, closed), "", *_cheapest(curve, end), ""]
         if curve["unsupported"]:
             rows = [[x["method"], x["reason"]] for x in curve["unsupported"]]
-            lines += [*table(["cannot model it", "why"], rows), ""]
+            lines += [*table(NOT_WRITTEN, rows), "", OF_ADAPTERS, ""]
         lines += [*_points(curve["rows"]), ""]
     return lines
 
 
-def _reference(check: Row) -> Lines:
+def _reference(check: Row, closed_form: bool) -> Lines:
     """How well the reference is known."""
+    what = "the closed form" if closed_form else "stmuav-jax at its tightest tolerance"
     said = []
-    for key, what in (("second_code", "another code"), ("other_formulation", "our augmented one")):
+    for key, who in (
+        ("second_code", "another program"),
+        ("other_formulation", "the augmented formulation of stmuav-jax"),
+    ):
         row = check[key]
         if row is None:
-            said.append(f"{what}: none was run")
+            said.append(f"{who} has no run that reached the end")
         else:
-            said.append(
-                f"{what}: {power(row['error'])} m ({row['method']}, {row['solver']}, "
-                f"{setting(row)})"
-            )
-    return [f"To {check['horizon']:g} s. Closest to the reference: {'; '.join(said)}."]
+            how = f"{row['method']}, {row['solver']}, {setting(row)}"
+            said.append(f"{who} comes within {power(row['error'])} m of it ({how})")
+    return [f"Runs to {check['horizon']:g} s. The reference is {what}; {'; '.join(said)}."]
 
 
 def _cheapest(curve: Row, end: float) -> Lines:
@@ -92,7 +103,8 @@ def _cheapest(curve: Row, end: float) -> Lines:
     head = ["method", "solver", *(f"<= {t} m" for t in targets)]
     body = [[r["method"], r["solver"], *(cell(r[t]) for t in targets)] for r in rows]
     return [
-        "Least time for an error, and in brackets its ratio to the fastest of ours:",
+        "Least run time that reaches an error, and in brackets its ratio to the fastest run of "
+        "stmuav-jax that reaches it:",
         "",
         *table(head, body),
     ]
@@ -134,8 +146,14 @@ def acceleration(result: Row) -> Lines:
         ]
         for row in result["rows"]
     ]
-    head = ["method", "states at once", "us per state", "compile [s]", "operations", "failure"]
-    lines = table(head, rows)
+    head = ["method", "states at once", "us per state", "compile [s]", "operations in the program",
+            "failure"]  # fmt: skip
+    lines = [
+        *table(head, rows),
+        "",
+        "Operations in the program are those of StableHLO before XLA optimises, each called "
+        "function counted once: a measure of its size, not of its arithmetic.",
+    ]
     done = [row for row in result["rows"] if row["seconds"] is not None]
     cpp = next((row for row in done if row["method"].startswith("Pinocchio (C++)")), None)
     ours = [row for row in done if row["method"].startswith("stmuav-jax")]
@@ -145,8 +163,9 @@ def acceleration(result: Row) -> Lines:
         lines += [
             "",
             f"The lower bound, one acceleration in {cpp['method']}: {number(cpp['seconds'], 1e6)} "
-            f"us. Ours takes {alone['seconds'] / cpp['seconds']:.2g} times as long for one state, "
-            f"{best['seconds'] / cpp['seconds']:.2g} times at {best['batch']} at once.",
+            f"us. stmuav-jax needs {alone['seconds'] / cpp['seconds']:.2g} times as long for one state, and "
+            f"per state {best['seconds'] / cpp['seconds']:.2g} times as long for {best['batch']} "
+            "states at once.",
         ]
     return lines
 
@@ -181,13 +200,14 @@ def batch(result: Row) -> Lines:
     ]
     done = [row for row in result["rows"] if row["per_second"] is not None]
     ours = max((r for r in done if r["method"].startswith("stmuav")), key=lambda r: r["per_second"])
-    said = [f"{ours['per_second'] / single['per_second']:.2g} times one trajectory after the other"]
+    rate = ours["per_second"]
+    said = [f"{rate / single['per_second']:.2g} times that of one trajectory after the other"]
     small = lambda r: (
         r["largest_error"] is not None and r["largest_error"] <= result["error_wanted"]
     )
     others = [r for r in done if not r["method"].startswith("stmuav") and small(r)]
-    said += [f"{ours['per_second'] / r['per_second']:.2g} times {r['method']}" for r in others]
-    return [*lines, "", f"The best batch gives {'; '.join(said)}."]
+    said += [f"{rate / r['per_second']:.2g} times that of {r['method']}" for r in others]
+    return [*lines, "", f"Throughput of the fastest batch: {'; '.join(said)}."]
 
 
 def scaling(result: Row) -> Lines:
@@ -202,12 +222,12 @@ def scaling(result: Row) -> Lines:
             number(row.get("run_compile_seconds")),
             power(row.get("residual")),
             power(row.get("cranks_differ")),
-            row["failure"],
+            row["failure"] or ("" if row.get("run_seconds") else "Only accelerations were timed."),
         ]
         for row in result["rows"]
     ]
     head = ["N", "bodies", "acceleration [us]", "run [ms]", "steps", "compile [s]",
-            "residual [m]", "cranks differ by [m]", "failure"]  # fmt: skip
+            "residual [m]", "largest difference between crank heights [m]", "failure or remark"]  # fmt: skip
     said = [
         f"{what} grows as N^{value:.2f} from N = {least}"
         for what, fits in result["exponents"].items()
@@ -265,8 +285,9 @@ def hexacopter(result: Row) -> Lines:
     return [
         *table(head, rows),
         "",
-        f"{result['span']:g} s. Ours takes, in run times by hand: {ratios}. At the tightest "
-        f"tolerance the ends differ by {power(result['ends_differ'])} m.",
+        f"Each run simulates {result['span']:g} s. Run time of stmuav-jax over that of the equations "
+        f"written by hand: {ratios}. At the tightest tolerance the two end positions differ by "
+        f"{power(result['ends_differ'])} m.",
     ]
 
 
@@ -287,4 +308,4 @@ def scenes(result: Row) -> Lines:
     ]
     head = ["scene", "run [ms]", "compile [s]", "evaluations", "steps", "rejected",
             "residual [m]", "failure"]  # fmt: skip
-    return [f"{result['span']:g} s each.", "", *table(head, rows)]
+    return [f"Each run simulates {result['span']:g} s.", "", *table(head, rows)]

@@ -9,12 +9,11 @@ one trim at a time. One core:
 import argparse
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from record import RESULTS, write
+from record import add_options, begin, write
 from scipy.optimize import root
 from timer import measure
 
@@ -83,8 +82,9 @@ def main() -> None:
     """Run and write `trims.json`."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="the smallest size")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    add_options(parser)
     arguments = parser.parse_args()
+    begin(arguments)
     size = QUICK if arguments.quick else Size()
     flyer = sj.uav_flyer()
     rng = np.random.default_rng(1)

@@ -15,6 +15,7 @@ from stmuav_jax import Scene
 
 from .mujoco_c import whole_steps
 from .plain import Plain, Start, plain, start, why_not
+from .tree import in_plane, span
 
 # Constrained axes (x, y, z, about x, about y, about z) of its generic joint.
 _AXES = {
@@ -39,12 +40,15 @@ class Mechanism:
         self.mbs = self.container.AddSystem()
         self.bodies = [self._body(k) for k in range(self.model.n)]
         self.bodies.append(self.mbs.CreateGround())
+        # a planar loop is closed in the plane, or its rows would be dependent
+        plane = in_plane(self.model)
+        cut = span(self.model).cuts if plane is not None else ()
         for joint in self.model.joints:
             ends = [
                 self._marker(joint.i, joint.point_i, joint.frame_i),
                 self._marker(joint.j, joint.point_j, joint.frame_j),
             ]
-            axes = _AXES[joint.kind]
+            axes = [1, 1, 0, 0, 0, 0] if joint in cut else _AXES[joint.kind]
             self.mbs.AddObject(self.items.GenericJoint(markerNumbers=ends, constrainedAxes=axes))
         self._loads(self.model, self.first)
         self.sensors = [
@@ -98,6 +102,31 @@ class Mechanism:
         for k, force in model.forces:
             at = self._marker(k, zero)
             self._wave(at, force.amplitude, force.rate, force.phase, body_fixed=False)
+        for k, moment in model.moments:
+            torque = self.items.Torque
+            self.mbs.AddLoad(torque(markerNumber=self._marker(k, zero), loadVector=moment))
+        self._springs(model)
+
+    def _springs(self, model: Plain) -> None:
+        """Exudyn's own connectors, whose laws are compiled."""
+        for s in model.springs:
+            ends = [self._marker(s.i, s.point_i), self._marker(s.j, s.point_j)]
+            spring = self.items.SpringDamper(
+                markerNumbers=ends, referenceLength=s.length, stiffness=s.stiffness,
+                damping=s.damping,
+            )  # fmt: skip
+            self.mbs.AddObject(spring)
+        for servo in model.servos:
+            joint = model.joints[servo.joint]
+            ends = [
+                self._marker(joint.i, joint.point_i, joint.frame_i),
+                self._marker(joint.j, joint.point_j, joint.frame_j),
+            ]
+            spring = self.items.LinearSpringDamper(
+                markerNumbers=ends, axisMarker0=[0, 0, 1], offset=servo.target,
+                stiffness=servo.stiffness, damping=servo.damping,
+            )  # fmt: skip
+            self.mbs.AddObject(spring)
 
     def _wave(
         self, marker: Any, amplitude: np.ndarray, rate: float, phase: float, *, body_fixed: bool
@@ -154,6 +183,12 @@ class ExudynPeer(Peer):
     caveats = (
         "Actuator forces are Python functions, called at every step.",
         "Joint residuals are not reported.",
+        "Accelerations alone are not timed: they come with an implicit step.",
+    )
+    how = (
+        "Redundant coordinates, index 3 (its default), spectral radius 0.9; modified Newton with its "
+        "default tolerances (relative 1e-8, absolute 1e-10), EigenSparse; springs and dampers are "
+        "its own connectors, user functions of forces are Python and not compiled."
     )
 
     def missing(self) -> str:
@@ -170,7 +205,7 @@ class ExudynPeer(Peer):
         model = plain(scene)
         slides = {frozenset((j.i, j.j)) for j in model.joints if j.kind == "translational"}
         if any(frozenset((a.base, a.slider)) not in slides for a in model.actuators):
-            return "An actuator pushes a body that does not slide on its base."
+            return "An actuator on a body that does not slide on its base is not written."
         return ""
 
     def settings(self) -> list[Setting]:

@@ -15,19 +15,19 @@ from adapter import Outcome, Peer, Prepared, Setting
 from stmuav_jax import Scene, State
 
 from .pinocchio_model import LinkModel, link_model, why_no_joint_forces
-from .plain import Sinus, Start, loop_seconds, plain, start, starts
+from .plain import Sinus, Start, UnsupportedError, loop_seconds, plain, start, starts
 from .tree import Tree, coordinates, span
 
 _AXES = {"turn": ("hinge", "z"), "slide": ("slide", "z"), "universal": ("hinge", "xy")}
 _UNIT = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
 
-def mjcf(links: LinkModel, step: float, iterations: int = 100) -> str:
+def mjcf(links: LinkModel, step: float, iterations: int = 100, integrator: str = "RK4") -> str:
     """The model in MuJoCo's own format, every body's frame being its link's."""
     out = [
         '<mujoco><compiler angle="radian" balanceinertia="false" boundmass="0" '
         'inertiafromgeom="false" fusestatic="false"/>',
-        f'<option timestep="{step!r}" integrator="RK4" gravity="{_text(links.gravity)}" '
+        f'<option timestep="{step!r}" integrator="{integrator}" gravity="{_text(links.gravity)}" '
         f'solver="Newton" iterations="{iterations}" tolerance="1e-14" jacobian="dense">',
         '<flag contact="disable" autoreset="disable" warmstart="disable"/></option><worldbody>',
         *_bodies(links, -1),
@@ -36,9 +36,17 @@ def mjcf(links: LinkModel, step: float, iterations: int = 100) -> str:
     ]
     soft = f'solref="{2 * step!r} 1" solimp="0.9999 0.9999 0.001 0.5 2"'
     out += [f'<connect site1="cut{k}a" site2="cut{k}b" {soft}/>' for k in range(len(links.cuts))]
-    out.append("</equality><actuator>")
+    out.append("</equality><tendon>")
+    for k, (*_, stiffness, damping, length) in enumerate(links.springs):
+        out.append(
+            f'<spatial stiffness="{stiffness!r}" damping="{damping!r}" springlength="{length!r}">'
+            f'<site site="spring{k}a"/><site site="spring{k}b"/></spatial>'
+        )
+    out.append("</tendon><actuator>")
     for k, (_, force, moment) in enumerate(links.wrenches):
         out.append(f'<motor site="wrench{k}" gear="{_text([*force, *moment])}"/>')
+    for link, torque in _torques(links):
+        out.append(f'<motor joint="joint{link}z" gear="{torque!r}"/>')
     for slider, gain in _pushes(links):
         out.append(f'<motor joint="joint{slider}z" gear="{gain!r}"/>')
     return "\n".join([*out, "</actuator></mujoco>"])
@@ -63,9 +71,14 @@ def _bodies(links: LinkModel, parent: int) -> list[str]:
         )
         if link.kind == "free":
             out.append("<freejoint/>")
+        elif link.kind == "ball":
+            out.append(f'<joint name="joint{k}" type="ball"/>')
         else:
             kind, axes = _AXES[link.kind]
-            out += [f'<joint name="joint{k}{a}" type="{kind}" axis="{_UNIT[a]}"/>' for a in axes]
+            held = _held(links, k)
+            out += [
+                f'<joint name="joint{k}{a}" type="{kind}" axis="{_UNIT[a]}"{held}/>' for a in axes
+            ]
         out += [*_sites(links, k), *_bodies(links, k), "</body>"]
     return out
 
@@ -76,9 +89,40 @@ def _sites(links: LinkModel, link: int) -> list[str]:
     for k, (a, x, b, y) in enumerate(links.cuts):
         out += [f'<site name="cut{k}a" pos="{_text(x)}"/>'] if a == link else []
         out += [f'<site name="cut{k}b" pos="{_text(y)}"/>'] if b == link else []
+    for k, (a, x, b, y, *_) in enumerate(links.springs):
+        out += [f'<site name="spring{k}a" pos="{_text(x)}"/>'] if a == link else []
+        out += [f'<site name="spring{k}b" pos="{_text(y)}"/>'] if b == link else []
     for k, (at, _, _) in enumerate(links.wrenches):
         out += [f'<site name="wrench{k}"/>'] if at == link else []
     return out
+
+
+def _held(links: LinkModel, link: int) -> str:
+    """A joint's own spring and damper, which is what a servo with a fixed target is."""
+    for at, stiffness, damping, target in links.servos:
+        if at == link:
+            return f' stiffness="{stiffness!r}" damping="{damping!r}" springref="{target!r}"'
+    return ""
+
+
+def _torques(links: LinkModel) -> list[tuple[int, float]]:
+    """Hinges on ground that a world moment drives, with its part along their axis [N m].
+
+    Raises:
+        UnsupportedError: a moment elsewhere, or across the hinge.
+    """
+    found = []
+    for k, moment in links.moments:
+        link = links.links[k]
+        along = float(link.placement.R[:, 2] @ moment)
+        if (link.kind, link.parent) != ("turn", -1) or abs(along) < 0.999999 * np.linalg.norm(
+            moment
+        ):
+            raise UnsupportedError(
+                "A world moment that is not along a hinge on ground is not written."
+            )
+        found.append((k, along))
+    return found
 
 
 def _pushes(links: LinkModel) -> list[tuple[int, float]]:
@@ -93,13 +137,13 @@ def _pushes(links: LinkModel) -> list[tuple[int, float]]:
 
 
 def why_no_mujoco(scene: Scene) -> str:
-    """Why the models made here cannot hold a scene; empty if they can."""
+    """What the models made here lack for a scene; empty if they lack nothing."""
     # motors act in joint coordinates too
     if reason := why_no_joint_forces(scene):
         return reason
     try:
         World(scene, 1e-3)
-    except ValueError as error:
+    except (UnsupportedError, ValueError) as error:
         return " ".join(str(error).split())
     return ""
 
@@ -107,7 +151,7 @@ def why_no_mujoco(scene: Scene) -> str:
 class World:
     """MuJoCo's model of a scene at one step."""
 
-    def __init__(self, scene: Scene, step: float) -> None:
+    def __init__(self, scene: Scene, step: float, integrator: str = "RK4") -> None:
         mujoco: Any = importlib.import_module("mujoco")
         self.mujoco = mujoco
         # or failures would be written into a file in the working directory
@@ -115,9 +159,11 @@ class World:
         numbers = plain(scene)
         self.tree: Tree = span(numbers)
         self.links = link_model(numbers, self.tree)
-        self.model = mujoco.MjModel.from_xml_string(mjcf(self.links, step))
+        self.model = mujoco.MjModel.from_xml_string(mjcf(self.links, step, integrator=integrator))
         self.data = mujoco.MjData(self.model)
         self.step, self.t0 = step, scene.t0
+        # controls that are always one, in front of those that swing
+        self.constant = len(self.links.wrenches) + len(self.links.moments)
         self.order = [self.model.body(f"link{k}").id for k, _ in self.links.bodies]
 
     def begin(self, state: Start) -> np.ndarray:
@@ -143,7 +189,7 @@ class World:
         """Controls of every step (count, m): the mean of each signal over the step."""
         h = self.step
         t = self.t0 + h * np.arange(count)
-        columns = [np.ones(count)] * len(self.links.wrenches)
+        columns = [np.ones(count)] * self.constant
         for s in self.waves():
             # sin(x) / x at half the angle of a step; NumPy's sinc has pi inside
             mean = np.sinc(0.5 * s.rate * h / np.pi)
@@ -183,6 +229,11 @@ class MujocoC(Peer):
         "Loop constraints are soft; the hardest admitted setting is used.",
         "Actuator forces are held at their mean over each step.",
     )
+    how = (
+        "Newton solver, at most 100 iterations, tolerance 1e-14, dense Jacobian, contacts and warm "
+        "start off; loops by `connect` with solref (2 h, 1) and solimp (0.9999, 0.9999); servos are "
+        "joint springs and dampers; whole runs in `mujoco.rollout`."
+    )
 
     def missing(self) -> str:
         if importlib.util.find_spec("mujoco") is None:
@@ -199,11 +250,18 @@ class MujocoC(Peer):
         steps = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1.6e-5)
         return [Setting("RK4", step=step) for step in steps]
 
+    def settings_for(self, scene: Scene) -> list[Setting]:
+        """RK4, and with servos also MuJoCo's integrator that takes damping implicitly."""
+        steps = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
+        stiff = [Setting("implicitfast", step=step) for step in steps]
+        return [*self.settings(), *(stiff if plain(scene).servos else [])]
+
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         rollout: Any = importlib.import_module("mujoco.rollout")
 
-        world = World(scene, setting.step or 1e-3)
+        world = World(scene, setting.step or 1e-3, setting.solver)
         counts = whole_steps(scene.t0, times, world.step)
+        each = 4 if setting.solver == "RK4" else 1
         first, controls = world.begin(start(scene)), world.control(int(counts[-1]))
 
         def run() -> Outcome:
@@ -219,7 +277,7 @@ class MujocoC(Peer):
             failed = not np.all(np.isfinite(positions))
             return Outcome(
                 positions,
-                4 * len(controls),
+                each * len(controls),
                 len(controls),
                 0,
                 residual=worst,
@@ -239,7 +297,7 @@ class MujocoC(Peer):
         world.begin(start(scene))
         mujoco, model, data = world.mujoco, world.model, world.data
         # forces at the very start, not their mean over the first step
-        data.ctrl[:] = [1.0] * len(world.links.wrenches) + [
+        data.ctrl[:] = [1.0] * world.constant + [
             np.sin(s.rate * scene.t0 + s.phase) for s in world.waves()
         ]
         mujoco.mj_forward(model, data)

@@ -24,6 +24,7 @@ class MujocoMjx(Peer):
         "Loop constraints are soft; the hardest admitted setting is used.",
         "Actuator forces are held at their mean over each step.",
     )
+    how = "The model of MuJoCo (C); one iteration of Newton's method, which equalities alone need."
 
     def __init__(self) -> None:
         self._programs: dict[str, tuple[Any, float]] = {}

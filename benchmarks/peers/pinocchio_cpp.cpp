@@ -1,4 +1,4 @@
-// A tree with cut ball joints in Pinocchio, integrated by Boost's Runge-Kutta-Fehlberg 7(8).
+// A tree with cut joints in Pinocchio, integrated by Boost's Runge-Kutta-Fehlberg 7(8).
 //
 //   pinocchio_cpp run  MODEL STARTS TOLERANCE REPEATS T...   times the first start
 //   pinocchio_cpp many MODEL STARTS TOLERANCE REPEATS T1     every start once per repeat

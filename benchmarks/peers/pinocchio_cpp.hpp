@@ -1,4 +1,4 @@
-// A tree with cut ball joints in Pinocchio: its model file, its loads, its accelerations.
+// A tree with cut joints in Pinocchio: its model file, its loads, its accelerations.
 
 #pragma once
 
@@ -50,6 +50,18 @@ struct Mover {
 struct Cut {
   Point a, b;
   std::vector<Mover> movers;
+};
+struct Moment {
+  std::size_t joint;
+  Vector3 value;  // in world axes
+};
+struct Spring {
+  Point a, b;
+  double stiffness, damping, length;
+};
+struct Servo {
+  std::size_t joint;
+  double stiffness, damping, target;
 };
 
 class Reader {
@@ -120,8 +132,25 @@ class Problem {
       const Point a = in.point(), b = in.point();
       cuts_.push_back({a, b, movers(a.joint, b.joint)});
     }
+    closed_.resize(in.count("closed"), 3);
+    for (Eigen::Index k = 0; k < closed_.rows(); ++k) closed_.row(k) = in.vector().transpose();
+    for (int k = in.count("moments"); k > 0; --k) {
+      const std::size_t j = in.joint();
+      moments_.push_back({j, in.vector()});
+    }
+    for (int k = in.count("springs"); k > 0; --k) {
+      const Point a = in.point(), b = in.point();
+      const double stiffness = in.number(), damping = in.number();
+      springs_.push_back({a, b, stiffness, damping, in.number()});
+      damped_ = damped_ || damping != 0;
+    }
+    for (int k = in.count("servos"); k > 0; --k) {
+      const std::size_t j = in.joint();
+      const double stiffness = in.number(), damping = in.number();
+      servos_.push_back({j, stiffness, damping, in.number()});
+    }
     data = pin::Data(model);
-    const auto rows = static_cast<Eigen::Index>(3 * cuts_.size());
+    const auto rows = closed_.rows() * static_cast<Eigen::Index>(cuts_.size());
     external_.assign(static_cast<std::size_t>(model.njoints), pin::Force::Zero());
     zero_.setZero(model.nv);
     Y_.setZero(model.nv, rows + 1);
@@ -144,11 +173,12 @@ class Problem {
       if (nq == nv) {
         std::copy(u, u + nv, out);
       } else {
-        const Eigen::Map<const Eigen::Quaterniond> turn(x.data() + model.idx_qs[j] + 3);
-        const Eigen::Map<const Vector3> linear(u), w(u + 3);
-        Eigen::Map<Vector3>(out).noalias() = data.oMi[j].rotation() * linear;
+        const int place = nv - 3;  // 3 in front of a free joint's quaternion, 0 of a ball's
+        const Eigen::Map<const Eigen::Quaterniond> turn(x.data() + model.idx_qs[j] + place);
+        const Eigen::Map<const Vector3> linear(u), w(u + place);
+        if (place) Eigen::Map<Vector3>(out).noalias() = data.oMi[j].rotation() * linear;
         const Eigen::Quaterniond half(0.0, 0.5 * w[0], 0.5 * w[1], 0.5 * w[2]);
-        Eigen::Map<Eigen::Vector4d>(out + 3) = (turn * half).coeffs();
+        Eigen::Map<Eigen::Vector4d>(out + place) = (turn * half).coeffs();
       }
       out += nq;
       u += nv;
@@ -162,19 +192,25 @@ class Problem {
     std::copy(x.begin(), x.begin() + model.nq, q.data());
     std::copy(x.begin() + model.nq, x.end(), v.data());
     for (std::size_t j = 1; j < model.joints.size(); ++j)
-      if (model.nqs[j] == 7) q.segment<4>(model.idx_qs[j] + 3).normalize();
+      if (model.nqs[j] != model.nvs[j])
+        q.segment<4>(model.idx_qs[j] + model.nvs[j] - 3).normalize();
   }
 
   // M a + h = tau + J^T lambda,  J a = gamma; all columns share one forward substitution
   void accelerate(double t) {
     pin::crba(model, data, q, pin::Convention::WORLD);
+    if (damped_) pin::forwardKinematics(model, data, q, v);
     apply_loads(t);
     const Eigen::Index rows = gamma_.size();
     Y_.col(rows) = -pin::rnea(model, data, q, v, zero_, external_);
+    for (const Servo& s : servos_) {
+      const int at_q = model.idx_qs[s.joint], at_v = model.idx_vs[s.joint];
+      Y_(at_v, rows) -= s.stiffness * (q[at_q] - s.target) + s.damping * v[at_v];
+    }
     Eigen::Index row = 0;
     for (const Cut& cut : cuts_) {
       close(row, cut);
-      row += 3;
+      row += closed_.rows();
     }
     factor(Y_);
     if (rows) {
@@ -222,6 +258,7 @@ class Problem {
 
   static pin::JointModel joint(const std::string& kind) {
     if (kind == "free") return pin::JointModelFreeFlyer();
+    if (kind == "ball") return pin::JointModelSpherical();
     if (kind == "turn") return pin::JointModelRZ();
     if (kind == "slide") return pin::JointModelPZ();
     if (kind == "universal")
@@ -256,6 +293,29 @@ class Problem {
       const Vector3 f = data.oMi[x.at.joint].rotation().transpose() * amount;
       external_[x.at.joint] += pin::Force(f, x.at.x.cross(f));
     }
+    for (const Moment& x : moments_) {
+      const Vector3 m = data.oMi[x.joint].rotation().transpose() * x.value;
+      external_[x.joint] += pin::Force(Vector3::Zero(), m);
+    }
+    for (const Spring& s : springs_) {
+      const Vector3 d = world(s.b) - world(s.a);
+      const double now = d.norm();
+      double pull = s.stiffness * (now - s.length);
+      if (damped_) pull += s.damping * d.dot(speed(s.b) - speed(s.a)) / now;
+      push(s.a, pull / now * d);
+      push(s.b, -pull / now * d);
+    }
+  }
+
+  // a force in world axes at a point; ground takes any
+  void push(const Point& at, const Vector3& force) {
+    if (at.joint == 0) return;
+    const Vector3 f = data.oMi[at.joint].rotation().transpose() * force;
+    external_[at.joint] += pin::Force(f, at.x.cross(f));
+  }
+  Vector3 speed(const Point& p) const {
+    const pin::Motion& m = data.v[p.joint];
+    return data.oMi[p.joint].rotation() * (m.linear() + m.angular().cross(p.x));
   }
 
   // acceleration of a point for zero joint accelerations; gravity cancels in differences
@@ -275,9 +335,9 @@ class Problem {
       Vector3 moved = Vector3::Zero();
       if (m.a) moved += linear + angular.cross(a);
       if (m.b) moved -= linear + angular.cross(b);
-      Y_.row(m.column).segment<3>(row) = moved.transpose();
+      Y_.row(m.column).segment(row, closed_.rows()) = (closed_ * moved).transpose();
     }
-    gamma_.segment<3>(row) = bias(cut.b) - bias(cut.a);
+    gamma_.segment(row, closed_.rows()) = closed_ * (bias(cut.b) - bias(cut.a));
   }
 
   // M = U D U^T by branches: Y becomes D^-1/2 U^-1 Y
@@ -297,6 +357,11 @@ class Problem {
   std::vector<Actuator> actuators_;
   std::vector<WorldForce> forces_;
   std::vector<Cut> cuts_;
+  Eigen::Matrix<double, Eigen::Dynamic, 3> closed_;  // world directions in which cuts are closed
+  std::vector<Moment> moments_;
+  std::vector<Spring> springs_;
+  std::vector<Servo> servos_;
+  bool damped_ = false;
   std::vector<pin::Force> external_;
   Eigen::VectorXd zero_, gamma_;
   Eigen::MatrixXd Y_, S_;

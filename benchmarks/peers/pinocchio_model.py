@@ -4,6 +4,7 @@ A link's frame is its joint's frame on the child, so that a link is: a placement
 the joint, the joint, and a body behind it.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +38,11 @@ class LinkModel:
         bodies: (link, centre of mass), in the scene's order.
         wrenches: (link, force, moment). actuators: (base, slider, point, axis, force), point
             and axis in the base's link. forces: (link, point, force), force in world axes.
-        cuts: (link a, point a, link b, point b), points that must coincide.
+        cuts: (link a, point a, link b, point b), points that must coincide in the world
+            directions `closed` (rows, 3).
+        moments: (link, moment), in world axes. springs: (link a, point a, link b, point b,
+            stiffness, damping, length). servos: (link, stiffness, damping, target) of slides, in
+            the link's own coordinate.
     """
 
     links: tuple[LinkBody, ...]
@@ -47,6 +52,10 @@ class LinkModel:
     actuators: tuple[tuple[int, int, np.ndarray, np.ndarray, Sinus], ...]
     forces: tuple[tuple[int, np.ndarray, Sinus], ...]
     cuts: tuple[tuple[int, np.ndarray, int, np.ndarray], ...]
+    closed: np.ndarray
+    moments: tuple[tuple[int, np.ndarray], ...]
+    springs: tuple[tuple[int, np.ndarray, int, np.ndarray, float, float, float], ...]
+    servos: tuple[tuple[int, float, float, float], ...]
 
 
 def link_model(model: Plain, tree: Tree) -> LinkModel:
@@ -80,6 +89,10 @@ def link_model(model: Plain, tree: Tree) -> LinkModel:
         for a in model.actuators
     ]
     zero = np.zeros(3)
+    springs = [
+        (*at(s.i, s.point_i), *at(s.j, s.point_j), s.stiffness, s.damping, s.length)
+        for s in model.springs
+    ]
     return LinkModel(
         tuple(links),
         model.gravity,
@@ -88,7 +101,26 @@ def link_model(model: Plain, tree: Tree) -> LinkModel:
         tuple(actuators),
         tuple((*at(k, zero), force) for k, force in model.forces),
         tuple((*at(c.i, c.point_i), *at(c.j, c.point_j)) for c in tree.cuts),
+        np.eye(3) if tree.plane is None else tree.plane,
+        tuple((link[k], moment) for k, moment in model.moments),
+        tuple(springs),
+        tuple(_servos(model, tree)),
     )
+
+
+def _servos(model: Plain, tree: Tree) -> Iterator[tuple[int, float, float, float]]:
+    """Servos by the link that slides; a slide led from its second body counts the other way."""
+    for servo in model.servos:
+        joint = model.joints[servo.joint]
+        number = next((k for k, one in enumerate(tree.links) if one.joint is joint), None)
+        if number is None:
+            raise UnsupportedError("A servo in a joint at which a loop is cut is not written.")
+        sign = 1.0 if tree.links[number].parent == joint.i else -1.0
+        yield number, servo.stiffness, servo.damping, sign * servo.target
+
+
+# Velocity coordinates of a link.
+WIDTH = {"free": 6, "ball": 3, "turn": 1, "slide": 1, "universal": 2}
 
 
 def generalised(
@@ -102,8 +134,7 @@ def generalised(
     Raises:
         UnsupportedError: another load.
     """
-    width = {"free": 6, "turn": 1, "slide": 1, "universal": 2}
-    ends = np.cumsum([0, *(width[link.kind] for link in links.links)])
+    ends = np.cumsum([0, *(WIDTH[link.kind] for link in links.links)])
     constant = np.zeros(ends[-1])
     waves = []
 
@@ -114,7 +145,7 @@ def generalised(
 
     for k, force, moment in links.wrenches:
         if links.links[k].kind != "free":
-            raise UnsupportedError("A moment acts on a body that is not free.")
+            raise UnsupportedError("A body-fixed wrench on a body that is not free is not written.")
         constant[ends[k] : ends[k + 1]] += np.concatenate([force, moment])
     for base, slider, _, axis, force in links.actuators:
         link = links.links[slider]
@@ -123,17 +154,19 @@ def generalised(
             or link.parent != base
             or abs(link.placement.R[:, 2] @ axis) < 1 - 1e-12
         ):
-            raise UnsupportedError("An actuator is not along the slide that it drives.")
+            raise UnsupportedError("An actuator across its slide is not written.")
         wave(slider, axis * force.amplitude, force)
     for k, _, force in links.forces:
         if links.links[k].kind != "slide" or links.links[k].parent != -1:
-            raise UnsupportedError("A force acts on a body that does not slide on ground.")
+            raise UnsupportedError(
+                "A force on a body that does not slide on ground is not written."
+            )
         wave(k, force.amplitude, force)
     return constant, waves
 
 
 def why_no_joint_forces(scene: Scene) -> str:
-    """Why a scene is no tree with joint forces that depend on time alone; empty if it is."""
+    """What lacks for a scene as a tree whose driving forces are joint forces; empty if nothing."""
     try:
         numbers = plain(scene)
         generalised(link_model(numbers, span(numbers)))
@@ -150,6 +183,8 @@ def start_vectors(tree: Tree, state: Start) -> tuple[np.ndarray, np.ndarray]:
             position = position[[0, 1, 2, 4, 5, 6, 3]]
             R = state.R_wb[link.child]
             rates = np.concatenate([R.T @ rates[:3], rates[3:]])
+        elif link.kind == "ball":
+            position = position[[1, 2, 3, 0]]
         q.append(position)
         v.append(rates)
     return np.concatenate(q), np.concatenate(v)
@@ -176,6 +211,13 @@ def model_text(model: LinkModel) -> str:
         lines.append(f"{k} {_text([*point, *s.amplitude, s.rate, s.phase])}")
     lines.append(f"cuts {len(model.cuts)}")
     lines += [f"{a} {_text(x)} {b} {_text(y)}" for a, x, b, y in model.cuts]
+    lines += [f"closed {len(model.closed)}", _text(model.closed)]
+    lines.append(f"moments {len(model.moments)}")
+    lines += [f"{k} {_text(m)}" for k, m in model.moments]
+    lines.append(f"springs {len(model.springs)}")
+    lines += [f"{a} {_text(x)} {b} {_text(y)} {_text(n)}" for a, x, b, y, *n in model.springs]
+    lines.append(f"servos {len(model.servos)}")
+    lines += [f"{k} {_text(n)}" for k, *n in model.servos]
     return "\n".join(lines) + "\n"
 
 

@@ -1,8 +1,9 @@
-"""Pinocchio from Python: a tree with cut ball joints, `constraintDynamics`, SciPy's DOP853."""
+"""Pinocchio from Python: a tree with cut joints, `constraintDynamics`, SciPy's DOP853."""
 
 import importlib.util
 import math
 from collections.abc import Callable
+from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ class Dynamics:
         self.model = self._tree()
         self.data = self.model.createData()
         self._close()
-        self.free = self.links.links[0].kind == "free"
+        self._quaternions()
         self.constant, self.waves = generalised(self.links)
 
     def _tree(self) -> Any:
@@ -39,6 +40,7 @@ class Dynamics:
         model.gravity = pin.Motion(self.links.gravity, np.zeros(3))
         joints = {
             "free": pin.JointModelFreeFlyer,
+            "ball": pin.JointModelSpherical,
             "turn": pin.JointModelRZ,
             "slide": pin.JointModelPZ,
             "universal": lambda: pin.JointModelUniversal(np.eye(3)[0], np.eye(3)[1]),
@@ -62,50 +64,106 @@ class Dynamics:
         self.cuts = models, data
         if len(models):
             pin.initConstraintDynamics(self.model, self.data, models, data)
-        # no proximal term: the rows are independent, so one exact solve is enough
-        self.solve = pin.ProximalSettings(1e-12, 0.0, 1)
+        if len(self.links.closed) == 3:
+            # no proximal term: the rows are independent, so one exact solve is enough
+            self.solve = pin.ProximalSettings(1e-12, 0.0, 1)
+        else:
+            # of three rows a cut, that across the plane is dependent
+            self.solve = pin.ProximalSettings(1e-14, 1e-9, 20)
+
+    def _quaternions(self) -> None:
+        """Where quaternions and their angular velocities are, and all that is copied as it is."""
+        kinds = [link.kind for link in self.links.links]
+        joints = [self.model.joints[k + 1] for k in range(len(kinds))]
+        turning = [(k, kind) for k, kind in enumerate(kinds) if kind in ("free", "ball")]
+        # a free link is the first, with its place in front of its quaternion
+        self.turning = [
+            (joints[k].idx_q + 3 * (kind == "free"), joints[k].idx_v + 3 * (kind == "free"))
+            for k, kind in turning
+        ]
+        self.free = kinds[0] == "free"
+        plain = [
+            joint for joint, kind in zip(joints, kinds, strict=True) if kind not in ("free", "ball")
+        ]
+        q = [joint.idx_q + n for joint in plain for n in range(joint.nq)]
+        v = [joint.idx_v + n for joint in plain for n in range(joint.nv)]
+        self.plain = np.array(q, dtype=int), np.array(v, dtype=int)
+        self.servos = [
+            (joints[k].idx_q, joints[k].idx_v, *numbers) for k, *numbers in self.links.servos
+        ]
+
+    def _normalised(self, q: np.ndarray) -> np.ndarray:
+        """A copy of q with unit quaternions."""
+        q = q.copy()
+        for k, _ in self.turning:
+            q[k : k + 4] /= math.sqrt(q[k : k + 4] @ q[k : k + 4])
+        return q
+
+    def _by_posture(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
+        """Add joint forces that depend on the state: servos, world moments, springs."""
+        for at_q, at_v, stiffness, damping, target in self.servos:
+            tau[at_v] -= stiffness * (q[at_q] - target) + damping * v[at_v]
+        if not (self.links.moments or self.links.springs):
+            return
+        pin, model, data = self.pin, self.model, self.data
+        pin.computeJointJacobians(model, data, q)
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        jacobian = lambda link: pin.getJointJacobian(model, data, link + 1, frame)
+        for link, moment in self.links.moments:
+            tau += jacobian(link)[3:].T @ moment
+        for a, x, b, y, stiffness, damping, length in self.links.springs:
+            ends, movers = [], []
+            for link, point in ((a, x), (b, y)):
+                ends.append(point if link < 0 else data.oMi[link + 1].act(point))
+                J = np.zeros((6, model.nv)) if link < 0 else jacobian(link)
+                arm = ends[-1] - (0 if link < 0 else data.oMi[link + 1].translation)
+                movers.append(J[:3] - pin.skew(arm) @ J[3:])
+            d, mover = ends[1] - ends[0], movers[1] - movers[0]
+            now = math.sqrt(d @ d)
+            rate = d @ (mover @ v) / now
+            tau -= (stiffness * (now - length) + damping * rate) / now * (mover.T @ d)
 
     def acceleration(self, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Joint accelerations at q with unit quaternions."""
         tau = self.constant.copy()
         for column, force in self.waves:
             tau += math.sin(force[0] * t + force[1]) * column
+        self._by_posture(q, v, tau)
         if not len(self.cuts[0]):
             return self.pin.aba(self.model, self.data, q, v, tau)
         return self.pin.constraintDynamics(self.model, self.data, q, v, tau, *self.cuts, self.solve)
 
     def rate(self) -> Callable[[float, np.ndarray], np.ndarray]:
         """dx/dt of x = (q, v); quaternions are normalised where they are used, not in x."""
-        nq, data, free = self.model.nq, self.data, self.free
+        nq, data, free, turning = self.model.nq, self.data, self.free, self.turning
+        to_q, from_v = self.plain
         half = np.zeros((4, 4))
 
         def rate(t: float, x: np.ndarray) -> np.ndarray:
             q, v, out = x[:nq], x[nq:], np.empty_like(x)
-            if not free:
+            if not turning:
                 out[:nq] = v
                 out[nq:] = self.acceleration(t, q, v)
                 return out
-            unit = q.copy()
-            unit[3:7] /= math.sqrt(q[3:7] @ q[3:7])
-            out[nq:] = self.acceleration(t, unit, v)
-            # of the first joint, which aba leaves out of oMi
-            out[:3] = data.liMi[1].rotation @ v[:3]
-            a, b, c = 0.5 * v[3:6]
-            half[0, 1:] = c, -b, a
-            half[1, 0], half[1, 2:] = -c, (a, b)
-            half[2, :2], half[2, 3] = (b, -a), c
-            half[3, :3] = -a, -b, -c
-            out[3:7] = half @ q[3:7]
-            out[7:nq] = v[6:]
+            out[nq:] = self.acceleration(t, self._normalised(q), v)
+            if free:
+                # of the first joint, which aba leaves out of oMi
+                out[:3] = data.liMi[1].rotation @ v[:3]
+            for k, w in turning:
+                a, b, c = 0.5 * v[w : w + 3]
+                half[0, 1:] = c, -b, a
+                half[1, 0], half[1, 2:] = -c, (a, b)
+                half[2, :2], half[2, 3] = (b, -a), c
+                half[3, :3] = -a, -b, -c
+                out[k : k + 4] = half @ q[k : k + 4]
+            out[to_q] = v[from_v]
             return out
 
         return rate
 
     def positions(self, x: np.ndarray) -> tuple[np.ndarray, float]:
         """Centres of mass (n, 3) and the largest gap of a cut joint [m]."""
-        q = x[: self.model.nq].copy()
-        if self.free:
-            q[3:7] /= np.linalg.norm(q[3:7])
+        q = self._normalised(x[: self.model.nq])
         self.pin.forwardKinematics(self.model, self.data, q)
         place = self.data.oMi
         gap = max(
@@ -120,8 +178,11 @@ class PinocchioPython(Peer):
 
     name = "Pinocchio (Python), SciPy DOP853"
     packages = ("pin", "scipy")
-    caveats = (
-        "Loads are written as constant or periodic joint forces, which is possible in these scenes.",
+    caveats = ("Loads are written as joint forces; those of springs by joint Jacobians.",)
+    how = (
+        "ABA, or constraintDynamics with rigid 3-D point constraints without proximal term (in "
+        "planar mechanisms, where a third of the rows is dependent, with mu = 1e-9), called from "
+        "Python; SciPy's DOP853, rtol = atol = tolerance."
     )
 
     def missing(self) -> str:
@@ -133,7 +194,7 @@ class PinocchioPython(Peer):
     def version(self) -> str:
         import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
-        return str(pin.__version__)
+        return f"{pin.__version__}, SciPy {metadata.version('scipy')}"
 
     def unsupported(self, scene: Scene) -> str:
         return why_no_joint_forces(scene)

@@ -14,7 +14,9 @@ from stmuav_jax import (
     AppliedForce,
     AppliedMoment,
     Gravity,
+    JointServo,
     LinearActuator,
+    LinearSpringDamper,
     Rotors,
     Scene,
     Sine,
@@ -26,7 +28,7 @@ ROWS = {"translational": 5, "revolute": 5, "universal": 4, "spherical": 3}
 
 
 class UnsupportedError(Exception):
-    """A scene holds something that the peers' models do not know."""
+    """A scene holds something that our adapters for the peers do not hand over."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,32 @@ class Actuator:
 
 
 @dataclass(frozen=True)
+class Spring:
+    """A spring and damper between points of two bodies: [N/m], [N s/m], length at rest [m]."""
+
+    i: int
+    j: int
+    point_i: np.ndarray
+    point_j: np.ndarray
+    stiffness: float
+    damping: float
+    length: float
+
+
+@dataclass(frozen=True)
+class Servo:
+    """The force -k (x - target) - c x_rate on the shift x of a translational joint.
+
+    joint: its number. stiffness k [N/m], damping c [N s/m], target [m].
+    """
+
+    joint: int
+    stiffness: float
+    damping: float
+    target: float
+
+
+@dataclass(frozen=True)
 class Plain:
     """Bodies, joints and loads of a scene.
 
@@ -72,6 +100,7 @@ class Plain:
         mass (n,) [kg], inertia (n, 3, 3) [kg m^2].
         wrenches: (body, force, moment), constant in body axes.
         forces: (body, force), at the centre of mass in world axes.
+        moments: (body, moment), constant in world axes.
     """
 
     names: tuple[str, ...]
@@ -82,6 +111,9 @@ class Plain:
     wrenches: tuple[tuple[int, np.ndarray, np.ndarray], ...]
     actuators: tuple[Actuator, ...]
     forces: tuple[tuple[int, Sinus], ...]
+    moments: tuple[tuple[int, np.ndarray], ...] = ()
+    springs: tuple[Spring, ...] = ()
+    servos: tuple[Servo, ...] = ()
 
     @property
     def n(self) -> int:
@@ -126,7 +158,7 @@ def plain(scene: Scene) -> Plain:
     """The scene in plain numbers.
 
     Raises:
-        UnsupportedError: a joint or force that the peers' models do not know.
+        UnsupportedError: a joint or force that no adapter hands over.
     """
     system = scene.system
     names = system.names
@@ -135,60 +167,103 @@ def plain(scene: Scene) -> Plain:
     joints = []
     for joint in system.joints:
         if joint.kind not in ROWS:
-            raise UnsupportedError(f"Joint '{joint.name}' is of kind {joint.kind}.")
+            raise UnsupportedError(f"A joint of kind {joint.kind} is not written in our adapters.")
         i, j = index[joint.body_i], index[joint.body_j]
         points = np.asarray(joint.point_i) - com[i], np.asarray(joint.point_j) - com[j]
         frames = np.asarray(joint.frame_i), np.asarray(joint.frame_j)
         joints.append(PlainJoint(joint.kind, i, j, *points, *frames))
-    gravity, wrenches, actuators, forces = _loads(scene, index, com)
+    loads = _loads(scene, index, com)
     return Plain(
         names,
         np.asarray(system.bodies.mass, dtype=float),
         np.asarray(system.bodies.inertia, dtype=float),
         tuple(joints),
-        gravity,
-        tuple(wrenches),
-        tuple(actuators),
-        tuple(forces),
+        loads.gravity,
+        tuple(loads.wrenches),
+        tuple(loads.actuators),
+        tuple(loads.forces),
+        tuple(loads.moments),
+        tuple(loads.springs),
+        tuple(loads.servos),
     )
 
 
-def _loads(scene: Scene, index: dict[str, int], com: np.ndarray) -> tuple:
-    gravity, wrenches, actuators, forces = np.zeros(3), [], [], []
-    for force in scene.system.forces:
+class _Loads:
+    """The loads of a scene, gathered force by force."""
+
+    def __init__(self, index: dict[str, int], com: np.ndarray) -> None:
+        self.index, self.com = index, com
+        self.gravity = np.zeros(3)
+        self.wrenches: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self.actuators: list[Actuator] = []
+        self.forces: list[tuple[int, Sinus]] = []
+        self.moments: list[tuple[int, np.ndarray]] = []
+        self.springs: list[Spring] = []
+        self.servos: list[Servo] = []
+
+    def add(self, force: object, scene: Scene) -> None:
+        """One force of the scene."""
+        index = self.index
         if isinstance(force, Gravity):
-            gravity = gravity + np.asarray(force.acceleration)
+            self.gravity = self.gravity + np.asarray(force.acceleration)
         elif isinstance(force, Rotors) and not callable(force.speed_squared):
             k = index[force.body]
             wrench = np.asarray(force.wrench(force.speed_squared, scene.system.bodies.com[k]))
-            wrenches.append((k, wrench[:3], wrench[3:]))
+            self.wrenches.append((k, wrench[:3], wrench[3:]))
         elif isinstance(force, LinearActuator) and force.couple == "consistent":
             base, slider = index[force.base], index[force.slider]
-            arm = np.asarray(force.axis_point) - com[base]
-            actuators.append(Actuator(base, slider, arm, _sinus(force.force)))
+            arm = np.asarray(force.axis_point) - self.com[base]
+            self.actuators.append(Actuator(base, slider, arm, _sinus(force.force)))
         elif isinstance(force, AppliedForce) and force.frame == "world" and force.point is None:
-            forces.append((index[force.body], _sinus(force.force)))
-        elif (
-            isinstance(force, AppliedMoment)
-            and force.frame == "body"
-            and not callable(force.moment)
-        ):
-            wrenches.append((index[force.body], np.zeros(3), np.asarray(force.moment)))
+            self.forces.append((index[force.body], _sinus(force.force)))
+        elif isinstance(force, AppliedMoment) and not callable(force.moment):
+            k, moment = index[force.body], np.asarray(force.moment)
+            if force.frame == "body":
+                self.wrenches.append((k, np.zeros(3), moment))
+            else:
+                self.moments.append((k, moment))
+        elif isinstance(force, LinearSpringDamper):
+            self._spring(force)
+        elif isinstance(force, JointServo):
+            self._servo(force, scene)
         else:
-            raise UnsupportedError(f"A force of kind {type(force).__name__} is not modelled.")
-    return gravity, wrenches, actuators, forces
+            kind = type(force).__name__
+            raise UnsupportedError(f"A force of kind {kind}, as used here, is not written.")
+
+    def _spring(self, force: LinearSpringDamper) -> None:
+        i, j = self.index[force.body_i], self.index[force.body_j]
+        points = np.asarray(force.point_i) - self.com[i], np.asarray(force.point_j) - self.com[j]
+        numbers = float(force.stiffness), float(force.damping), float(force.length)
+        self.springs.append(Spring(i, j, *points, *numbers))
+
+    def _servo(self, force: JointServo, scene: Scene) -> None:
+        names = [joint.name for joint in scene.system.joints]
+        number = names.index(force.joint)
+        if scene.system.joints[number].kind != "translational":
+            raise UnsupportedError("A servo in a joint that turns is not written.")
+        if callable(force.target):
+            raise UnsupportedError("A servo with a moving target is not written.")
+        numbers = float(force.stiffness), float(force.damping), float(force.target)
+        self.servos.append(Servo(number, *numbers))
+
+
+def _loads(scene: Scene, index: dict[str, int], com: np.ndarray) -> _Loads:
+    loads = _Loads(index, com)
+    for force in scene.system.forces:
+        loads.add(force, scene)
+    return loads
 
 
 def _sinus(value: object) -> Sinus:
     if isinstance(value, Sine):
         return Sinus(np.asarray(value.amplitude), float(value.angular_frequency), 0.0)
     if callable(value):
-        raise UnsupportedError("A force that is a function of the state is not modelled.")
+        raise UnsupportedError("A force that is a function of the state is not written.")
     return Sinus(np.asarray(value, dtype=float), 0.0, 0.5 * np.pi)
 
 
 def why_not(scene: Scene) -> str:
-    """Why the peers cannot model a scene; empty if they can."""
+    """What all our adapters lack for a scene; empty if they lack nothing."""
     try:
         plain(scene)
     except UnsupportedError as error:

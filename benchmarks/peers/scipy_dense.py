@@ -23,6 +23,7 @@ from stmuav_jax import Scene
 
 from .plain import Plain, loop_seconds, plain, start, why_not
 from .scipy_run import follow
+from .tree import in_plane
 
 # The report's primitives: the point, and axes as columns of frames i and j.
 _TERMS = {
@@ -31,6 +32,8 @@ _TERMS = {
     "revolute": (("point", 2, 2), ("p1", 2, 2)),
     "translational": (("p1", 2, 2), ("p2", 2, 2), ("n1", 0, 1)),
 }
+# Singular values below this, relative to the largest, are those of dependent rows.
+DEPENDENT = 1e-13
 _KEEP = np.array([[1, 2], [0, 2], [0, 1]])
 
 
@@ -132,6 +135,8 @@ class Dense:
         n, groups = self.model.n, self.fixed.groups
         self.m = sum(len(g.i) * c for g, c in zip(groups.values(), (3, 1, 2, 2), strict=True))
         self.K = np.zeros((7 * n + self.m, 7 * n + self.m))
+        # planar loops of spatial joints
+        self.redundant = in_plane(self.model) is not None and len(self.model.joints) > n
         for k in range(n):
             self.K[6 * k : 6 * k + 3, 7 * k : 7 * k + 3] = self.model.mass[k] * np.eye(3)
         body = np.arange(n)
@@ -203,7 +208,39 @@ class Dense:
             moment[act.slider] += A[act.slider].T @ cross(lever, push)
         for k, f in model.forces:
             force[k] += f(t)
+        for k, n in model.moments:
+            moment[k] += A[k].T @ n
         return force, moment
+
+    def pulls(
+        self, q: np.ndarray, u: np.ndarray, A: np.ndarray, omega: np.ndarray
+    ) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """Forces that depend on the state, springs and servos: body, world force, world arm."""
+        r, v = q[:, :3], u[:, :3]
+
+        def point(body: int, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            arm = A[body] @ place
+            return r[body] + arm, v[body] + A[body] @ cross(omega[body], place), arm
+
+        found = []
+        for s in self.model.springs:
+            a, a_rate, arm_a = point(s.i, s.point_i)
+            b, b_rate, arm_b = point(s.j, s.point_j)
+            d = b - a
+            now = np.linalg.norm(d)
+            pull = s.stiffness * (now - s.length) + s.damping * (d @ (b_rate - a_rate)) / now
+            found += [(s.i, pull / now * d, arm_a), (s.j, -pull / now * d, arm_b)]
+        for servo in self.model.servos:
+            joint = self.model.joints[servo.joint]
+            a, a_rate, arm_a = point(joint.i, joint.point_i)
+            b, b_rate, arm_b = point(joint.j, joint.point_j)
+            axis = A[joint.i] @ joint.frame_i[:, 2]
+            spin = cross(A[joint.i] @ omega[joint.i], b - a)
+            x, x_rate = axis @ (b - a), axis @ (b_rate - a_rate - spin)
+            push = -servo.stiffness * (x - servo.target) - servo.damping * x_rate
+            # both at the second body's point, so that they have no net moment
+            found += [(joint.j, push * axis, arm_b), (joint.i, -push * axis, b - r[joint.i])]
+        return found
 
     def acceleration(self, t: float, x: np.ndarray) -> np.ndarray:
         """qddot of all bodies (7 n,)."""
@@ -213,8 +250,13 @@ class Dense:
         q[:n], u[:n] = x[: 7 * n].reshape(n, 7), x[7 * n :].reshape(n, 7)
         (G, L), (Gd, Ld) = matrices(q[:, 3:]), matrices(u[:, 3:])
         inertia, p_rate = self.model.inertia, u[:n, 3:]
-        force, moment = self.loads(t, q[:, :3], G @ L.transpose(0, 2, 1))
+        A = G @ L.transpose(0, 2, 1)
+        force, moment = self.loads(t, q[:, :3], A)
         omega = 2 * np.einsum("nab,nb->na", L[:n], p_rate)
+        if self.model.springs or self.model.servos:
+            for k, f, arm in self.pulls(q, u, A, np.concatenate([omega, np.zeros((1, 3))])):
+                force[k] += f
+                moment[k] += A[k].T @ cross(arm, f)
         turning = cross(omega, np.einsum("nab,nb->na", inertia, omega))
         K[self.at_turning] = 2 * inertia @ L[:n]
         K[self.at_norm] = q[:n, 3:]
@@ -235,6 +277,8 @@ class Dense:
             first += k * c
         K[7 * n :, : 7 * n] = Phi[:, :n].reshape(m, 7 * n)
         K[: 6 * n, 7 * n :] = B[:, :n].reshape(m, 6 * n).T
+        if self.redundant:
+            return np.linalg.lstsq(K, right, rcond=DEPENDENT)[0][: 7 * n]
         return np.linalg.solve(K, right)[: 7 * n]
 
     def rate(self, t: float, x: np.ndarray) -> np.ndarray:
@@ -262,7 +306,14 @@ class ScipyDense(Peer):
 
     name = "NumPy, the report's dense system"
     packages = ("scipy",)
-    caveats = ("Not stabilised: violations of the constraints stay and grow.",)
+    how = (
+        "One dense system per evaluation by numpy.linalg.solve; SciPy's solvers, "
+        "rtol = atol = tolerance."
+    )
+    caveats = (
+        "Planar loops of spatial joints, whose rows are dependent: least squares by numpy.linalg.lstsq.",
+        "Not stabilised: violations of the constraints stay and grow.",
+    )
 
     def missing(self) -> str:
         return "" if importlib.util.find_spec("scipy") else "The package scipy is not installed."
@@ -270,7 +321,7 @@ class ScipyDense(Peer):
     def version(self) -> str:
         import scipy
 
-        return f"{scipy.__version__}, NumPy {np.__version__}"
+        return f"NumPy {np.__version__}, SciPy {scipy.__version__}"
 
     def unsupported(self, scene: Scene) -> str:
         return why_not(scene)

@@ -1,8 +1,8 @@
 """A spanning tree of a scene for programs in relative coordinates: Pinocchio and MuJoCo.
 
-The joints with the most rows are kept, the others (ball joints, in our scenes) are cut and
-closed by constraints. Joints are listed depth first, parents before children; Pinocchio
-gives a wrong mass matrix otherwise.
+The joints with the most rows are kept, the others are cut and closed by constraints: ball joints,
+and hinges of planar mechanisms, where two rows in the plane say all that is left to say. Joints
+are listed depth first, parents before children; Pinocchio gives a wrong mass matrix otherwise.
 """
 
 from dataclasses import dataclass
@@ -32,11 +32,11 @@ IDENTITY = Frame(np.eye(3), np.zeros(3))
 
 @dataclass(frozen=True)
 class Link:
-    """A joint of the tree. `kind`: "free", "turn" and "slide" (z), "universal" (x, then y).
+    """A joint of the tree. `kind`: "free", "ball", "turn" and "slide" (z), "universal" (x, then y).
 
     Attributes:
         parent, child: bodies (ground is n). ahead: number of the parent's link, -1: ground.
-        on_parent, on_child: the joint's frame on each.
+        on_parent, on_child: the joint's frame on each. joint: where it comes from.
     """
 
     kind: str
@@ -45,18 +45,28 @@ class Link:
     ahead: int
     on_parent: Frame
     on_child: Frame
+    joint: PlainJoint | None = None
 
 
 @dataclass(frozen=True)
 class Tree:
-    """Links, depth first; the joints that are cut; the link that carries each body."""
+    """Links, depth first; the joints that are cut; the link that carries each body.
+
+    plane: (2, 3) world directions in which cut joints are closed; None: in all three.
+    """
 
     links: tuple[Link, ...]
     cuts: tuple[PlainJoint, ...]
     carrier: tuple[int, ...]
+    plane: np.ndarray | None = None
 
 
-KINDS = {"translational": "slide", "revolute": "turn", "universal": "universal"}
+KINDS = {
+    "translational": "slide",
+    "revolute": "turn",
+    "universal": "universal",
+    "spherical": "ball",
+}
 
 
 def span(model: Plain) -> Tree:
@@ -81,11 +91,34 @@ def span(model: Plain) -> Tree:
         carrier[0] = 0
     grow(model.n if tied else 0)
     if len(carrier) != model.n + 1:
-        raise UnsupportedError("More than one part of the system floats.")
+        raise UnsupportedError("More than one floating part is not written.")
     cuts = tuple(joint for joint in model.joints if joint not in kept)
+    plane = None
     if any(joint.kind != "spherical" for joint in cuts):
-        raise UnsupportedError("A loop would be cut at a joint that is not spherical.")
-    return Tree(tuple(links), cuts, tuple(carrier[k] for k in range(model.n)))
+        plane = in_plane(model)
+        if plane is None:
+            raise UnsupportedError(
+                "Cutting a spatial loop at a joint that is not spherical is not written."
+            )
+    return Tree(tuple(links), cuts, tuple(carrier[k] for k in range(model.n)), plane)
+
+
+def in_plane(model: Plain) -> np.ndarray | None:
+    """Two world directions across all axes, (2, 3), if all joints are parallel hinges on ground.
+
+    Parallel axes on every body are parallel in the world in every posture.
+    """
+    normals: dict[int, np.ndarray] = {}
+    for joint in model.joints:
+        if joint.kind != "revolute":
+            return None
+        for body, frame in ((joint.i, joint.frame_i), (joint.j, joint.frame_j)):
+            first = normals.setdefault(body, frame[:, 2])
+            if np.abs(np.cross(first, frame[:, 2])).max() > 1e-12:
+                return None
+    if model.n not in normals:
+        return None
+    return np.linalg.svd(normals[model.n][None])[2][1:]
 
 
 def why_no_tree(model: Plain) -> str:
@@ -112,16 +145,19 @@ def _kruskal(model: Plain) -> list[PlainJoint]:
 def _link(joint: PlainJoint, parent: int, child: int, ahead: int) -> Link:
     ends = Frame(joint.frame_i, joint.point_i), Frame(joint.frame_j, joint.point_j)
     if joint.kind not in KINDS or (joint.kind == "universal" and parent != joint.i):
-        raise UnsupportedError(f"A {joint.kind} joint cannot lead from body {parent} to {child}.")
+        raise UnsupportedError(
+            f"A {joint.kind} joint from its second body to its first is not written."
+        )
     if parent != joint.i:
         ends = ends[::-1]
-    return Link(KINDS[joint.kind], parent, child, ahead, *ends)
+    return Link(KINDS[joint.kind], parent, child, ahead, *ends, joint)
 
 
 def coordinates(tree: Tree, state: Start) -> list[tuple[np.ndarray, np.ndarray]]:
     """Each link's coordinates and their rates in a consistent state.
 
-    A free link has r and Euler parameters (7,), world velocity and body angular velocity (6,).
+    A free link has r and Euler parameters (7,), world velocity and body angular velocity (6,); a
+    ball Euler parameters (4,) and the relative angular velocity in the child's frame (3,).
     """
     R = np.concatenate([state.R_wb, np.eye(3)[None]])
     r, v = (np.concatenate([x, np.zeros((1, 3))]) for x in (state.r, state.v))
@@ -136,7 +172,9 @@ def coordinates(tree: Tree, state: Start) -> list[tuple[np.ndarray, np.ndarray]]
         F = R[a] @ link.on_parent.R
         T = F.T @ R[b] @ link.on_child.R
         turning = F.T @ (w[b] - w[a])
-        if link.kind == "turn":
+        if link.kind == "ball":
+            result.append((euler_parameters(T), T.T @ turning))
+        elif link.kind == "turn":
             result.append((np.array([np.arctan2(T[1, 0], T[0, 0])]), turning[2:]))
         elif link.kind == "universal":
             first, second = np.arctan2(T[2, 1], T[1, 1]), np.arctan2(T[0, 2], T[0, 0])
@@ -151,3 +189,14 @@ def coordinates(tree: Tree, state: Start) -> list[tuple[np.ndarray, np.ndarray]]
             rates = np.array([z @ (d_rate - np.cross(w[a], d))])
             result.append((np.array([z @ d]), rates))
     return result
+
+
+def euler_parameters(R: np.ndarray) -> np.ndarray:
+    """Euler parameters (4,), scalar first, of a rotation: the eigenvector of Bar-Itzhack's matrix."""
+    x, y, z = R[:, 0], R[:, 1], R[:, 2]
+    trace = np.trace(R)
+    K = np.empty((4, 4))
+    K[0, 0] = trace
+    K[0, 1:] = K[1:, 0] = y[2] - z[1], z[0] - x[2], x[1] - y[0]
+    K[1:, 1:] = R + R.T - trace * np.eye(3)
+    return np.linalg.eigh(K)[1][:, -1]

@@ -48,7 +48,8 @@ def check(folder: Path, sections: tuple[str, ...], page: Path) -> None:
         for row in [*rows, *(point for curve in rows for point in curve.get("rows", []))]:
             assert row["failure"] == ""
     text = page.read_text()
-    assert text.count("\n## ") == 1 + len(sections)
+    # two more: what was compared with, and the state of the results
+    assert text.count("\n## ") == 2 + len(sections)
     assert "smallest size" in text
     shown = [line.split("(")[1].rstrip(")") for line in text.splitlines() if line.startswith("![")]
     assert all((page.parent / place).stat().st_size > 0 for place in shown)

@@ -1,0 +1,106 @@
+"""The pages that benchmarks write: failures with reasons, and honest words about other programs."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+sys.path.append(str(FOLDER))
+
+import montecarlo_page  # noqa: E402
+import report  # noqa: E402
+import report_figures  # noqa: E402
+import report_state  # noqa: E402
+import suite_tables  # noqa: E402
+from record import RESULTS  # noqa: E402
+
+NAN = float("nan")
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """The suite's page from the committed results."""
+    return report.build(RESULTS, tmp_path_factory.mktemp("docs") / "benchmarks.md").read_text()
+
+
+def tables(text):
+    """Cells of all table rows of a page, without heads' rules."""
+    lines = [line for line in text.splitlines() if line.startswith("|") and "---" not in line]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_no_page_says_what_another_program_cannot_do(page):
+    assert "cannot model" not in page
+    assert "not about the programs" in page
+    throughput = (FOLDER.parent / "docs" / "throughput.md").read_text()
+    for text in (page, throughput):
+        assert "nan" not in [cell for row in tables(text) for cell in row]
+
+
+def test_rows_without_an_error_say_why():
+    """In the stored results: a run with no error or no rate has its reason in words."""
+    for path in sorted(RESULTS.glob("suite_*.json")):
+        content = json.loads(path.read_text())
+        for curve in content.get("curves", []):
+            for row in curve["rows"]:
+                assert row["error"] is not None or row["failure"], (path.name, row)
+    for row in json.loads((RESULTS / "montecarlo.json").read_text())["peers"]:
+        assert montecarlo_page.of_peer(row)[-1] or montecarlo_page.of_peer(row)[2] != "-"
+
+
+@pytest.mark.parametrize(
+    ("row", "cells"),
+    [
+        (
+            {"tolerance": 1e-4, "per_second": 16036.7, "median_error": NAN, "largest_error": NAN},
+            ("-", "-", "-", "Some flights (how many was not recorded) ended with a state that is "
+             "not finite."),
+        ),
+        (
+            {"step": 1e-3, "per_second": 34.8, "median_error": NAN, "largest_error": NAN,
+             "not_finite": 3, "failure": "3 of 64 flights ended so."},
+            ("-", "-", "-", "3 of 64 flights ended so."),
+        ),
+        (
+            {"tolerance": 1e-5, "per_second": 129.2, "median_error": 9e-4, "largest_error": 0.21},
+            ("129.2", "9.0e-04", "2.1e-01", ""),
+        ),
+    ],
+)  # fmt: skip
+def test_flights_that_were_lost_have_no_throughput(row, cells):
+    row = {"method": "a program", "failure": "", **row}
+    assert montecarlo_page.of_peer(row)[2:] == cells
+
+
+def test_state_of_the_results_names_every_result(page):
+    section = page.split("## State of the results")[1].split("\n## ")[0]
+    names = {row[0].split(",")[0] for row in tables(section)[1:]}
+    assert names == {path.stem for path in RESULTS.glob("*.json")}
+
+
+def test_state_of_a_result_that_left_the_history(monkeypatch):
+    about = {"commit": "f" * 40, "date": "2026-11-21T18:26:22+00:00"}
+    monkeypatch.setattr(report_state, "git", lambda *call: "12" if "--count" in call else "x")
+    monkeypatch.setattr(report_state, "in_history", lambda _: False)
+    assert report_state.age(about) == ("no", "12, by date")
+    monkeypatch.setattr(report_state, "git", lambda *_: None)
+    assert report_state.age(about) == ("no history here", "-")
+
+
+def test_figures_name_what_they_do_not_show():
+    row = {"method": "A", "error": 1e-3, "seconds": {"median": 1.0}, "failure": ""}
+    failed = {**row, "method": "B", "error": None, "failure": "The step became too small."}
+    lacking = {"method": "C", "reason": "No ball joints."}
+    curve = {"rows": [row, failed], "unsupported": [lacking]}
+    assert report_figures.not_drawn(curve) == [
+        ("C", "not in our adapter: No ball joints."),
+        ("B", "The step became too small."),
+    ]
+
+
+def test_reference_in_closed_form_is_called_so():
+    check = {"horizon": 1.0, "second_code": None, "other_formulation": None}
+    assert "The reference is the closed form" in suite_tables._reference(check, True)[0]
+    assert "tightest tolerance" in suite_tables._reference(check, False)[0]
