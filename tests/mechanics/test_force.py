@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import np_rotation, random_quaternion, relative_error, state_of
+from helpers import np_rotation, random_quaternion, relative_error, state_of, unit
 
 import stmuav_jax as sj
 from stmuav_jax.mechanics.force import _frame
@@ -240,22 +240,75 @@ def test_power_of_a_torsional_spring():
     assert World(at(0.9)).power(load) == pytest.approx(expected, rel=1e-8)
 
 
+SAME = [[1.0, 0, 0, 0]] * 2
+
+
+def pull_on_a(x, length, damping=0.0, stiffness=50.0):
+    """Force on a [N] and potential [J] of a spring between centres of mass b - a = x[:3]."""
+    spring = sj.LinearSpringDamper(
+        "a", "b", point_i=COM["a"], point_j=COM["b"],
+        stiffness=stiffness, damping=damping, length=length,
+    )  # fmt: skip
+    none = jnp.zeros(3)
+    state = sj.State(
+        jnp.stack([none, x[:3]]), jnp.asarray(SAME), jnp.stack([none, x[3:]]), jnp.zeros((2, 3))
+    )
+    load = spring.load(jnp.zeros(()), system_with(spring).kinematics(state))
+    return load.force[0], load.potential, load.power
+
+
+of_spring = jax.jit(lambda x, *numbers: pull_on_a(x, *numbers)[0])
+# forward and reverse mode; and the potential's two derivatives
+ahead, back = jax.jit(jax.jacfwd(of_spring)), jax.jit(jax.jacrev(of_spring))
+slope = jax.jit(jax.grad(lambda x, *numbers: pull_on_a(x, *numbers)[1]))
+curvature = jax.jit(jax.hessian(lambda x, *numbers: pull_on_a(x, *numbers)[1]))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-120, 1e-9, 0.3])
+def test_a_spring_without_a_length_is_linear(size):
+    x = jnp.array([size, -2 * size, 0.5 * size, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(of_spring(x, 0.0), 50 * x[:3], rtol=1e-15)
+    for J in (ahead(x, 0.0), back(x, 0.0)):
+        np.testing.assert_allclose(J, np.hstack([50 * np.eye(3), np.zeros((3, 3))]), atol=1e-13)
+    np.testing.assert_allclose(slope(x, 0.0)[:3], 50 * x[:3], rtol=1e-14)
+    np.testing.assert_allclose(curvature(x, 0.0)[:3, :3], 50 * np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-120, 1e-9, 0.3, 2.0])
+def test_derivatives_of_a_spring_with_a_length(size):
+    """k (I - l (I - u u^T) / |d|), and c u u^T of the damper."""
+    u = unit([1.0, -2.0, 0.5])
+    x = jnp.concatenate([size * u, jnp.zeros(3)])
+    stiff = 50 * (np.eye(3) - 0.4 * (np.eye(3) - np.outer(u, u)) / size)
+    expected = np.hstack([stiff, 3 * np.outer(u, u)])
+    for J in (ahead(x, 0.4, 3.0), back(x, 0.4, 3.0)):
+        np.testing.assert_allclose(J, expected, rtol=1e-12, atol=1e-12 * np.abs(stiff).max())
+
+
 @pytest.mark.parametrize("length", [0.0, 0.3])
-def test_a_spring_of_no_length_has_finite_gradients(length):
-    spring = sj.LinearSpringDamper("a", "b", stiffness=50.0, damping=3.0, length=length)
-    system = system_with(spring)
-    R = np.eye(3)
-    same = state_of([R @ COM["a"], R @ COM["b"]], [[1.0, 0, 0, 0]] * 2, [[1.0, 0, 0], [0, 0, 0]])
+def test_a_damper_where_its_ends_meet(length):
+    """Straight through the point: the force before, there and after is c times the velocity."""
+    v = np.array([0.3, -1.0, 2.0])
+    at = lambda t: pull_on_a(jnp.asarray([*(t * v), *v]), length, 3.0, 0.0)
+    for t in (-1e-3, 0.0, 1e-3):
+        force, potential, power = at(t)
+        np.testing.assert_allclose(force, 3 * v, rtol=1e-14)
+        np.testing.assert_allclose([potential, power], [0, -3 * v @ v], atol=1e-13)
+    if length == 0:
+        J = np.asarray(ahead(jnp.zeros(6), 0.0, 3.0))
+        np.testing.assert_allclose(J, np.hstack([50 * np.eye(3), 3 * np.eye(3)]))
 
-    def total(state, spring):
-        load = spring.load(jnp.zeros(()), system.kinematics(state))
-        return jnp.sum(load.force**2) + jnp.sum(load.moment**2) + load.potential + load.power
 
-    value, gradients = jax.value_and_grad(total, argnums=(0, 1))(same, spring)
-    assert float(value) == pytest.approx(25 * length**2)
-    assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradients))
-    rates = jax.jvp(total, (same, spring), jax.tree.map(jnp.ones_like, (same, spring)))[1]
-    assert np.isfinite(float(rates))
+def test_a_spring_with_a_length_has_no_derivative_where_its_ends_meet():
+    """The force jumps there: NaN, not a number made up; its value is left out, not NaN."""
+    force, potential, _ = pull_on_a(jnp.zeros(6), 0.3)
+    assert not np.any(force)
+    assert float(potential) == pytest.approx(25 * 0.3**2)
+    assert np.all(np.isnan(np.diagonal(ahead(jnp.zeros(6), 0.3)[:, :3])))
+    assert np.all(np.isnan(np.diagonal(back(jnp.zeros(6), 0.3)[:, :3])))
+    # with respect to numbers of the spring it has
+    stiffness = jax.grad(lambda k: pull_on_a(jnp.zeros(6), 0.3, 0.0, k)[1])(50.0)
+    assert float(stiffness) == pytest.approx(0.5 * 0.3**2)
 
 
 def test_loads_add_up(state):
@@ -276,7 +329,14 @@ def test_loads_add_up(state):
         (lambda: sj.LinearSpringDamper("a", "", stiffness=1.0), "needs two bodies"),
         (lambda: sj.LinearSpringDamper("a", "b", stiffness=np.nan), "stiffness of the spring"),
         (lambda: sj.LinearSpringDamper("a", "b", stiffness=1.0, length=np.inf), "length of the"),
+        (lambda: sj.LinearSpringDamper("a", "b", stiffness=-1.0), "stiffness .*'a' and 'b' must not"),
+        (lambda: sj.LinearSpringDamper("a", "b", stiffness=1.0, damping=-1.0), "but it is -1 N s/m"),
+        (lambda: sj.LinearSpringDamper("a", "b", stiffness=1.0, length=-2.0), "but it is -2 m"),
         (lambda: sj.TorsionalSpringDamper("J", stiffness=np.nan), "torsional spring in joint 'J'"),
+        (lambda: sj.TorsionalSpringDamper("J", stiffness=-1.0), "must not be negative"),
+        (lambda: sj.TorsionalSpringDamper("J", stiffness=1.0, damping=-1.0), "must not be negative"),
+        (lambda: sj.JointDamping("J", turning=-1.0), "joint 'J' must not be negative"),
+        (lambda: sj.JointDamping("J", sliding=-1.0), "joint 'J' must not be negative"),
         (lambda: sj.JointDamping("J", turning=np.nan), "damping of joint 'J' must be finite"),
     ],
 )
