@@ -25,7 +25,7 @@ def directional(
 
 
 @jax.custom_jvp
-def without_derivative(x: Float[Array, "*s"], there: Bool[Array, ""]) -> Float[Array, "*s"]:
+def without_derivative(x: Float[Array, "*s"], there: Bool[Array, "..."]) -> Float[Array, "*s"]:
     """x itself, which has no derivative where `there` is true: it is NaN, not a number made up."""
     del there
     return x

@@ -14,7 +14,18 @@ from .body import GROUND
 from .errors import ModelError
 from .joint_coordinate import coordinate
 from .joint_force import AbstractJointForce
-from .load import (AbstractForce, Load, Signal, couple, evaluate, nonnegative, push, scalar, signal, vector)
+from .load import (
+    AbstractForce,
+    Load,
+    Signal,
+    couple,
+    evaluate,
+    nonnegative,
+    push,
+    scalar,
+    signal,
+    vector,
+)
 from .state import Kinematics
 
 

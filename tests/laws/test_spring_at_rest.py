@@ -47,5 +47,14 @@ def test_spectrum(damping):
     free = system(damping)
     values = sj.spectrum(free, free.reference)
     pair = np.roots([1.0, damping, 100.0])
-    np.testing.assert_allclose(np.sort_complex(values[:6]), np.sort_complex([*pair] * 3), atol=1e-12)
+    np.testing.assert_allclose(
+        np.sort_complex(values[:6]), np.sort_complex([*pair] * 3), atol=1e-12
+    )
     np.testing.assert_allclose(values[6:], 0, atol=1e-12)
+
+
+def test_a_spring_with_a_length_has_no_spectrum_where_its_ends_meet():
+    spring = sj.LinearSpringDamper("ground", "mass", stiffness=100.0, length=0.2)
+    bad = sj.System([sj.Body("mass", 1.0, [0.1, 0.1, 0.1], free=True)], (), (spring,))
+    with pytest.raises(sj.StateError, match="a force jumps there"):
+        sj.spectrum(bad, bad.reference)
