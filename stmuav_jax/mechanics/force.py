@@ -53,9 +53,14 @@ class AppliedForce(AbstractForce):
 
     Args:
         body: its name.
-        force: (3,) [N], or a function of (t, kinematics) that returns it.
+        force: (3,) [N], or a function of (t, kinematics) that returns it; `lambda t, kin: ...`
+            where it depends on the time alone.
         frame: the axes of `force`: "world" or "body".
         point: in the body's reference frame (3,) [m]; by default the centre of mass.
+
+    Raises:
+        ModelError: a number that is not finite, another shape or frame, a function of other
+            arguments; when it is evaluated first, a function that returns another shape.
     """
 
     body: str = eqx.field(static=True)
@@ -72,10 +77,14 @@ class AppliedForce(AbstractForce):
         point: Numbers | None = None,
     ) -> None:
         self.body = body
-        self.force = signal(force, f"The force on body '{body}'", (3,), "N")
+        self.force = signal(force, self._what(body), (3,), "N")
         self.frame = _frame(frame)
         what = f"The point of the force on body '{body}'"
         self.point = None if point is None else vector(point, what, "m")
+
+    @staticmethod
+    def _what(body: str) -> str:
+        return f"AppliedForce: the force on body '{body}'"
 
     def bodies(self) -> tuple[str, ...]:
         return (self.body,)
@@ -84,7 +93,7 @@ class AppliedForce(AbstractForce):
         return ()
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        value = evaluate(self.force, t, kin)
+        value = evaluate(self.force, t, kin, self._what(self.body), (3,))
         force_w = apply(kin.R_wb[kin.index(self.body)], value) if self.frame == "body" else value
         arm = None if self.point is None else kin.arm(self.body, self.point)
         return push(kin, self.body, force_w, arm)
@@ -105,8 +114,12 @@ class AppliedMoment(AbstractForce):
         frame: Literal["world", "body"] = "world",
     ) -> None:
         self.body = body
-        self.moment = signal(moment, f"The moment on body '{body}'", (3,), "N m")
+        self.moment = signal(moment, self._what(body), (3,), "N m")
         self.frame = _frame(frame)
+
+    @staticmethod
+    def _what(body: str) -> str:
+        return f"AppliedMoment: the moment on body '{body}'"
 
     def bodies(self) -> tuple[str, ...]:
         return (self.body,)
@@ -115,7 +128,7 @@ class AppliedMoment(AbstractForce):
         return ()
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        value = evaluate(self.moment, t, kin)
+        value = evaluate(self.moment, t, kin, self._what(self.body), (3,))
         moment_w = apply(kin.R_wb[kin.index(self.body)], value) if self.frame == "body" else value
         return push(kin, self.body, jnp.zeros_like(moment_w), moment_w=moment_w)
 

@@ -69,7 +69,8 @@ class AirframeDrag(AbstractForce):
         if self.point is not None:
             arm, velocity = kin.arm(self.body, self.point), kin.point(self.body, self.point)[1]
         if self.wind is not None:
-            velocity = velocity - evaluate(self.wind, t, kin)
+            what = f"AirframeDrag: the wind on body '{self.body}'"
+            velocity = velocity - evaluate(self.wind, t, kin, what, (3,))
         w = apply_transposed(kin.R_wb[k], velocity)
         square = dot(w, w)
         # |w| has a tip at rest, but |w| w has the derivative zero, which this gives

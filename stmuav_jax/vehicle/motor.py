@@ -9,7 +9,7 @@ from ..algebra.shapes import Numbers
 from ..algebra.stacked import apply
 from ..mechanics.errors import ModelError, check_finite, concrete
 from ..mechanics.internal import AbstractInternalForce
-from ..mechanics.load import Load, evaluate, push
+from ..mechanics.load import Load, push
 from ..mechanics.state import Kinematics
 from .allocation import RotorLimits
 from .rotor import Rotors
@@ -127,7 +127,7 @@ class MotorRotors(AbstractInternalForce):
 
     def command(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " k"]:
         """omega_c at time t [s] (k,) [rad/s]."""
-        return self.speeds_of(evaluate(self.rotors.speed_squared, t, kin))
+        return self.speeds_of(self.rotors.commands(t, kin))
 
     def speeds(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " k"]:
         """omega at time t [s] (k,) [rad/s]."""
@@ -148,7 +148,7 @@ class MotorRotors(AbstractInternalForce):
         k = kin.index(self.rotors.body)
         if self.time_constant is None:
             # not the squares of roots, which have no derivative at zero
-            squared = self.reached(evaluate(self.rotors.speed_squared, t, kin))
+            squared = self.reached(self.rotors.commands(t, kin))
         else:
             squared = self.internal**2
         wrench = self.rotors.wrench(squared, kin.com[k])

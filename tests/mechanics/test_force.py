@@ -9,6 +9,7 @@ from helpers import np_rotation, random_quaternion, relative_error, state_of, un
 
 import stmuav_jax as sj
 from stmuav_jax.mechanics.force import _frame
+from stmuav_jax.mechanics.load import AbstractForce, total_load
 
 COM = {"a": np.array([0.1, -0.2, 0.05]), "b": np.array([-0.3, 0.1, 0.2])}
 POINT_A, POINT_B = np.array([0.3, 0.1, -0.4]), np.array([0.2, -0.5, 0.6])
@@ -370,3 +371,69 @@ def test_bad_input_is_refused(build, words):
 def test_bad_shapes_and_points_are_refused_in_the_users_words(build):
     with pytest.raises(sj.ModelError, match=r"must (be finite|have shape)"):
         build()
+
+
+# --- functions that a user writes, and forces of a user's own
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (
+            lambda: sj.AppliedForce("a", lambda t: jnp.zeros(3)),
+            r"AppliedForce: the force on body 'a' .* two arguments, .*lambda t, kin",
+        ),
+        (lambda: sj.AppliedMoment("b", lambda t, kin, more: 0), "AppliedMoment: .* body 'b'"),
+        (lambda: sj.AirframeDrag("a", linear=[1.0] * 3, wind=lambda: 0.0), "wind on body 'a'"),
+    ],
+)
+def test_functions_of_other_arguments_are_refused_as_they_are_given(build, words):
+    with pytest.raises(sj.ModelError, match=words):
+        build()
+
+
+class Crooked(AbstractForce):
+    """A user's force that forgets ground."""
+
+    rows: int = eqx.field(static=True)
+
+    def bodies(self):
+        return ("a",)
+
+    def joint_names(self):
+        return ()
+
+    def load(self, t, kin):
+        if not self.rows:
+            return None
+        force = jnp.zeros((self.rows, 3))
+        return sj.Load(force, force, jnp.zeros(()), jnp.zeros(()))
+
+
+@pytest.mark.parametrize(
+    ("force", "words"),
+    [
+        (
+            sj.AppliedForce("a", lambda t, kin: jnp.zeros(2)),
+            r"'a' must have shape \(3,\), .*\(2,\)",
+        ),
+        (sj.AppliedMoment("b", lambda t, kin: 1.0), r"'b' must have shape \(3,\), .* shape \(\)"),
+        (sj.AppliedForce("b", lambda t, kin: None), "'b' must be numbers .* returns NoneType"),
+        (sj.AppliedForce("b", lambda t, kin: [1.0, [2.0], 3.0]), "'b' must be numbers .* list"),
+        (Crooked(2), r"load of Crooked on a must be .* shape \(3, 3\).* shape \(2, 3\)"),
+        (Crooked(0), "load of Crooked on a must be a Load .* it is none"),
+    ],
+)
+def test_loads_of_other_shapes_are_refused_where_they_are_traced(state, force, words):
+    kin = system_with(force).kinematics(state)
+    with pytest.raises(sj.ModelError, match=words):
+        total_load((sj.Gravity(), force), jnp.zeros(()), kin)
+
+
+def test_a_formulation_says_which_force_is_of_another_shape():
+    bad = sj.System(
+        [sj.Body("a", 1.0, [1.0] * 3, free=True)],
+        forces=[sj.AppliedForce("a", lambda t, kin: jnp.zeros(2))],
+    )
+    with pytest.raises(sj.ModelError, match="AppliedForce: the force on body 'a' must have shape"):
+        sj.evaluate(bad, bad.reference, formulation=sj.Augmented())
