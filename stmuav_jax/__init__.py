@@ -25,6 +25,7 @@ from .dynamics.energy import Energy, energy, momentum
 from .dynamics.formulation import Accelerations, Reactions
 from .dynamics.initial import Assembly, Rank, assemble, rank, ranks
 from .dynamics.integrate import Trajectory, integrate
+from .dynamics.joint_start import state_from_joints
 from .dynamics.prescribed import (
     KinematicPath,
     PathReason,
@@ -96,6 +97,7 @@ from .mechanics.joint import (
 )
 from .mechanics.joint_effort import JointEffort
 from .mechanics.joint_force import EndStop, JointFriction, JointServo
+from .mechanics.joint_motion import JointMotion, joint_motion
 from .mechanics.load import Load, Sine
 from .mechanics.sampled import Sampled
 from .mechanics.state import Kinematics, State
@@ -191,7 +193,7 @@ __all__ = [
     "Estimate", "EstimationError", "EstimationStudy", "EstimationWork", "Evaluation", "Filtered",
     "Flaws", "Flight", "FlightWork", "Flights", "Flyer", "Friction", "Gaussian", "Gravity",
     "Gusts", "IdentifiabilityError", "Identified", "Innovation", "Inputs", "Joint",
-    "JointDamping", "JointEffort", "JointFriction", "JointLoads", "JointServo", "KinematicPath",
+    "JointDamping", "JointEffort", "JointFriction", "JointLoads", "JointMotion", "JointServo", "KinematicPath",
     "Kinematics", "Limits", "Linear", "LinearActuator", "LinearSpringDamper", "Linearised",
     "Load", "Loop", "Method", "ModelError", "Motor", "MotorRotors", "Moved", "Observability",
     "OnlineFilter", "Parameter", "Parameters", "PathReason", "Place", "Projection", "Quantity",
@@ -210,7 +212,7 @@ __all__ = [
     "flight_model", "flights", "follow", "from_matrix", "from_rotation_vector", "gaussian",
     "growth", "hold", "holding_time", "hover", "hover_model", "hover_speed_squared", "identify",
     "identify_many", "inconsistent", "inertia_about_centre", "inertia_matrix", "inertia_states",
-    "initial_angles", "integrate", "internal_names", "joint_loads", "joint_reactions",
+    "initial_angles", "integrate", "internal_names", "joint_loads", "joint_motion", "joint_reactions",
     "kalman_filter", "kinematic_path", "kvaerno3", "kvaerno5", "linearize", "low_altitude",
     "make_scene", "make_work", "matrix_g", "matrix_l", "mean_interval", "momentum", "moved",
     "nees", "normalise", "observability", "observable_model", "outer_jit", "panel_angles",
@@ -219,7 +221,7 @@ __all__ = [
     "revolute", "revolute_spherical", "rk4", "rotation_matrix", "rotorcraft_model", "run_loads",
     "sampling_from_plain", "search", "sensed_flight", "sensed_sun", "shooting", "simulate",
     "simulate_case", "simulate_hover", "skew", "slew", "smooth", "smooth_peaks", "spanning_tree",
-    "spectrum", "spherical", "spin_exact", "standard_errors", "states_at", "steady_turn",
+    "spectrum", "spherical", "spin_exact", "standard_errors", "state_from_joints", "states_at", "steady_turn",
     "strokes", "study_case", "study_from_plain", "summarise", "sun_at", "sun_direction",
     "sun_in_body", "sun_position", "survey", "to_rotation_vector", "track_day", "tracker_bodies",
     "tracker_geometry", "tracker_joints", "tracker_limits", "transition", "translational", "trim",

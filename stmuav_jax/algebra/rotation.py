@@ -185,5 +185,9 @@ def from_matrix(A: Mat3Like) -> Quat:
 
 
 def rotation_angle(p: QuatLike) -> Scalar:
-    """Angle of the rotation in [0, pi] [rad], shape (); not differentiable at the identity."""
-    return 2 * jnp.arctan2(jnp.sqrt(p[1:] @ p[1:]), jnp.abs(p[0]))
+    """Angle of the rotation in [0, pi] [rad], shape ().
+
+    It has a tip at the identity, where its derivative is NaN, and a ridge at half turns, where
+    its derivative is that of the side e0 > 0 (as of `to_rotation_vector`).
+    """
+    return 2 * jnp.arctan2(jnp.sqrt(p[1:] @ p[1:]), jnp.where(p[0] < 0, -p[0], p[0]))

@@ -13,7 +13,6 @@ or, with W = diag(1/m_i, J'_i^-1) and g6 = (f_i, n'_i - omega' x J' omega'),
                                                           solve="structured"
 """
 
-from functools import reduce
 from typing import Any, Literal
 
 import equinox as eqx
@@ -29,7 +28,7 @@ from ..algebra.rotation import (
     normalise,
     product,
 )
-from ..mechanics.load import Load, no_load
+from ..mechanics.load import Load, total_load
 from ..mechanics.state import Kinematics, State
 from ..mechanics.system import System
 from .differential import Constraints, Equations, RowChoice, constraints
@@ -47,8 +46,7 @@ class Model(eqx.Module):
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
         """The sum of all force elements."""
-        loads = [force.load(t, kin) for force in self.system.forces]
-        return reduce(Load.__add__, loads, no_load(kin))
+        return total_load(self.system.forces, t, kin)
 
     def weigh(self, rows: Float[Array, "m n 6"]) -> Float[Array, "m n 6"]:
         """rows @ W, W the inverse of the block-diagonal mass matrix."""

@@ -15,6 +15,7 @@ from ..algebra.rotation import normalise
 from ..algebra.shapes import Numbers
 from ..mechanics.errors import ModelError, StateError, concrete
 from ..mechanics.joint import drive
+from ..mechanics.joint_coordinate import coordinate
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .augmented import Augmented, Model, displace
@@ -101,7 +102,7 @@ def _assembled(
 ) -> tuple[State, Float[Array, " joints"]]:
     """The assembled state and the largest position residual of each joint."""
     model = Augmented().prepare(system)
-    state = _velocities(model, t, _positions(model, t, guess, free, max_steps), free)
+    state = velocities(model, t, _positions(model, t, guess, free, max_steps), free)
     kin = system.kinematics(state)
     value = jnp.abs(model.constraints.scales() * model.constraints.equations(t, kin).value)
     owner = np.array(model.constraints.owner, dtype=int)
@@ -142,16 +143,7 @@ def _lock(system: System, state: State, names: tuple[str, ...]) -> System:
     for name in names:
         joint = system.joints[system.joint_index(name)]
         kind = "shift" if joint.kind in ("translational", "cylindrical") else "angle"
-        i, j = kin.index(joint.body_i), kin.index(joint.body_j)
-        F_i, F_j = kin.R_wb[i] @ joint.frame_i, kin.R_wb[j] @ joint.frame_j
-        if kind == "shift":
-            apart = (
-                kin.point(joint.body_j, joint.point_j)[0]
-                - kin.point(joint.body_i, joint.point_i)[0]
-            )
-            value = F_i[:, 2] @ apart
-        else:
-            value = jnp.arctan2(F_i[:, 1] @ F_j[:, 0], F_i[:, 0] @ F_j[:, 0])
+        value = coordinate(kin, joint, kind).value
         locks.append(drive(f"hold {name}", joint, _Constant(value), coordinate=kind))
     return eqx.tree_at(lambda s: s.joints, system, (*system.joints, *locks))
 
@@ -213,7 +205,7 @@ def _positions(
     return moved(solution.value[0], guess)
 
 
-def _velocities(model: Model, t: Float[Array, ""], state: State, free: Bool[Array, " k"]) -> State:
+def velocities(model: Model, t: Float[Array, ""], state: State, free: Bool[Array, " k"]) -> State:
     """The mass-weighted nearest velocities with J qdot = target."""
     if not model.constraints.n_rows:
         return state

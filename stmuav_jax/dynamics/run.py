@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike
 
+from ..mechanics.joint_motion import JointMotion, joint_motion
 from ..mechanics.state import State
 from .analysis import Snapshot
 from .integrate import Trajectory
@@ -97,6 +98,12 @@ class Run:
         """The saved states of one body, arrays (k, .)."""
         k = self.scene.system.index(name)
         return jax.tree.map(lambda x: np.asarray(x)[:, k], self.states)
+
+    def joint(self, name: str) -> JointMotion:
+        """Coordinates and rates of one joint at the saved times, angles counted on: `.angle`,
+        `.shift`, or `.coordinates` (k, c)."""
+        found = joint_motion(self.scene.system, self.states, name, self.ts)
+        return jax.tree.map(np.asarray, found)
 
 
 def relative(error: ArrayLike, *scales: ArrayLike) -> float:

@@ -238,7 +238,8 @@ def error_norm(n_state: int) -> Callable[[Vector], Float[Array, ""]]:
     def norm(error: Vector) -> Float[Array, ""]:
         part = error[:n_state]
         square = jnp.mean(part * part)
-        # safe to differentiate at zero; an error that is not a number stays one
+        # at zero, the tip of a cone, the derivative is taken as zero; an error that is not a
+        # number stays one
         return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), square)
 
     return norm

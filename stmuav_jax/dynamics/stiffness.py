@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.shapes import Numbers
+from ..mechanics.errors import StateError
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .formulation import AbstractFormulation
@@ -35,10 +36,18 @@ def spectrum(
 
     Raises:
         SettingError: shapes or precision of the state do not fit the system.
+        StateError: the derivatives are not finite at the state.
     """
     check_state(system, state)
     how = formulation if formulation is not None else Tree()
-    values = np.linalg.eigvals(np.asarray(_jacobian(how, system, state, jnp.asarray(t, float))))
+    matrix = np.asarray(_jacobian(how, system, state, jnp.asarray(t, float)))
+    if not np.all(np.isfinite(matrix)):
+        raise StateError(
+            "The motion cannot be linearised at this state: the accelerations or their derivatives "
+            "are not finite. Either the state is not, or a force jumps there, as that of a spring "
+            "with a length does where its ends meet."
+        )
+    values = np.linalg.eigvals(matrix)
     return values[np.argsort(-np.abs(values))]
 
 

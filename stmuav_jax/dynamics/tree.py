@@ -13,7 +13,6 @@ Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 6 (composite
 and ch. 8 (closed loops). Derivation: docs/dynamics.md.
 """
 
-from functools import reduce
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -33,7 +32,7 @@ from ..algebra.rotation import (
 )
 from ..algebra.stacked import apply, apply_transposed
 from ..mechanics.constraint import ROWS
-from ..mechanics.load import Load, no_load
+from ..mechanics.load import total_load
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .balance import balanced
@@ -163,7 +162,7 @@ class Tree(AbstractFormulation):
         system, tree = model.system, model.chain.tree
         kin = system.kinematics(state)
         cut = _cut_reactions(model, t, state, result.multipliers)
-        load = reduce(Load.__add__, [f.load(t, kin) for f in system.forces], no_load(kin))
+        load = total_load(system.forces, t, kin)
         return tree_reactions(system, tree, kin, load, result, cut)
 
     def _solve(
@@ -329,7 +328,7 @@ def _left(model: TreeModel, at: Coordinates, rows: Rows | None) -> Residuals:
 def _loads(system: System, t: Float[Array, ""], placed: Placed) -> Loads:
     """The sum of all force elements."""
     kin = kinematics(system, placed)
-    load = reduce(Load.__add__, [force.load(t, kin) for force in system.forces], no_load(kin))
+    load = total_load(system.forces, t, kin)
     return Loads(load.force.T, load.moment.T, load.power)
 
 

@@ -17,6 +17,9 @@ UNIT_TOLERANCE = 1e-9
 # Relative slack of the two exact physical checks, for round-off in rotated tensors.
 _ROUND_OFF = 1e-12
 
+# A principal moment below this part of the largest is zero to round-off.
+_SINGULAR = 1e-15
+
 
 class Body(eqx.Module):
     """One rigid body, as the user describes it.
@@ -25,7 +28,10 @@ class Body(eqx.Module):
         name: how joints and forces refer to it.
         mass: [kg].
         inertia: inertia tensor about the centre of mass in body axes, (3, 3) or its
-            diagonal (3,) [kg m^2]; off-diagonal entries are -int xy dm.
+            diagonal (3,) [kg m^2]; off-diagonal entries are -int xy dm. Where JAX traces it,
+            its numbers cannot be looked at, and its symmetric part is what counts: the
+            derivative with respect to one of two opposite entries is then half of that with
+            respect to both.
         com: centre of mass in the body's reference frame (3,) [m].
         position: origin of the body's reference frame in the world, at the reference
             posture (3,) [m]; with `com` zero it is the centre of mass.
@@ -68,6 +74,8 @@ class Body(eqx.Module):
         self.mass = jnp.asarray(mass, dtype=float)
         tensor = jnp.asarray(inertia, dtype=float)
         self.inertia = jnp.diag(tensor) if tensor.ndim == 1 else tensor
+        if tensor.shape == (3, 3) and not concrete(tensor):
+            self.inertia = 0.5 * (tensor + tensor.T)
         self.com = jnp.asarray(com, dtype=float)
         self.position = jnp.asarray(position, dtype=float)
         self.orientation = jnp.asarray(orientation, dtype=float)
@@ -112,11 +120,10 @@ def check_inertia(inertia: Numbers, what: str, tolerance: float) -> None:
         )
     moments = np.linalg.eigvalsh(tensor)
     listed = ", ".join(f"{m:.6g}" for m in moments)
-    if moments[0] <= 0:
+    if moments[0] <= _SINGULAR * moments[2]:
         raise ModelError(
             f"The inertia tensor of {what} must be positive definite, but its principal moments "
-            f"are {listed} kg m^2. (A point mass has none: give it a small tensor, it matters "
-            "only where something turns it.)"
+            f"are {listed} kg m^2.{_advice(moments)}"
         )
     excess = moments[2] / (moments[0] + moments[1]) - 1
     if excess > max(tolerance, _ROUND_OFF):
@@ -126,6 +133,24 @@ def check_inertia(inertia: Numbers, what: str, tolerance: float) -> None:
             f"{100 * excess:.3g} %. Correct the entry, or admit a rounded table by "
             f"triangle_tolerance={excess * 1.01:.2g}."
         )
+
+
+def _advice(moments: np.ndarray) -> str:
+    """What a body with such principal moments (ascending) may have been meant to be."""
+    size = np.abs(moments).max()
+    if size == 0:
+        return (
+            " A point mass has no inertia to turn: give it that of a small sphere "
+            "(stmuav_jax.sphere); where nothing turns it, the value does not matter."
+        )
+    if abs(moments[0]) <= _SINGULAR * size and moments[1] > _SINGULAR * size:
+        return (
+            " A rod without thickness has no inertia about its own axis, so that nothing would "
+            "resist a turn about it: give it the moment that its thickness gives, m r^2 / 2 for "
+            "the radius r (stmuav_jax.rod); where joints keep it from that turn, the value does "
+            "not matter."
+        )
+    return ""
 
 
 def check_unit(p: Numbers, what: str, error: type[Exception]) -> None:

@@ -7,13 +7,25 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..algebra.derivative import length_and_direction, without_derivative
 from ..algebra.shapes import Numbers
 from ..algebra.stacked import apply, dot
 from .body import GROUND
 from .errors import ModelError
 from .joint_coordinate import coordinate
 from .joint_force import AbstractJointForce
-from .load import AbstractForce, Load, Signal, couple, evaluate, push, scalar, signal, vector
+from .load import (
+    AbstractForce,
+    Load,
+    Signal,
+    couple,
+    evaluate,
+    nonnegative,
+    push,
+    scalar,
+    signal,
+    vector,
+)
 from .state import Kinematics
 
 
@@ -41,9 +53,14 @@ class AppliedForce(AbstractForce):
 
     Args:
         body: its name.
-        force: (3,) [N], or a function of (t, kinematics) that returns it.
+        force: (3,) [N], or a function of (t, kinematics) that returns it; `lambda t, kin: ...`
+            where it depends on the time alone.
         frame: the axes of `force`: "world" or "body".
         point: in the body's reference frame (3,) [m]; by default the centre of mass.
+
+    Raises:
+        ModelError: a number that is not finite, another shape or frame, a function of other
+            arguments; when it is evaluated first, a function that returns another shape.
     """
 
     body: str = eqx.field(static=True)
@@ -60,10 +77,14 @@ class AppliedForce(AbstractForce):
         point: Numbers | None = None,
     ) -> None:
         self.body = body
-        self.force = signal(force, f"The force on body '{body}'", (3,), "N")
+        self.force = signal(force, self._what(body), (3,), "N")
         self.frame = _frame(frame)
         what = f"The point of the force on body '{body}'"
         self.point = None if point is None else vector(point, what, "m")
+
+    @staticmethod
+    def _what(body: str) -> str:
+        return f"AppliedForce: the force on body '{body}'"
 
     def bodies(self) -> tuple[str, ...]:
         return (self.body,)
@@ -72,7 +93,7 @@ class AppliedForce(AbstractForce):
         return ()
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        value = evaluate(self.force, t, kin)
+        value = evaluate(self.force, t, kin, self._what(self.body), (3,))
         force_w = apply(kin.R_wb[kin.index(self.body)], value) if self.frame == "body" else value
         arm = None if self.point is None else kin.arm(self.body, self.point)
         return push(kin, self.body, force_w, arm)
@@ -93,8 +114,12 @@ class AppliedMoment(AbstractForce):
         frame: Literal["world", "body"] = "world",
     ) -> None:
         self.body = body
-        self.moment = signal(moment, f"The moment on body '{body}'", (3,), "N m")
+        self.moment = signal(moment, self._what(body), (3,), "N m")
         self.frame = _frame(frame)
+
+    @staticmethod
+    def _what(body: str) -> str:
+        return f"AppliedMoment: the moment on body '{body}'"
 
     def bodies(self) -> tuple[str, ...]:
         return (self.body,)
@@ -103,7 +128,7 @@ class AppliedMoment(AbstractForce):
         return ()
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        value = evaluate(self.moment, t, kin)
+        value = evaluate(self.moment, t, kin, self._what(self.body), (3,))
         moment_w = apply(kin.R_wb[kin.index(self.body)], value) if self.frame == "body" else value
         return push(kin, self.body, jnp.zeros_like(moment_w), moment_w=moment_w)
 
@@ -113,10 +138,19 @@ class LinearSpringDamper(AbstractForce):
 
     Args:
         point_i, point_j: in the bodies' reference frames (3,) [m] (world for ground).
-        stiffness: [N/m]. damping: [N s/m]. length: at rest [m].
+        stiffness: k >= 0 [N/m]. damping: c >= 0 [N s/m]. length: at rest, l >= 0 [m].
 
-    A spring of length zero pulls along no direction: it exerts no force there, and its
-    gradients stay finite.
+    With d from the point on i to the point on j and d_rate its rate, body i is pulled by
+
+        k d - k l d / |d| + c (d . d_rate) d / |d|^2.
+
+    Where the ends meet (d = 0) the first term is smooth. The second has no direction and
+    is left out; for l > 0 it jumps there, and the derivatives of force and energy with
+    respect to d are NaN. The third is c d_rate, what it is before and after in a motion
+    straight through the point, with the derivative along such motions: across them it jumps.
+
+    Raises:
+        ModelError: a number that is not finite or is negative.
     """
 
     body_i: str = eqx.field(static=True)
@@ -143,9 +177,9 @@ class LinearSpringDamper(AbstractForce):
         of = f"of the spring between '{body_i}' and '{body_j}'"
         self.point_i = vector(point_i, f"The point on '{body_i}' {of}", "m")
         self.point_j = vector(point_j, f"The point on '{body_j}' {of}", "m")
-        self.stiffness = scalar(stiffness, f"The stiffness {of}", "N/m")
-        self.damping = scalar(damping, f"The damping {of}", "N s/m")
-        self.length = scalar(length, f"The length {of}", "m")
+        self.stiffness = nonnegative(stiffness, f"The stiffness {of}", "N/m")
+        self.damping = nonnegative(damping, f"The damping {of}", "N s/m")
+        self.length = nonnegative(length, f"The length {of}", "m")
 
     def bodies(self) -> tuple[str, ...]:
         return (self.body_i, self.body_j)
@@ -157,20 +191,22 @@ class LinearSpringDamper(AbstractForce):
         a, a_rate = kin.point(self.body_i, self.point_i)
         b, b_rate = kin.point(self.body_j, self.point_j)
         d, d_rate = b - a, b_rate - a_rate
-        square = dot(d, d)
-        length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-        direction = jnp.where(square > 0, d / length, jnp.zeros_like(d))
-        stretch = jnp.where(square > 0, length, 0.0) - self.length
-        rate = dot(direction, d_rate)
-        pull = (self.stiffness * stretch + self.damping * rate) * direction
+        length, direction, apart = length_and_direction(d)
+        stretch, rate = length - self.length, dot(direction, d_rate)
+        away = (self.stiffness * stretch + self.damping * rate) * direction
+        # only a spring without a length is smooth where its ends meet
+        met = without_derivative(d, ~apart & (self.length != 0))
+        pull = jnp.where(apart, away, self.stiffness * met + self.damping * d_rate)
+        square = jnp.where(apart, stretch**2, dot(met, met) + self.length**2)
+        rate_square = jnp.where(apart, rate**2, dot(d_rate, d_rate))
         load = push(kin, self.body_i, pull, kin.arm(self.body_i, self.point_i)) + push(
             kin, self.body_j, -pull, kin.arm(self.body_j, self.point_j)
         )
         return Load(
             load.force,
             load.moment,
-            0.5 * self.stiffness * stretch**2,
-            -self.damping * rate**2,
+            0.5 * self.stiffness * square,
+            -self.damping * rate_square,
         )
 
 
@@ -179,9 +215,12 @@ class TorsionalSpringDamper(AbstractJointForce):
 
     Args:
         joint: name of a revolute or cylindrical joint.
-        stiffness: [N m/rad]. damping: [N m s/rad]. angle: at rest [rad].
+        stiffness: k >= 0 [N m/rad]. damping: c >= 0 [N m s/rad]. angle: at rest [rad].
 
     A spring wound past half a turn jumps back.
+
+    Raises:
+        ModelError: a number that is not finite, a negative stiffness or damping.
     """
 
     stiffness: Float[Array, ""]
@@ -193,8 +232,8 @@ class TorsionalSpringDamper(AbstractJointForce):
     ) -> None:
         self.joint, self.coordinate = joint, "angle"
         of = f"of the torsional spring in joint '{joint}'"
-        self.stiffness = scalar(stiffness, f"The stiffness {of}", "N m/rad")
-        self.damping = scalar(damping, f"The damping {of}", "N m s/rad")
+        self.stiffness = nonnegative(stiffness, f"The stiffness {of}", "N m/rad")
+        self.damping = nonnegative(damping, f"The damping {of}", "N m s/rad")
         self.angle = scalar(angle, f"The angle {of}", "rad")
 
     def law(
@@ -214,8 +253,11 @@ class JointDamping(AbstractForce):
 
     Args:
         joint: its name.
-        turning: [N m s/rad], on the relative angular velocity.
-        sliding: [N s/m], on the velocity of j's point along the joint's z axis.
+        turning: >= 0 [N m s/rad], on the relative angular velocity.
+        sliding: >= 0 [N s/m], on the velocity of j's point along the joint's z axis.
+
+    Raises:
+        ModelError: a number that is not finite or is negative.
     """
 
     joint: str = eqx.field(static=True)
@@ -224,8 +266,8 @@ class JointDamping(AbstractForce):
 
     def __init__(self, joint: str, *, turning: Numbers = 0.0, sliding: Numbers = 0.0) -> None:
         self.joint = joint
-        self.turning = scalar(turning, f"The turning damping of joint '{joint}'", "N m s/rad")
-        self.sliding = scalar(sliding, f"The sliding damping of joint '{joint}'", "N s/m")
+        self.turning = nonnegative(turning, f"The turning damping of joint '{joint}'", "N m s/rad")
+        self.sliding = nonnegative(sliding, f"The sliding damping of joint '{joint}'", "N s/m")
 
     def bodies(self) -> tuple[str, ...]:
         return ()

@@ -6,8 +6,10 @@ any), and the power of its part that has none. Values may be numbers or function
 (t, kinematics); numbers are leaves of the pytree, so they can be differentiated.
 """
 
+import inspect
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,17 +28,59 @@ Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Ar
 def signal(
     value: "Numbers | Callable[..., object]", what: str, shape: tuple[int, ...], unit: str
 ) -> Signal:
-    """A constant as an array (checked), or the function itself."""
+    """A constant as an array, or a function of (t, kinematics); both checked.
+
+    Raises:
+        ModelError: a shape that is not the given one, a number that is not finite, a function
+            that does not take these two arguments.
+    """
     if callable(value):
+        check_arguments(value, what)
         return value  # pyright: ignore[reportReturnType]
     check_shape(value, shape, what)
     check_finite(value, what, unit)
     return jnp.asarray(value, dtype=float)
 
 
-def evaluate(value: Signal, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "..."]:
-    """The signal's value at time t [s]."""
-    return jnp.asarray(value(t, kin), dtype=kin.r.dtype) if callable(value) else value
+def check_arguments(function: Callable[..., object], what: str) -> None:
+    """Raise `ModelError` unless the function can be called with (t, kinematics)."""
+    try:
+        inspect.signature(function).bind(None, None)
+    except TypeError as error:
+        raise ModelError(
+            f"{what} must be given by a function of two arguments, the time and the kinematics "
+            f"(lambda t, kin: ...), but calling it with two is not possible: {error}."
+        ) from None
+    except ValueError:
+        pass  # a built-in function that does not say what it takes
+
+
+def evaluate(
+    value: Signal, t: Float[Array, ""], kin: Kinematics, what: str, shape: tuple[int, ...]
+) -> Float[Array, "..."]:
+    """The signal's value at time t [s].
+
+    Args:
+        what: which signal, for the message. shape: what it must return.
+
+    Raises:
+        ModelError: a function that returns another shape, or nothing that is an array.
+    """
+    if not callable(value):
+        return value
+    found: Any = value(t, kin)
+    try:
+        array = jnp.asarray(found, dtype=kin.r.dtype)
+    except (TypeError, ValueError):
+        kind = type(found).__name__
+        raise ModelError(
+            f"{what} must be numbers of shape {shape}, but its function returns {kind}."
+        ) from None
+    if array.shape != shape:
+        raise ModelError(
+            f"{what} must have shape {shape}, but its function returns shape {array.shape}."
+        )
+    return array
 
 
 class Sine(eqx.Module):
@@ -110,6 +154,37 @@ def push(
     return Load(
         row * force_w, row * apply_transposed(kin.R_wb[k], total), jnp.zeros((), kin.r.dtype), power
     )
+
+
+def total_load(forces: "Sequence[AbstractForce]", t: Float[Array, ""], kin: Kinematics) -> Load:
+    """The sum of all force elements at time t [s].
+
+    Raises:
+        ModelError: a force whose load has not the shapes of `Load`; names its class and where
+            it acts.
+    """
+    total = no_load(kin)
+    for force in forces:
+        found = force.load(t, kin)
+        _check_load(force, found, total)
+        total = total + found
+    return total
+
+
+def _check_load(force: "AbstractForce", found: object, expected: Load) -> None:
+    for name in ("force", "moment", "potential", "power"):
+        must = jnp.shape(getattr(expected, name))
+        shape = jnp.shape(getattr(found, name, None)) if isinstance(found, Load) else None
+        if shape != must:
+            where = ", ".join((*force.bodies(), *force.joint_names())) or "all bodies"
+            given = f"has {name} of shape {shape}" if shape is not None else "is none"
+            raise ModelError(
+                f"The load of {type(force).__name__} on {where} must be a Load with {name} of "
+                f"shape {must}, a row for every body and one for ground, but it {given}."
+                if must
+                else f"The load of {type(force).__name__} on {where} must be a Load with {name} a "
+                f"single number, but it {given}."
+            )
 
 
 class AbstractForce(eqx.Module):

@@ -4,7 +4,9 @@ from collections import Counter
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .body import GROUND, Bodies, Body, stack_bodies
@@ -129,6 +131,11 @@ def check_state(system: System, state: State) -> None:
     n = system.n_bodies
     for name, width in (("r", 3), ("p", 4), ("v", 3), ("omega", 3)):
         array = getattr(state, name)
+        if not isinstance(array, jax.Array | np.ndarray):
+            raise SettingError(
+                f"State.{name} must be an array of shape (..., {n}, {width}), but it is of type "
+                f"{type(array).__name__}: write jnp.asarray(...) around the numbers."
+            )
         if jnp.shape(array)[-2:] != (n, width):
             raise SettingError(
                 f"State.{name} must have shape (..., {n}, {width}) for bodies "

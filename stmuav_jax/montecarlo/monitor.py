@@ -67,7 +67,9 @@ def peak(curve: Cubic) -> Float[Array, " q"]:
 def highest(span: Span) -> Float[Array, " q"]:
     """The largest value over a step (q,)."""
     curve = cubic(span)
-    return jnp.maximum(jnp.maximum(span.g0, span.g1), curve(peak(curve)))
+    # its value does not change, to first order, with its place: exact, and defined without one
+    top = curve(jax.lax.stop_gradient(peak(curve)))
+    return jnp.maximum(jnp.maximum(span.g0, span.g1), top)
 
 
 class Crossings(eqx.Module):

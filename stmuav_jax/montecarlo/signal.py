@@ -97,13 +97,13 @@ class Signal:
 
 
 def length(x: Float[Array, " k"]) -> Float[Array, ""]:
-    """Of a vector, with the derivative zero at zero."""
+    """Of a vector; at zero, the tip of a cone, its derivative is taken as zero."""
     square = jnp.sum(x * x)
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 def angle_between(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
-    """Of two vectors [rad]; exact for small angles and near pi."""
+    """Of two vectors [rad]; exact for small angles and near pi, derivatives of zero at both."""
     return jnp.arctan2(length(jnp.cross(a, b)), a @ b)
 
 

@@ -59,7 +59,8 @@ class LinearActuator(AbstractForce):
         return ()
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        u = evaluate(self.force, t, kin)
+        what = f"LinearActuator: the force on body '{self.slider}'"
+        u = evaluate(self.force, t, kin, what, ())
         base, slider = kin.index(self.base), kin.index(self.slider)
         arm = kin.arm(self.base, self.axis_point)
         along = u * kin.R_wb[base][:, 2]

@@ -69,10 +69,11 @@ class AirframeDrag(AbstractForce):
         if self.point is not None:
             arm, velocity = kin.arm(self.body, self.point), kin.point(self.body, self.point)[1]
         if self.wind is not None:
-            velocity = velocity - evaluate(self.wind, t, kin)
+            what = f"AirframeDrag: the wind on body '{self.body}'"
+            velocity = velocity - evaluate(self.wind, t, kin, what, (3,))
         w = apply_transposed(kin.R_wb[k], velocity)
         square = dot(w, w)
-        # at rest the derivative of |w| w is zero
+        # |w| has a tip at rest, but |w| w has the derivative zero, which this gives
         speed = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
         force = -(self.linear + self.quadratic * speed) * w
         return push(kin, self.body, apply(kin.R_wb[k], force), arm)

@@ -217,7 +217,10 @@ def elevation(s_w: Float[Array | np.ndarray, "3 *s"]) -> Float[Array, "*s"]:
 
 
 def azimuth(s_w: Float[Array | np.ndarray, "3 *s"]) -> Float[Array, "*s"]:
-    """Angle of a direction clockwise from north [rad], 0 to 2 pi; 0 at the zenith."""
+    """Angle of a direction clockwise from north [rad], 0 to 2 pi; 0 at the zenith.
+
+    At the zenith it is not determined; its gradient is taken as 0 there.
+    """
     x, y = s_w[0], s_w[1]
     there = x**2 + y**2 > 0.0
     return jnp.arctan2(jnp.where(there, x, 0.0), jnp.where(there, y, 1.0)) % (2.0 * jnp.pi)

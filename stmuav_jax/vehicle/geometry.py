@@ -168,7 +168,10 @@ class Loops(NamedTuple):
 
 
 def safe_root(square: Float[Array, "*s"]) -> Float[Array, "*s"]:
-    """The root where there is one, else NaN; derivatives elsewhere stay finite."""
+    """The root where there is one, else NaN, with zero derivatives.
+
+    So a sum that leaves out the elements without a root keeps its derivatives.
+    """
     real = square > 0
     return jnp.where(real, jnp.sqrt(jnp.where(real, square, 1.0)), jnp.nan)
 

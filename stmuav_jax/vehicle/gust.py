@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..algebra.derivative import length_and_direction, without_derivative
 from ..algebra.shapes import Numbers
 from ..algebra.stacked import apply
 from ..mechanics.errors import ModelError, check_finite, check_shape, concrete
@@ -158,11 +159,14 @@ def dryden(
 
 
 def _axes(mean: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Columns along the mean wind's horizontal part, across, up."""
-    x, y = mean[0], mean[1]
-    square = x * x + y * y
-    length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    x, y = jnp.where(square > 0, x / length, 1.0), jnp.where(square > 0, y / length, 0.0)
+    """Columns along the mean wind's horizontal part, across, up.
+
+    Without a horizontal wind the first is x, and the derivatives by the wind are NaN: which
+    way the axes would turn is not known.
+    """
+    _, direction, blows = length_and_direction(mean[:2])
+    calm = without_derivative(jnp.array([1.0, 0.0], mean.dtype) + 0 * mean[:2], ~blows)
+    x, y = jnp.where(blows, direction, calm)
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)
     return jnp.stack(
         [jnp.stack([x, -y, zero]), jnp.stack([y, x, zero]), jnp.stack([zero, zero, one])]

@@ -3,12 +3,13 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..algebra.derivative import without_derivative
 from ..algebra.rotation import cross
 from ..algebra.shapes import Numbers
 from ..algebra.stacked import apply
 from ..mechanics.errors import ModelError, check_finite, concrete
 from ..mechanics.internal import AbstractInternalForce
-from ..mechanics.load import Load, evaluate, push
+from ..mechanics.load import Load, push
 from ..mechanics.state import Kinematics
 from .allocation import RotorLimits
 from .rotor import Rotors
@@ -24,7 +25,9 @@ class MotorRotors(AbstractInternalForce):
     with thrust and drag torque of `Rotors` at omega^2, and the body's angular velocity W in
     its own axes. omega and h are against the body, whose inertia tensor holds the rotors'
     masses and their inertias as if they stood still. The limits are those of the motors:
-    a command beyond them is not reached, and its derivative there is zero.
+    a command beyond them is not reached, and its derivative there is zero; at a limit it is
+    that of the inside. The root has no derivative at u = 0: that of omega is NaN there, while
+    thrust and drag torque of rotors without lag, which need omega^2 = u, keep theirs.
 
     Args:
         rotors: arms, spins and coefficients; its `speed_squared` are the commands.
@@ -110,14 +113,21 @@ class MotorRotors(AbstractInternalForce):
 
     def speeds_of(self, squared: Float[Array, " k"]) -> Float[Array, " k"]:
         """omega_c [rad/s] of commanded squares; not a number for a negative one without limits."""
-        if self.squared_limits is not None:
-            squared = jnp.clip(squared, *self.squared_limits)
+        squared = self.reached(squared)
         turning = squared != 0
-        return jnp.where(turning, jnp.sqrt(jnp.where(turning, squared, 1.0)), 0.0)
+        root = jnp.sqrt(jnp.where(turning, squared, 1.0))
+        return jnp.where(turning, root, without_derivative(squared, ~turning))
+
+    def reached(self, squared: Float[Array, " k"]) -> Float[Array, " k"]:
+        """u within the limits [rad^2/s^2]; not a number for a negative one without limits."""
+        if self.squared_limits is None:
+            return squared * jnp.where(squared < 0, jnp.nan, 1.0)
+        lowest, highest = self.squared_limits
+        return jnp.where(squared < lowest, lowest, jnp.where(squared > highest, highest, squared))
 
     def command(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " k"]:
         """omega_c at time t [s] (k,) [rad/s]."""
-        return self.speeds_of(evaluate(self.rotors.speed_squared, t, kin))
+        return self.speeds_of(self.rotors.commands(t, kin))
 
     def speeds(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " k"]:
         """omega at time t [s] (k,) [rad/s]."""
@@ -136,7 +146,12 @@ class MotorRotors(AbstractInternalForce):
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
         k = kin.index(self.rotors.body)
-        wrench = self.rotors.wrench(self.speeds(t, kin) ** 2, kin.com[k])
+        if self.time_constant is None:
+            # not the squares of roots, which have no derivative at zero
+            squared = self.reached(self.rotors.commands(t, kin))
+        else:
+            squared = self.internal**2
+        wrench = self.rotors.wrench(squared, kin.com[k])
         moment = wrench[3:]
         if self.inertia is not None:
             z = jnp.array([0.0, 0.0, 1.0])

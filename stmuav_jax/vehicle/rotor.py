@@ -76,9 +76,14 @@ class Rotors(AbstractForce):
         moment = jnp.cross(self.arms - com, forces) + drag
         return jnp.concatenate([jnp.sum(forces, axis=0), jnp.sum(moment, axis=0)])
 
+    def commands(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " k"]:
+        """Squared speeds at time t [s] (k,) [rad^2/s^2]."""
+        what = f"Rotors: the squared speeds of the rotors of body '{self.body}'"
+        return evaluate(self.speed_squared, t, kin, what, self.spin.shape)
+
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
         k = kin.index(self.body)
-        wrench = self.wrench(evaluate(self.speed_squared, t, kin), kin.com[k])
+        wrench = self.wrench(self.commands(t, kin), kin.com[k])
         R_wb = kin.R_wb[k]
         return push(kin, self.body, apply(R_wb, wrench[:3]), moment_w=apply(R_wb, wrench[3:]))
 

@@ -204,3 +204,11 @@ def test_gradient_of_log_after_exp_is_the_unit_matrix(where):
     both = lambda x: rot.to_rotation_vector(rot.from_rotation_vector(x))
     close(jax.jacfwd(both)(jnp.asarray(v)), np.eye(3), 1e-8)
     close(jax.jacrev(both)(jnp.asarray(v)), np.eye(3), 1e-8)
+
+
+@pytest.mark.parametrize("p", HALF_TURNS, ids=str)
+def test_angle_at_half_turns_has_the_derivative_of_one_side(p):
+    """d angle / d e0 = -2 where e0 goes up from 0; at the identity there is none."""
+    for mode in (jax.jacfwd, jax.jacrev):
+        close(mode(rot.rotation_angle)(jnp.asarray(p)), [-2.0, 0, 0, 0])
+    assert np.all(np.isnan(jax.grad(rot.rotation_angle)(jnp.asarray(IDENTITY))[1:]))

@@ -152,3 +152,34 @@ def test_checks_do_not_stop_a_trace():
     moment = lambda m: jnp.sum(sj.Body("b", m, jnp.stack([m, m, m])).inertia)
     assert float(jax.grad(moment)(2.0)) == 3
     assert float(jax.jit(moment)(2.0)) == 6
+
+
+@pytest.mark.parametrize(
+    ("moments", "words"),
+    [
+        ([0.0, 1.0, 1.0], r"A rod without thickness .* m r\^2 / 2"),
+        ([0.0, 0.0, 0.0], "A point mass has no inertia"),
+    ],
+)
+def test_ideal_bodies_are_refused_by_their_own_names(moments, words):
+    for seed in range(3):
+        R = np_rotation(random_quaternion(np.random.default_rng(seed)))
+        tensor = R @ np.diag(moments) @ R.T
+        with pytest.raises(sj.ModelError, match=words):
+            body(inertia=0.5 * (tensor + tensor.T))
+    with pytest.raises(sj.ModelError) as error:
+        body(inertia=[-1.0, 1.0, 1.0])
+    assert "rod" not in str(error.value)
+    assert "point mass" not in str(error.value)
+
+
+def test_of_a_traced_tensor_the_symmetric_part_counts():
+    """So a derivative with respect to the whole tensor is symmetric, whatever is done with it."""
+    omega = jnp.array([1.0, -2.0, 0.5])
+    spin = lambda tensor: (body(inertia=tensor).inertia @ omega)[0]
+    tensor = jnp.diag(jnp.array([1.0, 2.0, 2.5])) + 0.1 * (1 - jnp.eye(3))
+    gradient = jax.jit(jax.grad(spin))(tensor)
+    np.testing.assert_array_equal(gradient, gradient.T)
+    change = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 0]])
+    assert float(jnp.sum(gradient * change)) == pytest.approx(-2.0)
+    np.testing.assert_array_equal(jax.jit(lambda x: body(inertia=x).inertia)(tensor), tensor)

@@ -5,10 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import np_rotation, random_quaternion, relative_error, state_of
+from helpers import np_rotation, random_quaternion, relative_error, state_of, unit
 
 import stmuav_jax as sj
 from stmuav_jax.mechanics.force import _frame
+from stmuav_jax.mechanics.load import AbstractForce, total_load
 
 COM = {"a": np.array([0.1, -0.2, 0.05]), "b": np.array([-0.3, 0.1, 0.2])}
 POINT_A, POINT_B = np.array([0.3, 0.1, -0.4]), np.array([0.2, -0.5, 0.6])
@@ -240,22 +241,75 @@ def test_power_of_a_torsional_spring():
     assert World(at(0.9)).power(load) == pytest.approx(expected, rel=1e-8)
 
 
+SAME = [[1.0, 0, 0, 0]] * 2
+
+
+def pull_on_a(x, length, damping=0.0, stiffness=50.0):
+    """Force on a [N] and potential [J] of a spring between centres of mass b - a = x[:3]."""
+    spring = sj.LinearSpringDamper(
+        "a", "b", point_i=COM["a"], point_j=COM["b"],
+        stiffness=stiffness, damping=damping, length=length,
+    )  # fmt: skip
+    none = jnp.zeros(3)
+    state = sj.State(
+        jnp.stack([none, x[:3]]), jnp.asarray(SAME), jnp.stack([none, x[3:]]), jnp.zeros((2, 3))
+    )
+    load = spring.load(jnp.zeros(()), system_with(spring).kinematics(state))
+    return load.force[0], load.potential, load.power
+
+
+of_spring = jax.jit(lambda x, *numbers: pull_on_a(x, *numbers)[0])
+# forward and reverse mode; and the potential's two derivatives
+ahead, back = jax.jit(jax.jacfwd(of_spring)), jax.jit(jax.jacrev(of_spring))
+slope = jax.jit(jax.grad(lambda x, *numbers: pull_on_a(x, *numbers)[1]))
+curvature = jax.jit(jax.hessian(lambda x, *numbers: pull_on_a(x, *numbers)[1]))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-120, 1e-9, 0.3])
+def test_a_spring_without_a_length_is_linear(size):
+    x = jnp.array([size, -2 * size, 0.5 * size, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(of_spring(x, 0.0), 50 * x[:3], rtol=1e-15)
+    for J in (ahead(x, 0.0), back(x, 0.0)):
+        np.testing.assert_allclose(J, np.hstack([50 * np.eye(3), np.zeros((3, 3))]), atol=1e-13)
+    np.testing.assert_allclose(slope(x, 0.0)[:3], 50 * x[:3], rtol=1e-14)
+    np.testing.assert_allclose(curvature(x, 0.0)[:3, :3], 50 * np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-120, 1e-9, 0.3, 2.0])
+def test_derivatives_of_a_spring_with_a_length(size):
+    """k (I - l (I - u u^T) / |d|), and c u u^T of the damper."""
+    u = unit([1.0, -2.0, 0.5])
+    x = jnp.concatenate([size * u, jnp.zeros(3)])
+    stiff = 50 * (np.eye(3) - 0.4 * (np.eye(3) - np.outer(u, u)) / size)
+    expected = np.hstack([stiff, 3 * np.outer(u, u)])
+    for J in (ahead(x, 0.4, 3.0), back(x, 0.4, 3.0)):
+        np.testing.assert_allclose(J, expected, rtol=1e-12, atol=1e-12 * np.abs(stiff).max())
+
+
 @pytest.mark.parametrize("length", [0.0, 0.3])
-def test_a_spring_of_no_length_has_finite_gradients(length):
-    spring = sj.LinearSpringDamper("a", "b", stiffness=50.0, damping=3.0, length=length)
-    system = system_with(spring)
-    R = np.eye(3)
-    same = state_of([R @ COM["a"], R @ COM["b"]], [[1.0, 0, 0, 0]] * 2, [[1.0, 0, 0], [0, 0, 0]])
+def test_a_damper_where_its_ends_meet(length):
+    """Straight through the point: the force before, there and after is c times the velocity."""
+    v = np.array([0.3, -1.0, 2.0])
+    at = lambda t: pull_on_a(jnp.asarray([*(t * v), *v]), length, 3.0, 0.0)
+    for t in (-1e-3, 0.0, 1e-3):
+        force, potential, power = at(t)
+        np.testing.assert_allclose(force, 3 * v, rtol=1e-14)
+        np.testing.assert_allclose([potential, power], [0, -3 * v @ v], atol=1e-13)
+    if length == 0:
+        J = np.asarray(ahead(jnp.zeros(6), 0.0, 3.0))
+        np.testing.assert_allclose(J, np.hstack([50 * np.eye(3), 3 * np.eye(3)]))
 
-    def total(state, spring):
-        load = spring.load(jnp.zeros(()), system.kinematics(state))
-        return jnp.sum(load.force**2) + jnp.sum(load.moment**2) + load.potential + load.power
 
-    value, gradients = jax.value_and_grad(total, argnums=(0, 1))(same, spring)
-    assert float(value) == pytest.approx(25 * length**2)
-    assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradients))
-    rates = jax.jvp(total, (same, spring), jax.tree.map(jnp.ones_like, (same, spring)))[1]
-    assert np.isfinite(float(rates))
+def test_a_spring_with_a_length_has_no_derivative_where_its_ends_meet():
+    """The force jumps there: NaN, not a number made up; its value is left out, not NaN."""
+    force, potential, _ = pull_on_a(jnp.zeros(6), 0.3)
+    assert not np.any(force)
+    assert float(potential) == pytest.approx(25 * 0.3**2)
+    assert np.all(np.isnan(np.diagonal(ahead(jnp.zeros(6), 0.3)[:, :3])))
+    assert np.all(np.isnan(np.diagonal(back(jnp.zeros(6), 0.3)[:, :3])))
+    # with respect to numbers of the spring it has
+    stiffness = jax.grad(lambda k: pull_on_a(jnp.zeros(6), 0.3, 0.0, k)[1])(50.0)
+    assert float(stiffness) == pytest.approx(0.5 * 0.3**2)
 
 
 def test_loads_add_up(state):
@@ -276,7 +330,23 @@ def test_loads_add_up(state):
         (lambda: sj.LinearSpringDamper("a", "", stiffness=1.0), "needs two bodies"),
         (lambda: sj.LinearSpringDamper("a", "b", stiffness=np.nan), "stiffness of the spring"),
         (lambda: sj.LinearSpringDamper("a", "b", stiffness=1.0, length=np.inf), "length of the"),
+        (
+            lambda: sj.LinearSpringDamper("a", "b", stiffness=-1.0),
+            "stiffness .*'a' and 'b' must not",
+        ),
+        (
+            lambda: sj.LinearSpringDamper("a", "b", stiffness=1.0, damping=-1.0),
+            "but it is -1 N s/m",
+        ),
+        (lambda: sj.LinearSpringDamper("a", "b", stiffness=1.0, length=-2.0), "but it is -2 m"),
         (lambda: sj.TorsionalSpringDamper("J", stiffness=np.nan), "torsional spring in joint 'J'"),
+        (lambda: sj.TorsionalSpringDamper("J", stiffness=-1.0), "must not be negative"),
+        (
+            lambda: sj.TorsionalSpringDamper("J", stiffness=1.0, damping=-1.0),
+            "must not be negative",
+        ),
+        (lambda: sj.JointDamping("J", turning=-1.0), "joint 'J' must not be negative"),
+        (lambda: sj.JointDamping("J", sliding=-1.0), "joint 'J' must not be negative"),
         (lambda: sj.JointDamping("J", turning=np.nan), "damping of joint 'J' must be finite"),
     ],
 )
@@ -301,3 +371,69 @@ def test_bad_input_is_refused(build, words):
 def test_bad_shapes_and_points_are_refused_in_the_users_words(build):
     with pytest.raises(sj.ModelError, match=r"must (be finite|have shape)"):
         build()
+
+
+# --- functions that a user writes, and forces of a user's own
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (
+            lambda: sj.AppliedForce("a", lambda t: jnp.zeros(3)),
+            r"AppliedForce: the force on body 'a' .* two arguments, .*lambda t, kin",
+        ),
+        (lambda: sj.AppliedMoment("b", lambda t, kin, more: 0), "AppliedMoment: .* body 'b'"),
+        (lambda: sj.AirframeDrag("a", linear=[1.0] * 3, wind=lambda: 0.0), "wind on body 'a'"),
+    ],
+)
+def test_functions_of_other_arguments_are_refused_as_they_are_given(build, words):
+    with pytest.raises(sj.ModelError, match=words):
+        build()
+
+
+class Crooked(AbstractForce):
+    """A user's force that forgets ground."""
+
+    rows: int = eqx.field(static=True)
+
+    def bodies(self):
+        return ("a",)
+
+    def joint_names(self):
+        return ()
+
+    def load(self, t, kin):
+        if not self.rows:
+            return None
+        force = jnp.zeros((self.rows, 3))
+        return sj.Load(force, force, jnp.zeros(()), jnp.zeros(()))
+
+
+@pytest.mark.parametrize(
+    ("force", "words"),
+    [
+        (
+            sj.AppliedForce("a", lambda t, kin: jnp.zeros(2)),
+            r"'a' must have shape \(3,\), .*\(2,\)",
+        ),
+        (sj.AppliedMoment("b", lambda t, kin: 1.0), r"'b' must have shape \(3,\), .* shape \(\)"),
+        (sj.AppliedForce("b", lambda t, kin: None), "'b' must be numbers .* returns NoneType"),
+        (sj.AppliedForce("b", lambda t, kin: [1.0, [2.0], 3.0]), "'b' must be numbers .* list"),
+        (Crooked(2), r"load of Crooked on a must be .* shape \(3, 3\).* shape \(2, 3\)"),
+        (Crooked(0), "load of Crooked on a must be a Load .* it is none"),
+    ],
+)
+def test_loads_of_other_shapes_are_refused_where_they_are_traced(state, force, words):
+    kin = system_with(force).kinematics(state)
+    with pytest.raises(sj.ModelError, match=words):
+        total_load((sj.Gravity(), force), jnp.zeros(()), kin)
+
+
+def test_a_formulation_says_which_force_is_of_another_shape():
+    bad = sj.System(
+        [sj.Body("a", 1.0, [1.0] * 3, free=True)],
+        forces=[sj.AppliedForce("a", lambda t, kin: jnp.zeros(2))],
+    )
+    with pytest.raises(sj.ModelError, match="AppliedForce: the force on body 'a' must have shape"):
+        sj.evaluate(bad, bad.reference, formulation=sj.Augmented())

@@ -117,3 +117,14 @@ def test_reference_posture_and_centre_of_mass():
     np.testing.assert_allclose(system.com(system.reference), [3, 0, 2.75])
     assert not np.any(system.reference.v)
     assert not np.any(system.reference.omega)
+
+
+def test_a_state_of_lists_is_refused_by_name():
+    system = sj.System([body("a", free=True)])
+    leaves, form = jax.tree.flatten(system.reference)
+    # made so that the type check that the tests switch on does not see it
+    listed = form.unflatten([leaves[0], [[1.0, 0.0, 0.0, 0.0]], *leaves[2:]])
+    with pytest.raises(
+        sj.SettingError, match=r"State.p must be an array of shape .*, 1, 4\).* list"
+    ):
+        check_state(system, listed)

@@ -68,3 +68,17 @@ def test_a_crossing_within_a_step_is_seen():
     monitor = watched(f, [0.0, 1.0])
     assert monitor.crossings.times()[0] == pytest.approx(0.5 - np.sqrt(0.2), abs=1e-12)
     assert monitor.extreme[0] == pytest.approx(0.2, abs=1e-12)
+
+
+def test_the_largest_value_can_be_differentiated_with_and_without_a_peak():
+    """Reverse mode too, where the cubic has no extreme at all and its formula no root."""
+    one = jnp.ones(1)
+    top = lambda x: highest(Span(jnp.zeros(()), jnp.ones(()), *(v * one for v in x)))[0]
+    for x in ([0.0, 1.0, 1.0, 1.0], [0.0, 1.0, 3.0, 0.5], [0.0, 0.2, 1.0, -1.0], [0.0] * 3 + [1.0]):
+        x = jnp.asarray(x)
+        gradient = jax.grad(top)(x)
+        expected = [(top(x + h) - top(x - h)) / 2e-6 for h in 1e-6 * jnp.eye(4)]
+        if float(x[1]) == 0:  # level: no derivative by differences, but finite
+            assert np.all(np.isfinite(gradient))
+        else:
+            np.testing.assert_allclose(gradient, expected, atol=1e-8)

@@ -174,3 +174,15 @@ def test_senseless_numbers_are_refused(numbers, words):
 def test_heights_outside_the_formulas_are_refused():
     with pytest.raises(ModelError, match=r"3.048 to 304.8 m .*height is 500 m"):
         low_altitude(500.0, 10.0)
+
+
+def test_without_a_wind_the_way_its_axes_turn_is_not_known():
+    """Gusts along x, and a derivative by the wind that is NaN, not one without the turning."""
+    t = jnp.asarray(0.2)
+    at = jax.jit(lambda mean: dryden(3, AIR, airspeed=V, duration=0.4, dt=DT, mean=mean)(t))
+    calm, none = np.array([0.0, 0.0, 0.7]), np.array([1e-9, 0.0, 0.7])
+    np.testing.assert_allclose(at(jnp.asarray(calm)), at(jnp.asarray(none)), atol=1e-8)
+    assert np.all(np.isnan(jax.jacfwd(at)(jnp.asarray(calm))[:2, :2]))
+    blowing = jnp.array([2.0, -1.0, 0.7])
+    expected = np.stack([central(lambda h, d=d: at(blowing + h * d), 1e-4) for d in np.eye(3)], 1)
+    np.testing.assert_allclose(jax.jacfwd(at)(blowing), expected, atol=1e-7)

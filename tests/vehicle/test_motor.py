@@ -258,3 +258,26 @@ def test_commands_that_vary_need_a_start_and_a_lag():
         sj.MotorRotors(varying, inertia=J)
     with pytest.raises(sj.ModelError, match=r"starting speeds .* must be given"):
         sj.MotorRotors(varying, time_constant=TAU)
+
+
+def test_thrust_has_its_derivative_where_rotors_stand_still():
+    """Without lag the thrust is k u: its derivative at u = 0 is k, not that of a root."""
+
+    def thrust(u, **parts):
+        force = sj.MotorRotors(rotors(u), **parts)
+        made = system(force)
+        load = force.load(jnp.zeros(()), made.kinematics(made.reference))
+        return load.force[0, 2]
+
+    still = jnp.zeros(4)
+    for parts in ({}, {"limits": sj.RotorLimits(0.0, 900.0)}):
+        for derivative in (jax.jacfwd, jax.jacrev):
+            slope = jax.jit(derivative(lambda u, p=parts: thrust(u, **p)))
+            np.testing.assert_allclose(slope(still), K_F)
+    assert float(thrust(still)) == 0
+    # the speeds themselves are roots: they have none
+    speeds = lambda u: sj.MotorRotors(rotors(u)).speeds_of(u)
+    assert np.all(np.isnan(np.diagonal(jax.jacfwd(speeds)(still))))
+    assert np.all(np.isnan(np.diagonal(jax.jacrev(speeds)(still))))
+    # the value at a negative command without limits stays no number
+    assert np.isnan(float(thrust(jnp.array([-1.0, 1.0, 1.0, 1.0]))))
