@@ -87,11 +87,13 @@ def check_record(model: StateSpaceModel, y: Array, u: Inputs, lanes: tuple[int, 
             )
 
 
-def check_functions(model: StateSpaceModel, prior: Gaussian, u: Inputs, m: int) -> None:
+def check_functions(
+    model: StateSpaceModel, prior: Gaussian, u: Inputs, m: int | None = None
+) -> None:
     """Refuse f or h that return another shape or precision than they must.
 
     Args:
-        u: shapes of the inputs of one step. m: components of a measurement.
+        u: shapes of the inputs of one step. m: components of a measurement; None leaves h out.
     """
     dtype, lanes = prior.factor.dtype, prior.factor.shape[2:]
     dt = jax.ShapeDtypeStruct((), dtype)
@@ -99,6 +101,8 @@ def check_functions(model: StateSpaceModel, prior: Gaussian, u: Inputs, m: int) 
         (model, "f(x, u, dt)", "The model's function"),
         (model.sensor, "h(x, u)", "The sensor's function"),
     ):
+        if part is model.sensor and m is None:
+            return
         # as many axes as the filter will give: sigma points, and filters of a bank
         stack = (2 * model.space.size + 1, *lanes) if part.stacked else ()
         x = jax.tree.map(lambda leaf, s=stack: _like(leaf, (leaf.shape[0], *s)), prior.mean)

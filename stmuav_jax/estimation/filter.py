@@ -45,7 +45,7 @@ class Filtered(eqx.Module):
     Attributes:
         mean: points with T first: an array (T, n, *s), or a pytree of such.
         factor: roots of the covariances (T, n, n, *s).
-        innovations: error, scaled, factor and missing count of each step, T first.
+        innovations: error, scaled, factor and which were measured, of each step, T first.
         ok: False from the step on at which a filter failed (T, *s).
         u, dt: inputs and steps [s] (T,), as used.
         prior: where it started.
@@ -83,7 +83,7 @@ class Filtered(eqx.Module):
     @property
     def missing(self) -> Int[Array, "*s"]:
         """How many single measurements were missing (NaN)."""
-        return jnp.sum(self.innovations.missing, axis=0)
+        return jnp.sum(~self.innovations.there, axis=(0, 1))
 
     def at(self, k: int) -> Gaussian:
         """The estimate after measurement k."""
