@@ -49,7 +49,7 @@ def cases() -> tuple[list, dict]:
         if case == 8:
             save_case_figures(study, FOLDER, dpi=120)
     Console(width=110).print(summary_table(rows))
-    return [row._asdict() for row in rows], smoothed
+    return [row.plain() for row in rows], smoothed
 
 
 def hovers() -> None:

@@ -60,7 +60,7 @@ from .estimation.extended import extended_model, extended_noise, inertia_matrix,
 from .estimation.filter import EstimationError, Filtered, kalman_filter
 from .estimation.gaussian import Gaussian, gaussian
 from .estimation.hover import Loop, hover_model, simulate_hover
-from .estimation.likelihood import Tuned, standard_errors, tune
+from .estimation.likelihood import Tuned, record_likelihood, standard_errors, tune
 from .estimation.model import Sensor, StateSpaceModel
 from .estimation.observability import Observability, observability
 from .estimation.online import Estimate, OnlineFilter
@@ -72,6 +72,7 @@ from .estimation.smoother import Smoothed, smooth
 from .estimation.space import Angle, Composite, Rotation, Vector
 from .estimation.tuning import Tuning, consistent_tuning, report_tuning
 from .estimation.update import Innovation, predict, update
+from .estimation.verdict import RunsVerdict, Verdict, over_runs, verdict, verdicts
 from .mechanics.body import GROUND, Body
 from .mechanics.errors import ModelError, SettingError, SimulationError, StateError
 from .mechanics.force import (
@@ -197,12 +198,12 @@ __all__ = [
     "Kinematics", "Limits", "Linear", "LinearActuator", "LinearSpringDamper", "Linearised",
     "Load", "Loop", "Method", "ModelError", "Motor", "MotorRotors", "Moved", "Observability",
     "OnlineFilter", "Parameter", "Parameters", "PathReason", "Place", "Projection", "Quantity",
-    "Rank", "Reactions", "Reason", "Rodas5P", "Rotation", "RotorLimits", "Rotors", "Run",
+    "Rank", "Reactions", "Reason", "Rodas5P", "Rotation", "RotorLimits", "Rotors", "Run", "RunsVerdict",
     "Sampled", "Sampling", "Scene", "Search", "SearchReason", "Sensor", "Servo", "SettingError",
     "SimulationError", "Sine", "SlewLimits", "Smoothed", "SpanningTree", "State", "StateError",
     "StateSpaceModel", "Stops", "Study", "Sun", "SunReason", "System", "TorsionalSpringDamper",
     "TrackerGeometry", "Trajectory", "Tree", "Trim", "TrimLimits", "TrimReason", "Tuned",
-    "Tuning", "Turbulence", "Unknown", "Unscented", "Unstabilised", "Vector", "Wind", "World",
+    "Tuning", "Turbulence", "Unknown", "Unscented", "Unstabilised", "Vector", "Verdict", "Wind", "World",
     "aim", "allocate", "angles_from_strokes", "angular_velocity", "assemble", "at_rest",
     "attitude", "attitude_model", "attitude_space", "autocorrelation", "centre_of_mass",
     "check_lift", "chi2_interval", "choose_solver", "climb", "compiler_options", "conjugate",
@@ -215,9 +216,9 @@ __all__ = [
     "initial_angles", "integrate", "internal_names", "joint_loads", "joint_motion", "joint_reactions",
     "kalman_filter", "kinematic_path", "kvaerno3", "kvaerno5", "linearize", "low_altitude",
     "make_scene", "make_work", "matrix_g", "matrix_l", "mean_interval", "momentum", "moved",
-    "nees", "normalise", "observability", "observable_model", "outer_jit", "panel_angles",
+    "nees", "normalise", "observability", "observable_model", "outer_jit", "over_runs", "panel_angles",
     "panel_normal", "path_nees", "peaks", "posture", "precision_error", "predict", "product",
-    "rank", "ranks", "ready", "report_model", "report_prior", "report_tuning", "resolved_loads",
+    "rank", "ranks", "ready", "record_likelihood", "report_model", "report_prior", "report_tuning", "resolved_loads",
     "revolute", "revolute_spherical", "rk4", "rotation_matrix", "rotorcraft_model", "run_loads",
     "sampling_from_plain", "search", "sensed_flight", "sensed_sun", "shooting", "simulate",
     "simulate_case", "simulate_hover", "skew", "slew", "smooth", "smooth_peaks", "spanning_tree",
@@ -225,7 +226,7 @@ __all__ = [
     "strokes", "study_case", "study_from_plain", "summarise", "sun_at", "sun_direction",
     "sun_in_body", "sun_position", "survey", "to_rotation_vector", "track_day", "tracker_bodies",
     "tracker_geometry", "tracker_joints", "tracker_limits", "transition", "translational", "trim",
-    "tune", "uav_flyer", "universal", "unix_time", "update", "weld", "with_internal",
+    "tune", "uav_flyer", "universal", "unix_time", "update", "verdict", "verdicts", "weld", "with_internal",
     "wrench_map",
 ]
 # fmt: on

@@ -12,7 +12,11 @@ from .output import written
 
 @dataclasses.dataclass
 class Estimate:
-    """Estimate the centre of mass in the report's cases; write NetCDF files and figures."""
+    """Estimate the centre of mass in the report's cases; write NetCDF files and figures.
+
+    Exit code: 0 all filters are consistent with their innovations; 1 a filter lost its covariance;
+    2 wrong input; 3 done, but a filter's own account of its errors cannot be trusted. The report's
+    tuning is of this kind in all eight cases."""
 
     case: int | None = None
     """Case of the report, 1 to 8; default all."""
@@ -30,7 +34,9 @@ class Estimate:
     t1: float = 2.0
     """End [s]."""
     params: Path | None = None
-    """TOML file with values that replace the table's."""
+    """TOML file with values that replace the table's, for truth and filters alike."""
+    filter_params: Path | None = None
+    """TOML file with values that the filters alone believe: a mismatch to try."""
     out: Path | None = None
     """Folder for the results; default runs/estimate_CASE or runs/hover."""
     figures: Literal["png", "pdf", "svg", "none"] = "png"
@@ -39,10 +45,15 @@ class Estimate:
     """Keep compiled code in the user's cache folder for the next run."""
 
 
+# Exit code of a run that is done, but of which a filter cannot be trusted.
+UNTRUSTED = 3
+
+
 def run_estimate(command: Estimate) -> int:
     """Run the command, print its table; the exit code."""
     from ..estimation.quadrotor import PART_III
     from ..mechanics.errors import SettingError
+    from ..view.estimate import verdict_lines
     from ..view.io import load_parameters
 
     if command.case is not None and command.case not in range(1, 9):
@@ -50,16 +61,23 @@ def run_estimate(command: Estimate) -> int:
     table = load_parameters(command.params, PART_III)
     names = ("report", "consistent") if command.tuning == "both" else (command.tuning,)
     work = _hover if command.hover else _cases
-    shown, paths, failed = work(command, names, table)
+    believed = load_parameters(command.filter_params, table)
+    shown, paths, verdicts = work(command, names, table, believed)
     out = Console()
     out.print(shown)
+    for line in verdict_lines(verdicts):
+        out.print(line, highlight=False, markup=False)
     written(out, paths)
+    failed = sum(found.failed for found in verdicts.values())
     if failed:
         out.print(f"{failed} filters lost their covariance and are left out.", highlight=False)
-    return 1 if failed else 0
+        return 1
+    return UNTRUSTED if any(found.status == "inconsistent" for found in verdicts.values()) else 0
 
 
-def _cases(command: Estimate, names: tuple, table: Any) -> tuple[Table, list[Path], int]:
+def _cases(
+    command: Estimate, names: tuple, table: Any, believed: Any
+) -> tuple[Table, list[Path], dict[str, Any]]:
     from ..estimation.assess import study_case
     from ..estimation.tuning import consistent_tuning, report_tuning
     from ..view.estimate import case_dataset, save_case_figures, save_dataset, summary_table
@@ -80,9 +98,9 @@ def _cases(command: Estimate, names: tuple, table: Any) -> tuple[Table, list[Pat
             if key not in made:
                 kind = kinds[name]
                 made[key] = (
-                    report_tuning(kind, parameters=table)
+                    report_tuning(kind, parameters=believed)
                     if name == "report"
-                    else consistent_tuning(case, kind, parameters=table)
+                    else consistent_tuning(case, kind, parameters=believed)
                 )
             tunings.append(made[key])
         study = study_case(
@@ -95,16 +113,21 @@ def _cases(command: Estimate, names: tuple, table: Any) -> tuple[Table, list[Pat
         paths.append(save_dataset(case_dataset(study), folder / "estimate.nc"))
         if command.figures != "none":
             paths += save_case_figures(study, folder, command.figures)
-    return summary_table(summaries), paths, sum(s.failed for s in summaries)
+    verdicts = {f"Case {s.case}, {s.tuning} tuning": s.verdict for s in summaries}
+    return summary_table(summaries), paths, verdicts
 
 
-def _hover(command: Estimate, names: tuple, table: Any) -> tuple[Table, list[Path], int]:
+def _hover(
+    command: Estimate, names: tuple, table: Any, believed: Any
+) -> tuple[Table, list[Path], dict[str, Any]]:
     from ..estimation.hover import simulate_hover
     from ..mechanics.errors import SettingError
     from ..view.estimate import hover_dataset, hover_table, save_dataset, save_hover_figure
 
     if command.model != "default":
         raise SettingError("--hover has a model of its own (14 states): leave --model out.")
+    if command.filter_params is not None:
+        raise SettingError("--hover flies with one table: leave --filter-params out.")
     flights = {
         name: simulate_hover(
             command.case or 1, name, seeds=command.seeds, t1=command.t1, seed=command.seed,
@@ -116,5 +139,5 @@ def _hover(command: Estimate, names: tuple, table: Any) -> tuple[Table, list[Pat
     paths = [save_dataset(hover_dataset(flights), folder / "hover.nc")]
     if command.figures != "none":
         paths += save_hover_figure(flights, folder, command.figures)
-    failed = sum(int((~flight.ok[-1]).sum()) for flight in flights.values())
-    return hover_table(flights), paths, failed
+    verdicts = {f"Hover, {name} tuning": flight.verdict() for name, flight in flights.items()}
+    return hover_table(flights), paths, verdicts

@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..algebra.shapes import Numbers
-from ..mechanics.errors import ModelError, SettingError, concrete
+from ..mechanics.errors import SettingError, check_finite, concrete
+from .check import check_filter
 from .factor import outer_square
 from .gaussian import Gaussian
 from .model import Inputs, StateSpaceModel
@@ -44,7 +45,7 @@ class Filtered(eqx.Module):
     Attributes:
         mean: points with T first: an array (T, n, *s), or a pytree of such.
         factor: roots of the covariances (T, n, n, *s).
-        innovations: error, scaled, factor and missing count of each step, T first.
+        innovations: error, scaled, factor and which were measured, of each step, T first.
         ok: False from the step on at which a filter failed (T, *s).
         u, dt: inputs and steps [s] (T,), as used.
         prior: where it started.
@@ -82,7 +83,7 @@ class Filtered(eqx.Module):
     @property
     def missing(self) -> Int[Array, "*s"]:
         """How many single measurements were missing (NaN)."""
-        return jnp.sum(self.innovations.missing, axis=0)
+        return jnp.sum(~self.innovations.there, axis=(0, 1))
 
     def at(self, k: int) -> Gaussian:
         """The estimate after measurement k."""
@@ -123,8 +124,9 @@ def kalman_filter(
     rule = Cubature() if rule is None else rule
     if not isinstance(y, jax.Array):
         y = jnp.asarray(y, dtype=prior.factor.dtype)
-    _check(model, prior, y, u, rule, form, points)
-    steps = _steps(dt, t, y.shape[0], prior.factor.dtype)
+    check_choices(form, points)
+    check_filter(model, prior, y, u, rule)
+    steps = step_lengths(dt, t, y.shape[0], prior.factor.dtype)
     if u is not None:
         u = jax.tree.map(jnp.asarray, u)
     _, out = jax.lax.scan(
@@ -197,49 +199,14 @@ def failure_message(filtered: Filtered) -> str:
     )
 
 
-def _check(
-    model: StateSpaceModel,
-    prior: Gaussian,
-    y: Array,
-    u: Inputs,
-    rule: AbstractRule,
-    form: str,
-    points: str,
-) -> None:
-    """Refuse what does not fit, in the user's words."""
-    n, m = model.space.size, model.sensor.space.size
-    if prior.factor.shape[:2] != (n, n):
-        raise ModelError(
-            f"The prior's covariance is {prior.factor.shape[0]} x {prior.factor.shape[0]}, but "
-            f"the model's state has {n} components ({', '.join(model.names)})."
-        )
-    model.space.check(prior.mean, "The prior's mean")
-    lanes = prior.factor.shape[2:]
-    points_of = jax.tree.leaves(prior.mean)[0].shape[1:]
-    if points_of != lanes:
-        raise ModelError(f"The prior's mean has stack axes {points_of}, its covariance {lanes}.")
-    if y.ndim != 2 + len(lanes) and not (lanes and y.ndim == 2):
-        raise ModelError(f"Measurements must have shape (T, {m}, *{lanes}), but it is {y.shape}.")
-    model.sensor.space.check(y[0] if y.shape[0] else jnp.zeros(y.shape[1:]), "A measurement")
-    for leaf in jax.tree.leaves(u):
-        if jnp.ndim(leaf) < 2 or jnp.shape(leaf)[0] != y.shape[0]:
-            raise ModelError(
-                f"Inputs must have shape (T, k) with T = {y.shape[0]} as the measurements, "
-                f"but it is {jnp.shape(leaf)}."
-            )
+def check_choices(form: str, points: str = "redraw") -> None:
+    """Raise `SettingError` for a form, or a treatment of sigma points, that there is not."""
     for value, known in ((form, ("square_root", "covariance")), (points, ("redraw", "reuse"))):
         if value not in known:
             raise SettingError(f"'{value}' is not one of {known}.")
-    rule.check(n, prior.factor.dtype)
-    for matrix, name in ((model.noise, "Q"), (model.sensor.noise, "R")):
-        if matrix.dtype != prior.factor.dtype:
-            raise SettingError(
-                f"{name} is {matrix.dtype}, but the prior's covariance {prior.factor.dtype}: "
-                "use one precision."
-            )
 
 
-def _steps(dt: Any, t: Any, count: int, dtype: Any) -> Float[Array, " T"]:
+def step_lengths(dt: Any, t: Any, count: int, dtype: Any) -> Float[Array, " T"]:
     """Lengths of the T steps [s].
 
     Raises:
@@ -256,6 +223,7 @@ def _steps(dt: Any, t: Any, count: int, dtype: Any) -> Float[Array, " T"]:
         return jnp.diff(jnp.asarray(t)).astype(dtype)
     if np.shape(dt) not in ((), (count,)):
         raise SettingError(f"dt must be a number or have shape ({count},), not {np.shape(dt)}.")
+    check_finite(dt, "dt", "s", SettingError)
     if concrete(dt) and not np.all(np.asarray(dt) >= 0):
         raise SettingError(f"Time goes backwards: the least step is {np.min(np.asarray(dt)):g} s.")
     return jnp.broadcast_to(jnp.asarray(dt, dtype=dtype), (count,))
@@ -265,6 +233,7 @@ def check_times(t: Any) -> None:
     """Raise `SettingError` unless times are finite and do not decrease."""
     if not concrete(t):
         return
+    check_finite(t, "The times", "s", SettingError)
     times = np.asarray(t, dtype=float)
     back = ~(np.diff(times) >= 0)
     if np.any(back):

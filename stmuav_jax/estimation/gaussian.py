@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.shapes import Numbers
-from ..mechanics.errors import ModelError, concrete
+from ..mechanics.errors import ModelError, check_finite, concrete
 from .factor import cholesky, divide_lower, outer_square, triangularise
 from .space import Point, Vector
 
@@ -44,9 +44,11 @@ def gaussian(mean: Point, covariance: Numbers, *, name: str = "P0") -> Gaussian:
 
     Raises:
         ModelError: the covariance is not symmetric, not finite or not positive semi-definite
-            (the message has the matrix's name and the eigenvalue), or of another size.
+            (the message has the matrix's name and the eigenvalue), or of another size; a mean
+            that is not finite.
     """
     factor = root(covariance, name)
+    check_finite(mean, f"The mean that belongs to {name}", "")
     if not isinstance(mean, dict):
         mean = jnp.asarray(mean, dtype=factor.dtype)
         Vector(factor.shape[0]).check(mean, f"The mean that belongs to {name}")

@@ -39,6 +39,8 @@ from .quadrotor import PART_III, matrix, offsets
 from .sigma import Cubature
 from .space import Composite, Rotation, Vector
 from .tuning import FOLLOWING, WIDE, TuningName
+from .update import Innovation
+from .verdict import RunsVerdict, judge, over_runs
 
 HOVER_NAMES = (
     *ATTITUDE_NAMES,
@@ -80,6 +82,7 @@ class Hover(eqx.Module):
         r: true position of the epicentre (T, 3, s) [m]. tilt: of the rotors' axis (T, s) [rad].
         nees: of all 14 error states (T, s). nees_offset: of the offset. nis: (T, s), infinite from a
             failure on. ok: whether the filter runs (T, s).
+        scaled, there: scaled innovations, and which were measured (T, 6, s).
     """
 
     t: Float[Array, " t"]
@@ -93,6 +96,12 @@ class Hover(eqx.Module):
     nees_offset: Float[Array, "T s"]
     nis: Float[Array, "T s"]
     ok: Bool[Array, "T s"]
+    scaled: Float[Array, "T 6 s"]
+    there: Bool[Array, "T 6 s"]
+
+    def verdict(self) -> RunsVerdict:
+        """Whether the filter's account of itself can be believed, over all seeds."""
+        return over_runs(judge(self.scaled, self.there, self.ok, np.diff(self.t)))
 
 
 def hover_space() -> Composite:
@@ -266,7 +275,7 @@ def _flown(
         after, seen = one_step(model, estimate, y, u, dt, rule=Cubature(), form="square_root")
         ok = running & is_finite(after)
         kept = jax.tree.map(lambda new, old: jnp.where(ok, new, old), after, estimate)
-        return (truth, kept, ok), _seen(truth, kept, u, seen.nis, ok, model)
+        return (truth, kept, ok), _seen(truth, kept, u, seen, ok, model)
 
     begin = (start, wide, jnp.ones(s, bool))
     return jax.lax.scan(step, begin, (t[:-1], kicks, noises))[1]
@@ -280,7 +289,7 @@ def _shifted(x: dict, d: Array) -> dict:
 
 
 def _seen(
-    truth: dict, estimate: Gaussian, u: Array, nis: Array, ok: Array, model: StateSpaceModel
+    truth: dict, estimate: Gaussian, u: Array, seen: Innovation, ok: Array, model: StateSpaceModel
 ) -> tuple:
     """What is kept of a step, in the order of `Hover`."""
     pick = lambda x: jnp.concatenate([x["omega"], x["offset"]])
@@ -289,5 +298,5 @@ def _seen(
     return (
         u, pick(truth), pick(estimate.mean), estimate.deviation[3:8], truth["r"],
         jnp.arccos(jnp.clip(axis, -1.0, 1.0)), compare(None), compare(slice(6, 8)),
-        jnp.where(ok, nis, jnp.inf), ok,
+        jnp.where(ok, seen.nis, jnp.inf), ok, seen.scaled, seen.there,
     )  # fmt: skip

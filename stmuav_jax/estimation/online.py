@@ -1,42 +1,113 @@
-"""One measurement at a time, from Python: for use beside a machine that runs."""
+"""One measurement at a time, from Python: for use beside a machine that runs.
 
-from typing import Any, NamedTuple
+A call of a compiled function costs some microseconds for each array that goes in or comes out,
+more than the arithmetic of a small filter. All numbers of a step therefore go in as two
+arrays (estimate; step, measurement and inputs) and come out as one.
 
-import equinox as eqx
+What is left is the runtime of JAX, which hands a computation to another thread and waits for it. A
+program that needs every microsecond calls, before anything else of JAX,
+
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+and the step then runs in the thread that asks for it, in a quarter of the time.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
+from ..algebra.compiler import compiler_options
 from ..mechanics.errors import ModelError, SettingError
-from .filter import EstimationError, is_finite, one_step
+from .check import check_functions, check_prior
+from .filter import EstimationError, check_choices, is_finite, one_step
 from .gaussian import Gaussian
 from .model import Inputs, StateSpaceModel
 from .sigma import AbstractRule, Cubature
 from .update import Form
 
 
-class Estimate(NamedTuple):
+class _Layout:
+    """Where mean and factor are among the numbers of an estimate."""
+
+    def __init__(self, prior: Gaussian) -> None:
+        leaves, self.structure = jax.tree.flatten(prior.mean)
+        self.shapes = [leaf.shape for leaf in leaves]
+        self.ends = np.cumsum([leaf.size for leaf in leaves]).tolist()
+        self.size = self.ends[-1] + prior.factor.size
+
+    def pack(self, g: Gaussian) -> Array:
+        """One array (size,)."""
+        return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves((g.mean, g.factor))])
+
+    def mean(self, numbers: Any) -> Any:
+        """The mean's array, or its pytree of arrays."""
+        starts = [0, *self.ends]
+        leaves = [
+            numbers[a:b].reshape(shape)
+            for a, b, shape in zip(starts, self.ends, self.shapes, strict=False)
+        ]
+        return jax.tree.unflatten(self.structure, leaves)
+
+    def factor(self, numbers: Any) -> Any:
+        """The factor (n, n)."""
+        flat = numbers[self.ends[-1] : self.size]
+        n = round(flat.shape[0] ** 0.5)
+        return flat.reshape(n, n)
+
+    def unpack(self, numbers: Any) -> Gaussian:
+        """The Gaussian."""
+        return Gaussian(self.mean(numbers), self.factor(numbers))
+
+
+class Estimate:
     """What is known after a measurement.
 
     Attributes:
-        t: its time [s]. state: the Gaussian. nis: normalised innovation squared.
+        t: its time [s]. nis: normalised innovation squared.
         missing: how many of its components were NaN.
     """
 
-    t: float
-    state: Gaussian
-    nis: float
-    missing: int
+    __slots__ = ("_layout", "_numbers", "missing", "nis", "t")
+
+    def __init__(
+        self, t: float, numbers: np.ndarray, layout: _Layout, nis: float, missing: int
+    ) -> None:
+        self.t, self.nis, self.missing = t, nis, missing
+        self._numbers, self._layout = numbers, layout
+
+    @property
+    def mean(self) -> Any:
+        """The mean as NumPy arrays, which cost no time."""
+        return self._layout.mean(self._numbers)
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviations (n,) as a NumPy array."""
+        return np.sqrt(np.sum(self._layout.factor(self._numbers) ** 2, axis=1))
+
+    @property
+    def state(self) -> Gaussian:
+        """The Gaussian, of JAX arrays made when it is asked for."""
+        return self._layout.unpack(jnp.asarray(self._numbers))
 
 
 class OnlineFilter:
     """A filter that waits for measurements.
 
-    The first call compiles (`warm_up` does it beforehand); all later ones run the same code as
-    `kalman_filter`.
+    The first call compiles (`warm_up` does it beforehand). Later ones evaluate the same equations
+    as `kalman_filter`; the numbers agree to rounding, because code compiled alone and code within
+    a loop may take sums in another order.
 
     Attributes:
-        t: time of the estimate [s]. state: the estimate. count, missing: measurements so far,
-            and how many of their components were NaN. nis: one number per measurement.
+        t: time of the estimate [s]. count, missing: measurements so far, and how many of their
+            components were NaN. nis: one number per measurement.
+
+    Raises:
+        ModelError, SettingError: as `kalman_filter`; functions are checked at the first call.
     """
 
     def __init__(
@@ -49,30 +120,37 @@ class OnlineFilter:
         form: Form = "square_root",
     ) -> None:
         rule = Cubature() if rule is None else rule
-        n = model.space.size
-        if prior.factor.shape != (n, n):
+        check_choices(form)
+        check_prior(model, prior, rule)
+        if prior.factor.ndim != 2:
             raise ModelError(
-                f"The prior's covariance must be {n} x {n}, but it is {prior.factor.shape}."
+                "An online filter is a single one, but its prior's covariance has shape "
+                f"{prior.factor.shape}."
             )
-        model.space.check(prior.mean, "The prior's mean")
-        rule.check(n, prior.factor.dtype)
-        self.model, self.state, self.t = model, prior, float(t)
+        self.model, self.t = model, float(t)
         self.count, self.missing = 0, 0
         self.nis: list[float] = []
+        self._prior, self._rule, self._form = prior, rule, form
+        self._layout, self._dtype = _Layout(prior), np.dtype(prior.factor.dtype)
+        self._numbers = np.asarray(self._layout.pack(prior))
+        self._programs: dict[Any, Callable[..., Any]] = {}
 
-        def step(state: Gaussian, y: Any, u: Inputs, dt: Any) -> tuple:
-            after, innovation = one_step(model, state, y, u, dt, rule=rule, form=form)
-            return after, innovation.nis, innovation.missing, is_finite(after)
+    @property
+    def state(self) -> Gaussian:
+        """The estimate."""
+        return self._layout.unpack(jnp.asarray(self._numbers))
 
-        self._step = eqx.filter_jit(step)
-
-    def warm_up(self, u: Inputs = None) -> None:
-        """Compile, with inputs of the kind that will be given."""
-        m = self.model.sensor.space.size
-        self._step(self.state, self._measured(np.full(m, np.nan)), self._inputs(u), self._time(0.0))
+    def warm_up(self, u: Inputs = None, *, y: Any = None) -> None:
+        """Compile, with inputs (and a measurement, by default one of m numbers) as they will be."""
+        y = np.full(self.model.sensor.space.size, np.nan) if y is None else y
+        program, given = self._prepared(y, 0.0, u)
+        jax.block_until_ready(program(self._numbers, given))
 
     def step(self, y: Any, t: float, u: Inputs = None) -> Estimate:
         """Predict to time t with inputs u held since the last measurement, and update with y.
+
+        Args:
+            y: measurement (m,), NaN where missing. t: its time [s]. u: a pytree of arrays (k,).
 
         Raises:
             ModelError: y has another size. SettingError: t before the last measurement.
@@ -80,27 +158,54 @@ class OnlineFilter:
         """
         if not t >= self.t:
             raise SettingError(f"Time goes backwards: after t = {self.t:g} s comes {t:g} s.")
-        y = self._measured(y)
-        self.model.sensor.space.check(y, "A measurement")
-        after, nis, missing, fine = self._step(
-            self.state, y, self._inputs(u), self._time(t - self.t)
-        )
-        if not bool(fine):
+        program, given = self._prepared(y, t - self.t, u)
+        numbers = np.asarray(program(self._numbers, given))
+        nis, missing, fine = numbers[-3:].tolist()
+        if not fine:
             raise EstimationError(
                 f"The filter failed at t = {t:g} s, measurement {self.count}: its covariance was "
                 f"not positive definite or its state not finite. The last NIS: {self.nis[-3:]}."
             )
-        self.state, self.t = after, float(t)
+        self._numbers, self.t = numbers[:-3], float(t)
         self.count += 1
         self.missing += int(missing)
-        self.nis.append(float(nis))
-        return Estimate(self.t, after, self.nis[-1], int(missing))
+        self.nis.append(nis)
+        return Estimate(self.t, self._numbers, self._layout, nis, int(missing))
 
-    def _measured(self, y: Any) -> np.ndarray:
-        return np.asarray(y, dtype=self.state.factor.dtype)
+    def _prepared(self, y: Any, dt: float, u: Inputs) -> tuple[Callable[..., Any], np.ndarray]:
+        """The compiled step for arrays of these shapes, and step, measurement, inputs in one."""
+        dtype = self._dtype
+        y = np.asarray(y, dtype)
+        leaves, structure = jax.tree.flatten(u)
+        leaves = [np.asarray(leaf, dtype) for leaf in leaves]
+        key = y.shape, structure, tuple([leaf.shape for leaf in leaves])
+        program = self._programs.get(key)
+        if program is None:
+            program = self._programs[key] = self._made(y, leaves, structure)
+        given = np.concatenate([[dt], y, *[leaf.ravel() for leaf in leaves]], dtype=dtype)
+        return program, given
 
-    def _time(self, dt: float) -> np.ndarray:
-        return np.asarray(dt, dtype=self.state.factor.dtype)
+    def _made(self, y: np.ndarray, leaves: list[np.ndarray], structure: Any) -> Callable[..., Any]:
+        """The function of one step, compiled at its first call."""
+        model, rule, form, layout = self.model, self._rule, self._form, self._layout
+        model.sensor.space.check(y, "A measurement")
+        m, shapes = y.shape[0], [leaf.shape for leaf in leaves]
+        like = [jax.ShapeDtypeStruct(shape, self._dtype) for shape in shapes]
+        check_functions(model, self._prior, jax.tree.unflatten(structure, like), m)
+        ends = np.cumsum([1 + m, *[leaf.size for leaf in leaves]]).tolist()
 
-    def _inputs(self, u: Inputs) -> Inputs:
-        return jax.tree.map(lambda leaf: np.asarray(leaf, self.state.factor.dtype), u)
+        def step(numbers: Array, given: Array) -> Array:
+            parts = [
+                given[a:b].reshape(shape)
+                for a, b, shape in zip(ends, ends[1:], shapes, strict=False)
+            ]
+            u = jax.tree.unflatten(structure, parts)
+            after, seen = one_step(
+                model, layout.unpack(numbers), given[1 : 1 + m], u, given[0], rule=rule, form=form
+            )
+            told = jnp.stack([seen.nis, *[
+                jnp.asarray(value, seen.nis.dtype) for value in (seen.missing, is_finite(after))
+            ]])  # fmt: skip
+            return jnp.concatenate([layout.pack(after), told])
+
+        return jax.jit(step, compiler_options=compiler_options())

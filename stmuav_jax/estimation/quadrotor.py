@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.rotation import cross
 from ..algebra.stacked import apply
-from ..mechanics.errors import SettingError
+from ..mechanics.errors import ModelError, SettingError
 from ..vehicle.parameters import Parameter, Parameters
 from .gaussian import Gaussian, gaussian
 from .model import Sensor, StateSpaceModel
@@ -97,12 +97,17 @@ def euler_angle_rates(
 
 
 def torque(
-    offset: Float[Array, "2 *s"], thrust: Float[Array, "4 *#s"], arm: Any, drag: Any
+    offset: Float[Array, "2 *s"], thrust: Float[Array, "rotors *#s"], arm: Any, drag: Any
 ) -> Float[Array, "3 *s"]:
     """tau about the centre of mass at `offset` [m], for thrusts (4,) [N], shape (3,) [N m].
 
+    Raises:
+        ModelError: another number of thrusts.
+
     Source: report Part III, Eq. 2.2.9.
     """
+    if thrust.shape[0] != 4:
+        raise ModelError(f"The inputs are four thrusts, but there are {thrust.shape[0]}.")
     total = jnp.sum(thrust, axis=0)
     x = -offset[1] * total + arm * (thrust[1] - thrust[3])
     y = offset[0] * total + arm * (thrust[2] - thrust[0])

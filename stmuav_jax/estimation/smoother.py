@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .check import check_functions, check_prior
 from .factor import divide_lower, downdate, outer_square, triangularise
 from .filter import Filtered
 from .gaussian import Gaussian
@@ -54,9 +55,15 @@ def smooth(
 
     Args:
         rule: `Cubature()` by default; use the filter's.
+
+    Raises:
+        ModelError, SettingError: a model that is not the record's; as `kalman_filter`.
     """
     rule = Cubature() if rule is None else rule
     prior = filtered.prior
+    check_prior(model, prior, rule)
+    now = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), filtered.u)
+    check_functions(model, prior, now)
     first = jax.tree.map(lambda leaf: leaf[None], (prior.mean, prior.factor))
     found = filtered.mean, filtered.factor
     # the estimates before each step, the prior first

@@ -16,11 +16,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import conjugate, from_rotation_vector, product
 from ..algebra.stacked import dot
-from ..mechanics.errors import ModelError
+from ..mechanics.body import UNIT_TOLERANCE
+from ..mechanics.errors import ModelError, concrete
 
 Point = Any
 Error = Float[Array, "n *s"]
@@ -94,6 +96,7 @@ class Rotation(AbstractSpace):
 
     def check(self, x: Point, what: str) -> None:
         _check_components(x, 4, what)
+        _check_unit(x, what)
 
 
 class Composite(AbstractSpace):
@@ -133,6 +136,21 @@ def _check_components(x: Any, size: int, what: str) -> None:
     shape = jnp.shape(x)
     if not shape or shape[0] != size:
         raise ModelError(f"{what} must have {size} components first, but its shape is {shape}.")
+
+
+def _check_unit(p: Any, what: str) -> None:
+    """Raise `ModelError` unless Euler parameters are unit where they are there (not NaN)."""
+    if not concrete(p):
+        return
+    norm = np.linalg.norm(np.asarray(p, dtype=float), axis=0)
+    # what rounding of numbers in their own precision leaves
+    epsilon = float(jnp.finfo(jnp.asarray(p, dtype=jnp.result_type(p, jnp.float16)).dtype).eps)
+    off = np.abs(norm - 1) > max(UNIT_TOLERANCE, 10 * epsilon)
+    if np.any(off):
+        raise ModelError(
+            f"{what} must be unit Euler parameters (a unit quaternion), but the norm is "
+            f"{norm[off].flat[0]:.9g}. Divide by it if that is only rounding."
+        )
 
 
 def _rotation_vector(p: Float[Array, "4 *s"]) -> Float[Array, "3 *s"]:

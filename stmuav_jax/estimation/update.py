@@ -47,13 +47,18 @@ class Innovation(NamedTuple):
         scaled: Ls^-1 error, of unit covariance if the filter is right, (m, *s).
         factor: Ls, the root of the innovation's covariance (m, m, *s); a missing measurement
             has the row and column of the unit matrix.
-        missing: how many of the m were missing (*s).
+        there: which of the m were measured, not missing (m, *s).
     """
 
     error: Float[Array, "m *s"]
     scaled: Float[Array, "m *s"]
     factor: Float[Array, "m m *s"]
-    missing: Int[Array, "*s"]
+    there: Bool[Array, "m *s"]
+
+    @property
+    def missing(self) -> Int[Array, "*s"]:
+        """How many of the m were missing."""
+        return jnp.sum(~self.there, axis=0)
 
     @property
     def nis(self) -> Float[Array, "*s"]:
@@ -121,10 +126,9 @@ def update(
         none = jnp.zeros((rows.shape[0] - q, n, *seen.inputs.shape[2:]), rows.dtype)
         inputs = jnp.concatenate([seen.inputs, none])
         move, factor, scaled, Ls = _jointly(rows, inputs, noise, less, error, form)
-    missing = jnp.sum(~there, axis=0)
     return (
         Gaussian(model.space.retract(prior.mean, move), factor),
-        Innovation(error, scaled, Ls, missing),
+        Innovation(error, scaled, Ls, there),
     )
 
 
@@ -166,7 +170,7 @@ def predict_and_update(
         form,
     )
     mean = model.space.retract(sent.mean["x"], move)
-    return Gaussian(mean, factor), Innovation(error, scaled, Ls, jnp.sum(~there, axis=0))
+    return Gaussian(mean, factor), Innovation(error, scaled, Ls, there)
 
 
 def _root(rows: Array, noise: Array, less: Array | None, form: Form) -> Array:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from ..estimation.assess import SETTLED, Estimates, convergence, estimate_case
+from ..estimation.assess import Estimates, convergence, estimate_case, settled_from
 from ..estimation.cases import CASES, Record, simulate_case
 from ..estimation.tuning import Tuning, consistent_tuning, report_tuning
 from ..mechanics.errors import SettingError
@@ -54,7 +54,7 @@ class EstimationStudy:
         """Everything that decides the numbers, as plain data."""
         return {
             "kind": "estimation", "name": self.name, "case": self.case, "tuning": self.tuning,
-            "t1": self.t1, "seed": self.seed,
+            "t1": self.t1, "seed": self.seed, "settled": settled_from(self.t1),
         }  # fmt: skip
 
 
@@ -81,15 +81,15 @@ class EstimationWork(AbstractWork):
     @property
     def columns(self) -> Mapping[str, Column]:
         """The seed, how the offset converges, errors, consistency, and the status."""
-        real, time = "float64", ("time",)
+        real, time, after = "float64", ("time",), f"after {settled_from(self.study.t1):g} s"
         return {
             "seed": Column("int64", "1", "seed of the noise", "input"),
             "to_2cm": Column(real, "s", "last time at which the offset is 2 cm wrong"),
             "to_5mm": Column(real, "s", "last time at which the offset is 5 mm wrong"),
-            "rmse_x": Column(real, "m", f"rms error of the offset's x after {SETTLED:g} s"),
-            "rmse_y": Column(real, "m", f"rms error of the offset's y after {SETTLED:g} s"),
-            "nees": Column(real, "1", "mean NEES of the offset (2 degrees of freedom)"),
-            "nis": Column(real, "1", "mean NIS (3 degrees of freedom)"),
+            "rmse_x": Column(real, "m", f"rms error of the offset's x {after}"),
+            "rmse_y": Column(real, "m", f"rms error of the offset's y {after}"),
+            "nees": Column(real, "1", f"mean NEES of the offset (2 degrees), {after}"),
+            "nis": Column(real, "1", f"mean NIS (3 degrees of freedom), {after}"),
             "error_x": Column(real, "m", "error of the offset's x", dims=time),
             "error_y": Column(real, "m", "error of the offset's y", dims=time),
             "status": Column("int8", "1", "how the filter ended", "status"),
@@ -151,7 +151,7 @@ def _wide(fine: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 def _measures(found: Estimates, t: np.ndarray) -> dict[str, np.ndarray]:
     """Of every run (s,), and errors at the kept times (s, k)."""
-    settled = t[1:] > min(SETTLED, t[-1] / 2)
+    settled = t[1:] > settled_from(t[-1])
     error = np.asarray(found.error)[:, 3:]
     never = lambda when: np.where(np.isnan(when), np.inf, when)
     rmse = np.sqrt(np.mean(error[settled] ** 2, axis=0))

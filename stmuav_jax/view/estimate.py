@@ -12,11 +12,13 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from rich.markup import escape
 from rich.table import Table
 
-from ..estimation.assess import SETTLED, CaseStudy, Estimates, Summary, last_beyond
+from ..estimation.assess import CaseStudy, Estimates, Summary, last_beyond, settled_from
 from ..estimation.consistency import mean_interval
 from ..estimation.hover import Hover
+from ..estimation.verdict import RunsVerdict
 from .io import versions, write_atomically
 from .plot import STYLES, grid, save_all
 
@@ -31,26 +33,35 @@ _LOOKS = {"truth": ("0.6", "-"), "report": STYLES[1], "consistent": STYLES[0]}
 
 
 def summary_table(summaries: Iterable[Summary]) -> Table:
-    """Convergence, errors and consistency, a row per case and tuning."""
+    """Convergence, errors, consistency and verdict, a row per case and tuning."""
     rows = list(summaries)
-    table = Table(title="Centre of mass: how fast, how well, how honestly", title_justify="left")
+    title = f"Centre of mass: convergence, errors, consistency ({rows[0].seeds} seeds)"
+    table = Table(title=title, title_justify="left", padding=(0, 0, 0, 1))
     for name in ("case", "tuning"):
         table.add_column(name)
-    for name in ("2 cm [s]", "5 mm [s]", "RMSE [mm]", "NEES 2", "NEES 5", "NIS 3", "lost"):
-        table.add_column(name, justify="right")
+    for name in ("to 2 cm\n[s]", "to 5 mm\n[s]", "RMSE x, y\n[mm]", "NEES\n(2)", "NEES\n(5)",
+                 "NIS\n(3)", "flag-\nged"):  # fmt: skip
+        table.add_column(escape(name), justify="right")
     for row in rows:
         table.add_row(
             str(row.case), row.tuning, _seconds(row.to_2cm), _seconds(row.to_5mm),
-            f"{1e3 * row.rmse[0]:.2f} {1e3 * row.rmse[1]:.2f}",
+            f"{1e3 * row.rmse[0]:.2f}, {1e3 * row.rmse[1]:.2f}",
             _mean(row.nees_offset, row.nees_offset_window), _mean(row.nees, row.nees_window),
-            _mean(row.nis, row.nis_window), str(row.failed),
+            _mean(row.nis, row.nis_window), str(row.verdict.flagged),
         )  # fmt: skip
     table.caption = (
-        f"{rows[0].seeds} seeds. Times from which on the error is below 2 cm and 5 mm, medians; RMSE "
-        "(x, y), NEES of the offset (2 degrees) and with the rates (5) and NIS of the settled part. "
-        "* outside the interval of 99.9 % of a consistent filter. Lost: covariances."
+        "Medians of the times from which on the error is below 2 cm and 5 mm. After "
+        f"{rows[0].settled:g} s: RMSE, and the means of NEES of the offset (2 is right), of rates and "
+        "offset (5), and of NIS (3); high and low: outside the interval of 99.9 % of a consistent "
+        "filter. Flagged: runs whose innovations contradict their filter."
     )
     return table
+
+
+def verdict_lines(found: dict[str, RunsVerdict]) -> list[str]:
+    """One line of verdict for each, by its title; of a single one all its words."""
+    lines = [f"{title}: {one.short}." for title, one in found.items()]
+    return lines if len(found) > 2 else [f"{title}: {one.words}" for title, one in found.items()]
 
 
 def _seconds(value: float) -> str:
@@ -58,22 +69,24 @@ def _seconds(value: float) -> str:
 
 
 def _mean(value: float, window: tuple[float, float]) -> str:
-    inside = window[0] <= value <= window[1]
-    return f"{value:.3g}{'' if inside else '*'}"
+    if not math.isfinite(value):
+        return "-"
+    side = " low" if value < window[0] else " high" if value > window[1] else ""
+    return f"{value:.3g}{side}"
 
 
 def hover_table(flights: dict[str, Hover]) -> Table:
     """How hovers went, by tuning: largest tilt and distance, errors, consistency at the end."""
     table = Table(title="Hover by a controller that sees the estimate", title_justify="left")
     table.add_column("tuning")
-    for name in ("largest tilt [degrees]", "furthest [m]", "to 2 cm [s]", "RMSE x, y [mm]",
-                 "NEES offset (2)", "NEES (14)", "failed"):  # fmt: skip
-        table.add_column(name, justify="right")
+    for name in ("largest tilt\n[degrees]", "furthest\n[m]", "to 2 cm\n[s]", "RMSE x, y\n[mm]",
+                 "NEES\n(2)", "NEES\n(14)", "failed"):  # fmt: skip
+        table.add_column(escape(name), justify="right")
     for name, flight in flights.items():
         t = np.asarray(flight.t)
         error = np.asarray(flight.mean - flight.truth)[:, 3:]
         seeds = error.shape[2]
-        settled = t[1:] > min(SETTLED, t[-1] / 2)
+        settled = t[1:] > settled_from(t[-1])
         rmse = 1e3 * np.sqrt(np.mean(error[settled] ** 2, axis=(0, 2)))
         table.add_row(
             name, f"{np.degrees(np.max(np.asarray(flight.tilt))):.1f}",
@@ -84,7 +97,10 @@ def hover_table(flights: dict[str, Hover]) -> Table:
             _mean(float(np.mean(flight.nees[-1])), mean_interval(14, seeds)),
             f"{int(np.sum(~np.asarray(flight.ok)[-1]))} of {seeds}",
         )  # fmt: skip
-    table.caption = "* outside the interval that holds 99.9 % of a consistent filter's means."
+    table.caption = (
+        f"RMSE after {settled_from(t[-1]):g} s; NEES at the end; high and low: outside the interval of "
+        "99.9 % of a consistent filter's means."
+    )
     return table
 
 
@@ -170,15 +186,14 @@ def consistency(study: CaseStudy) -> Figure:
     figure, axes = grid(2, 1, 4.8)
     t = np.asarray(study.record.t)[1:]
     seeds = study.record.seeds
-    for row, (words, degrees) in enumerate((("NEES of rates and offset", 5), ("NIS", 3))):
+    for row, (words, degrees) in enumerate((("NEES (5)", 5), ("NIS (3)", 3))):
         ax = axes[row, 0]
-        ax.axhspan(
-            *mean_interval(degrees, seeds), color="0.8", label="99.9 % of a consistent filter's"
-        )
+        ax.axhspan(*mean_interval(degrees, seeds), color="0.8", label="consistent: 99.9 %")
         for name, found in study.estimates.items():
             values = np.asarray(found.nees if degrees == 5 else found.nis)
             _line(ax, t, np.mean(values, axis=1), name, linewidth=0.8, linestyle="-")
         ax.set_yscale("log")
+        ax.axvline(settled_from(t[-1]), color="0.4", linewidth=0.8, linestyle=":", label="settled")
         ax.set_ylabel(f"{words}, mean", fontsize=9)
     axes[0, 0].legend(fontsize=8)
     axes[1, 0].set_xlabel("time [s]", fontsize=9)
@@ -294,7 +309,7 @@ def case_dataset(study: CaseStudy) -> xr.Dataset:
         table,
         {"time": _times(record.t), "tuning": list(found)},
         _title(study),
-        {name: summary._asdict() for name, summary in study.summaries.items()},
+        {name: summary.plain() for name, summary in study.summaries.items()},
     )
 
 

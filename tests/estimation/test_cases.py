@@ -102,7 +102,10 @@ def test_the_target_table(studies, case):
     ):
         assert window[0] <= value <= window[1]
     assert consistent.outside <= 1
-    # the report's is not consistent, and is seen not to be
+    # the report's is not consistent, and is seen not to be, from the innovations alone
+    assert report.verdict.status == "inconsistent"
+    assert report.verdict.flagged == 50
+    assert consistent.verdict.status == "consistent"
     assert not report.nis_window[0] <= report.nis <= report.nis_window[1]
 
 
@@ -241,10 +244,15 @@ def test_a_bank_that_fails_is_counted():
     """All runs lost: no figures, but their number."""
     none = jnp.zeros((3, 2))
     path = jnp.zeros((3, 5, 2))
-    lost = Estimates(path, path, path, none, none, none, jnp.zeros((3, 2), bool))
+    seen = jnp.zeros((3, 3, 2))
+    lost = Estimates(
+        path, path, path, none, none, none, jnp.zeros((3, 2), bool), seen, jnp.ones_like(seen, bool)
+    )
     t = jnp.arange(4) * 1e-3
     record = Record(t, jnp.zeros((3, 4)), jnp.zeros((4, 4, 2)), jnp.zeros((4, 3, 2)),
                     jnp.zeros((4, 2, 2)), jnp.zeros((3, 3, 2)), 1)  # fmt: skip
     row = summarise(lost, record, "consistent")
     assert row.failed == 2
+    assert row.verdict.status == "failed"
+    assert row.verdict.short == "failed: 2 of 2 runs lost their covariance"
     assert np.isnan(row.to_2cm)
