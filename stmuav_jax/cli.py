@@ -1,5 +1,8 @@
 """The command line, `stmuav`: list, simulate, sun, trim, linearize, tune, estimate, montecarlo,
-report."""
+report.
+
+Options are read without JAX; what a command needs is imported when it runs.
+"""
 
 import contextlib
 import dataclasses
@@ -7,50 +10,84 @@ import math
 import os
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import diffrax
-import jax
-import numpy as np
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
+from . import __version__
 from .commands.estimate import Estimate, run_estimate
 from .commands.flight import Linearize, Trim, run_linearize, run_trim
 from .commands.montecarlo import Montecarlo, Report, cores, run_montecarlo, run_report
-from .commands.output import written
+from .commands.options import (
+    ANGLE,
+    END,
+    TOLERANCE,
+    Number,
+    arguments_of,
+    check_options,
+    check_words,
+    count,
+    default,
+)
+from .commands.output import explain, working, written
 from .commands.tune import Tune, run_tune
-from .dynamics.augmented import Augmented
-from .dynamics.rosenbrock import Rodas5P
-from .dynamics.run import Run
-from .dynamics.scene import Scene
-from .dynamics.simulate import simulate
-from .dynamics.solvers import kvaerno3, kvaerno5
-from .dynamics.stabilisation import Baumgarte, Projection, Unstabilised
-from .dynamics.tree import Tree
-from .mechanics.errors import ModelError, SettingError, SimulationError, StateError
-from .scenes.registry import SCENES, make_scene
-from .view.io import FileError, load_parameters, save, save_certificate
-from .view.report import certificate_table
+from .mechanics.errors import SettingError, SimulationError
+from .scenes.catalogue import CATALOGUE
+from .view.terminal import line, row, table
 
-SOLVERS = {
-    "dopri8": diffrax.Dopri8,
-    "tsit5": diffrax.Tsit5,
-    "kvaerno3": kvaerno3,
-    "kvaerno5": kvaerno5,
-    "rodas5p": Rodas5P,
-    "auto": lambda: "auto",
-}
-FORMULATIONS = {
-    "tree": Tree(),
-    "augmented": Augmented(),
-    "augmented-dense": Augmented(solve="dense"),
-    "report": Augmented(solve="dense", rows="report"),
-}
-STABILISATIONS = {"projection": Projection, "baumgarte": Baumgarte, "none": Unstabilised}
+if TYPE_CHECKING:
+    from .dynamics.run import Run
+    from .dynamics.scene import Scene
+
+ABOUT = """Simulate, trim, tune and estimate a UAV that carries a parallel-mechanism solar tracker,
+from the command line. Results go to files in runs/; `stmuav COMMAND --help` describes a command.
+
+Examples: stmuav simulate uav_tracker --case 2; stmuav sun --lat 11.55 --lon 104.92 --date 2024-03-21;
+stmuav trim --phi 10 --theta -5. Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted.
+`--version` prints the version; `--debug` with a command prints the traceback of an error.
+"""
+
+
+def _solver(name: str) -> Any:
+    import diffrax
+
+    from .dynamics.rosenbrock import Rodas5P
+    from .dynamics.solvers import kvaerno3, kvaerno5
+
+    makers: dict[str, Callable[[], Any]] = {
+        "dopri8": diffrax.Dopri8,
+        "tsit5": diffrax.Tsit5,
+        "kvaerno3": kvaerno3,
+        "kvaerno5": kvaerno5,
+        "rodas5p": Rodas5P,
+        "auto": lambda: "auto",
+    }
+    return makers[name]()
+
+
+def _formulation(name: str) -> Any:
+    from .dynamics.augmented import Augmented
+    from .dynamics.tree import Tree
+
+    return {
+        "tree": Tree(),
+        "augmented": Augmented(),
+        "augmented-dense": Augmented(solve="dense"),
+        "report": Augmented(solve="dense", rows="report"),
+    }[name]
+
+
+def _stabilisation(name: str) -> Any:
+    from .dynamics.stabilisation import Baumgarte, Projection, Unstabilised
+
+    return {"projection": Projection, "baumgarte": Baumgarte, "none": Unstabilised}[name]()
+
+
+# Saved times are kept in memory: a spacing far below a step's would ask for too many.
+SPACING = Number("spacing of the saved times", "s", above=1e-7, high=1e5)
 
 
 @dataclasses.dataclass
@@ -60,17 +97,20 @@ class List:
 
 @dataclasses.dataclass
 class Simulate:
-    """Simulate a scene; write run.nc, certificate.json and figures."""
+    """Simulate a scene; write run.nc, certificate.json and figures.
+
+    Example: stmuav simulate uav_tracker --case 2 --t1 1 --loads
+    """
 
     scene: tyro.conf.Positional[Literal["spin", "tracker", "hexacopter", "uav_tracker"]]
     """Which scene; see `stmuav list`."""
-    case: int | None = None
-    """Case of the report; default the scene's first choice."""
-    t1: float | None = None
-    """End [s]; default the scene's."""
-    rtol: float = 1e-8
+    case: Annotated[int | None, default("the scene's first choice")] = None
+    """Case of the report."""
+    t1: Annotated[float | None, END, default("the scene's own")] = None
+    """End [s]."""
+    rtol: Annotated[float, dataclasses.replace(TOLERANCE, what="relative tolerance")] = 1e-8
     """Relative tolerance of a step."""
-    atol: float = 1e-8
+    atol: Annotated[float, dataclasses.replace(TOLERANCE, what="absolute tolerance")] = 1e-8
     """Absolute tolerance of a step [m, m/s, rad/s]."""
     solver: Literal["dopri8", "tsit5", "kvaerno3", "kvaerno5", "rodas5p", "auto"] = "dopri8"
     """Explicit, or implicit for stiff scenes (kvaerno, rodas5p); auto looks at the start."""
@@ -78,16 +118,16 @@ class Simulate:
     """Relative coordinates; or all bodies' by structure, densely, in the report's rows."""
     stabilisation: Literal["projection", "baumgarte", "none"] = "projection"
     """What keeps the constraints from drifting."""
-    save_every: float | None = None
-    """Spacing of the saved times [s]; default the scene's."""
-    max_steps: int = 100_000
+    save_every: Annotated[float | None, SPACING, default("the scene's own")] = None
+    """Spacing of the saved times [s]."""
+    max_steps: Annotated[int, count("steps allowed", 1e8)] = 100_000
     """Steps allowed between two saved times."""
-    params: Path | None = None
+    params: Annotated[Path | None, default("the report's values")] = None
     """TOML file with values that replace the table's."""
-    actuators: Literal["consistent", "printed"] | None = None
+    actuators: Annotated[Literal["consistent", "printed"] | None, default("consistent")] = None
     """Couple of the actuators' force pair; uav_tracker only."""
-    out: Path | None = None
-    """Folder for the results; default runs/SCENE."""
+    out: Annotated[Path | None, default("runs/SCENE")] = None
+    """Folder for the results."""
     figures: Literal["png", "pdf", "svg", "none"] = "png"
     """Format of the figures."""
     loads: bool = False
@@ -98,38 +138,45 @@ class Simulate:
 
 @dataclasses.dataclass
 class SunDay:
-    """Point the panel at the sun for a day; write day.nc and figures."""
+    """Point the panel at the sun for a day; write day.nc and figures.
 
-    lat: float
+    Example: stmuav sun --lat 11.55 --lon 104.92 --date 2024-03-21 --timezone Asia/Phnom_Penh
+    """
+
+    lat: Annotated[float, Number("latitude", "degrees", -90, 90)]
     """Latitude, north positive [degrees]."""
-    lon: float
+    lon: Annotated[float, Number("longitude", "degrees", -360, 360)]
     """Longitude, east positive [degrees]."""
     date: str
     """Date at the place, as 2024-03-21."""
-    timezone: str | None = None
-    """Time zone such as Asia/Phnom_Penh or +07:00; default whole hours by the longitude."""
-    altitude: float = 0.0
+    timezone: Annotated[str | None, default("whole hours by the longitude")] = None
+    """Time zone such as Asia/Phnom_Penh or +07:00."""
+    altitude: Annotated[float, Number("altitude", "m", -500, 11000)] = 0.0
     """Above sea level [m]."""
-    roll: float = 0.0
+    roll: Annotated[float, ANGLE] = 0.0
     """Attitude of the UAV [degrees]: turn about its x axis."""
-    pitch: float = 0.0
+    pitch: Annotated[float, ANGLE] = 0.0
     """Turn about its y axis [degrees]; positive lowers its x axis."""
-    yaw: float = 0.0
+    yaw: Annotated[float | None, ANGLE, default("the heading of the most energy")] = None
     """Its x axis from east towards north [degrees]."""
-    attitude: Path | None = None
+    attitude: Annotated[Path | None, default("a constant attitude")] = None
     """CSV file with a history of the attitude instead: columns t [s], roll, pitch, yaw."""
-    step: float = 300.0
+    step: Annotated[float, Number("time step", "s", 1, 7200)] = 300.0
     """Time between samples [s]."""
-    stroke_step: float = 0.0
+    stroke_step: Annotated[float, Number("step of the actuators", "m", 0, 0.1)] = 0.0
     """Smallest step of the linear actuators [m]."""
-    attitude_error: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    attitude_error: Annotated[
+        tuple[float, float, float], dataclasses.replace(ANGLE, what="error of the attitude")
+    ] = (0.0, 0.0, 0.0)
     """Rotation vector from the true attitude to the one believed, body axes [degrees]."""
-    turbidity: float | None = None
-    """Linke's turbidity of the air; default the month's mean at the place."""
-    params: Path | None = None
+    turbidity: Annotated[
+        float | None, Number("turbidity", "", 1, 20), default("the month's mean at the place")
+    ] = None
+    """Linke's turbidity of the air."""
+    params: Annotated[Path | None, default("the report's values")] = None
     """TOML file with values that replace the table's."""
-    out: Path | None = None
-    """Folder for the results; default runs/sun_DATE."""
+    out: Annotated[Path | None, default("runs/sun_DATE")] = None
+    """Folder for the results."""
     figures: Literal["png", "pdf", "svg", "none"] = "png"
     """Format of the figures."""
     cache: bool = True
@@ -156,6 +203,8 @@ def cache_folder() -> Path:
 
 
 def _configure(use_cache: bool) -> None:
+    import jax
+
     jax.config.update("jax_enable_x64", True)
     if use_cache:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
@@ -165,14 +214,17 @@ def _configure(use_cache: bool) -> None:
 
 def list_scenes(console: Console) -> None:
     """Print the scenes."""
-    table = Table("scene", "cases", "what it is", "report", "end [s]")
-    for name, entry in SCENES.items():
+    shown = table("scene", "cases", "what it is", "report", "end [s]")
+    for name, entry in CATALOGUE.items():
         cases = ", ".join(map(str, entry.cases)) or "-"
-        table.add_row(name, cases, entry.summary, entry.source, f"{make_scene(name).t1:g}")
-    console.print(table)
+        row(shown, name, cases, entry.summary, entry.source, f"{entry.t1:g}")
+    console.print(shown)
 
 
-def _scene(command: Simulate) -> Scene:
+def _scene(command: Simulate) -> "Scene":
+    from .scenes.registry import SCENES, make_scene
+    from .view.io import load_parameters
+
     entry = SCENES[command.scene]
     table = load_parameters(command.params, entry.parameters)
     options: dict[str, Any] = {}
@@ -183,8 +235,18 @@ def _scene(command: Simulate) -> Scene:
     return make_scene(command.scene, command.case, table, **options)
 
 
-def run_scene(command: Simulate, console: Console) -> Run:
+def run_scene(command: Simulate, console: Console) -> "Run":
     """Build and simulate the scene with a progress bar on stderr."""
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from .dynamics.simulate import simulate
+
     scene = _scene(command)
     if command.loads and not scene.system.joints:
         raise SettingError(f"--loads is for scenes with joints; {command.scene} has none.")
@@ -202,9 +264,9 @@ def run_scene(command: Simulate, console: Console) -> Run:
 
         return simulate(
             scene,
-            formulation=FORMULATIONS[command.formulation],
-            solver=SOLVERS[command.solver](),
-            stabilisation=STABILISATIONS[command.stabilisation](),
+            formulation=_formulation(command.formulation),
+            solver=_solver(command.solver),
+            stabilisation=_stabilisation(command.stabilisation),
             rtol=command.rtol,
             atol=command.atol,
             t1=command.t1,
@@ -215,8 +277,10 @@ def run_scene(command: Simulate, console: Console) -> Run:
         )
 
 
-def write_results(run: Run, command: Simulate) -> list[Path]:
+def write_results(run: "Run", command: Simulate) -> list[Path]:
     """Write results, certificate and figures; their paths."""
+    from .view.io import save, save_certificate
+
     folder = command.out if command.out is not None else Path("runs") / run.scene.name
     paths = [save(run, folder / "run.nc"), save_certificate(run, folder / "certificate.json")]
     if command.figures != "none":
@@ -227,7 +291,7 @@ def write_results(run: Run, command: Simulate) -> list[Path]:
     return paths
 
 
-def write_loads(run: Run, command: Simulate, folder: Path, out: Console) -> list[Path]:
+def write_loads(run: "Run", command: Simulate, folder: Path, out: Console) -> list[Path]:
     """Write the joints' reaction loads, resolved between saved times; print their peaks."""
     from .study.loads import resolved_loads
     from .view.loads import loads_table, save_loads, save_loads_figure
@@ -241,6 +305,8 @@ def write_loads(run: Run, command: Simulate, folder: Path, out: Console) -> list
 
 
 def _simulate(command: Simulate, console: Console, started: float) -> int:
+    from .view.report import certificate_table
+
     run = run_scene(command, console)
     clock = time.perf_counter()
     paths = write_results(run, command)
@@ -250,7 +316,7 @@ def _simulate(command: Simulate, console: Console, started: float) -> int:
     if command.loads:
         paths += write_loads(run, command, paths[0].parent, out)
     for note in run.scene.notes:
-        out.print(f"Note: {note}", highlight=False)
+        line(out, f"Note: {note}")
     out.print(f"Imports {started:.2f} s, results and figures {writing:.2f} s.", highlight=False)
     written(out, paths)
     if run.certificate.result == "interrupted":
@@ -262,28 +328,35 @@ def _simulate(command: Simulate, console: Console, started: float) -> int:
 
 def _sun(command: SunDay) -> int:
     # pvlib and matplotlib are slow to import: only here
+    import numpy as np
+
     from .study.day import Flaws, day_zone, parse_date, track_day
+    from .study.heading import best_heading
     from .vehicle.airframe import PART_II
     from .vehicle.ephemeris import Place
     from .vehicle.sun import attitude
     from .view.day import day_tables, load_attitude, save_day, save_day_figures
+    from .view.io import load_parameters
 
-    turned = (command.roll, command.pitch, command.yaw)
-    if command.attitude is not None and any(turned):
+    if command.attitude is not None and (command.roll or command.pitch or command.yaw is not None):
         raise SettingError("Give --attitude or --roll, --pitch and --yaw, not both.")
-    table = load_parameters(command.params, PART_II)
-    day = track_day(
-        Place.degrees(command.lat, command.lon, command.altitude),
-        parse_date(command.date),
-        day_zone(command.timezone, command.lon),
-        attitude(*(math.radians(angle) for angle in turned))
-        if command.attitude is None
-        else load_attitude(command.attitude),
-        step=command.step,
-        flaws=Flaws(command.stroke_step, math.radians(1) * np.array(command.attitude_error)),
-        parameters=table,
-        turbidity=command.turbidity,
-    )
+    day_of, zone = parse_date(command.date), day_zone(command.timezone, command.lon)
+    place = Place.degrees(command.lat, command.lon, command.altitude)
+    settings: dict[str, Any] = {
+        "parameters": load_parameters(command.params, PART_II), "turbidity": command.turbidity,
+    }  # fmt: skip
+    flaws = Flaws(command.stroke_step, math.radians(1) * np.array(command.attitude_error))
+    turn = lambda yaw: attitude(math.radians(command.roll), math.radians(command.pitch), yaw)
+    chosen = ""
+    if command.attitude is not None:
+        R_wb = load_attitude(command.attitude)
+    elif command.yaw is not None:
+        R_wb = turn(math.radians(command.yaw))
+    else:
+        yaw = best_heading(place, day_of, zone, turn, **settings)
+        chosen = f"Heading chosen for the most energy: --yaw {math.degrees(yaw):g}."
+        R_wb = turn(yaw)
+    day = track_day(place, day_of, zone, R_wb, step=command.step, flaws=flaws, **settings)
     folder = command.out if command.out is not None else Path("runs") / f"sun_{command.date}"
     paths = [save_day(day, folder / "day.nc")]
     if command.figures != "none":
@@ -291,49 +364,62 @@ def _sun(command: SunDay) -> int:
     out = Console()
     for each in day_tables(day):
         out.print(each)
+    if chosen:
+        line(out, chosen)
     written(out, paths)
     return 0
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point; returns the exit code: 0, 1 for a failed run, 2 for bad input."""
-    started = time.process_time()
-    command = tyro.cli(Command, args=arguments, prog="stmuav", description=__doc__)  # pyright: ignore
-    console = Console(stderr=True)
-    try:
-        if isinstance(command, List):
-            _configure(False)
-            list_scenes(Console())
-            return 0
-        if isinstance(command, Report):
+def _run(command: Any, started: float) -> int:
+    """Run one command; its exit code."""
+    if isinstance(command, List):
+        list_scenes(Console())
+        return 0
+    if isinstance(command, Report):
+        with working("Reading the store and drawing"):
             return run_report(command)
-        _configure(command.cache)
-        if isinstance(command, SunDay):
-            return _sun(command)
-        if isinstance(command, Trim):
-            return run_trim(command)
-        if isinstance(command, Linearize):
-            return run_linearize(command)
-        if isinstance(command, Tune):
-            return run_tune(command)
-        if isinstance(command, Estimate):
-            return run_estimate(command)
-        if isinstance(command, Montecarlo):
-            if command.scheduler is None and command.workers is None:
-                # before the first array: JAX counts its devices once, in another program too
-                with contextlib.suppress(RuntimeError):
-                    jax.config.update("jax_num_cpu_devices", command.devices or cores())
-            return run_montecarlo(command)
-        return _simulate(command, console, started)
-    except SimulationError as error:
-        console.print(f"stmuav: {error}", style="red", markup=False, highlight=False)
-        return 1
-    except (ModelError, StateError, SettingError, FileError, OSError) as error:
-        console.print(f"stmuav: {error}", style="red", markup=False, highlight=False)
-        return 2
-    except KeyboardInterrupt:
-        console.print("stmuav: interrupted before anything was reached.", markup=False)
-        return 130
+    _configure(command.cache)
+    if isinstance(command, Montecarlo):
+        if command.scheduler is None and command.workers is None:
+            import jax
+
+            # before the first array: JAX counts its devices once, in another program too
+            with contextlib.suppress(RuntimeError):
+                jax.config.update("jax_num_cpu_devices", command.devices or cores())
+        return run_montecarlo(command)
+    if isinstance(command, Tune):
+        return run_tune(command)
+    if isinstance(command, Simulate):
+        return _simulate(command, Console(stderr=True), started)
+    silent: dict[type, tuple[str, Callable[[Any], int]]] = {
+        SunDay: ("Following the sun through the day", _sun),
+        Trim: ("Compiling and solving the trim", run_trim),
+        Linearize: ("Compiling and solving trim and linear equations", run_linearize),
+        Estimate: ("Compiling and running the filters", run_estimate),
+    }
+    words, run = silent[type(command)]
+    with working(words):
+        return run(command)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; the exit code: 0, 1 for a failed run, 2 for bad input, 130 for Ctrl-C."""
+    started = time.process_time()
+    words = arguments_of(arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    if words == ["--version"]:
+        line(Console(), f"stmuav_jax {__version__}")
+        return 0
+    try:
+        check_words(words)
+        command: Any = tyro.cli(Command, args=words, prog="stmuav", description=ABOUT)  # pyright: ignore
+        check_options(command, words)
+        return _run(command, started)
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 2
+    except (Exception, KeyboardInterrupt) as error:
+        return explain(error, debug)
 
 
 if __name__ == "__main__":

@@ -2,11 +2,12 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from rich.console import Console
 from rich.table import Table
 
+from .options import END, SEED, Number, count, default
 from .output import written
 
 
@@ -18,8 +19,8 @@ class Estimate:
     2 wrong input; 3 done, but a filter's own account of its errors cannot be trusted. The report's
     tuning is of this kind in all eight cases."""
 
-    case: int | None = None
-    """Case of the report, 1 to 8; default all."""
+    case: Annotated[int | None, Number("number of the case", "", 1, 8), default("all")] = None
+    """Case of the report, 1 to 8."""
     tuning: Literal["both", "report", "consistent"] = "both"
     """Table 2.4.2, or one whose covariances say what is known."""
     model: Literal["default", "observable", "report", "printed", "attitude"] = "default"
@@ -27,18 +28,18 @@ class Estimate:
     Default: the report's tuning on the report's, the consistent one on the observable states."""
     hover: bool = False
     """Instead fly a hover whose controller sees only the estimate."""
-    seeds: int = 50
+    seeds: Annotated[int, count("runs", 100_000)] = 50
     """How many runs with other noise."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """The first of them."""
-    t1: float = 2.0
+    t1: Annotated[float, END] = 2.0
     """End [s]."""
-    params: Path | None = None
+    params: Annotated[Path | None, default("the report's values")] = None
     """TOML file with values that replace the table's, for truth and filters alike."""
-    filter_params: Path | None = None
+    filter_params: Annotated[Path | None, default("the values of --params")] = None
     """TOML file with values that the filters alone believe: a mismatch to try."""
-    out: Path | None = None
-    """Folder for the results; default runs/estimate_CASE or runs/hover."""
+    out: Annotated[Path | None, default("runs/estimate_CASE or runs/hover")] = None
+    """Folder for the results."""
     figures: Literal["png", "pdf", "svg", "none"] = "png"
     """Format of the figures."""
     cache: bool = True

@@ -4,55 +4,63 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from ..mechanics.errors import ModelError, SettingError
-from ..vehicle.parameters import Parameters
+from ..view.terminal import line, row, table
+from .options import ANGLE, FORCE, SPEED, Number, default
+from .output import written
+
+if TYPE_CHECKING:
+    from ..vehicle.parameters import Parameters
+
+_ROTOR = Number("speed of the rotors", "rad/s", 0.0, 1e5)
 
 
 @dataclasses.dataclass
 class Flight:
     """A steady flight of the UAV with its tracker."""
 
-    phi: float | None = None
-    """First angle of the panel [degrees]; default the initial one."""
-    theta: float | None = None
+    phi: Annotated[float | None, ANGLE, default("the initial one")] = None
+    """First angle of the panel [degrees]."""
+    theta: Annotated[float | None, ANGLE, default("the initial one")] = None
     """Second angle of the panel [degrees]."""
-    sun: tuple[float, float] | None = None
-    """Point the panel at the sun instead: azimuth from north (y) to east (x) and elevation
-    [degrees]."""
-    climb: float = 0.0
+    sun: Annotated[tuple[float, float] | None, ANGLE, default("at --phi and --theta")] = None
+    """Point the panel at the sun instead: azimuth from north (y) to east (x), elevation [degrees]."""
+    climb: Annotated[float, SPEED] = 0.0
     """Speed upwards [m/s]."""
-    speed: float = 0.0
+    speed: Annotated[float, SPEED] = 0.0
     """Level speed [m/s]."""
-    course: float = 0.0
+    course: Annotated[float, ANGLE] = 0.0
     """Direction of the level speed, from x (east) towards y (north) [degrees]."""
-    turn: float = 0.0
+    turn: Annotated[float, Number("rate of turn", "degrees/s", -3600.0, 3600.0)] = 0.0
     """Rate of turn, from x towards y [degrees/s]."""
-    yaw: float = 0.0
+    yaw: Annotated[float, ANGLE] = 0.0
     """Heading of the UAV's x axis, from x towards y [degrees]."""
-    params: Path | None = None
+    params: Annotated[Path | None, default("the report's values")] = None
     """TOML file with values that replace the table's."""
-    out: Path | None = None
-    """Folder for the results; default runs/trim or runs/linearize."""
+    out: Annotated[Path | None, default("runs/trim or runs/linearize")] = None
+    """Folder for the results."""
     cache: bool = True
     """Keep compiled code in the user's cache folder for the next run."""
 
 
 @dataclasses.dataclass
 class Trim(Flight):
-    """Find attitude, rotor speeds and actuator forces of a steady flight; write trim.json."""
+    """Find attitude, rotor speeds and actuator forces of a steady flight; write trim.json.
 
-    highest: float | None = None
+    Example: stmuav trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods
+    """
+
+    highest: Annotated[float | None, _ROTOR, default("none")] = None
     """Limit of the rotors' speeds [rad/s]."""
-    lowest: float = 0.0
+    lowest: Annotated[float, _ROTOR] = 0.0
     """Least speed of the rotors [rad/s], with --highest."""
-    force: float | None = None
+    force: Annotated[float | None, FORCE, default("none")] = None
     """Limit of the actuators' forces either way [N]."""
     by: tuple[str, ...] = ()
     """Parameters to which the trim's sensitivity is wanted, such as mass.panel_7."""
@@ -60,13 +68,16 @@ class Trim(Flight):
 
 @dataclasses.dataclass
 class Linearize(Flight):
-    """Linearise about a steady flight; write A, B, C, D with names to linear.npz."""
+    """Linearise about a steady flight; write A, B, C, D with names to linear.npz.
 
-    outputs: tuple[str, ...] = ()
-    """States that are measured, such as omega_x; default all."""
+    Example: stmuav linearize --sun 150 60 --outputs phi theta
+    """
+
+    outputs: Annotated[tuple[str, ...], default("all")] = ()
+    """States that are measured, such as omega_x."""
 
 
-def table_of(params: Path | None) -> Parameters:
+def table_of(params: Path | None) -> "Parameters":
     """Part II of the report, with the user's values."""
     from ..vehicle.airframe import PART_II
     from ..view.io import load_parameters
@@ -74,7 +85,7 @@ def table_of(params: Path | None) -> Parameters:
     return load_parameters(params, PART_II)
 
 
-def wanted_of(command: Flight, table: Parameters) -> Any:
+def wanted_of(command: Flight, values: "Parameters") -> Any:
     """The flight that the options describe."""
     from ..study.trim import climb, cruise, steady_turn
     from ..vehicle.geometry import initial_angles
@@ -93,7 +104,7 @@ def wanted_of(command: Flight, table: Parameters) -> Any:
         level = math.cos(height)
         sun = [level * math.sin(azimuth), level * math.cos(azimuth), math.sin(height)]
     else:
-        first = np.asarray(initial_angles(table))
+        first = np.asarray(initial_angles(values))
         given = (command.phi, command.theta)
         angles = [a if x is None else math.radians(x) for a, x in zip(first, given, strict=True)]
     if command.turn:
@@ -116,42 +127,43 @@ def _limits(command: Trim) -> Any:
 
 
 def _unknowns(found: Any) -> Any:
-    """What a trim finds, as one vector: attitude (rotation vector), speeds, forces."""
+    """What a trim finds, as one vector: attitude (rotation vector, degrees), speeds, forces."""
     import jax.numpy as jnp
 
     from ..algebra.rotation import to_rotation_vector
 
-    turned = to_rotation_vector(found.coordinates.p)
+    turned = jnp.degrees(to_rotation_vector(found.coordinates.p))
     return jnp.concatenate([turned, found.speeds, found.inputs.forces])
 
 
 def _labels(count: int) -> list[tuple[str, str]]:
     """Names and units of `_unknowns`."""
-    names = [(f"turn_{k}", "rad") for k in "xyz"]
+    names = [(f"turn_{k}", "degrees") for k in "xyz"]
     names += [(f"speed_{k + 1}", "rad/s") for k in range(count)]
     return [*names, ("force_2", "N"), ("force_3", "N")]
 
 
-def _solved(command: Trim, table: Parameters, limits: Any) -> tuple[Any, dict[str, np.ndarray]]:
+def _solved(command: Trim, given: "Parameters", limits: Any) -> tuple[Any, dict[str, np.ndarray]]:
     """The trim, and its derivatives by parameters of the table, by name: (unknowns, shape of it)."""
+    import jax
     import jax.numpy as jnp
 
     from ..algebra.compiler import outer_jit
     from ..scenes.uav_tracker import uav_flyer
     from ..study.trim import TrimReason, trim
 
-    wanted = wanted_of(command, table)
-    values = {name: jnp.asarray(table.value(name), dtype=float) for name in command.by}
+    wanted = wanted_of(command, given)
+    values = {name: jnp.asarray(given.value(name), dtype=float) for name in command.by}
 
     def of(values: Any) -> Any:
-        found = trim(uav_flyer(table.replaced(values)), wanted, limits, throw=False)
+        found = trim(uav_flyer(given.replaced(values)), wanted, limits, throw=False)
         return _unknowns(found), found
 
     if values:
         slopes, found = outer_jit(jax.jacfwd(of, has_aux=True))(values)
         if found.reason == TrimReason.VALID:
             return found, {k: np.asarray(v) for k, v in slopes.items()}
-    return trim(uav_flyer(table), wanted, limits), {}
+    return trim(uav_flyer(given), wanted, limits), {}
 
 
 def run_trim(command: Trim) -> int:
@@ -160,22 +172,23 @@ def run_trim(command: Trim) -> int:
 
     from ..view.io import versions, write_atomically
 
-    table = table_of(command.params)
-    found, slopes = _solved(command, table, _limits(command))
+    given = table_of(command.params)
+    found, slopes = _solved(command, given, _limits(command))
     unknowns = np.asarray(_unknowns(found))
     labels = _labels(len(found.speeds))
     out = Console()
     out.print(_trim_table(unknowns, labels))
-    angles = ", ".join(f"{math.degrees(float(a)):.4f}" for a in found.coordinates.angles)
-    out.print(
+    degrees = [math.degrees(float(a)) for a in found.coordinates.angles]
+    angles = ", ".join(f"{a:.4f}" for a in degrees)
+    line(
+        out,
         f"Panel angles {angles} degrees. Accelerations left: {float(found.residual):.1e}; "
         f"{found.choices} dimensions of choice among the rotors' speeds, taken nearest each other.",
-        highlight=False,
     )
     content = {
         "values": {name: float(v) for (name, _), v in zip(labels, unknowns, strict=True)},
         "units": dict(labels),
-        "panel_angles_rad": [float(a) for a in found.coordinates.angles],
+        "panel_angles_deg": degrees,
         "residual": float(found.residual),
         "conditioning": float(found.conditioning),
         "versions": versions(),
@@ -183,31 +196,48 @@ def run_trim(command: Trim) -> int:
     if slopes:
         content["sensitivities"] = {k: v.tolist() for k, v in slopes.items()}
         for name, slope in slopes.items():
-            out.print(_slope_table(name, table, slope, labels))
+            out.print(_slope_table(name, given, slope, labels))
     folder = command.out if command.out is not None else Path("runs") / "trim"
-    path = write_atomically(folder / "trim.json", json.dumps(content, indent=2).encode())
-    out.print(f"Written: {path}", highlight=False, soft_wrap=True)
+    written(out, [write_atomically(folder / "trim.json", json.dumps(content, indent=2).encode())])
     return 0
 
 
 def _trim_table(unknowns: Any, labels: Sequence[tuple[str, str]]) -> Table:
-    shown = Table("unknown", "value", "unit", title="Trim")
+    shown = table("unknown", "value", "unit", title="Trim")
     for (name, unit), value in zip(labels, unknowns, strict=True):
-        shown.add_row(name, f"{value:.6g}" if abs(value) > 1e-12 else "0", unit)
+        row(shown, name, f"{value:.6g}" if abs(value) > 1e-12 else "0", unit)
     return shown
 
 
 def _slope_table(
-    name: str, table: Parameters, slope: np.ndarray, labels: Sequence[tuple[str, str]]
+    name: str, given: "Parameters", slope: np.ndarray, labels: Sequence[tuple[str, str]]
 ) -> Table:
-    """Derivatives by one parameter; of a larger one only for its entries that matter."""
-    unit = table[name].unit
+    """Derivatives by one parameter; of a larger one for its first three entries."""
+    unit = given[name].unit
     flat = slope.reshape(len(labels), -1)
     entries = list(np.ndindex(slope.shape[1:]))
     heads = [name + (str(list(entry)) if entry else "") for entry in entries]
-    shown = Table("by", *(f"{head} [{unit}]" for head in heads[:3]), title="Sensitivity")
-    for (label, own), row in zip(labels, flat, strict=True):
-        shown.add_row(f"{label} [{own}]", *(f"{x:.5g}" for x in row[:3]))
+    title = "Sensitivity" + (f", 3 of {len(heads)} entries; all in trim.json" if heads[3:] else "")
+    shown = table("by", *(f"{head} [{unit}]" for head in heads[:3]), title=title)
+    for (label, own), values in zip(labels, flat, strict=True):
+        row(shown, f"{label} [{own}]", *(f"{x:.5g}" for x in values[:3]))
+    return shown
+
+
+def modes_table(modes: Sequence[Any]) -> Table:
+    """Modes that are not those of a free rigid body: what grows, what decays, what oscillates."""
+    shown = table("s [1/s]", "doubles or halves in [s]", "states that take part", title="Modes")
+    for mode in modes:
+        if abs(mode.s) < 1e-3:
+            continue
+        s = f"{mode.s.real:.4g}"
+        if abs(mode.s.imag) > 1e-9 * abs(mode.s):
+            s += f" {'+' if mode.s.imag > 0 else '-'} {abs(mode.s.imag):.4g} i"
+        time = "neither"
+        if math.isfinite(mode.doubling):
+            time = f"{'doubles' if mode.doubling > 0 else 'halves'} in {abs(mode.doubling):.4g}"
+        parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in mode.states[:3])
+        row(shown, s, time, parts)
     return shown
 
 
@@ -222,26 +252,19 @@ def run_linearize(command: Linearize) -> int:
         raise ModelError(
             "A turn has no constant matrices in the world's axes: linearise a straight flight."
         )
-    table = table_of(command.params)
-    flyer = uav_flyer(table)
-    found = trim(flyer, wanted_of(command, table))
+    given = table_of(command.params)
+    flyer = uav_flyer(given)
+    found = trim(flyer, wanted_of(command, given))
     outputs = list(command.outputs) or None
     linear = linearize(flyer, found.coordinates, found.inputs, outputs=outputs)
-    shown = Table("s [1/s]", "doubles in [s]", "states that take part", title="Modes")
-    for mode in linear.modes():
-        if abs(mode.s) < 1e-3:
-            continue
-        parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in mode.states[:3])
-        shown.add_row(f"{mode.s:.4g}", f"{mode.doubling:.4g}", parts)
     out = Console()
-    out.print(shown)
-    out.print(
+    out.print(modes_table(linear.modes()))
+    line(
+        out,
         "The other modes are those of a free rigid body, at zero. Least measure of "
         f"controllability {np.min(linear.controllability()):.2g}, of observability "
         f"{np.min(linear.observability()):.2g}.",
-        highlight=False,
     )
     folder = command.out if command.out is not None else Path("runs") / "linearize"
-    path = save_linear(linear, folder / "linear.npz")
-    out.print(f"Written: {path}", highlight=False, soft_wrap=True)
+    written(out, [save_linear(linear, folder / "linear.npz")])
     return 0

@@ -4,12 +4,13 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
 from ..mechanics.errors import SettingError
+from .options import SEED, count, default
 from .output import written
 
 
@@ -22,28 +23,30 @@ class Montecarlo:
 
     study: tyro.conf.Positional[str]
     """TOML file (see docs/studies.md), or a ready study."""
-    samples: int | None = None
-    """How many; default the study's. More than a finished store has extend it."""
-    seed: int | None = None
-    """Seed of the draws; default the study's."""
+    samples: Annotated[int | None, count("samples", 1e9), default("the study's")] = None
+    """How many. More than a finished store has extend it."""
+    seed: Annotated[int | None, SEED, default("the study's")] = None
+    """Seed of the draws."""
     resume: bool = False
     """Go on with the store in the folder of the results."""
-    chunk: int | None = None
-    """Samples written together; default some seconds' worth."""
-    devices: int | None = None
-    """Cores (or GPUs) to use; default all."""
-    lanes: int | None = None
-    """Flights that go on together on a device; default by measurement."""
+    chunk: Annotated[
+        int | None, count("samples written together", 1e9), default("some seconds' worth")
+    ] = None
+    """Samples written together."""
+    devices: Annotated[int | None, count("devices", 1024), default("all")] = None
+    """Cores (or GPUs) to use."""
+    lanes: Annotated[int | None, count("lanes", 1e6), default("by measurement")] = None
+    """Flights that go on together on a device."""
     precision: Literal["float64", "float32"] | None = None
     """float32 is an experiment: its error is measured on the first samples and printed."""
     scheduler: str | None = None
     """Address of a Dask scheduler, such as tcp://10.0.0.1:8786."""
-    workers: int | None = None
+    workers: Annotated[int | None, count("workers", 1024), default("none")] = None
     """Instead start a Dask cluster of so many processes here."""
-    params: Path | None = None
+    params: Annotated[Path | None, default("the scene's table")] = None
     """TOML file with values that replace the scene's table's."""
-    out: Path | None = None
-    """Folder for the results; default runs/STUDY."""
+    out: Annotated[Path | None, default("runs/STUDY")] = None
+    """Folder for the results."""
     figures: Literal["png", "pdf", "svg", "none"] = "png"
     """Format of the report's figures; none leaves the report out."""
     cache: bool = True
@@ -56,8 +59,8 @@ class Report:
 
     store: tyro.conf.Positional[Path]
     """Folder of the store."""
-    out: Path | None = None
-    """Folder for the report; default beside the store."""
+    out: Annotated[Path | None, default("beside the store")] = None
+    """Folder for the report."""
     figures: Literal["png", "pdf", "svg"] = "png"
     """Format of the figures."""
 

@@ -1,13 +1,105 @@
-"""What every command prints at its end."""
+"""What every command prints: files written, what it is doing, an error in one paragraph."""
 
-from collections.abc import Iterable
+import contextlib
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from rich.console import Console
+from rich.text import Text
+
+from ..view.terminal import line
+
+# Longer messages are cut: they hold what the user gave, of any length.
+_LONGEST = 2000
 
 
 def written(out: Console, paths: Iterable[Path]) -> None:
     """Say which files there are now."""
-    out.print("Written:", highlight=False)
+    line(out, "Written:")
     for path in paths:
-        out.print(f"  {path}", highlight=False, soft_wrap=True)
+        out.print(Text(f"  {path}"), soft_wrap=True, highlight=False)
+
+
+@contextlib.contextmanager
+def working(words: str) -> Iterator[None]:
+    """Say on stderr what is being done, where a person is looking, until it is done."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(Text(words)):
+        yield
+
+
+# --- errors
+
+
+def explain(error: BaseException, debug: bool) -> int:
+    """Print one paragraph about an error on stderr; the exit code.
+
+    2: bad input. 1: what was asked for has failed, or the program has a fault. 130: Ctrl-C.
+    """
+    out = Console(stderr=True)
+    code, words = _code_and_words(error)
+    if code is None:
+        code, words = 1, f"{words} {_kept(error, debug)}"
+    _say(out, words)
+    if debug:
+        _say(out, "".join(traceback.format_exception(error)), cut=False)
+    return code
+
+
+def _code_and_words(error: BaseException) -> tuple[int | None, str]:
+    from ..mechanics.errors import ModelError, SettingError, SimulationError, StateError
+
+    if isinstance(error, KeyboardInterrupt):
+        return 130, "interrupted before anything was reached."
+    if isinstance(error, SimulationError) or _is(error, "filter", "EstimationError"):
+        return 1, str(error)
+    if isinstance(error, ModelError | StateError | SettingError) or _is(error, "io", "FileError"):
+        return 2, str(error)
+    if isinstance(error, OSError):
+        return 2, _file_words(error)
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+        return 1, "there is not enough memory for this. Ask for less: fewer samples, times or runs."
+    kind = type(error).__name__
+    return None, f"a fault of the program, not of what you gave it: {kind}: {error}"
+
+
+def _is(error: BaseException, module: str, name: str) -> bool:
+    """Whether an error is of a class of a module that may never have been loaded."""
+    return any(
+        kind.__name__ == name and kind.__module__.endswith(f".{module}")
+        for kind in type(error).__mro__
+    )
+
+
+def _file_words(error: OSError) -> str:
+    """The operating system's words, with the file that they are about."""
+    words = error.strerror or str(error)
+    return f"{words}: {error.filename}" if error.filename is not None else words
+
+
+def _kept(error: BaseException, debug: bool) -> str:
+    """Where the traceback is."""
+    if debug:
+        return "Please report it with the traceback below."
+    with contextlib.suppress(OSError):
+        handle, path = tempfile.mkstemp(prefix="stmuav-fault-", suffix=".log")
+        with os.fdopen(handle, "w", encoding="utf-8", errors="replace") as log:
+            log.write(" ".join(sys.argv) + "\n" + "".join(traceback.format_exception(error)))
+        return f"Please report it; the traceback is in {path}."
+    return "Please report it with the traceback that --debug prints."
+
+
+def _say(out: Console, words: str, *, cut: bool = True) -> None:
+    words = "".join(c if c.isprintable() or c == "\n" else "?" for c in words)
+    if cut:
+        words = " ".join(words.split())
+    if cut and len(words) > _LONGEST:
+        words = f"{words[: _LONGEST // 2]} ... {words[-_LONGEST // 2 :]}"
+    out.print(Text(f"stmuav: {words}" if cut else words, style="red"), highlight=False)

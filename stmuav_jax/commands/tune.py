@@ -3,53 +3,64 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import tyro
 from rich.console import Console
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from ..mechanics.errors import SettingError
-from ..study.search import Search, SearchReason, search
-from ..vehicle.parameters import Parameters
+from ..view.terminal import line, row, table
 from .flight import table_of
+from .options import ANGLE, END, FORCE, SEED, Number, count, default
 from .output import written
+
+if TYPE_CHECKING:
+    from ..study.search import Search
+    from ..vehicle.parameters import Parameters
+
+
+SEGMENTS = "hold: one in 0.4 s, slew: one in 0.2 s"
+# Time over which departures count, and for the turn [s]; the longest segment of each [s].
+_TIMES = {"hold": 0.4, "slew": 1.0}
+_LONGEST = {"hold": 0.4, "slew": 0.2}
 
 
 @dataclasses.dataclass
 class Tune:
-    """Tune by gradients through the flight; write inputs or parameters, history and figures."""
+    """Tune by gradients through the flight; write inputs or parameters, history and figures.
+
+    Example: stmuav tune hold --t1 0.4. A search that does not converge ends with exit code 1.
+    """
 
     what: tyro.conf.Positional[Literal["hold", "slew", "identify"]]
-    """hold: constant inputs that keep the UAV level and its panel standing, from equal rotor
-    speeds and idle actuators. slew: histories of inputs that turn the panel. identify:
-    parameters and their uncertainty from a noisy record of a simulated flight."""
-    to: tuple[float, float] = (8.0, 0.0)
+    """hold: constant inputs that keep the UAV level and its panel standing, from equal rotor speeds and idle
+    actuators. slew: histories of inputs that turn the panel. identify: parameters and their uncertainty from a
+    noisy record of a simulated flight."""
+    to: Annotated[tuple[float, float], ANGLE] = (8.0, 0.0)
     """slew: panel angles at the end [degrees]; at the start they are the initial ones."""
-    duration: float = 1.0
-    """slew: time for the turn [s]. hold: time over which departures count."""
-    force: float | None = None
+    t1: Annotated[float | None, END, default("hold 0.4, slew 1")] = None
+    """slew: time for the turn [s]. hold: time over which departures count [s]."""
+    force: Annotated[float | None, FORCE, default("none")] = None
     """slew: limit of the actuators' forces [N]."""
-    reaction: float | None = None
+    reaction: Annotated[float | None, FORCE, default("none")] = None
     """slew: limit of the force in any joint [N]."""
-    segments: int | None = None
-    """Segments of multiple shooting; default one in 0.2 s."""
-    knots: int = 8
+    segments: Annotated[int | None, count("segments", 1000), default(SEGMENTS)] = None
+    """Segments of multiple shooting."""
+    knots: Annotated[int, Number("number of knots", "", 4, 200)] = 8
     """slew: knots of the cubic splines."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """identify: of the record's noise and of the start."""
-    steps: int = 60
+    steps: Annotated[int, count("steps", 1e6)] = 60
     """Steps allowed."""
     resume: bool = False
     """Go on with search.npz in the folder of the results."""
-    params: Path | None = None
+    params: Annotated[Path | None, default("the report's values")] = None
     """TOML file with values that replace the table's."""
-    out: Path | None = None
-    """Folder for the results; default runs/tune_WHAT."""
+    out: Annotated[Path | None, default("runs/tune_WHAT")] = None
+    """Folder for the results."""
     figures: Literal["png", "pdf", "svg", "none"] = "png"
     """Format of the figures."""
     cache: bool = True
@@ -65,7 +76,7 @@ class _Watch:
         self.task = self.bar.add_task("compiling")
         self.problem, self.path, self.steps = problem, path, steps
 
-    def __call__(self, now: Search) -> None:
+    def __call__(self, now: "Search") -> None:
         from ..view.tuning import save_search
 
         words = f"step {now.steps} of {self.steps}: loss {now.history[-1]:.4g}, best {now.loss:.4g}"
@@ -84,7 +95,11 @@ def _watched(command: Tune, folder: Path, problem: str, start: Any, run: Any) ->
         return run(steps=command.steps, report=watch, resume=before)
 
 
-def _search(command: Tune, folder: Path, problem: str, residuals: Any, start: Any) -> Search:
+def _search(command: Tune, folder: Path, problem: str, residuals: Any, start: Any) -> "Search":
+    import optimistix as optx
+
+    from ..study.search import search
+
     method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
     run = lambda **watched: search(residuals, start, method, patience=15, **watched)
     return _watched(command, folder, problem, start, run)
@@ -92,53 +107,88 @@ def _search(command: Tune, folder: Path, problem: str, residuals: Any, start: An
 
 def run_tune(command: Tune) -> int:
     """Run the command; the exit code."""
-    table = table_of(command.params)
+    from ..study.search import SearchReason
+
+    given = table_of(command.params)
     folder = command.out if command.out is not None else Path("runs") / f"tune_{command.what}"
     if command.what != "slew" and (command.force is not None or command.reaction is not None):
         raise SettingError("--force and --reaction are limits of a slew.")
     work = {"hold": _hold, "slew": _slew, "identify": _identify}[command.what]
-    found, shown, paths = work(command, table, folder)
+    found, shown, paths, done = work(command, given, folder)
     out = Console()
     out.print(shown)
-    out.print(found.words(), highlight=False)
+    line(out, found.words())
     written(out, [folder / "search.npz", *paths])
     if found.reason is SearchReason.INTERRUPTED:
         return 130
-    return 1 if found.reason is SearchReason.NOT_FINITE else 0
+    if done:
+        return 0
+    more = found.steps + 60
+    line(
+        Console(stderr=True),
+        f"stmuav: the search has not converged; what it has reached is in {folder}. Go on with "
+        f"--resume --steps {more}, or try other --segments.",
+    )
+    return 1
+
+
+def _time(command: Tune) -> float:
+    return command.t1 if command.t1 is not None else _TIMES[command.what]
 
 
 def _segments(command: Tune) -> int:
-    return command.segments or max(1, math.ceil(command.duration / 0.2))
+    if command.segments is not None:
+        return command.segments
+    # 1.2 / 0.4 is a little more than 3
+    return max(1, math.ceil(_time(command) / _LONGEST[command.what] - 1e-9))
 
 
-def _hold(command: Tune, table: Parameters, folder: Path) -> tuple[Search, Table, list[Path]]:
+def _converged(found: "Search") -> bool:
+    from ..study.search import SearchReason
+
+    return found.reason is SearchReason.CONVERGED
+
+
+def titled(title: str, found: "Search", done: bool) -> str:
+    """The title of a table of results, which says so where the search has not converged."""
+    if done:
+        return title
+    return f"NOT CONVERGED: the best of {found.steps} steps ({title.lower()})"
+
+
+def _hold(
+    command: Tune, given: "Parameters", folder: Path
+) -> tuple["Search", Table, list[Path], bool]:
+    import jax.numpy as jnp
+
     from ..scenes.uav_tracker import uav_flyer
     from ..study.tuning import at_rest, hold, holding_time
     from ..vehicle.flyer import Inputs
     from ..vehicle.geometry import initial_angles
     from ..vehicle.rotor import hover_speed_squared
 
-    flyer = uav_flyer(table)
+    flyer = uav_flyer(given)
     rotors = flyer.propellers
     mass = jnp.sum(flyer.system.bodies.mass)
     count = rotors.spin.shape[0]
-    equal = hover_speed_squared(mass, table.value("gravity"), rotors.k_f, count)
+    equal = hover_speed_squared(mass, given.value("gravity"), rotors.k_f, count)
     untuned = Inputs(equal, jnp.zeros(2))
-    angles = initial_angles(table)
-    tuning = hold(flyer, angles, untuned, horizon=command.duration, segments=_segments(command))
+    angles = initial_angles(given)
+    tuning = hold(flyer, angles, untuned, horizon=_time(command), segments=_segments(command))
     found = _search(command, folder, tuning.name, tuning.residuals, tuning.start)
+    done = _converged(found)
     inputs = tuning.inputs(found.values)
     start = at_rest(angles)
     times = [holding_time(flyer, each, start) for each in (untuned, inputs)]
-    shown = Table("", "untuned", "tuned", title="Constant inputs that hold")
+    shown = table("", "untuned", "tuned", title=titled("Constant inputs that hold", found, done))
     for k in range(count):
         pair = (untuned.squared[k], inputs.squared[k])
-        shown.add_row(f"rotor {k + 1} [rad/s]", *(_speed(float(x)) for x in pair))
+        row(shown, f"rotor {k + 1} [rad/s]", *(_speed(float(x)) for x in pair))
     for k in range(2):
         pair = (untuned.forces[k], inputs.forces[k])
-        shown.add_row(f"actuator {k + 2} [N]", *(f"{float(x):.6f}" for x in pair))
-    shown.add_row("within 5 degrees until [s]", *(f"{t:.3f}" for t in times))
-    return found, shown, _figures(command, folder, found, {})
+        row(shown, f"actuator {k + 2} [N]", *(f"{float(x):.6f}" for x in pair))
+    row(shown, "within 5 degrees until [s]", *(f"{t:.3f}" for t in times))
+    return found, shown, _figures(command, folder, found, {}), done
 
 
 def _speed(squared: float) -> str:
@@ -146,24 +196,29 @@ def _speed(squared: float) -> str:
     return f"{math.sqrt(squared):.4f}" if squared >= 0 else f"none: square {squared:.3g}"
 
 
-def _slew(command: Tune, table: Parameters, folder: Path) -> tuple[Search, Table, list[Path]]:
+def _slew(
+    command: Tune, given: "Parameters", folder: Path
+) -> tuple["Search", Table, list[Path], bool]:
     from ..scenes.uav_tracker import uav_flyer
     from ..study.tuning import SlewLimits, flown, peaks, slew
     from ..vehicle.geometry import initial_angles
     from ..vehicle.workspace import tracker_limits
     from ..view.tuning import flight_figure
 
-    flyer = uav_flyer(table)
-    stops = tracker_limits(table)
+    flyer = uav_flyer(given)
+    stops = tracker_limits(given)
     force = math.inf if command.force is None else command.force
     limits = SlewLimits(force, stops.home, stops.lower, stops.upper, command.reaction)
     after = np.radians(command.to)
     tuning = slew(
-        flyer, initial_angles(table), after, command.duration, limits,
+        flyer, initial_angles(given), after, _time(command), limits,
         knots=command.knots, segments=_segments(command),
     )  # fmt: skip
     found = _search(command, folder, tuning.name, tuning.residuals, tuning.start)
-    shown = Table("", "straight inputs", "tuned", "limit", title="Turn of the panel")
+    done = _converged(found)
+    shown = table(
+        "", "straight inputs", "tuned", "limit", title=titled("Turn of the panel", found, done)
+    )
     each = [peaks(tuning, values) for values in (tuning.start, found.values)]
     mm = lambda x: ", ".join(f"{1e3 * float(v):.1f}" for v in x)
     rows: list[tuple[str, Any, str]] = [
@@ -177,37 +232,48 @@ def _slew(command: Tune, table: Parameters, folder: Path) -> tuple[Search, Table
     if command.reaction is not None:
         rows.append(("reaction [N]", lambda p: f"{float(p.reaction):.2f}", f"{command.reaction}"))
     for label, of, limit in rows:
-        shown.add_row(label, *(of(p) for p in each), limit)
+        row(shown, label, *(of(p) for p in each), limit)
     ts, curves = flown(tuning, found.values)
     marks = {"actuators [N]": [-command.force, command.force]} if command.force else {}
-    return (
-        found,
-        shown,
-        _figures(command, folder, found, {"flight": flight_figure(ts, curves, marks)}),
-    )
+    figures = _figures(command, folder, found, {"flight": flight_figure(ts, curves, marks)})
+    return found, shown, figures, done
 
 
-def _identify(command: Tune, table: Parameters, folder: Path) -> tuple[Search, Table, list[Path]]:
+def _identify(
+    command: Tune, given: "Parameters", folder: Path
+) -> tuple["Search", Table, list[Path], bool]:
+    import jax.numpy as jnp
+    from scipy.stats import chi2
+
     from ..scenes.uav_tracker import uav_flyer
     from ..study.experiment import experiment
     from ..study.identify import identify
+    from ..study.search import SearchReason
     from ..vehicle.drive import Friction
 
     make = lambda table: uav_flyer(table, friction=Friction())
-    case = experiment(make, table, seed=command.seed)
+    case = experiment(make, given, seed=command.seed)
     run = lambda **watched: identify(
         case.predict, case.record, case.sigma, case.start, case.sizes,
         labels=case.labels, weakest=0.5, **watched,
     )  # fmt: skip
     found = _watched(command, folder, f"identify {case.name}", jnp.zeros(len(case.truth)), run)
-    shown = Table("parameter", "true", "start", "found", "deviation", title="Identified")
+    # at the noise's floor a search may find nothing better without coming to rest
+    freedom = case.record.size - len(case.truth)
+    stopped = found.search.reason is SearchReason.PATIENCE
+    noise = stopped and found.misfit * freedom <= chi2.ppf(0.999, freedom)
+    done = _converged(found.search) or bool(noise)
+    shown = table(
+        "parameter", "true", "start", "found", "deviation",
+        title=titled("Identified parameters", found.search, done),
+    )  # fmt: skip
     for k, label in enumerate(case.labels):
         numbers = (case.truth[k], case.start[k], found.values[k], found.deviations[k])
-        shown.add_row(label, *(f"{x:.5g}" for x in numbers))
-    return found.search, shown, _figures(command, folder, found.search, {})
+        row(shown, label, *(f"{x:.5g}" for x in numbers))
+    return found.search, shown, _figures(command, folder, found.search, {}), done
 
 
-def _figures(command: Tune, folder: Path, found: Search, more: dict[str, Any]) -> list[Path]:
+def _figures(command: Tune, folder: Path, found: "Search", more: dict[str, Any]) -> list[Path]:
     from ..view.tuning import loss_history, save_tuning_figures
 
     if command.figures == "none":

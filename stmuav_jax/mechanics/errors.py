@@ -9,8 +9,6 @@ import difflib
 from collections.abc import Iterable
 from typing import Any
 
-import jax
-import jax.core
 import numpy as np
 
 
@@ -36,6 +34,10 @@ class SimulationError(RuntimeError):
 
 def concrete(*values: object) -> bool:
     """Whether none of the values is a tracer, so that their numbers can be looked at."""
+    # here: the command line knows the errors before it needs JAX
+    import jax
+    import jax.core
+
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
@@ -43,6 +45,8 @@ def check_finite(value: object, what: str, unit: str, error: type[Exception] = M
     """Raise `error` unless every number in `value` is finite."""
     if not concrete(value):
         return
+    import jax
+
     for part in jax.tree.leaves(value):
         if not np.all(np.isfinite(np.asarray(part, dtype=float))):
             shown = np.asarray(part, dtype=float).tolist()

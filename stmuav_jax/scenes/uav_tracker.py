@@ -22,6 +22,7 @@ from ..vehicle.geometry import tracker_geometry
 from ..vehicle.parameters import Parameters
 from ..vehicle.rotor import hover_speed_squared
 from ..vehicle.tracker import TRACKER_BODIES, tracker_bodies, tracker_joints
+from ..vehicle.workspace import tracker_limits
 from .hexacopter import rotors
 
 BASE = "hexacopter_1"
@@ -108,7 +109,8 @@ def uav_flyer(parameters: Parameters = PART_II, **options: Any) -> Flyer:
         options: of `uav_tracker`, such as friction or drag; its case is 2, which has actuators.
     """
     scene = uav_tracker(2, parameters, **options)
-    return Flyer(scene.system, tracker_geometry(parameters), parameters.value("mount.shift"))
+    shift, limits = parameters.value("mount.shift"), tracker_limits(parameters)
+    return Flyer(scene.system, tracker_geometry(parameters), shift, limits)
 
 
 def _flight(case: int, parameters: Parameters, **options: Any) -> Flight:

@@ -53,6 +53,9 @@ from .irradiance import (
 )
 from .reach import nearest_reachable
 
+# Where the series is within 0.005 degrees of the SPA (docs/sun.md).
+YEARS = (1950, 2110)
+
 PANELS = ("tracker", "two_axis", "single_axis", "airframe", "flat")
 
 Attitude = Numbers | Callable[..., object]
@@ -160,10 +163,23 @@ def parse_date(words: str) -> date:
     Raises:
         SettingError: other words, or no such day.
     """
+    if not re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}", words):
+        raise SettingError(f"The date must be like 2024-03-21, not '{words[:40]}'.")
     try:
-        return date.fromisoformat(words)
+        day = date.fromisoformat(words)
     except ValueError:
-        raise SettingError(f"The date must be like 2024-03-21, not '{words}'.") from None
+        raise SettingError(f"There is no day {words} in the calendar.") from None
+    check_year(day)
+    return day
+
+
+def check_year(day: date) -> None:
+    """Raise SettingError outside the years for which the sun's place is known well enough."""
+    if not YEARS[0] <= day.year <= YEARS[1]:
+        raise SettingError(
+            f"The sun's place is known for the years {YEARS[0]} to {YEARS[1]}, not for "
+            f"{day.isoformat()}."
+        )
 
 
 def day_zone(words: str | None, longitude: float) -> tzinfo:
@@ -321,6 +337,7 @@ def track_day(
     """
     flaws = Flaws() if flaws is None else flaws
     _check_flaws(flaws)
+    check_year(day)
     start, unix = day_times(day, zone, step)
     air = Air.standard(place.altitude)
     sun = jax.jit(sun_position)(unix, place, air=air)

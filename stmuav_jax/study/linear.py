@@ -166,11 +166,19 @@ def linearize(flyer: Flyer, at: Coordinates, inputs: Inputs, outputs: Any = None
     """Linearise about a trim, or about any point of a trajectory (the x' there left out).
 
     Args:
-        outputs: names of states that are measured; default all.
+        outputs: names of states that are measured, one or more; default all.
 
     Raises:
-        SettingError: an unknown name.
+        SettingError: an unknown name, none, or something else than names.
     """
+    if outputs is not None and (
+        isinstance(outputs, str)
+        or not all(isinstance(name, str) for name in outputs)
+        or not len(outputs)
+    ):
+        raise SettingError(
+            f"The outputs must be a list of names of states, such as ['omega_x'], not {outputs!r}."
+        )
     A, B = (np.asarray(m) for m in matrices(flyer, at, inputs))
     states = _states(flyer)
     names = [name for name, _ in states]

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from ..algebra.rotation import product, rotation_matrix
 from ..dynamics.tree import TreeModel
-from ..mechanics.errors import ModelError, StateError, check_finite, concrete
+from ..mechanics.errors import ModelError, StateError, concrete
 from ..mechanics.force import Gravity
 from ..mechanics.reason import first_reason
 from ..vehicle.allocation import (
@@ -36,11 +36,18 @@ from ..vehicle.allocation import (
     wrench_map,
 )
 from ..vehicle.flyer import Coordinates, Flyer, Inputs
-from ..vehicle.geometry import close_loops, turn_by_angles
-from ..vehicle.kinematics import panel_angles, parallel_margin, strokes
+from ..vehicle.geometry import turn_by_angles
+from ..vehicle.kinematics import RISING, Reason, panel_angles
 from ..vehicle.motor import MotorRotors
 from ..vehicle.placement import turn_about
+from ..vehicle.pointing import why_outside
+from ..vehicle.workspace import Limits, measure, reasons, survey
 from .newton import Newton
+from .steady import Wanted
+from .steady import climb as climb
+from .steady import cruise as cruise
+from .steady import hover as hover
+from .steady import steady_turn as steady_turn
 
 # Largest residual that counts as a trim [m/s^2], [rad/s^2].
 TOLERANCE = 1e-10
@@ -57,32 +64,34 @@ class TrimReason(IntEnum):
     ROTOR_LIMIT = 4
     ACTUATOR_LIMIT = 5
     ROTOR_MOMENTUM = 6
+    TILT = 7
+    SINGULAR = 8
+    STROKE_2 = 9
+    STROKE_3 = 10
 
 
-class Wanted(NamedTuple):
-    """A steady flight; see `hover`, `climb`, `cruise` and `steady_turn`.
-
-    Attributes:
-        angles: of the panel (2,) [rad], or None where it points at the sun.
-        sun: direction to it, world (3,), or None.
-        yaw: heading [rad]. v: velocity of the base, world (3,) [m/s].
-        rate: of turn about the vertical [rad/s].
-        acceleration: of the base beside that of the turn, world (3,) [m/s^2].
-    """
-
-    angles: Float[Array, "2"] | None
-    sun: Float[Array, "3"] | None
-    yaw: Float[Array, ""]
-    v: Float[Array, "3"]
-    rate: Float[Array, ""]
-    acceleration: Float[Array, "3"]
+# Limits that a balanced flight breaks: its values are given beside the reason.
+_OUTSIDE = {
+    TrimReason.TILT: Reason.TILT,
+    TrimReason.SINGULAR: Reason.SINGULAR,
+    TrimReason.STROKE_2: Reason.STROKE_2,
+    TrimReason.STROKE_3: Reason.STROKE_3,
+}
 
 
 class TrimLimits(NamedTuple):
-    """rotors: of their speeds, or None. actuator: largest force either way [N]."""
+    """What bounds a trim.
+
+    Attributes:
+        rotors: of their speeds; None for those of the motors, if there are any.
+        actuator: largest force either way [N].
+        workspace: of the panel's tilt, the sliders' strokes and the distance from the
+            singularity; None for those of the flyer.
+    """
 
     rotors: RotorLimits | None = None
     actuator: Float[Array, ""] | float = jnp.inf
+    workspace: Limits | None = None
 
 
 class Trim(eqx.Module):
@@ -90,8 +99,9 @@ class Trim(eqx.Module):
 
     Attributes:
         coordinates: at the trim, the base at the origin; attitude and angles found.
-        inputs: found. speeds: of the rotors (k,) [rad/s]; all NaN where there is no trim,
-            whatever the reason.
+        inputs: found. speeds: of the rotors (k,) [rad/s]; all NaN where there is no trim.
+            A flight that balances, but outside a limit of the actuators or of the tracker's
+            workspace, keeps its values: `reason` alone says whether it is allowed.
         residual: largest acceleration left [m/s^2] or [rad/s^2].
         conditioning: smallest over largest singular value of the equations, in units of a
             radian, the weight, and the weight times a metre: near zero, other trims lie near.
@@ -110,57 +120,6 @@ class Trim(eqx.Module):
     @property
     def choices(self) -> int:
         return self.speeds.shape[-1] - 4
-
-
-def hover(angles: Any = None, yaw: Any = 0.0, *, sun: Any = None) -> Wanted:
-    """Standing still with the panel at angles (2,) [rad], or at the sun (3,), world."""
-    return _flight(angles, sun, yaw, jnp.zeros(3), 0.0)
-
-
-def climb(speed: Any, angles: Any = None, yaw: Any = 0.0, *, sun: Any = None) -> Wanted:
-    """Straight up at a speed [m/s]; negative for a descent."""
-    return _flight(angles, sun, yaw, jnp.asarray(speed, dtype=float) * _UP, 0.0)
-
-
-def cruise(
-    speed: Any, course: Any = 0.0, angles: Any = None, yaw: Any = 0.0, *, sun: Any = None
-) -> Wanted:
-    """Level flight at a speed [m/s] towards a course from x to y [rad]."""
-    course = jnp.asarray(course, dtype=float)
-    along = jnp.stack([jnp.cos(course), jnp.sin(course), jnp.zeros_like(course)])
-    return _flight(angles, sun, yaw, jnp.asarray(speed, dtype=float) * along, 0.0)
-
-
-def steady_turn(speed: Any, rate: Any, angles: Any, course: Any = 0.0, yaw: Any = 0.0) -> Wanted:
-    """A level turn at a speed [m/s] and a rate [rad/s], positive from x to y; at its start."""
-    straight = cruise(speed, course, angles, yaw)
-    check_finite(rate, "The rate of turn", "rad/s")
-    return straight._replace(rate=jnp.asarray(rate, dtype=float))
-
-
-_UP = np.array([0.0, 0.0, 1.0])
-
-
-def _flight(angles: Any, sun: Any, yaw: Any, v: Array, rate: Any) -> Wanted:
-    if (angles is None) == (sun is None):
-        raise ModelError(
-            "A flight needs either the panel's angles or the direction to the sun, and not both."
-        )
-    for value, what, unit in (
-        (angles, "The panel's angles", "rad"), (sun, "The direction to the sun", ""),
-        (yaw, "The heading", "rad"), (v, "The velocity", "m/s"),
-    ):  # fmt: skip
-        if value is not None:
-            check_finite(value, what, unit)
-    number = lambda x: jnp.asarray(x, dtype=float)
-    angles = None if angles is None else number(angles)
-    sun = None if sun is None else number(sun)
-    for value, size, what in ((angles, 2, "panel's angles are"), (sun, 3, "sun's direction has")):
-        if value is not None and value.shape != (size,):
-            raise ModelError(f"The {what} {size} numbers, not an array of shape {value.shape}.")
-    if sun is not None and concrete(sun) and not float(jnp.linalg.norm(sun)) > 0:
-        raise ModelError("The direction to the sun must not be zero.")
-    return Wanted(angles, sun, number(yaw), v, number(rate), jnp.zeros(3))
 
 
 def _attitude(tilt: Float[Array, "2"], yaw: Float[Array, ""]) -> Float[Array, "4"]:
@@ -221,16 +180,21 @@ def trim(
 
     Args:
         wanted: see `hover`, `climb`, `cruise` and `steady_turn`.
-        limits: of rotors and actuators; by default those of the motors, if there are any.
+        limits: of rotors, actuators and the tracker; by default those of the motors, if there
+            are any, and of the flyer's workspace.
         throw: raise where there is no trim, if values are known.
 
     Raises:
         StateError: no trim; says why, with the quantity and its limit.
-        ModelError: limits that make no sense, or within which the rotors cannot carry the weight.
+        ModelError: limits that make no sense, or within which the rotors cannot carry the weight;
+            something else in the place of the flyer, the flight or the limits.
     """
     limits = TrimLimits() if limits is None else limits
+    _check_kinds(flyer, wanted, limits)
     if limits.rotors is None and isinstance(flyer.propulsion, MotorRotors):
         limits = limits._replace(rotors=flyer.propulsion.limits)
+    if limits.workspace is None:
+        limits = limits._replace(workspace=_workspace(flyer))
     flyer = flyer.steady()
     if limits.rotors is not None:
         limits.rotors.squared(flyer.propellers.spin.shape[0])
@@ -240,11 +204,37 @@ def trim(
     bounds: Any = jax.tree.map(lambda x: jnp.asarray(x, dtype=float), limits)
     found = _found(_Setting(flyer, flyer.model(), wanted), bounds)
     if throw and concrete(found.reason):
-        _raise(TrimReason(int(found.reason)), found, limits)
-    fine = found.reason == TrimReason.VALID
+        _raise(TrimReason(int(found.reason)), found, flyer, limits)
+    balanced = (TrimReason.VALID, TrimReason.ACTUATOR_LIMIT, *_OUTSIDE)
+    fine = jnp.isin(found.reason, jnp.array(balanced, found.reason.dtype))
     keep = lambda tree: jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), tree)
     at, inputs, speeds = keep((found.coordinates, found.inputs, found.speeds))
     return Trim(at, inputs, speeds, found.residual, found.conditioning, found.reason, found.steps)
+
+
+def _check_kinds(flyer: Any, wanted: Any, limits: Any) -> None:
+    for value, kind, what, how in (
+        (flyer, Flyer, "flies", "a Flyer, such as uav_flyer() makes"),
+        (wanted, Wanted, "is wanted", "a steady flight, such as hover() makes"),
+        (limits, TrimLimits, "bounds the trim", "a TrimLimits"),
+    ):
+        if not isinstance(value, kind):
+            raise ModelError(f"What {what} must be {how}, not {_shown(value)}.")
+    if np.ndim(limits.actuator) or (concrete(limits.actuator) and not limits.actuator > 0):
+        raise ModelError(
+            f"The limit of the actuators' forces must be a positive number of newtons, not {limits.actuator}."
+        )
+
+
+def _shown(value: object) -> str:
+    return repr(value) if isinstance(value, str | int | float) else f"a {type(value).__name__}"
+
+
+def _workspace(flyer: Flyer) -> Limits:
+    """The flyer's, or all that its rods reach and its sliders hold."""
+    if flyer.limits is not None:
+        return flyer.limits
+    return Limits(home=(0.0, 0.0), tilt=np.pi, margin=0.0)
 
 
 def _weight(flyer: Flyer) -> Float[Array, ""]:
@@ -285,13 +275,20 @@ def _found(setting: _Setting, limits: TrimLimits) -> Trim:
         # ... unless the speeds have a momentum of their own
         again = jnp.max(jnp.abs(jax.lax.stop_gradient(_left(at, inputs, setting))))
         spun, left = (left <= TOLERANCE) & ~(again <= TOLERANCE), jnp.maximum(left, again)
+    assert limits.workspace is not None
+    turned = turn_by_angles(at.angles)
+    strokes, margins, _ = measure(flyer.geometry, limits.workspace, turned, RISING)
+    # whether the rods reach, and the sliders hold the panel at all
+    held = margins.parallel + limits.workspace.margin > 0
+    outside = reasons(margins)
     reason = first_reason(
-        (~(_margin(flyer, at.angles) > 0), TrimReason.POSTURE),
+        (~(jnp.isfinite(jnp.sum(strokes)) & held), TrimReason.POSTURE),
         (missed, TrimReason.ROTOR_LIMIT),
         (spun, TrimReason.ROTOR_MOMENTUM),
         (~(left <= TOLERANCE), TrimReason.NOT_CONVERGED),
         (jnp.min(squared) < 0, TrimReason.ROTOR_STOPPED),
         (jnp.max(jnp.abs(inputs.forces)) > limits.actuator, TrimReason.ACTUATOR_LIMIT),
+        *((outside == why, own) for own, why in _OUTSIDE.items()),
     )
     turning = squared > 0
     speeds = jnp.where(turning, jnp.sqrt(jnp.where(turning, squared, 1.0)), 0.0)
@@ -299,21 +296,19 @@ def _found(setting: _Setting, limits: TrimLimits) -> Trim:
     return Trim(at, inputs, speeds, left, values[-1] / values[0], reason, steps)
 
 
-def _margin(flyer: Flyer, angles: Float[Array, "2"]) -> Float[Array, ""]:
-    """Positive where the tracker can take, and its sliders hold, the panel's angles."""
-    turned = turn_by_angles(angles)
-    loops = close_loops(flyer.geometry, turned)
-    reached = jnp.sum(strokes(flyer.geometry, angles))
-    return jnp.where(jnp.isfinite(reached), parallel_margin(flyer.geometry, turned, loops), -1.0)
-
-
-def _raise(reason: TrimReason, found: Trim, limits: TrimLimits) -> None:
+def _raise(reason: TrimReason, found: Trim, flyer: Flyer, limits: TrimLimits) -> None:
     if reason is TrimReason.VALID:
         return
-    angles = ", ".join(f"{float(a):.4g}" for a in found.coordinates.angles)
+    phi, theta = np.degrees(np.asarray(found.coordinates.angles))
+    angles = f"phi = {phi:.4g}, theta = {theta:.4g} degrees"
+    if reason in _OUTSIDE:
+        assert limits.workspace is not None
+        at = survey(flyer.geometry, found.coordinates.angles, limits.workspace)
+        why = why_outside(flyer.geometry, limits.workspace, at.margins, _OUTSIDE[reason])
+        raise StateError(f"The panel at {angles} is outside the tracker's workspace: {why}")
     strongest = float(jnp.max(jnp.abs(found.inputs.forces)))
     words = {
-        TrimReason.POSTURE: f"the tracker cannot take the panel angles ({angles}) rad",
+        TrimReason.POSTURE: f"the tracker cannot take the panel angles {angles}",
         TrimReason.NOT_CONVERGED: (
             f"Newton's method has stopped with accelerations of {float(found.residual):.3g} left "
             f"(tolerance {TOLERANCE:.0e})"

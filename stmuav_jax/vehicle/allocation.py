@@ -7,10 +7,14 @@ one whose speeds differ least. `allocate` keeps to limits of the speeds:
     attainable      min |u - u_0|      with B u = w,  u within its limits
     not attainable  min |W (B u - w)|  with           u within its limits
 
-by two quadratic programs. An interior-point method finds which rotors end at a limit; with
-these held there, a linear solve makes the rest exact and carries the derivatives.
+by two quadratic programs. An active-set method finds which rotors end at a limit; with these
+held there, a linear solve makes the rest exact and carries the derivatives. On the edge of what
+is attainable no u lies strictly within all limits: interior-point methods, which want one, take
+rotors there for held that are not. The conditions of optimality (Karush, Kuhn, Tucker) of both
+programs are checked at the end, and a result that does not meet them is flagged.
 
-Source: report Part II, Eq. 4.10, with B_M built from the arms themselves (corrected).
+Source: report Part II, Eq. 4.10, with B_M built from the arms themselves (corrected); J. Nocedal,
+S. J. Wright, Numerical Optimization (2006), Algorithm 16.3 (active sets).
 """
 
 from enum import IntEnum
@@ -19,11 +23,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import qpax
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..algebra.shapes import Numbers
 from ..mechanics.errors import ModelError, check_finite, concrete
+from ..mechanics.numbers import numbers
 from ..mechanics.reason import first_reason
 from .rotor import Rotors
 
@@ -33,10 +38,11 @@ _ROWS = (2, 3, 4, 5)
 # All of these are relative: squared speeds to the widest span of the limits, wrenches to the
 # span that each component has within the limits.
 ATTAINED = 1e-10  # a wrench missed by less counts as given
-_OPTIMAL = 1e-6  # slope of the squared misfit that is taken for zero
-_TOLERANCE = 1e-13  # of the interior-point method
+_OPTIMAL = 1e-5  # slope of the misfit that is taken for zero
+_ROUND_OFF = 1e-12  # of squared speeds and of multipliers
+_LEAST = 1e-8  # slope of the norm of u - u_0 that is taken for zero
 _RANK = 1e-9  # singular values below this fraction of the largest count as zero
-_MOST_STEPS = 60
+_MOST_STEPS = 12  # of the active-set method, for each rotor
 
 
 def wrench_map(rotors: Rotors, about: Float[Array, "3"]) -> Float[Array, "4 k"]:
@@ -102,7 +108,7 @@ class Allocation(eqx.Module):
     Attributes:
         squared: u (k,) [rad^2/s^2]. speeds: (k,) [rad/s].
         wrench: given by them (4,) [N], [N m]. missed: wanted less given.
-        at_limit: whether each rotor is held at one of its limits.
+        at_limit: whether each rotor is at one of its limits.
         reason: a code of `AllocationReason`.
     """
 
@@ -135,22 +141,30 @@ def allocate(
         preferred: u_0, from which u deviates least where there is a choice, () or (k,).
 
     Raises:
-        ModelError: limits or priorities that make no sense, a wrench that is not finite.
+        ModelError: arguments of another kind, shape or sign, or not finite; says which.
     """
-    check_finite(wrench, "The wanted wrench", "N, N m")
-    weights = jnp.asarray(priority, dtype=float)
-    if weights.shape != (4,) or (concrete(weights) and not bool(jnp.all(weights > 0))):
+    if np.ndim(B) != 2 or np.shape(B)[0] != 4:
+        raise ModelError(
+            f"The map of the rotors has shape (4, k), see `wrench_map`, not {np.shape(B)}."
+        )
+    count = np.shape(B)[1]
+    B = numbers(B, (4, count), "The map of the rotors", "")
+    wrench = numbers(wrench, (4,), "The wanted wrench", "N, N m")
+    weights = numbers(priority, (4,), "The priorities of thrust and three moments", "")
+    if concrete(weights) and not bool(jnp.all(weights > 0)):
         raise ModelError(
             f"The priorities of thrust and three moments must be four positive numbers, not {priority}."
         )
-    count = B.shape[1]
+    if not isinstance(limits, RotorLimits):
+        raise ModelError(f"The limits of the rotors must be a RotorLimits, not {limits!r}.")
     lower, upper = limits.squared(count)
-    u0 = jnp.broadcast_to(jnp.asarray(preferred, dtype=float), (count,))
-    return _allocate(B, jnp.asarray(wrench, dtype=float), lower, upper, weights, u0)
+    each = () if np.ndim(preferred) == 0 else (count,)
+    u0 = numbers(preferred, each, "The preferred squares of the speeds", "rad^2/s^2")
+    return _allocate(B, wrench, lower, upper, weights, jnp.broadcast_to(u0, (count,)))
 
 
 class _Box(NamedTuple):
-    """min |x - x_0| with A x = b, or min |A x - b|, for 0 <= x <= r."""
+    """min |x - x_0| with A x = b, or min |A x - b|, for 0 <= x <= r; r is at most 1."""
 
     A: Float[Array, "4 k"]
     b: Float[Array, "4"]
@@ -174,70 +188,108 @@ def _allocate(
         (preferred - lower) / span,
     )  # fmt: skip
     known = jax.lax.stop_gradient(box)
-    near, held = _nearest(known)
-    also = _chosen(known, near, held)
-    chosen = _settled(known._replace(b=known.A @ near), also, known.x0)
-    better = _inside(known, chosen) & (_size(known.A @ (chosen - near)) < ATTAINED)
-    start, held = jnp.where(better, known.x0, near), jnp.where(better, also, held)
-    x = _settled(box, held, start)
+    near = _nearest(known)
+    forced = _forced(known, near)
+    # what is attainable, and from here on to be kept
+    kept = known._replace(b=known.A @ near)
+    best, held, *_ = _walked(kept, near, forced, forced, kept.x0)
+    # from where the walk has ended, what round-off has left of the wrench
+    exact = _settled(known, held, best)
+    best = jnp.where(_beyond(known, exact) < 0.1 * ATTAINED, exact, best)
+    # a change of the box moves it by the linear solve
+    x = _settled(box, held, box.x0)
+    x = best + (x - jax.lax.stop_gradient(x))
     missed = wrench - B @ (lower + span * x)
     off = box.b - box.A @ x
-    slope = box.A.T @ off
-    uphill = jnp.where(held > 0, -slope, jnp.where(held < 0, slope, jnp.abs(slope)))
-    optimal = _inside(known, x) & jnp.all(uphill < _OPTIMAL)
-    given = _size(off) < ATTAINED
+    least = _least_norm(known, jax.lax.stop_gradient(x), held, forced)
+    optimal = (_beyond(known, x) < ATTAINED) & _is_nearest(known, x) & least
     reason = first_reason(
-        (~optimal, AllocationReason.NOT_CONVERGED), (~given, AllocationReason.UNATTAINABLE)
+        (~optimal, AllocationReason.NOT_CONVERGED),
+        (_size(off) >= ATTAINED, AllocationReason.UNATTAINABLE),
     )
     u = lower + span * x
     turning = u > 0
     speeds = jnp.where(turning, jnp.sqrt(jnp.where(turning, u, 1.0)), 0.0)
-    return Allocation(u, speeds, wrench - missed, missed, held != 0, reason)
+    at_limit = (x < ATTAINED) | (x > box.r - ATTAINED)
+    return Allocation(u, speeds, wrench - missed, missed, at_limit, reason)
 
 
 def _size(x: Float[Array, "..."]) -> Float[Array, ""]:
     return jnp.max(jnp.abs(x))
 
 
-def _inside(box: _Box, x: Float[Array, " k"]) -> Bool[Array, ""]:
-    return jnp.max(jnp.maximum(-x, x - box.r)) < ATTAINED
+def _beyond(box: _Box, x: Float[Array, " k"]) -> Float[Array, ""]:
+    """By how much a limit is passed."""
+    return jnp.max(jnp.maximum(-x, x - box.r))
 
 
-def _nearest(box: _Box) -> tuple[Float[Array, " k"], Int[Array, " k"]]:
-    """A minimiser of |A x - b|, and which of its entries are held at r (+1) or at 0 (-1)."""
-    k = box.r.shape[0]
-    G, h = jnp.concatenate([jnp.eye(k), -jnp.eye(k)]), jnp.concatenate([box.r, jnp.zeros(k)])
-    no_rows = jnp.zeros((0, k)), jnp.zeros(0)
-    x, held = _solved(box.A.T @ box.A, -box.A.T @ box.b, *no_rows, G, h)
-    return _walked(box, jnp.clip(x[:k], 0.0, box.r), held, None)
+# --- the conditions of optimality
 
 
-def _chosen(box: _Box, near: Float[Array, " k"], held: Int[Array, " k"]) -> Int[Array, " k"]:
-    """Which entries are held where x is nearest to x_0 with the same A x as `near`."""
-    k, m = box.r.shape[0], box.b.shape[0]
-    _, values, rows = jnp.linalg.svd(box.A * (held == 0), full_matrices=False)
-    counts = values > _RANK * jnp.max(values)
-    rows = jnp.where(counts[:, None], rows, 0.0)
-    # unknowns that are zero stand in for rows that say nothing: the solver wants full rank
-    C = jnp.concatenate([rows, jnp.diag(1.0 * ~counts)], axis=1)
-    G = jnp.concatenate([jnp.eye(k), -jnp.eye(k)])
-    G = jnp.concatenate([G, jnp.zeros((2 * k, m))], axis=1)
-    h = jnp.concatenate([box.r, jnp.zeros(k)])
-    q = -jnp.concatenate([box.x0, jnp.zeros(m)])
-    x, also = _solved(jnp.eye(k + m), q, C, rows @ near, G, h)
-    also = jnp.where(held == 0, also, held)
-    return _walked(box._replace(b=box.A @ near), jnp.clip(x[:k], 0.0, box.r), also, box.x0)[1]
+def _is_nearest(box: _Box, x: Float[Array, " k"]) -> Bool[Array, ""]:
+    """Whether no allowed change of x lessens |A x - b|, or next to nothing is missed."""
+    slope, missed = _slope(box, x)
+    up, down = x < box.r - ATTAINED, x > ATTAINED
+    fine = ~(up & (slope > _OPTIMAL)) & ~(down & (slope < -_OPTIMAL))
+    return (missed < ATTAINED) | jnp.all(fine)
 
 
-def _solved(
-    Q: Array, q: Array, C: Array, d: Array, G: Array, h: Array
-) -> tuple[Float[Array, " n"], Int[Array, " k"]]:
-    """min x Q x / 2 + q x with C x = d, G x <= h, and which entries end at a limit."""
-    x, slack, push, *_ = qpax.solve_qp(
-        Q, q, C, d, G, h, backend="i", solver_tol=_TOLERANCE, max_iter=_MOST_STEPS
-    )
-    at_top, at_bottom = jnp.split(push > slack, 2)
-    return x, 1 * at_top - 1 * at_bottom
+def _least_norm(
+    box: _Box, x: Float[Array, " k"], held: Int[Array, " k"], forced: Int[Array, " k"]
+) -> Bool[Array, ""]:
+    """Whether no allowed change of x that keeps A x lessens |x - x_0|.
+
+    x - x_0 = A^T y + z, where z is zero at entries between their limits, not negative at 0 and
+    not positive at r; entries that the misfit itself keeps at a limit may have any z.
+    """
+    inverse, _ = _inverse(box, held)
+    z = x - box.x0 - box.A.T @ (inverse.T @ jnp.where(held == 0, x - box.x0, 0.0))
+    up, down = x < box.r - ATTAINED, x > ATTAINED
+    limit = _LEAST * (1.0 + _size(z - (x - box.x0)))
+    fine = ~(up & (z < -limit)) & ~(down & (z > limit))
+    return jnp.all(fine | (forced != 0))
+
+
+# --- active sets
+
+
+class _Walk(NamedTuple):
+    """A point, its entries held at r (+1) or at 0 (-1), whether to end, begun again, steps."""
+
+    x: Float[Array, " k"]
+    held: Int[Array, " k"]
+    done: Bool[Array, ""]
+    again: Bool[Array, ""]
+    count: Int[Array, ""]
+
+
+def _nearest(box: _Box) -> Float[Array, " k"]:
+    """A minimiser of |A x - b|."""
+    none = jnp.zeros(box.r.shape, int)
+    free = _settled(box, none, box.x0)
+    held = 1 * (free > box.r) - 1 * (free < 0)
+    x = _walked(box, jnp.clip(free, 0.0, box.r), held, none, None).x
+    # the walk may pass a limit by round-off
+    return jnp.clip(x, 0.0, box.r)
+
+
+def _forced(box: _Box, near: Float[Array, " k"]) -> Int[Array, " k"]:
+    """Which entries every minimiser of |A x - b| has at r (+1) or at 0 (-1)."""
+    slope, missed = _slope(box, near)
+    counts = (missed >= ATTAINED) & (jnp.abs(slope) > _least_slope(missed))
+    return jnp.where(counts, jnp.where(slope > 0, 1, -1), 0)
+
+
+def _slope(box: _Box, x: Float[Array, " k"]) -> tuple[Float[Array, " k"], Float[Array, ""]]:
+    """What |A x - b| loses per unit of each entry, and itself."""
+    off = box.b - box.A @ x
+    size = jnp.sqrt(jnp.sum(off**2))
+    return box.A.T @ off / jnp.where(size > 0, size, 1.0), size
+
+
+def _least_slope(missed: Float[Array, ""]) -> Float[Array, ""]:
+    """Slopes above this are not round-off: the direction of a small misfit has much of it."""
+    return jnp.maximum(_RANK, 1e-15 / jnp.maximum(missed, 1e-15))
 
 
 def _settled(box: _Box, held: Int[Array, " k"], start: Float[Array, " k"]) -> Float[Array, " k"]:
@@ -247,32 +299,72 @@ def _settled(box: _Box, held: Int[Array, " k"], start: Float[Array, " k"]) -> Fl
     return fixed + inverse @ (box.b - box.A @ fixed)
 
 
-def _walked(
-    box: _Box, x: Float[Array, " k"], held: Int[Array, " k"], anchor: Float[Array, " k"] | None
-) -> tuple[Float[Array, " k"], Int[Array, " k"]]:
-    """Go from x to where `_settled` says, holding entries as they meet their limits."""
+def _inverse(box: _Box, held: Int[Array, " k"]) -> tuple[Float[Array, "k 4"], Float[Array, ""]]:
+    """Pseudoinverse of the free columns of A, and the round-off of what is solved with it."""
+    U, values, V = jnp.linalg.svd(box.A * (held == 0), full_matrices=False)
+    counts = values > _RANK * values[0]
+    kept = jnp.where(counts, values, jnp.inf)
+    least = jnp.min(kept) / jnp.where(values[0] > 0, values[0], 1.0)
+    return (V.T / kept) @ U.T, _ROUND_OFF + 1e-15 / least
 
-    def go(now: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        x, held, _, count = now
-        target = _settled(box, held, x if anchor is None else anchor)
+
+def _walked(
+    box: _Box,
+    x: Float[Array, " k"],
+    held: Int[Array, " k"],
+    forced: Int[Array, " k"],
+    anchor: Float[Array, " k"] | None,
+) -> _Walk:
+    """From x to a minimiser of |A x - b|; or, with an anchor, of |x - anchor| where A x = b.
+
+    Goes to where `_settled` says, holding the first entry that meets a limit on its way; there,
+    lets an entry go whose multiplier has the wrong sign. With an anchor the free columns of A keep their rank, so
+    that the multipliers are unique. Entries that are `forced` stay.
+    """
+    k = box.r.shape[0]
+
+    def go(now: _Walk) -> _Walk:
+        x, held = now.x, now.held
+        inverse, noise = _inverse(box, held)
+        start, noise = (x, _ROUND_OFF) if anchor is None else (anchor, noise)
+        fixed = jnp.where(held > 0, box.r, jnp.where(held < 0, 0.0, start))
+        target = fixed + inverse @ (box.b - box.A @ fixed)
         step = jnp.where(held == 0, target - x, 0.0)
         room = jnp.maximum(jnp.where(step > 0, box.r - x, x), 0.0)
-        moves = jnp.abs(step) > room
-        share = jnp.where(moves, room / jnp.where(moves, jnp.abs(step), 1.0), 1.0)
-        first = jnp.argmin(share)
-        done = ~jnp.any(moves)
-        met = (jnp.arange(x.shape[0]) == first) & ~done
-        stop = x + share[first] * step
-        reached = jnp.where(done, target, stop)
-        held = jnp.where(met, jnp.where(step > 0, 1, -1), held)
-        return reached, held, done, count + 1
+        moves = jnp.abs(step) > room + noise
+        share = jnp.where(moves, room / jnp.where(moves, jnp.abs(step), 1.0), 2.0)
+        # of several at once the one that moves most: the rest stays as far from singular as can be
+        early = share <= jnp.min(share) + _ROUND_OFF
+        first = jnp.argmax(jnp.where(early & moves, jnp.abs(step), -1.0))
+        arrived = ~jnp.any(moves)
+        met = (jnp.arange(k) == first) & ~arrived
+        here = arrived & (_size(step) <= noise)
+        after = jnp.where(here, x, x + jnp.where(arrived, 1.0, share[first]) * step)
+        if anchor is None:
+            slope, missed = _slope(box, after)
+            limit = _least_slope(missed)
+            # where next to nothing is missed slopes are lost in round-off: all may move once more
+            small = (missed > 1e-14) & (missed < 1e3 * ATTAINED)
+        else:
+            back = box.A.T @ (inverse.T @ jnp.where(held == 0, after - anchor, 0.0))
+            slope, limit = anchor - after + back, noise * (1.0 + _size(back))
+            small = jnp.zeros((), bool)
+        wrong = jnp.where(forced == 0, -held * slope, 0.0)
+        most = jnp.argmax(wrong)
+        leaves = (jnp.arange(k) == most) & arrived & (wrong[most] > limit)
+        after = jnp.where(met, jnp.where(step > 0, box.r, 0.0), after)
+        held = jnp.where(met, jnp.where(step > 0, 1, -1), jnp.where(leaves, 0, held))
+        ends = arrived & ~jnp.any(leaves)
+        anew = ends & small & ~now.again
+        held = jnp.where(anew, forced, held)
+        return _Walk(after, held, ends & ~anew, now.again | anew, now.count + 1)
 
-    def unfinished(now: tuple[Array, Array, Array, Array]) -> Array:
-        return ~now[2] & (now[3] <= x.shape[0])
+    def unfinished(now: _Walk) -> Array:
+        return ~now.done & (now.count < _MOST_STEPS * k)
 
-    start = (x, held, jnp.zeros((), bool), jnp.zeros((), int))
-    x, held, _, _ = jax.lax.while_loop(unfinished, go, start)
-    return x, held
+    no = jnp.zeros((), bool)
+    start = _Walk(x, held, no, no, jnp.zeros((), int))
+    return jax.lax.while_loop(unfinished, go, start)
 
 
 def check_lift(

@@ -112,6 +112,10 @@ class Air(eqx.Module):
     Attributes:
         pressure: at the place [Pa].
         temperature: at the place [K].
+
+    Raises:
+        SettingError: single numbers that are not finite, a pressure below or a temperature not
+            above zero.
     """
 
     pressure: Float[Array, "*#s"]
@@ -120,14 +124,31 @@ class Air(eqx.Module):
     def __init__(self, pressure: Numbers = 101325.0, temperature: Numbers = 285.15) -> None:
         self.pressure = jnp.asarray(pressure, dtype=float)
         self.temperature = jnp.asarray(temperature, dtype=float)
+        check_finite(self.pressure, "The air's pressure", "Pa", SettingError)
+        check_finite(self.temperature, "The air's temperature", "K", SettingError)
+        if concrete(self.pressure, self.temperature) and not (
+            np.all(np.asarray(self.pressure) >= 0) and np.all(np.asarray(self.temperature) > 0)
+        ):
+            raise SettingError(
+                "The air's pressure must not be below zero and its temperature must be above, but "
+                f"they are {self.pressure} Pa and {self.temperature} K."
+            )
 
     @staticmethod
     def standard(altitude: Numbers, temperature: Numbers = 285.15) -> "Air":
-        """Air of the pressure that the standard atmosphere has at an altitude [m].
+        """Air of the pressure that the standard atmosphere has at an altitude [m], up to 11 km.
+
+        Raises:
+            SettingError: an altitude outside -500 to 11,000 m.
 
         Source: US Standard Atmosphere 1976, troposphere.
         """
         height = jnp.asarray(altitude, dtype=float)
+        check_finite(height, "The altitude", "m", SettingError)
+        if concrete(height) and np.any((np.asarray(height) < -500) | (np.asarray(height) > 11000)):
+            raise SettingError(
+                f"The standard atmosphere is known from -500 to 11000 m, not at {height} m."
+            )
         return Air(101325.0 * (1.0 - 2.25577e-5 * height) ** 5.25588, temperature)
 
 

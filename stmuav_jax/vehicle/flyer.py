@@ -37,6 +37,7 @@ from .kinematics import angle_motion, panel_angles, stroke_jacobian
 from .motor import MotorRotors
 from .placement import posture
 from .rotor import Rotors
+from .workspace import Limits
 
 # Euler parameters of the world's axes.
 _LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -95,6 +96,8 @@ class Flyer(eqx.Module):
         system: the seven bodies, base first, with one `Rotors` or `MotorRotors` and forces in the
             sliders: one `LinearActuator` each. Other forces stay as they are.
         geometry: of its tracker. shift: of the tracker in the base's frame (3,) [m].
+        limits: what bounds the tracker's workspace (`tracker_limits`), to which `trim` keeps;
+            None for what its rods reach.
 
     Raises:
         ModelError: no rotors, or not two actuators.
@@ -103,10 +106,13 @@ class Flyer(eqx.Module):
     system: System
     geometry: TrackerGeometry
     shift: Float[Array, "3"]
+    limits: Limits | None
     rotors: int = eqx.field(static=True)
     actuators: tuple[int, int] = eqx.field(static=True)
 
-    def __init__(self, system: System, geometry: TrackerGeometry, shift: Any) -> None:
+    def __init__(
+        self, system: System, geometry: TrackerGeometry, shift: Any, limits: Limits | None = None
+    ) -> None:
         rotors = [k for k, f in enumerate(system.forces) if isinstance(f, Rotors | MotorRotors)]
         pushers = {
             f.slider: k for k, f in enumerate(system.forces) if isinstance(f, LinearActuator)
@@ -117,7 +123,7 @@ class Flyer(eqx.Module):
                 f"system has {len(rotors)} and those for {', '.join(sorted(pushers)) or 'none'}."
             )
         self.system, self.geometry = system, geometry
-        self.shift = jnp.asarray(shift, dtype=float)
+        self.shift, self.limits = jnp.asarray(shift, dtype=float), limits
         self.rotors = rotors[0]
         self.actuators = (pushers["slider_2"], pushers["slider_3"])
 
@@ -146,7 +152,7 @@ class Flyer(eqx.Module):
         forces = list(self.system.forces)
         forces[self.rotors] = own.steady()
         system = eqx.tree_at(lambda s: s.forces, self.system, tuple(forces))
-        return Flyer(system, self.geometry, self.shift)
+        return Flyer(system, self.geometry, self.shift, self.limits)
 
     def with_inputs(self, inputs: Inputs, speeds: Float[Array, " k"] | None = None) -> System:
         """The system with its rotors and actuators set, to numbers or to histories.

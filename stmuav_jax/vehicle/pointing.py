@@ -90,12 +90,12 @@ def _raise(
     if reason == Reason.ZERO_LENGTH:
         raise StateError("The direction to face has zero length; give any vector towards it.")
     raise StateError(
-        f"The panel cannot face the direction {shown}: {_why(geometry, limits, margins, reason)}"
+        f"The panel cannot face the direction {shown}: {why_outside(geometry, limits, margins, reason)}"
     )
 
 
-def _why(geometry: TrackerGeometry, limits: Limits, margins: Margins, reason: Reason) -> str:
-    """Which limit, and by how much."""
+def why_outside(geometry: TrackerGeometry, limits: Limits, margins: Margins, reason: Reason) -> str:
+    """Which limit of the workspace one posture breaks, and by how much, in words."""
     if reason == Reason.TILT:
         limit, over = np.degrees(float(limits.tilt)), -np.degrees(float(margins.tilt))
         return (

@@ -1,5 +1,6 @@
 """Trim and linearisation of the UAV: published figures, another formulation, differences."""
 
+import inspect
 from dataclasses import replace
 
 import equinox as eqx
@@ -16,8 +17,20 @@ from stmuav_jax.study.linear import STATES, linearize, rates
 from stmuav_jax.study.trim import TrimLimits, TrimReason, climb, cruise, hover, steady_turn, trim
 from stmuav_jax.vehicle.allocation import RotorLimits, least, wrench_map
 from stmuav_jax.vehicle.flyer import Flyer, shifted
+from stmuav_jax.vehicle.kinematics import Reason
 
 START = sj.initial_angles(sj.PART_II)
+
+
+# phi, theta in degrees and the limit of the table that each breaks
+OUTSIDE = {
+    TrimReason.VALID: (10.0, 10.0),
+    TrimReason.TILT: (20.0, 62.0),
+    TrimReason.SINGULAR: (-55.0, 0.0),
+    TrimReason.STROKE_2: (0.0, -36.0),
+    TrimReason.STROKE_3: (55.0, -12.0),
+    TrimReason.POSTURE: (0.0, -60.0),
+}
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +40,14 @@ def flyer():
 
 @pytest.fixture(scope="module")
 def many(flyer):
-    """Trims at several panel angles, the first the initial ones; the last out of reach."""
+    """Trims at several panel angles, the first the initial ones; the 16th out of reach.
+
+    Then one for each of OUTSIDE.
+    """
     angles = np.random.default_rng(5).uniform(-0.5, 0.5, (16, 2))
     angles[0] = START
     angles[-1] = [0.2, -1.5]
+    angles = np.concatenate([angles, np.radians(list(OUTSIDE.values()))])
     both = jax.vmap(lambda a: trim(flyer, hover(a), throw=False))
     return angles, sj.outer_jit(both)(jnp.asarray(angles))
 
@@ -45,11 +62,11 @@ def test_hover_speeds(many):
     angles, found = many
     expected = [1361.0, 1359.7, 1355.0, 1351.7, 1353.0, 1357.6]
     np.testing.assert_allclose(found.speeds[0], expected, atol=0.05)
-    assert list(np.asarray(found.reason)) == [0] * 15 + [TrimReason.POSTURE]
-    assert np.max(found.residual[:-1]) < 1e-10
-    assert np.all(np.isnan(found.speeds[-1]))
-    assert np.ptp(np.asarray(found.inputs.forces[:-1]), axis=0).min() > 1e-3
-    assert len(angles) == 16
+    assert list(np.asarray(found.reason)) == [0] * 15 + [TrimReason.POSTURE, *OUTSIDE]
+    assert np.max(found.residual[:15]) < 1e-10
+    assert np.all(np.isnan(found.speeds[15]))
+    assert np.ptp(np.asarray(found.inputs.forces[:15]), axis=0).min() > 1e-3
+    assert len(angles) == 22
 
 
 def test_thrust_carries_the_weight(flyer, start):
@@ -128,11 +145,55 @@ def test_refused(flyer):
         trim(flyer, hover([0.2, -1.5]))
     with pytest.raises(sj.ModelError, match="either the panel's angles or the direction"):
         hover(START, sun=[0, 0, 1.0])
-    with pytest.raises(sj.ModelError, match="sun's direction has 3 numbers"):
+    with pytest.raises(
+        sj.ModelError, match=r"sun must be numbers of shape \(3,\), but its shape is \(2,\)"
+    ):
         hover(sun=[0, 1.0])
     bare = eqx.tree_at(lambda s: s.forces, flyer.system, flyer.system.forces[:2])
     with pytest.raises(sj.ModelError, match="one LinearActuator for each slider"):
         Flyer(bare, flyer.geometry, flyer.shift)
+
+
+def test_outside_the_workspace(flyer, many):
+    """Each limit has its reason; the values stay, and are those of a trim without the limit."""
+    angles, found = many[0][16:], jax.tree.map(lambda x: x[16:], many[1])
+    assert np.all(np.isfinite(found.speeds[:5]))
+    assert np.all(np.isnan(found.speeds[5]))
+    wide = TrimLimits(workspace=sj.Limits(home=(0.0, 0.0), tilt=np.pi))
+    for at, speeds in zip(angles[:5], np.asarray(found.speeds), strict=False):
+        free = trim(flyer, hover(at), wide)
+        np.testing.assert_allclose(free.speeds, speeds, rtol=1e-9)
+    # the workspace's own map
+    seen = sj.survey(flyer.geometry, angles[:5].T, flyer.limits).reason
+    assert [Reason(int(k)).name for k in np.asarray(seen)] == [k.name for k in list(OUTSIDE)[:5]]
+
+
+def test_words_for_what_is_outside(flyer):
+    """As `aim` says it: the limit, and by how much it is passed."""
+    with pytest.raises(sj.StateError, match=r"theta = 62 degrees .* the tilt limit of 60"):
+        trim(flyer, hover(np.radians([20.0, 62.0])))
+    with pytest.raises(sj.StateError, match=r"slider 3 would have to stand at 102\.5 mm .* 100 mm"):
+        trim(flyer, hover(np.radians([59.9, 0.0])))
+    with pytest.raises(sj.StateError, match=r"too near the singularity .* at least 0\.05"):
+        trim(flyer, hover(np.radians([-55.0, 0.0])))
+
+
+def test_other_things_in_place_of_a_flight(flyer):
+    bare = inspect.unwrap(trim)
+    with pytest.raises(sj.ModelError, match=r"a steady flight, such as hover.* not 'hover'"):
+        bare(flyer, "hover")
+    with pytest.raises(sj.ModelError, match=r"must be a Flyer, .* not a System"):
+        bare(flyer.system, hover(START))
+    with pytest.raises(sj.ModelError, match="must be a TrimLimits, not a RotorLimits"):
+        bare(flyer, hover(START), RotorLimits(0.0, 1e3))
+    with pytest.raises(sj.ModelError, match="positive number of newtons, not nan"):
+        trim(flyer, hover(START), TrimLimits(actuator=np.nan))
+    with pytest.raises(sj.ModelError, match=r"climb must be a number \[m/s\], but it is 'a'"):
+        climb("a", START)
+    with pytest.raises(sj.ModelError, match=r"level speed must be a number .* shape is \(2,\)"):
+        cruise([1, 2], angles=START)
+    with pytest.raises(sj.ModelError, match="rate of turn must be finite, but it is nan"):
+        steady_turn(1.0, np.nan, START)
 
 
 def test_within_rotor_limits(flyer, start):
@@ -246,6 +307,8 @@ def test_panel_at_the_sun(flyer):
     c, s = np.cos(0.4), np.sin(0.4)
     s_b = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]) @ s_w
     np.testing.assert_allclose(sj.panel_normal(found.coordinates.angles), s_b, atol=1e-12)
+    with pytest.raises(sj.StateError, match=r"theta = 87\.\d+ degrees .* the tilt limit of 60"):
+        trim(flyer, hover(sun=[1.0, 0.0, 0.05]))
 
 
 def test_steady_turn_stays_steady(flyer):

@@ -1,12 +1,16 @@
 """Allocation: the report's mixing corrected, and bounded least squares against SciPy and KKT."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from active_sets import least_squares
 from scipy.optimize import lsq_linear
 
 from stmuav_jax import PART_II, AllocationReason, ModelError, RotorLimits, Rotors, allocate
+from stmuav_jax.vehicle import allocation
 from stmuav_jax.vehicle.allocation import check_lift, least, wrench_map
 
 K_F, K_TAU = PART_II.value("rotor.k_f"), PART_II.value("rotor.k_tau")
@@ -197,6 +201,27 @@ def test_attained_ones_deviate_least(allocated):
         assert np.sqrt(2 * left.cost) < 1e-9
 
 
+def test_edges_against_every_active_set(batched):
+    """Some thousand wrenches on the edge of what is attainable, where limits nearly coincide."""
+    B, rng = np.asarray(TABLE), np.random.default_rng(7)
+    many = 9 * COUNT
+    corners = LOW**2 + SPAN * rng.integers(0, 2, size=(many, 6))
+    loose = rng.uniform(size=(many, 6)) < rng.uniform(0.1, 0.6, size=(many, 1))
+    w = np.where(loose, LOW**2 + SPAN * rng.uniform(size=(many, 6)), corners) @ B.T
+    # at these, interior-point methods hold a rotor at a limit that should be free of it
+    w[0] = [46.46127051074373, -1.8309029665440097, 4.53209735215301, 0.6364491758979717]
+    w[1] = [61.73041336033286, 5.1890569454280415, 1.944752909428937, 0.7111826341989693]
+    w[2] = [59.91159339990186, -3.1748450119483715, -11.966062841010555, 0.38751480191924464]
+    w[3] = [24.724670250138225, 0.8415109867563909, 6.343915974655395, 0.364939590132125]
+    for start in (0.0, 1356.3**2):
+        for part in np.split(w, 3):
+            found = batched(TABLE, part, EVEN, np.full(6, start))
+            assert np.all(found.reason == AllocationReason.VALID)
+            exact = least_squares(B, part, LOW, HIGH, start)
+            # the twin may use its tolerance in limits and wrench where few sets are regular
+            assert np.max(np.abs(found.squared - exact)) < 1e-6 * SPAN
+
+
 def test_without_active_limits_it_is_the_least_norm_inverse(batched):
     w = jnp.array([72.25, 0.05, -0.08, 0.01])
     found = batched(TABLE, w[None], limits=(0.0, 2000.0))
@@ -281,6 +306,34 @@ def test_senseless_wishes_are_refused():
         allocate(TABLE, [70.0, 0, 0, 0], LIMITS, priority=(1, 1, 0, 1))
     with pytest.raises(ModelError, match="must be finite"):
         allocate(TABLE, [70.0, np.nan, 0, 0], LIMITS)
+    wish = [70.0, 0, 0, 0]
+    for preferred in (np.nan, [1e6, np.inf, 0, 0, 0, 0]):
+        with pytest.raises(ModelError, match="preferred squares of the speeds must be finite"):
+            allocate(TABLE, wish, LIMITS, preferred=preferred)
+    with pytest.raises(ModelError, match=r"shape \(6,\) .* but its shape is \(5,\)"):
+        allocate(TABLE, wish, LIMITS, preferred=np.zeros(5))
+    with pytest.raises(ModelError, match=r"wrench must be numbers of shape \(4,\).* is \(3,\)"):
+        allocate(TABLE, wish[:3], LIMITS)
+    with pytest.raises(ModelError, match=r"wrench must be numbers .* but it is 'up'"):
+        allocate(TABLE, "up", LIMITS)
+    bare = inspect.unwrap(allocate)
+    with pytest.raises(ModelError, match=r"has shape \(4, k\).* not \(3, 6\)"):
+        bare(TABLE[:3], wish, LIMITS)
+    with pytest.raises(ModelError, match="must be a RotorLimits, not None"):
+        bare(TABLE, wish, None)
+
+
+def test_a_result_off_the_optimum_is_flagged():
+    """What the walk has found is not believed: each condition fails where it should."""
+    box = allocation._Box(
+        jnp.eye(4, 6) + jnp.eye(4, 6, 2), jnp.full(4, 0.8), jnp.ones(6), jnp.zeros(6)
+    )
+    none, best = jnp.zeros(6, int), jnp.linalg.pinv(box.A) @ box.b
+    way = jnp.linalg.svd(box.A)[2][5]
+    assert allocation._least_norm(box, best, none, none)
+    assert not allocation._least_norm(box, best + 1e-5 * way, none, none)
+    assert allocation._is_nearest(box, best)
+    assert not allocation._is_nearest(box, best + 1e-5 * box.A[0])
 
 
 def test_lift_that_does_not_carry_says_required_and_available():

@@ -1,0 +1,107 @@
+"""What the options of the command line may be: one description of a number, checked in one place."""
+
+import dataclasses
+import math
+import sys
+from collections.abc import Sequence
+from typing import Any, get_type_hints
+
+import tyro
+
+from ..mechanics.errors import SettingError
+
+
+@dataclasses.dataclass(frozen=True)
+class Number:
+    """A finite number, or a tuple of them, within a range.
+
+    Attributes:
+        what: it is, for "The {what} must ...". unit: of it. low, high: the range, ends included.
+        above: the range's open lower end instead.
+    """
+
+    what: str
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    above: float | None = None
+
+    def check(self, value: Any, option: str) -> None:
+        """Raise SettingError unless a value, None, or every one of several is within the range."""
+        for each in value if isinstance(value, tuple) else (value,):
+            if each is not None:
+                self._check_one(each, option)
+
+    def _check_one(self, value: float, option: str) -> None:
+        unit = f" {self.unit}" if self.unit else ""
+        tail = f"but it is {_short(value)}{unit} ({option})."
+        if not (isinstance(value, int) or math.isfinite(value)):
+            raise SettingError(f"The {self.what} must be finite, {tail}")
+        least = value > self.above if self.above is not None else value >= self.low
+        if least and value <= self.high:
+            return
+        if self.above is not None:
+            span = f"be above {self.above:g}"
+            span += f" and at most {self.high:g}" if self.high < math.inf else ""
+        elif self.high < math.inf and self.low > -math.inf:
+            span = f"lie within {self.low:g} and {self.high:g}"
+        else:
+            span = (
+                f"be at least {self.low:g}" if self.low > -math.inf else f"be at most {self.high:g}"
+            )
+        raise SettingError(f"The {self.what} must {span}{unit}, {tail}")
+
+
+def _short(value: float) -> str:
+    words = str(value) if isinstance(value, int) and abs(value) < 10**300 else ""
+    words = words or (f"an integer of {math.log10(abs(value)):.0f} digits" if value else "0")
+    if isinstance(value, float):
+        words = f"{value:g}"
+    return words if len(words) < 40 else f"{words[:12]}... ({len(words)} digits)"
+
+
+def default(words: str) -> Any:
+    """In an option's help, in place of "default: None"."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {words})")
+
+
+# What several commands have.
+ANGLE = Number("angle", "degrees", -360.0, 360.0)
+SPEED = Number("speed", "m/s", -1000.0, 1000.0)
+END = Number("end of the time span", "s", above=0.0, high=1e5)
+SEED = Number("seed", "", 0, 2**32 - 1)
+FORCE = Number("limit of the force", "N", above=0.0, high=1e6)
+TOLERANCE = Number("tolerance", "", above=0.0, high=1.0)
+
+
+def count(what: str, high: float = 1e9) -> Number:
+    """At least one of something."""
+    return Number(f"number of {what}", "", 1, high)
+
+
+def check_words(words: Sequence[str]) -> None:
+    """Raise SettingError for an argument that is empty, or that no name of a file can hold."""
+    for before, word in zip(["", *words], words, strict=False):
+        if not word.strip():
+            where = f" after {before}" if before.startswith("--") else ""
+            raise SettingError(f"There is an empty argument{where}: give a value, or leave it out.")
+        if "\0" in word:
+            raise SettingError("An argument holds a zero byte, which no name can hold.")
+
+
+def check_options(command: Any, words: Sequence[str]) -> None:
+    """Raise SettingError unless every option of a command is what its annotation says."""
+    hints = get_type_hints(type(command), include_extras=True)
+    for field in dataclasses.fields(command):
+        option = "--" + field.name.replace("_", "-")
+        value = getattr(command, field.name)
+        if value == () and option in words:
+            raise SettingError(f"{option} needs at least one name after it.")
+        for note in getattr(hints[field.name], "__metadata__", ()):
+            if isinstance(note, Number):
+                note.check(value, option)
+
+
+def arguments_of(given: Sequence[str] | None) -> list[str]:
+    """The arguments given, or else those of the process."""
+    return list(sys.argv[1:] if given is None else given)

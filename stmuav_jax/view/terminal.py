@@ -1,0 +1,26 @@
+"""Tables and lines of the terminal, taken as they are: brackets are units and paths, not markup."""
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+
+def line(out: Console, words: object) -> None:
+    """Print words as they are: brackets are units and paths, not markup."""
+    out.print(Text(str(words)), highlight=False)
+
+
+def table(*heads: str, title: str | None = None, right: int = 0) -> Table:
+    """A table whose title and heads are taken as they are; `right`: first column set right.
+
+    Give rows to `row`.
+    """
+    made = Table(title=None if title is None else Text(title), title_justify="left")
+    for k, head in enumerate(heads):
+        made.add_column(Text(head), justify="right" if right and k >= right else "left")
+    return made
+
+
+def row(made: Table, *cells: object) -> None:
+    """Add a row of cells taken as they are."""
+    made.add_row(*(Text(str(cell)) for cell in cells))
