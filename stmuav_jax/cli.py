@@ -1,7 +1,6 @@
 """The command line, `stmuav`: list, simulate, sun, trim, linearize, tune, estimate, montecarlo,
 report."""
 
-import contextlib
 import dataclasses
 import math
 import os
@@ -20,7 +19,7 @@ from rich.table import Table
 
 from .commands.estimate import Estimate, run_estimate
 from .commands.flight import Linearize, Trim, run_linearize, run_trim
-from .commands.montecarlo import Montecarlo, Report, cores, run_montecarlo, run_report
+from .commands.montecarlo import Montecarlo, Report, run_montecarlo, run_report
 from .commands.output import written
 from .commands.tune import Tune, run_tune
 from .dynamics.augmented import Augmented
@@ -319,10 +318,6 @@ def main(arguments: list[str] | None = None) -> int:
         if isinstance(command, Estimate):
             return run_estimate(command)
         if isinstance(command, Montecarlo):
-            if command.scheduler is None and command.workers is None:
-                # before the first array: JAX counts its devices once, in another program too
-                with contextlib.suppress(RuntimeError):
-                    jax.config.update("jax_num_cpu_devices", command.devices or cores())
             return run_montecarlo(command)
         return _simulate(command, console, started)
     except SimulationError as error:

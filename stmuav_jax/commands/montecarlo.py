@@ -31,9 +31,9 @@ class Montecarlo:
     chunk: int | None = None
     """Samples written together; default some seconds' worth."""
     devices: int | None = None
-    """Cores (or GPUs) to use; default all."""
+    """Cores (or GPUs) to use, default all; no number depends on it."""
     lanes: int | None = None
-    """Flights that go on together on a device; default by measurement."""
+    """Flights that go on together on a device, a multiple of 8; part of the study, default 16."""
     precision: Literal["float64", "float32"] | None = None
     """float32 is an experiment: its error is measured on the first samples and printed."""
     scheduler: str | None = None
@@ -96,6 +96,19 @@ def _table(command: Montecarlo, plain: Mapping[str, Any]) -> Any:
     return load_parameters(command.params, SCENES[plain["scene"]].parameters)
 
 
+def _options(command: Montecarlo, plain: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a work of flights."""
+    if plain.get("kind", "flights") != "flights":
+        return {}
+    import jax
+
+    here = command.scheduler is None and command.workers is None
+    devices = command.devices
+    if devices is None and here and jax.default_backend() == "cpu":
+        devices = cores()
+    return {"lanes": command.lanes, "devices": devices}
+
+
 def run_montecarlo(command: Montecarlo) -> int:
     """Run the command; the exit code."""
     if command.scheduler is not None and command.workers is not None:
@@ -106,8 +119,7 @@ def run_montecarlo(command: Montecarlo) -> int:
     from ..montecarlo.ready import make_work
 
     plain = plain_of(command)
-    options = {k: getattr(command, k) for k in ("lanes", "devices") if getattr(command, k)}
-    work = make_work(plain, _table(command, plain), **options)
+    work = make_work(plain, _table(command, plain), **_options(command, plain))
     total = command.samples or plain.get("samples", 1024)
     folder = command.out if command.out is not None else Path("runs") / str(plain["name"])
     store = folder / "study.zarr"

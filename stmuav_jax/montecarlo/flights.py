@@ -19,9 +19,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..algebra.rotation import product, rotation_matrix
 from ..mechanics.errors import SettingError, nearest_names
@@ -38,6 +39,9 @@ from ..vehicle.gust import dryden, low_altitude
 from ..vehicle.parameters import Parameters
 from ..vehicle.placement import posture, turn_about
 from ..vehicle.rotor import Rotors
+
+# Relative slack of the check of sampled inertia tensors, for round-off.
+ROUND_OFF = 1e-12
 
 SceneName = Literal["tracker", "hexacopter", "uav_tracker"]
 
@@ -186,6 +190,32 @@ class Flights:
             new[name] = now
         return self.table.replaced(new, source="drawn") if new else self.table
 
+    def possible(
+        self, names: tuple[str, ...], drawn: Float[np.ndarray, "n d"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Whether samples have only masses and inertia tensors that bodies can have (n,).
+
+        The checks are those of `Body`, which looks at no number that is traced: masses are positive,
+        tensors positive definite, and no principal moment exceeds the sum of the other two.
+        """
+        fine = np.ones(len(drawn), bool)
+        own = self.own()
+        places = [k for k, name in enumerate(names) if name not in own]
+        chosen = {self.entry(names[k]).name: self.table[self.entry(names[k]).name] for k in places}
+        if not {p.unit for p in chosen.values()} & {"kg", "kg m^2"}:
+            return fine
+        factors = [names[k] for k in places]
+        table = lambda row: self._table(dict(zip(factors, row, strict=True)))
+        sampled = lambda row: {name: jnp.asarray(table(row).value(name)) for name in chosen}
+        values = jax.vmap(sampled)(jnp.asarray(drawn[:, places]))
+        for name, parameter in chosen.items():
+            value = np.asarray(values[name], dtype=float)
+            if parameter.unit == "kg":
+                fine &= (np.isfinite(value) & (value > 0)).reshape(len(drawn), -1).all(axis=1)
+            elif parameter.unit == "kg m^2" and value.shape[1:] == (3, 3):
+                fine &= _tensors(value, parameter.tolerance)
+        return fine
+
     def _air(self, table: Parameters, values: Mapping[str, Array], seed: Array) -> Any:
         mean = jnp.asarray(table.value("wind.mean"), dtype=float)
         parts = [values.get(f"wind.{axis}", mean[k]) for k, axis in enumerate("xyz")]
@@ -251,6 +281,15 @@ class Flights:
             return np.array([0.0, 0.0, 1.0])
         start = posture(tracker_geometry(self.table), initial_angles(self.table))
         return np.asarray(rotation_matrix(start.p[-1])[:, 2])
+
+
+def _tensors(inertia: Float[np.ndarray, "n 3 3"], tolerance: float) -> Bool[np.ndarray, " n"]:
+    """Whether a body can have each of these tensors, with a relative excess of its moments."""
+    finite = np.isfinite(inertia).all(axis=(1, 2))
+    moments = np.linalg.eigvalsh(np.where(finite[:, None, None], inertia, np.eye(3)))
+    with np.errstate(over="ignore"):
+        most = (moments[:, 0] + moments[:, 1]) * (1 + max(tolerance, ROUND_OFF))
+    return finite & (moments[:, 0] > 0) & (moments[:, 2] <= most)
 
 
 def _hover_inputs(table: Parameters) -> Inputs:

@@ -35,9 +35,13 @@ class Ending(IntEnum):
     NO_START = 2
     MAX_STEPS = 3
     COLLAPSED = 4
+    NOT_PHYSICAL = 5
+    NOT_FINITE = 6
 
 
 REASONS = {
+    Ending.NOT_PHYSICAL: "a mass that is not positive, or an inertia tensor that no body can have",
+    Ending.NOT_FINITE: "accelerations are not finite: forces too large or bodies too light",
     Ending.NO_START: "the start cannot be made: out of the mechanism's reach, or not finite",
     Ending.MAX_STEPS: "the most steps allowed did not reach the end",
     Ending.COLLAPSED: "the step size fell to round-off: the motion cannot be followed",
@@ -168,7 +172,9 @@ def attempt(plan: Plan, problem: Problem, lane: Lane) -> Lane:
             t0, t1, lane.y, y1, problem.model, error, order, lane.controller_state
         )
         step = controller_state[0]
-        collapsed = result != diffrax.RESULTS.successful
+        # a step that is not a number, or too short to be one of many, can only be tried for ever
+        least = jnp.finfo(y1.dtype).eps * (plan.times[-1] - plan.t0)
+        collapsed = (result != diffrax.RESULTS.successful) | (~keep & ~(step > least))
     else:
         # whole steps from the start, so that cutting one short does not shift the others
         keep, controller_state = jnp.asarray(True), lane.controller_state
@@ -187,8 +193,9 @@ def attempt(plan: Plan, problem: Problem, lane: Lane) -> Lane:
         monitor.crossings.found & jnp.asarray(plan.stops, bool)
     )
     most = accepted + rejected >= problem.method.max_steps
-    codes = [Ending.FINE, Ending.COLLAPSED, Ending.MAX_STEPS]
-    ending = jnp.select([ended, collapsed, most], codes, Ending.RUNNING)
+    broken = collapsed & ~jnp.all(jnp.isfinite(y1))
+    codes = [Ending.FINE, Ending.NOT_FINITE, Ending.COLLAPSED, Ending.MAX_STEPS]
+    ending = jnp.select([ended, broken, collapsed, most], codes, Ending.RUNNING)
     return Lane(
         t, y, jnp.where(running, t + step, lane.next),
         _select(taken, solver_state, lane.solver_state),
