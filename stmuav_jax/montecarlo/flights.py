@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..algebra.rotation import product, rotation_matrix
 from ..mechanics.errors import SettingError, nearest_names
+from ..mechanics.schema import SHOWN, named, shown
 from ..mechanics.state import State
 from ..mechanics.system import System
 from ..scenes.registry import SCENES, make_scene
@@ -138,12 +139,17 @@ class Flights:
         match = re.fullmatch(r"([\w.]+)(?:\[([\d, ]+)\])?", factor)
         if match is None or match[1] not in set(self.table):
             known = [*own, *self.table]
-            hint = nearest_names(match[1] if match else factor, known)
+            hint = nearest_names((match[1] if match else factor)[:SHOWN], known)
             raise SettingError(
-                f"'{factor}' is neither a parameter of {self.scene} nor part of its start.{hint}"
+                f"{named(factor)} is neither a parameter of {self.scene} nor part of its start.{hint}"
             )
         name = match[1]
-        place = tuple(int(k) for k in match[2].split(",")) if match[2] else ()
+        try:
+            place = tuple(int(k) for k in match[2].split(",")) if match[2] else ()
+        except ValueError:
+            raise SettingError(
+                f"{named(factor)} names no entry; one is written such as {name}[0, 1]."
+            ) from None
         value = np.asarray(self.table.value(name), dtype=float)
         if place and (
             len(place) != value.ndim or any(k >= n for k, n in zip(place, value.shape, strict=True))
@@ -310,6 +316,8 @@ def flights(
     Raises:
         SettingError: an unknown scene or case, gusts without drag, trim of another scene.
     """
+    if not isinstance(scene, str) or not (case is None or isinstance(case, int)):
+        raise SettingError(f"A scene has a name and a case a number, not {shown((scene, case))}.")
     make_scene(scene, case, table)
     if scene == "spin":
         raise SettingError("Studies are of tracker, hexacopter and uav_tracker, not of spin.")
