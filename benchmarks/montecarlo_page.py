@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,19 @@ def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> list[str]:
     return [*lines, *("| " + " | ".join(str(x) for x in row) + " |" for row in rows), ""]
 
 
+def _metres(error: float | None) -> str:
+    """An error, if there is one."""
+    return f"{error:.1e}" if error is not None and math.isfinite(error) else ""
+
+
+def _why(peer: dict[str, Any]) -> str:
+    """Why a throughput of an older record has no error."""
+    error = peer.get("largest_error")
+    if error is None or math.isfinite(error):
+        return ""
+    return "some flights end in numbers that are not finite: the step is too long for them"
+
+
 def write_page(result: Path, page: Path) -> Path:
     """Write page and figure; the page's path."""
     content = json.loads(result.read_text())
@@ -88,8 +102,7 @@ def write_page(result: Path, page: Path) -> Path:
     peers = [
         (p["method"], p.get("tolerance") or p.get("step") or "",
          f"{p['per_second']:.1f}" if p.get("per_second") else "",
-         f"{p['median_error']:.1e}" if p.get("median_error") else "",
-         f"{p['largest_error']:.1e}" if p.get("largest_error") else "", p["failure"])
+         _metres(p.get("median_error")), _metres(p.get("largest_error")), p["failure"] or _why(p))
         for p in content["peers"]
     ]  # fmt: skip
     head = ("program", "tolerance or step", "per second", "median [m]", "largest [m]", "failure")

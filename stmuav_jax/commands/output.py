@@ -10,4 +10,4 @@ def written(out: Console, paths: Iterable[Path]) -> None:
     """Say which files there are now."""
     out.print("Written:", highlight=False)
     for path in paths:
-        out.print(f"  {path}", highlight=False, soft_wrap=True)
+        out.print(f"  {path}", highlight=False, soft_wrap=True, markup=False, emoji=False)

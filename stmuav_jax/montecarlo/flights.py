@@ -161,7 +161,9 @@ class Flights:
                 f"{name}[{', '.join('0' * value.ndim)}], or make the factor relative."
             )
         places = (place,) if place else ()
-        if name.startswith("inertia.") and len(place) == 2 and place[0] != place[1]:
+        # a tensor of inertia stays symmetric, "bare.inertia" of the hexacopter too
+        tensor = self.table[name].unit == "kg m^2" and len(place) == 2
+        if tensor and place[0] != place[1]:
             places = (place, place[::-1])
         unit = "1" if factor in self.relative else self.table[name].unit
         return Entry(name, places, unit)

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..mechanics.errors import SettingError, nearest_names
-from ..mechanics.schema import shown
+from ..mechanics.schema import SHOWN, named, shown
 from .distribution import Distribution, Number, from_plain
 
 DESIGNS = ("random", "latin", "sobol", "saltelli", "table")
@@ -307,10 +307,13 @@ def _triples(given: Pairs, names: tuple[str, ...]) -> tuple[tuple[str, str, floa
         for name in (a, b):
             if name not in names:
                 raise SettingError(
-                    f"A correlation names '{name}', which is no factor.{nearest_names(name, names)}"
+                    f"A correlation names {named(name)}, which is no factor."
+                    f"{nearest_names(name[:SHOWN], [known[:SHOWN] for known in names])}"
                 )
         if a == b or frozenset((a, b)) in seen:
-            raise SettingError(f"The correlation of '{a}' with '{b}' is given twice or is its own.")
+            raise SettingError(
+                f"The correlation of {named(a)} with {named(b)} is given twice or is its own."
+            )
         seen.add(frozenset((a, b)))
         if not -1 < rho < 1:
             raise SettingError(

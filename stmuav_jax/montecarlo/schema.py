@@ -170,7 +170,9 @@ def check_count(value: Any, what: str, most: int = MOST) -> int:
     Raises:
         SettingError: another number, or one that is too large to be meant.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+    if type(value) is int and value < 1:
+        raise SettingError(f"{what} must be 1 or more, not {shown(value)}.")
+    if isinstance(value, bool) or not isinstance(value, int) or value > most:
         raise SettingError(
             f"{what} must be a whole number from 1 to {most:,}, but it is {shown(value)}."
         )

@@ -88,7 +88,7 @@ class Signal:
 
     Attributes:
         of: what it is. unit: SI. words: for tables and figures.
-        smooth: whether its rate is worth its cost; reactions are watched at the steps alone.
+        smooth: whether its rate is worth its cost; reactions are evaluated within steps instead.
     """
 
     of: Callable[[View], Array]

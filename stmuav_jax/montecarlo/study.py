@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -56,9 +57,11 @@ class Quantity:
         crossing = self.take.startswith("when_")
         if crossing != (self.level is not None):
             words = "needs a level" if crossing else "has no level"
-            raise SettingError(f"'{self.take}' of signal '{self.signal}' {words}.")
+            raise SettingError(f"'{self.take}' of signal {named(self.signal)} {words}.")
         if self.level is not None and not np.isfinite(self.level):
-            raise SettingError(f"The level of '{self.signal}' must be finite, not {self.level}.")
+            raise SettingError(
+                f"The level of {named(self.signal)} must be finite, not {self.level}."
+            )
         if self.stop and not crossing:
             raise SettingError(f"Only a crossing can stop a flight, not '{self.take}'.")
 
@@ -274,7 +277,7 @@ def _check_numbers(study: Study) -> None:
             f"Times {study.every:g} s apart are more than {MOST_TIMES:,} in {study.t1:g} s."
         )
     if study.direction is not None:
-        size = float(np.linalg.norm(study.direction))
+        size = math.hypot(*study.direction)
         if not abs(size - 1) <= 1e-9:
             raise SettingError(
                 f"The direction must be a unit vector, but its length is {size:.12g}."
