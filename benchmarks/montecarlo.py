@@ -192,9 +192,8 @@ def on_devices(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
 
 def child(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
     """What `on_devices` runs: the same flights by bare calls, and as a study with its store."""
-    jax.config.update("jax_num_cpu_devices", devices)
     count = size.flights * devices
-    work = FlightWork(study(size, tolerance), block=count)
+    work = FlightWork(study(size, tolerance), block=size.flights, devices=devices)
     work.run(0, 2)
     bare, stored = [], []
     for repeat in range(size.repeats):

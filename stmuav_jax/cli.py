@@ -4,7 +4,6 @@ report.
 Options are read without JAX; what a command needs is imported when it runs.
 """
 
-import contextlib
 import dataclasses
 import math
 import os
@@ -20,7 +19,7 @@ from rich.console import Console
 from . import __version__
 from .commands.estimate import Estimate, run_estimate
 from .commands.flight import Linearize, Trim, run_linearize, run_trim
-from .commands.montecarlo import Montecarlo, Report, cores, run_montecarlo, run_report
+from .commands.montecarlo import Montecarlo, Report, run_montecarlo, run_report
 from .commands.options import (
     ANGLE,
     END,
@@ -380,12 +379,6 @@ def _run(command: Any, started: float) -> int:
             return run_report(command)
     _configure(command.cache)
     if isinstance(command, Montecarlo):
-        if command.scheduler is None and command.workers is None:
-            import jax
-
-            # before the first array: JAX counts its devices once, in another program too
-            with contextlib.suppress(RuntimeError):
-                jax.config.update("jax_num_cpu_devices", command.devices or cores())
         return run_montecarlo(command)
     if isinstance(command, Tune):
         return run_tune(command)

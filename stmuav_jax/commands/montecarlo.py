@@ -4,7 +4,7 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -12,6 +12,9 @@ from rich.console import Console
 from ..mechanics.errors import SettingError
 from .options import SEED, count, default
 from .output import written
+
+if TYPE_CHECKING:
+    from ..jobs.progress import Outcome
 
 
 @dataclasses.dataclass
@@ -34,9 +37,9 @@ class Montecarlo:
     ] = None
     """Samples written together."""
     devices: Annotated[int | None, count("devices", 1024), default("all")] = None
-    """Cores (or GPUs) to use."""
-    lanes: Annotated[int | None, count("lanes", 1e6), default("by measurement")] = None
-    """Flights that go on together on a device."""
+    """Cores (or GPUs) to use; no number depends on it."""
+    lanes: Annotated[int | None, count("lanes", 1e6), default("16")] = None
+    """Flights that go on together on a device, a multiple of 8; part of the study."""
     precision: Literal["float64", "float32"] | None = None
     """float32 is an experiment: its error is measured on the first samples and printed."""
     scheduler: str | None = None
@@ -99,41 +102,76 @@ def _table(command: Montecarlo, plain: Mapping[str, Any]) -> Any:
     return load_parameters(command.params, SCENES[plain["scene"]].parameters)
 
 
+def _options(command: Montecarlo, plain: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a work of flights."""
+    if plain.get("kind", "flights") != "flights":
+        return {}
+    import jax
+
+    here = command.scheduler is None and command.workers is None
+    devices = command.devices
+    if devices is None and here and jax.default_backend() == "cpu":
+        devices = cores()
+    return {"lanes": command.lanes, "devices": devices}
+
+
+def _work(command: Montecarlo) -> tuple[Any, dict[str, Any]]:
+    """The study's work and plain data; errors name the file."""
+    from ..montecarlo.ready import READY, make_work
+
+    plain = plain_of(command)
+    try:
+        return make_work(plain, _table(command, plain), **_options(command, plain)), plain
+    except SettingError as error:
+        if command.study in READY:
+            raise
+        raise SettingError(f"{command.study}: {error}") from None
+
+
 def run_montecarlo(command: Montecarlo) -> int:
     """Run the command; the exit code."""
     if command.scheduler is not None and command.workers is not None:
         raise SettingError("Give --scheduler or --workers, not both.")
+    from ..jobs.stop import stoppable
+    from ..montecarlo.schema import check_count
+
+    for name in ("samples", "chunk", "workers"):
+        if (value := getattr(command, name)) is not None:
+            check_count(value, f"--{name}")
+    with stoppable():
+        work, plain = _work(command)
+        total = plain.get("samples", 1024) if command.samples is None else command.samples
+        folder = command.out if command.out is not None else Path("runs") / str(plain["name"])
+        chunk = plain.get("chunk") if command.chunk is None else command.chunk
+        outcome = _carried_out(command, work, folder / "study.zarr", total, chunk)
+    out = Console()
+    say = lambda words: out.print(words, highlight=False, markup=False, emoji=False)
+    say(outcome.words())
+    if command.precision == "float32":
+        say(_precision(work, min(64, total)))
+    paths = [folder / "study.zarr"]
+    if command.figures != "none":
+        paths += _report(folder / "study.zarr", folder, command.figures, out)
+    written(out, paths)
+    return 130 if outcome.interrupted else 0
+
+
+def _carried_out(
+    command: Montecarlo, work: Any, store: Path, total: int, chunk: int | None
+) -> "Outcome":
+    """Compute what the store lacks, here or on a cluster."""
     from ..jobs.cluster import run_on_cluster
     from ..jobs.local import run_study
     from ..jobs.watch import Watch
-    from ..montecarlo.ready import make_work
 
-    plain = plain_of(command)
-    options = {k: getattr(command, k) for k in ("lanes", "devices") if getattr(command, k)}
-    work = make_work(plain, _table(command, plain), **options)
-    total = command.samples or plain.get("samples", 1024)
-    folder = command.out if command.out is not None else Path("runs") / str(plain["name"])
-    store = folder / "study.zarr"
-    settings: dict[str, Any] = {
-        "chunk": command.chunk or plain.get("chunk"), "resume": command.resume,
-    }  # fmt: skip
+    settings: dict[str, Any] = {"chunk": chunk, "resume": command.resume}
     with Watch("flights") as watch:
-        if command.scheduler is not None or command.workers is not None:
-            outcome = run_on_cluster(
-                work, store, total, scheduler=command.scheduler, workers=command.workers,
-                progress=watch, **settings,
-            )  # fmt: skip
-        else:
-            outcome = run_study(work, store, total, progress=watch, **settings)
-    out = Console()
-    out.print(outcome.words(), highlight=False)
-    if command.precision == "float32":
-        out.print(_precision(work, min(64, total)), highlight=False)
-    paths = [store]
-    if command.figures != "none":
-        paths += _report(store, folder, command.figures, out)
-    written(out, paths)
-    return 130 if outcome.interrupted else 0
+        if command.scheduler is None and command.workers is None:
+            return run_study(work, store, total, progress=watch, **settings)
+        return run_on_cluster(
+            work, store, total, scheduler=command.scheduler, workers=command.workers,
+            progress=watch, **settings,
+        )  # fmt: skip
 
 
 def _precision(work: Any, count: int) -> str:
@@ -148,11 +186,21 @@ def _precision(work: Any, count: int) -> str:
 
 
 def _report(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]:
+    """Verify the store, write its report and print a summary."""
     from ..view.store import open_store
+    from ..view.study_analysis import analyse
+    from ..view.study_data import study_data
     from ..view.study_report import write_report
+    from ..view.study_table import summary_lines, summary_table
 
     with open_store(store) as opened:
-        paths = write_report(opened.dataset(), folder, figures)
+        opened.verify()
+        dataset = opened.dataset()
+        analysis = analyse(study_data(dataset))
+        paths = write_report(dataset, folder, figures, analysis=analysis)
+    out.print(summary_table(analysis), markup=False, emoji=False)
+    for line in summary_lines(analysis):
+        out.print(line, highlight=False, markup=False, emoji=False)
     return paths
 
 

@@ -21,6 +21,7 @@ from ..view.store import Store
 from .compute import MEMORY, Piece, chunk_size
 from .keep import Keeper, New, Report, begin, there
 from .progress import Outcome, Standing
+from .stop import stoppable
 
 # Chunks on the way for each thread of a worker: one computed, one waiting.
 _AHEAD = 2
@@ -67,6 +68,7 @@ def run_on_cluster(
     there(path, resume=resume)
     interrupted = False
     with (
+        stoppable() as stop,
         _client(scheduler, workers, patience) as client,
         _shipped(client, work, ours=scheduler is None) as name,
     ):
@@ -88,6 +90,7 @@ def run_on_cluster(
                 _carry_out(client, name, store, keeper)
                 keeper.settle()
             except KeyboardInterrupt:
+                stop.heard()
                 interrupted = True
                 keeper.settle()
             return keeper.outcome(interrupted=interrupted)
@@ -209,7 +212,7 @@ def _carry_out(client: Any, name: str, store: Store, keeper: Keeper) -> None:
 
     from .shipped import computed
 
-    waiting = iter(store.pending)
+    waiting = store.waiting()
     versions = dict(store.layout.versions)
     running = as_completed(loop=client.loop)
     chunks: dict[str, int] = {}

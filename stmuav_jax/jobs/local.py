@@ -7,6 +7,7 @@ from ..view.layout import computing_versions
 from .compute import MEMORY, Pieces, chunk_size
 from .keep import Keeper, New, Report, begin
 from .progress import Outcome
+from .stop import stoppable
 
 
 def run_study(
@@ -23,8 +24,8 @@ def run_study(
 
     Each chunk is written while the next is computed, and is there whole or not at all: a run that
     is killed loses at most the two chunks at hand, and one that goes on with it ends with the same
-    files. Ctrl-C ends the run after the chunk that is being written; a second one does not wait
-    for progress to be told.
+    files. Ctrl-C, or SIGTERM, ends the run after the chunk that is being written; a second one does
+    not wait for progress to be told.
 
     Args:
         path: folder of the store. total: samples; more than the store has extend it.
@@ -52,14 +53,16 @@ def run_study(
 
     interrupted = False
     with (
+        stoppable() as stop,
         begin(work, path, total, chunk=chunk, resume=resume, new=new) as store,
         Keeper(store, progress) as keeper,
     ):
         try:
-            for number in store.pending:
+            for number in store.waiting():
                 keeper.keep(number, pieces(*store.todo(number)))
             keeper.settle()
         except KeyboardInterrupt:
+            stop.heard()
             interrupted = True
             keeper.settle()
         return keeper.outcome(interrupted=interrupted)

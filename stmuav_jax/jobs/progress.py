@@ -15,7 +15,8 @@ class Standing(NamedTuple):
 
     Attributes:
         done: samples stored. total: samples of the study.
-        rate: samples stored in a second lately; 0 before any were.
+        rate: samples stored in a second lately, without the first chunk, on the way to which code is
+            compiled; 0 before there are two.
         remaining: seconds to go at this rate; inf while it is 0.
         note: what there is to say, such as that memory was short; empty if nothing.
     """
@@ -76,7 +77,7 @@ class Meter:
         now = time.monotonic()
         if done > self._seen[-1][1]:
             self._seen.append((now, done))
-            if self._first and len(self._seen) > 2:
+            if self._first:
                 # code is compiled on the way to the first chunk, and not on the way to others
                 self._seen.popleft()
                 self._first = False

@@ -17,8 +17,8 @@ class Watch:
 
     def __init__(self, words: str = "samples") -> None:
         columns = (
-            TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(),
-            TextColumn("{task.fields[standing]}"), TimeElapsedColumn(),
+            TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(),
+            TextColumn("{task.fields[standing]}", markup=False), TimeElapsedColumn(),
         )  # fmt: skip
         self.bar = Progress(*columns, console=Console(stderr=True), transient=True)
         self.task = self.bar.add_task(words, total=None, standing="starting")
@@ -37,5 +37,5 @@ class Watch:
 
     def __call__(self, now: Standing) -> None:
         if now.note:
-            self.bar.console.print(now.note, highlight=False)
+            self.bar.console.print(now.note, highlight=False, markup=False, emoji=False)
         self.bar.update(self.task, total=now.total, completed=now.done, standing=now.words())

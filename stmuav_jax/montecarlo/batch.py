@@ -1,6 +1,14 @@
-"""A study as work: blocks of flights through compiled lanes, on all devices."""
+"""A study as work: blocks of flights through compiled lanes, on all cores or devices.
 
-from collections.abc import Mapping
+A sample's numbers are its own. One program, compiled for one device and always of the same shape,
+flies every block; the cores of a CPU share it as threads, and other devices have a copy each. What
+is left that decides the last digits is the number of lanes, which is part of the study's identity.
+"""
+
+import itertools
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import Any
 
@@ -8,7 +16,6 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 
 from ..algebra.compiler import compiler_options
 from ..dynamics.problem import Method, Problem, prepare
@@ -26,8 +33,14 @@ from .work import AbstractWork, Axis, Column
 LANES = {"cpu": 16}
 LANES_ELSEWHERE = 4096
 
+# Lanes are computed so many at a time by one instruction of a processor (AVX-512, double
+# precision); lanes left over would be rounded otherwise, and a flight's lane would matter.
+TOGETHER = 8
+
 # Flights of one call of the compiled program; results do not depend on it.
-BLOCK = 2048
+BLOCK = 512
+
+MOST_DEVICES = 1024
 
 _SOLVERS = {"dopri8": diffrax.Dopri8, "tsit5": diffrax.Tsit5}
 
@@ -36,12 +49,16 @@ class FlightWork(AbstractWork):
     """A study's flights by number.
 
     Args:
-        lanes: flights that go on together on a device; default by the kind of device.
-        block: flights of one compiled call.
-        devices: to be used; default all local ones.
+        lanes: flights that go on together on a device, a multiple of 8; default 16 on a CPU and
+            4096 elsewhere, whatever the number of cores. Part of the study's identity, as the last
+            digits depend on it.
+        block: flights of one call of the compiled program; at least the lanes.
+        devices: threads on a CPU, default one; GPUs elsewhere, default all. Numbers do not depend
+            on it.
 
     Raises:
-        SettingError: numbers that are not positive, or a study in double precision without x64.
+        SettingError: numbers that are not positive, lanes that are not a multiple of 8, more
+            devices than there are, or a study in double precision without x64.
     """
 
     def __init__(
@@ -56,22 +73,31 @@ class FlightWork(AbstractWork):
         for name, value in (("lanes", lanes), ("block", block), ("devices", devices)):
             if value is not None and value < 1:
                 raise SettingError(f"{name} must be at least 1, but it is {value}.")
-        self._lanes, self._block, self._devices = lanes, block, devices
+        kind = jax.default_backend()
+        self.lanes = LANES.get(kind, LANES_ELSEWHERE) if lanes is None else lanes
+        if self.lanes % TOGETHER:
+            raise SettingError(
+                f"lanes must be a multiple of {TOGETHER}, but it is {lanes}: a processor computes so "
+                "many together, and a flight's numbers may not depend on its lane."
+            )
+        if devices is not None and devices > (most := _most_devices()):
+            raise SettingError(f"There are {most} devices, but {devices} are to be used.")
+        self._block, self._devices = max(block, self.lanes), devices
 
     def __getstate__(self) -> dict[str, Any]:
         """Compiled programs stay here."""
-        keep = ("study", "_lanes", "_block", "_devices")
+        keep = ("study", "lanes", "_block", "_devices")
         return {k: self.__dict__[k] for k in keep}
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        """The study's plain data."""
-        return self.study.plain()
+        """The study's plain data, and the lanes."""
+        return {**self.study.plain(), "lanes": self.lanes}
 
     @property
     def unit(self) -> int:
-        """Flights of one compiled call: chunks of a store are best multiples of it."""
-        return self._block
+        """Flights that keep all devices busy: chunks of a store are best multiples of it."""
+        return self._block * len(self._places)
 
     @property
     def columns(self) -> Mapping[str, Column]:
@@ -118,38 +144,71 @@ class FlightWork(AbstractWork):
         """
         study = self.study
         drawn = study.sampling.draw(first, count)
-        parts = []
-        with jax.enable_x64(not study.flights.float32):
-            if not study.flights.float32 and jnp.zeros(()).dtype != jnp.float64:
-                raise SimulationError("Double precision could not be switched on.")
-            for start in range(0, count, self._block):
-                part = drawn[start : start + self._block]
-                parts.append(self._fly(part, first + start))
-        joined = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]} if parts else {}
-        inputs = {column_name(name): drawn[:, k] for k, name in enumerate(study.sampling.names)}
-        found = inputs | joined
-        return {k: np.asarray(found[k], c.dtype) for k, c in self.columns.items()} if parts else {
-            k: np.zeros((0, *(len(self.axes[d].values) for d in c.dims)), c.dtype)
-            for k, c in self.columns.items()
-        }  # fmt: skip
+        if not count:
+            shape = lambda c: (0, *(len(self.axes[d].values) for d in c.dims))
+            return {k: np.zeros(shape(c), c.dtype) for k, c in self.columns.items()}
+        parts = self._on_all(
+            [
+                (drawn[start:stop], first + start)
+                for start, stop in _parts(count, self._block, self.lanes, len(self._places))
+            ]
+        )
+        found = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
+        found |= {column_name(name): drawn[:, k] for k, name in enumerate(study.sampling.names)}
+        return {k: np.asarray(found[k], c.dtype) for k, c in self.columns.items()}
 
-    def _fly(self, drawn: np.ndarray, first: int) -> dict[str, np.ndarray]:
+    def _on_all(self, parts: list[tuple[np.ndarray, int]]) -> list[dict[str, np.ndarray]]:
+        """The parts' columns: each device takes the next part that nobody has taken."""
+        places = self._places[: len(parts)]
+        with self._precision():
+            # compiled here, once for each device, before threads ask for it
+            programs = [self._programs(place) for place in places]
+        found: list[Any] = [None] * len(parts)
+        waiting, taking, stop = iter(enumerate(parts)), threading.Lock(), threading.Event()
+
+        def carry_out(program: Any) -> None:
+            with self._precision():
+                while not stop.is_set():
+                    with taking:
+                        number, part = next(waiting, (-1, None))
+                    if part is None:
+                        return
+                    found[number] = self._fly(program, *part)
+
+        if len(places) == 1:
+            carry_out(programs[0])
+            return found
+        with ThreadPoolExecutor(len(places), thread_name_prefix="flights") as pool:
+            try:
+                for done in [pool.submit(carry_out, program) for program in programs]:
+                    done.result()
+            finally:
+                # after Ctrl-C or an error the parts at hand are the last
+                stop.set()
+        return found
+
+    def _precision(self) -> Any:
+        """The study's, for this thread."""
+        double = not self.study.flights.float32
+        context = jax.enable_x64(double)
+        with context:
+            if double and jnp.zeros(()).dtype != jnp.float64:
+                raise SimulationError("Double precision could not be switched on.")
+        return jax.enable_x64(double)
+
+    def _fly(self, program: Any, drawn: np.ndarray, first: int) -> dict[str, np.ndarray]:
         """One block, filled up to its size by flights that are not flown."""
         count, size = len(drawn), self._block
+        possible = self.study.flights.possible(self.study.sampling.names, drawn)
+        # NaN is a start that cannot be made, which costs nothing
+        drawn = np.where(possible[:, None], drawn, np.nan)
         values = np.concatenate([drawn, np.zeros((size - count, drawn.shape[1]))])
         seeds = np.concatenate([self.seeds(first, count), np.zeros(size - count, np.uint32)])
-        devices = self._mesh.size
-        shares = np.array([len(range(d, count, devices)) for d in range(devices)], np.int32)
-        # flights go to the devices in turn, so that all have as many
-        spread = lambda x: np.ascontiguousarray(
-            x.reshape(size // devices, devices, *x.shape[1:]).swapaxes(0, 1)
-        )
         real = np.float32 if self.study.flights.float32 else np.float64
-        flown = self._program(
-            jnp.asarray(spread(values), real), jnp.asarray(spread(seeds)), jnp.asarray(shares)
-        )
-        gather = lambda x: np.asarray(x).swapaxes(0, 1).reshape(size, *x.shape[2:])[:count]
-        return {k: gather(v) for k, v in flown.items()}
+        flown = program(values.astype(real), seeds.astype(np.uint32), np.int32(count))
+        found = {k: np.array(v[:count]) for k, v in jax.device_get(flown).items()}
+        found["status"][~possible] = Ending.NOT_PHYSICAL
+        return found
 
     def seeds(self, first: int, count: int) -> np.ndarray:
         """Of the flights' own noise (count,): zeros where they have none."""
@@ -159,40 +218,42 @@ class FlightWork(AbstractWork):
         return np.array([own(first + k) for k in range(count)], np.uint32)
 
     @cached_property
-    def _mesh(self) -> Mesh:
-        devices = jax.local_devices()[: self._devices]
-        while self._block % len(devices):
-            devices = devices[:-1]
-        return Mesh(np.array(devices), ("flights",))
+    def _places(self) -> list[Any]:
+        """A device for each thread: the first, again and again, on a CPU; all of them elsewhere."""
+        there = jax.local_devices()
+        if there[0].platform == "cpu":
+            return [there[0]] * (self._devices or 1)
+        return there[: self._devices]
+
+    def _programs(self, place: Any) -> Callable[..., dict[str, Any]]:
+        """The compiled program of a device: values (block, d), seeds (block,), count -> columns."""
+        if place not in self._compiled:
+            self._compiled[place] = self._program(place)
+        return self._compiled[place]
 
     @cached_property
-    def _program(self) -> Any:
-        """Blocks (devices, flights of each, .) -> columns of the same shape."""
-        kind, single = self._mesh.devices.flat[0].platform, self.study.flights.float32
-        size = self._block // self._mesh.size
-        lanes = self._lanes or LANES.get(kind, LANES_ELSEWHERE)
+    def _compiled(self) -> dict[Any, Any]:
+        return {}
+
+    def _program(self, place: Any) -> Any:
+        single, plan = self.study.flights.float32, self.plan
         if single:
             # JAX keeps NumPy's constants of a trace in the precision of the first that had them
             jax.clear_caches()
-        plan = self.plan
 
-        def share(values: Any, seeds: Any, count: Any) -> dict[str, Any]:
-            queue = Drawn(values[0], seeds[0])
-            flown = fly(plan, queue, count[0], min(lanes, size))
-            columns = jax.vmap(self._kept)(queue, flown)
-            return {k: v[None] for k, v in columns.items()}
+        def block(values: Any, seeds: Any, count: Any) -> dict[str, Any]:
+            queue = Drawn(values, seeds)
+            return jax.vmap(self._kept)(queue, fly(plan, queue, count, self.lanes))
 
-        over = PartitionSpec("flights")
-        spread = jax.shard_map(
-            share, mesh=self._mesh, in_specs=(over, over, over), out_specs=over, check_vma=False
+        at = jax.sharding.SingleDeviceSharding(place)
+        of = lambda dtype, *shape: jax.ShapeDtypeStruct(shape, dtype, sharding=at)
+        values = of(
+            jnp.float32 if single else jnp.float64, self._block, len(self.study.sampling.names)
         )
-        program = jax.jit(spread, compiler_options=compiler_options())
-        if not single:
-            return program
-        of = lambda dtype, *more: jax.ShapeDtypeStruct((self._mesh.size, *more), dtype)
-        values = of(jnp.float32, size, len(self.study.sampling.names))
-        compiled = program.lower(values, of(jnp.uint32, size), of(jnp.int32)).compile()
-        jax.clear_caches()
+        program = jax.jit(block, compiler_options=compiler_options())
+        compiled = program.lower(values, of(jnp.uint32, self._block), of(jnp.int32)).compile()
+        if single:
+            jax.clear_caches()
         return compiled
 
     @cached_property
@@ -280,3 +341,18 @@ def _turned(quantity: Quantity, g: Any) -> Any:
     if quantity.take == "when_above":
         return g - quantity.level
     return quantity.level - g if quantity.take == "when_below" else g
+
+
+def _most_devices() -> int:
+    """Threads, or devices that there are."""
+    there = jax.local_devices()
+    return MOST_DEVICES if there[0].platform == "cpu" else len(there)
+
+
+def _parts(count: int, block: int, lanes: int, devices: int) -> Iterator[tuple[int, int]]:
+    """(start, stop) of parts of up to a block, as many as keep the devices busy."""
+    least = -(-count // block)
+    # no part so small that lanes of it stand idle
+    number = max(least, min(-(-least // devices) * devices, -(-count // lanes)))
+    ends = [count * k // number for k in range(number + 1)]
+    return itertools.pairwise(ends)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..mechanics.errors import SettingError, nearest_names
+from ..mechanics.schema import SHOWN, named, shown
 
 # Whole numbers are fine wherever numbers are.
 Number = float | int
@@ -96,6 +97,10 @@ KINDS: Mapping[str, _Kind] = {
 }  # fmt: skip
 
 
+# Share of draws beyond those that are tried for being finite.
+_RARE = 1e-9
+
+
 @dataclasses.dataclass(frozen=True)
 class Distribution:
     """A distribution by its name and parameters.
@@ -113,10 +118,10 @@ class Distribution:
 
     def __post_init__(self) -> None:
         if self.name not in KINDS:
-            raise SettingError(
-                f"There is no distribution '{self.name}'.{nearest_names(self.name, KINDS)}"
-            )
+            near = nearest_names(str(self.name)[:SHOWN], KINDS)
+            raise SettingError(f"There is no distribution {named(self.name)}.{near}")
         object.__setattr__(self, "parameters", _checked(self.name, self.parameters))
+        self._check_draws()
 
     def quantile(self, u: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
         """The values below which the shares u of all draws lie, 0 < u < 1."""
@@ -127,6 +132,18 @@ class Distribution:
             values, shares = self._steps()
             return values[np.searchsorted(shares[:-1], u, side="left")]
         return np.asarray(self._scipy().ppf(u, **KINDS[self.name].arguments(p)), dtype=float)
+
+    def _check_draws(self) -> None:
+        """Refuse parameters with which draws are beyond what doubles can hold."""
+        if not KINDS[self.name].scipy:
+            return
+        with np.errstate(all="ignore"):
+            drawn = self.quantile(np.array([_RARE, 0.5, 1 - _RARE]))
+        if not np.all(np.isfinite(drawn)):
+            given = ", ".join(f"{k} = {_shown(v)}" for k, v in self.parameters.items())
+            raise SettingError(
+                f"The distribution '{self.name}' with {given} has draws that are not finite."
+            )
 
     @property
     def variance(self) -> float:
@@ -181,9 +198,14 @@ def from_plain(plain: Given | Number, factor: str = "") -> Distribution:
                 f"An entry 'distribution' with its name is missing.{nearest_names('', KINDS)}"
             )
         rest = {name: value for name, value in plain.items() if name != "distribution"}
-        return Distribution(str(plain["distribution"]), rest)
+        if not isinstance(plain["distribution"], str):
+            raise SettingError(
+                f"'distribution' must be a name, but it is {shown(plain['distribution'])}."
+                f"{nearest_names('', KINDS)}"
+            )
+        return Distribution(plain["distribution"], rest)
     except SettingError as error:
-        raise SettingError(f"Factor '{factor}': {error}" if factor else str(error)) from None
+        raise SettingError(f"Factor {named(factor)}: {error}" if factor else str(error)) from None
 
 
 def normal(mean: Number, deviation: Number) -> Distribution:
@@ -253,8 +275,8 @@ def _checked(kind: str, given: Given) -> dict[str, Parameter]:
     for name in given:
         if name not in known.parameters:
             raise SettingError(
-                f"The distribution '{kind}' has no parameter '{name}'."
-                f"{nearest_names(name, known.parameters)}"
+                f"The distribution '{kind}' has no parameter {named(name)}."
+                f"{nearest_names(str(name)[:SHOWN], known.parameters)}"
             )
     found: dict[str, Parameter] = {}
     for name, sort in known.parameters.items():
@@ -284,8 +306,11 @@ def _shown(value: Parameter) -> str:
 
 def _number(value: Any, sort: str, what: str) -> float:
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number):
-        raise SettingError(f"{what} must be a number, but it is {value!r}.")
-    number = float(value)
+        raise SettingError(f"{what} must be a number, but it is {shown(value)}.")
+    try:
+        number = float(value)
+    except OverflowError:
+        raise SettingError(f"{what} is too large for a number: {shown(value)}.") from None
     fine = not math.isnan(number) if sort == "limit" else math.isfinite(number)
     if not fine:
         raise SettingError(f"{what} must be finite, but it is {number}.")
@@ -296,7 +321,7 @@ def _number(value: Any, sort: str, what: str) -> float:
 
 def _list(values: Any, sort: str, what: str) -> tuple[float, ...]:
     if not isinstance(values, list | tuple | np.ndarray):
-        raise SettingError(f"{what} must be a list of numbers, but it is {values!r}.")
+        raise SettingError(f"{what} must be a list of numbers, but it is {shown(values)}.")
     if len(values) == 0 and sort == "list":
         raise SettingError(f"{what} must have at least one number, but it is empty.")
     one = "positive" if sort == "positives" else "finite"

@@ -19,12 +19,14 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..algebra.rotation import product, rotation_matrix
 from ..mechanics.errors import SettingError, nearest_names
+from ..mechanics.schema import SHOWN, named, shown
 from ..mechanics.state import State
 from ..mechanics.system import System
 from ..scenes.registry import SCENES, make_scene
@@ -38,6 +40,9 @@ from ..vehicle.gust import dryden, low_altitude
 from ..vehicle.parameters import Parameters
 from ..vehicle.placement import posture, turn_about
 from ..vehicle.rotor import Rotors
+
+# Relative slack of the check of sampled inertia tensors, for round-off.
+ROUND_OFF = 1e-12
 
 SceneName = Literal["tracker", "hexacopter", "uav_tracker"]
 
@@ -134,12 +139,17 @@ class Flights:
         match = re.fullmatch(r"([\w.]+)(?:\[([\d, ]+)\])?", factor)
         if match is None or match[1] not in set(self.table):
             known = [*own, *self.table]
-            hint = nearest_names(match[1] if match else factor, known)
+            hint = nearest_names((match[1] if match else factor)[:SHOWN], known)
             raise SettingError(
-                f"'{factor}' is neither a parameter of {self.scene} nor part of its start.{hint}"
+                f"{named(factor)} is neither a parameter of {self.scene} nor part of its start.{hint}"
             )
         name = match[1]
-        place = tuple(int(k) for k in match[2].split(",")) if match[2] else ()
+        try:
+            place = tuple(int(k) for k in match[2].split(",")) if match[2] else ()
+        except ValueError:
+            raise SettingError(
+                f"{named(factor)} names no entry; one is written such as {name}[0, 1]."
+            ) from None
         value = np.asarray(self.table.value(name), dtype=float)
         if place and (
             len(place) != value.ndim or any(k >= n for k, n in zip(place, value.shape, strict=True))
@@ -151,7 +161,9 @@ class Flights:
                 f"{name}[{', '.join('0' * value.ndim)}], or make the factor relative."
             )
         places = (place,) if place else ()
-        if name.startswith("inertia.") and len(place) == 2 and place[0] != place[1]:
+        # a tensor of inertia stays symmetric, "bare.inertia" of the hexacopter too
+        tensor = self.table[name].unit == "kg m^2" and len(place) == 2
+        if tensor and place[0] != place[1]:
             places = (place, place[::-1])
         unit = "1" if factor in self.relative else self.table[name].unit
         return Entry(name, places, unit)
@@ -185,6 +197,32 @@ class Flights:
                 now = now.at[place].set(value)
             new[name] = now
         return self.table.replaced(new, source="drawn") if new else self.table
+
+    def possible(
+        self, names: tuple[str, ...], drawn: Float[np.ndarray, "n d"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Whether samples have only masses and inertia tensors that bodies can have (n,).
+
+        The checks are those of `Body`, which looks at no number that is traced: masses are positive,
+        tensors positive definite, and no principal moment exceeds the sum of the other two.
+        """
+        fine = np.ones(len(drawn), bool)
+        own = self.own()
+        places = [k for k, name in enumerate(names) if name not in own]
+        chosen = {self.entry(names[k]).name: self.table[self.entry(names[k]).name] for k in places}
+        if not {p.unit for p in chosen.values()} & {"kg", "kg m^2"}:
+            return fine
+        factors = [names[k] for k in places]
+        table = lambda row: self._table(dict(zip(factors, row, strict=True)))
+        sampled = lambda row: {name: jnp.asarray(table(row).value(name)) for name in chosen}
+        values = jax.vmap(sampled)(jnp.asarray(drawn[:, places]))
+        for name, parameter in chosen.items():
+            value = np.asarray(values[name], dtype=float)
+            if parameter.unit == "kg":
+                fine &= (np.isfinite(value) & (value > 0)).reshape(len(drawn), -1).all(axis=1)
+            elif parameter.unit == "kg m^2" and value.shape[1:] == (3, 3):
+                fine &= _tensors(value, parameter.tolerance)
+        return fine
 
     def _air(self, table: Parameters, values: Mapping[str, Array], seed: Array) -> Any:
         mean = jnp.asarray(table.value("wind.mean"), dtype=float)
@@ -253,6 +291,15 @@ class Flights:
         return np.asarray(rotation_matrix(start.p[-1])[:, 2])
 
 
+def _tensors(inertia: Float[np.ndarray, "n 3 3"], tolerance: float) -> Bool[np.ndarray, " n"]:
+    """Whether a body can have each of these tensors, with a relative excess of its moments."""
+    finite = np.isfinite(inertia).all(axis=(1, 2))
+    moments = np.linalg.eigvalsh(np.where(finite[:, None, None], inertia, np.eye(3)))
+    with np.errstate(over="ignore"):
+        most = (moments[:, 0] + moments[:, 1]) * (1 + max(tolerance, ROUND_OFF))
+    return finite & (moments[:, 0] > 0) & (moments[:, 2] <= most)
+
+
 def _hover_inputs(table: Parameters) -> Inputs:
     found = trim(uav_flyer(table), hover(initial_angles(table)))
     if int(found.reason) != TrimReason.VALID:
@@ -271,6 +318,8 @@ def flights(
     Raises:
         SettingError: an unknown scene or case, gusts without drag, trim of another scene.
     """
+    if not isinstance(scene, str) or not (case is None or isinstance(case, int)):
+        raise SettingError(f"A scene has a name and a case a number, not {shown((scene, case))}.")
     make_scene(scene, case, table)
     if scene == "spin":
         raise SettingError("Studies are of tracker, hexacopter and uav_tracker, not of spin.")

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from ..dynamics.problem import Problem, begin
 from ..mechanics.state import State
-from .monitor import Monitor, follow, start
+from .monitor import Monitor, Step, follow, follow_parts, start
 
 # Steps between two looks at which lanes have finished: a finished one waits half of these.
 ROUND = 8
@@ -35,9 +35,13 @@ class Ending(IntEnum):
     NO_START = 2
     MAX_STEPS = 3
     COLLAPSED = 4
+    NOT_PHYSICAL = 5
+    NOT_FINITE = 6
 
 
 REASONS = {
+    Ending.NOT_PHYSICAL: "a mass that is not positive, or an inertia tensor that no body can have",
+    Ending.NOT_FINITE: "accelerations are not finite: forces too large or bodies too light",
     Ending.NO_START: "the start cannot be made: out of the mechanism's reach, or not finite",
     Ending.MAX_STEPS: "the most steps allowed did not reach the end",
     Ending.COLLAPSED: "the step size fell to round-off: the motion cannot be followed",
@@ -70,7 +74,8 @@ class Lane(eqx.Module):
     """A flight under way.
 
     Attributes:
-        t, y: now [s], (n,). next: end of the step to try [s].
+        t, y: now [s], (n,). slope: its rate (n,), kept where signals without rates are watched, else
+            (0,). next: end of the step to try [s].
         solver_state, controller_state: diffrax's.
         place: how many of the kept times have been reached. kept: states there (k, n).
         monitor: of the watched signals. accepted, rejected: steps. ending: a code of `Ending`.
@@ -78,6 +83,7 @@ class Lane(eqx.Module):
 
     t: Float[Array, ""]
     y: Float[Array, " n"]
+    slope: Float[Array, " m"]
     next: Float[Array, ""]
     solver_state: Any
     controller_state: Any
@@ -117,15 +123,31 @@ def _select(which: Any, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(wide(a), a, b), yes, no)
 
 
-def _signals(plan: Plan, problem: Problem, t: Array, y: Array) -> tuple[Array, Array]:
-    """Watched signals (q,), and the rates of those that have some (q1,)."""
-    sharp = plan.sharp(problem, t, y)
-    if jax.eval_shape(plan.smooth, problem, t, y).shape == (0,):
-        return sharp, jnp.zeros(0, y.dtype)
-    slope = problem.field(t, y, problem.model)
+class _Seen(NamedTuple):
+    """Watched signals at one time: values with rates (q1,), values without (q2,), slope of y."""
+
+    smooth: Float[Array, " q1"]
+    rate: Float[Array, " q1"]
+    sharp: Float[Array, " q2"]
+    slope: Float[Array, " m"]
+
+
+def _count(of: Any, problem: Problem, t: Array, y: Array) -> int:
+    return jax.eval_shape(of, problem, t, y).shape[0]
+
+
+def _seen(plan: Plan, problem: Problem, t: Array, y: Array, *, all_signals: bool) -> _Seen:
+    """Those with rates, or all of them; the slope where there are some without."""
+    none = jnp.zeros(0, y.dtype)
+    smooth, sharp = (_count(of, problem, t, y) for of in (plan.smooth, plan.sharp))
+    slope = problem.field(t, y, problem.model) if smooth or sharp else none
+    value = plan.sharp(problem, t, y) if sharp and all_signals else none
+    found = _Seen(none, none, value, slope if sharp else none)
+    if not smooth:
+        return found
     along = lambda t, y: plan.smooth(problem, t, y)
-    smooth, rate = jax.jvp(along, (t, y), (jnp.ones_like(t), slope))
-    return jnp.concatenate([smooth, sharp]), rate
+    value, rate = jax.jvp(along, (t, y), (jnp.ones_like(t), slope))
+    return found._replace(smooth=value, rate=rate)
 
 
 def launch(plan: Plan, numbers: Any) -> Lane:
@@ -140,11 +162,12 @@ def launch(plan: Plan, numbers: Any) -> Lane:
     reached = sum(bool(t <= plan.t0) for t in plan.times)
     kept = jnp.full((len(plan.times), carry.y.shape[0]), jnp.nan, carry.y.dtype)
     kept = kept.at[:reached].set(carry.y)
-    g, rate = _signals(plan, problem, t0, carry.y)
-    monitor = start(t0, g, jnp.pad(rate, (0, g.shape[0] - rate.shape[0])))
+    seen = _seen(plan, problem, t0, carry.y, all_signals=True)
+    rate = jnp.concatenate([seen.rate, jnp.zeros_like(seen.sharp)])
+    monitor = start(t0, jnp.concatenate([seen.smooth, seen.sharp]), rate)
     ending = jnp.where(fine, Ending.RUNNING, Ending.NO_START).astype(int)
     return Lane(
-        carry.t, carry.y, carry.t + step, carry.solver_state, carry.controller_state,
+        carry.t, carry.y, seen.slope, carry.t + step, carry.solver_state, carry.controller_state,
         zero + reached, kept, monitor, zero, zero, ending,
     )  # fmt: skip
 
@@ -168,7 +191,9 @@ def attempt(plan: Plan, problem: Problem, lane: Lane) -> Lane:
             t0, t1, lane.y, y1, problem.model, error, order, lane.controller_state
         )
         step = controller_state[0]
-        collapsed = result != diffrax.RESULTS.successful
+        # a step that is not a number, or too short to be one of many, can only be tried for ever
+        least = jnp.finfo(y1.dtype).eps * (plan.times[-1] - plan.t0)
+        collapsed = (result != diffrax.RESULTS.successful) | (~keep & ~(step > least))
     else:
         # whole steps from the start, so that cutting one short does not shift the others
         keep, controller_state = jnp.asarray(True), lane.controller_state
@@ -180,17 +205,18 @@ def attempt(plan: Plan, problem: Problem, lane: Lane) -> Lane:
     reached = taken & (t >= goal)
     row = jnp.where(reached, lane.place, len(plan.times))
     place = lane.place + reached
-    monitor = _watched(plan, problem, lane, taken, t0, t, y)
+    monitor, slope = _watched(plan, problem, lane, taken, t, y)
     accepted = lane.accepted + taken
     rejected = lane.rejected + (running & ~keep)
     ended = (place >= len(plan.times)) | jnp.any(
         monitor.crossings.found & jnp.asarray(plan.stops, bool)
     )
     most = accepted + rejected >= problem.method.max_steps
-    codes = [Ending.FINE, Ending.COLLAPSED, Ending.MAX_STEPS]
-    ending = jnp.select([ended, collapsed, most], codes, Ending.RUNNING)
+    broken = collapsed & ~jnp.all(jnp.isfinite(y1))
+    codes = [Ending.FINE, Ending.NOT_FINITE, Ending.COLLAPSED, Ending.MAX_STEPS]
+    ending = jnp.select([ended, broken, collapsed, most], codes, Ending.RUNNING)
     return Lane(
-        t, y, jnp.where(running, t + step, lane.next),
+        t, y, slope, jnp.where(running, t + step, lane.next),
         _select(taken, solver_state, lane.solver_state),
         _select(running, controller_state, lane.controller_state),
         place, lane.kept.at[row].set(y, mode="drop"), monitor, accepted, rejected,
@@ -199,18 +225,22 @@ def attempt(plan: Plan, problem: Problem, lane: Lane) -> Lane:
 
 
 def _watched(
-    plan: Plan, problem: Problem, lane: Lane, taken: Array, t0: Array, t1: Array, y: Array
-) -> Monitor:
-    """The monitor after the step, where it was taken."""
+    plan: Plan, problem: Problem, lane: Lane, taken: Array, t: Array, y: Array
+) -> tuple[Monitor, Array]:
+    """The monitor after the step to t, y, where it was taken, and the slope there."""
     if not plan.stops:
-        return lane.monitor
-    g, rate = _signals(plan, problem, t1, y)
-    # a signal without rates goes straight from step to step
-    before, count = lane.monitor, rate.shape[0]
-    secant = (g - before.g) / jnp.where(t1 > t0, t1 - t0, 1.0)
-    join = lambda rates: jnp.concatenate([rates[:count], secant[count:]])
-    seen = eqx.tree_at(lambda m: m.rate, before, join(before.rate))
-    return _select(taken, follow(seen, t0, t1, g, join(rate)), before)
+        return lane.monitor, lane.slope
+    t0, before = lane.t, lane.monitor
+    # the others' values at the end of the step are among those within it
+    seen = _seen(plan, problem, t, y, all_signals=False)
+    count = seen.smooth.shape[0]
+    part = lambda rows: jax.tree.map(lambda x: x[rows], before)
+    after = follow(part(slice(0, count)), t0, t, seen.smooth, seen.rate)
+    if seen.slope.shape[0]:
+        step = Step(t0, t, lane.y, y, lane.slope, seen.slope)
+        rest = follow_parts(part(slice(count, None)), step, lambda t, y: plan.sharp(problem, t, y))
+        after = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), after, rest)
+    return _select(taken, (after, seen.slope), (before, lane.slope))
 
 
 def _left(lane: Lane) -> Flown:

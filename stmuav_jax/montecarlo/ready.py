@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..mechanics.errors import SettingError, nearest_names
+from ..mechanics.schema import shown
 from ..vehicle.airframe import PART_II
 from ..vehicle.parameters import Parameters
 from .batch import FlightWork
 from .estimates import EstimationStudy, EstimationWork
+from .schema import estimation_file
 from .study import study_from_plain
 from .work import AbstractWork
 
@@ -91,10 +93,12 @@ READY: dict[str, dict[str, Any]] = {
 READY["collapse"] = {
     "scene": "uav_tracker", "case": 1, "t1": 0.3, "samples": 10_000, "design": "sobol",
     "every": 0.01, "factors": _start(0.1), "quantities": _COLLAPSE,
+    "failure": {"quantity": "collapse"},
 }  # fmt: skip
 READY["hover"] = {
     "scene": "uav_tracker", "inputs": "trim", "t1": 1.0, "samples": 4096, "design": "sobol",
     "every": 0.02, "factors": _TOLERANCES, "quantities": _HOVER,
+    "failure": {"quantity": "lost"},
 }  # fmt: skip
 READY |= {
     f"estimate_{case}": {"kind": "estimation", "case": case, "samples": 1024}
@@ -133,19 +137,20 @@ def make_work(
     Raises:
         SettingError: entries that are unknown, missing or impossible.
     """
-    if plain.get("kind", "flights") == "flights":
-        return FlightWork(study_from_plain(plain, table), **options)
-    known = ("kind", "name", "case", "tuning", "t1", "seed", "samples", "chunk")
-    for key in plain:
-        if key not in known:
-            raise SettingError(
-                f"A study of estimation has no entry '{key}'.{nearest_names(key, known)}"
-            )
-    if plain["kind"] != "estimation":
-        raise SettingError(f"A study's kind is flights or estimation, not '{plain['kind']}'.")
+    kind = plain.get("kind", "flights")
+    if kind == "flights":
+        study = study_from_plain(plain, table)
+        if options.get("lanes") is None:
+            options["lanes"] = plain.get("lanes")
+        return FlightWork(study, **options)
+    if kind != "estimation":
+        raise SettingError(f"A study's kind is flights or estimation, not {shown(kind)}.")
+    given = estimation_file(plain)
     if table is not None:
         raise SettingError("Studies of estimation take no other parameters yet.")
-    if "case" not in plain:
-        raise SettingError("A study of estimation needs a case, 1 to 8.")
-    given = {k: plain[k] for k in ("case", "tuning", "t1", "seed") if k in plain}
-    return EstimationWork(EstimationStudy(plain.get("name", "estimation"), **given))
+    if any(value is not None for value in options.values()):
+        names = ", ".join(name for name, value in options.items() if value is not None)
+        raise SettingError(f"Studies of estimation have no settings {names}.")
+    return EstimationWork(
+        EstimationStudy(given.name, given.case, given.tuning, given.t1, given.seed)
+    )

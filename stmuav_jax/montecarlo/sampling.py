@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..mechanics.errors import SettingError, nearest_names
+from ..mechanics.schema import SHOWN, named, shown
 from .distribution import Distribution, Number, from_plain
 
 DESIGNS = ("random", "latin", "sobol", "saltelli", "table")
@@ -173,7 +174,7 @@ def sampling_from_plain(plain: Mapping[str, Any]) -> Sampling:
         value = plain.get(name, 0)
         if isinstance(value, bool) or not isinstance(value, int):
             raise SettingError(
-                f"'{name}' of a sampling must be a whole number, but it is {value!r}."
+                f"'{name}' of a sampling must be a whole number, but it is {shown(value)}."
             )
     given = plain["factors"]
     if not isinstance(given, Mapping):
@@ -190,7 +191,7 @@ def _pair(given: Any) -> tuple[str, str, float]:
         return str(a), str(b), float(rho)
     except (TypeError, ValueError):
         raise SettingError(
-            f"A correlation is given as [name, name, number], but there is {given!r}."
+            f"A correlation is given as [name, name, number], but there is {shown(given)}."
         ) from None
 
 
@@ -306,10 +307,13 @@ def _triples(given: Pairs, names: tuple[str, ...]) -> tuple[tuple[str, str, floa
         for name in (a, b):
             if name not in names:
                 raise SettingError(
-                    f"A correlation names '{name}', which is no factor.{nearest_names(name, names)}"
+                    f"A correlation names {named(name)}, which is no factor."
+                    f"{nearest_names(name[:SHOWN], [known[:SHOWN] for known in names])}"
                 )
         if a == b or frozenset((a, b)) in seen:
-            raise SettingError(f"The correlation of '{a}' with '{b}' is given twice or is its own.")
+            raise SettingError(
+                f"The correlation of {named(a)} with {named(b)} is given twice or is its own."
+            )
         seen.add(frozenset((a, b)))
         if not -1 < rho < 1:
             raise SettingError(

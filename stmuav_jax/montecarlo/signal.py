@@ -13,6 +13,7 @@ from ..dynamics.energy import energy
 from ..dynamics.formulation import Reactions
 from ..dynamics.problem import Problem, at_internal
 from ..mechanics.errors import SettingError, nearest_names
+from ..mechanics.schema import SHOWN, named
 from ..mechanics.state import State
 from ..mechanics.system import System
 from ..vehicle.kinematics import panel_angles
@@ -87,7 +88,7 @@ class Signal:
 
     Attributes:
         of: what it is. unit: SI. words: for tables and figures.
-        smooth: whether its rate is worth its cost; reactions are watched at the steps alone.
+        smooth: whether its rate is worth its cost; reactions are evaluated within steps instead.
     """
 
     of: Callable[[View], Array]
@@ -171,5 +172,5 @@ def signal(system: System, name: str) -> Signal:
     """
     known = signals(system)
     if name not in known:
-        raise SettingError(f"There is no signal '{name}'.{nearest_names(name, known)}")
+        raise SettingError(f"There is no signal {named(name)}.{nearest_names(name[:SHOWN], known)}")
     return known[name]

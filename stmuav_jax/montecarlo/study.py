@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -11,13 +12,17 @@ import equinox as eqx
 import numpy as np
 
 from ..mechanics.errors import SettingError, nearest_names
+from ..mechanics.schema import SHOWN, named
 from ..vehicle.parameters import Parameters
 from .flights import Flights, flights
 from .sampling import Sampling, sampling_from_plain
+from .schema import check_name, flights_file
 from .signal import Signal, signal
 
 TAKES = ("final", "largest", "smallest", "path", "when_above", "when_below")
 SOLVERS = ("dopri8", "tsit5")
+# Kept times of a flight, which every flight's memory must hold.
+MOST_TIMES = 100_000
 # Columns that every study has.
 OWN = {"status", "sample", "time", "end", "steps", "rejected", "residual", "records"}
 
@@ -52,9 +57,11 @@ class Quantity:
         crossing = self.take.startswith("when_")
         if crossing != (self.level is not None):
             words = "needs a level" if crossing else "has no level"
-            raise SettingError(f"'{self.take}' of signal '{self.signal}' {words}.")
+            raise SettingError(f"'{self.take}' of signal {named(self.signal)} {words}.")
         if self.level is not None and not np.isfinite(self.level):
-            raise SettingError(f"The level of '{self.signal}' must be finite, not {self.level}.")
+            raise SettingError(
+                f"The level of {named(self.signal)} must be finite, not {self.level}."
+            )
         if self.stop and not crossing:
             raise SettingError(f"Only a crossing can stop a flight, not '{self.take}'.")
 
@@ -71,6 +78,34 @@ class Quantity:
 
 
 @dataclass(frozen=True)
+class Failure:
+    """When a flight that was completed counts as a failure; the report gives its probability.
+
+    Attributes:
+        quantity: one of the study's, no path.
+        above, below: it fails if the quantity is above or below these, in the quantity's unit. A
+            crossing without them fails if it happens at all.
+
+    Raises:
+        SettingError: limits that are not finite.
+    """
+
+    quantity: str
+    above: float | None = None
+    below: float | None = None
+
+    def __post_init__(self) -> None:
+        for limit in (self.above, self.below):
+            if limit is not None and not np.isfinite(limit):
+                raise SettingError(f"The limits of a failure must be finite, not {limit}.")
+
+    def plain(self) -> dict[str, Any]:
+        """As a file holds it."""
+        limits = {"above": self.above, "below": self.below}
+        return {"quantity": self.quantity} | {k: v for k, v in limits.items() if v is not None}
+
+
+@dataclass(frozen=True)
 class Study:
     """Many flights of one scene.
 
@@ -83,9 +118,12 @@ class Study:
         rtol, atol: tolerances of a step. solver: one of `SOLVERS`.
         step: constant step [s] instead of adaptive ones.
         max_steps: of a flight, after which it has failed.
+        direction: that the panel should face, world; default the one it faces at the start.
+        failure: which completed flights count as failures; default none.
 
     Raises:
-        SettingError: no quantities, names that clash, impossible numbers.
+        SettingError: no quantities, names that clash or are no names, impossible numbers, a failure
+            of a quantity that there is not.
     """
 
     name: str
@@ -100,19 +138,22 @@ class Study:
     step: float | None = None
     max_steps: int = 20_000
     direction: tuple[float, float, float] | None = field(default=None)
+    failure: Failure | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "quantities", dict(self.quantities))
+        check_name(self.name)
         if not self.quantities:
             raise SettingError(f"Study '{self.name}' keeps nothing: give it quantities.")
-        for name in self.sampling.names:
-            self.flights.entry(name)
+        _check_factors(self)
         inputs = {column_name(name) for name in self.sampling.names}
         clash = sorted({*self.quantities} & (inputs | OWN))
         if clash:
             words = ", ".join(clash)
             raise SettingError(f"Other columns have these names, which quantities cannot: {words}.")
         _check_numbers(self)
+        if self.failure is not None:
+            _check_failure(self.failure, self.quantities)
 
     @property
     def times(self) -> np.ndarray:
@@ -131,7 +172,8 @@ class Study:
         numbers = {name: np.asarray(table.value(name)).tolist() for name in table}
         text = json.dumps(numbers, sort_keys=True)
         of = self.flights
-        return {
+        failure = {} if self.failure is None else {"failure": self.failure.plain()}
+        return failure | {
             "kind": "flights",
             "name": self.name,
             "scene": of.scene,
@@ -168,6 +210,37 @@ def _plain(quantity: Quantity) -> dict[str, Any]:
     return found
 
 
+def _check_factors(study: Study) -> None:
+    """Every factor has a place and a column of its own."""
+    places: dict[Any, str] = {}
+    columns: dict[str, str] = {}
+    for name in study.sampling.names:
+        entry = study.flights.entry(name)
+        column = column_name(name)
+        # a whole array's factor and one of an entry of it would both write the entry
+        for place in entry.places or ((),):
+            if (other := places.get((entry.name, place))) is not None:
+                raise SettingError(f"'{other}' and '{name}' are the same number; give one of them.")
+            places[entry.name, place] = name
+        if (other := columns.get(column)) is not None:
+            raise SettingError(f"'{other}' and '{name}' would share the column '{column}'.")
+        columns[column] = name
+
+
+def _check_failure(failure: Failure, quantities: Mapping[str, Quantity]) -> None:
+    known = [name for name, quantity in quantities.items() if quantity.take != "path"]
+    if failure.quantity not in known:
+        raise SettingError(
+            f"The failure is of {named(failure.quantity)}, which is no quantity with one number a "
+            f"flight.{nearest_names(failure.quantity[:SHOWN], known)}"
+        )
+    crossing = quantities[failure.quantity].take.startswith("when_")
+    if not crossing and failure.above is None and failure.below is None:
+        raise SettingError(
+            f"The failure by '{failure.quantity}' needs a limit: above = ... or below = ..."
+        )
+
+
 def _check_numbers(study: Study) -> None:
     numbers = {"t1": study.t1, "rtol": study.rtol, "atol": study.atol}
     optional = {"every": study.every, "step": study.step}
@@ -194,8 +267,17 @@ def _check_numbers(study: Study) -> None:
         raise SettingError(
             f"Times {study.every:g} s apart do not fit into a flight of {study.t1:g} s."
         )
+    if study.step is not None and study.t1 / study.step > study.max_steps:
+        raise SettingError(
+            f"Steps of {study.step:g} s need more than the {study.max_steps} of max_steps for "
+            f"{study.t1:g} s."
+        )
+    if study.every is not None and study.t1 / study.every > MOST_TIMES:
+        raise SettingError(
+            f"Times {study.every:g} s apart are more than {MOST_TIMES:,} in {study.t1:g} s."
+        )
     if study.direction is not None:
-        size = float(np.linalg.norm(study.direction))
+        size = math.hypot(*study.direction)
         if not abs(size - 1) <= 1e-9:
             raise SettingError(
                 f"The direction must be a unit vector, but its length is {size:.12g}."
@@ -218,36 +300,23 @@ def study_from_plain(
     Raises:
         SettingError: an unknown entry (with the nearest known one), or numbers that do not fit.
     """
-    given = dict(plain)
-    known = {
-        "name", "scene", "case", "samples", "inputs", "drag", "gusts", "precision", "t1", "every",
-        "rtol", "atol", "solver", "step", "max_steps", "direction", "seed", "design", "stratum",
-        "correlation", "factors", "quantities", "chunk", "kind",
-    }  # fmt: skip
-    for key in given:
-        if key not in known:
-            raise SettingError(f"A study has no entry '{key}'.{nearest_names(key, known)}")
-    for key in ("scene", "factors", "quantities"):
-        if key not in given:
-            raise SettingError(f"A study needs '{key}'.")
-    if given.get("precision", "float64") not in ("float64", "float32"):
-        raise SettingError(f"precision is float64 or float32, not '{given['precision']}'.")
-    factors, relative = _factors(given["factors"])
-    t1 = float(given.get("t1", 1.0))
+    given = flights_file(plain)
+    factors, relative = _factors(given.factors)
     of = flights(
-        given["scene"], given.get("case"), table,
-        relative=relative, inputs=given.get("inputs", "case"), drag=given.get("drag", False),
-        gusts=given.get("gusts", False), duration=t1,
-        float32=given.get("precision") == "float32",
+        given.scene, given.case, table, relative=relative, inputs=given.inputs, drag=given.drag,
+        gusts=given.gusts, duration=given.t1, float32=given.precision == "float32",
     )  # fmt: skip
-    drawn = {k: given[k] for k in ("seed", "design", "stratum", "correlation") if k in given}
-    sampling = sampling_from_plain({"seed": 0, "factors": factors} | drawn)
-    keep = ("every", "rtol", "atol", "solver", "step", "max_steps")
-    options = {k: given[k] for k in keep if k in given}
-    if "direction" in given:
-        options["direction"] = tuple(float(x) for x in given["direction"])
-    quantities = {k: _quantity(k, q) for k, q in given["quantities"].items()}
-    return Study(given.get("name", name), of, sampling, quantities, t1=t1, **options)
+    drawn: dict[str, Any] = {"seed": given.seed, "design": given.design, "factors": factors}
+    if given.stratum is not None:
+        drawn["stratum"] = given.stratum
+    sampling = sampling_from_plain(drawn | {"correlation": list(given.correlation)})
+    quantities = {k: Quantity(**dict(q)) for k, q in given.quantities.items()}
+    failure = None if given.failure is None else Failure(**dict(given.failure))
+    return Study(
+        given.name if "name" in plain else name, of, sampling, quantities, t1=given.t1,
+        every=given.every, rtol=given.rtol, atol=given.atol, solver=given.solver, step=given.step,
+        max_steps=given.max_steps, direction=given.direction, failure=failure,
+    )  # fmt: skip
 
 
 def _factors(given: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[str]]:
@@ -261,16 +330,6 @@ def _factors(given: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[str]]:
                 relative.add(name)
         found[name] = what
     return found, frozenset(relative)
-
-
-def _quantity(name: str, given: Any) -> Quantity:
-    known = ("signal", "take", "level", "stop")
-    if not isinstance(given, Mapping) or not {"signal", "take"} <= set(given):
-        raise SettingError(f"Quantity '{name}' needs a signal and what to take of it.")
-    for key in given:
-        if key not in known:
-            raise SettingError(f"Quantity '{name}' has no '{key}'.{nearest_names(key, known)}")
-    return Quantity(**given)
 
 
 def with_precision(study: Study, *, float32: bool, **tolerances: float) -> Study:

@@ -6,7 +6,19 @@ from typing import Any
 
 import numpy as np
 
+from ..mechanics.body import check_inertia
 from ..mechanics.errors import ModelError, concrete, nearest_names
+from ..mechanics.schema import SHOWN, Entries, named, shown
+
+# Lists within lists that a value may be; arrays have fewer axes.
+_DEEPEST = 4
+
+
+class ParameterEntry(Entries):
+    """A parameter in a file that says its unit: {value = 0.95, unit = "kg"}."""
+
+    value: Any
+    unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -36,7 +48,7 @@ class Parameters(Mapping[str, Parameter]):
 
     def __getitem__(self, key: str) -> Parameter:
         if key not in self._entries:
-            raise ModelError(f"{self.name} has no parameter '{key}'.{self._hint(key)}")
+            raise ModelError(f"{self.name} has no parameter {named(key)}.{self._hint(key)}")
         return self._entries[key]
 
     def __iter__(self) -> Iterator[str]:
@@ -50,7 +62,7 @@ class Parameters(Mapping[str, Parameter]):
 
     def _hint(self, key: str) -> str:
         group = [k for k in self._entries if k.split(".")[0] == key.split(".")[0]]
-        return nearest_names(key, group or self._entries)
+        return nearest_names(key[:SHOWN], group or self._entries)
 
     def value(self, key: str) -> Any:
         """The value of a parameter."""
@@ -65,7 +77,8 @@ class Parameters(Mapping[str, Parameter]):
             values: new values by name, of the shapes of the old.
 
         Raises:
-            ModelError: an unknown name, a wrong shape, or a number that is not finite.
+            ModelError: an unknown name, a wrong shape, a number that is not finite, a mass that is
+                not positive, or an inertia tensor that no body can have.
         """
         entries = dict(self._entries)
         for key, value in values.items():
@@ -87,20 +100,34 @@ class Parameters(Mapping[str, Parameter]):
 
 
 def _check(key: str, value: Any, old: Parameter) -> None:
+    wrong = f"Parameter '{key}' must be numbers [{old.unit}], not {shown(value)}."
+    if _is_other(value):
+        raise ModelError(wrong)
     if not concrete(value):
         return
     try:
         array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ModelError(
-            f"Parameter '{key}' must be numbers [{old.unit}], not {value!r}."
-        ) from None
+    except (TypeError, ValueError, OverflowError):
+        raise ModelError(wrong) from None
     shape = np.shape(old.value)
     if array.shape != shape:
         raise ModelError(
-            f"Parameter '{key}' must have shape {shape}, but {value!r} has {array.shape}."
+            f"Parameter '{key}' must have shape {shape}, but {shown(value)} has {array.shape}."
         )
     if not np.all(np.isfinite(array)):
         raise ModelError(
-            f"Parameter '{key}' must be finite, but it is {array.tolist()} {old.unit}."
+            f"Parameter '{key}' must be finite, but it is {shown(array.tolist())} {old.unit}."
         )
+    if old.unit == "kg" and not np.all(array > 0):
+        raise ModelError(
+            f"Parameter '{key}' is a mass and must be positive, but it is {shown(array.tolist())} kg."
+        )
+    if old.unit == "kg m^2" and shape == (3, 3):
+        check_inertia(array, f"parameter '{key}'", old.tolerance)
+
+
+def _is_other(value: Any, depth: int = 0) -> bool:
+    """Whether something else than numbers is in nested lists: text, truth values, tables."""
+    if isinstance(value, list | tuple):
+        return depth > _DEEPEST or any(_is_other(each, depth + 1) for each in value)
+    return value is None or isinstance(value, bool | str | bytes | Mapping)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .io import FileError, write_atomically
-from .layout import RECORDS, Layout, read_node
+from .layout import RECORDS, Layout, check_inside, read_node
 
 _AGAIN = "To have the chunk computed again, delete {folder} and go on with the study."
 
@@ -53,13 +53,15 @@ def read_records(path: Path, layout: Layout) -> Iterator[tuple[int, Record]]:
         FileError: one is damaged, or does not belong to this store.
     """
     for file in sorted((path / RECORDS).glob("*/zarr.json")):
+        check_inside(path, file.parent)
         attributes = read_node(file.parent)["attributes"]
         samples, sums = attributes.get("samples"), attributes.get("sha256")
         name = file.parent.name
-        chunk = int(name) if name.isdecimal() else -1
+        chunk = int(name) if name.isdecimal() and len(name) < 20 else -1
         fits = (
             0 <= chunk < layout.chunks
             and isinstance(samples, int)
+            and not isinstance(samples, bool)
             and 1 <= samples <= size(layout, chunk)
             and isinstance(sums, dict)
             and set(sums) == set(layout.columns)
@@ -85,14 +87,19 @@ def read_samples(path: Path, layout: Layout, name: str, chunk: int, samples: int
 
     file = chunk_file(path, layout, name, chunk)
     again = _AGAIN.format(folder=path / RECORDS / str(chunk))
-    try:
-        content = file.read_bytes()
-    except FileNotFoundError:
-        raise FileError(
-            f"There is no file {file}, though its chunk was complete. {again}"
-        ) from None
     item = np.dtype(layout.columns[name].dtype).itemsize * int(np.prod(layout.row(name), dtype=int))
     wanted = layout.chunk * item + 4
+    try:
+        if not file.is_file():
+            what = "is no file" if file.exists() else "is missing"
+            raise FileError(
+                f"There is no file {file}, though its chunk was complete: it {what}. {again}"
+            )
+        if file.stat().st_size != wanted:
+            raise FileError(f"{file} has {file.stat().st_size} bytes instead of {wanted}. {again}")
+        content = file.read_bytes()
+    except OSError as error:
+        raise FileError(f"{file} cannot be read: {error.strerror}. {again}") from error
     if len(content) != wanted:
         raise FileError(f"{file} has {len(content)} bytes instead of {wanted}. {again}")
     if google_crc32c.value(content[:-4]) != int.from_bytes(content[-4:], "little"):

@@ -16,9 +16,13 @@ import numpy as np
 import xarray as xr
 
 from ..dynamics.run import Run
-from ..mechanics.errors import ModelError
+from ..mechanics.errors import ModelError, SettingError
 from ..mechanics.internal import internal_names
-from ..vehicle.parameters import Parameters
+from ..mechanics.schema import checked, shown
+from ..vehicle.parameters import ParameterEntry, Parameters
+
+# Bytes of a TOML file.
+MOST_TOML = 4_000_000
 
 FORMAT = "stmuav_jax run"
 FORMAT_VERSION = 1
@@ -105,18 +109,22 @@ def _attributes(run: Run) -> dict[str, Any]:
 def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
     """Write a file so that a reader sees the old content or the new, never a part."""
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(name, 0o644)
+            os.replace(name, target)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        # a disk that is full does not say of which file
+        raise OSError(error.errno, error.strerror, str(target)) from error
     return target
 
 
@@ -168,14 +176,28 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The content of a TOML file.
 
     Raises:
-        FileError: the file is missing or not valid TOML.
+        FileError: the file is missing, no file but a folder or pipe, longer than 4 MB, nested too
+            deeply, or not valid TOML.
     """
+    source = Path(path)
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        if source.exists() and not source.is_file():
+            raise FileError(f"{shown(str(source))} is no file but a folder or a pipe.")
+        if source.stat().st_size > MOST_TOML:
+            raise FileError(
+                f"{source} is larger than {MOST_TOML / 1e6:g} MB; long lists of numbers belong in a "
+                "CSV file, which a factor can name."
+            )
+        return tomllib.loads(source.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise FileError(f"There is no file {path}.") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise FileError(f"{path} is not a readable TOML file: {error}.") from error
+        raise FileError(f"There is no file {shown(str(source))}.") from None
+    except RecursionError:
+        raise FileError(f"{source} is nested too deeply.") from None
+    except FileError:
+        raise
+    # a whole number of more digits than Python reads is a ValueError
+    except (OSError, ValueError) as error:
+        raise FileError(f"{source} is not a readable TOML file: {error}.") from error
 
 
 def load_parameters(path: str | os.PathLike[str] | None, base: Parameters) -> Parameters:
@@ -207,13 +229,14 @@ def _flat(content: Mapping[str, Any], base: Parameters, prefix: str = "") -> dic
     for key, value in content.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping) and "value" in value:
-            extra = set(value) - {"value", "unit"}
-            if extra:
-                raise ModelError(f"'{name}' has unknown entries: {', '.join(sorted(extra))}.")
-            unit = value.get("unit", base[name].unit)
-            if unit != base[name].unit:
-                raise ModelError(f"'{name}' must be given in {base[name].unit}, not in {unit}.")
-            found[name] = value["value"]
+            unit = base[name].unit
+            try:
+                given = checked(ParameterEntry, value, f"'{name}'")
+            except SettingError as error:
+                raise ModelError(str(error)) from None
+            if given.unit not in (None, unit):
+                raise ModelError(f"'{name}' must be given in {unit}, not in {shown(given.unit)}.")
+            found[name] = given.value
         elif isinstance(value, Mapping):
             found |= _flat(value, base, f"{name}.")
         else:

@@ -5,8 +5,11 @@ read here. An array's chunk is the plain numbers in little-endian order and a CR
 nothing compressed and no Python objects; arrays stored in any other way are refused unread.
 """
 
+import contextlib
+import functools
 import importlib.metadata
 import json
+import platform
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,14 +17,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..mechanics.errors import SettingError
+from ..mechanics.schema import named, shown
+from ..montecarlo.schema import MOST, check_count
 from ..montecarlo.work import FINE, MISSING, AbstractWork, Axis, Column
-from .io import FileError
+from .io import FileError, write_atomically
 from .io import versions as _versions
 
 FORMAT = "stmuav_jax study"
 FORMAT_VERSION = 1
 SAMPLE = "sample"
 RECORDS = "records"
+
+# Bytes of a zarr.json; a table of 10^5 drawn numbers is part of the root's.
+_LONGEST_NODE = 100_000_000
 
 _TYPES = {f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
 _TYPES |= {"float32", "float64", "complex64", "complex128", "bool"}
@@ -65,7 +73,24 @@ class Layout(NamedTuple):
 def computing_versions() -> dict[str, str]:
     """Versions that numbers may depend on: the package, its numerical libraries, the device."""
     found = _versions() | {"scipy": importlib.metadata.version("scipy")}
+    found["processor"] = processor()
     return {name: version for name, version in found.items() if name not in ("python", "xarray")}
+
+
+@functools.cache
+def processor() -> str:
+    """Architecture of the processor and its instructions for vectors.
+
+    Compilers choose instructions by them, and with these the last digits of a number.
+    """
+    flags: set[str] = set()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.partition(":")[0].strip() in ("flags", "Features"):
+                flags = set(line.partition(":")[2].split())
+                break
+    vector = ("avx", "avx2", "fma", "avx512f", "avx512dq", "avx512vl", "asimd", "sve", "sve2")
+    return " ".join([platform.machine() or "unknown", *(x for x in vector if x in flags)])
 
 
 def layout_of(
@@ -77,8 +102,7 @@ def layout_of(
         SettingError: numbers of samples below 1, or columns that a store cannot hold.
     """
     for what, count in (("A study's samples", total), ("A chunk's samples", chunk)):
-        if count < 1:
-            raise SettingError(f"{what} must be 1 or more, not {count}.")
+        check_count(count, what)
     _check_columns(work.columns, work.axes)
     try:
         identity = json.loads(json.dumps(dict(work.identity)))
@@ -183,9 +207,17 @@ def read_node(folder: Path) -> dict[str, Any]:
     """
     file = folder / "zarr.json"
     try:
+        if file.exists() and not file.is_file():
+            raise FileError(f"{file} is no file; the store was altered.")
+        if file.stat().st_size > _LONGEST_NODE:
+            raise FileError(f"{file} is longer than the description of any study.")
         found = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise FileError(f"There is no file {file}.") from None
+    except FileError:
+        raise
+    except RecursionError:
+        raise FileError(f"{file} is nested too deeply; it was altered.") from None
     except (OSError, ValueError) as error:
         raise FileError(f"{file} is truncated, damaged or of another kind: {error}.") from None
     if not isinstance(found, dict) or not isinstance(found.get("attributes"), dict):
@@ -200,7 +232,9 @@ def read_layout(path: Path) -> tuple[Layout, dict[str, int]]:
         FileError: no store of a study, one of another format, or damaged descriptions.
     """
     if not (path / "zarr.json").is_file():
-        what = "holds no store of a study" if path.is_dir() else "does not exist"
+        what = "holds no store of a study" if path.is_dir() else (
+            "is no folder, as a study's store is" if path.exists() else "does not exist"
+        )  # fmt: skip
         raise FileError(f"{path} {what}.")
     head = read_node(path)["attributes"]
     if head.get("format") != FORMAT:
@@ -210,38 +244,79 @@ def read_layout(path: Path) -> tuple[Layout, dict[str, int]]:
             f"{path} has format version {head.get('format_version')}; this package reads version "
             f"{FORMAT_VERSION}."
         )
+    check_inside(path, path / RECORDS)
     read_node(path / RECORDS)
     try:
-        total, chunk = int(head["total"]), int(head["chunk"])
+        total, chunk = (_whole(path, head, name) for name in ("total", "chunk"))
         texts = {key: json.loads(head[key]) for key in ("identity", "versions", "reasons")}
         reasons = {int(code): str(words) for code, words in texts["reasons"].items()}
         # all descriptions are looked at before a number is read
         nodes = {str(n): _plain_array(path, str(n)) for n in (*head["axes"], *head["columns"])}
         axes = {name: _read_axis(path, name, nodes[name]) for name in head["axes"]}
         found = {n: _read_column(path, n, nodes[n], chunk, axes) for n in head["columns"]}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (
+        KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, RecursionError
+    ) as error:  # fmt: skip
         if isinstance(error, FileError):
             raise
-        raise FileError(f"{path / 'zarr.json'} is damaged: {error!r}.") from None
+        why = shown(repr(error))
+        raise FileError(f"{path / 'zarr.json'} is damaged: {why}.") from None
     columns = {name: column for name, (column, _) in found.items()}
     layout = Layout(total, chunk, texts["identity"], texts["versions"], columns, axes, reasons)
     return layout, {name: length for name, (_, length) in found.items()}
 
 
+def _whole(path: Path, head: Mapping[str, Any], name: str) -> int:
+    """A number of samples of the root's attributes."""
+    value = head[name]
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST:
+        raise FileError(
+            f"{path / 'zarr.json'} is damaged: '{name}' must be a whole number from 1 to {MOST:,}, but "
+            f"it is {shown(value)}."
+        )
+    return value
+
+
+def check_inside(path: Path, folder: Path) -> None:
+    """Refuse a link within a store, which would have files outside of it read and written.
+
+    Raises:
+        FileError: the folder is a link.
+    """
+    if folder.is_symlink():
+        raise FileError(f"{folder} is a link; all of a store lies within {path}. It was altered.")
+
+
+def lengthen(folder: Path, total: int) -> None:
+    """Have an array's description say that it has more samples; chunks are not touched."""
+    node = read_node(folder)
+    if node["shape"][0] >= total:
+        return
+    node["shape"][0] = total
+    write_atomically(folder / "zarr.json", json.dumps(node, indent=2).encode())
+
+
 def _plain_array(path: Path, name: str) -> dict[str, Any]:
     """An array's description, if its chunks are plain numbers."""
     if not name.isidentifier():
-        raise FileError(f"{path / 'zarr.json'} is damaged: '{name}' names no array of a study.")
+        raise FileError(
+            f"{path / 'zarr.json'} is damaged: {named(name)} names no array of a study."
+        )
+    check_inside(path, path / name)
+    check_inside(path, path / name / "c")
     node = read_node(path / name)
     codecs = node.get("codecs")
     simple = (
         isinstance(codecs, list)
         and [codec.get("name") for codec in codecs] == ["bytes", "crc32c"]
         and codecs[0].get("configuration", {}).get("endian", "little") == "little"
+        and isinstance(node.get("shape"), list)
+        and all(type(n) is int and 0 <= n <= MOST for n in node["shape"])
     )
     if str(node.get("data_type")) not in _TYPES or not simple:
         raise FileError(
-            f"{path / name / 'zarr.json'} describes {node.get('data_type')} stored by {codecs}, "
+            f"{path / name / 'zarr.json'} describes {shown(node.get('data_type'))} of shape "
+            f"{shown(node.get('shape'))} stored by {shown(codecs)}, "
             "which no store of a study holds; it was altered, and nothing of it was read."
         )
     return node
@@ -262,10 +337,16 @@ def _read_column(
 def _read_axis(path: Path, name: str, node: Mapping[str, Any]) -> Axis:
     import zarr
 
-    file = path / name / "c" / "0"
+    file, shape = path / name / "c" / "0", node["shape"]
     if not file.is_file():
         # zarr would take it for a chunk without numbers
         raise FileError(f"There is no file {file}; the store was altered.")
+    item = np.dtype(node["data_type"]).itemsize
+    # one chunk holds all of it, so that a shape that was altered is seen before anything is read
+    if len(shape) != 1 or node["chunk_grid"]["configuration"]["chunk_shape"] != shape or (
+        file.stat().st_size != shape[0] * item + 4
+    ):  # fmt: skip
+        raise FileError(f"{path / name / 'zarr.json'} does not fit {file}; the store was altered.")
     try:
         values = np.asarray(zarr.open_array(str(path / name), mode="r")[:])
     except (OSError, ValueError) as error:

@@ -8,10 +8,13 @@ chunks were computed.
 
 import contextlib
 import errno
+import glob
 import hashlib
 import os
 import shutil
-from collections.abc import Iterable, Mapping
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,6 +23,7 @@ import numpy as np
 import xarray as xr
 
 from ..mechanics.errors import SettingError, nearest_names
+from ..montecarlo.schema import check_count
 from ..montecarlo.work import AbstractWork
 from .chunks import (
     Record,
@@ -33,7 +37,18 @@ from .chunks import (
     write_record,
 )
 from .io import FileError
-from .layout import SAMPLE, Layout, differences, layout_of, read_layout, write_layout
+from .layout import (
+    SAMPLE,
+    Layout,
+    differences,
+    layout_of,
+    lengthen,
+    read_layout,
+    write_layout,
+)
+
+# Seconds after which an unfinished store that nobody touches was left by a run that was killed.
+_STALE = 3600.0
 
 
 class Store:
@@ -81,8 +96,12 @@ class Store:
 
     @property
     def pending(self) -> tuple[int, ...]:
-        """Chunks of which samples are missing."""
-        return tuple(chunk for chunk in range(self.layout.chunks) if self.todo(chunk)[1])
+        """Chunks of which samples are missing; `waiting` gives them one by one."""
+        return tuple(self.waiting())
+
+    def waiting(self) -> Iterator[int]:
+        """Chunks of which samples are missing, one by one: a study may have very many."""
+        return (chunk for chunk in range(self.layout.chunks) if self.todo(chunk)[1])
 
     def todo(self, chunk: int) -> tuple[int, int]:
         """The first of a chunk's samples that are missing, and how many they are."""
@@ -156,11 +175,15 @@ class Store:
         return self._arrays[name]
 
     def _failed(self, error: OSError) -> FileError:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        why = "The disk is full" if full else f"The disk fails ({error})"
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            why, what = "The disk is full", "Make room"
+        elif error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+            why, what = f"The store may not be written ({error})", "Have it made writable"
+        else:
+            why, what = f"The disk fails ({error})", "Repair it"
         return FileError(
             f"{why}: {self.path} keeps {self.finished} of {self.total} samples. "
-            f"{'Make room' if full else 'Repair it'} and go on with the study where it stands."
+            f"{what} and go on with the study where it stands."
         )
 
     def extend(self, total: int) -> None:
@@ -172,6 +195,7 @@ class Store:
         """
         import zarr
 
+        check_count(total, "A study's samples")
         if total < self.total:
             raise SettingError(
                 f"{self.path} has {self.total} samples; a study can grow, not shrink to {total}."
@@ -182,9 +206,8 @@ class Store:
             # first what is meant, so that a run that goes on with this one completes it
             zarr.open_group(str(self.path), mode="r+").attrs["total"] = total
             for name in self.layout.columns:
-                array = self._array(name)
-                if array.shape[0] < total:
-                    array.resize((total, *array.shape[1:]))
+                lengthen(self.path / name, total)
+            self._arrays.clear()
         except OSError as error:
             raise self._failed(error) from error
         self.layout = self.layout._replace(total=total)
@@ -226,6 +249,8 @@ class Store:
         gapless = not numbers.size or numbers[-1] + 1 == numbers.size
         # a slice reads whole chunks; so long as all from the first are there it says the same
         kept = whole.isel({SAMPLE: slice(0, numbers.size) if gapless else numbers})
+        # in the study's order, not in that of the folder
+        kept = kept[[name for name in self.layout.columns if name in chosen]]
         words = {"long_name": "number of the sample", "units": "1"}
         return kept.assign_coords({SAMPLE: (SAMPLE, numbers, words)}).assign_attrs(
             total=self.total, finished=int(numbers.size)
@@ -259,18 +284,40 @@ def create(
     layout = layout_of(work, total, chunk, versions)
     if target.exists() and not (target.is_dir() and not any(target.iterdir())):
         raise FileError(f"{target} exists; go on with it (resume), or give another name.")
-    partial = target.parent / f".{target.name}.partial"
+    # a name of its own: of processes that make one store at the same time, one puts its in place
+    partial = target.parent / f".{target.name}.{uuid.uuid4().hex}.partial"
     try:
-        shutil.rmtree(partial, ignore_errors=True)
         target.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(target)
         write_layout(partial, layout)
-        os.replace(partial, target)
+        _put(partial, target)
     except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
         if isinstance(error, OSError):
             raise FileError(f"{target} cannot be made: {error}.") from error
         raise
     return resume_store(target, work, versions)
+
+
+def _put(partial: Path, target: Path) -> None:
+    """Give a new store its name, unless there is one of that name by now."""
+    try:
+        os.rename(partial, target)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+        raise FileError(
+            f"{target} exists: another run has made it just now; go on with it (resume) when that has "
+            "ended, or give another name."
+        ) from None
+
+
+def _sweep(target: Path) -> None:
+    """Remove what runs that were killed as they made the store have left, long ago."""
+    for left in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
+        with contextlib.suppress(OSError):
+            if time.time() - left.stat().st_mtime > _STALE:
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def open_store(path: str | os.PathLike[str]) -> Store:

@@ -1,6 +1,7 @@
 """What a study says: outcomes, statistics of every quantity, and which inputs decide."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,6 +59,18 @@ class Finding(NamedTuple):
     influence: Influence
 
 
+class Failing(NamedTuple):
+    """The event that the study declares a failure.
+
+    Attributes:
+        words: what happens. probability: among the `samples` that were completed.
+    """
+
+    words: str
+    probability: Estimate
+    samples: int
+
+
 class Analysis(NamedTuple):
     """All of a study.
 
@@ -67,6 +80,7 @@ class Analysis(NamedTuple):
         findings: of quantities, in their order.
         failing: how differently each varying input is distributed in failed samples (d,), or None.
         notes: what to know of all numbers.
+        failure: the event that the study declares, where it does.
     """
 
     total: int
@@ -77,6 +91,7 @@ class Analysis(NamedTuple):
     findings: tuple[Finding, ...]
     failing: np.ndarray | None
     notes: tuple[str, ...]
+    failure: Failing | None = None
 
 
 def analyse(data: StudyData, level: float = LEVEL) -> Analysis:
@@ -93,7 +108,37 @@ def analyse(data: StudyData, level: float = LEVEL) -> Analysis:
     names = data.factors if data.design == "saltelli" else tuple(one.key for one in varying)
     findings = tuple(_finding(data, one, names, table, level) for one in data.quantities)
     failing, notes = _failing(data, picked), _notes(data)
-    return Analysis(len(data.status), found, level, inputs, varying, findings, failing, notes)
+    failure = _failure(data, level)
+    return Analysis(
+        len(data.status), found, level, inputs, varying, findings, failing, notes, failure
+    )
+
+
+def _failure(data: StudyData, level: float) -> Failing | None:
+    """The declared event among the completed samples; a value that is not a number is no event."""
+    given = data.identity.get("failure")
+    found = {one.key: one for one in data.quantities}
+    if not isinstance(given, Mapping) or given.get("quantity") not in found:
+        return None
+    one = found[given["quantity"]]
+    values, limits = data.values(one), {k: given[k] for k in ("above", "below") if k in given}
+    # a crossing that never happens is at an infinite time
+    happened = np.zeros(len(values), bool) if limits else np.isfinite(values)
+    unit = "" if one.unit in ("", "1") else f" {one.unit}"
+    said = []
+    if "above" in limits:
+        happened |= values > limits["above"]
+        said.append(f"above {limits['above']:g}{unit}")
+    if "below" in limits:
+        happened |= values < limits["below"]
+        said.append(f"below {limits['below']:g}{unit}")
+    if said:
+        words = f"{one.words} {' or '.join(said)}"
+    else:
+        words = one.words.removeprefix("time at which ")
+    if not len(values):
+        return None
+    return Failing(words, probability(int(np.sum(happened)), len(values), level), len(values))
 
 
 def is_event(one: Quantity, values: np.ndarray) -> bool:
@@ -183,14 +228,18 @@ def plain(analysis: Analysis) -> dict[str, Any]:
     return {
         "level": analysis.level,
         "samples": {
-            "total": analysis.total, "not_computed": o.missing, "fine": o.fine, "failed": o.failed,
-            "failure_probability": _estimate(o.failure),
+            "total": analysis.total, "not_computed": o.missing, "completed": o.fine,
+            "not_completed": o.failed, "share_not_completed": _estimate(o.failure),
             "reasons": {
                 str(code): {
                     "words": words, "count": o.codes.get(code, 0), "probability": _estimate(share)
                 }
                 for code, (words, share) in o.reasons.items()
             },
+        },
+        "failure": None if analysis.failure is None else {
+            "words": analysis.failure.words, "samples": analysis.failure.samples,
+            "probability": _estimate(analysis.failure.probability),
         },
         "inputs": {key: _summary(one) for key, one in analysis.inputs.items()},
         "quantities": {

@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 
 from ..montecarlo.statistics import independent
+from ..montecarlo.study import column_name
 from ..montecarlo.work import FINE, MISSING
 from .io import FileError
 
@@ -93,9 +94,10 @@ class StudyData:
 
     @property
     def factors(self) -> tuple[str, ...]:
-        """Names of the sampling's factors, in its order."""
+        """Columns of the sampling's factors, in its order."""
         given = self.sampling.get("factors", ())
-        return tuple(given) if isinstance(given, Mapping) else tuple(one["name"] for one in given)
+        names = given if isinstance(given, Mapping) else (one["name"] for one in given)
+        return tuple(column_name(str(name)) for name in names)
 
     @property
     def title(self) -> str:
@@ -187,7 +189,7 @@ def study_data(dataset: xr.Dataset) -> StudyData:
     codes = np.asarray(dataset[status[0]].values)
     found = (tuple(quantities), tuple(curves), tuple(notes))
     data = StudyData(dataset, codes, identity, reasons, tuple(inputs), *found)
-    # a store may have sorted its columns
+    # a folder may have sorted its columns
     place = {name: k for k, name in enumerate(data.factors)}
     inputs.sort(key=lambda one: place.get(one.key, len(place)))
     return dataclasses.replace(data, inputs=tuple(inputs))

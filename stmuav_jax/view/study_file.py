@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..mechanics.errors import SettingError, nearest_names
+from ..mechanics.schema import SHOWN, named, shown
 from .io import FileError, read_toml
 
 
@@ -39,6 +40,9 @@ def _filled(given: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     extra = set(given) - {"file", "column", "relative"}
     if extra or "column" not in given:
         raise SettingError("A factor from a file has a file and a column, and nothing else.")
+    for name in ("file", "column"):
+        if not isinstance(given[name], str) or "\0" in given[name]:
+            raise SettingError(f"A factor's '{name}' must be text, but it is {shown(given[name])}.")
     values = column(folder / given["file"], given["column"])
     more = {"relative": given["relative"]} if "relative" in given else {}
     return {"distribution": "empirical", "values": values} | more
@@ -52,6 +56,8 @@ def column(path: str | os.PathLike[str], name: str) -> list[float]:
             that is not a finite number.
     """
     source = Path(path)
+    if source.exists() and not source.is_file():
+        raise FileError(f"{source} is no file but a folder or a pipe.")
     try:
         with source.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
@@ -63,13 +69,14 @@ def column(path: str | os.PathLike[str], name: str) -> list[float]:
         raise FileError(f"{source} has no rows below its header.")
     if name not in rows[0]:
         known = [key for key in rows[0] if key]
-        raise SettingError(f"{source} has no column '{name}'.{nearest_names(name, known)}")
+        near = nearest_names(name[:SHOWN], [key[:SHOWN] for key in known])
+        raise SettingError(f"{source} has no column {named(name)}.{near}")
     values = []
     for line, row in enumerate(rows, start=2):
         try:
-            values.append(float(row[name]))
+            values.append(float(row[name] or ""))
         except (TypeError, ValueError):
             raise SettingError(
-                f"{source}, line {line}: '{row[name]}' in column '{name}' is not a number."
+                f"{source}, line {line}: {shown(row[name])} in column '{name}' is not a number."
             ) from None
     return values

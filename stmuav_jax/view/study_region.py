@@ -38,7 +38,9 @@ _SHADES = LinearSegmentedColormap.from_list("shades", ["#FFFFFF", "#F3B383", ORA
 def failures(data: StudyData, analysis: Analysis) -> Figure | None:
     """Where samples fail, over the two inputs in which failed samples differ most from the others."""
     failed = ~np.isin(data.computed[:ROWS], data.fine)
-    return _region(data, analysis, failed, ("failed", "samples that fail"), "computed")
+    return _region(
+        data, analysis, failed, ("did not complete", "runs that did not complete"), "computed"
+    )
 
 
 def event(data: StudyData, analysis: Analysis, one: Quantity) -> Figure | None:
@@ -153,7 +155,7 @@ def settling(data: StudyData, analysis: Analysis) -> Figure | None:
     figure, axes = panels(len(shown) + 1, 1.9)
     failed = ~np.isin(data.computed, data.fine)
     _settle(axes[0], failed, "probability", analysis.level)
-    axes[0].set_ylabel("probability of failure", fontsize=9)
+    axes[0].set_ylabel("share that did not complete", fontsize=9)
     for one, ax in zip(shown, axes[1:], strict=True):
         values = data.values(one.quantity)
         values = values[~np.isnan(values)]
@@ -225,7 +227,9 @@ def _sobol_bars(ax: Axes, one: Finding, names: list[str]) -> None:
         ends = np.maximum([value - part.low[picked], part.high[picked] - value], 0.0)
         ax.barh(np.arange(len(names)) + shift, value, 0.38, xerr=ends, color=colour, label=words,
                 error_kw={"elinewidth": 0.8, "capsize": 1.5})  # fmt: skip
-    ax.set_xlim(left=min(1.1 * float(np.min(found.first.low[picked])), -0.02))
+    # estimates of shares may lie below zero, and their intervals further
+    least = min(float(np.min(part.low[picked])) for part, *_ in looks)
+    ax.set_xlim(left=min(1.1 * least, -0.02))
     ax.set_xlabel("share of the variance", fontsize=8)
 
 
@@ -254,5 +258,6 @@ def _share_bars(ax: Axes, one: Finding, names: list[str]) -> None:
                 color="0.25",
             )
         ax.set_title("rank correlation", loc="right", fontsize=6.5, color="0.25")
-    ax.set_xlim(min(0.0, float(np.min(value))), 1.23 * widest)
+    # an estimate of a share may lie below zero
+    ax.set_xlim(min(0.0, 1.1 * float(np.min(value))), 1.23 * widest)
     ax.set_xlabel("share of the variance", fontsize=8)

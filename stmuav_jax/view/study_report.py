@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from ..mechanics.errors import SettingError, nearest_names
 from ..montecarlo.sensitivity import Shares
 from ..montecarlo.statistics import LEVEL, Estimate, Summary
+from ..montecarlo.study import column_name
 from . import study_plot, study_region
 from .io import write_atomically
 from .study_analysis import Analysis, Finding, analyse, number, plain
@@ -28,7 +29,7 @@ FORMAT, FORMAT_VERSION = "stmuav_jax study summary", 1
 FIGURES: Mapping[str, tuple[Callable[[StudyData, Analysis], Figure | None], str]] = {
     "quantities": (study_plot.quantities, "How the quantities are distributed"),
     "fans": (study_plot.fans, "Curves: quantiles at each place, and some single samples"),
-    "failures": (study_region.failures, "Where samples fail"),
+    "failures": (study_region.failures, "Where runs did not complete"),
     "sensitivities": (study_region.sensitivities, "Which inputs decide"),
     "scatter": (study_plot.scatter, "Quantities against the inputs that decide most"),
     "settling": (study_region.settling, "How estimates settle with the number of samples"),
@@ -76,6 +77,7 @@ def write_report(
     *,
     level: float = LEVEL,
     dpi: int = 160,
+    analysis: Analysis | None = None,
 ) -> list[Path]:
     """Write `report.html`, `summary.json` and the figures in `figures/`; their paths.
 
@@ -85,6 +87,7 @@ def write_report(
     Args:
         dataset: a study, as `study_data` describes it.
         format: of the figures: png, svg or pdf. level: of all confidence intervals.
+        analysis: of the dataset, where it has been made already.
 
     Raises:
         FileError: the dataset is not a study. SettingError: another format or an impossible level.
@@ -92,7 +95,7 @@ def write_report(
     if format not in _TYPES:
         raise SettingError(f"Figures cannot be '{format}'.{nearest_names(format, _TYPES)}")
     data = study_data(dataset)
-    analysis = analyse(data, level)
+    analysis = analyse(data, level) if analysis is None else analysis
     place, paths, shown = Path(folder), [], []
     for name, words, figure in _figures(data, analysis):
         buffer = io.BytesIO()
@@ -173,17 +176,22 @@ def _lead(analysis: Analysis) -> str:
     words = "1 sample" if analysis.total == 1 else f"{analysis.total:,} samples"
     if used < analysis.total:
         words += f", of which {used:,} are independent of each other"
-    words += f": {o.fine:,} fine, {o.failed:,} failed, {o.missing:,} not computed. "
-    if o.failure:
-        words += f"Probability of failure: {_percent(o.failure)}. "
+    words += f": {o.fine:,} completed, {o.failed:,} did not complete, {o.missing:,} not computed. "
+    if o.failure and o.failed:
+        words += f"Share of runs that did not complete: {_percent(o.failure)}. "
+    if analysis.failure:
+        event, probability = _text(analysis.failure.words), _percent(analysis.failure.probability)
+        words += f"Probability of failure among those completed ({event}): {probability}. "
     return words + f"All intervals hold with {100 * analysis.level:g} %, each by itself."
 
 
 def _outcomes(analysis: Analysis) -> str:
     o = analysis.outcomes
-    rows = [["fine", f"{o.fine:,}", "", ""]]
+    rows = [["completed", f"{o.fine:,}", "", ""]]
     for code, (words, share) in o.reasons.items():
-        rows.append([f"failed: {words}", f"{o.codes.get(code, 0):,}", _percent(share), f"{code}"])
+        rows.append(
+            [f"did not complete: {words}", f"{o.codes.get(code, 0):,}", _percent(share), f"{code}"]
+        )
     rows.append(["not computed", f"{o.missing:,}", "", ""])
     head = ["", "samples", "probability among the computed", "code"]
     return _table(head, [[_text(row[0]), *row[1:]] for row in rows])
@@ -198,7 +206,7 @@ def _quantities(analysis: Analysis) -> str:
         words = _text(label(one.quantity.words, one.quantity.unit))
         rows.append([words + _remarks(one.summary), *_statistics(one.summary)])
     head = ["", "values", "mean", "deviation", "5 %", "median", "95 %", "least", "most"]
-    return "<h2>Quantities, over the fine samples</h2>" + _table(head, rows)
+    return "<h2>Quantities, over the completed samples</h2>" + _table(head, rows)
 
 
 def _statistics(one: Summary) -> list[str]:
@@ -224,8 +232,8 @@ def _events(analysis: Analysis) -> str:
     ]
     if not rows:
         return ""
-    head = ["", "fine samples", "probability"]
-    return "<h2>Events, among the fine samples</h2>" + _table(head, rows)
+    head = ["", "completed samples", "probability"]
+    return "<h2>Events, among the completed samples</h2>" + _table(head, rows)
 
 
 def _decide(data: StudyData, analysis: Analysis) -> str:
@@ -273,7 +281,7 @@ def _sampling(data: StudyData, analysis: Analysis) -> str:
     plans = given.get("factors", [])
     if isinstance(plans, Mapping):
         plans = [{"name": name} | dict(one) for name, one in plans.items()]
-    laws = {str(one["name"]): _law(one) for one in plans}
+    laws = {column_name(str(one["name"])): _law(one) for one in plans}
     for one in data.inputs:
         summary = analysis.inputs[one.key]
         known = [_estimate(summary.mean), _estimate(summary.deviation)]

@@ -22,6 +22,9 @@ design = "sobol"
 tilt = {signal = "tilt", take = "largest"}
 over = {signal = "tilt", take = "when_above", level = 0.4}
 height = {signal = "z", take = "path"}
+[failure]
+quantity = "over"
+below = 0.25
 """
 
 
@@ -34,9 +37,12 @@ def study(tmp_path):
 
 
 def test_fly_report_extend(study, tmp_path, capsys):
-    out = tmp_path / "out"
+    # no path is taken for markup or a picture
+    out = tmp_path / "out[/b][v2] :x:"
     given = ["montecarlo", str(study), "--out", str(out), "--no-cache", "--devices", "1"]
     assert main(given) == 0
+    said = capsys.readouterr().out
+    assert str(out) in "".join(said.split("\n")).replace("  ", " ")
     store = xr.open_zarr(out / "study.zarr", consolidated=False).load()
     assert store.sizes["sample"] == 40
     assert np.all(store.status == 1)
@@ -44,18 +50,62 @@ def test_fly_report_extend(study, tmp_path, capsys):
     assert store.height.attrs["units"] == "m"
     page = (out / "report.html").read_text()
     assert "turning" in page
-    assert json.loads((out / "summary.json").read_text())
+    summary = json.loads((out / "summary.json").read_text())
+    share = np.mean(store.over.values < 0.25)
+    assert 0 < share < 1
+    found = summary["failure"]
+    assert found["probability"]["value"] == pytest.approx(share, abs=1e-15)
+    assert found["words"] == "time at which base, tilt exceeds 0.4 rad below 0.25 s"
+    assert "Probability of failure (time at which base, tilt exceeds 0.4 rad below 0.25 s)" in (
+        " ".join(said.split())
+    )
+    assert "base, tilt, largest [rad]" in said
+    assert list(summary["inputs"]) == ["start_p", "bare_mass", "start_q"]
+    # another number of cores goes on with it, and ends with the same numbers
     # a finished store is not overwritten, but can be extended; what is there stays
     assert main(given) == 2
     assert "resume" in capsys.readouterr().err
-    assert main([*given, "--resume", "--samples", "48", "--figures", "none"]) == 0
+    two = [*given[:-1], "3"]
+    assert main([*two, "--resume", "--samples", "48", "--figures", "none"]) == 0
     longer = xr.open_zarr(out / "study.zarr", consolidated=False).load()
     assert longer.sizes["sample"] == 48
     assert np.array_equal(longer.tilt[:40], store.tilt)
     assert main([*given, "--resume", "--samples", "48", "--seed", "3"]) == 2
     assert "seed" in capsys.readouterr().err
+    assert main([*given, "--resume", "--samples", "48", "--lanes", "8"]) == 2
+    assert "lanes is 16 there and 8 here" in " ".join(capsys.readouterr().err.split())
     assert main(["report", str(out / "study.zarr"), "--out", str(tmp_path / "again")]) == 0
     assert (tmp_path / "again" / "report.html").is_file()
+    # a store that lacks numbers is not reported on
+    (out / "study.zarr" / "tilt" / "c" / "0").unlink()
+    assert main(["report", str(out / "study.zarr"), "--out", str(tmp_path / "third")]) == 2
+    assert "tilt/c/0" in "".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "third").exists()
+
+
+@pytest.mark.parametrize("name", ["--samples", "--chunk", "--devices", "--lanes", "--workers"])
+@pytest.mark.parametrize("value", ["0", "-1", "9" * 30])
+def test_counts_are_not_defaults(study, tmp_path, name, value, capsys):
+    out = tmp_path / "out"
+    assert main(["montecarlo", str(study), "--out", str(out), name, value]) == 2
+    assert name.strip("-") in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_errors_name_the_file(study, tmp_path, capsys):
+    study.write_text(STUDY.replace('design = "sobol"', 'design = "sobl"'))
+    assert main(["montecarlo", str(study), "--out", str(tmp_path / "x")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "turning.toml: 'design' must be" in said
+    assert "Did you mean 'sobol'" in said
+
+
+def test_a_name_is_no_path(study, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    study.write_text('name = "../../EVIL"\n' + STUDY)
+    assert main(["montecarlo", str(study)]) == 2
+    assert "'name' must" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(

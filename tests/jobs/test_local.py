@@ -43,7 +43,9 @@ def test_a_run(tmp_path, whole):
     assert [now.done for now in seen] == [0, 150, 300, 450, 600, 750, 900, 1000]
     assert seen[0].rate == 0
     assert seen[0].remaining == np.inf
-    assert all(now.rate > 0 for now in seen[1:])
+    # nor by the first chunk, on the way to which code is compiled
+    assert seen[1].rate == 0
+    assert all(now.rate > 0 for now in seen[2:])
     assert seen[-1].remaining == 0
     found = open_store(path).load()
     for name, values in WORK.run(0, 1000).items():
@@ -247,8 +249,8 @@ def test_standings_in_words(monkeypatch):
     clock = iter([0.0, 10.0, 12.0, 14.0, 14.5])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     meter = Meter(100, 1000)
-    # the first chunk's compilation counts until there are others to go by
-    assert meter(200)[:4] == (200, 1000, 10.0, 80.0)
+    # the first chunk's compilation is no part of the rate
+    assert meter(200)[:4] == (200, 1000, 0.0, np.inf)
     assert meter(300).rate == 50.0
     assert meter(400).words() == "400 of 1000 samples, 50/s, 12.0 s to go"
     assert meter(400, "memory is short") == Standing(400, 1000, 50.0, 12.0, "memory is short")
@@ -293,6 +295,43 @@ outcome = run_study(
 )
 print(outcome.words())
 """
+
+
+DEAF = """
+import sys
+sys.path.insert(0, {tests!r})
+from jobs.toy import Toy
+from stmuav_jax.jobs.local import run_study
+class Deaf(Toy):
+    def run(self, first, count):
+        if first == 20:
+            # as in a callback of a library: the first exception is printed and forgotten
+            print("deaf", flush=True)
+            try:
+                import time
+                time.sleep(30)
+            except KeyboardInterrupt:
+                print("lost", flush=True)
+        return Toy.run(self, first, count)
+outcome = run_study(Deaf(seed=7, pause=0.1), {path!r}, 1000, chunk=10)
+print(outcome.words())
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_cannot_get_lost(tmp_path, number):
+    path = tmp_path / "study.zarr"
+    code = DEAF.format(tests=str(HERE.parent), path=str(path))
+    command = [sys.executable, "-W", "error", "-c", code]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == "deaf"
+        process.send_signal(number)
+        rest = process.stdout.read().splitlines()
+    assert process.returncode == 0
+    assert rest[0] == "lost"
+    assert rest[-1].startswith(f"Interrupted: {path} keeps ")
+    assert 20 <= open_store(path).finished < 100
 
 
 def test_ctrl_c(tmp_path):

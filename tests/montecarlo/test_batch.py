@@ -1,5 +1,6 @@
 """Flights through lanes: against flights one by one, whatever the block, lane and device."""
 
+import itertools
 import pickle
 
 import diffrax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from stmuav_jax import Method, SettingError, integrate, rotation_matrix
-from stmuav_jax.montecarlo.batch import FlightWork
+from stmuav_jax.montecarlo.batch import FlightWork, _parts
 from stmuav_jax.montecarlo.flights import Drawn
 from stmuav_jax.montecarlo.precision import precision_error
 from stmuav_jax.montecarlo.study import study_from_plain
@@ -89,6 +90,68 @@ def test_any_range_gives_the_same_numbers(turning):
             assert np.all(same | both), name
 
 
+@pytest.mark.parametrize("devices", [2, 5])
+def test_any_number_of_devices_gives_the_same_numbers(turning, devices):
+    """Threads share one program: it is that of one device, and not compiled again."""
+    work, whole = turning
+    shared = FlightWork(work.study, block=work._block, lanes=work.lanes, devices=devices)
+    shared.__dict__["_compiled"] = work._compiled
+    assert len(shared._places) == devices
+    found = shared.run(0, 32)
+    for name, values in whole.items():
+        assert np.array_equal(found[name], values, equal_nan=True), name
+    assert shared.identity == work.identity
+    assert len(work._compiled) == 1
+
+
+def test_parts_keep_devices_busy_and_lanes_full():
+    for count, block, lanes, devices in itertools.product(
+        (1, 15, 16, 400, 5000), (16, 512), (8, 16), (1, 3)
+    ):
+        parts = list(_parts(count, block, lanes, devices))
+        assert [start for start, _ in parts] == [0, *(stop for _, stop in parts[:-1])]
+        assert parts[-1][1] == count
+        assert all(1 <= stop - start <= block for start, stop in parts)
+    assert len(list(_parts(400, 512, 16, 2))) == 2
+    assert len(list(_parts(16, 512, 16, 2))) == 1
+
+
+def test_lanes_are_part_of_the_study_and_devices_are_not():
+    study = study_from_plain(TURNING)
+    works = [FlightWork(study, lanes=16, devices=k) for k in (None, 1, 2)]
+    assert all(work.identity == works[0].identity for work in works)
+    assert FlightWork(study).identity == works[0].identity
+    assert FlightWork(study, lanes=8).identity["lanes"] == 8
+    with pytest.raises(SettingError, match="multiple of 8, but it is 7"):
+        FlightWork(study, lanes=7)
+    with pytest.raises(SettingError, match="There are 1024 devices"):
+        FlightWork(study, devices=10**9)
+    for name in ("lanes", "block", "devices"):
+        with pytest.raises(SettingError, match=f"{name} must be at least 1, but it is 0"):
+            FlightWork(study, **{name: 0})
+
+
+def test_bodies_that_cannot_be_are_named_and_cost_nothing():
+    """Masses and tensors of samples, by the checks that a body alone would get."""
+    shares = {"distribution": "choice", "values": [-1.0, 0.0, 1.0, 1e300], "relative": True}
+    tensor = {"distribution": "choice", "values": [-1.0, 1.0, 5.0], "relative": True}
+    factors = {"bare.mass": shares, "bare.inertia[0, 0]": tensor}
+    work = FlightWork(study_from_plain(TURNING | {"factors": factors}), block=32, lanes=8)
+    found = work.run(0, 32)
+    mass, moment = found["bare_mass"], found["bare_inertia_0_0"]
+    wrong = (mass <= 0) | (moment != 1)
+    assert np.all((found["status"] == 5) == wrong)
+    assert np.all(found["status"][~wrong & (mass == 1)] == FINE)
+    heavy = ~wrong & (mass == 1e300)
+    assert heavy.any()
+    assert np.all(found["status"][heavy] == 6)
+    assert "not positive" in work.reasons[5]
+    assert "not finite" in work.reasons[6]
+    # no more steps are tried than it takes to see it
+    assert np.all(found["rejected"][wrong | heavy] < 30)
+    assert np.all(np.isnan(found["tilt"][wrong | heavy]))
+
+
 def test_a_pickle_is_small_and_gives_the_same(turning):
     work, whole = turning
     content = pickle.dumps(work)
@@ -100,8 +163,8 @@ def test_a_pickle_is_small_and_gives_the_same(turning):
 
 def test_fixed_steps_are_the_same_for_any_block_and_lanes():
     plain = TURNING | {"step": 0.005}
-    narrow = FlightWork(study_from_plain(plain), block=8, lanes=3).run(0, 20)
-    wide = FlightWork(study_from_plain(plain), block=32, lanes=8).run(0, 20)
+    narrow = FlightWork(study_from_plain(plain), block=8, lanes=8).run(0, 20)
+    wide = FlightWork(study_from_plain(plain), block=32, lanes=16).run(0, 20)
     assert np.all(narrow["steps"] == 80)
     for name, values in wide.items():
         assert np.array_equal(narrow[name], values, equal_nan=True), name

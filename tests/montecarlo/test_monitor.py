@@ -7,7 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from stmuav_jax.montecarlo.monitor import Span, cubic, follow, highest, peak, start
+from stmuav_jax.montecarlo.monitor import (
+    Span,
+    Step,
+    cubic,
+    follow,
+    follow_parts,
+    highest,
+    peak,
+    start,
+)
 
 RNG = np.random.default_rng(5)
 
@@ -82,3 +91,30 @@ def test_the_largest_value_can_be_differentiated_with_and_without_a_peak():
             assert np.all(np.isfinite(gradient))
         else:
             np.testing.assert_allclose(gradient, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("count", [10, 20])
+def test_signals_without_rates_are_watched_within_steps(count):
+    """States of an oscillator, a signal of them: as close as the cubic of the states, h^4 / 384."""
+    state = lambda t: jnp.stack([jnp.sin(t), jnp.cos(t)])
+    slope = lambda t: jnp.stack([jnp.cos(t), -jnp.sin(t)])
+    phases = jnp.asarray([0.3, 1.0, 2.6])
+    signals = lambda t, y: y[0] * jnp.cos(phases) + y[1] * jnp.sin(phases) - 0.7
+    ts = jnp.linspace(0.0, 6.0, count + 1)
+    first = signals(ts[0], state(ts[0]))
+    monitor = start(ts[0], first, jnp.zeros(3))
+    for t0, t1 in itertools.pairwise(ts):
+        step = Step(t0, t1, state(t0), state(t1), slope(t0), slope(t1))
+        monitor = follow_parts(monitor, step, signals)
+    bound = 2 * (6.0 / count) ** 4 / 384
+    assert np.max(np.abs(np.asarray(monitor.extreme) - 0.3)) < bound
+    exact = (np.arcsin(0.7) - np.asarray(phases)) % (2 * np.pi)
+    exact[1] = 0.0
+    slope_there = np.cos(np.arcsin(0.7))
+    assert np.max(np.abs(np.asarray(monitor.crossings.times()) - exact)) < bound / slope_there
+    assert np.array_equal(monitor.g, signals(ts[-1], state(ts[-1])))
+    # a step that was not taken changes nothing
+    still = Step(ts[-1], ts[-1], state(ts[-1]), state(ts[-1]), slope(ts[-1]), slope(ts[-1]))
+    again = follow_parts(monitor, still, signals)
+    assert np.array_equal(again.extreme, monitor.extreme)
+    assert np.array_equal(again.crossings.times(), monitor.crossings.times())

@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -149,8 +150,8 @@ def test_an_extension_that_is_broken_off(whole, tmp_path, monkeypatch):
 
     # in the middle of the arrays, as a kill would
     with resume_store(path, WORK) as store:
-        column = store._array("path")
-        monkeypatch.setattr(type(column), "resize", _torn_after(2, type(column).resize, TornError))
+        torn = _torn_after(2, store_module.lengthen, TornError)
+        monkeypatch.setattr(store_module, "lengthen", torn)
         with pytest.raises(TornError):
             store.extend(1000)
         monkeypatch.undo()
@@ -173,11 +174,11 @@ def test_an_extension_that_is_broken_off(whole, tmp_path, monkeypatch):
 def _torn_after(count, function, error):
     calls = []
 
-    def torn(self, *arguments):
+    def torn(*arguments):
         calls.append(1)
         if len(calls) > count:
             raise error
-        return function(self, *arguments)
+        return function(*arguments)
 
     return torn
 
@@ -532,3 +533,215 @@ def test_files_are_flushed_before_the_record(tmp_path, monkeypatch):
     assert len(seen) == 6
     assert ".zarr.json" in seen[-1]
     assert {Path(name).parts[-3] for name in seen[:-1]} >= {"x", "y", "steps", "status"}
+
+
+MAKERS = """
+import sys
+import time
+sys.path.insert(0, {tests!r})
+from jobs.toy import Toy
+from stmuav_jax.mechanics.errors import SettingError
+from stmuav_jax.view.io import FileError
+from stmuav_jax.view.store import create
+import os
+import time
+versions = {{"what": "toy"}}
+for k in range({times}):
+    # both wait for the same instant
+    time.sleep(max({begin} + 0.1 * k - 0.005 - time.time(), 0))
+    while time.time() < {begin} + 0.1 * k:
+        pass
+    try:
+        store = create({folder!r} + f"/{{k}}.zarr", Toy(seed=3), 1000, 300, versions)
+        print("made", flush=True)
+        store.close()
+    except FileError as error:
+        print(str(error).replace("\\n", " "), flush=True)
+"""
+
+
+def test_two_processes_that_make_one_store(tmp_path):
+    """Exactly one has it, the other says so; and what is there is a whole store."""
+    times = 40
+    begin = time.time() + 8.0
+    code = MAKERS.format(
+        tests=str(Path(__file__).parents[1]), times=times, begin=begin, folder=str(tmp_path)
+    )
+    started = [
+        subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    said = [process.communicate()[0].splitlines() for process in started]
+    assert [process.returncode for process in started] == [0, 0]
+    for k, two in enumerate(zip(*said, strict=True)):
+        # one may be so late that the other has made its store and let go of it
+        assert sorted(words == "made" for words in two) == [False, True], two
+        other = next(words for words in two if words != "made")
+        assert f"{k}.zarr exists" in other or "being written by another run" in other
+        store = open_store(tmp_path / f"{k}.zarr")
+        assert (store.total, store.finished) == (1000, 0)
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_what_a_killed_maker_left_is_removed_when_it_is_old(tmp_path):
+    old, new = (tmp_path / f".study.zarr.{name}.partial" for name in ("old", "new"))
+    for folder in (old, new):
+        folder.mkdir()
+        (folder / "zarr.json").write_text("{}")
+    os.utime(old, (0, 0))
+    made(tmp_path / "study.zarr")
+    assert not old.exists()
+    assert new.exists()
+
+
+def test_columns_come_in_the_studys_order(whole):
+    assert list(open_store(whole).dataset().data_vars) == list(WORK.columns)
+    assert list(open_store(whole).load(["y", "x"]).data_vars) == ["x", "y"]
+
+
+def test_very_many_samples_answer_at_once(tmp_path):
+    """Nothing goes through all chunks: making, opening, extending and asking what comes next."""
+    begin = time.process_time()
+    with create(tmp_path / "huge.zarr", WORK, 10**12, 100) as store:
+        assert next(store.waiting()) == 0
+        store.write(0, WORK.run(0, 100))
+        assert next(store.waiting()) == 1
+    made(tmp_path / "small.zarr")
+    with resume_store(tmp_path / "small.zarr", WORK) as store:
+        store.extend(10**12)
+        assert next(store.waiting()) == 3
+    opened = open_store(tmp_path / "huge.zarr")
+    assert opened.load()["y"].size == 100
+    assert time.process_time() - begin < 10.0
+    with pytest.raises(SettingError, match="from 1 to 1,000,000,000,000"):
+        create(tmp_path / "more.zarr", WORK, 10**31, 100)
+
+
+def altered(path, change):
+    """A description with something changed."""
+    node = json.loads(path.read_text())
+    change(node)
+    path.write_text(json.dumps(node))
+
+
+def put(*keys, value):
+    def change(node):
+        for key in keys[:-1]:
+            node = node[key]
+        node[keys[-1]] = value
+
+    return change
+
+
+DEEP = '{"a":' * 5000 + "1" + "}" * 5000
+
+
+def fifo(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+def linked(path):
+    path.rename(path.parent.parent / "elsewhere")
+    path.symlink_to(path.parent.parent / "elsewhere")
+
+
+def folder(path):
+    path.unlink()
+    path.mkdir()
+
+
+TAMPERINGS = {
+    "root total text": lambda p: altered(p / "zarr.json", put("attributes", "total", value="x")),
+    "root total true": lambda p: altered(p / "zarr.json", put("attributes", "total", value=True)),
+    "root total inf": lambda p: altered(p / "zarr.json", put("attributes", "total", value=1e400)),
+    "root total 0": lambda p: altered(p / "zarr.json", put("attributes", "total", value=0)),
+    "root total 2^70": lambda p: altered(p / "zarr.json", put("attributes", "total", value=2**70)),
+    "root total 1e30": lambda p: altered(p / "zarr.json", put("attributes", "total", value=10**30)),
+    "root chunk 0": lambda p: altered(p / "zarr.json", put("attributes", "chunk", value=0)),
+    "root chunk 7": lambda p: altered(p / "zarr.json", put("attributes", "chunk", value=7)),
+    "root columns": lambda p: altered(p / "zarr.json", put("attributes", "columns", value=3)),
+    "root column of another folder": lambda p: altered(
+        p / "zarr.json", put("attributes", "columns", value=["../../etc"])
+    ),
+    "root identity": lambda p: altered(p / "zarr.json", put("attributes", "identity", value="{")),
+    "root reasons": lambda p: altered(p / "zarr.json", put("attributes", "reasons", value='{"a":1}')),
+    "root deep": lambda p: (p / "zarr.json").write_text(DEEP),
+    "root fifo": lambda p: fifo(p / "zarr.json"),
+    "root empty": lambda p: (p / "zarr.json").write_text(""),
+    "column deep": lambda p: (p / "y" / "zarr.json").write_text(DEEP),
+    "column fifo": lambda p: fifo(p / "y" / "zarr.json"),
+    "column shape": lambda p: altered(p / "y" / "zarr.json", put("shape", value=[])),
+    "column shape 1e30": lambda p: altered(p / "y" / "zarr.json", put("shape", value=[10**30])),
+    "column shape text": lambda p: altered(p / "y" / "zarr.json", put("shape", value=["1000"])),
+    "column longer": lambda p: altered(p / "y" / "zarr.json", put("shape", value=[1001])),
+    "column missing": lambda p: shutil.rmtree(p / "y"),
+    "column linked": lambda p: linked(p / "y"),
+    "chunks linked": lambda p: linked(p / "y" / "c"),
+    "records linked": lambda p: linked(p / "records"),
+    "record linked": lambda p: linked(p / "records" / "1"),
+    "axis shape": lambda p: altered(p / "time" / "zarr.json", put("shape", value=[10**6])),
+    "axis shape 1e10": lambda p: altered(p / "time" / "zarr.json", put("shape", value=[10**10])),
+    "axis both shapes": lambda p: altered(
+        p / "time" / "zarr.json",
+        lambda node: (put("shape", value=[10**9])(node),
+                      put("chunk_grid", "configuration", "chunk_shape", value=[10**9])(node)),
+    ),
+    "axis missing": lambda p: (p / "time" / "c" / "0").unlink(),
+    "record samples": lambda p: altered(
+        p / "records" / "1" / "zarr.json", put("attributes", "samples", value=10**40)
+    ),
+    "record sums": lambda p: altered(
+        p / "records" / "1" / "zarr.json", put("attributes", "sha256", value=3)
+    ),
+    "record name": lambda p: (p / "records" / "1").rename(p / "records" / ("9" * 5000)[:200]),
+    "record deep": lambda p: (p / "records" / "1" / "zarr.json").write_text(DEEP),
+    "chunk missing": lambda p: (p / "y" / "c" / "1").unlink(),
+    "status missing": lambda p: (p / "status" / "c" / "1").unlink(),
+    "input missing": lambda p: (p / "x" / "c" / "1").unlink(),
+    "chunk folder": lambda p: folder(p / "y" / "c" / "1"),
+    "chunk fifo": lambda p: fifo(p / "y" / "c" / "1"),
+    "chunk truncated": lambda p: os.truncate(p / "y" / "c" / "1", 100),
+    "chunk byte": lambda p: _flip(p / "y" / "c" / "1"),
+    "chunk forged": lambda p: _forge(p / "y" / "c" / "1"),
+}  # fmt: skip
+
+
+def _flip(path):
+    content = bytearray(path.read_bytes())
+    content[17] ^= 4
+    path.write_bytes(bytes(content))
+
+
+def _forge(path):
+    """Other numbers with the right CRC-32C."""
+    import google_crc32c
+
+    content = bytearray(path.read_bytes()[:-4])
+    content[17] ^= 4
+    path.write_bytes(bytes(content) + google_crc32c.value(bytes(content)).to_bytes(4, "little"))
+
+
+@pytest.mark.parametrize("how", TAMPERINGS)
+def test_tampered_stores(copy, how, capsys, monkeypatch):
+    """Loading, resuming and reporting say what is wrong, at once and without a traceback."""
+    from stmuav_jax.cli import main
+
+    TAMPERINGS[how](copy)
+    before = contents(copy.parent) if "fifo" not in how else {}
+    begin = time.process_time()
+    with pytest.raises(FileError) as caught:
+        open_store(copy).load()
+    assert len(str(caught.value)) < 1200
+    with pytest.raises(FileError):
+        resume_store(copy, WORK)
+    assert main(["report", str(copy), "--out", str(copy.parent / "report")]) == 2
+    assert "copy.zarr" in "".join(capsys.readouterr().err.split())
+    assert time.process_time() - begin < 20.0
+    assert not (copy.parent / "report").exists()
+    # nothing was repaired in silence
+    if before:
+        after = contents(copy.parent)
+        assert all(
+            after.get(name) == value for name, value in before.items() if "elsewhere" in name
+        )

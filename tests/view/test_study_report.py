@@ -1,6 +1,7 @@
 """Reports of studies: what they say is what the statistics say, whatever a study holds."""
 
 import html.parser
+import io
 import json
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import scipy.stats as st
 import xarray as xr
 from matplotlib.image import imread
+from rich.console import Console
 from studies import FACTORS, REASONS, study
 
 from stmuav_jax.mechanics.errors import SettingError
@@ -17,9 +19,11 @@ from stmuav_jax.montecarlo.statistics import mean, probability, quantiles
 from stmuav_jax.view import study_data as data_module
 from stmuav_jax.view import study_plot, study_region
 from stmuav_jax.view.io import FileError
+from stmuav_jax.view.plot import grid
 from stmuav_jax.view.study_analysis import analyse, plain
 from stmuav_jax.view.study_data import study_data
 from stmuav_jax.view.study_report import write_report
+from stmuav_jax.view.study_table import summary_lines, summary_table
 
 VOID = {"meta", "img", "br"}
 
@@ -96,10 +100,10 @@ def test_summary_is_what_the_statistics_say(whole):
     peak, fall = dataset.peak.values[fine], dataset.fall.values[fine]
     said = summary["samples"]
     assert said["total"] == 1500
-    assert (said["fine"], said["failed"], said["not_computed"]) == (
+    assert (said["completed"], said["not_completed"], said["not_computed"]) == (
         np.sum(fine), np.sum(failed), 60
     )  # fmt: skip
-    assert tuple(said["failure_probability"].values()) == probability(int(np.sum(failed)), 1440)
+    assert tuple(said["share_not_completed"].values()) == probability(int(np.sum(failed)), 1440)
     for code, words in REASONS.items():
         assert said["reasons"][str(code)]["words"] == words
         assert said["reasons"][str(code)]["count"] == np.sum(dataset.status == code)
@@ -149,12 +153,12 @@ def test_saltelli_study(tmp_path):
 
 
 SMALL = {
-    "one": (study(1), "1 sample: 1 fine"),
+    "one": (study(1), "1 sample: 1 completed"),
     "one, failed": (
         tiny(1).assign(status=("sample", [2], {"role": "status"})),
-        "0 fine, 1 failed",
+        "0 completed, 1 did not complete",
     ),
-    "none fine": (study(40, pending=40), "0 fine, 0 failed, 40 not computed"),
+    "none fine": (study(40, pending=40), "0 completed, 0 did not complete, 40 not computed"),
     "none": (study(0), "0 samples"),
     "two": (tiny(2), "2 samples"),
 }
@@ -307,3 +311,49 @@ def test_what_is_refused(tmp_path):
         write_report(tiny(3), tmp_path, level=95.0)
     with pytest.raises(FileError):
         write_report(xr.Dataset(), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("failure", "event", "words"),
+    [
+        ({"quantity": "fall"}, lambda d: np.isfinite(d.fall.values), "until the tracker touches"),
+        ({"quantity": "fall", "below": 2.0}, lambda d: d.fall.values < 2.0, "below 2 s"),
+        ({"quantity": "peak", "above": 1.0}, lambda d: d.peak.values > 1.0, "above 1 rad"),
+    ],
+)
+def test_a_declared_failure_is_what_is_reported(failure, event, words):
+    """Among the samples that were completed; the share that was not is another number."""
+    dataset = study(400, pending=40)
+    identity = json.loads(dataset.attrs["identity"]) | {"failure": failure}
+    dataset.attrs["identity"] = json.dumps(identity)
+    analysis = analyse(study_data(dataset))
+    fine = dataset.status.values == 1
+    wanted = probability(int(np.sum(event(dataset)[fine])), int(np.sum(fine)))
+    assert analysis.failure is not None
+    assert analysis.failure.probability == wanted
+    assert words in analysis.failure.words
+    said = " ".join(summary_lines(analysis))
+    assert f"Probability of failure ({analysis.failure.words}): {100 * wanted.value:.3g} %" in said
+    assert "did not complete" in said
+    assert "40 not computed" in said
+
+
+def test_without_a_declared_failure_none_is_reported():
+    analysis = analyse(study_data(study(100, failing=False)))
+    assert analysis.failure is None
+    assert "failure" not in " ".join(summary_lines(analysis))
+    table = summary_table(analysis)
+    console = Console(width=200, file=io.StringIO())
+    console.print(table)
+    assert "largest angle [rad]" in console.file.getvalue()  # pyright: ignore
+
+
+def test_shares_below_zero_stay_within_their_axes():
+    analysis = analyse(study_data(study(300)))
+    one = analysis.findings[0]
+    low = np.full(len(one.influence.names), -0.4)
+    found = one._replace(influence=one.influence._replace(first=low))
+    figure, axes = grid(1, 1, 3.0)
+    study_region._share_bars(axes[0, 0], found, list(one.influence.names))
+    assert axes[0, 0].get_xlim()[0] < -0.4
+    del figure

@@ -1,0 +1,77 @@
+"""Ctrl-C and SIGTERM that cannot get lost: a flag, and the exception until somebody hears it.
+
+Python raises KeyboardInterrupt wherever the main thread happens to be. Where that is a callback of
+a library, such as JAX's when memory is collected, the exception is printed and forgotten, and the
+program runs on. Here the signal is raised again until it has been heard.
+"""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+from typing import Any
+
+# Seconds after which a signal that nobody has heard is raised again.
+AGAIN = 0.5
+
+
+class Stop:
+    """Whether the run was asked to stop, and whether it knows.
+
+    Attributes:
+        asked: a signal has come.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._heard = threading.Event()
+        self._over = threading.Event()
+
+    def heard(self) -> None:
+        """The run knows: the signal is not raised again."""
+        self._heard.set()
+
+    def _come(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        if not self.asked:
+            self.asked = True
+            threading.Thread(target=self._insist, args=(number,), daemon=True).start()
+        raise KeyboardInterrupt
+
+    def _insist(self, number: int) -> None:
+        while not self._over.is_set() and not self._heard.wait(AGAIN):
+            if not self._over.is_set() and not self._heard.is_set():
+                signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+
+_now: list[Stop] = []
+
+
+@contextlib.contextmanager
+def stoppable() -> Iterator[Stop]:
+    """Within it Ctrl-C and SIGTERM raise KeyboardInterrupt, again and again until `Stop.heard`.
+
+    Inside another one it is that one; in threads other than the main one it does nothing. A
+    signal that was never heard raises KeyboardInterrupt at the end.
+    """
+    if _now or threading.current_thread() is not threading.main_thread():
+        yield _now[0] if _now else Stop()
+        return
+    stop = Stop()
+    before: dict[int, Any] = {}
+    _now.append(stop)
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, stop._come)
+        yield stop
+    except KeyboardInterrupt:
+        stop.heard()
+        raise
+    finally:
+        stop._over.set()
+        _now.clear()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if stop.asked and not stop._heard.is_set():
+        raise KeyboardInterrupt
