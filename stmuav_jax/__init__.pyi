@@ -22,6 +22,7 @@ from .dynamics.energy import Energy, energy, momentum
 from .dynamics.formulation import Accelerations, Reactions
 from .dynamics.initial import Assembly, Rank, assemble, rank, ranks
 from .dynamics.integrate import Trajectory, integrate
+from .dynamics.joint_start import state_from_joints
 from .dynamics.prescribed import (
     KinematicPath,
     PathReason,
@@ -56,7 +57,7 @@ from .estimation.extended import extended_model, extended_noise, inertia_matrix,
 from .estimation.filter import EstimationError, Filtered, kalman_filter
 from .estimation.gaussian import Gaussian, gaussian
 from .estimation.hover import Loop, hover_model, simulate_hover
-from .estimation.likelihood import Tuned, standard_errors, tune
+from .estimation.likelihood import Tuned, record_likelihood, standard_errors, tune
 from .estimation.model import Sensor, StateSpaceModel
 from .estimation.observability import Observability, observability
 from .estimation.online import Estimate, OnlineFilter
@@ -68,6 +69,7 @@ from .estimation.smoother import Smoothed, smooth
 from .estimation.space import Angle, Composite, Rotation, Vector
 from .estimation.tuning import Tuning, consistent_tuning, report_tuning
 from .estimation.update import Innovation, predict, update
+from .estimation.verdict import RunsVerdict, Verdict, over_runs, verdict, verdicts
 from .mechanics.body import GROUND, Body
 from .mechanics.errors import ModelError, SettingError, SimulationError, StateError
 from .mechanics.force import (
@@ -93,6 +95,7 @@ from .mechanics.joint import (
 )
 from .mechanics.joint_effort import JointEffort
 from .mechanics.joint_force import EndStop, JointFriction, JointServo
+from .mechanics.joint_motion import JointMotion, joint_motion
 from .mechanics.load import Load, Sine
 from .mechanics.sampled import Sampled
 from .mechanics.state import Kinematics, State
@@ -180,48 +183,50 @@ __version__: str
 
 # fmt: off
 __all__ = [
-    "AbstractInternalForce", "AbstractWork", "Accelerations", "aim", "Air", "AirframeDrag",
-    "allocate", "Allocation", "AllocationReason", "Angle", "angles_from_strokes",
-    "angular_velocity", "AppliedForce", "AppliedMoment", "assemble", "Assembly", "at_rest",
-    "attitude", "attitude_model", "attitude_space", "Augmented", "autocorrelation", "Axis",
-    "Baumgarte", "Body", "CaseStudy", "centre_of_mass", "Certificate", "check_lift",
-    "chi2_interval", "choose_solver", "climb", "Column", "compiler_options", "Composite",
-    "conjugate", "consistent_tuning", "Coordinates", "cruise", "Cubature", "Cubature5",
-    "cylindrical", "Day", "distance", "Distribution", "distribution_from_plain", "Drag",
-    "drive", "driven", "driver_efforts", "dryden", "EndStop", "energy", "Energy", "envelope",
-    "Envelope", "Estimate", "estimate_case", "EstimationError", "EstimationStudy",
-    "EstimationWork", "euler", "euler_parameter_rate", "evaluate", "Evaluation",
-    "extended_model", "extended_noise", "filter_bank", "Filtered", "final_gradients", "Flaws",
-    "Flight", "flight_model", "Flights", "flights", "FlightWork", "Flyer", "follow", "Friction",
-    "from_matrix", "from_rotation_vector", "Gaussian", "gaussian", "Gravity", "GROUND",
-    "growth", "Gusts", "hold", "holding_time", "hover", "hover_model", "hover_speed_squared",
-    "IdentifiabilityError", "Identified", "identify", "identify_many", "inconsistent",
-    "inertia_about_centre", "inertia_matrix", "inertia_states", "initial_angles", "Innovation",
-    "Inputs", "integrate", "internal_names", "Joint", "joint_loads", "joint_reactions",
-    "JointDamping", "JointEffort", "JointFriction", "JointLoads", "JointServo", "kalman_filter",
-    "kinematic_path", "KinematicPath", "Kinematics", "kvaerno3", "kvaerno5", "Limits", "Linear",
-    "LinearActuator", "Linearised", "linearize", "LinearSpringDamper", "Load", "Loop",
-    "low_altitude", "make_scene", "make_work", "matrix_g", "matrix_l", "mean_interval",
-    "Method", "ModelError", "momentum", "Motor", "MotorRotors", "moved", "Moved", "nees",
-    "normalise", "observability", "Observability", "observable_model", "OnlineFilter",
-    "outer_jit", "panel_angles", "panel_normal", "Parameter", "Parameters", "PART_I", "PART_II",
-    "PART_III", "path_nees", "PathReason", "peaks", "Place", "posture", "precision_error",
-    "predict", "PRINTED_ORIENTATIONS", "product", "Projection", "Quantity", "rank", "Rank",
-    "ranks", "Reactions", "READY", "ready", "Reason", "report_model", "report_prior",
-    "report_tuning", "resolved_loads", "revolute", "revolute_spherical", "rk4", "Rodas5P",
-    "Rotation", "rotation_matrix", "rotorcraft_model", "RotorLimits", "Rotors", "Run",
-    "run_loads", "Sampled", "Sampling", "sampling_from_plain", "Scene", "SCENES", "Search",
-    "search", "SearchReason", "sensed_flight", "sensed_sun", "Sensor", "Servo", "SettingError",
-    "shooting", "simulate", "simulate_case", "simulate_hover", "SimulationError", "Sine",
-    "skew", "slew", "SlewLimits", "smooth", "smooth_peaks", "Smoothed", "spanning_tree",
-    "SpanningTree", "spectrum", "spherical", "spin_exact", "standard_errors", "State",
-    "StateError", "states_at", "StateSpaceModel", "steady_turn", "Stops", "strokes", "Study",
-    "study_case", "study_from_plain", "summarise", "Sun", "sun_at", "sun_direction",
-    "sun_in_body", "sun_position", "SunReason", "survey", "System", "to_rotation_vector",
-    "TorsionalSpringDamper", "track_day", "tracker_bodies", "tracker_geometry",
-    "tracker_joints", "tracker_limits", "TrackerGeometry", "Trajectory", "transition",
-    "translational", "Tree", "trim", "Trim", "TrimLimits", "TrimReason", "tune", "Tuned",
-    "Tuning", "Turbulence", "uav_flyer", "universal", "unix_time", "Unknown", "Unscented",
-    "Unstabilised", "update", "Vector", "weld", "Wind", "with_internal", "World", "wrench_map",
+    "GROUND", "PART_I", "PART_II", "PART_III", "PRINTED_ORIENTATIONS", "READY", "SCENES",
+    "AbstractInternalForce", "AbstractWork", "Accelerations", "Air", "AirframeDrag",
+    "Allocation", "AllocationReason", "Angle", "AppliedForce", "AppliedMoment", "Assembly",
+    "Augmented", "Axis", "Baumgarte", "Body", "CaseStudy", "Certificate", "Column", "Composite",
+    "Coordinates", "Cubature", "Cubature5", "Day", "Distribution", "Drag", "EndStop", "Energy",
+    "Envelope", "Estimate", "EstimationError", "EstimationStudy", "EstimationWork",
+    "Evaluation", "Filtered", "Flaws", "Flight", "FlightWork", "Flights", "Flyer", "Friction",
+    "Gaussian", "Gravity", "Gusts", "IdentifiabilityError", "Identified", "Innovation",
+    "Inputs", "Joint", "JointDamping", "JointEffort", "JointFriction", "JointLoads",
+    "JointMotion", "JointServo", "KinematicPath", "Kinematics", "Limits", "Linear",
+    "LinearActuator", "LinearSpringDamper", "Linearised", "Load", "Loop", "Method",
+    "ModelError", "Motor", "MotorRotors", "Moved", "Observability", "OnlineFilter", "Parameter",
+    "Parameters", "PathReason", "Place", "Projection", "Quantity", "Rank", "Reactions",
+    "Reason", "Rodas5P", "Rotation", "RotorLimits", "Rotors", "Run", "RunsVerdict", "Sampled",
+    "Sampling", "Scene", "Search", "SearchReason", "Sensor", "Servo", "SettingError",
+    "SimulationError", "Sine", "SlewLimits", "Smoothed", "SpanningTree", "State", "StateError",
+    "StateSpaceModel", "Stops", "Study", "Sun", "SunReason", "System", "TorsionalSpringDamper",
+    "TrackerGeometry", "Trajectory", "Tree", "Trim", "TrimLimits", "TrimReason", "Tuned",
+    "Tuning", "Turbulence", "Unknown", "Unscented", "Unstabilised", "Vector", "Verdict", "Wind",
+    "World", "aim", "allocate", "angles_from_strokes", "angular_velocity", "assemble",
+    "at_rest", "attitude", "attitude_model", "attitude_space", "autocorrelation",
+    "centre_of_mass", "check_lift", "chi2_interval", "choose_solver", "climb",
+    "compiler_options", "conjugate", "consistent_tuning", "cruise", "cylindrical", "distance",
+    "distribution_from_plain", "drive", "driven", "driver_efforts", "dryden", "energy",
+    "envelope", "estimate_case", "euler", "euler_parameter_rate", "evaluate", "extended_model",
+    "extended_noise", "filter_bank", "final_gradients", "flight_model", "flights", "follow",
+    "from_matrix", "from_rotation_vector", "gaussian", "growth", "hold", "holding_time",
+    "hover", "hover_model", "hover_speed_squared", "identify", "identify_many", "inconsistent",
+    "inertia_about_centre", "inertia_matrix", "inertia_states", "initial_angles", "integrate",
+    "internal_names", "joint_loads", "joint_motion", "joint_reactions", "kalman_filter",
+    "kinematic_path", "kvaerno3", "kvaerno5", "linearize", "low_altitude", "make_scene",
+    "make_work", "matrix_g", "matrix_l", "mean_interval", "momentum", "moved", "nees",
+    "normalise", "observability", "observable_model", "outer_jit", "over_runs", "panel_angles",
+    "panel_normal", "path_nees", "peaks", "posture", "precision_error", "predict", "product",
+    "rank", "ranks", "ready", "record_likelihood", "report_model", "report_prior",
+    "report_tuning", "resolved_loads", "revolute", "revolute_spherical", "rk4",
+    "rotation_matrix", "rotorcraft_model", "run_loads", "sampling_from_plain", "search",
+    "sensed_flight", "sensed_sun", "shooting", "simulate", "simulate_case", "simulate_hover",
+    "skew", "slew", "smooth", "smooth_peaks", "spanning_tree", "spectrum", "spherical",
+    "spin_exact", "standard_errors", "state_from_joints", "states_at", "steady_turn", "strokes",
+    "study_case", "study_from_plain", "summarise", "sun_at", "sun_direction", "sun_in_body",
+    "sun_position", "survey", "to_rotation_vector", "track_day", "tracker_bodies",
+    "tracker_geometry", "tracker_joints", "tracker_limits", "transition", "translational",
+    "trim", "tune", "uav_flyer", "universal", "unix_time", "update", "verdict", "verdicts",
+    "weld", "with_internal", "wrench_map",
 ]
 # fmt: on
