@@ -194,7 +194,8 @@ def batch(result: Row) -> Lines:
         f"To {result['horizon']:g} s; errors over the first {result['references']} trajectories "
         f"against runs at a tighter tolerance, wanted {power(result['error_wanted'])} m. One "
         f"trajectory alone: {1e3 * single['seconds']['best']:.3g} ms, {number(single['per_second'])} "
-        "per second.",
+        "per second. Studies, whose flights differ in more than their first velocities and whose lanes "
+        "are filled again as flights end, are measured apart ([throughput](throughput.md)).",
         "",
         *table(head, rows),
     ]
