@@ -81,7 +81,7 @@ def _reference(check: Row, closed_form: bool) -> Lines:
     ):
         row = check[key]
         if row is None:
-            said.append(f"{who} has no run that reached the end")
+            said.append(f"there is no run by {who} to compare with it")
         else:
             how = f"{row['method']}, {row['solver']}, {setting(row)}"
             said.append(f"{who} comes within {power(row['error'])} m of it ({how})")
