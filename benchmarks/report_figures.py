@@ -90,10 +90,10 @@ def work_precision(curve: Row) -> Figure:
     labels = list(handles)
     figure.legend(
         handles.values(), labels, loc="outside lower center", fontsize=7.5,
-        ncols=3 if len(ends) > 1 else 2,
+        ncols=3 if len(ends) > 1 else 2, title_fontsize=6.5,
+        title=missing(not_drawn(curve), 70 * len(ends) + 40),
     )  # fmt: skip
     figure.suptitle(curve["title"], fontsize=10)
-    _note(figure, not_drawn(curve), 70 * len(ends) + 30)
     return figure
 
 
@@ -108,14 +108,15 @@ def not_drawn(curve: Row) -> list[tuple[str, str]]:
     return absent
 
 
-def _note(figure: Figure, absent: list[tuple[str, str]], width: int) -> None:
-    """Who is missing from a figure, and why, below it; programs with one reason together."""
+def missing(absent: list[tuple[str, str]], width: int) -> str:
+    """Who is missing from a figure, and why; programs with one reason together."""
     together: dict[str, list[str]] = {}
     for name, reason in absent:
         together.setdefault(reason.rstrip("."), []).append(name)
-    if together:
-        text = "; ".join(f"{', '.join(names)} ({why})" for why, names in together.items())
-        figure.supxlabel("\n".join(textwrap.wrap(f"Not shown: {text}.", width)), fontsize=6.5)
+    if not together:
+        return ""
+    text = "; ".join(f"{' / '.join(names)} ({why})" for why, names in together.items())
+    return "\n".join(textwrap.wrap(f"Not shown: {text}.", width))
 
 
 def _ends(rows: list[Row], x: list[float], y: list[float]) -> list[tuple[Row, float, float]]:
@@ -183,19 +184,26 @@ def scaling(result: Row) -> Figure:
     return figure
 
 
+def _program(row: Row) -> str:
+    """A method without the integrator, which has no part in one acceleration."""
+    method = row["method"]
+    return method if method.startswith(("stmuav-jax", "NumPy")) else method.split(",")[0]
+
+
 def acceleration(result: Row) -> Figure:
-    """One acceleration, as bars."""
+    """One acceleration, as points: on an axis of powers of ten, lengths of bars mean nothing."""
     rows = [row for row in result["rows"] if row["seconds"] is not None]
     figure, (axes,) = _figure(1, 7.5, 1.2 + 0.32 * len(rows))
     values = [1e6 * row["seconds"] for row in rows]
     names = [
-        row["method"] + (f", {row['batch']} at once" if row["batch"] > 1 else "") for row in rows
+        _program(row) + (f", {row['batch']} at once" if row["batch"] > 1 else "") for row in rows
     ]
     ours = ["C0" if row in _ours(rows) else "0.6" for row in rows]
-    axes.barh(range(len(rows)), values, color=ours)
+    axes.scatter(values, range(len(rows)), color=ours, s=30, zorder=3)
+    axes.grid(alpha=0.3)
     for k, value in enumerate(values):
         axes.annotate(
-            f"{value:.3g}", (value, k), xytext=(3, 0), textcoords="offset points",
+            f"{value:.3g}", (value, k), xytext=(6, 0), textcoords="offset points",
             va="center", fontsize=8,
         )  # fmt: skip
     axes.set_yticks(range(len(rows)), names, fontsize=8)
@@ -204,5 +212,6 @@ def acceleration(result: Row) -> Figure:
     axes.margins(x=0.15)
     axes.set_xlabel("microseconds per acceleration and state")
     absent = [(r["method"], r["failure"]) for r in result["rows"] if r["seconds"] is None]
-    _note(figure, absent, 100)
+    if note := missing(absent, 100):
+        figure.supxlabel(note, fontsize=6.5)
     return figure

@@ -20,6 +20,7 @@ import stmuav_jax as sj
 NUDGE = 1e-15
 # A peer's setting that takes longer than this for all its trajectories ends its list [s].
 PATIENCE = 2.0
+NOT_ALONE = "Accelerations alone are not timed in our adapter."
 # Growing chains end where one size took longer than this [s].
 LONGEST = 90.0
 
@@ -84,7 +85,7 @@ def acceleration(size: Size, others: list[Peer]) -> dict[str, Any]:
         try:
             why = peer.unsupported(scene)
             row["seconds"] = None if why else peer.acceleration_seconds(scene)
-            row["failure"] = why or ("" if row["seconds"] is not None else "does not offer it")
+            row["failure"] = why or ("" if row["seconds"] is not None else NOT_ALONE)
         except Exception as error:
             row["failure"] = reason(error)
         rows.append(row)
@@ -144,7 +145,10 @@ class Batches:
         program, _ = self.program(count, 1)
         ends, fine = program(self.first(count), self.ts, jnp.asarray(self.size.tight))
         if not bool(np.all(fine)):
-            raise RuntimeError("A tight run failed.")
+            lost = int(np.sum(~np.asarray(fine)))
+            raise RuntimeError(
+                f"{lost} of {count} reference runs at {self.size.tight:g} stopped before the end."
+            )
         self.tight_program = program
         return np.asarray(ends)
 
@@ -167,6 +171,7 @@ class Batches:
         timing, (ends, fine) = measure(
             lambda: program(*arguments), repeats=3, warm_up=0, budget=self.size.budget
         )
+        lost = int(np.sum(~np.asarray(fine)))
         row = {
             "method": "stmuav-jax, tree",
             "trajectories": count,
@@ -175,8 +180,8 @@ class Batches:
             "per_second": count / timing.median,
             "seconds": timing.to_dict(),
             "compile_seconds": seconds,
-            "failed": int(np.sum(~np.asarray(fine))),
-            "failure": "",
+            "failed": lost,
+            "failure": f"{lost} of {count} runs stopped before the end." if lost else "",
             **errors(ends, self.exact),
         }
         print(f"  {count} in blocks of {block}: {row['per_second']:.1f} per second", flush=True)
@@ -188,7 +193,7 @@ class Batches:
         offered = getattr(peer, "throughput", None)
         empty = {"method": peer.name, "per_second": None}
         if offered is None:
-            return [empty | {"failure": "does not offer it"}]
+            return [empty | {"failure": "A batch of trajectories is not written in our adapter."}]
         count = min(self.size.peer_trajectories, len(self.states.r))
         for setting in peer.settings():
             try:
@@ -197,6 +202,8 @@ class Batches:
             except Exception as error:
                 return [*rows, empty | {"failure": reason(error)}]
             found = errors(ends, self.exact)
+            lost = int(np.sum(~np.isfinite(ends).all((1, 2))))
+            said = f"{lost} of {count} trajectories ended with a state that is not finite."
             rows.append(
                 {
                     **empty,
@@ -204,8 +211,8 @@ class Batches:
                     "trajectories": count,
                     "tolerance": setting.tolerance,
                     "step": setting.step,
-                    "per_second": rate,
-                    "failure": "",
+                    "per_second": None if lost else rate,
+                    "failure": said if lost else "",
                     **found,
                 }
             )
@@ -286,7 +293,7 @@ def chain_run(problem: Problem, loops: int, size: Size) -> dict[str, Any]:
         "steps": int(path.counts.accepted[-1] + path.counts.rejected[-1]),
         "residual": float(path.worst.position[-1]),
         "cranks_differ": distance(heights, heights[:1] + 0 * heights),
-        "failure": "" if fine else "The integration failed.",
+        "failure": "" if fine else " ".join(str(diffrax.RESULTS[path.result]).split())[:120],
     }
 
 

@@ -81,7 +81,7 @@ def _reference(check: Row, closed_form: bool) -> Lines:
     ):
         row = check[key]
         if row is None:
-            said.append(f"{who} has no run that reached the end")
+            said.append(f"there is no run by {who} to compare with it")
         else:
             how = f"{row['method']}, {row['solver']}, {setting(row)}"
             said.append(f"{who} comes within {power(row['error'])} m of it ({how})")
@@ -194,7 +194,8 @@ def batch(result: Row) -> Lines:
         f"To {result['horizon']:g} s; errors over the first {result['references']} trajectories "
         f"against runs at a tighter tolerance, wanted {power(result['error_wanted'])} m. One "
         f"trajectory alone: {1e3 * single['seconds']['best']:.3g} ms, {number(single['per_second'])} "
-        "per second.",
+        "per second. Studies, whose flights differ in more than their first velocities and whose lanes "
+        "are filled again as flights end, are measured apart ([throughput](throughput.md)).",
         "",
         *table(head, rows),
     ]

@@ -143,14 +143,14 @@ def _kruskal(model: Plain) -> list[PlainJoint]:
 
 
 def _link(joint: PlainJoint, parent: int, child: int, ahead: int) -> Link:
-    ends = Frame(joint.frame_i, joint.point_i), Frame(joint.frame_j, joint.point_j)
+    first, second = Frame(joint.frame_i, joint.point_i), Frame(joint.frame_j, joint.point_j)
     if joint.kind not in KINDS or (joint.kind == "universal" and parent != joint.i):
         raise UnsupportedError(
             f"A {joint.kind} joint from its second body to its first is not written."
         )
     if parent != joint.i:
-        ends = ends[::-1]
-    return Link(KINDS[joint.kind], parent, child, ahead, *ends, joint)
+        first, second = second, first
+    return Link(KINDS[joint.kind], parent, child, ahead, first, second, joint)
 
 
 def coordinates(tree: Tree, state: Start) -> list[tuple[np.ndarray, np.ndarray]]:
