@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.core
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -51,8 +52,14 @@ def check_finite(value: object, what: str, unit: str, error: type[Exception] = M
 
 def check_shape(value: Any, shape: tuple[int, ...], what: str) -> None:
     """Raise `ModelError` unless `value` has the given shape."""
-    if np.shape(value) != shape:
-        raise ModelError(f"{what} must have shape {shape}, but it has {np.shape(value)}.")
+    found = shape_of(value)
+    if found != shape:
+        raise ModelError(f"{what} must have shape {shape}, but it has {found}.")
+
+
+def shape_of(value: Any) -> tuple[int, ...]:
+    """The shape of a number, an array, or a sequence of them, traced by JAX or not."""
+    return np.shape(value) if concrete(value) else jnp.shape(jnp.asarray(value))
 
 
 def nearest_names(name: str, known: Iterable[str]) -> str:
