@@ -31,7 +31,7 @@ from .dynamics.prescribed import (
     kinematic_path,
 )
 from .dynamics.problem import Method
-from .dynamics.reactions import joint_reactions
+from .dynamics.reactions import joint_reactions, reaction_on
 from .dynamics.rosenbrock import Rodas5P
 from .dynamics.run import Certificate, Run
 from .dynamics.scene import Scene
@@ -71,6 +71,7 @@ from .estimation.tuning import Tuning, consistent_tuning, report_tuning
 from .estimation.update import Innovation, predict, update
 from .estimation.verdict import RunsVerdict, Verdict, over_runs, verdict, verdicts
 from .mechanics.body import GROUND, Body
+from .mechanics.compound import Part, box, compound, cylinder, point_mass, rod, sphere
 from .mechanics.errors import ModelError, SettingError, SimulationError, StateError
 from .mechanics.force import (
     AppliedForce,
@@ -195,7 +196,7 @@ __all__ = [
     "JointMotion", "JointServo", "KinematicPath", "Kinematics", "Limits", "Linear",
     "LinearActuator", "LinearSpringDamper", "Linearised", "Load", "Loop", "Method",
     "ModelError", "Motor", "MotorRotors", "Moved", "Observability", "OnlineFilter", "Parameter",
-    "Parameters", "PathReason", "Place", "Projection", "Quantity", "Rank", "Reactions",
+    "Parameters", "Part", "PathReason", "Place", "Projection", "Quantity", "Rank", "Reactions",
     "Reason", "Rodas5P", "Rotation", "RotorLimits", "Rotors", "Run", "RunsVerdict", "Sampled",
     "Sampling", "Scene", "Search", "SearchReason", "Sensor", "Servo", "SettingError",
     "SimulationError", "Sine", "SlewLimits", "Smoothed", "SpanningTree", "State", "StateError",
@@ -203,30 +204,31 @@ __all__ = [
     "TrackerGeometry", "Trajectory", "Tree", "Trim", "TrimLimits", "TrimReason", "Tuned",
     "Tuning", "Turbulence", "Unknown", "Unscented", "Unstabilised", "Vector", "Verdict", "Wind",
     "World", "aim", "allocate", "angles_from_strokes", "angular_velocity", "assemble",
-    "at_rest", "attitude", "attitude_model", "attitude_space", "autocorrelation",
+    "at_rest", "attitude", "attitude_model", "attitude_space", "autocorrelation", "box",
     "centre_of_mass", "check_lift", "chi2_interval", "choose_solver", "climb",
-    "compiler_options", "conjugate", "consistent_tuning", "cruise", "cylindrical", "distance",
-    "distribution_from_plain", "drive", "driven", "driver_efforts", "dryden", "energy",
-    "envelope", "estimate_case", "euler", "euler_parameter_rate", "evaluate", "extended_model",
-    "extended_noise", "filter_bank", "final_gradients", "flight_model", "flights", "follow",
-    "from_matrix", "from_rotation_vector", "gaussian", "growth", "hold", "holding_time",
-    "hover", "hover_model", "hover_speed_squared", "identify", "identify_many", "inconsistent",
-    "inertia_about_centre", "inertia_matrix", "inertia_states", "initial_angles", "integrate",
-    "internal_names", "joint_loads", "joint_motion", "joint_reactions", "kalman_filter",
-    "kinematic_path", "kvaerno3", "kvaerno5", "linearize", "low_altitude", "make_scene",
-    "make_work", "matrix_g", "matrix_l", "mean_interval", "momentum", "moved", "nees",
-    "normalise", "observability", "observable_model", "outer_jit", "over_runs", "panel_angles",
-    "panel_normal", "path_nees", "peaks", "posture", "precision_error", "predict", "product",
-    "rank", "ranks", "ready", "record_likelihood", "report_model", "report_prior",
-    "report_tuning", "resolved_loads", "revolute", "revolute_spherical", "rk4",
-    "rotation_matrix", "rotorcraft_model", "run_loads", "sampling_from_plain", "search",
-    "sensed_flight", "sensed_sun", "shooting", "simulate", "simulate_case", "simulate_hover",
-    "skew", "slew", "smooth", "smooth_peaks", "spanning_tree", "spectrum", "spherical",
-    "spin_exact", "standard_errors", "state_from_joints", "states_at", "steady_turn", "strokes",
-    "study_case", "study_from_plain", "summarise", "sun_at", "sun_direction", "sun_in_body",
-    "sun_position", "survey", "to_rotation_vector", "track_day", "tracker_bodies",
-    "tracker_geometry", "tracker_joints", "tracker_limits", "transition", "translational",
-    "trim", "tune", "uav_flyer", "universal", "unix_time", "update", "verdict", "verdicts",
-    "weld", "with_internal", "wrench_map",
+    "compiler_options", "compound", "conjugate", "consistent_tuning", "cruise", "cylinder",
+    "cylindrical", "distance", "distribution_from_plain", "drive", "driven", "driver_efforts",
+    "dryden", "energy", "envelope", "estimate_case", "euler", "euler_parameter_rate",
+    "evaluate", "extended_model", "extended_noise", "filter_bank", "final_gradients",
+    "flight_model", "flights", "follow", "from_matrix", "from_rotation_vector", "gaussian",
+    "growth", "hold", "holding_time", "hover", "hover_model", "hover_speed_squared", "identify",
+    "identify_many", "inconsistent", "inertia_about_centre", "inertia_matrix", "inertia_states",
+    "initial_angles", "integrate", "internal_names", "joint_loads", "joint_motion",
+    "joint_reactions", "kalman_filter", "kinematic_path", "kvaerno3", "kvaerno5", "linearize",
+    "low_altitude", "make_scene", "make_work", "matrix_g", "matrix_l", "mean_interval",
+    "momentum", "moved", "nees", "normalise", "observability", "observable_model", "outer_jit",
+    "over_runs", "panel_angles", "panel_normal", "path_nees", "peaks", "point_mass", "posture",
+    "precision_error", "predict", "product", "rank", "ranks", "reaction_on", "ready",
+    "record_likelihood", "report_model", "report_prior", "report_tuning", "resolved_loads",
+    "revolute", "revolute_spherical", "rk4", "rod", "rotation_matrix", "rotorcraft_model",
+    "run_loads", "sampling_from_plain", "search", "sensed_flight", "sensed_sun", "shooting",
+    "simulate", "simulate_case", "simulate_hover", "skew", "slew", "smooth", "smooth_peaks",
+    "spanning_tree", "spectrum", "sphere", "spherical", "spin_exact", "standard_errors",
+    "state_from_joints", "states_at", "steady_turn", "strokes", "study_case",
+    "study_from_plain", "summarise", "sun_at", "sun_direction", "sun_in_body", "sun_position",
+    "survey", "to_rotation_vector", "track_day", "tracker_bodies", "tracker_geometry",
+    "tracker_joints", "tracker_limits", "transition", "translational", "trim", "tune",
+    "uav_flyer", "universal", "unix_time", "update", "verdict", "verdicts", "weld",
+    "with_internal", "wrench_map",
 ]
 # fmt: on

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -18,7 +19,14 @@ from ..algebra.rotation import (
     rotation_matrix,
 )
 from ..algebra.shapes import Numbers
-from ..mechanics.errors import ModelError, StateError, check_finite, concrete, nearest_names
+from ..mechanics.errors import (
+    ModelError,
+    StateError,
+    check_finite,
+    concrete,
+    nearest_names,
+    shape_of,
+)
 from ..mechanics.joint import Joint
 from ..mechanics.joint_motion import COORDINATES, coordinate_count, relative
 from ..mechanics.state import State
@@ -72,7 +80,7 @@ def state_from_joints(
     state = _placed(system, tree, q, u, start)
     if not tree.cut:
         return state
-    return _closed(system, state, q, u, jnp.asarray(t, state.r.dtype), start)
+    return _closed(system, state, q, u, jnp.asarray(t, state.r.dtype))
 
 
 def _checked(system: System, given: Given, what: str) -> dict[str, Float[Array, " c"]]:
@@ -88,7 +96,7 @@ def _checked(system: System, given: Given, what: str) -> dict[str, Float[Array, 
                 f"Joint '{name}' is a driver, whose {what} is prescribed as a function of time."
             )
         words = ", ".join(f"{word} [{unit}]" for word, unit in COORDINATES[joint.kind])
-        shape = np.shape(value)
+        shape = shape_of(value)
         if shape != (count,) and not (count == 1 and shape == ()):
             raise ModelError(
                 f"The {what} of joint '{name}' ({joint.kind}) must be {count} number"
@@ -173,7 +181,9 @@ def _placed(
         step = _relative_pose(joint.kind, q.get(joint.name, x), u.get(joint.name, x_rate))
         body = _behind if link.forward else _in_front
         com = lambda b: system.bodies.com[b] if b < ground else zero
-        found[link.child] = body(found[link.parent], joint, step, com(link.parent), com(link.child))
+        placed = body(found[link.parent], joint, step, com(link.parent), com(link.child))
+        # without it XLA merges a whole chain into one expression, which takes for ever to compile
+        found[link.child] = jax.lax.optimization_barrier(placed)
     bodies = [found[b] for b in range(ground)]
     sign = lambda p, like: jnp.where(jnp.sum(p * like) < 0, -p, p)
     p = jnp.stack([sign(body.p, start.p[b]) for b, body in enumerate(bodies)])
@@ -254,30 +264,26 @@ def _closed(
     q: dict[str, Array],
     u: dict[str, Array],
     t: Float[Array, ""],
-    start: State,
 ) -> State:
     """The loops closed with the given joints held, and velocities with the given rates."""
-    # a rate alone is one at the posture of the start
-    kin = system.kinematics(start)
-    held = dict(q)
-    for name in u:
-        held.setdefault(name, relative(kin, system.joints[system.joint_index(name)])[0])
-    zero = {name: jnp.zeros_like(value) for name, value in held.items()}
-    locked = _driven(system, held, zero, t)
+    zero = {name: jnp.zeros_like(value) for name, value in q.items()}
+    locked = _driven(system, q, zero, t)
     found = assemble(locked, guess, t, throw=False)
     if concrete(found) and not bool(found.converged):
         open_by = np.asarray(found.residuals)
         k = int(np.argmax(np.where(np.isfinite(open_by), open_by, np.inf)))
         raise StateError(
-            f"The mechanism has no posture with {_listed(system, held)} that is found from this "
+            f"The mechanism has no posture with {_listed(q) or 'closed loops'} that is found from this "
             f"start: joint '{locked.joints[k].name}' stays off by {open_by[k]:.3g}. Name fewer "
             "coordinates, choose values that fit together, or give a start nearer to the posture."
         )
     there = State(found.state.r, found.state.p, guess.v, guess.omega)
-    state, off = _moving(_driven(system, {name: held[name] for name in u}, u, t), there, t)
+    kin = system.kinematics(there)
+    now = {name: relative(kin, system.joints[system.joint_index(name)])[0] for name in u}
+    state, off = _moving(_driven(system, now, u, t), there, t)
     if concrete(off) and not bool(off <= _RATE_TOLERANCE):
         raise StateError(
-            f"No velocities of the mechanism have the joint rates {_listed(system, u)} in this "
+            f"No velocities of the mechanism have the joint rates {_listed(u)} in this "
             f"posture: they miss each other, or the constraints, by {float(off):.3g}. Name fewer "
             "rates, or values that fit together."
         )
@@ -352,7 +358,7 @@ def _drivers(joint: Joint, q: Array, u: Array) -> list[Any]:
     return [(w, k, same, x, x_rate) for w, k, x, x_rate in zip(words, kinds, q, u, strict=True)]
 
 
-def _listed(system: System, given: Mapping[str, Array]) -> str:
+def _listed(given: Mapping[str, Array]) -> str:
     """'A = 0.3, B = (1, 2)'."""
     parts = []
     for name, value in given.items():

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..mechanics.constraint import ROWS
+from ..mechanics.errors import ModelError
 from ..mechanics.load import Load
 from ..mechanics.state import Kinematics, State
 from ..mechanics.system import System
@@ -56,6 +57,32 @@ def in_joint_axes(system: System, state: State, found: Reactions) -> Reactions:
     axes = _points(system, system.kinematics(state))[1]
     turn = lambda x: jnp.einsum("kba,kb->ka", axes, x)
     return Reactions(turn(found.force), turn(found.moment))
+
+
+def reaction_on(
+    system: System, found: Reactions, joint: str, body: str
+) -> tuple[Float[Array | np.ndarray, "... 3"], Float[Array | np.ndarray, "... 3"]]:
+    """Force [N] and moment [N m] that a joint exerts on one of its two bodies, (..., 3) each.
+
+    The moment is about the joint's point on body j, the force acts there, whichever body is
+    asked for; in the axes in which the reactions are. `Reactions` hold what body i exerts on
+    body j, its opposite acts on body i.
+
+    Args:
+        found: reactions at all joints, of one time or along a run (..., joints, 3).
+        joint: its name. body: the name of one of its bodies, "ground" among them.
+
+    Raises:
+        ModelError: an unknown joint, or a body that it does not join.
+    """
+    k = system.joint_index(joint)
+    ends = (system.joints[k].body_i, system.joints[k].body_j)
+    if body not in ends:
+        raise ModelError(
+            f"Joint '{joint}' joins '{ends[0]}' and '{ends[1]}', and exerts nothing on '{body}'."
+        )
+    sign = 1.0 if body == ends[1] else -1.0
+    return sign * found.force[..., k, :], sign * found.moment[..., k, :]
 
 
 def tree_reactions(

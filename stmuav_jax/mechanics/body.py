@@ -140,14 +140,14 @@ def _advice(moments: np.ndarray) -> str:
     size = np.abs(moments).max()
     if size == 0:
         return (
-            " A point mass has no inertia to turn: give it that of a small sphere "
+            " A point mass has no inertia to turn: give it that of a small sphere, 2 m r^2 / 5 "
             "(stmuav_jax.sphere); where nothing turns it, the value does not matter."
         )
     if abs(moments[0]) <= _SINGULAR * size and moments[1] > _SINGULAR * size:
         return (
             " A rod without thickness has no inertia about its own axis, so that nothing would "
             "resist a turn about it: give it the moment that its thickness gives, m r^2 / 2 for "
-            "the radius r (stmuav_jax.rod); where joints keep it from that turn, the value does "
+            "the radius r (stmuav_jax.cylinder); where joints keep it from that turn, the value does "
             "not matter."
         )
     return ""

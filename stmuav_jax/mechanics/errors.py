@@ -55,8 +55,18 @@ def check_finite(value: object, what: str, unit: str, error: type[Exception] = M
 
 def check_shape(value: Any, shape: tuple[int, ...], what: str) -> None:
     """Raise `ModelError` unless `value` has the given shape."""
-    if np.shape(value) != shape:
-        raise ModelError(f"{what} must have shape {shape}, but it has {np.shape(value)}.")
+    found = shape_of(value)
+    if found != shape:
+        raise ModelError(f"{what} must have shape {shape}, but it has {found}.")
+
+
+def shape_of(value: Any) -> tuple[int, ...]:
+    """The shape of a number, an array, or a sequence of them, traced by JAX or not."""
+    if concrete(value):
+        return np.shape(value)
+    import jax.numpy as jnp
+
+    return jnp.shape(jnp.asarray(value))
 
 
 def nearest_names(name: str, known: Iterable[str]) -> str:

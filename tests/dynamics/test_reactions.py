@@ -139,3 +139,20 @@ def test_a_motors_moment_is_the_reaction_of_its_driver():
     close(found.accelerations.v_rate, np.zeros((1, 3)))
     close(found.reactions.moment[1], [0, MASS * GRAVITY * LENGTH * np.sin(0.6), 0])
     close(found.reactions.force[0], [0, 0, MASS * GRAVITY])
+
+
+def test_what_a_joint_exerts_on_either_body():
+    """On the body its weight, on ground the opposite at the same point; along a run too."""
+    system = pendulum()
+    found = evaluated(system).reactions
+    weight = np.array([0, 0, MASS * GRAVITY])
+    for body, sign in ((system.joints[0].body_j, 1), (system.joints[0].body_i, -1)):
+        force, moment = sj.reaction_on(system, found, "hinge", body)
+        close(force, sign * weight)
+        close(moment, np.zeros(3))
+        along = jax.tree.map(lambda x: np.stack([x, 2 * x]), found)
+        close(sj.reaction_on(system, along, "hinge", body)[0][1], 2 * sign * weight)
+    with pytest.raises(sj.ModelError, match="exerts nothing on 'x'"):
+        sj.reaction_on(system, found, "hinge", "x")
+    with pytest.raises(sj.ModelError, match="no joint 'hinges'"):
+        sj.reaction_on(system, found, "hinges", "ground")
