@@ -244,7 +244,7 @@ def _settled(z: np.ndarray, there: np.ndarray, window: int) -> tuple[np.ndarray,
         return np.zeros(z.shape[2], dtype=int), np.zeros(z.shape[2], dtype=bool)
     cut = lambda a: a[: count * window].reshape(count, window * z.shape[1], -1)
     inside = chi2_p_values(np.sum(cut(z) ** 2, axis=1), np.sum(cut(there), axis=1))[2] > WITHIN
-    some = inside.any(axis=0)
+    some = np.asarray(np.any(inside, axis=0))
     return np.where(some, np.argmax(inside, axis=0) * window, 0), ~some
 
 
@@ -349,9 +349,9 @@ def _verdict(found: dict[str, Any], i: int, level: float, names: tuple[str, ...]
     number = lambda key: float(of[key])
     return Verdict(
         status, level, least, p_values,
-        *(number(key) for key in ("settled", "since", "high", "low", "start", "size", "memory",
-                                  "missing")),
-        " ".join(_sentences(status, of, spoke, level, names)),
+        settled=number("settled"), since=number("since"), high=number("high"), low=number("low"),
+        start=number("start"), size=number("size"), memory=number("memory"),
+        missing=number("missing"), words=" ".join(_sentences(status, of, spoke, level, names)),
     )  # fmt: skip
 
 
