@@ -1,12 +1,13 @@
 """Figures and tables of docs/estimation.md; takes minutes.
 
-    python docs/make_estimation.py
+    python docs/make_estimation.py [machine] [walk] [loads] [cases] [hover]
 
 Writes docs/figures/estimation/*.png and numbers.json. The tables of the eight cases and of the
 hover are those of `stmuav estimate` and `stmuav estimate --hover`.
 """
 
 import json
+import sys
 from pathlib import Path
 
 import jax
@@ -42,13 +43,16 @@ def cases() -> tuple[list, dict]:
         rows += study.summaries.values()
         if case in (1, 8):
             late = stm.estimate_case(study.record, own, smoothed=True)
-            rmse = lambda e: np.sqrt(np.mean(np.asarray(e.error)[500:, 3:] ** 2, axis=(0, 2)))
+            rmse = lambda e: np.sqrt(np.mean(np.asarray(e.error)[1200:, 3:] ** 2, axis=(0, 2)))
             smoothed[case] = [
                 (1e3 * rmse(e)).tolist() for e in (study.estimates["consistent"], late)
             ]
         if case == 8:
             save_case_figures(study, FOLDER, dpi=120)
-    Console(width=110).print(summary_table(rows))
+    out = Console(width=100)
+    out.print(summary_table(rows))
+    for row in rows:
+        out.print(f"case {row.case}, {row.tuning}: {row.verdict.short}", highlight=False)
     return [row.plain() for row in rows], smoothed
 
 
@@ -137,15 +141,29 @@ def machine() -> dict:
     return {words: size(values - truth) for words, values in found.items()}
 
 
-def main() -> None:
-    """Everything."""
-    numbers: dict = {"machine": machine(), "random walk": followed(), "loads": loads()}
-    print(json.dumps(numbers, indent=1), flush=True)
-    numbers["cases"], numbers["smoother"] = cases()
-    print(numbers["smoother"], flush=True)
-    hovers()
-    (FOLDER / "numbers.json").write_text(json.dumps(numbers, indent=1) + "\n")
+def tabled() -> dict:
+    """The eight cases, and what smoothing leaves."""
+    rows, smoothed = cases()
+    return {"cases": rows, "smoother": smoothed}
+
+
+PARTS = {
+    "machine": lambda: {"machine": machine()},
+    "walk": lambda: {"random walk": followed()},
+    "loads": lambda: {"loads": loads()},
+    "cases": tabled,
+    "hover": lambda: hovers() or {},
+}
+
+
+def main(names: list[str]) -> None:
+    """The parts that are named, or everything; numbers of the other parts stay."""
+    path = FOLDER / "numbers.json"
+    numbers = json.loads(path.read_text()) if path.exists() else {}
+    for name in names or PARTS:
+        numbers |= PARTS[name]()
+        path.write_text(json.dumps(numbers, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

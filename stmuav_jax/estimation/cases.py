@@ -80,6 +80,27 @@ class World(eqx.Module):
     substeps: int = eqx.field(static=True, default=4)
 
 
+# Runs times steps that are kept at most: 12 GB of truth and measurements.
+MOST = 1e8
+
+
+def check_seeds(seeds: int, seed: int) -> None:
+    """Raise `SettingError` unless there are runs, and their seeds are whole numbers of 63 bits."""
+    if seeds < 1:
+        raise SettingError(f"At least one seed is needed, not {seeds}.")
+    if not 0 <= seed < 2**62:
+        raise SettingError(f"The first seed must lie between 0 and 2^62, but it is {seed}.")
+
+
+def check_room(seeds: int, steps: float) -> None:
+    """Raise `SettingError` where runs times steps are more than are kept."""
+    if seeds * steps > MOST:
+        raise SettingError(
+            f"{seeds} runs of {steps:.0f} steps are too many to keep at once: at most {MOST:g} in all. "
+            "Take fewer seeds or an earlier end."
+        )
+
+
 def simulate_case(
     case: int,
     *,
@@ -95,17 +116,18 @@ def simulate_case(
         seeds: how many. t1: end [s]. seed: of the first; run i is that of seed + i.
 
     Raises:
-        SettingError: a case that is not 1 to 8, no seeds, or an end before the first step.
+        SettingError: a case that is not 1 to 8, no seeds, a seed that is negative, an end before
+            the first step, or more than fits into memory.
     """
     dt = float(parameters.value("step"))
     if case not in CASES:
         raise SettingError(f"The report has cases 1 to 8, not {case}.")
-    if seeds < 1:
-        raise SettingError(f"At least one seed is needed, not {seeds}.")
+    check_seeds(seeds, seed)
     if not dt <= t1 < 1e4:
         raise SettingError(
             f"The end must lie between one step of {dt:g} s and 1e4 s, not {t1:g} s."
         )
+    check_room(seeds, t1 / dt)
     world = World() if world is None else world
     if world.load is not None:
         load_factor(parameters.value("mass"), world.load)

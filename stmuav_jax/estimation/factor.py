@@ -22,6 +22,9 @@ from ..algebra.linalg import solve_lower
 
 Root = Float[Array, "k k *s"]
 
+# What rounding leaves of a pivot that is zero, in units of epsilon.
+_ROUND_OFF = 100
+
 # Columns up to which written-out code beats a call of LAPACK for a single matrix.
 _FEW = 3
 
@@ -81,6 +84,29 @@ def cholesky(P: Root) -> Root:
     for _ in range(k):
         pivot = P[:1, 0]
         column = P[:, 0] / jnp.sqrt(jnp.where(pivot > 0, pivot, jnp.nan))
+        columns.append(column)
+        P = P[1:, 1:] - column[1:, None] * column[None, 1:]
+    return _assemble(columns)
+
+
+def semidefinite(P: Root) -> Root:
+    """The lower factor of positive semi-definite matrices; NaN for any other.
+
+    A pivot of zero, within rounding of its diagonal entry, makes a column of zeros. The factor
+    is differentiable where the null directions stay: a variance of zero counts as a constant,
+    since its root has no derivative.
+    """
+    scale = jnp.stack([P[i, i] for i in range(P.shape[0])])
+    allowed = _ROUND_OFF * jnp.finfo(P.dtype).eps * scale
+    columns = []
+    for k in range(P.shape[0]):
+        pivot, below = P[0, 0], P[1:, 0]
+        some = pivot > allowed[k]
+        # |P_ij| <= sqrt(P_ii P_jj): nothing is beside a pivot of zero
+        none = (pivot >= -allowed[k]) & jnp.all(below**2 <= allowed[k] * scale[k + 1 :], axis=0)
+        inverse = jnp.where(some, 1 / jnp.sqrt(jnp.where(some, pivot, 1.0)), 0.0)
+        inverse = jnp.where(some | none, inverse, jnp.nan)
+        column = P[:, 0] * inverse
         columns.append(column)
         P = P[1:, 1:] - column[1:, None] * column[None, 1:]
     return _assemble(columns)

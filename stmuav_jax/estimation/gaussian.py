@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.shapes import Numbers
 from ..mechanics.errors import ModelError, check_finite, concrete
-from .factor import cholesky, divide_lower, outer_square, triangularise
+from .factor import divide_lower, outer_square, semidefinite, triangularise
 from .space import Point, Vector
 
 # An eigenvalue below zero by this fraction of the largest is round-off, in units of epsilon.
@@ -58,14 +58,15 @@ def gaussian(mean: Point, covariance: Numbers, *, name: str = "P0") -> Gaussian:
 def root(covariance: Numbers, name: str) -> Float[Array, "n n *s"]:
     """Lower triangular L with L L^T = covariance, which may be singular.
 
-    Inside `jax.jit` or `grad` the values cannot be looked at: there the covariance must be
-    positive definite, and NaN comes out where it is not.
+    Inside `jax.jit` or `grad` the values cannot be looked at: there NaN comes out of a matrix that is
+    no covariance. Derivatives exist by all variances that are not zero; a variance of zero counts as a
+    constant (`factor.semidefinite`).
 
     Raises:
         ModelError: as `gaussian`.
     """
     if not concrete(covariance):
-        return cholesky(jnp.asarray(covariance))
+        return semidefinite(jnp.asarray(covariance))
     given = np.asarray(covariance)
     P = given.astype(float)
     check_covariance(P, name, epsilon=_epsilon(given))

@@ -31,6 +31,7 @@ from ..algebra.stacked import apply, apply_transposed, dot
 from ..mechanics.errors import SettingError
 from ..vehicle.parameters import Parameters
 from .attitude import ATTITUDE_NAMES, attitude_model
+from .cases import check_room, check_seeds
 from .consistency import nees
 from .filter import is_finite, one_step
 from .gaussian import Gaussian, gaussian
@@ -223,6 +224,8 @@ def simulate_hover(
             "A hover needs a case from 1 to 8, at least one seed, and an end between one step of "
             f"{dt:g} s and 1e4 s, not case {case}, {seeds} seeds, {t1:g} s."
         )
+    check_seeds(seeds, seed)
+    check_room(seeds, t1 / dt)
     loop = Loop() if loop is None else loop
     model, prior = hover_filter(tuning, loop, moves=case > 4, parameters=parameters)
     t = jnp.asarray(dt * np.arange(round(t1 / dt) + 1))

@@ -1,9 +1,9 @@
-"""Covariances from measurements alone: those that make a record most likely.
+"""Covariances and other parameters from measurements alone: those that make a record most likely.
 
 The logarithms of the variances are moved along the gradient of the filter's log-likelihood
-(optax), so that they stay positive. The curvature at the optimum gives their standard errors:
-for independent records the estimate of ln(variance) has the covariance H^-1, H the Hessian of
-the negative log-likelihood.
+(optax), so that they stay positive; parameters of either sign are moved themselves. The curvature
+at the optimum gives their standard errors: for independent records the estimate of ln(variance) has
+the covariance H^-1, H the Hessian of the negative log-likelihood.
 
 Source: S. Sarkka, L. Svensson, Bayesian filtering and smoothing, 2nd ed. (2023), ch. 16.
 """
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.compiler import outer_jit
 from ..mechanics.errors import SettingError
-from .filter import kalman_filter
+from .filter import kalman_filter, step_lengths
 from .gaussian import Gaussian
 from .model import Inputs, StateSpaceModel
 from .sigma import AbstractRule
@@ -33,7 +33,7 @@ class Tuned(NamedTuple):
     """What maximising the likelihood has found.
 
     Attributes:
-        values: the best variances, a pytree like the start's.
+        values: the best parameters, a pytree like the start's.
         log_likelihood: of the records with them.
         history: log-likelihood at every step, the start's first.
         reason: "converged", "steps" (all used) or "not finite" (the best before that is kept).
@@ -52,15 +52,22 @@ def record_likelihood(
     y: Array,
     *,
     u: Inputs = None,
-    dt: Any,
+    dt: Any = None,
+    t: Any = None,
     rule: AbstractRule | None = None,
     form: Form = "square_root",
 ) -> Float[Array, ""]:
-    """Log-likelihood of a record (T, m), or of independent ones (T, m, s), by the variances."""
+    """Log-likelihood of a record (T, m), or of independent ones (T, m, s), by the parameters.
+
+    Args:
+        model_of: makes the model of `values`. The others as `kalman_filter`.
+    """
     if y.ndim == 3 and prior.factor.ndim == 2:
         wide = lambda a: jnp.broadcast_to(a[..., None], (*a.shape, y.shape[2]))
         prior = jax.tree.map(wide, prior)
-    out = kalman_filter(model_of(values), prior, y, u=u, dt=dt, rule=rule, form=form, throw=False)
+    out = kalman_filter(
+        model_of(values), prior, y, u=u, dt=dt, t=t, rule=rule, form=form, throw=False
+    )
     return jnp.sum(out.log_likelihood)
 
 
@@ -71,10 +78,12 @@ def tune(
     y: Array,
     *,
     u: Inputs = None,
-    dt: Any,
+    dt: Any = None,
+    t: Any = None,
     rule: AbstractRule | None = None,
     form: Form = "square_root",
     optimiser: optax.GradientTransformation | None = None,
+    signed: Any = False,
     steps: int = 100,
     tolerance: float = 1e-3,
     progress: Callable[[int, float], None] | None = None,
@@ -84,26 +93,33 @@ def tune(
     Args:
         model_of: makes the model of the variances, a pytree of positive numbers: of whole
             diagonals of Q and R, of some of their entries, or of factors of them.
-        start: where to begin. prior, y, u, dt, rule, form: as `kalman_filter`; y may hold
+        start: where to begin. prior, y, u, dt, t, rule, form: as `kalman_filter`; y may hold
             independent records (T, m, s).
+        signed: True, or a pytree of booleans like `start`, for parameters that may have either sign
+            (a bias, an offset): they are moved themselves, variances by their logarithms.
         optimiser: of optax; default L-BFGS with its line search.
         steps: at most. tolerance: a gain of log-likelihood below this ends it, as does a
             gradient (by ln variance) below it.
         progress: called with the step and the log-likelihood so far.
 
     Raises:
-        SettingError: a start that is not positive, no step, or one that the filter cannot run with.
+        SettingError: a start that is not positive and not `signed`, no step, or one that the filter
+            cannot run with.
     """
-    for leaf in jax.tree.leaves(start):
-        if not np.all(np.asarray(leaf) > 0):
-            raise SettingError(f"Variances to tune must be positive, but one is {np.min(leaf):g}.")
+    signs = _signs(signed, start)
+    for leaf, either in zip(jax.tree.leaves(start), jax.tree.leaves(signs), strict=True):
+        if not either and not np.all(np.asarray(leaf) > 0):
+            raise SettingError(
+                f"Variances to tune must be positive, but one is {np.min(leaf):g}. Parameters of "
+                "either sign are named by `signed`."
+            )
     if steps < 1:
         raise SettingError(f"At least one step is needed, not {steps}.")
-    as_given = lambda p: jax.tree.map(jnp.exp, p)
+    lengths = step_lengths(dt, t, y.shape[0], prior.factor.dtype)
 
     def loss(p: Any, y: Array, u: Inputs) -> Array:
-        found = record_likelihood(model_of, as_given(p), prior, y, u=u, dt=dt, rule=rule, form=form)
-        return -found
+        now = _given(p, signs)
+        return -record_likelihood(model_of, now, prior, y, u=u, dt=lengths, rule=rule, form=form)
 
     search = optax.with_extra_args_support(optax.lbfgs() if optimiser is None else optimiser)
 
@@ -114,11 +130,34 @@ def tune(
         )
         return optax.apply_updates(p, moves), state, value, optax.tree.norm(slope)
 
-    p = jax.tree.map(lambda leaf: jnp.log(jnp.asarray(leaf, prior.factor.dtype)), start)
+    p = _free(jax.tree.map(lambda leaf: jnp.asarray(leaf, prior.factor.dtype), start), signs)
     u = jax.tree.map(jnp.asarray, u)
-    return _climb(
+    found = _climb(
         outer_jit(step), p, search.init(p), (jnp.asarray(y), u), steps, tolerance, progress
     )
+    return found._replace(values=jax.tree.map(np.asarray, _given(found.values, signs)))
+
+
+def _signs(signed: Any, values: Any) -> Any:
+    """Whether each leaf of the parameters may have either sign."""
+    if isinstance(signed, bool):
+        return jax.tree.map(lambda leaf: signed, values)
+    if jax.tree.structure(signed) != jax.tree.structure(values):
+        raise SettingError(
+            "`signed` must be True, False, or have the structure of the parameters, "
+            f"{jax.tree.structure(values)}, not {jax.tree.structure(signed)}."
+        )
+    return signed
+
+
+def _free(values: Any, signs: Any) -> Any:
+    """What is moved: logarithms of positive parameters, the others themselves."""
+    return jax.tree.map(lambda leaf, either: leaf if either else jnp.log(leaf), values, signs)
+
+
+def _given(p: Any, signs: Any) -> Any:
+    """The parameters of what is moved."""
+    return jax.tree.map(lambda leaf, either: leaf if either else jnp.exp(leaf), p, signs)
 
 
 def _climb(
@@ -141,7 +180,9 @@ def _climb(
             if k == 0:
                 raise SettingError(
                     f"The log-likelihood of the start is {gained}: the filter cannot run with it. "
-                    "Begin with larger variances."
+                    f"The gradient's norm is {float(slope)}. Usual causes: variances that are too "
+                    "small for the record (begin with larger ones), a record or inputs that are not "
+                    "finite, a model that diverges."
                 )
             break
         if progress is not None:
@@ -153,8 +194,7 @@ def _climb(
             reason = "converged"
             break
         p = after
-    values = jax.tree.map(lambda leaf: np.exp(np.asarray(leaf)), best)
-    return Tuned(values, highest, np.array(history), reason)
+    return Tuned(best, highest, np.array(history), reason)
 
 
 def standard_errors(
@@ -164,16 +204,26 @@ def standard_errors(
     y: Array,
     *,
     u: Inputs = None,
-    dt: Any,
+    dt: Any = None,
+    t: Any = None,
     rule: AbstractRule | None = None,
     form: Form = "square_root",
+    signed: Any = False,
 ) -> Any:
-    """Standard errors of ln(variance), a pytree like `values`; NaN where nothing is known."""
-    flat, back = ravel_pytree(jax.tree.map(lambda leaf: jnp.log(jnp.asarray(leaf)), values))
+    """Standard errors, a pytree like `values`; NaN where nothing is known.
+
+    They are those of ln(variance), and of `signed` parameters themselves.
+
+    Args:
+        as `tune`.
+    """
+    signs = _signs(signed, values)
+    lengths = step_lengths(dt, t, y.shape[0], prior.factor.dtype)
+    flat, back = ravel_pytree(_free(jax.tree.map(jnp.asarray, values), signs))
 
     def loss(p: Array, y: Array, u: Inputs) -> Array:
-        now = jax.tree.map(jnp.exp, back(p))
-        return -record_likelihood(model_of, now, prior, y, u=u, dt=dt, rule=rule, form=form)
+        now = _given(back(p), signs)
+        return -record_likelihood(model_of, now, prior, y, u=u, dt=lengths, rule=rule, form=form)
 
     curve = outer_jit(jax.jacfwd(jax.grad(loss)))
     H = np.asarray(curve(flat, jnp.asarray(y), jax.tree.map(jnp.asarray, u)))

@@ -214,18 +214,17 @@ def judge(
     z = np.where(there & np.asarray(ok)[:, None], np.asarray(scaled, dtype=float), 0.0)
     # in short records windows are shorter, so that there are some
     window = max(2, min(window, len(z) // 8))
-    from_step = (
-        _settled(z, there, window)
-        if settle is None
-        else np.full(z.shape[2], np.sum(t <= settle * (1 + 1e-9)))
-    )
+    from_step, never = _settled(z, there, window)
+    if settle is not None:
+        from_step = np.full(z.shape[2], np.sum(t <= settle * (1 + 1e-9)))
+        never = np.zeros_like(never)
     steps = np.arange(len(z))[:, None]
     # without a transient the first window is the start
     first = np.maximum(from_step, window if settle is None else 0)
     found = _numbers(z, there & (steps >= from_step)[:, None], window, level)
     start = there & (steps < first)[:, None]
     found |= _sizes("start", np.sum(z**2 * start, (0, 1)), np.sum(start, (0, 1)))
-    found["never"] = never if settle is None else np.zeros_like(never)
+    found["never"] = never
     found["missing"] = 1 - np.mean(there, axis=(0, 1))
     found["settled"] = np.where(from_step > 0, t[np.maximum(from_step, 1) - 1], 0.0)
     at = found["since step"]
@@ -245,7 +244,7 @@ def _settled(z: np.ndarray, there: np.ndarray, window: int) -> tuple[np.ndarray,
         return np.zeros(z.shape[2], dtype=int), np.zeros(z.shape[2], dtype=bool)
     cut = lambda a: a[: count * window].reshape(count, window * z.shape[1], -1)
     inside = chi2_p_values(np.sum(cut(z) ** 2, axis=1), np.sum(cut(there), axis=1))[2] > WITHIN
-    some = inside.any(axis=0)
+    some = np.asarray(np.any(inside, axis=0))
     return np.where(some, np.argmax(inside, axis=0) * window, 0), ~some
 
 
@@ -350,9 +349,9 @@ def _verdict(found: dict[str, Any], i: int, level: float, names: tuple[str, ...]
     number = lambda key: float(of[key])
     return Verdict(
         status, level, least, p_values,
-        *(number(key) for key in ("settled", "since", "high", "low", "start", "size", "memory",
-                                  "missing")),
-        " ".join(_sentences(status, of, spoke, level, names)),
+        settled=number("settled"), since=number("since"), high=number("high"), low=number("low"),
+        start=number("start"), size=number("size"), memory=number("memory"),
+        missing=number("missing"), words=" ".join(_sentences(status, of, spoke, level, names)),
     )  # fmt: skip
 
 

@@ -82,6 +82,7 @@ def hover_table(flights: dict[str, Hover]) -> Table:
     for name in ("largest tilt\n[degrees]", "furthest\n[m]", "to 2 cm\n[s]", "RMSE x, y\n[mm]",
                  "NEES\n(2)", "NEES\n(14)", "failed"):  # fmt: skip
         table.add_column(escape(name), justify="right")
+    end = float(max(flight.t[-1] for flight in flights.values()))
     for name, flight in flights.items():
         t = np.asarray(flight.t)
         error = np.asarray(flight.mean - flight.truth)[:, 3:]
@@ -98,7 +99,7 @@ def hover_table(flights: dict[str, Hover]) -> Table:
             f"{int(np.sum(~np.asarray(flight.ok)[-1]))} of {seeds}",
         )  # fmt: skip
     table.caption = (
-        f"RMSE after {settled_from(t[-1]):g} s; NEES at the end; high and low: outside the interval of "
+        f"RMSE after {settled_from(end):g} s; NEES at the end; high and low: outside the interval of "
         "99.9 % of a consistent filter's means."
     )
     return table

@@ -232,6 +232,10 @@ def test_refused():
         simulate_case(9)
     with pytest.raises(SettingError, match="At least one seed"):
         simulate_case(1, seeds=0)
+    with pytest.raises(SettingError, match="first seed must lie"):
+        simulate_case(1, seed=-1)
+    with pytest.raises(SettingError, match="too many to keep at once"):
+        simulate_case(1, seeds=10**10)
     with pytest.raises(SettingError, match=r"between one step of 0.001 s"):
         simulate_case(1, t1=-1.0)
     with pytest.raises(SettingError, match="between 0 and the total"):

@@ -84,3 +84,19 @@ def test_sine_and_cosine():
     np.testing.assert_allclose(c, np.cos(x), rtol=0, atol=1e-15)
     slope = jax.grad(lambda v: sine_cosine(v)[0])(jnp.asarray(0.3))
     np.testing.assert_allclose(slope, np.cos(0.3), rtol=1e-15)
+
+
+def test_semidefinite():
+    """Zero variances, rank one, banks; the square comes back, what is no covariance is NaN."""
+    g = np.array([0.5, 0.0, 2.0])
+    single = [
+        np.diag([2.0, 0.0, 3.0]),
+        np.outer(g, g),
+        np.zeros((3, 3)),
+        np.eye(3) + np.outer(g, g),
+    ]
+    L = jax.jit(factor.semidefinite)(jnp.stack([jnp.asarray(P) for P in single], -1))
+    square = np.asarray(factor.outer_square(L))
+    np.testing.assert_allclose(square, np.stack(single, -1), rtol=0, atol=1e-14)
+    for P in ([[0.0, 1.0], [1.0, 0.0]], [[1.0, 2.0], [2.0, 1.0]], [[-1.0, 0.0], [0.0, 1.0]]):
+        assert np.any(np.isnan(factor.semidefinite(jnp.array(P))))

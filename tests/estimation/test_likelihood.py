@@ -95,3 +95,44 @@ def test_refused(records):
     bad = records.at[3].set(jnp.inf)
     with pytest.raises(SettingError, match="the filter cannot run with it"):
         tune(model_of, START, PRIOR, bad, dt=1.0)
+
+
+def with_zeros(v):
+    """The second state has no noise of its own; Q is a factor times a matrix with zeros."""
+    A = jnp.asarray(F)
+    sensor = Sensor(lambda x, u: x[:1], jnp.diag(v["R"]), stacked=True)
+    step = lambda x, u, dt: jnp.einsum("ij,j...->i...", A, x)
+    return StateSpaceModel(step, v["q"] * jnp.diag(jnp.array([1.0, 0.0])), sensor, stacked=True)
+
+
+def test_zero_process_noise_has_gradients(records):
+    """Against central differences; and `tune` finds its way."""
+    start = {"q": np.array(0.1), "R": np.array([0.5])}
+    loss = jax.jit(lambda v: record_likelihood(with_zeros, v, PRIOR, records[:40], dt=1.0))
+    slope = jax.jit(jax.grad(loss))(start)
+    for key in start:
+        h = 1e-5
+        up, down = ({**start, key: start[key] + s * h} for s in (1, -1))
+        expected = (loss(up) - loss(down)) / (2 * h)
+        np.testing.assert_allclose(np.ravel(slope[key])[0], expected, rtol=1e-6)
+
+
+def test_signed_parameters_and_times(records):
+    """A bias by the identity instead of the logarithm, from times instead of a step."""
+    y, t = records[:100] + 0.7, np.arange(101.0)
+
+    def biased(v):
+        sensor = Sensor(lambda x, u: x[:1] + v["bias"], jnp.diag(v["R"]), stacked=True)
+        step = lambda x, u, dt: jnp.einsum("ij,j...->i...", jnp.asarray(F), x)
+        return StateSpaceModel(step, jnp.diag(jnp.asarray(TRUE["Q"])), sensor, stacked=True)
+
+    start = {"bias": np.array(-0.2), "R": np.array([1.0])}
+    signed = {"bias": True, "R": False}
+    found = tune(biased, start, PRIOR, y, t=t, signed=signed, steps=25)
+    errors = standard_errors(biased, found.values, PRIOR, y, t=t, signed=signed)
+    assert abs(found.values["bias"] - 0.7) < 3.3 * float(errors["bias"])
+    assert float(errors["bias"]) < 0.3
+    with pytest.raises(SettingError, match=r"must be positive, but one is -0\.2"):
+        tune(biased, start, PRIOR, y, t=t)
+    with pytest.raises(SettingError, match="either dt"):
+        tune(biased, start, PRIOR, y, signed=signed)

@@ -1,5 +1,7 @@
 """The verdict: its level over healthy records, its power against what is wrong, its words."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -132,6 +134,7 @@ def test_one_record():
     )
     with pytest.raises(SettingError, match="verdicts for a bank"):
         verdict(bank)
+    wrong: dict[str, Any]
     for wrong in ({"level": 0.0}, {"window": 1}, {"settle": 1e9}):
         with pytest.raises(SettingError):
             verdict(out, **wrong)
