@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 
 from ..mechanics.errors import SettingError
+from ..view.terminal import line
 from .options import SEED, count, default
 from .output import written
 
@@ -126,9 +127,9 @@ def run_montecarlo(command: Montecarlo) -> int:
         else:
             outcome = run_study(work, store, total, progress=watch, **settings)
     out = Console()
-    out.print(outcome.words(), highlight=False)
+    line(out, outcome.words())
     if command.precision == "float32":
-        out.print(_precision(work, min(64, total)), highlight=False)
+        line(out, _precision(work, min(64, total)))
     paths = [store]
     if command.figures != "none":
         paths += _report(store, folder, command.figures, out)

@@ -13,6 +13,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
+from rich.text import Text
 
 from ..estimation.assess import SETTLED, CaseStudy, Estimates, Summary, last_beyond
 from ..estimation.consistency import mean_interval
@@ -37,7 +38,7 @@ def summary_table(summaries: Iterable[Summary]) -> Table:
     for name in ("case", "tuning"):
         table.add_column(name)
     for name in ("2 cm [s]", "5 mm [s]", "RMSE [mm]", "NEES 2", "NEES 5", "NIS 3", "lost"):
-        table.add_column(name, justify="right")
+        table.add_column(Text(name), justify="right")
     for row in rows:
         table.add_row(
             str(row.case), row.tuning, _seconds(row.to_2cm), _seconds(row.to_5mm),
@@ -68,7 +69,7 @@ def hover_table(flights: dict[str, Hover]) -> Table:
     table.add_column("tuning")
     for name in ("largest tilt [degrees]", "furthest [m]", "to 2 cm [s]", "RMSE x, y [mm]",
                  "NEES offset (2)", "NEES (14)", "failed"):  # fmt: skip
-        table.add_column(name, justify="right")
+        table.add_column(Text(name), justify="right")
     for name, flight in flights.items():
         t = np.asarray(flight.t)
         error = np.asarray(flight.mean - flight.truth)[:, 3:]
