@@ -278,6 +278,16 @@ def _simulate(command: Simulate, console: Console, started: float) -> int:
     return 0
 
 
+def _use_devices(command: Montecarlo) -> None:
+    """Have JAX make a device of each core to be used, where this process itself flies."""
+    if command.scheduler is None and command.workers is None:
+        import jax
+
+        # before the first array: JAX counts its devices once, in another program too
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", command.devices or cores())
+
+
 def _run(command: Any, started: float) -> int:
     """Run one command; its exit code."""
     if isinstance(command, List):
@@ -288,12 +298,7 @@ def _run(command: Any, started: float) -> int:
             return run_report(command)
     _configure(command.cache)
     if isinstance(command, Montecarlo):
-        if command.scheduler is None and command.workers is None:
-            import jax
-
-            # before the first array: JAX counts its devices once, in another program too
-            with contextlib.suppress(RuntimeError):
-                jax.config.update("jax_num_cpu_devices", command.devices or cores())
+        _use_devices(command)
         return run_montecarlo(command)
     if isinstance(command, Tune):
         return run_tune(command)

@@ -231,7 +231,7 @@ def test_linearize_command(tmp_path, capsys):
 @pytest.mark.slow
 def test_tune_commands(tmp_path, capsys):
     """Hold, cut short and gone on with; another problem's checkpoint is refused."""
-    given = ["tune", "hold", "--t1", "0.3", "--segments", "1", "--out", str(tmp_path)]
+    given = ["tune", "hold", "--t1", "0.3", "--out", str(tmp_path)]
     assert main([*given, "--no-cache", "--steps", "2"]) == 1
     printed = capsys.readouterr()
     assert "2 steps allowed" in printed.out
@@ -242,6 +242,9 @@ def test_tune_commands(tmp_path, capsys):
     assert "Converged" in printed
     assert "NOT CONVERGED" not in printed
     assert "rotor 1 [rad/s]" in printed
+    # those of the trim
+    assert "1360.97" in printed
+    assert "5.478037" in printed
     assert (tmp_path / "loss.png").stat().st_size > 5000
     given[3] = "0.25"
     assert main([*given, "--no-cache", "--resume"]) == 2

@@ -5,7 +5,7 @@ import random
 import pytest
 
 from stmuav_jax import cli
-from stmuav_jax.commands import flight, sun, tune
+from stmuav_jax.commands import flight, tune
 from stmuav_jax.commands.options import Number
 from stmuav_jax.mechanics.errors import SettingError
 
@@ -66,7 +66,8 @@ def stubbed(monkeypatch):
         monkeypatch.setattr(module, name, stop)
     monkeypatch.setattr("stmuav_jax.study.heading.best_heading", stop)
     monkeypatch.setattr("stmuav_jax.study.day.track_day", stop)
-    monkeypatch.setattr(cli, "_configure", lambda use: None)
+    for name in ("_configure", "_use_devices"):
+        monkeypatch.setattr(cli, name, lambda _: None)
     return reached
 
 
@@ -130,4 +131,3 @@ def test_words_of_a_range():
         Number("time", "s", above=0.0).check(0.0, "--t1")
     with pytest.raises(SettingError, match="must be at least 1, but it is an integer of 4"):
         Number("count", "", low=1).check(-(10**4000), "--n")
-    assert sun.SunDay.__doc__
