@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import stmuav_jax as sj
 from stmuav_jax.cli import main
+from stmuav_jax.scenes.catalogue import CATALOGUE
+from stmuav_jax.scenes.registry import SCENES, make_scene
 from stmuav_jax.view.io import load
 
 
@@ -28,6 +31,28 @@ def test_list_names_every_scene_and_case(capsys):
     out = capsys.readouterr().out
     for words in ("spin", "uav_tracker", "1, 2, 3", "Part II, 5.1"):
         assert words in out
+
+
+def test_what_list_says_is_what_the_scenes_are():
+    for name, entry in CATALOGUE.items():
+        built = SCENES[name]
+        assert (entry.cases, entry.summary, entry.source) == (
+            built.cases, built.summary, built.source
+        )  # fmt: skip
+        assert make_scene(name).t1 == entry.t1
+    assert list(CATALOGUE) == list(SCENES)
+
+
+def test_version_and_help(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.split()[-1] == sj.__version__
+    assert main(["--help"]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "Simulate, trim, tune and estimate a UAV that carries" in words
+    assert main(["trim", "--help"]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "Example: stmuav trim --phi 10" in words
+    assert "default: None" not in words
 
 
 def test_simulate_writes_results_and_prints_the_certificate(tmp_path, capsys):
@@ -68,8 +93,8 @@ def test_parameters_and_solver_reach_the_run(tmp_path):
     ("arguments", "words"),
     [
         (("tracker", "--case", "7"), "no case 7"),
-        (("tracker", "--t1", "-1"), "t1 = -1.0 s"),
-        (("tracker", "--rtol", "0"), "rtol must be"),
+        (("tracker", "--t1", "-1"), "end of the time span must be above 0"),
+        (("tracker", "--rtol", "0"), "relative tolerance must be above 0"),
         (("tracker", "--actuators", "printed"), "tracker has no actuators"),
         (("tracker", "--params", "/none.toml"), "There is no file /none.toml"),
         (("hexacopter", "--loads"), "hexacopter has none"),
@@ -127,12 +152,18 @@ def test_sun_prints_draws_and_saves_a_day(tmp_path, capsys):
         (("--lat", "91"), "latitude must lie within"),
         (("--lat", "nan"), "latitude must be finite"),
         (("--date", "yesterday"), "The date must be like 2024-03-21, not 'yesterday'"),
+        (("--date", "2024-02-30"), "There is no day 2024-02-30 in the calendar"),
+        (("--date", "0001-01-01"), "years 1950 to 2110, not for 0001-01-01"),
+        (("--date", "9999-12-31"), "years 1950 to 2110"),
+        (("--altitude", "60000"), "altitude must lie within -500 and 11000 m, but it is 60000"),
+        (("--roll", "nan"), "angle must be finite, but it is nan degrees (--roll)"),
+        (("--turbidity", "inf"), "turbidity must be finite"),
         (("--date", "2024-12-21", "--lat", "80"), "The sun does not rise at 80 degrees north"),
         (("--timezone", "Asia/Pnom_Penh"), "Did you mean 'Asia/Phnom_Penh'"),
         (("--step", "0"), "step must lie within"),
         (("--attitude", "/none.csv"), "There is no file /none.csv"),
         (("--attitude", "/none.csv", "--yaw", "3"), "not both"),
-        (("--turbidity", "0"), "turbidity must be at least 1"),
+        (("--turbidity", "0"), "turbidity must lie within 1 and 20"),
     ],
 )
 def test_sun_bad_input_is_one_paragraph_and_exit_code_two(arguments, words, capsys, tmp_path):
@@ -150,8 +181,12 @@ def test_installed_command_and_import_leave_jax_alone():
     code = "import stmuav_jax, jax; assert not jax.config.jax_enable_x64"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
     # what few commands need and is slow to import waits for them
-    code = "import sys, stmuav_jax.cli; assert not {'pvlib', 'matplotlib'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    code = (
+        "import sys; from stmuav_jax.cli import main; assert main(['--help']) == main(['list']) == 0; "
+        "assert main(['--version']) == 0; slow = {'jax', 'pvlib', 'matplotlib', 'scipy'}; "
+        "assert not slow & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120, capture_output=True)
     code = "from importlib.metadata import entry_points as e; e(name='stmuav')['stmuav'].load()"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
@@ -172,6 +207,8 @@ def test_trim_command(tmp_path, capsys):
     assert "N are required" in " ".join(capsys.readouterr().err.split())
     assert main([*given, "--phi", "3"]) == 2
     assert "not both" in capsys.readouterr().err
+    assert main(["trim", "--phi", "70", "--no-cache"]) == 2
+    assert "70 degrees from the base's z axis, 10 more" in " ".join(capsys.readouterr().err.split())
     assert main([*given, "--turn", "10"]) == 2
     assert "no steady" in " ".join(capsys.readouterr().err.split())
 
@@ -182,7 +219,11 @@ def test_linearize_command(tmp_path, capsys):
         assert found["A"].shape == (16, 16)
         assert list(found["outputs"]) == ["phi [rad]"]
         assert found["C"].shape == (1, 16)
-    assert "Modes" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Modes" in printed
+    assert "doubles or halves in [s]" in printed
+    assert "halves in 0.08" in printed
+    assert "0j" not in printed
     assert main(["linearize", "--turn", "3"]) == 2
     assert "straight flight" in capsys.readouterr().err
 
@@ -190,11 +231,20 @@ def test_linearize_command(tmp_path, capsys):
 @pytest.mark.slow
 def test_tune_commands(tmp_path, capsys):
     """Hold, cut short and gone on with; another problem's checkpoint is refused."""
-    given = ["tune", "hold", "--duration", "0.3", "--segments", "1", "--out", str(tmp_path)]
-    assert main([*given, "--no-cache", "--steps", "2"]) == 0
-    assert "2 steps allowed" in capsys.readouterr().out
+    given = ["tune", "hold", "--t1", "0.3", "--out", str(tmp_path)]
+    assert main([*given, "--no-cache", "--steps", "2"]) == 1
+    printed = capsys.readouterr()
+    assert "2 steps allowed" in printed.out
+    assert "NOT CONVERGED: the best of 2 steps" in printed.out
+    assert "--resume --steps 62" in " ".join(printed.err.split())
     assert main([*given, "--no-cache", "--resume"]) == 0
-    assert "Converged" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Converged" in printed
+    assert "NOT CONVERGED" not in printed
+    assert "rotor 1 [rad/s]" in printed
+    # those of the trim
+    assert "1360.97" in printed
+    assert "5.478037" in printed
     assert (tmp_path / "loss.png").stat().st_size > 5000
     given[3] = "0.25"
     assert main([*given, "--no-cache", "--resume"]) == 2
@@ -241,9 +291,10 @@ def test_estimate_hovers(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--case", "9"), "cases 1 to 8, not 9"),
-        (("--case", "1", "--seeds", "0"), "At least one seed"),
-        (("--case", "1", "--t1", "0"), "between one step of 0.001 s"),
+        (("--case", "9"), "number of the case must lie within 1 and 8"),
+        (("--case", "1", "--seeds", "0"), "number of runs must lie within 1 and 100000"),
+        (("--case", "1", "--t1", "0"), "must be above 0 and at most 100000 s"),
+        (("--case", "1", "--t1", "1e-4"), "between one step of 0.001 s"),
         (("--params", "/none.toml"), "There is no file /none.toml"),
         (("--hover", "--model", "printed"), "a model of its own"),
     ],

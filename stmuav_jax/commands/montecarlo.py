@@ -36,7 +36,7 @@ class Montecarlo:
         int | None, count("samples written together", 1e9), default("some seconds' worth")
     ] = None
     """Samples written together."""
-    devices: Annotated[int | None, count("devices", 1024), default("all")] = None
+    devices: Annotated[int | None, count("devices", 256), default("all")] = None
     """Cores (or GPUs) to use; no number depends on it."""
     lanes: Annotated[int | None, count("lanes", 1e6), default("16")] = None
     """Flights that go on together on a device, a multiple of 8; part of the study."""
@@ -44,7 +44,7 @@ class Montecarlo:
     """float32 is an experiment: its error is measured on the first samples and printed."""
     scheduler: str | None = None
     """Address of a Dask scheduler, such as tcp://10.0.0.1:8786."""
-    workers: Annotated[int | None, count("workers", 1024), default("none")] = None
+    workers: Annotated[int | None, count("workers", 256), default("none")] = None
     """Instead start a Dask cluster of so many processes here."""
     params: Annotated[Path | None, default("the scene's table")] = None
     """TOML file with values that replace the scene's table's."""

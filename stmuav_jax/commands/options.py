@@ -22,9 +22,9 @@ class Number:
 
     what: str
     unit: str = ""
-    low: float = -math.inf
-    high: float = math.inf
-    above: float | None = None
+    low: float | int = -math.inf
+    high: float | int = math.inf
+    above: float | int | None = None
 
     def check(self, value: Any, option: str) -> None:
         """Raise SettingError unless a value, None, or every one of several is within the range."""
@@ -32,7 +32,7 @@ class Number:
             if each is not None:
                 self._check_one(each, option)
 
-    def _check_one(self, value: float, option: str) -> None:
+    def _check_one(self, value: float | int, option: str) -> None:
         unit = f" {self.unit}" if self.unit else ""
         tail = f"but it is {_short(value)}{unit} ({option})."
         if not (isinstance(value, int) or math.isfinite(value)):
@@ -52,7 +52,7 @@ class Number:
         raise SettingError(f"The {self.what} must {span}{unit}, {tail}")
 
 
-def _short(value: float) -> str:
+def _short(value: float | int) -> str:
     words = str(value) if isinstance(value, int) and abs(value) < 10**300 else ""
     words = words or (f"an integer of {math.log10(abs(value)):.0f} digits" if value else "0")
     if isinstance(value, float):
@@ -74,7 +74,7 @@ FORCE = Number("limit of the force", "N", above=0.0, high=1e6)
 TOLERANCE = Number("tolerance", "", above=0.0, high=1.0)
 
 
-def count(what: str, high: float = 1e9) -> Number:
+def count(what: str, high: float | int = 1e9) -> Number:
     """At least one of something."""
     return Number(f"number of {what}", "", 1, high)
 

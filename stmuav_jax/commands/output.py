@@ -67,7 +67,7 @@ def _code_and_words(error: BaseException) -> tuple[int | None, str]:
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return 1, "there is not enough memory for this. Ask for less: fewer samples, times or runs."
     kind = type(error).__name__
-    return None, f"a fault of the program, not of what you gave it: {kind}: {error}"
+    return None, f"a fault of the program, not of what you gave it: {kind}: {error}."
 
 
 def _is(error: BaseException, module: str, name: str) -> bool:

@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from ..vehicle.parameters import Parameters
 
 
-SEGMENTS = "hold: one in 0.4 s, slew: one in 0.2 s"
-# Time over which departures count, and for the turn [s]; the longest segment of each [s].
+SEGMENTS = "hold: one in 0.05 s, slew: one in 0.2 s"
+# Time over which departures count, and for the turn [s]; the longest segment of each [s]. From rest
+# an untuned UAV falls far within 0.2 s: segments as long as that keep the search from its end.
 _TIMES = {"hold": 0.4, "slew": 1.0}
-_LONGEST = {"hold": 0.4, "slew": 0.2}
+_LONGEST = {"hold": 0.05, "slew": 0.2}
 
 
 @dataclasses.dataclass
@@ -139,7 +140,7 @@ def _time(command: Tune) -> float:
 def _segments(command: Tune) -> int:
     if command.segments is not None:
         return command.segments
-    # 1.2 / 0.4 is a little more than 3
+    # 0.3 / 0.05 is a little less or more than 6
     return max(1, math.ceil(_time(command) / _LONGEST[command.what] - 1e-9))
 
 

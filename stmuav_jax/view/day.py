@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.table import Table
+from rich.text import Text
 
 from ..study.day import PANELS, Day
 from ..vehicle.kinematics import Reason, panel_angles, panel_normal
@@ -102,11 +103,11 @@ def day_rows(day: Day) -> list[tuple[str, str]]:
 
 def day_tables(day: Day) -> tuple[Table, Table]:
     """The main figures, and the energies of the panels, for the terminal."""
-    table = Table(title=title(day), show_header=False, title_justify="left")
+    table = Table(title=Text(title(day)), show_header=False, title_justify="left")
     table.add_column(style="bold")
     table.add_column()
     for row in day_rows(day):
-        table.add_row(*row)
+        table.add_row(*(Text(cell) for cell in row))
     energies = Table("panel", title="Under a clear sky", title_justify="left")
     for name in ("kWh/m² a day", "more than level", "more than single axis"):
         energies.add_column(name, justify="right")

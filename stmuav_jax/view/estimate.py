@@ -12,8 +12,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from ..estimation.assess import CaseStudy, Estimates, Summary, last_beyond, settled_from
 from ..estimation.consistency import mean_interval
@@ -41,7 +41,7 @@ def summary_table(summaries: Iterable[Summary]) -> Table:
         table.add_column(name)
     for name in ("to 2 cm\n[s]", "to 5 mm\n[s]", "RMSE x, y\n[mm]", "NEES\n(2)", "NEES\n(5)",
                  "NIS\n(3)", "flag-\nged"):  # fmt: skip
-        table.add_column(escape(name), justify="right")
+        table.add_column(Text(name), justify="right")
     for row in rows:
         table.add_row(
             str(row.case), row.tuning, _seconds(row.to_2cm), _seconds(row.to_5mm),
@@ -81,7 +81,7 @@ def hover_table(flights: dict[str, Hover]) -> Table:
     table.add_column("tuning")
     for name in ("largest tilt\n[degrees]", "furthest\n[m]", "to 2 cm\n[s]", "RMSE x, y\n[mm]",
                  "NEES\n(2)", "NEES\n(14)", "failed"):  # fmt: skip
-        table.add_column(escape(name), justify="right")
+        table.add_column(Text(name), justify="right")
     end = float(max(flight.t[-1] for flight in flights.values()))
     for name, flight in flights.items():
         t = np.asarray(flight.t)

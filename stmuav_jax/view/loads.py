@@ -14,6 +14,8 @@ from ..mechanics.system import System
 from ..study.loads import COMPONENTS, UNITS, Envelope, JointLoads, envelope
 from .io import write_atomically
 from .plot import curves, grid, save_all
+from .terminal import row as add_row
+from .terminal import table
 
 HEADER = (
     "joint", "type", "body_i", "body_j", "component", "unit", "min", "t_min_s", "max", "t_max_s",
@@ -51,16 +53,16 @@ def save_loads(scene: Scene, loads: JointLoads, path: str | os.PathLike[str]) ->
 def loads_table(scene: Scene, loads: JointLoads) -> Table:
     """Peaks of force and moment at every joint, for the terminal."""
     found = envelope(loads)
-    table = Table("joint", "type", "peak force [N]", "at [s]", "peak moment [N m]", "at [s]")
-    table.title, table.title_justify = f"{scene.title}: peaks of the joint reactions", "left"
+    heads = ("joint", "type", "peak force [N]", "at [s]", "peak moment [N m]", "at [s]")
+    shown = table(*heads, title=f"{scene.title}: peaks of the joint reactions")
     force, moment = COMPONENTS.index("|F|"), COMPONENTS.index("|M|")
     for k, joint in enumerate(scene.system.joints):
         cells: list[str] = []
         for c in (force, moment):
             value, time = float(found.most[k, c]), float(found.t_most[k, c])
             cells += ["0", ""] if value < _NOTHING else [f"{value:.4g}", f"{time:.4f}"]
-        table.add_row(joint.name, joint.kind, *cells)
-    return table
+        add_row(shown, joint.name, joint.kind, *cells)
+    return shown
 
 
 def loads_figure(scene: Scene, found: JointLoads) -> Figure:

@@ -1,9 +1,11 @@
 """Reaction loads on paper: every joint and component with its unit, nothing hidden."""
 
 import csv
+import io
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from stmuav_jax import envelope, run_loads
 from stmuav_jax.study.loads import COMPONENTS
@@ -33,9 +35,14 @@ def test_csv_holds_every_component_of_every_joint(short_run, loads, tmp_path):
 
 def test_terminal_table_has_a_row_for_each_joint(short_run, loads):
     table = loads_table(short_run.scene, loads)
-    assert [c.header for c in table.columns][2:5:2] == ["peak force [N]", "peak moment [N m]"]
+    heads = ["peak force [N]", "at [s]", "peak moment [N m]", "at [s]"]
+    assert [str(c.header) for c in table.columns][2:] == heads
+    console = Console(width=150, record=True, file=io.StringIO())
+    console.print(table)
+    # units are not markup
+    assert console.export_text().count("at [s]") == 2
     assert table.row_count == 8
-    assert list(table.columns[4].cells)[-1] == "0"  # a ball carries no moment
+    assert str(list(table.columns[4].cells)[-1]) == "0"  # a ball carries no moment
 
 
 def test_figure_shows_histories_with_units(short_run, loads, tmp_path):

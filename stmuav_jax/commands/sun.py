@@ -1,0 +1,105 @@
+"""`stmuav sun`: a day of pointing the panel at the sun."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from rich.console import Console
+
+from ..mechanics.errors import SettingError
+from ..view.terminal import line
+from .options import ANGLE, Number, default
+from .output import written
+
+
+@dataclasses.dataclass
+class SunDay:
+    """Point the panel at the sun for a day; write day.nc and figures.
+
+    Example: stmuav sun --lat 11.55 --lon 104.92 --date 2024-03-21 --timezone Asia/Phnom_Penh
+    """
+
+    lat: Annotated[float, Number("latitude", "degrees", -90, 90)]
+    """Latitude, north positive [degrees]."""
+    lon: Annotated[float, Number("longitude", "degrees", -360, 360)]
+    """Longitude, east positive [degrees]."""
+    date: str
+    """Date at the place, as 2024-03-21."""
+    timezone: Annotated[str | None, default("whole hours by the longitude")] = None
+    """Time zone such as Asia/Phnom_Penh or +07:00."""
+    altitude: Annotated[float, Number("altitude", "m", -500, 11000)] = 0.0
+    """Above sea level [m]."""
+    roll: Annotated[float, ANGLE] = 0.0
+    """Attitude of the UAV [degrees]: turn about its x axis."""
+    pitch: Annotated[float, ANGLE] = 0.0
+    """Turn about its y axis [degrees]; positive lowers its x axis."""
+    yaw: Annotated[float | None, ANGLE, default("the heading of the most energy")] = None
+    """Its x axis from east towards north [degrees]."""
+    attitude: Annotated[Path | None, default("a constant attitude")] = None
+    """CSV file with a history of the attitude instead: columns t [s], roll, pitch, yaw."""
+    step: Annotated[float, Number("time step", "s", 1, 7200)] = 300.0
+    """Time between samples [s]."""
+    stroke_step: Annotated[float, Number("step of the actuators", "m", 0, 0.1)] = 0.0
+    """Smallest step of the linear actuators [m]."""
+    attitude_error: Annotated[
+        tuple[float, float, float], dataclasses.replace(ANGLE, what="error of the attitude")
+    ] = (0.0, 0.0, 0.0)
+    """Rotation vector from the true attitude to the one believed, body axes [degrees]."""
+    turbidity: Annotated[
+        float | None, Number("turbidity", "", 1, 20), default("the month's mean at the place")
+    ] = None
+    """Linke's turbidity of the air."""
+    params: Annotated[Path | None, default("the report's values")] = None
+    """TOML file with values that replace the table's."""
+    out: Annotated[Path | None, default("runs/sun_DATE")] = None
+    """Folder for the results."""
+    figures: Literal["png", "pdf", "svg", "none"] = "png"
+    """Format of the figures."""
+    cache: bool = True
+    """Keep compiled code in the user's cache folder for the next run."""
+
+
+def run_sun(command: SunDay) -> int:
+    """Follow the sun, print and write the day; the exit code."""
+    # pvlib and matplotlib are slow to import: only here
+    import numpy as np
+
+    from ..study.day import Flaws, day_zone, parse_date, track_day
+    from ..study.heading import best_heading
+    from ..vehicle.airframe import PART_II
+    from ..vehicle.ephemeris import Place
+    from ..vehicle.sun import attitude
+    from ..view.day import day_tables, load_attitude, save_day, save_day_figures
+    from ..view.io import load_parameters
+
+    if command.attitude is not None and (command.roll or command.pitch or command.yaw is not None):
+        raise SettingError("Give --attitude or --roll, --pitch and --yaw, not both.")
+    day_of, zone = parse_date(command.date), day_zone(command.timezone, command.lon)
+    place = Place.degrees(command.lat, command.lon, command.altitude)
+    settings: dict[str, Any] = {
+        "parameters": load_parameters(command.params, PART_II), "turbidity": command.turbidity,
+    }  # fmt: skip
+    flaws = Flaws(command.stroke_step, math.radians(1) * np.array(command.attitude_error))
+    turn = lambda yaw: attitude(math.radians(command.roll), math.radians(command.pitch), yaw)
+    chosen = ""
+    if command.attitude is not None:
+        R_wb = load_attitude(command.attitude)
+    elif command.yaw is not None:
+        R_wb = turn(math.radians(command.yaw))
+    else:
+        yaw = best_heading(place, day_of, zone, turn, **settings)
+        chosen = f"Heading chosen for the most energy: --yaw {math.degrees(yaw):g}."
+        R_wb = turn(yaw)
+    day = track_day(place, day_of, zone, R_wb, step=command.step, flaws=flaws, **settings)
+    folder = command.out if command.out is not None else Path("runs") / f"sun_{command.date}"
+    paths = [save_day(day, folder / "day.nc")]
+    if command.figures != "none":
+        paths += save_day_figures(day, folder, command.figures)
+    out = Console()
+    for each in day_tables(day):
+        out.print(each)
+    if chosen:
+        line(out, chosen)
+    written(out, paths)
+    return 0

@@ -1,0 +1,133 @@
+"""A thousand odd command lines: a message and an exit code for each, no traceback."""
+
+import random
+
+import pytest
+
+from stmuav_jax import cli
+from stmuav_jax.commands import flight, tune
+from stmuav_jax.commands.options import Number
+from stmuav_jax.mechanics.errors import SettingError
+
+LINES = 1000
+NUMBERS = (
+    "0", "-1", "1e-300", "5e-324", "1e308", "1e400", "nan", "-inf", "inf", "hello", "", " ",
+    "9" * 40, "9" * 400, "1.5", "0x10", "1_000", "None", "[b]", "[/b]", ":x:", "--", "-", "1,2",
+)  # fmt: skip
+NAMES = ("", "[/b]", "a b", "../..", "\n", "none.toml", "é", "x" * 3000, "nan", "/", "~", "-q")
+OPTIONS = {
+    "list": (), "report": ("--out", "--figures"),
+    "simulate": ("--case", "--t1", "--rtol", "--atol", "--save-every", "--max-steps", "--solver",
+                 "--params", "--actuators", "--out", "--figures", "--loads", "--nope"),
+    "sun": ("--lat", "--lon", "--date", "--timezone", "--altitude", "--roll", "--pitch", "--yaw",
+            "--step", "--stroke-step", "--turbidity", "--attitude-error", "--attitude"),
+    "trim": ("--phi", "--theta", "--sun", "--climb", "--speed", "--course", "--turn", "--yaw",
+             "--highest", "--lowest", "--force", "--by", "--params"),
+    "linearize": ("--phi", "--sun", "--outputs", "--speed", "--turn"),
+    "tune": ("--to", "--t1", "--force", "--reaction", "--segments", "--knots", "--seed", "--steps"),
+    "estimate": ("--case", "--tuning", "--model", "--seeds", "--seed", "--t1", "--hover"),
+    "montecarlo": ("--samples", "--seed", "--chunk", "--devices", "--lanes", "--workers"),
+}  # fmt: skip
+FIRST = {
+    "simulate": ("spin", "tracker", "uav", "", "[b]"), "tune": ("hold", "slew", "fly", "0"),
+    "montecarlo": ("collapse", "nope", "", "a/[/b].toml"), "report": ("nope", "", "[/b]"),
+}  # fmt: skip
+
+
+def odd_line(rng):
+    name = rng.choice([*OPTIONS, "nope", "--help", "--version", ""])
+    words = [name]
+    if name in FIRST and rng.random() < 0.95:
+        words.append(rng.choice(FIRST[name]))
+    if name == "sun" and rng.random() < 0.8:
+        words += ["--lat", "11.5", "--lon", "104.9"]
+        words += ["--date", rng.choice(("2024-03-21", "2024-02-30", "0001-01-01", "20240321", "x"))]
+    for option in rng.choices(OPTIONS.get(name) or ("--x",), k=rng.randint(0, 3)):
+        words.append(option)
+        words += [rng.choice(NUMBERS if rng.random() < 0.7 else NAMES)] * rng.choice(
+            (0, 1, 1, 1, 2, 3)
+        )
+    return words
+
+
+@pytest.fixture
+def stubbed(monkeypatch):
+    """What starts to compute says so instead; what comes before is the commands' own."""
+    reached = []
+
+    def stop(*_, **__):
+        reached.append(1)
+        raise SettingError("The work would begin.")
+
+    for module, name in (
+        (cli, "run_scene"), (cli, "run_montecarlo"), (cli, "run_estimate"), (cli, "run_report"),
+        (flight, "_solved"), (flight, "table_of"), (tune, "table_of"),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, stop)
+    monkeypatch.setattr("stmuav_jax.study.heading.best_heading", stop)
+    monkeypatch.setattr("stmuav_jax.study.day.track_day", stop)
+    for name in ("_configure", "_use_devices"):
+        monkeypatch.setattr(cli, name, lambda _: None)
+    return reached
+
+
+def test_a_thousand_odd_lines(stubbed, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng = random.Random(5)
+    codes = {0: 0, 1: 0, 2: 0}
+    for _ in range(LINES):
+        words = odd_line(rng)
+        code = cli.main(words)
+        printed = capsys.readouterr()
+        assert code in (0, 2), (words, printed.err)
+        assert "Traceback" not in printed.err + printed.out, words
+        assert "fault of the program" not in printed.err, (words, printed.err)
+        assert code == 0 or len(printed.err) > 20, words
+        codes[code] += 1
+    # most are refused, some get as far as the work
+    assert codes[2] > 0.8 * LINES
+    assert len(stubbed) > 0.02 * LINES
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (ZeroDivisionError("division by zero"), 1, "a fault of the program"),
+        (MemoryError(), 1, "not enough memory"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (OSError(28, "No space left on device", "a.nc"), 2, "No space left on device: a.nc"),
+        (SettingError("[rad/s] of [/b] :x:"), 2, "[rad/s] of [/b] :x:"),
+        (RecursionError("x" * 10_000), 1, "xx ... xx"),
+    ],
+)
+def test_one_boundary(error, code, words, monkeypatch, capsys, tmp_path):
+    """Whatever a command raises is one paragraph; the traceback comes with --debug or in a file."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+
+    def run(command, started):
+        raise error
+
+    monkeypatch.setattr(cli, "_run", run)
+    monkeypatch.setenv("COLUMNS", "100000")
+    assert cli.main(["list"]) == code
+    printed = capsys.readouterr().err
+    assert words in printed
+    assert "Traceback" not in printed
+    logs = list(tmp_path.glob("stmuav-fault-*.log"))
+    assert len(logs) == ("fault" in printed)
+    assert all("Traceback" in log.read_text() for log in logs)
+    assert cli.main(["list", "--debug"]) == code
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_words_of_a_range():
+    number = Number("speed", "m/s", -1.0, 2.0)
+    with pytest.raises(SettingError, match=r"speed must lie within -1 and 2 m/s, but it is 3 m/s"):
+        number.check(3, "--speed")
+    number.check((0.0, None, 2), "--speed")
+    with pytest.raises(SettingError, match="must be above 0 s, but it is 0 s"):
+        Number("time", "s", above=0.0).check(0.0, "--t1")
+    with pytest.raises(SettingError, match="must be at least 1, but it is an integer of 4"):
+        Number("count", "", low=1).check(-(10**4000), "--n")
