@@ -37,8 +37,8 @@ def main() -> None:
             run = stm.simulate(stm.make_scene(name, case))
             c = run.certificate
             rows += (
-                f"| `{name}` | {case} | {c.position_residual:.1e} m | {c.velocity_residual:.1e} m/s "
-                f"| {c.norm_error:.1e} | {c.relative_energy_error:.1e} | {c.accepted_steps} |\n"
+                f"| `{name}` | {case} | {c.position_violation:.1e} m | {c.velocity_violation:.1e} m/s "
+                f"| {c.norm_violation:.1e} | {c.relative_energy_error:.1e} | {c.accepted_steps} |\n"
             )
             place = Path("figures") / run.scene.name
             for path in save_figures(run, FOLDER / place, dpi=110):

@@ -118,9 +118,9 @@ def test_a_run_and_its_certificate(run):
     assert c.t_end == 0.4
     np.testing.assert_allclose(found.ts, np.linspace(0, 0.4, 21), atol=1e-15)
     assert found.ts[-1] == 0.4
-    assert c.position_residual < 1e-14
-    assert c.velocity_residual < 1e-13
-    assert c.norm_error < 1e-15
+    assert c.position_violation < 1e-14
+    assert c.velocity_violation < 1e-13
+    assert c.norm_violation < 1e-15
     assert c.relative_energy_error < 1e-9
     assert (c.rows, c.rank, c.redundant) == (5, 5, ())
     assert c.momentum_error is None
