@@ -43,7 +43,9 @@ def check_parts(**parts: Any) -> None:
         names = [each.__name__ for each in known]
         valid = ", ".join(f"{each}()" for each in names) + (', or "auto"' * (name == "solver"))
         if isinstance(given, str):
-            what = f"the text '{given}'.{nearest_names(given, names)}"
+            meant = [each for each in names if each.lower() == given.lower()]
+            hint = f": write {meant[0]}()." if meant else f".{nearest_names(given, names)}"
+            what = f"the text '{given}'{hint}"
         elif isinstance(given, type):
             what = f"the class {given.__name__}: write {given.__name__}()."
         else:
