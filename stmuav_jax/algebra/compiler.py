@@ -1,16 +1,38 @@
-"""Options for XLA that suit programs of many small products."""
+"""Compiled programs: options for XLA, and how many of them a process keeps.
 
-from collections.abc import Callable
-from functools import cache
+JAX keeps every program that it compiles. On Linux each takes some hundred memory maps, of which
+the kernel gives a process 65,530 by default; a process that needs more ends with a segmentation
+fault. What this package compiles for a system of new structure goes through `kept_jit`, which keeps
+the programs used last and releases the others.
+"""
+
+import threading
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from functools import cache, wraps
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.extend.core import get_opaque_trace_state
 
 # XLA's CPU compiler hands sums of products above some size to a library meant for large
 # single-precision matrices. The sums here are over three to thirteen terms, many at once.
 _NO_LIBRARY = {"xla_cpu_experimental_ynn_fusion_type": ""}
+
+# Programs that `kept_jit` keeps: those of some twelve structures of systems.
+MOST_PROGRAMS = 48
+
+# Of the kernel's limit of memory maps; beyond it `check_maps` warns.
+_WARNING_SHARE = 0.5
+
+_MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+
+with jax.ensure_compile_time_eval():
+    _NO_TRANSFORMATION = get_opaque_trace_state()
 
 
 @cache
@@ -34,3 +56,110 @@ def compiler_options() -> dict[str, str | bool | int | float]:
 def outer_jit(function: Callable[..., Any]) -> Any:
     """`eqx.filter_jit` with `compiler_options`, for the outermost function of a program."""
     return eqx.filter_jit(function, compiler_options=compiler_options())  # pyright: ignore[reportCallIssue]
+
+
+_programs: OrderedDict[Hashable, Callable[..., Any]] = OrderedDict()
+_lock = threading.Lock()
+
+
+def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`eqx.filter_jit` of a function of arrays and structure, with a bounded number of programs.
+
+    Programs are kept by function, structure, and shapes of the arguments, at most `MOST_PROGRAMS` of
+    all functions together; those used longest ago are released. Within a transformation
+    (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a larger program.
+
+    Args:
+        function: of positional arguments. Arrays are traced, all else must be hashable.
+    """
+    within: Any = eqx.filter_jit(function)
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        if transformed(args):
+            return within(*args)
+        return program(function, *args)(*args)
+
+    return call
+
+
+def program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
+    """A function compiled for arguments such as these, with `compiler_options`; see `kept_jit`.
+
+    It is to be called with arguments of the same structure, shapes and data types.
+    """
+    leaves, structure = jax.tree.flatten(args)
+    setting = (jax.config.jax_enable_x64, jax.config.jax_default_device)  # pyright: ignore[reportAttributeAccessIssue]
+    key = (function, structure, setting, tuple(map(_kind, leaves)))
+    with _lock:
+        found = _programs.get(key)
+        if found is not None:
+            _programs.move_to_end(key)
+            return found
+    check_maps()
+    made = _compiled(function, args)
+    with _lock:
+        _programs[key] = made
+        while len(_programs) > MOST_PROGRAMS:
+            _programs.popitem(last=False)
+    return made
+
+
+def _compiled(function: Callable[..., Any], args: tuple[Any, ...]) -> Callable[..., Any]:
+    numbers, rest = eqx.partition(args, eqx.is_array)
+    static: list[Any] = []
+
+    def run(numbers: Any) -> Any:
+        found, others = eqx.partition(function(*eqx.combine(numbers, rest)), eqx.is_array)
+        static[:] = [others]
+        return found
+
+    run.__name__ = run.__qualname__ = getattr(function, "__name__", "run")
+    compiled = jax.jit(run, compiler_options=compiler_options()).lower(numbers).compile()
+
+    def call(*args: Any) -> Any:
+        found = compiled(eqx.filter(args, eqx.is_array))
+        return eqx.combine(jax.block_until_ready(found), static[0])
+
+    return call
+
+
+def _kind(leaf: Any) -> Hashable:
+    """What a program depends on: of an array all but its numbers, anything else itself."""
+    if not eqx.is_array(leaf):
+        return type(leaf), leaf
+    where = leaf.sharding if getattr(leaf, "committed", False) else None
+    return leaf.shape, str(leaf.dtype), getattr(leaf, "weak_type", False), where
+
+
+def transformed(args: Any) -> bool:
+    """Whether JAX is transforming what calls this, or one of the arguments."""
+    tracers = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(args))
+    return tracers or get_opaque_trace_state() != _NO_TRANSFORMATION
+
+
+def memory_maps() -> tuple[int, int] | None:
+    """Memory maps of this process and the kernel's limit; None where there is no such count."""
+    try:
+        return _MAPS.read_bytes().count(b"\n"), int(_MOST_MAPS.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+_warned = threading.Event()
+
+
+def check_maps() -> None:
+    """Warn, once in a process, when it has half as many memory maps as the kernel allows."""
+    maps = memory_maps()
+    if maps is None or maps[0] < _WARNING_SHARE * maps[1] or _warned.is_set():
+        return
+    _warned.set()
+    warnings.warn(
+        f"This process holds {maps[0]} memory maps of the {maps[1]} that the kernel allows "
+        "(vm.max_map_count), most of them for programs that JAX has compiled and keeps; beyond the limit "
+        "it ends with a segmentation fault. Put repeated work under jax.jit, make functions and systems "
+        "once instead of in every pass of a loop, or call jax.clear_caches() now and then.",
+        RuntimeWarning,
+        stacklevel=3,
+    )

@@ -1,6 +1,6 @@
 """What is computed of a state besides its motion: accelerations, reactions, balances."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..algebra.compiler import kept_jit
 from ..algebra.shapes import Numbers
 from ..mechanics.load import Load
 from ..mechanics.state import State
@@ -28,8 +29,8 @@ class Snapshot(eqx.Module):
         reactions: at every joint, world axes.
         kinetic, potential: energies [J].
         momentum: linear and angular about the world's origin (6,).
-        residuals: scaled position residual of every row (m,) [m].
-        rates: scaled velocity residual of every row (m,) [m/s].
+        residuals: scaled position residual of every row (m,) [m], or [rad] for cosines and angles.
+        rates: scaled velocity residual of every row (m,) [m/s] or [rad/s].
         singular_values: of the constraint Jacobian in (v, omega'), descending.
         acceleration_misfit: largest |J qddot - gamma|: non-zero for contradictory rows.
         finite_loads: whether each force element's load is finite.
@@ -81,7 +82,7 @@ def snapshot(
     )
 
 
-@eqx.filter_jit
+@kept_jit
 def _snapshots(
     formulation: AbstractFormulation, model: Any, rows: Model, ts: Any, states: State, own: Any
 ) -> Snapshot:
@@ -121,6 +122,47 @@ def snapshots(
         keep = min(_BLOCK, k - start)
         blocks.append(jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], block))
     return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
+
+
+class Look(NamedTuple):
+    """What `simulate` must know of the start; see `Snapshot` for its parts."""
+
+    residuals: np.ndarray
+    rates: np.ndarray
+    singular_values: np.ndarray
+    finite_loads: np.ndarray
+    norm: float
+
+
+def first_look(view: Snapshot, state: State) -> Look:
+    """Of the first of some snapshots."""
+    parts = (view.residuals, view.rates, view.singular_values, view.finite_loads)
+    residuals, rates, values, finite = (np.asarray(part)[0] for part in parts)
+    return Look(residuals, rates, values, finite, _off_unit(state))
+
+
+def look(rows: Model, state: State, t: float) -> Look:
+    """At one state, without its accelerations: less to compile than a snapshot."""
+    *parts, matrix = _rows_and_loads(rows, state, jnp.asarray(t, dtype=state.r.dtype))
+    residuals, rates, finite = map(np.asarray, parts)
+    values = np.linalg.svd(matrix, compute_uv=False) if residuals.size else residuals
+    return Look(residuals, rates, values, finite, _off_unit(state))
+
+
+def _off_unit(state: State) -> float:
+    return float(np.max(np.abs(np.sum(np.asarray(state.p) ** 2, axis=-1) - 1)))
+
+
+@kept_jit
+def _rows_and_loads(rows: Model, state: State, t: Any) -> tuple[Array, Array, Array, Array]:
+    kin = rows.system.kinematics(state)
+    eq = rows.constraints.equations(t, kin)
+    scale = rows.constraints.scales()
+    u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
+    loads = [force.load(t, kin) for force in rows.system.forces]
+    finite = [jnp.all(jnp.isfinite(x.force)) & jnp.all(jnp.isfinite(x.moment)) for x in loads]
+    fine = jnp.stack(finite) if finite else jnp.zeros((0,), bool)
+    return scale * eq.value, scale * (eq.matrix @ u - eq.target), fine, eq.matrix
 
 
 class Evaluation(eqx.Module):

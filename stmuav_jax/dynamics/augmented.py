@@ -32,7 +32,14 @@ from ..mechanics.load import Load, total_load
 from ..mechanics.state import Kinematics, State
 from ..mechanics.system import System
 from .differential import Constraints, Equations, RowChoice, constraints
-from .formulation import AbstractFormulation, Accelerations, Flows, Reactions, Residuals
+from .formulation import (
+    AbstractFormulation,
+    Accelerations,
+    Flows,
+    Reactions,
+    Residuals,
+    residuals_of,
+)
 from .reactions import joint_reactions
 from .stabilisation import AbstractStabilisation, Baumgarte
 
@@ -230,14 +237,7 @@ class Augmented(AbstractFormulation):
 
 def _left(model: Model, eq: Equations, p: Float[Array, "n 4"], u: Float[Array, " k"]) -> Residuals:
     norm = jnp.max(jnp.abs(jnp.sum(p**2, axis=1) - 1))
-    if not model.constraints.n_rows:
-        return Residuals(jnp.zeros_like(norm), jnp.zeros_like(norm), norm)
-    scale = model.constraints.scales()
-    return Residuals(
-        position=jnp.max(jnp.abs(scale * eq.value)),
-        velocity=jnp.max(jnp.abs(scale * (eq.matrix @ u - eq.target))),
-        norm=norm,
-    )
+    return residuals_of(model.constraints, eq.value, eq.matrix @ u - eq.target, norm)
 
 
 def displace(

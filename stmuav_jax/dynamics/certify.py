@@ -1,30 +1,76 @@
 """From what a run left behind to its certificate."""
 
-from typing import Any
-
 import numpy as np
 
 from ..mechanics.system import System
-from .analysis import Snapshot
+from .accuracy import ErrorEstimate
+from .analysis import Look, Snapshot
+from .differential import Constraints
 from .initial import Rank
 from .integrate import Trajectory
-from .run import Certificate, relative
+from .run import Certificate, Seconds, relative
 
 
 def certify(
     system: System,
     trajectory: Trajectory,
-    view: Snapshot,
+    view: Snapshot | None,
+    errors: ErrorEstimate,
     rank: Rank,
+    worst: dict[str, float],
     result: str,
-    seconds: tuple[float, float, float],
+    seconds: Seconds,
 ) -> Certificate:
     """The certificate of a finished run.
 
     Args:
-        view: `Snapshot`s of the saved states. rank: at the start. result: in words.
-        seconds: spent on compiling, running, and looking.
+        view: `Snapshot`s of the saved states, if they were analysed. rank: at the start.
+        worst: from `violations`. result: in words.
     """
+    drift, relative_drift, momentum = _balances(system, trajectory, view)
+    position, angle, velocity, angular_velocity = (
+        _over_all(x)
+        for x in (errors.position, errors.angle, errors.velocity, errors.angular_velocity)
+    )
+    smallest = None
+    if view is not None and rank.rank:
+        smallest = float(np.min(view.singular_values[:, rank.rank - 1]))
+    return Certificate(
+        result=result,
+        t_end=float(trajectory.ts[-1]),
+        position_error=position,
+        position_error_end=_over_all(errors.position[-1]),
+        angle_error=angle,
+        angle_error_end=_over_all(errors.angle[-1]),
+        velocity_error=velocity,
+        angular_velocity_error=angular_velocity,
+        error_e_folding=errors.e_folding,
+        error_lost_at=errors.lost_at,
+        error_words=errors.words(np.asarray(trajectory.ts)),
+        **worst,
+        energy_error=drift,
+        relative_energy_error=relative_drift,
+        momentum_error=momentum[0],
+        angular_momentum_error=momentum[1],
+        smallest_singular_value=smallest,
+        rows=rank.rows,
+        rank=rank.rank,
+        redundant=rank.redundant,
+        accepted_steps=int(trajectory.counts.accepted[-1]),
+        rejected_steps=int(trajectory.counts.rejected[-1]),
+        compile_seconds=seconds.compile,
+        run_seconds=seconds.run,
+        estimate_seconds=seconds.estimate,
+        analysis_seconds=seconds.analysis,
+    )
+
+
+def _balances(
+    system: System, trajectory: Trajectory, view: Snapshot | None
+) -> tuple[float, float, tuple[float | None, float | None]]:
+    """Energy's error and over the largest energy; momentum's and angular momentum's, relative."""
+    if view is None:
+        return float("nan"), float("nan"), (None, None)
     total = view.kinetic + view.potential
     drift = total - total[0] - trajectory.work
     momentum: tuple[float | None, float | None] = (None, None)
@@ -34,29 +80,23 @@ def certify(
             relative(change[:, part], view.momentum[:, part], trajectory.impulse[:, part])
             for part in (slice(0, 3), slice(3, 6))
         )  # pyright: ignore[reportAssignmentType]
-    values = view.singular_values
-    return Certificate(
-        result=result,
-        t_end=float(trajectory.ts[-1]),
-        position_residual=_largest(trajectory.worst.position[-1], view.residuals[0]),
-        velocity_residual=_largest(trajectory.worst.velocity[-1], view.rates[0]),
-        norm_error=_largest(trajectory.worst.norm[-1], np.sum(trajectory.states.p[0] ** 2, -1) - 1),
-        energy_error=float(np.max(np.abs(drift))),
-        relative_energy_error=relative(drift, view.kinetic, view.potential, trajectory.work),
-        momentum_error=momentum[0],
-        angular_momentum_error=momentum[1],
-        smallest_singular_value=float(np.min(values[:, rank.rank - 1])) if rank.rank else None,
-        rows=rank.rows,
-        rank=rank.rank,
-        redundant=rank.redundant,
-        accepted_steps=int(trajectory.counts.accepted[-1]),
-        rejected_steps=int(trajectory.counts.rejected[-1]),
-        compile_seconds=seconds[0],
-        run_seconds=seconds[1],
-        analysis_seconds=seconds[2],
-    )
+    ratio = relative(drift, view.kinetic, view.potential, trajectory.work)
+    return float(np.max(np.abs(drift))), ratio, momentum
 
 
-def _largest(on_the_way: Any, at_the_start: Any) -> float:
-    """The largest absolute value over the accepted steps and the start."""
-    return float(max(on_the_way, np.max(np.abs(at_the_start), initial=0.0)))
+def violations(constraints: Constraints, trajectory: Trajectory, start: Look) -> dict[str, float]:
+    """The largest residuals over the accepted steps and the start, as a certificate has them."""
+    angular, worst = constraints.angular, trajectory.worst
+    over = lambda way, x: max(float(way[-1]), float(np.max(np.abs(x), initial=0.0)))
+    return {
+        "position_violation": over(worst.position, start.residuals[~angular]),
+        "angle_violation": over(worst.angle, start.residuals[angular]),
+        "velocity_violation": over(worst.velocity, start.rates[~angular]),
+        "angular_velocity_violation": over(worst.angular_velocity, start.rates[angular]),
+        "norm_violation": max(float(worst.norm[-1]), start.norm),
+    }
+
+
+def _over_all(errors: np.ndarray) -> float:
+    """The largest estimate; not a number where there is none."""
+    return float(np.nanmax(errors)) if np.any(np.isfinite(errors)) else float("nan")

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import kept_jit
 from ..algebra.rotation import conjugate, from_matrix, product
 from ..algebra.stacked import dot, summed
 from ..mechanics.errors import concrete
@@ -133,7 +134,7 @@ def _by_frame(
     return _stack(list(masses), ()), _stack(list(centres), (3,)), _stack(list(tensors), (3, 3))
 
 
-@eqx.filter_jit
+@kept_jit
 def _parameters(
     tree: SpanningTree, K: Float[Array, "3 3 f"], B: Float[Array, "3 3 N"], p: Float[Array, "n 4"]
 ) -> tuple[Float[Array, "4 f"], Float[Array, "4 N"]]:

@@ -2,12 +2,12 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import kept_jit
 from ..algebra.shapes import Numbers
 from ..mechanics.errors import SettingError
 from ..mechanics.internal import with_internal
@@ -51,7 +51,7 @@ def between(run: Run, times: Numbers) -> tuple[State, np.ndarray]:
     return jax.tree.map(np.asarray, found)
 
 
-@eqx.filter_jit
+@kept_jit
 def _ends(
     system: System, method: Method, starts: tuple[State, Array], spans: Float[Array, "k 2"]
 ) -> tuple[State, Float[Array, "k m"]]:

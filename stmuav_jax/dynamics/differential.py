@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..mechanics.constraint import PRIMITIVES, ROWS, Data, Form, Row, Side, side
+from ..mechanics.constraint import ANGULAR, PRIMITIVES, ROWS, Data, Form, Row, Side, side
 from ..mechanics.errors import concrete
 from ..mechanics.joint import Motion
 from ..mechanics.state import Kinematics
@@ -130,13 +130,22 @@ class Constraints(eqx.Module):
         return len(self.owner)
 
     def scales(self) -> Float[Array, "m *s"]:
-        """Factors that turn row residuals into metres: 1 / (2 l) for distances, else 1."""
+        """Factors that turn rows into lengths or angles: 1 / (2 l) for distances, else 1.
+
+        Near zero; rows that are cosines are then angles [rad], see `angular`.
+        """
         if not self.groups:
             return jnp.zeros((0,))
         lengths = [(g.kind, jnp.repeat(g.data.length, ROWS[g.kind], axis=0)) for g in self.groups]
         return jnp.concatenate(
             [0.5 / x if kind == "distance" else jnp.ones_like(x) for kind, x in lengths]
         )
+
+    @property
+    def angular(self) -> np.ndarray:
+        """Whether a row is a cosine or an angle [rad] and not a length [m], (m,)."""
+        kinds = [np.full(len(g.i) * ROWS[g.kind], g.kind in ANGULAR) for g in self.groups]
+        return np.concatenate([np.zeros(0, bool), *kinds])
 
     def equations(
         self, t: Float[Array, ""], kin: Kinematics, p: Float[Array, "n 4"] | None = None

@@ -4,10 +4,12 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..mechanics.state import State
 from ..mechanics.system import System
+from .differential import Constraints
 from .stabilisation import AbstractStabilisation
 
 
@@ -44,14 +46,43 @@ class Residuals(eqx.Module):
     """How well a state satisfies its constraints; each is the largest absolute value.
 
     Attributes:
-        position: [m], rows of direction cosines counted as rad.
-        velocity: [m/s] or [rad/s].
+        position: of rows that are lengths [m]. angle: of rows that are cosines or angles [rad].
+        velocity: of the rates of lengths [m/s]. angular_velocity: of those of cosines and
+            angles [rad/s].
         norm: of |p|^2 - 1.
     """
 
     position: Float[Array, ""]
+    angle: Float[Array, ""]
     velocity: Float[Array, ""]
+    angular_velocity: Float[Array, ""]
     norm: Float[Array, ""]
+
+
+def residuals_of(
+    constraints: Constraints,
+    value: Float[Array, "m *s"],
+    rate: Float[Array, "m *s"],
+    norm: Float[Array, "*s"],
+) -> Residuals:
+    """The largest residuals of positions and velocities, lengths apart from angles.
+
+    Args:
+        value: Phi of every row. rate: J qdot - target of every row. norm: the largest of |p|^2 - 1.
+    """
+    if not constraints.n_rows:
+        none = jnp.zeros_like(norm)
+        return Residuals(none, none, none, none, norm)
+    scale = constraints.scales()
+    angular = constraints.angular.reshape(-1, *(1,) * (value.ndim - 1))
+    largest = lambda x, rows: jnp.max(jnp.abs(scale * x) * rows, axis=0)
+    return Residuals(
+        position=largest(value, ~angular),
+        angle=largest(value, angular),
+        velocity=largest(rate, ~angular),
+        angular_velocity=largest(rate, angular),
+        norm=norm,
+    )
 
 
 class Reactions(eqx.Module):

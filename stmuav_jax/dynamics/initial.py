@@ -11,6 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from ..algebra.compiler import kept_jit
 from ..algebra.rotation import normalise
 from ..algebra.shapes import Numbers
 from ..mechanics.errors import ModelError, StateError, concrete
@@ -96,7 +97,7 @@ def assemble(
     return result
 
 
-@eqx.filter_jit
+@kept_jit
 def _assembled(
     system: System, t: Float[Array, ""], guess: State, free: Bool[Array, " k"], max_steps: int
 ) -> tuple[State, Float[Array, " joints"]]:
@@ -286,7 +287,7 @@ def ranks(
     return count, np.take_along_axis(values, count[:, None] - 1, axis=1)[:, 0]
 
 
-@eqx.filter_jit
+@kept_jit
 def _singular_values(model: Model, states: State, t: Float[Array, ""]) -> Float[Array, "k m"]:
     matrices = jax.vmap(lambda state: _jacobian(model, state, t))(states)
     return jnp.linalg.svd(matrices, compute_uv=False)
@@ -310,6 +311,6 @@ def jacobian(model: Model, state: State, t: float = 0.0) -> np.ndarray:
     return np.asarray(_jacobian(model, state, jnp.asarray(t, dtype=state.r.dtype)))
 
 
-@eqx.filter_jit
+@kept_jit
 def _jacobian(model: Model, state: State, t: Float[Array, ""]) -> Float[Array, "m k"]:
     return model.constraints.equations(t, model.system.kinematics(state)).matrix

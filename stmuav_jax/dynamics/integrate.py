@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import kept_jit
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .adjoint import recordable, recorded
@@ -139,5 +140,10 @@ def integrate(
     check_state(system, state0)
     problem = prepare(system, method if method is not None else Method())
     ts = jnp.asarray(ts, dtype=state0.r.dtype)
-    start = begin(problem, ts[0], state0)
-    return advance(problem, start, ts)[1]
+    start = compiled_begin(problem, ts[0], state0)
+    return compiled_advance(problem, start, ts)[1]
+
+
+# Called eagerly, neither compiles again for a system of the same structure.
+compiled_begin = kept_jit(begin)
+compiled_advance = kept_jit(advance)

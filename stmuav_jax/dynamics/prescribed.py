@@ -19,6 +19,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..algebra.compiler import kept_jit
 from ..mechanics.errors import ModelError, StateError, concrete
 from ..mechanics.joint import Motion, drive
 from ..mechanics.joint_coordinate import choose
@@ -160,7 +161,7 @@ class _At(NamedTuple):
     lost: Bool[Array, ""]
 
 
-@eqx.filter_jit
+@kept_jit
 def _path(
     system: System, guess: State, ts: Any, free: tuple[int, ...], tolerance: Any, longest: Any
 ) -> KinematicPath:

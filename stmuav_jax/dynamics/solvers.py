@@ -6,6 +6,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
@@ -95,7 +96,7 @@ class Stabilised(diffrax.AbstractWrappedSolver):
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> Any:
         none = jnp.zeros((), y0.dtype)
-        return self.solver.init(terms, t0, t1, y0, args), Residuals(none, none, none)
+        return self.solver.init(terms, t0, t1, y0, args), Residuals(*(none,) * 5)
 
     def step(
         self,
@@ -116,11 +117,7 @@ class Stabilised(diffrax.AbstractWrappedSolver):
             end, now = y1, self.residuals(t1, y1, args)
         else:
             end, now = self.project(t1, y1, args)
-        worst = Residuals(
-            jnp.maximum(worst.position, now.position),
-            jnp.maximum(worst.velocity, now.velocity),
-            jnp.maximum(worst.norm, now.norm),
-        )
+        worst = jax.tree.map(jnp.maximum, worst, now)
         info = {"inner": dense_info, "end": end, "shift": end - y1}
         return end, y_error, info, (inner, worst), result
 

@@ -1,12 +1,12 @@
 """How fast the fastest motions of a system are, and which solver that asks for."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import kept_jit
 from ..algebra.shapes import Numbers
 from ..mechanics.errors import StateError
 from ..mechanics.state import State
@@ -51,7 +51,7 @@ def spectrum(
     return values[np.argsort(-np.abs(values))]
 
 
-@eqx.filter_jit
+@kept_jit
 def _jacobian(
     formulation: AbstractFormulation, system: System, state: State, t: Float[Array, ""]
 ) -> Float[Array, "k k"]:

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import kept_jit
 from ..algebra.linalg import right_inverse, solve_saddle
 from ..algebra.rotation import (
     conjugate,
@@ -41,7 +42,13 @@ from .chain import Chain, chain, parameters
 from .coordinates import Coordinates, join, read, shapes, split
 from .cut import Placed, Rows, cut_rows, in_world, kinematics
 from .differential import Constraints, constraints
-from .formulation import AbstractFormulation, Accelerations, Flows, Residuals
+from .formulation import (
+    AbstractFormulation,
+    Accelerations,
+    Flows,
+    Residuals,
+    residuals_of,
+)
 from .motion import (
     Motion,
     bias,
@@ -266,7 +273,7 @@ class Tree(AbstractFormulation):
         return _left(model, at, rows)
 
 
-@eqx.filter_jit
+@kept_jit
 def _inverse_of_base(numbers: Chain) -> Float[Array, "6 6"]:
     """The inverse mass matrix of a base without joints but welds."""
     tree = numbers.tree
@@ -315,14 +322,9 @@ def _left(model: TreeModel, at: Coordinates, rows: Rows | None) -> Residuals:
     p = jnp.concatenate([at.p, at.balls], axis=1)
     norm = jnp.max(jnp.abs(jnp.sum(p**2, axis=0) - 1), axis=0, initial=0.0)
     if rows is None:
-        return Residuals(jnp.zeros_like(norm), jnp.zeros_like(norm), norm)
-    scale = model.constraints.scales()
+        return residuals_of(model.constraints, norm[None], norm[None], norm)
     off = jnp.sum(rows.J * at.u, axis=1) - rows.target
-    return Residuals(
-        position=jnp.max(jnp.abs(scale * rows.value), axis=0),
-        velocity=jnp.max(jnp.abs(scale * off), axis=0),
-        norm=norm,
-    )
+    return residuals_of(model.constraints, rows.value, off, norm)
 
 
 def _loads(system: System, t: Float[Array, ""], placed: Placed) -> Loads:

@@ -49,6 +49,9 @@ ROWS: dict[str, int] = {
     "point": 3, "n1": 1, "n2": 1, "p1": 2, "p2": 2, "distance": 1, "angle": 1, "shift": 1,
 }  # fmt: skip
 
+# Primitives whose rows are cosines or angles; those of all others are lengths.
+ANGULAR = ("n1", "p1", "angle")
+
 
 class Data(eqx.Module):
     """The body-fixed numbers of one primitive (or a stack); a primitive reads those that it needs.

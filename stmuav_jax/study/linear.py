@@ -14,12 +14,12 @@ ch. 3.7 (linearisation), 1.2 (modes, controllability).
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import kept_jit
 from ..algebra.rotation import from_rotation_vector, rotation_matrix
 from ..dynamics.tree import TreeModel
 from ..mechanics.errors import SettingError, nearest_names
@@ -152,7 +152,7 @@ def matrices(
     return _matrices(flyer, flyer.model(), at, inputs)
 
 
-@eqx.filter_jit
+@kept_jit
 def _matrices(
     flyer: Flyer, model: TreeModel, at: Coordinates, inputs: Inputs
 ) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..algebra.compiler import kept_jit
 from ..algebra.shapes import Numbers
 from ..dynamics.dense import between
 from ..dynamics.formulation import AbstractFormulation, Reactions
@@ -112,7 +113,7 @@ def run_loads(run: Run) -> JointLoads:
     return JointLoads(ts, found.force, found.moment, tuple(j.name for j in system.joints))
 
 
-@eqx.filter_jit
+@kept_jit
 def _turned(system: System, states: State, world: Reactions) -> Reactions:
     return jax.vmap(lambda state, found: in_joint_axes(system, state, found))(states, world)
 
@@ -166,7 +167,7 @@ def _between(run: Run, ts: np.ndarray) -> np.ndarray:
     return np.concatenate(found)
 
 
-_compiled = eqx.filter_jit(joint_loads)
+_compiled = kept_jit(joint_loads)
 
 
 def envelope(loads: JointLoads) -> Envelope:

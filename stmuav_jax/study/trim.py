@@ -22,6 +22,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
+from ..algebra.compiler import kept_jit
 from ..algebra.rotation import product, rotation_matrix
 from ..dynamics.tree import TreeModel
 from ..mechanics.errors import ModelError, StateError, concrete
@@ -243,7 +244,7 @@ def _weight(flyer: Flyer) -> Float[Array, ""]:
     return mass * jnp.linalg.norm(jnp.asarray(pull[0])) if pull else jnp.zeros(())
 
 
-@eqx.filter_jit
+@kept_jit
 def _found(setting: _Setting, limits: TrimLimits) -> Trim:
     """What Newton's method arrives at, whether it is a trim or not."""
     flyer = setting.flyer

@@ -1,7 +1,9 @@
 """Runs as labelled datasets and NetCDF files; parameter tables from TOML."""
 
 import datetime
+import hashlib
 import importlib.metadata
+import io
 import json
 import os
 import platform
@@ -25,7 +27,7 @@ from ..vehicle.parameters import ParameterEntry, Parameters
 MOST_TOML = 4_000_000
 
 FORMAT = "stmuav_jax run"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 _PACKAGES = ("stmuav-jax", "jax", "jaxlib", "diffrax", "equinox", "lineax", "numpy", "xarray")
 
@@ -46,28 +48,26 @@ def to_dataset(run: Run) -> xr.Dataset:
 
     Dimensions: time, body, axis (x, y, z), component (e0 to e3), joint. Every variable has
     `units` and `description`; attributes hold scene, parameters, settings, versions, date
-    and certificate (the mappings as JSON).
+    and certificate (the mappings as JSON). Estimated errors are NaN where there are none.
     """
-    states, view = run.states, run.snapshot
-    system = run.scene.system
+    states, system, errors = run.states, run.scene.system, run.errors
     vector = ("time", "body", "axis")
-    wrench = ("time", "joint", "axis")
+    of_body = ("time", "body")
+    exact = "estimated distance from the exact"
     table: dict[str, tuple[tuple[str, ...], Any, str, str]] = {
         "position": (vector, states.r, "m", "centre of mass, world axes"),
         "euler_parameters": (("time", "body", "component"), states.p, "1", "body to world"),
         "velocity": (vector, states.v, "m/s", "of the centre of mass, world axes"),
         "angular_velocity": (vector, states.omega, "rad/s", "body axes"),
-        "acceleration": (vector, view.accelerations.v_rate, "m/s^2", "of the centre of mass"),
-        "angular_acceleration": (vector, view.accelerations.omega_rate, "rad/s^2", "body axes"),
-        "reaction_force": (wrench, view.reactions.force, "N", "of body i on body j, world axes"),
-        "reaction_moment": (
-            wrench, view.reactions.moment, "N m",
-            "of body i on body j about the joint's point on body j, world axes",
+        "position_error": (of_body, errors.position, "m", f"{exact} position"),
+        "angle_error": (of_body, errors.angle, "rad", f"{exact} orientation"),
+        "velocity_error": (of_body, errors.velocity, "m/s", f"{exact} velocity"),
+        "angular_velocity_error": (
+            of_body, errors.angular_velocity, "rad/s", f"{exact} angular velocity",
         ),
-        "kinetic_energy": (("time",), view.kinetic, "J", "of all bodies"),
-        "potential_energy": (("time",), view.potential, "J", "of gravity and springs"),
-        "work": (("time",), run.trajectory.work, "J", "done by forces without potential"),
     }  # fmt: skip
+    if run.analysis is not None:
+        table |= _analysed(run)
     data = {
         name: xr.Variable(dims, np.asarray(values), {"units": unit, "description": words})
         for name, (dims, values, unit, words) in table.items()
@@ -89,6 +89,24 @@ def to_dataset(run: Run) -> xr.Dataset:
         "joint_body_j": ("joint", [joint.body_j for joint in system.joints]),
     } | ({"internal_state": list(names)} if names else {})
     return xr.Dataset(data, coordinates, _attributes(run))
+
+
+def _analysed(run: Run) -> dict[str, tuple[tuple[str, ...], Any, str, str]]:
+    """Dimensions, values, unit and description of what the analysis has found."""
+    view = run.snapshot
+    vector, wrench = ("time", "body", "axis"), ("time", "joint", "axis")
+    return {
+        "acceleration": (vector, view.accelerations.v_rate, "m/s^2", "of the centre of mass"),
+        "angular_acceleration": (vector, view.accelerations.omega_rate, "rad/s^2", "body axes"),
+        "reaction_force": (wrench, view.reactions.force, "N", "of body i on body j, world axes"),
+        "reaction_moment": (
+            wrench, view.reactions.moment, "N m",
+            "of body i on body j about the joint's point on body j, world axes",
+        ),
+        "kinetic_energy": (("time",), view.kinetic, "J", "of all bodies"),
+        "potential_energy": (("time",), view.potential, "J", "of gravity and springs"),
+        "work": (("time",), run.trajectory.work, "J", "done by forces without potential"),
+    }  # fmt: skip
 
 
 def _attributes(run: Run) -> dict[str, Any]:
@@ -128,10 +146,43 @@ def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
     return target
 
 
+# What ends a file: HDF5 reads no further than the end that its own header names.
+_SEAL = b"\nstmuav_jax sha256 "
+_SEAL_LENGTH = len(_SEAL) + 64 + 1
+
+
 def save(run: Run, path: str | os.PathLike[str]) -> Path:
-    """Save a run as NetCDF (HDF5), atomically; returns the path."""
-    content = to_dataset(run).to_netcdf(engine="h5netcdf")
-    return write_atomically(path, bytes(content))
+    """Save a run as NetCDF (HDF5), atomically; returns the path.
+
+    Numbers have Fletcher's checksum, which any reader of HDF5 verifies; a SHA-256 of the whole file
+    stands at its end, which `load` verifies.
+    """
+    data = to_dataset(run)
+    checked = {k: {"fletcher32": True} for k, v in data.variables.items() if v.dtype.kind == "f"}
+    checked = {k: v for k, v in checked.items() if data[k].size}
+    content = bytes(data.to_netcdf(engine="h5netcdf", encoding=checked))
+    return write_atomically(path, content + _seal(content))
+
+
+def _seal(content: bytes) -> bytes:
+    return _SEAL + hashlib.sha256(content).hexdigest().encode() + b"\n"
+
+
+def _verified(source: Path) -> bytes:
+    """The content of a saved run without its seal; HDF5 is not trusted with a damaged file."""
+    whole = source.read_bytes()
+    content, seal = whole[:-_SEAL_LENGTH], whole[-_SEAL_LENGTH:]
+    if not seal.startswith(_SEAL):
+        raise FileError(
+            f"{source} cannot be read: it is truncated, was changed since it was saved, or is not a run "
+            "saved by stmuav_jax."
+        )
+    if seal != _seal(content):
+        raise FileError(
+            f"{source} cannot be read as a saved run: it is damaged, its SHA-256 is not the one that it "
+            "was saved with."
+        )
+    return content
 
 
 def load(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -139,12 +190,15 @@ def load(path: str | os.PathLike[str]) -> xr.Dataset:
 
     Raises:
         FileError: the file is missing, truncated, damaged, or not a run of this package.
+
+    Other programs read the file as NetCDF; `xarray.open_dataset(path, engine="h5netcdf")` does.
     """
     source = Path(path)
     if not source.is_file():
         raise FileError(f"There is no file {source}.")
+    content = _verified(source)
     try:
-        with xr.open_dataset(source, engine="h5netcdf") as dataset:
+        with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as dataset:
             found = dataset.load()
     except Exception as error:
         raise FileError(

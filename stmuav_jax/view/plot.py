@@ -80,7 +80,7 @@ def euler_parameters(run: Run) -> Figure:
 
 
 def balances(run: Run) -> Figure:
-    """Energies, and how well energy and constraints are kept."""
+    """Energies, how well energy and constraints are kept, and the estimated error."""
     figure, axes = grid(1, 2, 3.3)
     view, trajectory = run.snapshot, run.trajectory
     energies = np.stack([view.kinetic, view.potential - view.potential[0], trajectory.work], axis=1)
@@ -88,13 +88,18 @@ def balances(run: Run) -> Figure:
     axes[0, 0].set_ylabel("energy [J]", fontsize=9)
     total = view.kinetic + view.potential
     drift = np.maximum.accumulate(np.abs(total - total[0] - trajectory.work))
-    errors = np.stack(
-        [drift, trajectory.worst.position, trajectory.worst.velocity, trajectory.worst.norm], axis=1
+    position = np.max(run.errors.position, axis=1)
+    worst = trajectory.worst
+    errors = np.stack([position, drift, worst.position, worst.velocity], axis=1)
+    labels = (
+        "estimated position error [m]",
+        "energy drift so far [J]",
+        "violation of lengths so far [m]",
+        "of their rates so far [m/s]",
     )
-    labels = ("energy [J]", "position [m]", "velocity [m/s]", "norm [1]")
     curves(axes[0, 1], run.ts, np.maximum(errors, 1e-18), labels)
     axes[0, 1].set_yscale("log")
-    axes[0, 1].set_ylabel("error so far", fontsize=9)
+    axes[0, 1].set_ylabel("error, violation", fontsize=9)
     for ax in axes.flat:
         ax.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     figure.suptitle(run.scene.title, fontsize=11)

@@ -1,12 +1,27 @@
 """The certificate as a table for people."""
 
+import math
+
 from rich.table import Table
 
 from ..dynamics.run import Run
 
+# Estimates below this, of motions of some metres, are differences of round-off.
+_ROUND_OFF = 1e-14
+
 
 def _number(value: float | None, unit: str) -> str:
-    return "not applicable" if value is None else f"{value:.2e} {unit}".rstrip()
+    if value is None or math.isnan(value):
+        return "not applicable" if value is None else "not found"
+    return f"{value:.2e} {unit}".rstrip()
+
+
+def _estimate(largest: float, end: float, unit: str) -> str:
+    if math.isnan(largest):
+        return "none"
+    words = f"{largest:.1e} {unit}"
+    words += "" if math.isnan(end) else f", at the end {end:.1e} {unit}"
+    return f"{words} (round-off)" if largest < _ROUND_OFF else words
 
 
 def certificate_rows(run: Run) -> list[tuple[str, str]]:
@@ -17,9 +32,17 @@ def certificate_rows(run: Run) -> list[tuple[str, str]]:
         rank += f"; dependent rows in {', '.join(c.redundant)}"
     rows = [
         ("Result", f"{c.result} at t = {c.t_end:g} s"),
-        ("Largest position residual", _number(c.position_residual, "m")),
-        ("Largest velocity residual", _number(c.velocity_residual, "m/s")),
-        ("Largest Euler-parameter norm error", _number(c.norm_error, "")),
+        ("Estimated position error", _estimate(c.position_error, c.position_error_end, "m")),
+        ("Estimated orientation error", _estimate(c.angle_error, c.angle_error_end, "rad")),
+    ]
+    if c.error_words:
+        rows.append(("About these errors", c.error_words))
+    rows += [
+        ("Constraint violation, lengths", _number(c.position_violation, "m")),
+        ("Constraint violation, angles", _number(c.angle_violation, "rad")),
+        ("Violation of the lengths' rates", _number(c.velocity_violation, "m/s")),
+        ("Violation of the angles' rates", _number(c.angular_velocity_violation, "rad/s")),
+        ("Violation of the Euler parameters' norm", _number(c.norm_violation, "")),
         ("Energy balance, of the largest energy", _number(c.relative_energy_error, "")),
     ]
     if c.momentum_error is not None:
@@ -35,6 +58,7 @@ def certificate_rows(run: Run) -> list[tuple[str, str]]:
         ("Steps accepted, rejected", f"{c.accepted_steps}, {c.rejected_steps}"),
         ("Time to compile the integration", f"{c.compile_seconds:.2f} s"),
         ("Time to run it", f"{c.run_seconds:.2f} s"),
+        ("Time for the second run, for the errors", f"{c.estimate_seconds:.2f} s"),
         ("Time for checks and balances", f"{c.analysis_seconds:.2f} s"),
     ]
 

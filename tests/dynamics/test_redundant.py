@@ -112,7 +112,7 @@ def test_simulate_finds_and_allows_for_dependent_rows(bars):
     assert (c.rows, c.rank) == (20, 17)
     assert c.redundant == sj.rank(system, state).redundant
     assert "redundant=True" in run.settings["formulation"]
-    assert c.position_residual < 1e-12
+    assert c.position_violation < 1e-12
     assert c.relative_energy_error < 1e-7
 
 

@@ -1,5 +1,6 @@
 """Results on disk: labelled, whole or absent, and never another program's file."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -7,8 +8,10 @@ import pytest
 import xarray as xr
 
 from stmuav_jax import PART_II, ModelError
+from stmuav_jax.dynamics.accuracy import without
 from stmuav_jax.view.io import (
     FileError,
+    _seal,
     load,
     load_parameters,
     save,
@@ -30,6 +33,9 @@ def test_dataset_is_labelled(short_run):
         assert variable.attrs["description"], name
     z = data["position"].sel(body="panel_7", axis="z").values
     assert z == pytest.approx(np.asarray(short_run.body("panel_7").r[:, 2]))
+    assert data["position_error"].dims == ("time", "body")
+    assert data["position_error"].attrs["units"] == "m"
+    assert np.all(data["position_error"] < 1e-6)
     assert data["joint_body_j"].sel(joint="S57").item() == "panel_7"
 
 
@@ -65,11 +71,45 @@ def test_foreign_and_missing_files_are_refused(tmp_path):
     xr.Dataset({"x": ("t", [1.0])}).to_netcdf(foreign, engine="h5netcdf")
     with pytest.raises(FileError, match="not a run saved by stmuav_jax"):
         load(foreign)
-    xr.Dataset(attrs={"format": "stmuav_jax run", "format_version": 99}).to_netcdf(
-        foreign, engine="h5netcdf"
-    )
+    other = xr.Dataset(attrs={"format": "stmuav_jax run", "format_version": 99})
+    content = bytes(other.to_netcdf(engine="h5netcdf"))
+    foreign.write_bytes(content + _seal(content))
     with pytest.raises(FileError, match="version 99"):
         load(foreign)
+
+
+def test_every_changed_byte_is_found(short_run, tmp_path):
+    whole = save(short_run, tmp_path / "run.nc").read_bytes()
+    rng = np.random.default_rng(7)
+    for count in np.repeat((1, 5, 20), 130):
+        broken = bytearray(whole)
+        for place in rng.choice(len(whole), count, replace=False):
+            broken[place] ^= rng.integers(1, 256)
+        path = tmp_path / "broken.nc"
+        path.write_bytes(bytes(broken))
+        with pytest.raises(FileError, match=r"broken\.nc cannot be read"):
+            load(path)
+
+
+def test_other_readers_open_a_run_and_find_changed_numbers(short_run, tmp_path):
+    path = save(short_run, tmp_path / "run.nc")
+    with xr.open_dataset(path, engine="h5netcdf") as found:
+        xr.testing.assert_identical(found.load().drop_attrs(), to_dataset(short_run).drop_attrs())
+    numbers = np.asarray(short_run.states.r).tobytes()[-64:]
+    whole = path.read_bytes()
+    assert whole.count(numbers) == 1
+    path.write_bytes(whole.replace(numbers, numbers[:-2] + b"ab"))
+    with xr.open_dataset(path, engine="h5netcdf") as found, pytest.raises(OSError):
+        found["position"].load()
+
+
+def test_a_run_without_analysis_has_no_reactions_in_its_file(short_run, tmp_path):
+    none = without(short_run.trajectory, "none was asked for")
+    bare = dataclasses.replace(short_run, analysis=None, errors=none)
+    found = load(save(bare, tmp_path / "run.nc"))
+    assert "position" in found
+    assert "reaction_force" not in found
+    assert np.all(np.isnan(found["position_error"]))
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

@@ -38,5 +38,9 @@ def test_saved_figures(short_run, tmp_path, suffix):
 def test_certificate_rows_name_quantity_and_unit(short_run):
     rows = dict(certificate_rows(short_run))
     assert rows["Rank of the constraint Jacobian"] == "34 of 34 rows"
-    assert rows["Largest position residual"].endswith(" m")
+    assert rows["Constraint violation, lengths"].endswith(" m")
+    assert rows["Constraint violation, angles"].endswith(" rad")
+    assert rows["Violation of the angles' rates"].endswith(" rad/s")
+    assert " m, at the end " in rows["Estimated position error"]
+    assert not any("residual" in name for name in rows)
     assert rows["Result"] == "successful at t = 0.05 s"

@@ -1,0 +1,212 @@
+"""What `simulate` refuses before it starts: settings, output times, starts, loads."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax
+import numpy as np
+
+from ..mechanics.body import check_unit
+from ..mechanics.constraint import ROWS
+from ..mechanics.errors import ModelError, SettingError, StateError, nearest_names
+from ..mechanics.state import State
+from ..mechanics.system import System, check_state
+from .augmented import Augmented, Model
+from .formulation import AbstractFormulation
+from .problem import Method
+from .rosenbrock import Rodas5P
+from .scene import Scene
+from .stabilisation import AbstractStabilisation, Baumgarte, Projection, Unstabilised
+from .tree import Tree
+
+# Initial residuals above these are refused: not round-off, and never repaired silently.
+POSITION_TOLERANCE = 1e-8
+VELOCITY_TOLERANCE = 1e-7
+
+# Saved times of a run of which only the end is given.
+_INTERVALS = 100
+
+_SOLVERS = (diffrax.Dopri8, diffrax.Tsit5, Rodas5P)
+_PARTS = (
+    ("solver", diffrax.AbstractSolver, _SOLVERS),
+    ("formulation", AbstractFormulation, (Tree, Augmented)),
+    ("stabilisation", AbstractStabilisation, (Projection, Baumgarte, Unstabilised)),
+)
+
+
+def check_parts(**parts: Any) -> None:
+    """Raise unless solver, formulation and stabilisation are objects of their kinds, or None."""
+    for name, kind, known in _PARTS:
+        given = parts[name]
+        if given is None or isinstance(given, kind) or (name == "solver" and given == "auto"):
+            continue
+        names = [each.__name__ for each in known]
+        valid = ", ".join(f"{each}()" for each in names) + (', or "auto"' * (name == "solver"))
+        if isinstance(given, str):
+            meant = [each for each in names if each.lower() == given.lower()]
+            hint = f": write {meant[0]}()." if meant else f".{nearest_names(given, names)}"
+            what = f"the text '{given}'{hint}"
+        elif isinstance(given, type):
+            what = f"the class {given.__name__}: write {given.__name__}()."
+        else:
+            what = f"of type {type(given).__name__}."
+        raise SettingError(f"{name} must be an object such as {valid}, but it is {what}")
+
+
+def scene_of(
+    what: Scene | System, state: State | None, t1: float | None, every: float | None, ts: Any
+) -> Scene:
+    """The scene given, or one made of a system, its state and the times given."""
+    if isinstance(what, Scene):
+        if state is not None:
+            raise SettingError(
+                "A scene has its own initial state: give a scene, or a system and a state."
+            )
+        return what
+    if not isinstance(what, System):
+        raise SettingError(
+            f"simulate takes a Scene, or a System and a State, but it was given a {type(what).__name__}."
+        )
+    if not isinstance(state, State):
+        given = "none" if state is None else f"a {type(state).__name__}"
+        raise SettingError(
+            f"To simulate a system give its initial State, such as system.reference (given: {given})."
+        )
+    title = "System of " + ", ".join(what.names)
+    if ts is not None:
+        times = _times(ts)
+        return Scene("system", title, what, state, times[0], times[-1])
+    if t1 is None:
+        raise SettingError("To simulate a system give the end t1 [s], or the saved times ts [s].")
+    every = abs(float(t1)) / _INTERVALS if every is None else every
+    return Scene("system", title, what, state, 0.0, float(t1), every or 1.0)
+
+
+def _times(ts: Any) -> np.ndarray:
+    times = np.asarray(ts, dtype=float)
+    if times.ndim != 1 or times.size < 1 or not np.all(np.isfinite(times)):
+        raise SettingError("The output times ts must be a list of finite numbers.")
+    if np.any(np.diff(times) <= 0):
+        k = int(np.argmax(np.diff(times) <= 0))
+        raise SettingError(
+            f"Output times must increase, but ts[{k + 1}] = {times[k + 1]} s follows ts[{k}] = {times[k]} s."
+        )
+    return times
+
+
+def output_times(
+    scene: Scene, t1: float | None, save_every: float | None, ts: Sequence[float] | Any
+) -> np.ndarray:
+    """The saved times (k,) [s], the scene's t0 first."""
+    if ts is not None:
+        times = _times(ts)
+        if times[0] != scene.t0:
+            raise SettingError(
+                f"The first output time must be the scene's t0 = {scene.t0} s, not {times[0]} s."
+            )
+        return times
+    end = scene.t1 if t1 is None else float(t1)
+    every = scene.save_every if save_every is None else float(save_every)
+    if not np.isfinite(end) or end < scene.t0:
+        raise SettingError(f"The end t1 = {end} s must be finite and not before t0 = {scene.t0} s.")
+    if not np.isfinite(every) or every <= 0:
+        raise SettingError(f"save_every must be finite and positive, but it is {every} s.")
+    count = int(np.floor((end - scene.t0) / every * (1 + 1e-12)))
+    times = scene.t0 + every * np.arange(count + 1)
+    if end - times[-1] > 1e-9 * every:
+        times = np.append(times, end)
+    times[-1] = end if count else times[-1]
+    return times
+
+
+def check_settings(method: Method) -> None:
+    """Raise unless tolerances, first step, number of steps and solver can be used."""
+    first = float(method.first_step)
+    if not (np.isfinite(first) and first > 0):
+        raise SettingError(f"first_step must be finite and positive, but it is {first} s.")
+    if method.max_steps < 1:
+        raise SettingError(f"max_steps must be at least 1, but it is {method.max_steps}.")
+    for name in ("rtol", "atol"):
+        value = float(getattr(method, name))
+        if not (np.isfinite(value) and value >= 1e-15):
+            raise SettingError(
+                f"{name} must be finite and at least 1e-15 (the round-off of double precision), "
+                f"but it is {value}."
+            )
+    if not isinstance(method.solver, diffrax.AbstractAdaptiveSolver):
+        raise SettingError(
+            f"{type(method.solver).__name__} has no error estimate and cannot adapt its steps; "
+            "choose Dopri8, Tsit5 or Rodas5P, or wrap it in diffrax.HalfSolver."
+        )
+
+
+def check_start(system: System, state: State) -> None:
+    """Raise unless the state fits the system's shapes, and is finite with unit Euler parameters."""
+    check_state(system, state)
+    units = (
+        ("r", "position", "m"),
+        ("v", "velocity", "m/s"),
+        ("omega", "angular velocity", "rad/s"),
+    )
+    for k, name in enumerate(system.names):
+        check_unit(state.p[k], f"body '{name}' in the initial state", StateError)
+        for field, words, unit in units:
+            value = np.asarray(getattr(state, field)[k])
+            if not np.all(np.isfinite(value)):
+                raise StateError(
+                    f"The initial {words} of body '{name}' must be finite, but it is {value.tolist()} {unit}."
+                )
+
+
+def check_loads(system: System, finite: np.ndarray, t: float) -> None:
+    """Raise unless the load of every force element is finite."""
+    for force, fine in zip(system.forces, finite, strict=True):
+        if not fine:
+            where = ", ".join((*force.bodies(), *force.joint_names())) or "all bodies"
+            raise ModelError(
+                f"The load of {type(force).__name__} on {where} is not finite at t = {t:.9g} s."
+            )
+
+
+def check_consistent(
+    system: System, model: Model, residuals: np.ndarray, rates: np.ndarray
+) -> None:
+    """Raise unless positions and velocities fit the joints.
+
+    Args:
+        residuals, rates: of every row (m,), in the units of `_off`.
+    """
+    owner = model.constraints.owner
+    checks: tuple[tuple[Any, float, str, Callable[..., str]], ...] = (
+        (residuals, POSITION_TOLERANCE, "positions", _off),
+        (rates, VELOCITY_TOLERANCE, "velocities", _off_rate),
+    )
+    for values, tolerance, words, shown in checks:
+        # a value that is not a number is not within the tolerance either
+        if np.all(np.abs(values) <= tolerance):
+            continue
+        k = int(np.argmax(np.where(np.isnan(values), np.inf, np.abs(values))))
+        raise StateError(
+            f"The initial {words} do not fit the joints: joint '{system.joints[owner[k]].name}' is off "
+            f"by {shown(model, k, values[k])} (tolerance {tolerance:.0e}). Find the nearest consistent "
+            "state with stmuav_jax.assemble(system, state)."
+        )
+
+
+def _off(model: Model, k: int, value: float) -> str:
+    """How far row k is off: a length, a cosine or an angle."""
+    kinds = [g.kind for g in model.constraints.groups for _ in range(len(g.i) * ROWS[g.kind])]
+    if kinds[k] == "distance":
+        # the row is (d^2 - l^2) / (2 l): exact for small misfits only
+        length = 0.5 / float(np.asarray(model.constraints.scales())[k])
+        return f"{abs(np.sqrt(max(length**2 + 2 * length * value, 0.0)) - length):.3g} m"
+    if kinds[k] == "angle":
+        return f"{abs(value):.3g} rad"
+    if model.constraints.angular[k]:
+        return f"{abs(value):.3g} (a cosine, zero where its axes are as they should be)"
+    return f"{abs(value):.3g} m"
+
+
+def _off_rate(model: Model, k: int, value: float) -> str:
+    unit = "rad/s" if model.constraints.angular[k] else "m/s"
+    return f"{abs(value):.3g} {unit}"

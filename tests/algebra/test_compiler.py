@@ -1,0 +1,121 @@
+"""Compiled programs: a bounded number of them, the right ones, and a warning in time."""
+
+import gc
+import warnings
+from collections import OrderedDict
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import stmuav_jax as sj
+from stmuav_jax.algebra import compiler
+from stmuav_jax.algebra.compiler import check_maps, kept_jit, memory_maps, transformed
+
+traced: list[str] = []
+
+
+def scaled(x, name, factor=2.0):
+    """A function of structure; notes when it is traced."""
+    traced.append(name)
+    return jnp.sin(x) @ x * len(name), (name, factor)
+
+
+kept = kept_jit(scaled)
+X = jnp.eye(3)
+
+
+@pytest.fixture
+def programs(monkeypatch):
+    """A registry of its own for four programs."""
+    found: OrderedDict = OrderedDict()
+    monkeypatch.setattr(compiler, "_programs", found)
+    monkeypatch.setattr(compiler, "MOST_PROGRAMS", 4)
+    traced.clear()
+    return found
+
+
+def test_programs_are_kept_by_structure_and_shape(programs):
+    for name in ("a", "bb", "a"):
+        found, rest = kept(X, name)
+        np.testing.assert_allclose(found, np.sin(np.eye(3)) @ np.eye(3) * len(name))
+        assert rest == (name, 2.0)
+    kept(np.ones((3, 3)), "a")
+    assert traced == ["a", "bb"]
+    kept(jnp.ones((2, 2)), "a")
+    kept(X.astype(jnp.float32), "a")
+    assert traced == ["a", "bb", "a", "a"]
+    # the fifth takes the place of the one used longest ago
+    kept(X, "ccc")
+    assert len(programs) == 4
+    kept(X, "bb")
+    assert traced == ["a", "bb", "a", "a", "ccc", "bb"]
+
+
+def test_released_programs_give_their_memory_maps_back(programs):
+    kept(X, "first")
+    for k in range(4):
+        kept(X, f"n{k}")
+    gc.collect()
+    maps = memory_maps()
+    if maps is None:
+        pytest.skip("This system does not count memory maps.")
+    for k in range(4, 44):
+        kept(X, f"n{k}")
+    gc.collect()
+    assert memory_maps()[0] < maps[0] + 20  # pyright: ignore[reportOptionalSubscript]
+
+
+def test_within_a_transformation_it_is_part_of_the_larger_program(programs):
+    loss = lambda x, name="abc": jnp.sum(kept(x, name)[0])
+    assert not transformed((X,))
+    for gradient in (jax.grad(loss)(X), jax.jit(jax.grad(loss))(X)):
+        difference = float(loss(X + 1e-6) - loss(X - 1e-6)) / 2e-6
+        assert float(jnp.sum(gradient)) == pytest.approx(difference, rel=1e-8)
+    assert jax.vmap(loss)(jnp.stack([X, 2 * X])).shape == (2,)
+    # arguments that are known, in a function that closes over what is differentiated
+    closing = lambda a: jnp.sum(kept_jit(lambda x: a * x)(X))
+    assert jax.grad(closing)(2.0) == 3.0
+
+
+def test_a_warning_comes_once_and_long_before_the_limit(monkeypatch):
+    counts = iter([(30_000, 65_530), (33_000, 65_530), (40_000, 65_530)])
+    monkeypatch.setattr(compiler, "memory_maps", lambda: next(counts))
+    compiler._warned.clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_maps()
+    with pytest.warns(RuntimeWarning, match=r"33000 memory maps of the 65530.*clear_caches"):
+        check_maps()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_maps()
+    compiler._warned.clear()
+    monkeypatch.setattr(compiler, "memory_maps", lambda: None)
+    check_maps()
+
+
+def simulated(name):
+    """A falling body: the cheapest system; its name is its structure."""
+    system = sj.System([sj.Body(name, 1.0, (1e-3,) * 3, free=True)], [], [sj.Gravity()])
+    settings = {"solver": diffrax.Heun(), "rtol": 1e-3, "atol": 1e-3, "analysis": False}
+    return sj.simulate(
+        system, system.reference, ts=[0.0, 0.1], error_estimate=False, **settings
+    ).states.r[-1, 0, 2]
+
+
+@pytest.mark.slow
+def test_systems_of_different_structure_leave_nothing_behind(monkeypatch):
+    monkeypatch.setattr(compiler, "MOST_PROGRAMS", 8)
+    counts = []
+    for k in range(40):
+        assert simulated(f"body {k}") == pytest.approx(-0.5 * 9.81 * 0.01, rel=1e-6)
+        gc.collect()
+        counts.append((memory_maps() or (0, 0))[0])
+    assert max(counts[5:]) < min(counts[5:]) + 60
+    # a structure seen a moment ago compiles nothing
+    before = list(compiler._programs)
+    simulated("body 39")
+    assert list(compiler._programs) == before
