@@ -14,7 +14,13 @@ import numpy as np
 
 from ..algebra.compiler import outer_jit
 from ..mechanics.body import check_unit
-from ..mechanics.errors import ModelError, SettingError, SimulationError, StateError
+from ..mechanics.errors import (
+    ModelError,
+    SettingError,
+    SimulationError,
+    StateError,
+    concrete,
+)
 from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
@@ -53,8 +59,11 @@ def simulate(
     save_every: float | None = None,
     ts: Sequence[float] | np.ndarray | None = None,
     event: Event | None = None,
+    direction: bool | None = None,
+    jump_ts: Sequence[float] | np.ndarray | None = None,
     max_steps: int = 100_000,
     first_step: float = 1e-4,
+    max_step: float = float("inf"),
     throw: bool = True,
     progress: Progress | None = None,
 ) -> Run:
@@ -70,7 +79,10 @@ def simulate(
         save_every: spacing of the saved times [s]; default the scene's. Or `ts`: the saved
             times themselves, the first at the scene's t0.
         event: (t, state) -> a number whose change of sign ends the run, or a truth value.
+        direction: of the change of sign: True upwards, False downwards, None both.
+        jump_ts: times at which forces jump [s].
         max_steps: between two saved times.
+        first_step: the first step tried [s]. max_step: no step is longer [s].
         throw: raise if the end was not reached; otherwise the run's certificate says so.
         progress: called with the fraction done.
 
@@ -83,6 +95,11 @@ def simulate(
         ModelError: contradictory constraints, or a load that is not finite at the start.
         SimulationError: the end was not reached (with `throw`); its `run` holds the rest.
     """
+    if not concrete(scene.system, scene.state0):
+        raise SettingError(
+            "simulate looks at values and cannot be differentiated, batched or compiled by JAX: "
+            "its scene holds traced numbers. Use stmuav_jax.integrate(system, state, ts, method)."
+        )
     formulation = formulation if formulation is not None else Tree()
     if solver == "auto":
         _check_start(scene.system, scene.state0)
@@ -97,7 +114,11 @@ def simulate(
         max_steps=max_steps,
         adjoint=diffrax.ForwardMode(),
         event=event,
+        direction=direction,
+        jump_ts=None if jump_ts is None else jnp.asarray(jump_ts, dtype=float),
         balances=True,
+        steps="state",
+        max_step=max_step,
     )
     times = _output_times(scene, t1, save_every, ts)
     _check_settings(method)
@@ -154,6 +175,8 @@ def _check_settings(method: Method) -> None:
     first = float(method.first_step)
     if not (np.isfinite(first) and first > 0):
         raise SettingError(f"first_step must be finite and positive, but it is {first} s.")
+    if not float(method.max_step) > 0:
+        raise SettingError(f"max_step must be positive, but it is {method.max_step} s.")
     if method.max_steps < 1:
         raise SettingError(f"max_steps must be at least 1, but it is {method.max_steps}.")
     for name in ("rtol", "atol"):
@@ -357,6 +380,9 @@ def _failure(run: Run) -> str:
             "(max_steps), save more often, or loosen the tolerances"
         ),
     }.get(run.certificate.result, run.certificate.result)
+    event = run.method.event
+    if event is not None and bool(jnp.any(jnp.isnan(jnp.asarray(event(jnp.asarray(t), state))))):
+        reason = "the value of its event is not a number there"
     system = with_internal(run.scene.system, jnp.asarray(run.trajectory.internal[-1]))
     kin = system.kinematics(state)
     for force in system.forces:
