@@ -19,6 +19,45 @@ from .problem import Carry, Landing, Problem, landing
 _NEAR = 1e3
 
 
+class _OfOne(optx.AbstractRootFinder):
+    """A root finder for the sum of several functions: of events, all but one are zero."""
+
+    inner: optx.Bisection
+
+    @property
+    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.inner.rtol
+
+    @property
+    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.inner.atol
+
+    @property
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return optx.max_norm
+
+    def init(self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, *rest: Any) -> Any:
+        one = jax.tree.leaves(f_struct)[0]
+        return self.inner.init(_sum(fn), y, args, options, one, *rest)
+
+    def step(self, fn: Any, *rest: Any) -> Any:
+        return self.inner.step(_sum(fn), *rest)
+
+    def terminate(self, fn: Any, *rest: Any) -> Any:
+        return self.inner.terminate(_sum(fn), *rest)
+
+    def postprocess(self, fn: Any, *rest: Any) -> Any:
+        return self.inner.postprocess(_sum(fn), *rest)
+
+
+def _sum(fn: Any) -> Any:
+    def summed(y: Any, args: Any) -> Any:
+        value, aux = fn(y, args)
+        return sum(jax.tree.leaves(value)), aux
+
+    return summed
+
+
 def to_event(
     problem: Problem, carry: Carry, t1: Float[Array, ""], adjoint: diffrax.AbstractAdjoint
 ) -> Landing:
@@ -43,7 +82,7 @@ def to_event(
             return jnp.where(start & (t <= carry.t), sign, now)
 
         lost = lambda t, y, args, **_: jnp.isnan(value(t, y, args))
-        finder = optx.Bisection(rtol=1e-12, atol=1e-14)
+        finder = _OfOne(optx.Bisection(rtol=1e-12, atol=1e-14))
         # in this order: where the first is true, the second does not count
         event = diffrax.Event((lost, crossing), finder, (None, method.direction))
     solution = problem.solve(carry, t1, adjoint, event=event)

@@ -101,11 +101,10 @@ def _past(carry: Carry, jump: Float[Array, ""]) -> Carry:
     at = (carry.t == prevbefore(jump)) | (carry.t == jump)
     at = at & (carry.result == diffrax.RESULTS.successful)
     carry = eqx.tree_at(lambda c: c.t, carry, jnp.where(at, nextafter(jump), carry.t))
-    inner, worst, modes = carry.solver_state
-    if modes is not None:
-        # the modes may be others now
-        modes = modes._replace(age=jnp.where(at, EVERY, modes.age))
-    return eqx.tree_at(lambda c: c.solver_state, carry, (inner, worst, modes))
+    inner, worst, *modes = carry.solver_state
+    # the modes may be others now
+    modes = [now._replace(age=jnp.where(at, EVERY, now.age)) for now in modes]
+    return eqx.tree_at(lambda c: c.solver_state, carry, (inner, worst, *modes))
 
 
 def _through(

@@ -99,8 +99,8 @@ class Stabilised(diffrax.AbstractWrappedSolver):
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> Any:
         none = jnp.zeros((), y0.dtype)
-        modes = None if self.guard is None else self.guard.begin(t0, y0)
-        return self.solver.init(terms, t0, t1, y0, args), Residuals(none, none, none), modes
+        start = (self.solver.init(terms, t0, t1, y0, args), Residuals(none, none, none))
+        return start if self.guard is None else (*start, self.guard.begin(t0, y0))
 
     def step(
         self,
@@ -112,11 +112,11 @@ class Stabilised(diffrax.AbstractWrappedSolver):
         solver_state: Any,
         made_jump: Any,
     ) -> tuple[Vector, Any, Any, Any, diffrax.RESULTS]:
-        inner, worst, modes = solver_state
+        inner, worst, *modes = solver_state
         jump = made_jump if self.project is None else True
         if self.guard is not None:
             field = lambda t, y: terms.vf(t, y, args)
-            modes = self.guard.looked(field, t0, y0, t1 - t0, modes)
+            modes = [self.guard.looked(field, t0, y0, t1 - t0, *modes)]
         y1, y_error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, jump
         )
@@ -130,8 +130,8 @@ class Stabilised(diffrax.AbstractWrappedSolver):
             jnp.maximum(worst.norm, now.norm),
         )
         info = {"inner": dense_info, "end": end, "shift": end - y1}
-        y_error = y_error if modes is None else (y_error, modes.longest)
-        return end, y_error, info, (inner, worst, modes), result
+        y_error = (y_error, modes[0].longest) if modes else y_error
+        return end, y_error, info, (inner, worst, *modes), result
 
     def func(self, terms: Any, t0: Any, y0: Vector, args: Any) -> Any:
         return self.solver.func(terms, t0, y0, args)
@@ -169,7 +169,7 @@ class Remembering(diffrax.AbstractAdaptiveStepSizeController):
 
     controller: diffrax.PIDController
     step: Float[Array, ""]
-    longest: Float[Array, ""]
+    longest: Float[Array, ""] | float = float("inf")
 
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
