@@ -64,7 +64,7 @@ def _look(system: System, state: State) -> jax.Array:
 def _run(name: str, case: int, design: Any, swapped: Any, ts: Any) -> tuple[Any, Any, Any]:
     def one(design: jax.Array, swapped: jax.Array) -> tuple[Any, Any, Any]:
         scene = varied_scene(name, case, design, swapped=swapped)
-        method = Method(rtol=1e-7, atol=1e-7, adjoint=diffrax.ForwardMode())
+        method = Method(rtol=1e-7, atol=1e-7, adjoint=diffrax.ForwardMode(), steps="state")
         path = integrate(scene.system, scene.state0, ts, method)
         seen = jax.vmap(lambda state: _look(scene.system, state))(path.states)
         return path.ts, seen, path.result == diffrax.RESULTS.successful

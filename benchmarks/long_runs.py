@@ -88,6 +88,7 @@ def adaptive(family: Family, redundant: bool) -> Callable[..., Path]:
             stabilisation=hold,
             adjoint=diffrax.ForwardMode(),
             max_steps=1_000_000,
+            steps="state",
         )
         found = sj.integrate(system, state, ts, method)
         # a run that stopped keeps its last time
@@ -105,7 +106,10 @@ def fixed(family: Family, redundant: bool) -> Callable[..., Path]:
     hold = sj.Projection() if family.projected else sj.Unstabilised()
     stages = 2 if family.solver == "gauss" else 1
     method = sj.Method(
-        formulation=sj.Tree(redundant=redundant), solver=Gauss(stages), stabilisation=hold
+        formulation=sj.Tree(redundant=redundant),
+        solver=Gauss(stages),
+        stabilisation=hold,
+        steps="state",
     )
 
     def run(count: Any, system: sj.System, state: sj.State, ts: Float[Array, " k"]) -> Path:

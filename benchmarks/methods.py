@@ -32,6 +32,8 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]
 
 def trajectory(formulation: Any, solver: Any, adjoint: Any = None, steps: int = STEPS) -> Any:
     """(system, state0, ts, tolerance) -> `Trajectory`; one compilation for all tolerances."""
+    # runs that are not differentiated need no steps that are safe for derivatives
+    kind = "state" if adjoint is None else "sensitivities"
     adjoint = diffrax.ForwardMode() if adjoint is None else adjoint
 
     def run(system: Any, state0: Any, ts: Any, tolerance: Any) -> sj.Trajectory:
@@ -42,6 +44,7 @@ def trajectory(formulation: Any, solver: Any, adjoint: Any = None, steps: int = 
             atol=tolerance,
             adjoint=adjoint,
             max_steps=steps,
+            steps=kind,
         )
         return sj.integrate(system, state0, ts, method)
 

@@ -33,6 +33,7 @@ def _integrate(solver: Any) -> Any:
             atol=tol,
             adjoint=diffrax.ForwardMode(),
             max_steps=1_000_000,
+            steps="state",
         )
         return sj.integrate(system, state, ts, method)
 

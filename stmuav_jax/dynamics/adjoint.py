@@ -7,8 +7,11 @@ stage to the first,
     K_i = h (b_i l + sum_j a_ji L_j),    L_i = (df/dy)^T K_i,    derivative by y: l + sum_i L_i.
 
 Accepted steps are kept with their slopes, so nothing is done again but the right-hand side that
-each derivative starts from, and rejected steps cost nothing. Step sizes count as given: by the end
-and the start of an integration it is differentiated as the flow is.
+each derivative starts from, and rejected steps cost nothing. Where there are more step attempts
+than are kept, a landing goes by windows: the start of each is kept with what step control
+remembers there, and the steps of the last. On the way back a window before it is done again from
+its start to the start of the next, so that what differs by round-off does not add up. Step sizes
+count as given: by the end and the start of an integration it is differentiated as the flow is.
 
 Source: E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006), ch. VI.10.2
 (adjoint equations of Runge-Kutta methods).
@@ -20,10 +23,22 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from equinox.internal import nondifferentiable_backward
 from jaxtyping import Array, Float, Int
 
 from .explicit import Lean, coefficients
 from .problem import Carry, Counts, Landing, Problem, landing
+
+TWICE = (
+    "Second derivatives of stmuav_jax.integrate by reverse mode over reverse mode are not available: "
+    "take forward mode over reverse mode, jax.jacfwd(jax.grad(f)), or forward mode twice with "
+    "Method(adjoint=diffrax.ForwardMode())."
+)
+
+# Windows of a landing, each of as many step attempts as are kept.
+WINDOWS = 256
+
+_MORE = diffrax.RESULTS.max_steps_reached
 
 
 def recordable(problem: Problem) -> bool:
@@ -32,7 +47,7 @@ def recordable(problem: Problem) -> bool:
 
 
 def recorded(problem: Problem, carry: Carry, t1: Float[Array, ""], kept: int) -> Landing:
-    """Integrate to t1 [s]; differentiated in reverse by its steps, at most `kept` of them."""
+    """Integrate to t1 [s]; differentiated in reverse by its steps, `kept` of them at a time."""
     bare = eqx.tree_at(lambda p: p.model, problem, None)
     start = _Start(problem.model, carry.y, carry.t, t1)
     memory = (carry.step, carry.solver_state, carry.controller_state)
@@ -68,11 +83,24 @@ class _Steps(NamedTuple):
     end: Float[Array, " k"]
 
 
+class _Windows(NamedTuple):
+    """A landing by windows of at most n step attempts each.
+
+    Attributes:
+        count: of windows. starts: what each starts from (windows, .): time, y, memory of the
+            solver and of the step control. last: the steps of the last one.
+    """
+
+    count: Int[Array, ""]
+    starts: Any
+    last: _Steps
+
+
 def _begun(start: _Start, problem: Problem, memory: Any) -> tuple[Problem, Carry]:
     problem = eqx.tree_at(lambda p: p.model, problem, start.model, is_leaf=lambda x: x is None)
     none = jnp.zeros((), int)
     step, solver_state, controller_state = memory
-    counts, fine = Counts(none, none), diffrax.RESULTS.successful
+    counts, fine = Counts(none, none, none), diffrax.RESULTS.successful
     carry = Carry(start.t0, start.y, step, solver_state, controller_state, counts, fine)
     return problem, carry
 
@@ -87,23 +115,60 @@ def _recorded(start: _Start, problem: Problem, memory: Any, kept: int) -> Landin
 @_recorded.def_fwd
 def _forward(
     perturbed: Any, start: _Start, problem: Problem, memory: Any, kept: int
-) -> tuple[Landing, _Steps]:
+) -> tuple[Landing, _Windows]:
+    """Window after window; where each starts is kept, and the steps of the last."""
     del perturbed
     problem, carry = _begun(start, problem, memory)
-    solution = problem.solve(carry, start.t1, diffrax.ForwardMode(), max_steps=kept, dense=True)
+    most = min(-(-problem.method.max_steps // kept), WINDOWS)
+    begin = (carry.t, carry.y, carry.solver_state, carry.controller_state)
+    none = jnp.zeros((), int)
+    starts = jax.tree.map(lambda x: jnp.zeros((most, *jnp.shape(x)), jnp.result_type(x)), begin)
+    _, steps = eqx.filter_eval_shape(_window, problem, begin, start.t1, kept)
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), steps)
+
+    def unfinished(at: tuple[Any, ...]) -> Any:
+        number, _, _, result, _, _ = at
+        return (number == 0) | ((result == _MORE) & (number < most))
+
+    def window(at: tuple[Any, ...]) -> tuple[Any, ...]:
+        number, now, starts, _, counts, _ = at
+        starts = jax.tree.map(lambda rows, x: rows.at[number].set(x), starts, now)
+        end, steps = _window(problem, now, start.t1, kept)
+        counts = (counts[0] + end.accepted, counts[1] + end.rejected)
+        now = (end.t, end.y, end.solver_state, end.controller_state)
+        return number + 1, now, starts, end.result, counts, steps
+
+    state = (none, begin, starts, diffrax.RESULTS.successful, (none, none), empty)
+    count, (t, y, solver_state, controller_state), starts, result, counts, last = (
+        jax.lax.while_loop(unfinished, window, state)
+    )
+    over = counts[0] + counts[1] > problem.method.max_steps
+    result = diffrax.RESULTS.where(over, _MORE, result)
+    end = Landing(t, y, solver_state, controller_state, *counts, result)
+    if most * kept < problem.method.max_steps:
+        # derivatives of part of the way would be wrong: not a number says so
+        end = end._replace(y=jnp.where(result == _MORE, jnp.nan, y))
+    return end, _Windows(count, starts, last._replace(end=end.y))
+
+
+def _window(
+    problem: Problem, begin: tuple[Any, ...], t1: Float[Array, ""], kept: int
+) -> tuple[Landing, _Steps]:
+    """At most `kept` step attempts towards t1 [s], with all that are accepted."""
+    t, y, solver_state, controller_state = begin
+    none, fine = jnp.zeros((), int), diffrax.RESULTS.successful
+    step, counts = controller_state[0], Counts(none, none, none)
+    carry = Carry(t, y, step, solver_state, controller_state, counts, fine)
+    solution = problem.solve(carry, t1, diffrax.ForwardMode(), max_steps=kept, dense=True)
     found: Any = solution.interpolation
     inner = found.infos["inner"]
     end = landing(solution)
-    if kept < problem.method.max_steps:
-        # derivatives of part of the way would be wrong: not a number says so
-        over = end.result == diffrax.RESULTS.max_steps_reached
-        end = end._replace(y=jnp.where(over, jnp.nan, end.y))
     return end, _Steps(end.accepted, found.ts, inner["y0"], inner["slopes"], end.y)
 
 
 @_recorded.def_bwd
 def _backward(
-    steps: _Steps,
+    windows: _Windows,
     wanted: Landing,
     perturbed: Any,
     start: _Start,
@@ -111,27 +176,49 @@ def _backward(
     memory: Any,
     kept: int,
 ) -> _Start:
-    del memory, kept
+    del memory
     arrays, rest = eqx.partition(start.model, eqx.is_inexact_array)
     field = lambda t, y, args: problem.field(t, y, eqx.combine(args, rest))
-    last = jnp.zeros_like(steps.end) if wanted.y is None else wanted.y
-    last = jnp.where(jnp.isnan(steps.end), jnp.nan, last)
-    zero = jax.tree.map(jnp.zeros_like, arrays)
+    end = windows.last.end
+    last = jnp.zeros_like(end) if wanted.y is None else wanted.y
+    last = jnp.where(jnp.isnan(end), jnp.nan, last)
+    whole = eqx.tree_at(lambda p: p.model, problem, start.model, is_leaf=lambda x: x is None)
 
-    def back(at: tuple[Any, ...]) -> tuple[Any, ...]:
-        i, by_end, by_model = at
-        by_start, more = _step_back(problem, arrays, rest, steps, i, by_end)
-        return i - 1, by_start, jax.tree.map(jnp.add, by_model, more)
+    def again(number: Any) -> _Steps:
+        """The steps of a window that was followed by another, done again."""
+        begin, after = (
+            jax.tree.map(lambda rows, k=k: rows[number + k], windows.starts) for k in (0, 1)
+        )
+        return _window(whole, begin, after[0], kept)[1]
 
-    begin = (steps.taken - 1, last, zero)
-    _, first, by_model = jax.lax.while_loop(lambda at: at[0] >= 0, back, begin)
+    def back_window(at: tuple[Any, ...]) -> tuple[Any, ...]:
+        number, by_end, by_model = at
+        final = number == windows.count - 1
+        steps = jax.lax.cond(final, lambda: windows.last, lambda: again(number))
+
+        def back(at: tuple[Any, ...]) -> tuple[Any, ...]:
+            i, by_end, by_model = at
+            by_start, more = _step_back(problem, arrays, rest, steps, i, by_end)
+            return i - 1, by_start, jax.tree.map(jnp.add, by_model, more)
+
+        begin = (steps.taken - 1, by_end, by_model)
+        _, by_start, by_model = jax.lax.while_loop(lambda at: at[0] >= 0, back, begin)
+        return number - 1, by_start, by_model
+
+    # also where there is no step to go back through
+    none = jnp.where(jnp.any(jnp.isnan(last)), jnp.nan, 0.0)
+    zero = jax.tree.map(lambda x: jnp.full_like(x, none), arrays)
+    _, first, by_model = jax.lax.while_loop(
+        lambda at: at[0] >= 0, back_window, (windows.count - 1, last, zero)
+    )
     by_t0, by_t1 = None, None
     if perturbed.t0:
         by_t0 = -jnp.vdot(first, field(start.t0, start.y, arrays))
     if perturbed.t1:
-        by_t1 = jnp.vdot(last, field(start.t1, steps.end, arrays))
+        by_t1 = jnp.vdot(last, field(start.t1, end, arrays))
     none = jax.tree.map(lambda _: None, rest)
-    return _Start(eqx.combine(by_model, none), first, by_t0, by_t1)  # pyright: ignore
+    found = _Start(eqx.combine(by_model, none), first, by_t0, by_t1)  # pyright: ignore
+    return nondifferentiable_backward(found, msg=TWICE)
 
 
 def _step_back(

@@ -124,6 +124,8 @@ def check_settings(method: Method) -> None:
     first = float(method.first_step)
     if not (np.isfinite(first) and first > 0):
         raise SettingError(f"first_step must be finite and positive, but it is {first} s.")
+    if not float(method.max_step) > 0:
+        raise SettingError(f"max_step must be positive, but it is {method.max_step} s.")
     if method.max_steps < 1:
         raise SettingError(f"max_steps must be at least 1, but it is {method.max_steps}.")
     for name in ("rtol", "atol"):

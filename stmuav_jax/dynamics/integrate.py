@@ -11,18 +11,27 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
+from equinox.internal import nextafter, nondifferentiable_backward, prevbefore
 from jaxtyping import Array, Float
 
 from ..algebra.compiler import kept_jit
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .adjoint import recordable, recorded
+from .events import to_event
 from .formulation import Residuals
+from .modes import EVERY
 from .problem import Carry, Counts, Landing, Method, Problem, begin, landing, prepare
 
-# Steps kept for reverse mode, some hundred numbers each, shared out among the output times.
+# Step attempts kept at a time for reverse mode, some hundred numbers each, shared out among the
+# output times.
 KEPT = 4096
+
+
+AHEAD = (
+    "A run with Method(adjoint=diffrax.ForwardMode()) cannot be differentiated in reverse mode: leave "
+    "`adjoint` out for jax.grad, or use jax.jacfwd, also for derivatives of its own derivatives."
+)
 
 
 class Trajectory(eqx.Module):
@@ -30,7 +39,7 @@ class Trajectory(eqx.Module):
 
     Attributes:
         ts: times reached (k,) [s]; after an event or a failure, the time where it stopped.
-        states: (k, n, .), see `State`.
+        states: (k, n, .), see `State`; not numbers at times that a failed run did not reach.
         work: done so far by forces without potential and by drivers (k,) [J]; zero, like
             the impulse, where the method has no `balances`.
         impulse: linear and angular (about the world's origin) so far (k, 6) [N s], [N m s];
@@ -66,34 +75,59 @@ def _to(
     """Integrate from the carry to t1, or to an event before it."""
     if isinstance(adjoint, int):
         return recorded(problem, carry, t1, adjoint)
-    condition = problem.method.event
-    if condition is None:
-        return landing(problem.solve(carry, t1, adjoint))
-
-    def cond_fn(t: Any, y: Any, args: Any, **_: Any) -> Array:
-        return condition(t, problem.method.formulation.to_state(args, y[: problem.n_state]))
-
-    kind = jax.eval_shape(lambda: cond_fn(carry.t, carry.y, problem.model)).dtype
-    finder = None if kind == jnp.bool_ else optx.Bisection(rtol=1e-12, atol=1e-14)
-    found = landing(problem.solve(carry, t1, adjoint, event=diffrax.Event(cond_fn, finder)))
-    # the event's time comes from interpolation; the state there from steps
-    again = jax.lax.cond(
-        found.result == diffrax.RESULTS.event_occurred,
-        lambda: landing(problem.solve(carry, found.t, adjoint)),
-        lambda: found,
-    )
-    return again._replace(result=found.result)
+    if problem.method.event is not None:
+        return to_event(problem, carry, t1, adjoint)
+    return landing(problem.solve(carry, t1, adjoint))
 
 
 def advance(problem: Problem, carry: Carry, ts: Float[Array, " k"]) -> tuple[Carry, Trajectory]:
     """Go on to each of the times ts [s] in turn; after a failure or an event, stay there."""
-    adjoint = _adjoint(problem, ts.shape[0])
+    jumps = problem.method.jump_ts
+    if jumps is None:
+        # the first output time is where it starts: nothing to keep there
+        end, rows = _through(problem, carry, ts, ts.shape[0] - 1)
+        return end, _trajectory(problem, end, rows)
+    # the times of jumps among the output times; at the same time outputs come first
+    merged = jnp.concatenate([ts, jumps])
+    order = jnp.argsort(merged)
+    end, rows = _through(problem, carry, (merged[order], order >= ts.shape[0]), len(merged) - 1)
+    rows = jax.tree.map(lambda x: x[jnp.argsort(order)[: ts.shape[0]]], rows)
+    # an output time at a jump is reached just before it
+    reached = jnp.where(rows[0] == prevbefore(ts), ts, rows[0])
+    return end, _trajectory(problem, end, (reached, *rows[1:]))
 
-    def to_next(carry: Carry, t1: Float[Array, ""]) -> tuple[Carry, Any]:
+
+def _past(carry: Carry, jump: Float[Array, ""]) -> Carry:
+    """The carry right after a jump that it has come to."""
+    at = (carry.t == prevbefore(jump)) | (carry.t == jump)
+    at = at & (carry.result == diffrax.RESULTS.successful)
+    carry = eqx.tree_at(lambda c: c.t, carry, jnp.where(at, nextafter(jump), carry.t))
+    inner, worst, *modes = carry.solver_state
+    # the modes may be others now
+    modes = [now._replace(age=jnp.where(at, EVERY, now.age)) for now in modes]
+    return eqx.tree_at(lambda c: c.solver_state, carry, (inner, worst, *modes))
+
+
+def _through(
+    problem: Problem, carry: Carry, ts: Any, segments: int
+) -> tuple[Carry, tuple[Any, ...]]:
+    """Through times [s], or through pairs of time and whether it is that of a jump."""
+    adjoint = _adjoint(problem, segments)
+    jumps = problem.method.jump_ts
+    if jumps is not None:
+        last = jnp.max(jnp.where(ts[1], -jnp.inf, ts[0]))
+
+    def to_next(carry: Carry, t1: Any) -> tuple[Carry, Any]:
         fine = carry.result == diffrax.RESULTS.successful
+        if jumps is not None:
+            (goal, jumping) = t1
+            t1 = jnp.where(jnp.any(goal == jumps), prevbefore(goal), goal)
+            t1 = jnp.where((jumping & (goal > last)) | (t1 < carry.t), carry.t, t1)
         found = _to(problem, carry, jnp.where(fine, t1, carry.t), adjoint)
         counts = Counts(
-            carry.counts.accepted + found.accepted, carry.counts.rejected + found.rejected
+            carry.counts.accepted + found.accepted,
+            carry.counts.rejected + found.rejected,
+            found.controller_state[2],
         )
         after = Carry(
             t=found.t,
@@ -104,9 +138,17 @@ def advance(problem: Problem, carry: Carry, ts: Float[Array, " k"]) -> tuple[Car
             counts=counts,
             result=diffrax.RESULTS.where(fine, found.result, carry.result),
         )
-        return after, (after.t, after.y, counts, after.worst)
+        row = (after.t, after.y, counts, after.worst)
+        if jumps is not None:
+            after = jax.lax.cond(jumping, lambda: _past(after, goal), lambda: after)
+        return after, row
 
-    end, (reached, ys, counts, worst) = jax.lax.scan(to_next, carry, ts)
+    return jax.lax.scan(to_next, carry, ts)
+
+
+def _trajectory(problem: Problem, end: Carry, rows: tuple[Any, ...]) -> Trajectory:
+    """From what was reached at the output times."""
+    reached, ys, counts, worst = rows
     first = problem.n_state
     n = first + problem.n_internal
     to_state = lambda y: problem.method.formulation.to_state(problem.model, y[:first])
@@ -116,7 +158,7 @@ def advance(problem: Problem, carry: Carry, ts: Float[Array, " k"]) -> tuple[Car
         impulse = ys[:, n + 1 :] if problem.floating else impulse
     states = jax.vmap(to_state)(ys)
     own = ys[:, first:n]
-    return end, Trajectory(reached, states, work, impulse, own, counts, worst, end.result)
+    return Trajectory(reached, states, work, impulse, own, counts, worst, end.result)
 
 
 def integrate(
@@ -126,7 +168,9 @@ def integrate(
 
     Pure: may be jitted, vmapped and differentiated. It assumes a consistent start (see
     `assemble`) and raises nothing for values: look at `Trajectory.result`. `simulate` is
-    the same with checks, progress and a certificate.
+    the same with checks, progress and a certificate. What a failed run did not reach, and its
+    derivatives, are not numbers: a sum over flights shows it. A run that ended at an event
+    keeps the state there.
 
     Args:
         system: bodies, joints, forces.
@@ -141,9 +185,28 @@ def integrate(
     problem = prepare(system, method if method is not None else Method())
     ts = jnp.asarray(ts, dtype=state0.r.dtype)
     start = compiled_begin(problem, ts[0], state0)
-    return compiled_advance(problem, start, ts)[1]
+    found = _compiled_path(problem, start, ts)
+    if isinstance(problem.method.adjoint, diffrax.ForwardMode):
+        return nondifferentiable_backward(found, msg=AHEAD)
+    return found
+
+
+def _marked(found: Trajectory, ts: Float[Array, " k"]) -> Trajectory:
+    """Not numbers, and no derivatives, where a run that failed did not come."""
+    fine = found.result == diffrax.RESULTS.successful
+    fine = fine | (found.result == diffrax.RESULTS.event_occurred)
+    missed = ~fine & (jax.lax.stop_gradient(found.ts) < ts)
+    # a product, so that the derivatives are marked too
+    factor = jnp.where(missed, jnp.nan, 1.0)
+    mark = lambda x: x * factor.reshape(-1, *(1,) * (x.ndim - 1)).astype(x.dtype)
+    where = lambda path: (path.states, path.work, path.impulse, path.internal)
+    return eqx.tree_at(where, found, jax.tree.map(mark, where(found)))
+
+
+def _path(problem: Problem, start: Carry, ts: Float[Array, " k"]) -> Trajectory:
+    return _marked(advance(problem, start, ts)[1], ts)
 
 
 # Called eagerly, neither compiles again for a system of the same structure.
 compiled_begin = kept_jit(begin)
-compiled_advance = kept_jit(advance)
+_compiled_path = kept_jit(_path)

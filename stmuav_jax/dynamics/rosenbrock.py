@@ -157,6 +157,17 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         return y1, found[7], {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 
+def stability(z: complex) -> complex:
+    """The stability function R(z): a step of y' = lambda y multiplies y by R(h lambda)."""
+    A, C, found = _weights(), _table(_C), np.zeros(_STAGES, complex)
+    for i in range(_STAGES):
+        right = z * (1 + A[i] @ found) + C[i] @ found
+        found[i] = right / (1 / _GAMMA - z)
+    b = A[7].copy()
+    b[7] = 1.0
+    return complex(1 + b @ found)
+
+
 def _derivatives(
     field: Any, t: Float[Array, ""], y: Vector
 ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..mechanics.errors import ModelError, SimulationError
+from ..mechanics.errors import ModelError, SettingError, SimulationError, concrete
 from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
@@ -56,8 +56,11 @@ def simulate(
     save_every: float | None = None,
     ts: Sequence[float] | np.ndarray | None = None,
     event: Event | None = None,
+    direction: bool | None = None,
+    jump_ts: Sequence[float] | np.ndarray | None = None,
     max_steps: int = 100_000,
     first_step: float = 1e-4,
+    max_step: float = float("inf"),
     error_estimate: bool = True,
     analysis: bool = True,
     throw: bool = True,
@@ -78,7 +81,10 @@ def simulate(
             for a system. Or `ts`: the saved times themselves, the first at the scene's t0. A saved
             time ends a step, so that no step is longer than the spacing.
         event: (t, state) -> a number whose change of sign ends the run, or a truth value.
+        direction: of the change of sign: True upwards, False downwards, None both.
+        jump_ts: times at which forces jump [s].
         max_steps: between two saved times.
+        first_step: the first step tried [s]. max_step: no step is longer [s].
         error_estimate: estimate the global error at every saved time by a second run at smaller
             tolerances, see `ErrorEstimate`. It takes one and a half to two times as long as the
             first; there is nothing more to compile.
@@ -97,6 +103,11 @@ def simulate(
         SimulationError: the end was not reached (with `throw`); its `run` holds the rest.
     """
     scene = scene_of(scene, state, t1, save_every, ts)
+    if not concrete(scene.system, scene.state0):
+        raise SettingError(
+            "simulate looks at values and cannot be differentiated, batched or compiled by JAX: "
+            "its scene holds traced numbers. Use stmuav_jax.integrate(system, state, ts, method)."
+        )
     check_parts(solver=solver, formulation=formulation, stabilisation=stabilisation)
     method = Method(
         formulation=formulation if formulation is not None else Tree(),  # pyright: ignore
@@ -108,7 +119,11 @@ def simulate(
         max_steps=max_steps,
         adjoint=diffrax.ForwardMode(),
         event=event,
+        direction=direction,
+        jump_ts=None if jump_ts is None else jnp.asarray(jump_ts, dtype=float),
         balances=analysis,
+        steps="state",
+        max_step=max_step,
     )
     times = output_times(scene, t1, save_every, ts)
     check_settings(method)
@@ -291,6 +306,9 @@ def _failure(run: Run, end: float) -> str:
             "(max_steps), save more often, or loosen the tolerances"
         ),
     }.get(run.certificate.result, run.certificate.result)
+    event = run.method.event
+    if event is not None and bool(jnp.any(jnp.isnan(jnp.asarray(event(jnp.asarray(t), state))))):
+        reason = "the value of its event is not a number there"
     system = with_internal(run.scene.system, jnp.asarray(run.trajectory.internal[-1]))
     kin = system.kinematics(state)
     for force in system.forces:

@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from .formulation import Residuals
+from .modes import Guard
 
 Vector = Float[Array, " k"]
 
@@ -54,11 +55,14 @@ class Stabilised(diffrax.AbstractWrappedSolver):
         project: (t, y, args) -> y and its `Residuals`, or None.
         residuals: (t, y, args) -> `Residuals`; their maxima over all accepted steps are
             kept in the solver state.
+        guard: bounds the steps for what is differentiated; the error estimate then comes
+            as a pair, with the longest step that is safe. Or None.
     """
 
     solver: diffrax.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
     project: Callable[[Any, Vector, Any], tuple[Vector, Residuals]] | None
     residuals: Callable[[Any, Vector, Any], Residuals]
+    guard: Guard | None = None
 
     @property
     def root_finder(self) -> Any:
@@ -96,7 +100,8 @@ class Stabilised(diffrax.AbstractWrappedSolver):
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> Any:
         none = jnp.zeros((), y0.dtype)
-        return self.solver.init(terms, t0, t1, y0, args), Residuals(*(none,) * 5)
+        start = (self.solver.init(terms, t0, t1, y0, args), Residuals(*(none,) * 5))
+        return start if self.guard is None else (*start, self.guard.begin(t0, y0))
 
     def step(
         self,
@@ -108,8 +113,11 @@ class Stabilised(diffrax.AbstractWrappedSolver):
         solver_state: Any,
         made_jump: Any,
     ) -> tuple[Vector, Any, Any, Any, diffrax.RESULTS]:
-        inner, worst = solver_state
+        inner, worst, *modes = solver_state
         jump = made_jump if self.project is None else True
+        if self.guard is not None:
+            field = lambda t, y: terms.vf(t, y, args)
+            modes = [self.guard.looked(field, t0, y0, t1 - t0, *modes)]
         y1, y_error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, jump
         )
@@ -119,7 +127,8 @@ class Stabilised(diffrax.AbstractWrappedSolver):
             end, now = self.project(t1, y1, args)
         worst = jax.tree.map(jnp.maximum, worst, now)
         info = {"inner": dense_info, "end": end, "shift": end - y1}
-        return end, y_error, info, (inner, worst), result
+        y_error = (y_error, modes[0].longest) if modes else y_error
+        return end, y_error, info, (inner, worst, *modes), result
 
     def func(self, terms: Any, t0: Any, y0: Vector, args: Any) -> Any:
         return self.solver.func(terms, t0, y0, args)
@@ -144,17 +153,20 @@ class Remembering(diffrax.AbstractAdaptiveStepSizeController):
 
     Landing on an output time cuts a step; without this the next step would start from the
     short one and grow again by at most a factor of ten a step. The state holds the step
-    size to go on with.
+    size to go on with, and how many steps grew as much as a step may: their error was far
+    below the tolerance and did not choose them.
 
     Args:
         controller: what decides on steps.
         step: the first one [s]. It is given here and not to diffrax as dt0, which would add
             a check by host callback, and code with callbacks is not kept in JAX's
             compilation cache.
+        longest: no step is longer [s].
     """
 
     controller: diffrax.PIDController
     step: Float[Array, ""]
+    longest: Float[Array, ""] | float = float("inf")
 
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -170,7 +182,7 @@ class Remembering(diffrax.AbstractAdaptiveStepSizeController):
 
     def wrap(self, direction: Any) -> "Remembering":
         return Remembering(  # pyright: ignore[reportCallIssue]
-            controller=self.controller.wrap(direction), step=self.step
+            controller=self.controller.wrap(direction), step=self.step, longest=self.longest
         )
 
     def init(
@@ -185,8 +197,9 @@ class Remembering(diffrax.AbstractAdaptiveStepSizeController):
         error_order: Any,
     ) -> Any:
         del dt0
-        end, inner = self.controller.init(terms, t0, t1, y0, self.step, args, func, error_order)
-        return end, (self.step, inner)
+        step = jnp.minimum(self.step, self.longest)
+        end, inner = self.controller.init(terms, t0, t1, y0, step, args, func, error_order)
+        return end, (step, inner, jnp.zeros((), int))
 
     def adapt_step_size(
         self,
@@ -199,16 +212,23 @@ class Remembering(diffrax.AbstractAdaptiveStepSizeController):
         error_order: Any,
         controller_state: Any,
     ) -> Any:
-        step, inner = controller_state
+        step, inner, grown = controller_state
+        longest = self.longest
+        if isinstance(y_error, tuple):
+            y_error, safe = y_error
+            longest = jnp.minimum(longest, safe)
         keep, next_t0, next_t1, jump, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
         proposed = next_t1 - next_t0
         cut_short = keep & (t1 - t0 < step)
+        most = 0.999 * float(self.controller.factormax) * (t1 - t0)
+        grown = grown + jnp.where(keep & (proposed >= most), 1, 0)
         step = jnp.where(cut_short, jnp.maximum(step, proposed), proposed)
+        step = jnp.minimum(step, longest)
         collapsed = ~keep & (step < _SHORTEST * (1 + jnp.abs(t0)))
         result = diffrax.RESULTS.where(collapsed, diffrax.RESULTS.dt_min_reached, result)
-        return keep, next_t0, next_t0 + step, jump, (step, inner), result
+        return keep, next_t0, next_t0 + step, jump, (step, inner, grown), result
 
 
 def kvaerno3() -> diffrax.Kvaerno3:

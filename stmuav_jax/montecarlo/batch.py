@@ -272,7 +272,7 @@ class FlightWork(AbstractWork):
         study, direction = self.study, self.direction
         method = Method(
             formulation=Tree(), solver=_SOLVERS[study.solver](), rtol=study.rtol, atol=study.atol,
-            max_steps=study.max_steps, adjoint=diffrax.ForwardMode(),
+            max_steps=study.max_steps, adjoint=diffrax.ForwardMode(), steps="state",
         )  # fmt: skip
         names = study.sampling.names
 

@@ -1,5 +1,6 @@
 """Derivatives of flights' final values by the numbers that were drawn."""
 
+from dataclasses import replace
 from typing import Any
 
 import diffrax
@@ -43,12 +44,15 @@ def final_gradients(
 
     def final(values: Any, seed: Any) -> Any:
         problem, state0 = work.plan.make(Drawn(values, seed))
-        path = integrate(problem.model.system, state0, ts, problem.method)
+        # the study's flights are not differentiated, these are
+        method = replace(problem.method, steps="sensitivities")
+        path = integrate(problem.model.system, state0, ts, method)
         end = jax.tree.map(lambda x: x[-1], path.states)
         y = jnp.concatenate([begin(problem, ts[0], end).y[: problem.n_state], path.internal[-1]])
         view = View(problem, ts[1], y, direction)
         fine = path.result == diffrax.RESULTS.successful
-        return jnp.stack([jnp.where(fine, of[name].of(view), jnp.nan) for name in wanted])
+        # a product, so that the derivatives are marked too
+        return jnp.stack([of[name].of(view) * jnp.where(fine, 1.0, jnp.nan) for name in wanted])
 
     drawn = jnp.asarray(study.sampling.draw(first, count))
     each = jax.jit(

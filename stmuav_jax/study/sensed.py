@@ -120,7 +120,8 @@ def sensed_flight(
             f"The end must lie between one step of {step:g} s and 1e4 s, not {t1:g} s."
         )
     t = step * np.arange(round(t1 / step) + 1)
-    method = Method(rtol=1e-9, atol=1e-9, first_step=step / 4) if method is None else method
+    if method is None:
+        method = Method(rtol=1e-9, atol=1e-9, first_step=step / 4, steps="state")
     gains = Gains() if gains is None else gains
     return eqx.filter_jit(_fly)(system, state0, jnp.asarray(t), gains, method, rotors[0], pull[0])
 

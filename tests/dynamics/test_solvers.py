@@ -30,6 +30,8 @@ def method(solver, tolerance=1e-8):
         rtol=tolerance,
         atol=tolerance,
         adjoint=diffrax.ForwardMode(),
+        # the wrapped solver alone, without the bound of steps that goes to step control
+        steps="state",
     )
 
 
@@ -74,6 +76,7 @@ def problem_of(solver, how=None):
         stabilisation=how,
         adjoint=diffrax.ForwardMode(),
         balances=True,
+        steps="state",
     )
     problem = prepare(SYSTEM, m)
     x = m.formulation.to_vector(problem.model, START)

@@ -98,7 +98,7 @@ Steps = Callable[[float, int], np.ndarray]
 def by_fixed_steps(omega: tuple[float, float, float], solver: Any) -> Steps:
     """(t1 [s], count) -> centre of mass at t1 by that many equal steps, one compilation."""
     system, state = top(omega)
-    method = sj.Method(solver=solver, adjoint=diffrax.ForwardMode())
+    method = sj.Method(solver=solver, adjoint=diffrax.ForwardMode(), steps="state")
     problem = prepare(system, method)
     y0 = begin(problem, jnp.zeros(()), state).y
 

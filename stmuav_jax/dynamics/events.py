@@ -1,0 +1,113 @@
+"""Events as diffrax needs them: what ends an integration, and what does not count as one.
+
+A run that starts where its event is zero, such as the next arc of a bouncing ball, starts after
+that event and not before it. An event whose value is not a number ends the run with the result
+`diffrax.RESULTS.nonfinite`.
+"""
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from .problem import Carry, Landing, Problem, landing
+
+# A run whose event will be, or has been, zero within so many tolerances, in seconds, starts at it.
+_NEAR = 1e3
+
+
+class _OfOne(optx.AbstractRootFinder):
+    """A root finder for the sum of several functions: of events, all but one are zero."""
+
+    inner: optx.Bisection
+
+    @property
+    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.inner.rtol
+
+    @property
+    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.inner.atol
+
+    @property
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return optx.max_norm
+
+    def init(self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, *rest: Any) -> Any:
+        one = jax.tree.leaves(f_struct)[0]
+        return self.inner.init(_sum(fn), y, args, options, one, *rest)
+
+    def step(self, fn: Any, *rest: Any) -> Any:
+        return self.inner.step(_sum(fn), *rest)
+
+    def terminate(self, fn: Any, *rest: Any) -> Any:
+        return self.inner.terminate(_sum(fn), *rest)
+
+    def postprocess(self, fn: Any, *rest: Any) -> Any:
+        return self.inner.postprocess(_sum(fn), *rest)
+
+
+def _sum(fn: Any) -> Any:
+    def summed(y: Any, args: Any) -> Any:
+        value, aux = fn(y, args)
+        return sum(jax.tree.leaves(value)), aux
+
+    return summed
+
+
+def to_event(
+    problem: Problem, carry: Carry, t1: Float[Array, ""], adjoint: diffrax.AbstractAdjoint
+) -> Landing:
+    """Integrate from the carry to t1 [s], or to an event before it."""
+    method = problem.method
+    assert method.event is not None
+    condition = method.event
+
+    def value(t: Any, y: Any, args: Any, **_: Any) -> Array:
+        state = method.formulation.to_state(args, y[: problem.n_state])
+        return jnp.asarray(condition(t, state))
+
+    kind = jax.eval_shape(lambda: value(carry.t, carry.y, problem.model)).dtype
+    if kind == jnp.bool_:
+        event = diffrax.Event(value)
+    else:
+        start, sign = _at_start(problem, carry, value)
+
+        def crossing(t: Any, y: Any, args: Any, **_: Any) -> Array:
+            now = value(t, y, args)
+            now = jnp.where(jnp.isnan(now), 1.0, now)
+            return jnp.where(start & (t <= carry.t), sign, now)
+
+        lost = lambda t, y, args, **_: jnp.isnan(value(t, y, args))
+        finder = _OfOne(optx.Bisection(rtol=1e-12, atol=1e-14))
+        # in this order: where the first is true, the second does not count
+        event = diffrax.Event((lost, crossing), finder, (None, method.direction))
+    solution = problem.solve(carry, t1, adjoint, event=event)
+    found = landing(solution)
+    occurred = found.result == diffrax.RESULTS.event_occurred
+    if kind != jnp.bool_:
+        bad = occurred & solution.event_mask[0]  # pyright: ignore[reportOptionalSubscript]
+        result = diffrax.RESULTS.where(bad, diffrax.RESULTS.nonfinite, found.result)
+        found, occurred = found._replace(result=result), occurred & ~bad
+    # the event's time comes from interpolation; the state there from steps
+    again = jax.lax.cond(
+        occurred, lambda: landing(problem.solve(carry, found.t, adjoint)), lambda: found
+    )
+    return again._replace(result=found.result)
+
+
+def _at_start(
+    problem: Problem, carry: Carry, value: Any
+) -> tuple[Bool[Array, ""], Float[Array, ""]]:
+    """Whether the run starts at its event, and the event's value right after the start."""
+    carry_t, y, model = jax.lax.stop_gradient((carry.t, carry.y, problem.model))
+    h = jnp.asarray(problem.method.first_step, y.dtype)
+    half = y + h / 2 * problem.field(carry_t, y, model)
+    after = y + h * problem.field(carry_t + h / 2, half, model)
+    first, then = value(carry_t, y, model), value(carry_t + h, after, model)
+    near = _NEAR * jnp.maximum(problem.method.rtol, problem.method.atol)
+    at_event = jnp.abs(first) <= jnp.abs(then - first) * jnp.minimum(near / h, 1.0)
+    return (carry.counts.accepted == 0) & at_event, jax.lax.stop_gradient(then)
