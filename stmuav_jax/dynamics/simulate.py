@@ -128,10 +128,28 @@ def simulate(
     times = output_times(scene, t1, save_every, ts)
     check_settings(method)
     check_start(scene.system, scene.state0)
+    run = _carried_out(scene, method, times, progress, error_estimate, analysis)
+    if run.successful or run.certificate.result == "interrupted":
+        return run
+    run = dataclasses.replace(run, failure=_failure(run, float(times[-1])))
+    if throw:
+        raise SimulationError(run.failure, run)
+    return run
+
+
+def _carried_out(
+    scene: Scene,
+    method: Method,
+    times: np.ndarray,
+    progress: Progress | None,
+    estimate: bool,
+    analysis: bool,
+) -> Run:
+    """The run with its certificate, whether or not it came to its end."""
     clock = time.perf_counter()
     method, models, rank, seen = _inspect(scene, method, analysis)
     looked = time.perf_counter() - clock
-    done = _run(scene, method, times, progress, error_estimate)
+    done = _run(scene, method, times, progress, estimate)
     clock = time.perf_counter()
     first = done.trajectory
     saved = (np.asarray(first.ts), first.states, np.asarray(first.internal))
@@ -142,13 +160,7 @@ def simulate(
     worst = violations(models[1].constraints, first, seen)
     certificate = certify(scene.system, first, view, errors, rank, worst, result, seconds)
     settings = _settings(scene.system, method)
-    run = Run(scene, method, first, view, errors, certificate, settings)
-    if run.successful or result == "interrupted":
-        return run
-    run = dataclasses.replace(run, failure=_failure(run, float(times[-1])))
-    if throw:
-        raise SimulationError(run.failure, run)
-    return run
+    return Run(scene, method, first, view, errors, certificate, settings)
 
 
 def _solver(scene: Scene, solver: Any, formulation: Any) -> diffrax.AbstractSolver:
