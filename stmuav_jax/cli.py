@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from . import __version__
 from .commands.estimate import Estimate, run_estimate
 from .commands.flight import Linearize, Trim, run_linearize, run_trim
 from .commands.montecarlo import Montecarlo, Report, run_montecarlo, run_report
@@ -310,7 +309,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
     if words == ["--version"]:
-        line(Console(), f"stmuav_jax {__version__}")
+        # the package itself is loaded by now, and is above all floors
+        line(Console(), f"stmuav_jax {sys.modules['stmuav_jax'].__version__}")
         return 0
     try:
         check_words(words)

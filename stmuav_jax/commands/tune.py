@@ -26,6 +26,8 @@ SEGMENTS = "hold: one in 0.05 s, slew: one in 0.2 s"
 # Time over which departures count, and for the turn [s]; the longest segment of each [s]. From rest
 # an untuned UAV falls far within 0.2 s: segments as long as that keep the search from its end.
 _TIMES = {"hold": 0.4, "slew": 1.0}
+# Loss below which inputs count as holding: departures of a millimetre or a milliradian.
+_HOLDS = 1e-6
 _LONGEST = {"hold": 0.05, "slew": 0.2}
 
 
@@ -177,7 +179,8 @@ def _hold(
     angles = initial_angles(given)
     tuning = hold(flyer, angles, untuned, horizon=_time(command), segments=_segments(command))
     found = _search(command, folder, tuning.name, tuning.residuals, tuning.start)
-    done = _converged(found)
+    # a search may come to rest where nothing holds
+    done = _converged(found) and found.loss < _HOLDS
     inputs = tuning.inputs(found.values)
     start = at_rest(angles)
     times = [holding_time(flyer, each, start) for each in (untuned, inputs)]
