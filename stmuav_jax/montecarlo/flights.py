@@ -13,6 +13,7 @@ Factors are the names of a scene's parameter table, such as "mass.panel_7" or
 A relative factor multiplies the table's value.
 """
 
+import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -25,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..algebra.rotation import product, rotation_matrix
-from ..mechanics.errors import SettingError, nearest_names
+from ..mechanics.errors import SettingError
 from ..mechanics.schema import SHOWN, named, shown
 from ..mechanics.state import State
 from ..mechanics.system import System
@@ -138,8 +139,7 @@ class Flights:
             return Entry(factor, (), own[factor])
         match = re.fullmatch(r"([\w.]+)(?:\[([\d, ]+)\])?", factor)
         if match is None or match[1] not in set(self.table):
-            known = [*own, *self.table]
-            hint = nearest_names((match[1] if match else factor)[:SHOWN], known)
+            hint = _alike((match[1] if match else factor)[:SHOWN], [*own, *self.table])
             raise SettingError(
                 f"{named(factor)} is neither a parameter of {self.scene} nor part of its start.{hint}"
             )
@@ -289,6 +289,15 @@ class Flights:
             return np.array([0.0, 0.0, 1.0])
         start = posture(tracker_geometry(self.table), initial_angles(self.table))
         return np.asarray(rotation_matrix(start.p[-1])[:, 2])
+
+
+def _alike(name: str, known: list[str]) -> str:
+    """The nearest of very many names, and some that are like it."""
+    some = difflib.get_close_matches(name, known, n=8, cutoff=0.3)
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f" Did you mean '{close[0]}'?" if close else ""
+    like = f" Names like it: {', '.join(some)}." if some else ""
+    return f"{hint}{like} docs/studies.md says which there are."
 
 
 def _tensors(inertia: Float[np.ndarray, "n 3 3"], tolerance: float) -> Bool[np.ndarray, " n"]:

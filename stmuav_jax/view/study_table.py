@@ -14,16 +14,15 @@ _MOST = 24
 
 
 def summary_table(analysis: Analysis) -> Table:
-    """Mean, quantiles and extremes of every quantity over the completed samples."""
-    columns = ("quantity", "values", "mean", "5 %", "median", "95 %", "least", "most")
-    table = Table(*(Text(name) for name in columns))
-    for column in table.columns[1:]:
-        column.justify = "right"
+    """Mean and quantiles of every quantity over the completed samples."""
+    columns = ("quantity", "mean", "5 %", "median", "95 %")
+    table = Table()
+    for k, name in enumerate(columns):
+        table.add_column(Text(name), justify="right" if k else "left")
     for one in analysis.findings[:_MOST]:
         summary = one.summary
         quantiles = [summary.quantiles.get(share) for share in (0.05, 0.5, 0.95)]
-        numbers = [summary.mean, *quantiles, summary.least, summary.most]
-        cells = [f"{summary.values}", *(_cell(number) for number in numbers)]
+        cells = [_cell(number) for number in (summary.mean, *quantiles)]
         # text and no markup, since units stand in brackets
         table.add_row(*map(Text, (label(one.quantity.words, one.quantity.unit), *cells)))
     return table

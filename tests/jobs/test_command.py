@@ -59,7 +59,7 @@ def test_fly_report_extend(study, tmp_path, capsys):
     assert "Probability of failure (time at which base, tilt exceeds 0.4 rad below 0.25 s)" in (
         " ".join(said.split())
     )
-    assert "base, tilt, largest [rad]" in said
+    assert "base, tilt, largest [rad]" in " ".join(said.split())
     assert list(summary["inputs"]) == ["start_p", "bare_mass", "start_q"]
     # another number of cores goes on with it, and ends with the same numbers
     # a finished store is not overwritten, but can be extended; what is there stays

@@ -413,3 +413,33 @@ def _calibrated(work: Toy, count: int, seconds: float) -> int:
     begin = time.process_time()
     dataclasses.replace(work, rounds=300).run(0, count)
     return max(1, round(300 * seconds / (time.process_time() - begin)))
+
+
+@pytest.mark.slow
+def test_changes_of_devices_give_the_same_files(tmp_path):
+    """A study of flights broken off three times and gone on with on other numbers of cores."""
+    from stmuav_jax.montecarlo.batch import FlightWork
+    from stmuav_jax.montecarlo.study import study_from_plain
+
+    study = study_from_plain(
+        {
+            "scene": "hexacopter", "t1": 0.02, "seed": 4,
+            "factors": {"start.p": {"distribution": "normal", "mean": 0.0, "deviation": 3.0}},
+            "quantities": {"tilt": {"signal": "tilt", "take": "largest"}},
+        }
+    )  # fmt: skip
+    first = FlightWork(study, block=16, lanes=8, devices=1)
+    run_study(first, tmp_path / "unbroken.zarr", 200, chunk=20)
+    path = tmp_path / "study.zarr"
+    for devices, end in ((1, 40), (2, 80), (5, 140), (3, 200)):
+        work = FlightWork(study, block=16, lanes=8, devices=devices)
+        work.__dict__["_compiled"] = first._compiled
+
+        def stop(now: Standing, end: int = end) -> None:
+            if end <= now.done < now.total:
+                raise KeyboardInterrupt
+
+        run_study(work, path, 200, chunk=20, resume=True, progress=stop)
+    assert contents(path) == contents(tmp_path / "unbroken.zarr")
+    with pytest.raises(FileError, match="lanes is 8 there and 16 here"):
+        run_study(FlightWork(study, lanes=16), path, 200, resume=True)
