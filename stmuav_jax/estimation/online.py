@@ -9,7 +9,7 @@ program that needs every microsecond calls, before anything else of JAX,
 
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
-and the step then runs in the thread that asks for it, in a quarter of the time.
+and the step then runs in the thread that asks for it, in some quarter to half of the time.
 """
 
 from collections.abc import Callable
@@ -130,7 +130,8 @@ class OnlineFilter:
         self.model, self.t = model, float(t)
         self.count, self.missing = 0, 0
         self.nis: list[float] = []
-        self._prior, self._rule, self._form = prior, rule, form
+        self._prior, self._rule = prior, rule
+        self._form: Form = form
         self._layout, self._dtype = _Layout(prior), np.dtype(prior.factor.dtype)
         self._numbers = np.asarray(self._layout.pack(prior))
         self._programs: dict[Any, Callable[..., Any]] = {}
