@@ -20,7 +20,7 @@ from ..mechanics.state import State
 from ..mechanics.system import System
 from .explicit import Lean
 from .formulation import AbstractFormulation, Residuals
-from .solvers import Remembering, Stabilised, error_norm, stage_loop
+from .solvers import Far, Remembering, Stabilised, error_norm, stage_loop
 from .stabilisation import AbstractStabilisation, Projection
 from .tree import Tree
 
@@ -123,6 +123,11 @@ def _project(formulation: AbstractFormulation, *args: Any) -> Any:
 
 
 @eqx.filter_jit
+def _at_step(formulation: AbstractFormulation, *args: Any) -> Any:
+    return formulation.at_step(*args)
+
+
+@eqx.filter_jit
 def _residuals(formulation: AbstractFormulation, *args: Any) -> Any:
     return formulation.residuals(*args)
 
@@ -165,6 +170,11 @@ class Problem(eqx.Module):
             parts += [flows.force, flows.moment]
         return jnp.concatenate(parts)
 
+    def at_step(self, t: Any, y: Any, args: Any) -> Any:
+        """The model with what is chosen once for a step that starts at y."""
+        t, x = jnp.asarray(t, y.dtype), y[: self.n_state]
+        return _at_step(self.method.formulation, args, t, x)
+
     def solver(self) -> Stabilised:
         """The method's solver, with the constraints held."""
         how = self.method.stabilisation
@@ -182,7 +192,9 @@ class Problem(eqx.Module):
         if isinstance(inner, diffrax.AbstractERK) and self.method.event is None:
             inner = Lean(inner)
         inner = stage_loop(inner, self.method.adjoint)
-        return Stabilised(inner, project if isinstance(how, Projection) else None, residuals)
+        far = Far(self.method.rtol, self.method.atol, n) if isinstance(how, Projection) else None
+        project = project if isinstance(how, Projection) else None
+        return Stabilised(inner, project, residuals, self.at_step, far)
 
     def controller(self, step: Float[Array, ""]) -> Remembering:
         """Step size control by the local error of the state, to start with `step` [s]."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
@@ -41,6 +42,32 @@ def _landed(inner: Callable[..., Any]) -> type:
     return Landed
 
 
+# A projection that moves the end of a step by more than this many times the step's tolerance is
+# none of its error: the step is not kept. Ordinary ones move it by less than the tolerance.
+FARTHEST = 10.0
+
+
+class Far(eqx.Module):
+    """How far a projection has moved the end of a step, in the terms of its tolerance.
+
+    Args:
+        rtol, atol: of the step. n_state: the first entries of y, which are those projected.
+    """
+
+    rtol: Any
+    atol: Any
+    n_state: int = eqx.field(static=True)
+
+    def error(self, y0: Vector, y1: Vector, end: Vector, error: Vector) -> Vector:
+        """The step's error; or, where it was moved too far, one that does not let it be kept."""
+        scale = lambda y: self.atol + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y))
+        n = self.n_state
+        moved = error_norm(n)(jax.lax.stop_gradient((end - y1) / scale(y1))) / FARTHEST
+        moved = jnp.where(jnp.isfinite(moved), moved, jnp.inf)
+        # measured by the controller this is `moved`, however large the end is
+        return jnp.where(moved > 1, moved * scale(end), error)
+
+
 class Stabilised(diffrax.AbstractWrappedSolver):
     """Any diffrax solver, each step followed by a projection, with the residuals watched.
 
@@ -53,11 +80,15 @@ class Stabilised(diffrax.AbstractWrappedSolver):
         project: (t, y, args) -> y and its `Residuals`, or None.
         residuals: (t, y, args) -> `Residuals`; their maxima over all accepted steps are
             kept in the solver state.
+        at_step: (t, y, args) -> args, with what is chosen once for a step that starts at y.
+        far: rejects steps that the projection moves too far, or None.
     """
 
     solver: diffrax.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
     project: Callable[[Any, Vector, Any], tuple[Vector, Residuals]] | None
     residuals: Callable[[Any, Vector, Any], Residuals]
+    at_step: Callable[[Any, Vector, Any], Any]
+    far: Far | None
 
     @property
     def root_finder(self) -> Any:
@@ -109,6 +140,7 @@ class Stabilised(diffrax.AbstractWrappedSolver):
     ) -> tuple[Vector, Any, Any, Any, diffrax.RESULTS]:
         inner, worst = solver_state
         jump = made_jump if self.project is None else True
+        args = self.at_step(t0, y0, args)
         y1, y_error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, jump
         )
@@ -116,6 +148,8 @@ class Stabilised(diffrax.AbstractWrappedSolver):
             end, now = y1, self.residuals(t1, y1, args)
         else:
             end, now = self.project(t1, y1, args)
+        if self.far is not None:
+            y_error = self.far.error(y0, y1, end, y_error)
         worst = Residuals(
             jnp.maximum(worst.position, now.position),
             jnp.maximum(worst.velocity, now.velocity),

@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..algebra.linalg import right_inverse, solve_saddle
 from ..algebra.rotation import (
@@ -55,20 +55,28 @@ from .motion import (
 )
 from .pose import kinds
 from .reactions import Reactions, joint_reactions, tree_reactions
+from .singular import around, interpolated, is_near, kept_rows
 from .stabilisation import AbstractStabilisation, Baumgarte
 from .topology import SpanningTree, spanning_tree
+
+# Iterations of the positions before and after a singular posture, which start further away.
+_ITERATIONS = 8
+# An interpolation between these that is less certain than this is none.
+_UNCERTAIN = 1e-6
 
 
 class TreeModel(eqx.Module):
     """A system prepared for relative coordinates; `constraints` are those of the cut joints.
 
-    `inverse` is that of the mass matrix where it is constant: nothing but a base.
+    `inverse` is that of the mass matrix where it is constant: nothing but a base. `kept` are
+    the rows that count through a step, of those that depend on each other, see `at_step`.
     """
 
     system: System
     chain: Chain
     constraints: Constraints
     inverse: Float[Array, "6 6"] | None
+    kept: Bool[Array, " m"] | None = None
 
 
 class Loads(NamedTuple):
@@ -144,16 +152,17 @@ class Tree(AbstractFormulation):
     ) -> tuple[Float[Array, " k"], Flows]:
         tree, how = model.chain.tree, stabilisation
         at = split(tree, x)
+        if self._passes(model) and model.kept is None:
+            model = self.at_step(model, t, x)
         solved = self._solve(model, t, at, how)
-        rate = _rates(tree, at, solved.rate)
+        u_rate, driven = self._smooth(model, t, at, how, solved)
+        rate = _rates(tree, at, u_rate)
         if isinstance(how, Baumgarte):
             pull = lambda p: how.norm * (1 - jnp.sum(p**2, axis=0)) * p
             rate = rate._replace(p=rate.p + pull(at.p), balls=rate.balls + pull(at.balls))
         load, placed = solved.loads, solved.placed
         moment = cross(placed.r, load.force) + apply(placed.R_wb, load.moment)
-        power = load.power
-        if solved.rows is not None:
-            power = power + jnp.sum(solved.multipliers * solved.rows.target, axis=0)
+        power = load.power if solved.rows is None else load.power + driven
         flows = Flows(power, jnp.sum(load.force[:, :-1], 1), jnp.sum(moment[:, :-1], 1))
         return join(rate), flows
 
@@ -205,6 +214,7 @@ class Tree(AbstractFormulation):
             -h,
             gamma,
             redundant=dependent if self.redundant else False,
+            kept=model.kept,
         )
         return Solved(moving, placed, rows, load, rate, multipliers)
 
@@ -212,6 +222,60 @@ class Tree(AbstractFormulation):
         """Whether the equations are solved branch by branch."""
         rows = sum(ROWS[group.kind] * len(group.i) for group in model.constraints.groups)
         return not self.redundant and serves(model.chain.tree, rows)
+
+    def at_step(self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"]) -> TreeModel:
+        """The model with the rows that count until the step is done.
+
+        A row that depends on others where the constraints hold need not do so at the stages of
+        a step, which are a little off; solved with all others it would act at any strength.
+        """
+        if not self._passes(model):
+            return model
+        kept = self._kept(model, t, split(model.chain.tree, x))
+        return eqx.tree_at(lambda m: m.kept, model, kept, is_leaf=lambda x: x is None)
+
+    def _kept(self, model: TreeModel, t: Float[Array, ""], at: Coordinates) -> Bool[Array, " m"]:
+        at = jax.lax.stop_gradient(at)
+        return kept_rows(model.constraints, at.u, lambda by: _rows_after(model, t, at, by))
+
+    def _near(
+        self, model: TreeModel, t: Float[Array, ""], at: Coordinates, J: Float[Array, "m k"]
+    ) -> Bool[Array, ""]:
+        """Whether the posture is so near a singular one that its equations are not to be used."""
+        assert model.kept is not None
+        at = jax.lax.stop_gradient(at)
+        J_after = lambda by: _rows_after(model, t, at, by)
+        return is_near(model.constraints, at.u, J_after, J, model.kept)
+
+    def _smooth(
+        self,
+        model: TreeModel,
+        t: Float[Array, ""],
+        at: Coordinates,
+        how: AbstractStabilisation,
+        solved: Solved,
+    ) -> tuple[Float[Array, "k"], Float[Array, ""]]:
+        """Accelerations and the power of drivers; near a singular posture between others."""
+        wanted = lambda found: (found.rate, _driven(found))
+        if not self._passes(model):
+            return wanted(solved)
+        assert solved.rows is not None
+
+        def one(by: Float[Array, "k"]) -> Any:
+            there, _ = self._closed(model, t, _moved(model.chain.tree, at, by), _ITERATIONS)
+            return wanted(self._solve(model, t, there, how))
+
+        def between() -> Any:
+            found, off = interpolated(jax.vmap(one)(around(jax.lax.stop_gradient(at.u))))
+            fine = off <= _UNCERTAIN * (1 + jnp.max(jnp.abs(found[0])))
+            return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), found)
+
+        near = self._near(model, t, at, solved.rows.J)
+        return jax.lax.cond(near, between, lambda: wanted(solved))
+
+    def _passes(self, model: TreeModel) -> bool:
+        """Whether rows may depend on each other."""
+        return self.redundant and bool(model.constraints.groups)
 
     def project(
         self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"], iterations: int
@@ -221,6 +285,31 @@ class Tree(AbstractFormulation):
         at = at._replace(p=normalise(at.p), balls=normalise(at.balls))
         if not model.constraints.groups:
             return join(at), _left(model, at, None)
+        found, rows = self._closed(model, t, at, iterations)
+        if not self._passes(model):
+            return join(found), _left(model, found, rows)
+        model = self.at_step(model, t, x) if model.kept is None else model
+
+        def one(by: Float[Array, "k"]) -> Coordinates:
+            start = _moved(tree, at, by)
+            there, _ = self._closed(model, t, start, _ITERATIONS)
+            return jax.tree.map(jnp.subtract, there, start)
+
+        def between() -> Coordinates:
+            step, off = interpolated(jax.vmap(one)(around(jax.lax.stop_gradient(at.u))))
+            step = jax.tree.map(lambda x: jnp.where(off <= _UNCERTAIN * (1 + jnp.max(jnp.abs(at.u))), x, jnp.nan), step)
+            end = jax.tree.map(jnp.add, at, step)
+            return end._replace(balls=normalise(end.balls))
+
+        near = self._near(model, t, at, _rows_after(model, t, at, 0 * at.u))
+        found = jax.lax.cond(near, between, lambda: found)
+        return join(found), _left(model, found, cut_rows(model.chain, model.constraints, t, motion(model.chain, found)))
+
+    def _closed(
+        self, model: TreeModel, t: Float[Array, ""], at: Coordinates, iterations: int
+    ) -> tuple[Coordinates, Rows]:
+        """The nearest coordinates that satisfy the rows, and the rows where positions do."""
+        tree = model.chain.tree
 
         def rows_of(moving: Motion) -> Rows:
             return cut_rows(model.chain, model.constraints, t, moving)
@@ -245,10 +334,13 @@ class Tree(AbstractFormulation):
         for _ in range(max(iterations, 2)):
             off = jnp.sum(rows.J * at.u, axis=1) - rows.target
             at = at._replace(u=at.u - by_rows(off))
-        return join(at), _left(model, at, rows)
+        return at, rows
 
     def _closing(
-        self, model: TreeModel, moving: Motion, J: Float[Array, "m k *s"]
+        self,
+        model: TreeModel,
+        moving: Motion,
+        J: Float[Array, "m k *s"],
     ) -> Float[Array, "k m *s"]:
         """G: of all velocities u with J u = b, G b is the smallest in the mass metric."""
         tree = model.chain.tree
@@ -256,7 +348,7 @@ class Tree(AbstractFormulation):
         if self._small(model):
             return right_inverse_branches(tree, moving.S, total, J)
         M = mass_matrix(tree, moving.S, total)
-        G = right_inverse(M, _all_columns(tree, J), redundant=self.redundant)
+        G = right_inverse(M, _all_columns(tree, J), redundant=self.redundant, kept=model.kept)
         return G[6 * tree.floating :]
 
     def residuals(self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"]) -> Residuals:
@@ -265,6 +357,20 @@ class Tree(AbstractFormulation):
             return _left(model, at, None)
         rows = cut_rows(model.chain, model.constraints, t, motion(model.chain, at))
         return _left(model, at, rows)
+
+
+def _rows_after(
+    model: TreeModel, t: Float[Array, ""], at: Coordinates, by: Float[Array, "k"]
+) -> Float[Array, "m k"]:
+    """The rows after a displacement."""
+    moving = motion(model.chain, _moved(model.chain.tree, at, by))
+    return cut_rows(model.chain, model.constraints, t, moving).J
+
+
+def _driven(found: Solved) -> Float[Array, "*s"]:
+    """The power of drivers in cut joints."""
+    rows = found.rows
+    return jnp.zeros(()) if rows is None else jnp.sum(found.multipliers * rows.target, axis=0)
 
 
 @eqx.filter_jit
