@@ -12,8 +12,9 @@ the equations have their rank.
 
 from collections.abc import Callable
 from math import factorial
-from typing import Any
+from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +22,8 @@ from jaxtyping import Array, Bool, Float
 
 from ..algebra.linalg import independent_rows
 from ..mechanics.constraint import ROWS
+from .closing import TreeModel, rows_after
+from .coordinates import Coordinates
 from .differential import Constraints
 
 # Rows are dependent where the square of their distance from others is below this, in terms of the
@@ -48,29 +51,54 @@ def _weights(half: int) -> np.ndarray:
     return np.array(one_side[::-1] + one_side)
 
 
-_PLACES = np.array([*range(-_HALF, 0), *range(1, _HALF + 1)])
-_WEIGHTS = _weights(_HALF)
+# The posture itself first, which serves where no other is needed.
+_PLACES = np.array([0, *range(-_HALF, 0), *range(1, _HALF + 1)])
+_WEIGHTS = np.array([0.0, *_weights(_HALF)])
 # of the polynomial through all but the outermost, to see how good the interpolation is
-_FEWER = np.concatenate([[0.0], _weights(_HALF - 1), [0.0]])
+_FEWER = np.array([0.0, 0.0, *_weights(_HALF - 1), 0.0])
+_UNCERTAIN = 1e-6
+
+T = TypeVar("T")
 
 
-def along(u: Float[Array, "k"]) -> Float[Array, "k"]:
+def _along(u: Float[Array, "k"]) -> Float[Array, "k"]:
     """Velocities scaled to a largest of one [rad], [m]; much less where they are round-off."""
-    return u / (_SLOW + jnp.max(jnp.abs(u), initial=0.0))
+    return jax.lax.stop_gradient(u / (_SLOW + jnp.max(jnp.abs(u), initial=0.0)))
 
 
-def around(u: Float[Array, "k"]) -> Float[Array, "p k"]:
-    """Displacements to the postures before and after."""
-    return _APART * jnp.asarray(_PLACES, u.dtype)[:, None] * along(u)
+def interpolated(
+    near: Bool[Array, ""], u: Float[Array, "k"], one: Callable[[Float[Array, "k"]], T]
+) -> T:
+    """one(0); near a singular posture what lies between one(displacement) before and after.
 
+    It is not a number where one order less makes a difference of more than 1e-6.
 
-def interpolated(values: Any) -> tuple[Any, Float[Array, ""]]:
-    """Values between those of the postures before and after (p, .); what one order less changes."""
-    between = lambda x, w: jnp.tensordot(jnp.asarray(w, x.dtype), x, 1)
-    found = jax.tree.map(lambda x: between(x, _WEIGHTS), values)
-    fewer = jax.tree.map(lambda x: between(x, _FEWER), values)
-    off = jax.tree.map(lambda x, y: jnp.max(jnp.abs(x - y), initial=0.0), found, fewer)
-    return found, jnp.max(jnp.stack(jax.tree.leaves(off)))
+    Args:
+        u: velocities. one: a displacement (k,) -> arrays.
+    """
+    step = _APART * _along(u)
+    first = np.eye(len(_PLACES))[0]
+    shape = jax.eval_shape(one, step)
+    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+
+    def add(sums: tuple[T, T], at: tuple[Any, ...]) -> tuple[tuple[T, T], None]:
+        place, weight, fewer = at
+        needed = near != (place == 0)
+        value = jax.lax.cond(needed, lambda: one(place * step), lambda: none)
+        more = lambda w: lambda total, x: total + w * x
+        return (
+            jax.tree.map(more(weight), sums[0], value),
+            jax.tree.map(more(fewer), sums[1], value),
+        ), None
+
+    weights = [jnp.where(near, w, first) for w in (_WEIGHTS, _FEWER)]
+    (found, less), _ = jax.lax.scan(add, (none, none), (jnp.asarray(_PLACES, u.dtype), *weights))
+    largest = lambda tree: jnp.max(
+        jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in jax.tree.leaves(tree)])
+    )
+    off = largest(jax.tree.map(jnp.subtract, found, less))
+    fine = off <= _UNCERTAIN * (1 + largest(found))
+    return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), found)
 
 
 def independent(
@@ -88,36 +116,35 @@ def independent(
     return independent_rows(J @ J.T, tolerance)
 
 
-def kept_rows(
-    constraints: Constraints,
-    u: Float[Array, "k"],
-    J_after: Callable[[Float[Array, "k"]], Float[Array, "m k"]],
-) -> Bool[Array, " m"]:
-    """Independent rows (m,) through a step.
+def kept_rows(model: TreeModel, t: Float[Array, ""], at: Coordinates) -> Bool[Array, " m"]:
+    """Independent rows (m,) through a step that starts here.
 
     They are looked for here and a little way ahead, and the more taken: in a singular posture
     rows depend on each other that do not before and after.
-
-    Args:
-        J_after: a displacement -> the rows there.
     """
-    one = lambda share: independent(constraints, J_after(share * AHEAD * along(u)), DEPENDENT)
-    here, there = jax.vmap(one)(jnp.array([0.0, 1.0], u.dtype))
+    ahead = AHEAD * _along(at.u)
+    J_after = lambda share: rows_after(model, t, at, share * ahead)
+    one = lambda share: independent(model.constraints, J_after(share), DEPENDENT)
+    here, there = jax.vmap(one)(jnp.array([0.0, 1.0], at.u.dtype))
     return jnp.where(jnp.sum(here) >= jnp.sum(there), here, there)
 
 
-def is_near(
-    constraints: Constraints,
-    u: Float[Array, "k"],
-    J_after: Callable[[Float[Array, "k"]], Float[Array, "m k"]],
-    J: Float[Array, "m k"],
-    kept: Bool[Array, " m"],
-) -> Bool[Array, ""]:
+def is_near(model: TreeModel, t: Float[Array, ""], at: Coordinates) -> Bool[Array, ""]:
     """Whether this posture is near a singular one, and those before and after are not."""
-    count = lambda J: jnp.sum(independent(constraints, J, NEAR))
-    rank = jnp.sum(kept)
+    assert model.kept is not None
+    model, at = _still(model), _still(at)
+    rank = jnp.sum(model.kept)
+    step = _APART * _along(at.u)
 
-    def clear() -> Bool[Array, ""]:
-        return jnp.all(jax.vmap(lambda by: count(J_after(by)) >= rank)(around(u)))
+    def full(place: Float[Array, ""]) -> Bool[Array, ""]:
+        J = rows_after(model, t, at, place * step)
+        return jnp.sum(independent(model.constraints, J, NEAR)) >= rank
 
-    return jax.lax.cond(count(J) < rank, clear, lambda: jnp.asarray(False))
+    places = jnp.asarray(_PLACES, at.u.dtype)
+    around = lambda: jnp.all(jax.lax.map(full, places[1:]))
+    return jax.lax.cond(full(places[0]), lambda: jnp.asarray(False), around)
+
+
+def _still(tree: T) -> T:
+    still = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x
+    return jax.tree.map(still, tree)
