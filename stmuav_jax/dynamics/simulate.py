@@ -22,7 +22,7 @@ from .analysis import Snapshot, snapshots
 from .augmented import Augmented, Model
 from .certify import certify
 from .formulation import AbstractFormulation
-from .initial import Rank, rank_of
+from .initial import Rank, rank_of, singular_posture
 from .integrate import Trajectory, advance
 from .problem import Event, Method, begin, prepare
 from .run import Run
@@ -209,7 +209,8 @@ def _inspect(scene: Scene, method: Method) -> tuple[Method, tuple[Any, Model], R
             raise ModelError(
                 "The constraints contradict each other: no accelerations satisfy all of them "
                 f"(misfit {first.acceleration_misfit[0]:.3g}). Among the dependent rows are those of "
-                f"{', '.join(rank.redundant)}."
+                f"{', '.join(rank.redundant)}. Where only this posture makes them dependent, it is "
+                "the velocities that fit no motion through it."
             )
     return method, (model, rows), rank
 
@@ -358,6 +359,8 @@ def _failure(run: Run) -> str:
         ),
     }.get(run.certificate.result, run.certificate.result)
     system = with_internal(run.scene.system, jnp.asarray(run.trajectory.internal[-1]))
+    values = run.snapshot.singular_values
+    reason = singular_posture(system, state, t, run.certificate.rank, values) or reason
     kin = system.kinematics(state)
     for force in system.forces:
         # a load may turn bad right after the last state that was still good
