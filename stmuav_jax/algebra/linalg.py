@@ -6,15 +6,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .shapes import Matrix, Vector
 
 # Weight of the proximal term against rows of unit size, and steps of the iteration: what is
 # left of an error along a singular value s is (w / (w + s))^steps. Where a mechanism passes
 # through a singular posture s goes through zero, and while s < w accelerations are wrong: the
-# smaller w, the shorter. With 1e-10 the four-bar chain of tests/published stops there.
-_PROXIMAL_WEIGHT = 1e-13
+# smaller w, the shorter. It has to be above the round-off of the matrix, no more: rows that are
+# dependent throughout have been left out.
+_PROXIMAL_WEIGHT = 1e-15
 _PROXIMAL_STEPS = 4
 
 
@@ -126,6 +127,32 @@ def _schur(S: Matrix, redundant: Redundant) -> Factor | Proximal | MinimumNorm:
     return factorise(S, redundant=bool(redundant), rcond=1e-11)
 
 
+def independent_rows(S: Matrix, tolerance: float | Float[Array, ""]) -> Bool[Array, " m"]:
+    """Rows of J that make up its row space, from S = J J^T, shape (m,).
+
+    Cholesky's method with pivoting: always the row is taken that is farthest from the space of
+    those before it, until the square of this distance is below `tolerance`. It has no derivative.
+
+    Source: N. J. Higham, Accuracy and Stability of Numerical Algorithms (2002), ch. 10.3.
+    """
+
+    def far(now: tuple[Matrix, Array]) -> Array:
+        return jnp.max(jnp.diagonal(now[0])) > tolerance
+
+    def take(now: tuple[Matrix, Array]) -> tuple[Matrix, Array]:
+        rest, taken = now
+        row = jnp.argmax(jnp.diagonal(rest))
+        column = rest[row]
+        rest = rest - column[:, None] * (column / column[row])
+        taken = taken.at[row].set(True)
+        # those taken have no distance left, whatever round-off says
+        keep = ~taken
+        return jnp.where(keep[:, None] & keep, rest, 0.0), taken
+
+    start = (jax.lax.stop_gradient(S), jnp.zeros(S.shape[0], bool))
+    return jax.lax.while_loop(far, take, start)[1]
+
+
 def _gram(Y: Matrix) -> Matrix:
     """Y^T Y; small ones as sums, which fuse and cost less to do than a product to call."""
     k, m = Y.shape
@@ -133,11 +160,18 @@ def _gram(Y: Matrix) -> Matrix:
 
 
 def solve_saddle(
-    M: Matrix, J: Matrix, f: Vector, g: Vector, *, redundant: Redundant
+    M: Matrix,
+    J: Matrix,
+    f: Vector,
+    g: Vector,
+    *,
+    redundant: Redundant,
+    kept: Bool[Array, " m"] | None = None,
 ) -> tuple[Vector, Vector]:
     """x (k,) and y (m,) with M x - J^T y = f, J x = g; M symmetric positive definite.
 
-    Where rows of J are dependent, `redundant` says how y is chosen: x is the same.
+    Where rows of J are dependent, `redundant` says how y is chosen: x is the same. With `kept`
+    the other rows are left out, and their y is zero.
     """
     L = cholesky(M)
     if not J.shape[0]:
@@ -145,17 +179,31 @@ def solve_saddle(
         return solve_lower(L, y, transpose=True)[:, 0], g
     Y = solve_lower(L, jnp.concatenate([f[:, None], J.T], axis=1))
     y, Y = Y[:, 0], Y[:, 1:]
-    S = _gram(Y)
+    if kept is not None:
+        Y, g = jnp.where(kept, Y, 0.0), jnp.where(kept, g, 0.0)
+    S = _with_ones(_gram(Y), kept)
     multipliers = _schur(S, redundant).solve(g - jnp.sum(Y * y[:, None], axis=0))
     x = y + jnp.sum(Y * multipliers, axis=1)
     return solve_lower(L, x[:, None], transpose=True)[:, 0], multipliers
 
 
-def right_inverse(M: Matrix, J: Matrix, *, redundant: bool) -> Matrix:
-    """G = M^-1 J^T (J M^-1 J^T)^-1: of all x with J x = b, G b is the smallest in M."""
+def _with_ones(S: Matrix, kept: Bool[Array, " m"] | None) -> Matrix:
+    """S with a unit diagonal in the rows left out, where nothing else is."""
+    return S if kept is None else S + jnp.diag(1.0 - kept)
+
+
+def right_inverse(
+    M: Matrix, J: Matrix, *, redundant: bool, kept: Bool[Array, " m"] | None = None
+) -> Matrix:
+    """G = M^-1 J^T (J M^-1 J^T)^-1: of all x with J x = b, G b is the smallest in M.
+
+    With `kept` this is so for these rows; columns of the others are zero.
+    """
     L = cholesky(M)
     Y = solve_lower(L, J.T)
-    S = _gram(Y)
+    if kept is not None:
+        Y = jnp.where(kept, Y, 0.0)
+    S = _with_ones(_gram(Y), kept)
     return solve_lower(L, _schur(S, "fast" if redundant else False).solve(Y.T).T, transpose=True)
 
 

@@ -231,6 +231,8 @@ def _step_back(
     t1 = steps.ts[i + 1]
     h = t1 - t
     by_model = jax.tree.map(jnp.zeros_like, arrays)
+    # what the step chose at its start has no derivative and is no number of the model
+    rest = eqx.partition(problem.at_step(t, y, eqx.combine(arrays, rest)), eqx.is_inexact_array)[1]
     if solver.project is not None:
         y1 = y + h * jnp.sum(b[:, None] * slopes, axis=0)
         project = lambda y, args: solver.project(t1, y, eqx.combine(args, rest))[0]  # pyright: ignore

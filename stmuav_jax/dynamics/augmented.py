@@ -199,6 +199,10 @@ class Augmented(AbstractFormulation):
         omega_rate = 2 * jnp.einsum("nap,np->na", L, q[:, 3:])
         return Accelerations(q[:, :3], omega_rate, -x[7 * n :]), eq.target
 
+    def at_step(self, model: Model, t: Float[Array, ""], x: Float[Array, " k"]) -> Model:
+        del t, x
+        return model
+
     def project(
         self, model: Model, t: Float[Array, ""], x: Float[Array, " k"], iterations: int
     ) -> tuple[Float[Array, " k"], Residuals]:

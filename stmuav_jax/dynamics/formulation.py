@@ -139,6 +139,10 @@ class AbstractFormulation(eqx.Module):
         """x' and the flows of energy and momentum at x."""
 
     @abstractmethod
+    def at_step(self, model: Any, t: Float[Array, ""], x: Float[Array, " k"]) -> Any:
+        """The model with what is chosen once for a step that starts at x; no derivative."""
+
+    @abstractmethod
     def project(
         self, model: Any, t: Float[Array, ""], x: Float[Array, " k"], iterations: int
     ) -> tuple[Float[Array, " k"], Residuals]:

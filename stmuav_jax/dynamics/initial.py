@@ -21,6 +21,10 @@ from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .augmented import Augmented, Model, displace
 
+# A run ended in a singular posture where the smallest singular value is below this, over that at
+# its start.
+_SINGULAR = 1e-3
+
 Held = Literal["position", "orientation", "all"]
 
 
@@ -304,6 +308,41 @@ def _dependent_rows(J: np.ndarray, count: int) -> list[int]:
         direction = rest[order[k]] / np.linalg.norm(rest[order[k]])
         rest = rest - np.outer(rest @ direction, direction)
     return sorted(order[count:])
+
+
+def weakest_rows(
+    system: System, model: Model, state: State, t: float, rank: int
+) -> tuple[float, tuple[str, ...]]:
+    """The smallest of `rank` singular values of the constraint Jacobian, and whose rows it has.
+
+    Returns:
+        The value, and the names of joints: drivers first, then those that own at least a tenth
+        of the combination of rows that is nearly zero, the largest share first.
+    """
+    vectors, values, _ = np.linalg.svd(jacobian(model, state, t), full_matrices=False)
+    share = np.zeros(len(system.joints))
+    np.add.at(share, np.array(model.constraints.owner), vectors[:, rank - 1] ** 2)
+    driver = np.array([joint.kind.startswith("drive") for joint in system.joints])
+    order = np.lexsort((-share, ~driver))
+    named = [k for k in order if share[k] >= (1e-6 if driver[k] else 0.1)]
+    return float(values[rank - 1]), tuple(system.joints[k].name for k in named)
+
+
+def singular_posture(system: System, state: State, t: float, rank: int, values: np.ndarray) -> str:
+    """In words that a run ended in a singular posture, with joints and drivers; "" if it did not.
+
+    Args:
+        rank: at the start. values: singular values at the saved states, the last included (k, m).
+    """
+    if not rank or not values[-1, rank - 1] < _SINGULAR * values[0, rank - 1]:
+        return ""
+    smallest, names = weakest_rows(system, Augmented().prepare(system), state, t, rank)
+    return (
+        f"the mechanism comes to a singular posture of {', '.join(names)}: the smallest singular "
+        f"value of the constraint Jacobian is {smallest:.3g} there and {values[0, rank - 1]:.3g} at "
+        "the start. What these joints or drivers demand takes unbounded velocities or forces; lead "
+        "the motion around that posture"
+    )
 
 
 def jacobian(model: Model, state: State, t: float = 0.0) -> np.ndarray:

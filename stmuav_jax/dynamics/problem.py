@@ -24,7 +24,7 @@ from .closures import opened
 from .explicit import Lean
 from .formulation import AbstractFormulation, Residuals
 from .modes import Guard, guard
-from .solvers import Remembering, Stabilised, error_norm, stage_loop
+from .solvers import Far, Remembering, Stabilised, error_norm, stage_loop
 from .stabilisation import AbstractStabilisation, Projection
 from .tree import Tree
 
@@ -154,6 +154,11 @@ def _project(formulation: AbstractFormulation, *args: Any) -> Any:
 
 
 @eqx.filter_jit
+def _at_step(formulation: AbstractFormulation, *args: Any) -> Any:
+    return formulation.at_step(*args)
+
+
+@eqx.filter_jit
 def _residuals(formulation: AbstractFormulation, *args: Any) -> Any:
     return formulation.residuals(*args)
 
@@ -196,6 +201,11 @@ class Problem(eqx.Module):
             parts += [flows.force, flows.moment]
         return jnp.concatenate(parts)
 
+    def at_step(self, t: Any, y: Any, args: Any) -> Any:
+        """The model with what is chosen once for a step that starts at y."""
+        t, x = jnp.asarray(t, y.dtype), y[: self.n_state]
+        return _at_step(self.method.formulation, args, t, x)
+
     def solver(self) -> Stabilised:
         """The method's solver, with the constraints held."""
         how = self.method.stabilisation
@@ -214,7 +224,8 @@ class Problem(eqx.Module):
             inner = Lean(inner)
         inner = stage_loop(inner, self.method.adjoint)
         held = project if isinstance(how, Projection) else None
-        return Stabilised(inner, held, residuals, self._guard())
+        far = Far(self.method.rtol, self.method.atol, n) if held is not None else None
+        return Stabilised(inner, held, residuals, self.at_step, far, self._guard())
 
     def _guard(self) -> Guard | None:
         if self.method.steps == "state":

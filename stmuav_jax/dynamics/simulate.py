@@ -30,7 +30,7 @@ from .checks import (
     scene_of,
 )
 from .formulation import AbstractFormulation
-from .initial import Rank, rank_of
+from .initial import Rank, rank_of, singular_posture
 from .integrate import Trajectory
 from .march import CHUNK, March
 from .problem import Event, Method, prepare
@@ -195,7 +195,8 @@ def _inspect(
             raise ModelError(
                 "The constraints contradict each other: no accelerations satisfy all of them "
                 f"(misfit {first.acceleration_misfit[0]:.3g}). Among the dependent rows are those of "
-                f"{', '.join(rank.redundant)}."
+                f"{', '.join(rank.redundant)}. Where only this posture makes them dependent, it is "
+                "the velocities that fit no motion through it."
             )
     return method, (model, rows), rank, seen
 
@@ -322,6 +323,9 @@ def _failure(run: Run, end: float) -> str:
     if event is not None and bool(jnp.any(jnp.isnan(jnp.asarray(event(jnp.asarray(t), state))))):
         reason = "the value of its event is not a number there"
     system = with_internal(run.scene.system, jnp.asarray(run.trajectory.internal[-1]))
+    if run.snapshot is not None:
+        values = run.snapshot.singular_values
+        reason = singular_posture(system, state, t, run.certificate.rank, values) or reason
     kin = system.kinematics(state)
     for force in system.forces:
         # a load may turn bad right after the last state that was still good

@@ -43,6 +43,32 @@ def _landed(inner: Callable[..., Any]) -> type:
     return Landed
 
 
+# A projection that moves the end of a step by more than this many times the step's tolerance is
+# none of its error: the step is not kept. Ordinary ones move it by less than the tolerance.
+FARTHEST = 10.0
+
+
+class Far(eqx.Module):
+    """How far a projection has moved the end of a step, in the terms of its tolerance.
+
+    Args:
+        rtol, atol: of the step. n_state: the first entries of y, which are those projected.
+    """
+
+    rtol: Any
+    atol: Any
+    n_state: int = eqx.field(static=True)
+
+    def error(self, y0: Vector, y1: Vector, end: Vector, error: Vector) -> Vector:
+        """The step's error; or, where it was moved too far, one that does not let it be kept."""
+        scale = lambda y: self.atol + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y))
+        n = self.n_state
+        moved = error_norm(n)(jax.lax.stop_gradient((end - y1) / scale(y1))) / FARTHEST
+        moved = jnp.where(jnp.isfinite(moved), moved, jnp.inf)
+        # measured by the controller this is `moved`, however large the end is
+        return jnp.where(moved > 1, moved * scale(end), error)
+
+
 class Stabilised(diffrax.AbstractWrappedSolver):
     """Any diffrax solver, each step followed by a projection, with the residuals watched.
 
@@ -55,6 +81,8 @@ class Stabilised(diffrax.AbstractWrappedSolver):
         project: (t, y, args) -> y and its `Residuals`, or None.
         residuals: (t, y, args) -> `Residuals`; their maxima over all accepted steps are
             kept in the solver state.
+        at_step: (t, y, args) -> args, with what is chosen once for a step that starts at y.
+        far: rejects steps that the projection moves too far, or None.
         guard: bounds the steps for what is differentiated; the error estimate then comes
             as a pair, with the longest step that is safe. Or None.
     """
@@ -62,6 +90,8 @@ class Stabilised(diffrax.AbstractWrappedSolver):
     solver: diffrax.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
     project: Callable[[Any, Vector, Any], tuple[Vector, Residuals]] | None
     residuals: Callable[[Any, Vector, Any], Residuals]
+    at_step: Callable[[Any, Vector, Any], Any]
+    far: Far | None
     guard: Guard | None = None
 
     @property
@@ -115,6 +145,7 @@ class Stabilised(diffrax.AbstractWrappedSolver):
     ) -> tuple[Vector, Any, Any, Any, diffrax.RESULTS]:
         inner, worst, *modes = solver_state
         jump = made_jump if self.project is None else True
+        args = self.at_step(t0, y0, args)
         if self.guard is not None:
             field = lambda t, y: terms.vf(t, y, args)
             modes = [self.guard.looked(field, t0, y0, t1 - t0, *modes)]
@@ -125,6 +156,8 @@ class Stabilised(diffrax.AbstractWrappedSolver):
             end, now = y1, self.residuals(t1, y1, args)
         else:
             end, now = self.project(t1, y1, args)
+        if self.far is not None:
+            y_error = self.far.error(y0, y1, end, y_error)
         worst = jax.tree.map(jnp.maximum, worst, now)
         info = {"inner": dense_info, "end": end, "shift": end - y1}
         y_error = (y_error, modes[0].longest) if modes else y_error

@@ -13,7 +13,7 @@ Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 6 (composite
 and ch. 8 (closed loops). Derivation: docs/dynamics.md.
 """
 
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,12 +21,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..algebra.compiler import kept_jit
-from ..algebra.linalg import right_inverse, solve_saddle
+from ..algebra.linalg import solve_saddle
 from ..algebra.rotation import (
     conjugate,
     cross,
     euler_parameter_rate,
-    from_rotation_vector,
     normalise,
     product,
     rotation_matrix,
@@ -37,18 +36,13 @@ from ..mechanics.load import total_load
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .balance import balanced
-from .branches import right_inverse_branches, serves
+from .branches import serves
 from .chain import Chain, chain, parameters
+from .closing import TreeModel, all_columns, closed, left, moved
 from .coordinates import Coordinates, join, read, shapes, split
 from .cut import Placed, Rows, cut_rows, in_world, kinematics
-from .differential import Constraints, constraints
-from .formulation import (
-    AbstractFormulation,
-    Accelerations,
-    Flows,
-    Residuals,
-    residuals_of,
-)
+from .differential import constraints
+from .formulation import AbstractFormulation, Accelerations, Flows, Residuals
 from .motion import (
     Motion,
     bias,
@@ -61,20 +55,9 @@ from .motion import (
 )
 from .pose import kinds
 from .reactions import Reactions, joint_reactions, tree_reactions
+from .singular import interpolated, is_near, kept_rows
 from .stabilisation import AbstractStabilisation, Baumgarte
 from .topology import SpanningTree, spanning_tree
-
-
-class TreeModel(eqx.Module):
-    """A system prepared for relative coordinates; `constraints` are those of the cut joints.
-
-    `inverse` is that of the mass matrix where it is constant: nothing but a base.
-    """
-
-    system: System
-    chain: Chain
-    constraints: Constraints
-    inverse: Float[Array, "6 6"] | None
 
 
 class Loads(NamedTuple):
@@ -151,15 +134,16 @@ class Tree(AbstractFormulation):
         tree, how = model.chain.tree, stabilisation
         at = split(tree, x)
         solved = self._solve(model, t, at, how)
-        rate = _rates(tree, at, solved.rate)
+        u_rate, driven = solved.rate, _driven(solved)
+        if self._passes(model):
+            u_rate, driven = self._through(model, t, x, how)
+        rate = _rates(tree, at, u_rate)
         if isinstance(how, Baumgarte):
             pull = lambda p: how.norm * (1 - jnp.sum(p**2, axis=0)) * p
             rate = rate._replace(p=rate.p + pull(at.p), balls=rate.balls + pull(at.balls))
         load, placed = solved.loads, solved.placed
         moment = cross(placed.r, load.force) + apply(placed.R_wb, load.moment)
-        power = load.power
-        if solved.rows is not None:
-            power = power + jnp.sum(solved.multipliers * solved.rows.target, axis=0)
+        power = load.power if solved.rows is None else load.power + driven
         flows = Flows(power, jnp.sum(load.force[:, :-1], 1), jnp.sum(moment[:, :-1], 1))
         return join(rate), flows
 
@@ -207,10 +191,11 @@ class Tree(AbstractFormulation):
         J, gamma = (jnp.zeros((0, len(at.u))), h[:0]) if rows is None else (rows.J, rows.gamma)
         rate, multipliers = solve_saddle(
             mass_matrix(tree, moving.S, total),
-            _all_columns(tree, J),
+            all_columns(tree, J),
             -h,
             gamma,
             redundant=dependent if self.redundant else False,
+            kept=model.kept,
         )
         return Solved(moving, placed, rows, load, rate, multipliers)
 
@@ -219,6 +204,42 @@ class Tree(AbstractFormulation):
         rows = sum(ROWS[group.kind] * len(group.i) for group in model.constraints.groups)
         return not self.redundant and serves(model.chain.tree, rows)
 
+    def at_step(self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"]) -> TreeModel:
+        """The model with the rows that count until the step is done.
+
+        A row that depends on others where the constraints hold need not do so at the stages of
+        a step, which are a little off; solved with all others it would act at any strength.
+        """
+        if not self._passes(model):
+            return model
+        kept = kept_rows(model, t, jax.lax.stop_gradient(split(model.chain.tree, x)))
+        return eqx.tree_at(lambda m: m.kept, model, kept, is_leaf=lambda x: x is None)
+
+    def _through(
+        self,
+        model: TreeModel,
+        t: Float[Array, ""],
+        x: Float[Array, " k"],
+        how: AbstractStabilisation,
+    ) -> tuple[Float[Array, "k"], Float[Array, ""]]:
+        """Accelerations and the power of drivers, through singular postures too."""
+        model = self.at_step(model, t, x) if model.kept is None else model
+        at = split(model.chain.tree, x)
+        near = is_near(model, t, at)
+
+        def one(by: Float[Array, "k"]) -> tuple[Float[Array, "k"], Float[Array, ""]]:
+            closed_there = lambda: closed(
+                model, t, moved(model.chain.tree, at, by), 3, self._small
+            )[0]
+            found = self._solve(model, t, jax.lax.cond(near, closed_there, lambda: at), how)
+            return found.rate, _driven(found)
+
+        return interpolated(near, at.u, one)
+
+    def _passes(self, model: TreeModel) -> bool:
+        """Whether rows may depend on each other."""
+        return self.redundant and bool(model.constraints.groups)
+
     def project(
         self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"], iterations: int
     ) -> tuple[Float[Array, " k"], Residuals]:
@@ -226,51 +247,33 @@ class Tree(AbstractFormulation):
         at = split(tree, x)
         at = at._replace(p=normalise(at.p), balls=normalise(at.balls))
         if not model.constraints.groups:
-            return join(at), _left(model, at, None)
+            return join(at), left(model, at, None)
+        if not self._passes(model):
+            at, rows = closed(model, t, at, iterations, self._small)
+            return join(at), left(model, at, rows)
+        model = self.at_step(model, t, x) if model.kept is None else model
 
-        def rows_of(moving: Motion) -> Rows:
-            return cut_rows(model.chain, model.constraints, t, moving)
+        def one(by: Float[Array, "k"]) -> Coordinates:
+            start = moved(tree, at, by)
+            end, _ = closed(model, t, start, iterations, self._small)
+            return jax.tree.map(jnp.subtract, end, start)
 
-        # The derivative of a converged iteration is that of its last step with G held: what
-        # this leaves out is of the size of the residual that the step before has left.
-        near = jax.lax.stop_gradient(at)
-        moving = motion(model.chain, near)
-        rows = jax.lax.stop_gradient(rows_of(moving))
-        G = jax.lax.stop_gradient(self._closing(model, moving, rows.J))
-        by_rows = lambda b: jnp.sum(G * b[None], axis=1)
-
-        def closer(_: Any, now: Coordinates) -> Coordinates:
-            rows = jax.lax.stop_gradient(rows_of(motion(model.chain, now)))
-            return _moved(tree, now, -by_rows(rows.value))
-
-        near = _moved(tree, near, -by_rows(rows.value))
-        near = jax.lax.fori_loop(1, iterations, closer, near)
-        at = _carried(at, near)
-        rows = rows_of(motion(model.chain, at))
-        at = _carried(_moved(tree, at, -by_rows(rows.value)), near)
-        for _ in range(max(iterations, 2)):
-            off = jnp.sum(rows.J * at.u, axis=1) - rows.target
-            at = at._replace(u=at.u - by_rows(off))
-        return join(at), _left(model, at, rows)
-
-    def _closing(
-        self, model: TreeModel, moving: Motion, J: Float[Array, "m k *s"]
-    ) -> Float[Array, "k m *s"]:
-        """G: of all velocities u with J u = b, G b is the smallest in the mass metric."""
-        tree = model.chain.tree
-        total = inertia(model.chain, moving, jnp.zeros_like(moving.V))
-        if self._small(model):
-            return right_inverse_branches(tree, moving.S, total, J)
-        M = mass_matrix(tree, moving.S, total)
-        G = right_inverse(M, _all_columns(tree, J), redundant=self.redundant)
-        return G[6 * tree.floating :]
+        end = jax.tree.map(jnp.add, at, interpolated(is_near(model, t, at), at.u, one))
+        end = end._replace(balls=normalise(end.balls))
+        return join(end), self.residuals(model, t, join(end))
 
     def residuals(self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"]) -> Residuals:
         at = split(model.chain.tree, x)
         if not model.constraints.groups:
-            return _left(model, at, None)
+            return left(model, at, None)
         rows = cut_rows(model.chain, model.constraints, t, motion(model.chain, at))
-        return _left(model, at, rows)
+        return left(model, at, rows)
+
+
+def _driven(found: Solved) -> Float[Array, "*s"]:
+    """The power of drivers in cut joints."""
+    rows = found.rows
+    return jnp.zeros(()) if rows is None else jnp.sum(found.multipliers * rows.target, axis=0)
 
 
 @kept_jit
@@ -296,35 +299,6 @@ def _cut_reactions(
     seen = State((state.r - r) @ R_w0, own, state.v @ R_w0, state.omega)
     found = joint_reactions(system, model.constraints, t, seen, multipliers)
     return Reactions(found.force @ R_w0.T, found.moment @ R_w0.T)
-
-
-def _all_columns(tree: SpanningTree, J: Float[Array, "m k"]) -> Float[Array, "m l"]:
-    """Rows in all velocities: those of the base move no row that joins two bodies on it."""
-    if not tree.floating:
-        return J
-    return jnp.concatenate([jnp.zeros((J.shape[0], 6, *J.shape[2:]), J.dtype), J], axis=1)
-
-
-def _carried(at: Coordinates, to: Coordinates) -> Coordinates:
-    """The values of `to`, with the derivatives of `at`."""
-    stop = jax.lax.stop_gradient
-    return jax.tree.map(lambda x, y: stop(y) + (x - stop(x)), at, to)
-
-
-def _moved(tree: SpanningTree, at: Coordinates, step: Float[Array, "k"]) -> Coordinates:
-    """The tree's coordinates after a small motion along its velocities."""
-    q1, shift, balls = kinds(tree, step)
-    turned = product(at.balls, from_rotation_vector(balls)) if balls.shape[1] else at.balls
-    return at._replace(q1=at.q1 + q1, shift=at.shift + shift, balls=turned)
-
-
-def _left(model: TreeModel, at: Coordinates, rows: Rows | None) -> Residuals:
-    p = jnp.concatenate([at.p, at.balls], axis=1)
-    norm = jnp.max(jnp.abs(jnp.sum(p**2, axis=0) - 1), axis=0, initial=0.0)
-    if rows is None:
-        return residuals_of(model.constraints, norm[None], norm[None], norm)
-    off = jnp.sum(rows.J * at.u, axis=1) - rows.target
-    return residuals_of(model.constraints, rows.value, off, norm)
 
 
 def _loads(system: System, t: Float[Array, ""], placed: Placed) -> Loads:

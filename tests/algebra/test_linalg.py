@@ -8,6 +8,7 @@ from helpers import central
 
 from stmuav_jax.algebra.linalg import (
     factorise,
+    independent_rows,
     proximal,
     right_inverse,
     solve_general,
@@ -143,3 +144,31 @@ def test_right_inverse_is_the_smallest_in_the_metric(rng, redundant):
     # M x lies in the range of J^T
     rest = M @ x - J.T @ np.linalg.lstsq(J.T, M @ x, rcond=1e-11)[0]
     assert np.max(np.abs(rest)) < 1e-8 * np.max(np.abs(M @ x))
+
+
+@pytest.mark.parametrize("rank", [2, 4, 6])
+def test_independent_rows_span_all(rng, rank):
+    """As many as the rank, spanning the same space; also of dependent rows off by 1e-8."""
+    J = rng.normal(size=(N, rank)) @ rng.normal(size=(rank, 2 * N))
+    off = J + 1e-8 * rng.normal(size=J.shape)
+    for rows in (J, off):
+        kept = np.asarray(jax.jit(independent_rows)(jnp.asarray(rows @ rows.T), 1e-12))
+        assert kept.sum() == rank
+        assert np.linalg.matrix_rank(rows[kept], tol=1e-6) == rank
+    assert not np.any(independent_rows(jnp.zeros((3, 3)), 1e-12))
+
+
+def test_rows_left_out_have_no_effect(rng):
+    """With `kept`, M x - J^T y = f and J x = g of these rows only, whatever the others want."""
+    M, J, f = definite(rng), rng.normal(size=(3, N)), rng.normal(size=N)
+    wrong = np.vstack([J, J[0] + 1e-9 * rng.normal(size=N)])
+    g = rng.normal(size=3)
+    kept = jnp.array([True, True, True, False])
+    x, y = solve_saddle(
+        *(jnp.asarray(a) for a in (M, wrong, f, np.append(g, 7.0))), redundant="fast", kept=kept
+    )
+    expected, multipliers = solve_saddle(*(jnp.asarray(a) for a in (M, J, f, g)), redundant=False)
+    np.testing.assert_allclose(x, expected, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(y, np.append(multipliers, 0.0), rtol=1e-8, atol=1e-10)
+    G = right_inverse(jnp.asarray(M), jnp.asarray(wrong), redundant=True, kept=kept)
+    np.testing.assert_allclose(J @ np.asarray(G), np.eye(3, 4), atol=1e-10)

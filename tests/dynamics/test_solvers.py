@@ -10,8 +10,9 @@ import pytest
 from helpers import pendulum, relative_error, swung
 
 import stmuav_jax as sj
+from stmuav_jax.dynamics.formulation import Residuals
 from stmuav_jax.dynamics.problem import prepare
-from stmuav_jax.dynamics.solvers import Remembering, error_norm
+from stmuav_jax.dynamics.solvers import Far, Remembering, Stabilised, error_norm
 
 SYSTEM = pendulum()
 START = swung(SYSTEM, 1.2, 2.0)
@@ -222,3 +223,45 @@ def test_a_step_cut_short_by_an_output_time_is_remembered():
     keep, t0, t1, _, state, _ = controller.adapt_step_size(t0, t1, y, y, None, 1e3 * y, 5, state)
     assert not bool(keep)
     assert float(t1 - t0) < 0.1
+
+
+def test_a_step_that_the_projection_moves_far_is_not_kept():
+    """Beyond t = 0.5 "projection" throws the state to 1e8: no such state is ever the last."""
+    none = jnp.zeros(())
+    residuals = Residuals(none, none, none)
+
+    def project(t, y, args):
+        return jnp.where(t > 0.5, 1e8 + y, y), residuals
+
+    far = Far(1e-8, 1e-8, 1)
+    solver = Stabilised(
+        diffrax.Dopri8(), project, lambda t, y, args: residuals, lambda t, y, args: args, far
+    )
+    controller = Remembering(
+        controller=diffrax.PIDController(rtol=1e-8, atol=1e-8, norm=error_norm(1)),
+        step=jnp.asarray(0.01),
+    )
+    found = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: -y),
+        solver,
+        0.0,
+        1.0,
+        None,
+        jnp.ones(1),
+        stepsize_controller=controller,
+        max_steps=500,
+        throw=False,
+    )
+    assert found.result == diffrax.RESULTS.dt_min_reached
+    assert float(found.ts[-1]) == pytest.approx(0.5, abs=1e-9)
+    assert float(found.ys[-1, 0]) == pytest.approx(np.exp(-0.5), rel=1e-7)
+
+
+def test_an_ordinary_projection_leaves_the_error_as_it_is():
+    y0, y1, error = jnp.array([1.0, 2.0]), jnp.array([1.1, 2.1]), jnp.array([1e-9, -2e-9])
+    far = Far(1e-8, 1e-8, 2)
+    np.testing.assert_array_equal(far.error(y0, y1, y1 + 1e-8, error), error)
+    for end in (y1 + 1e-5, y1 + 1e9, y1 + jnp.nan):
+        off = far.error(y0, y1, end, error)
+        scale = 1e-8 + 1e-8 * jnp.maximum(jnp.abs(y0), jnp.abs(end))
+        assert not error_norm(2)(off / scale) < 1

@@ -1,0 +1,150 @@
+"""Rows that depend on each other, always or for a moment, and motion through singular postures.
+
+Where a mechanism passes through a singular posture, its accelerations and the projection onto
+its constraints are smooth along the motion, but their equations lose rank: round-off is divided
+by a singular value that goes through zero. Near by they are interpolated, from
+
+    f(0) = sum_j w_j f(s_j) + O(s^10),    s_j = +-s, +-2 s, ..., +-5 s,
+
+with f(s_j) at postures a little before and after along the velocities, on the constraints, where
+the equations have their rank.
+"""
+
+from collections.abc import Callable
+from math import factorial
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..algebra.linalg import independent_rows
+from ..mechanics.constraint import ROWS
+from .closing import TreeModel, rows_after
+from .coordinates import Coordinates
+from .differential import Constraints
+
+# Rows are dependent where the square of their distance from others is below this, in terms of the
+# longest row of their kind. It is measured here and `AHEAD` [rad], [m] further along the
+# velocities, but not below `_SLOW` [1/s], where they are round-off: a posture that is singular for
+# a moment only gives some AHEAD^2 there, and rows that depend on each other where they hold
+# AHEAD^4, as they hold up to AHEAD^2.
+DEPENDENT = 1e-12
+AHEAD = 1e-4
+_SLOW = 1e-6
+
+# Squares of singular values below this are near a singular posture: round-off over the cube of
+# the singular value comes to the tolerances in use. Postures around are `_APART` [rad], [m] apart.
+NEAR = 5e-5
+_APART = 0.06
+_HALF = 5
+
+
+def _weights(half: int) -> np.ndarray:
+    """Of values at -half, ..., -1, 1, ..., half in the one at 0 of the polynomial through them."""
+    one_side = [
+        (-1.0) ** (j + 1) * factorial(half) ** 2 / (factorial(half - j) * factorial(half + j))
+        for j in range(1, half + 1)
+    ]
+    return np.array(one_side[::-1] + one_side)
+
+
+# The posture itself first, which serves where no other is needed.
+_PLACES = np.array([0, *range(-_HALF, 0), *range(1, _HALF + 1)])
+_WEIGHTS = np.array([0.0, *_weights(_HALF)])
+# of the polynomial through all but the outermost, to see how good the interpolation is
+_FEWER = np.array([0.0, 0.0, *_weights(_HALF - 1), 0.0])
+_UNCERTAIN = 1e-6
+
+T = TypeVar("T")
+
+
+def _along(u: Float[Array, "k"]) -> Float[Array, "k"]:
+    """Velocities scaled to a largest of one [rad], [m]; much less where they are round-off."""
+    return jax.lax.stop_gradient(u / (_SLOW + jnp.max(jnp.abs(u), initial=0.0)))
+
+
+def interpolated(
+    near: Bool[Array, ""], u: Float[Array, "k"], one: Callable[[Float[Array, "k"]], T]
+) -> T:
+    """one(0); near a singular posture what lies between one(displacement) before and after.
+
+    It is not a number where one order less makes a difference of more than 1e-6.
+
+    Args:
+        u: velocities. one: a displacement (k,) -> arrays.
+    """
+    step = _APART * _along(u)
+    first = np.eye(len(_PLACES))[0]
+    shape = jax.eval_shape(one, step)
+    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+
+    def add(sums: tuple[T, T], at: tuple[Any, ...]) -> tuple[tuple[T, T], None]:
+        place, weight, fewer = at
+        needed = near != (place == 0)
+        value = jax.lax.cond(needed, lambda: one(place * step), lambda: none)
+        more = lambda w: lambda total, x: total + w * x
+        return (
+            jax.tree.map(more(weight), sums[0], value),
+            jax.tree.map(more(fewer), sums[1], value),
+        ), None
+
+    weights = [jnp.where(near, w, first) for w in (_WEIGHTS, _FEWER)]
+    (found, less), _ = jax.lax.scan(add, (none, none), (jnp.asarray(_PLACES, u.dtype), *weights))
+    largest = lambda tree: jnp.max(
+        jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in jax.tree.leaves(tree)])
+    )
+    off = largest(jax.tree.map(jnp.subtract, found, less))
+    fine = off <= _UNCERTAIN * (1 + largest(found))
+    return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), found)
+
+
+def independent(
+    constraints: Constraints, J: Float[Array, "m k"], tolerance: float
+) -> Bool[Array, " m"]:
+    """Independent rows, in terms of the longest row of their kind."""
+    J = jax.lax.stop_gradient(J)
+    square, sizes, start = jnp.sum(J**2, axis=1), [], 0
+    for group in constraints.groups:
+        count = ROWS[group.kind] * len(group.i)
+        sizes.append(jnp.full(count, jnp.max(square[start : start + count])))
+        start += count
+    size = jnp.sqrt(jnp.concatenate(sizes))
+    J = J / jnp.where(size > 0, size, 1.0)[:, None]
+    return independent_rows(J @ J.T, tolerance)
+
+
+def kept_rows(model: TreeModel, t: Float[Array, ""], at: Coordinates) -> Bool[Array, " m"]:
+    """Independent rows (m,) through a step that starts here.
+
+    They are looked for here and a little way ahead, and the more taken: in a singular posture
+    rows depend on each other that do not before and after.
+    """
+    ahead = AHEAD * _along(at.u)
+    J_after = lambda share: rows_after(model, t, at, share * ahead)
+    one = lambda share: independent(model.constraints, J_after(share), DEPENDENT)
+    here, there = jax.vmap(one)(jnp.array([0.0, 1.0], at.u.dtype))
+    return jnp.where(jnp.sum(here) >= jnp.sum(there), here, there)
+
+
+def is_near(model: TreeModel, t: Float[Array, ""], at: Coordinates) -> Bool[Array, ""]:
+    """Whether this posture is near a singular one, and those before and after are not."""
+    assert model.kept is not None
+    model, at = _still(model), _still(at)
+    rank = jnp.sum(model.kept)
+    step = _APART * _along(at.u)
+
+    def full(place: Float[Array, ""]) -> Bool[Array, ""]:
+        J = rows_after(model, t, at, place * step)
+        return jnp.sum(independent(model.constraints, J, NEAR)) >= rank
+
+    places = jnp.asarray(_PLACES, at.u.dtype)
+    around = lambda: jnp.all(jax.lax.map(full, places[1:]))
+    return jax.lax.cond(full(places[0]), lambda: jnp.asarray(False), around)
+
+
+def _still(tree: T) -> T:
+    still = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x
+    return jax.tree.map(still, tree)
