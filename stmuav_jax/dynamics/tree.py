@@ -221,13 +221,13 @@ class Tree(AbstractFormulation):
         t: Float[Array, ""],
         x: Float[Array, " k"],
         how: AbstractStabilisation,
-    ) -> tuple[Float[Array, "k"], Float[Array, ""]]:
+    ) -> tuple[Float[Array, " u"], Float[Array, ""]]:
         """Accelerations and the power of drivers, through singular postures too."""
         model = self.at_step(model, t, x) if model.kept is None else model
         at = split(model.chain.tree, x)
         near = is_near(model, t, at)
 
-        def one(by: Float[Array, "k"]) -> tuple[Float[Array, "k"], Float[Array, ""]]:
+        def one(by: Float[Array, " u"]) -> tuple[Float[Array, " u"], Float[Array, ""]]:
             closed_there = lambda: closed(
                 model, t, moved(model.chain.tree, at, by), 3, self._small
             )[0]
@@ -253,7 +253,7 @@ class Tree(AbstractFormulation):
             return join(at), left(model, at, rows)
         model = self.at_step(model, t, x) if model.kept is None else model
 
-        def one(by: Float[Array, "k"]) -> Coordinates:
+        def one(by: Float[Array, " u"]) -> Coordinates:
             start = moved(tree, at, by)
             end, _ = closed(model, t, start, iterations, self._small)
             return jax.tree.map(jnp.subtract, end, start)
