@@ -95,11 +95,6 @@ def simulate(
         ModelError: contradictory constraints, or a load that is not finite at the start.
         SimulationError: the end was not reached (with `throw`); its `run` holds the rest.
     """
-    if not concrete(scene.system, scene.state0):
-        raise SettingError(
-            "simulate looks at values and cannot be differentiated, batched or compiled by JAX: "
-            "its scene holds traced numbers. Use stmuav_jax.integrate(system, state, ts, method)."
-        )
     formulation = formulation if formulation is not None else Tree()
     if solver == "auto":
         _check_start(scene.system, scene.state0)
@@ -194,6 +189,11 @@ def _check_settings(method: Method) -> None:
 
 
 def _check_start(system: System, state: State) -> None:
+    if not concrete(system, state):
+        raise SettingError(
+            "simulate looks at values and cannot be differentiated, batched or compiled by JAX: "
+            "its scene holds traced numbers. Use stmuav_jax.integrate(system, state, ts, method)."
+        )
     check_state(system, state)
     units = (
         ("r", "position", "m"),
