@@ -8,7 +8,7 @@ import numpy as np
 
 from ..mechanics.body import check_unit
 from ..mechanics.constraint import ROWS
-from ..mechanics.errors import ModelError, SettingError, StateError, nearest_names
+from ..mechanics.errors import ModelError, SettingError, StateError, concrete, nearest_names
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .augmented import Augmented, Model
@@ -144,6 +144,11 @@ def check_settings(method: Method) -> None:
 
 def check_start(system: System, state: State) -> None:
     """Raise unless the state fits the system's shapes, and is finite with unit Euler parameters."""
+    if not concrete(system, state):
+        raise SettingError(
+            "simulate looks at values and cannot be differentiated, batched or compiled by JAX: "
+            "its scene holds traced numbers. Use stmuav_jax.integrate(system, state, ts, method)."
+        )
     check_state(system, state)
     units = (
         ("r", "position", "m"),

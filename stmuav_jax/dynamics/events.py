@@ -37,8 +37,17 @@ class _OfOne(optx.AbstractRootFinder):
         return optx.max_norm
 
     def init(self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, *rest: Any) -> Any:
-        one = jax.tree.leaves(f_struct)[0]
-        return self.inner.init(_sum(fn), y, args, options, one, *rest)
+        one, of = jax.tree.leaves(f_struct)[0], _sum(fn)
+        lower, upper = options["lower"], options["upper"]
+        low, high = of(lower, args)[0], of(upper, args)[0]
+        # an end where the function is zero is an end of the interval all the same
+        low, high = jnp.where(low == 0, -high, low), jnp.where(high == 0, -low, high)
+
+        def ends(t: Any, args: Any) -> Any:
+            value, aux = of(t, args)
+            return jnp.where(t <= lower, low, jnp.where(t >= upper, high, value)), aux
+
+        return self.inner.init(ends, y, args, options, one, *rest)
 
     def step(self, fn: Any, *rest: Any) -> Any:
         return self.inner.step(_sum(fn), *rest)

@@ -114,13 +114,12 @@ def _through(
     """Through times [s], or through pairs of time and whether it is that of a jump."""
     adjoint = _adjoint(problem, segments)
     jumps = problem.method.jump_ts
-    if jumps is not None:
-        last = jnp.max(jnp.where(ts[1], -jnp.inf, ts[0]))
+    last = None if jumps is None else jnp.max(jnp.where(ts[1], -jnp.inf, ts[0]))
 
     def to_next(carry: Carry, t1: Any) -> tuple[Carry, Any]:
         fine = carry.result == diffrax.RESULTS.successful
+        goal, jumping = (t1, False) if jumps is None else t1
         if jumps is not None:
-            (goal, jumping) = t1
             t1 = jnp.where(jnp.any(goal == jumps), prevbefore(goal), goal)
             t1 = jnp.where((jumping & (goal > last)) | (t1 < carry.t), carry.t, t1)
         found = _to(problem, carry, jnp.where(fine, t1, carry.t), adjoint)

@@ -205,7 +205,7 @@ def stability_function(solver: Any) -> Callable[[complex], complex] | None:
     """R(z) of a solver or a class of solvers, where its coefficients are known."""
     if isinstance(solver, Rodas5P) or solver is Rodas5P:
         return stability
-    table = getattr(solver, "tableau", None)
+    table: Any = getattr(solver, "tableau", None)
     if not isinstance(table, diffrax.ButcherTableau):
         return None
     count = len(table.b_sol)
@@ -215,4 +215,4 @@ def stability_function(solver: Any) -> Callable[[complex], complex] | None:
     if table.a_diagonal is not None:
         A += np.diag(table.a_diagonal)
     b, one = np.asarray(table.b_sol), np.ones(count)
-    return lambda z: 1 + z * (b @ np.linalg.solve(np.eye(count) - z * A, one))
+    return lambda z: complex(1 + z * (b @ np.linalg.solve(np.eye(count) - z * A, one)))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..mechanics.errors import ModelError, SettingError, SimulationError, concrete
+from ..mechanics.errors import ModelError, SimulationError
 from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
@@ -103,11 +103,6 @@ def simulate(
         SimulationError: the end was not reached (with `throw`); its `run` holds the rest.
     """
     scene = scene_of(scene, state, t1, save_every, ts)
-    if not concrete(scene.system, scene.state0):
-        raise SettingError(
-            "simulate looks at values and cannot be differentiated, batched or compiled by JAX: "
-            "its scene holds traced numbers. Use stmuav_jax.integrate(system, state, ts, method)."
-        )
     check_parts(solver=solver, formulation=formulation, stabilisation=stabilisation)
     method = Method(
         formulation=formulation if formulation is not None else Tree(),  # pyright: ignore

@@ -36,9 +36,15 @@ def graded():
 
 
 @pytest.fixture(scope="module")
-def batched():
-    """Values and gradients of the batch, from one compiled function."""
-    return jax.jit(jax.vmap(jax.value_and_grad(loss)))(BATCH)
+def of_batch():
+    """Values and gradients of a batch, compiled."""
+    return jax.jit(jax.vmap(jax.value_and_grad(loss)))
+
+
+@pytest.fixture(scope="module")
+def batched(of_batch):
+    """Values and gradients of the batch."""
+    return of_batch(BATCH)
 
 
 def minimal(parameters, t, event=None):
@@ -61,6 +67,16 @@ def test_values_under_jit_and_vmap(graded, batched):
 def test_gradients_of_a_batch_are_those_of_its_members(graded, batched):
     for parameters, gradient in zip(BATCH, batched[1], strict=True):
         assert relative_error(gradient, graded(parameters)[1]) < 1e-10
+
+
+def test_a_failed_flight_is_not_a_number(of_batch, batched):
+    """Nor is its gradient, so that a sum shows it; the others are as without it."""
+    values, gradients = of_batch(BATCH.at[1, 1].set(jnp.nan))
+    assert np.isnan(values[1])
+    assert np.all(np.isnan(gradients[1]))
+    for k in (0, 2):
+        assert float(values[k]) == pytest.approx(float(batched[0][k]), rel=1e-12)
+        assert relative_error(gradients[k], batched[1][k]) < 1e-10
 
 
 def test_gradients_equal_finite_differences(graded):
