@@ -26,7 +26,7 @@ def _public_names() -> dict[str, tuple[str, str]]:
 _NAMES = _public_names()
 _FOLDERS = {module.split(".")[1] for module, _ in _NAMES.values()}
 
-__all__ = list(_NAMES)
+__all__ = list(_NAMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> object:
