@@ -37,7 +37,9 @@ def test_bouncing_ball():
         return sj.integrate(system, start, jnp.stack([t, t + 3.0]), method)
 
     t, z, v = jnp.zeros(()), jnp.ones(()), jnp.zeros(())
-    ground = Plane(jnp.zeros(()), jnp.asarray(np.inf))
+    # of one type, as weakly typed numbers would be compiled again
+    plane = lambda height, until: Plane(*(jnp.asarray(x, float) for x in (height, until)))
+    ground = plane(0.0, np.inf)
     for bounce in range(6):
         arc = fall(t, z, v, ground)
         assert arc.result == diffrax.RESULTS.event_occurred
