@@ -48,12 +48,17 @@ def test_an_open_chain_takes_all_coordinates_and_rates(chain):
         found = sj.joint_motion(chain, state, name)
         np.testing.assert_allclose(found.coordinates, np.atleast_1d(Q[name]), atol=5e-15)
         np.testing.assert_allclose(found.rates, np.atleast_1d(U[name]), atol=1e-14)
-    # and the rows that hold coordinates where loops are closed say the same of all kinds
+
+
+@pytest.mark.slow
+def test_the_rows_that_hold_coordinates_of_closed_loops_say_the_same(chain):
+    state = sj.state_from_joints(chain, Q, U)
     given = {name: jnp.atleast_1d(jnp.asarray(x)) for name, x in Q.items()}
     rates = {name: jnp.atleast_1d(jnp.asarray(x)) for name, x in U.items()}
     assert max(misfit(_driven(chain, given, rates, jnp.zeros(())), state)) < 1e-14
 
 
+@pytest.mark.slow
 def test_the_reference_posture_at_rest_is_the_start(chain):
     state = sj.state_from_joints(chain)
     for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(chain.reference), strict=True):

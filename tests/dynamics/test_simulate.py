@@ -161,6 +161,17 @@ def run():
     return found, seen
 
 
+def test_a_joint_of_a_run(run):
+    """Its angle from the body's own turn, its rate from the body's angular velocity."""
+    found, _ = run
+    joint = found.scene.system.joints[0]
+    motion = found.joint(joint.name)
+    p = found.body(joint.body_j).p
+    np.testing.assert_allclose(np.cos(motion.angle / 2), np.abs(p[:, 0]), atol=1e-12)
+    rates = np.linalg.norm(found.body(joint.body_j).omega, axis=1)
+    np.testing.assert_allclose(np.abs(motion.angle_rate), rates, atol=1e-9)
+
+
 def test_a_run_and_its_certificate(run):
     found, seen = run
     c = found.certificate
