@@ -87,11 +87,11 @@ class _Windows(NamedTuple):
     """A landing by windows of at most n step attempts each.
 
     Attributes:
-        count: of windows. starts: what each starts from (windows, .): time, y, memory of the
+        number: of windows. starts: what each starts from (windows, .): time, y, memory of the
             solver and of the step control. last: the steps of the last one.
     """
 
-    count: Int[Array, ""]
+    number: Int[Array, ""]
     starts: Any
     last: _Steps
 
@@ -144,7 +144,8 @@ def _forward(
     )
     over = counts[0] + counts[1] > problem.method.max_steps
     result = diffrax.RESULTS.where(over, _MORE, result)
-    end = Landing(t, y, solver_state, controller_state, *counts, result)
+    accepted, rejected = counts
+    end = Landing(t, y, solver_state, controller_state, accepted, rejected, result)
     if most * kept < problem.method.max_steps:
         # derivatives of part of the way would be wrong: not a number says so
         end = end._replace(y=jnp.where(result == _MORE, jnp.nan, y))
@@ -193,7 +194,7 @@ def _backward(
 
     def back_window(at: tuple[Any, ...]) -> tuple[Any, ...]:
         number, by_end, by_model = at
-        final = number == windows.count - 1
+        final = number == windows.number - 1
         steps = jax.lax.cond(final, lambda: windows.last, lambda: again(number))
 
         def back(at: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -209,7 +210,7 @@ def _backward(
     none = jnp.where(jnp.any(jnp.isnan(last)), jnp.nan, 0.0)
     zero = jax.tree.map(lambda x: jnp.full_like(x, none), arrays)
     _, first, by_model = jax.lax.while_loop(
-        lambda at: at[0] >= 0, back_window, (windows.count - 1, last, zero)
+        lambda at: at[0] >= 0, back_window, (windows.number - 1, last, zero)
     )
     by_t0, by_t1 = None, None
     if perturbed.t0:

@@ -36,7 +36,7 @@ class _OfOne(optx.AbstractRootFinder):
     def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return optx.max_norm
 
-    def init(self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, *rest: Any) -> Any:
+    def init(self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, *rest: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         one, of = jax.tree.leaves(f_struct)[0], _sum(fn)
         lower, upper = options["lower"], options["upper"]
         low, high = of(lower, args)[0], of(upper, args)[0]
@@ -49,13 +49,13 @@ class _OfOne(optx.AbstractRootFinder):
 
         return self.inner.init(ends, y, args, options, one, *rest)
 
-    def step(self, fn: Any, *rest: Any) -> Any:
+    def step(self, fn: Any, *rest: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.inner.step(_sum(fn), *rest)
 
-    def terminate(self, fn: Any, *rest: Any) -> Any:
+    def terminate(self, fn: Any, *rest: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.inner.terminate(_sum(fn), *rest)
 
-    def postprocess(self, fn: Any, *rest: Any) -> Any:
+    def postprocess(self, fn: Any, *rest: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.inner.postprocess(_sum(fn), *rest)
 
 
@@ -91,7 +91,7 @@ def to_event(
             return jnp.where(start & (t <= carry.t), sign, now)
 
         lost = lambda t, y, args, **_: jnp.isnan(value(t, y, args))
-        finder = _OfOne(optx.Bisection(rtol=1e-12, atol=1e-14))
+        finder = _OfOne(inner=optx.Bisection(rtol=1e-12, atol=1e-14))  # pyright: ignore[reportCallIssue]
         # in this order: where the first is true, the second does not count
         event = diffrax.Event((lost, crossing), finder, (None, method.direction))
     solution = problem.solve(carry, t1, adjoint, event=event)
@@ -99,7 +99,8 @@ def to_event(
     occurred = found.result == diffrax.RESULTS.event_occurred
     if kind != jnp.bool_:
         bad = occurred & solution.event_mask[0]  # pyright: ignore[reportOptionalSubscript]
-        result = diffrax.RESULTS.where(bad, diffrax.RESULTS.nonfinite, found.result)
+        nonfinite: Any = diffrax.RESULTS.nonfinite
+        result = diffrax.RESULTS.where(bad, nonfinite, found.result)
         found, occurred = found._replace(result=result), occurred & ~bad
     # the event's time comes from interpolation; the state there from steps
     again = jax.lax.cond(

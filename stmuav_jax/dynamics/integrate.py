@@ -88,7 +88,7 @@ def advance(problem: Problem, carry: Carry, ts: Float[Array, " k"]) -> tuple[Car
         end, rows = _through(problem, carry, ts, ts.shape[0] - 1)
         return end, _trajectory(problem, end, rows)
     # the times of jumps among the output times; at the same time outputs come first
-    merged = jnp.concatenate([ts, jumps])
+    merged = jnp.concatenate([ts, jnp.asarray(jumps)])
     order = jnp.argsort(merged)
     end, rows = _through(problem, carry, (merged[order], order >= ts.shape[0]), len(merged) - 1)
     rows = jax.tree.map(lambda x: x[jnp.argsort(order)[: ts.shape[0]]], rows)

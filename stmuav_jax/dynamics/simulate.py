@@ -319,7 +319,7 @@ def _failure(run: Run, end: float) -> str:
         reason = "the value of its event is not a number there"
     system = with_internal(run.scene.system, jnp.asarray(run.trajectory.internal[-1]))
     if run.snapshot is not None:
-        values = run.snapshot.singular_values
+        values = np.asarray(run.snapshot.singular_values)
         reason = singular_posture(system, state, t, run.certificate.rank, values) or reason
     kin = system.kinematics(state)
     for force in system.forces:

@@ -132,8 +132,8 @@ def kept_rows(model: TreeModel, t: Float[Array, ""], at: Coordinates) -> Bool[Ar
 def is_near(model: TreeModel, t: Float[Array, ""], at: Coordinates) -> Bool[Array, ""]:
     """Whether this posture is near a singular one, and those before and after are not."""
     assert model.kept is not None
-    model, at = _still(model), _still(at)
     rank = jnp.sum(model.kept)
+    model, at = _still(model), _still(at)
     step = _APART * _along(at.u)
 
     def full(place: Float[Array, ""]) -> Bool[Array, ""]:

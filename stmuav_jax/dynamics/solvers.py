@@ -156,7 +156,7 @@ class Stabilised(diffrax.AbstractWrappedSolver):
             end, now = y1, self.residuals(t1, y1, args)
         else:
             end, now = self.project(t1, y1, args)
-        if self.far is not None:
+        if self.far is not None and y_error is not None:
             y_error = self.far.error(y0, y1, end, y_error)
         worst = jax.tree.map(jnp.maximum, worst, now)
         info = {"inner": dense_info, "end": end, "shift": end - y1}

@@ -174,7 +174,7 @@ def total_load(forces: "Sequence[AbstractForce]", t: Float[Array, ""], kin: Kine
 def _check_load(force: "AbstractForce", found: object, expected: Load) -> None:
     for name in ("force", "moment", "potential", "power"):
         must = jnp.shape(getattr(expected, name))
-        shape = jnp.shape(getattr(found, name, None)) if isinstance(found, Load) else None
+        shape = jnp.shape(getattr(found, name)) if isinstance(found, Load) else None
         if shape != must:
             where = ", ".join((*force.bodies(), *force.joint_names())) or "all bodies"
             given = f"has {name} of shape {shape}" if shape is not None else "is none"

@@ -141,7 +141,7 @@ def check_state(system: System, state: State) -> None:
                 f"State.{name} must have shape (..., {n}, {width}) for bodies "
                 f"{', '.join(system.names)}, but it has {jnp.shape(array)}."
             )
-        check_precision(array, system.allow_float32)
+        check_precision(jnp.asarray(array), system.allow_float32)
 
 
 def _check_names(bodies: Sequence[Body], joints: Sequence[Joint]) -> None:

@@ -163,8 +163,9 @@ class Flights:
         places = (place,) if place else ()
         # a tensor of inertia stays symmetric, "bare.inertia" of the hexacopter too
         tensor = self.table[name].unit == "kg m^2" and len(place) == 2
-        if tensor and place[0] != place[1]:
-            places = (place, place[::-1])
+        across = place[::-1]
+        if tensor and place != across:
+            places = (place, across)
         unit = "1" if factor in self.relative else self.table[name].unit
         return Entry(name, places, unit)
 
@@ -302,7 +303,7 @@ def _alike(name: str, known: list[str]) -> str:
 
 def _tensors(inertia: Float[np.ndarray, "n 3 3"], tolerance: float) -> Bool[np.ndarray, " n"]:
     """Whether a body can have each of these tensors, with a relative excess of its moments."""
-    finite = np.isfinite(inertia).all(axis=(1, 2))
+    finite = np.all(np.isfinite(inertia), axis=(1, 2))
     moments = np.linalg.eigvalsh(np.where(finite[:, None, None], inertia, np.eye(3)))
     with np.errstate(over="ignore"):
         most = (moments[:, 0] + moments[:, 1]) * (1 + max(tolerance, ROUND_OFF))

@@ -260,7 +260,7 @@ class _Walk(NamedTuple):
     held: Int[Array, " k"]
     done: Bool[Array, ""]
     again: Bool[Array, ""]
-    count: Int[Array, ""]
+    steps: Int[Array, ""]
 
 
 def _nearest(box: _Box) -> Float[Array, " k"]:
@@ -357,10 +357,10 @@ def _walked(
         ends = arrived & ~jnp.any(leaves)
         anew = ends & small & ~now.again
         held = jnp.where(anew, forced, held)
-        return _Walk(after, held, ends & ~anew, now.again | anew, now.count + 1)
+        return _Walk(after, held, ends & ~anew, now.again | anew, now.steps + 1)
 
     def unfinished(now: _Walk) -> Array:
-        return ~now.done & (now.count < _MOST_STEPS * k)
+        return ~now.done & (now.steps < _MOST_STEPS * k)
 
     no = jnp.zeros((), bool)
     start = _Walk(x, held, no, no, jnp.zeros((), int))

@@ -178,7 +178,9 @@ def ours(key):
     found = stm.evaluate(scene.system, scene.state0, formulation=formulation)
     t1 = MOTION[key][0]
     if key == "four_bar_1":
-        return np.asarray(found.accelerations.v_rate), problems.chain(1).exact(t1)
+        exact = problems.chain(1).exact
+        assert exact is not None
+        return np.asarray(found.accelerations.v_rate), exact(t1)
     run = stm.simulate(scene, ts=[0.0, t1], rtol=1e-11, atol=1e-11, formulation=formulation)
     return np.asarray(found.accelerations.v_rate), np.asarray(run.states.r)[-1]
 

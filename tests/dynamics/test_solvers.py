@@ -228,7 +228,7 @@ def test_a_step_cut_short_by_an_output_time_is_remembered():
 def test_a_step_that_the_projection_moves_far_is_not_kept():
     """Beyond t = 0.5 "projection" throws the state to 1e8: no such state is ever the last."""
     none = jnp.zeros(())
-    residuals = Residuals(none, none, none)
+    residuals = Residuals(*(none,) * 5)
 
     def project(t, y, args):
         return jnp.where(t > 0.5, 1e8 + y, y), residuals
@@ -237,7 +237,7 @@ def test_a_step_that_the_projection_moves_far_is_not_kept():
     solver = Stabilised(
         diffrax.Dopri8(), project, lambda t, y, args: residuals, lambda t, y, args: args, far
     )
-    controller = Remembering(
+    controller = Remembering(  # pyright: ignore[reportCallIssue]
         controller=diffrax.PIDController(rtol=1e-8, atol=1e-8, norm=error_norm(1)),
         step=jnp.asarray(0.01),
     )
@@ -253,6 +253,8 @@ def test_a_step_that_the_projection_moves_far_is_not_kept():
         throw=False,
     )
     assert found.result == diffrax.RESULTS.dt_min_reached
+    assert found.ts is not None
+    assert found.ys is not None
     assert float(found.ts[-1]) == pytest.approx(0.5, abs=1e-9)
     assert float(found.ys[-1, 0]) == pytest.approx(np.exp(-0.5), rel=1e-7)
 

@@ -433,7 +433,7 @@ def test_changes_of_devices_give_the_same_files(tmp_path):
     path = tmp_path / "study.zarr"
     for devices, end in ((1, 40), (2, 80), (5, 140), (3, 200)):
         work = FlightWork(study, block=16, lanes=8, devices=devices)
-        work.__dict__["_compiled"] = first._compiled
+        vars(work)["_compiled"] = first._compiled  # pyright: ignore[reportIndexIssue]
 
         def stop(now: Standing, end: int = end) -> None:
             if end <= now.done < now.total:

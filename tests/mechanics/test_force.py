@@ -294,7 +294,7 @@ def test_a_damper_where_its_ends_meet(length):
     for t in (-1e-3, 0.0, 1e-3):
         force, potential, power = at(t)
         np.testing.assert_allclose(force, 3 * v, rtol=1e-14)
-        np.testing.assert_allclose([potential, power], [0, -3 * v @ v], atol=1e-13)
+        np.testing.assert_allclose([potential, power], [0.0, float(-3 * v @ v)], atol=1e-13)
     if length == 0:
         J = np.asarray(ahead(jnp.zeros(6), 0.0, 3.0))
         np.testing.assert_allclose(J, np.hstack([50 * np.eye(3), 3 * np.eye(3)]))
@@ -403,7 +403,7 @@ class Crooked(AbstractForce):
     def joint_names(self):
         return ()
 
-    def load(self, t, kin):
+    def load(self, t, kin):  # pyright: ignore[reportIncompatibleMethodOverride]
         if not self.rows:
             return None
         force = jnp.zeros((self.rows, 3))

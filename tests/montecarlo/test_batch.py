@@ -95,7 +95,7 @@ def test_any_number_of_devices_gives_the_same_numbers(turning, devices):
     """Threads share one program: it is that of one device, and not compiled again."""
     work, whole = turning
     shared = FlightWork(work.study, block=work._block, lanes=work.lanes, devices=devices)
-    shared.__dict__["_compiled"] = work._compiled
+    vars(shared)["_compiled"] = work._compiled  # pyright: ignore[reportIndexIssue]
     assert len(shared._places) == devices
     found = shared.run(0, 32)
     for name, values in whole.items():

@@ -75,7 +75,7 @@ def test_the_dependent_row_costs_no_steps_and_no_energy(run: sj.Run) -> None:
     assert run.successful
     assert run.certificate.accepted_steps + run.certificate.rejected_steps <= 300
     assert run.certificate.energy_error <= 1e-7
-    assert run.certificate.position_residual <= 1e-12
+    assert run.certificate.position_violation <= 1e-12
 
 
 def test_it_moves_as_without_the_dependent_row(run: sj.Run, twin: sj.Run) -> None:
