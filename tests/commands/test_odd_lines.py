@@ -65,8 +65,7 @@ def stubbed(monkeypatch):
         monkeypatch.setattr(module, name, stop)
     monkeypatch.setattr("stmuav_jax.study.heading.best_heading", stop)
     monkeypatch.setattr("stmuav_jax.study.day.track_day", stop)
-    for name in ("_configure", "_use_devices"):
-        monkeypatch.setattr(cli, name, lambda _: None)
+    monkeypatch.setattr(cli, "_configure", lambda _: None)
     return reached
 
 
