@@ -75,7 +75,7 @@ class Method(eqx.Module):
         steps: what their lengths are safe for. "sensitivities", the default: beside the error
             estimate of the state, the modes of the linearised motion bound them, so that
             derivatives by the start and by constant numbers are as accurate at rest as in
-            motion; see `modes`. Five to ten per cent more to compute in ordinary motion. "state": the
+            motion; see `modes`. It takes more right-hand sides, eleven every twelve steps. "state": the
             error estimate alone, for runs that nobody differentiates.
         max_step: no step is longer [s]. It is what makes derivatives safe by inputs that are zero
             in the run itself but would vary faster than the system does.
