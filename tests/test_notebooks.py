@@ -21,9 +21,7 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 # Notebooks whose stored outputs are not those of the present package, with the reason. A notebook
 # that is executed again has to be taken out.
-STALE: dict[str, str] = {
-    "01_first_flight": "Executed before the present default formulation: 457 steps, now 606.",
-}
+STALE: dict[str, str] = {}
 
 # Figures of a run repeat to this (relative), and one unit of the last digit that is printed.
 REPEATS = 1e-3
