@@ -47,9 +47,7 @@ def test_bouncing_ball():
         expected = np.sqrt(2 / PULL) * (1 + 2 * sum(0.8**k for k in range(1, bounce + 1)))
         assert abs(float(t) - expected) < 1e-9, bounce
     # another threshold, and an event that stops being a number
-    lost = fall(
-        jnp.zeros(()), jnp.ones(()), jnp.zeros(()), Plane(jnp.asarray(-1.0), jnp.asarray(0.3))
-    )
+    lost = fall(jnp.zeros(()), jnp.ones(()), jnp.zeros(()), plane(-1.0, 0.3))
     assert lost.result == diffrax.RESULTS.nonfinite
     assert 0.3 < float(lost.ts[-1]) < 3.0
     assert np.isnan(lost.states.r[-1, 0, 2])
