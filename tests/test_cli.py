@@ -96,7 +96,7 @@ def test_parameters_and_solver_reach_the_run(tmp_path):
         (("tracker", "--t1", "-1"), "end of the time span must be above 0"),
         (("tracker", "--rtol", "0"), "relative tolerance must be above 0"),
         (("tracker", "--actuators", "printed"), "tracker has no actuators"),
-        (("tracker", "--params", "/none.toml"), "There is no file /none.toml"),
+        (("tracker", "--params", "/none.toml"), "There is no file '/none.toml'"),
         (("hexacopter", "--loads"), "hexacopter has none"),
     ],
 )
@@ -295,7 +295,7 @@ def test_estimate_hovers(tmp_path, capsys):
         (("--case", "1", "--seeds", "0"), "number of runs must lie within 1 and 100000"),
         (("--case", "1", "--t1", "0"), "must be above 0 and at most 100000 s"),
         (("--case", "1", "--t1", "1e-4"), "between one step of 0.001 s"),
-        (("--params", "/none.toml"), "There is no file /none.toml"),
+        (("--params", "/none.toml"), "There is no file '/none.toml'"),
         (("--hover", "--model", "printed"), "a model of its own"),
     ],
 )

@@ -70,7 +70,7 @@ def texts(cell: nbformat.NotebookNode) -> str:
     for output in cell.outputs:
         if output.output_type == "stream" and output.name == "stdout":
             parts.append(output.text)
-        elif "data" in output:
+        elif "data" in output and "image/png" not in output.data:
             parts.append(output.data.get("text/plain", ""))
     return "\n".join(parts)
 
