@@ -141,6 +141,8 @@ def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
             Path(name).unlink(missing_ok=True)
             raise
     except OSError as error:
+        if error.errno is None:
+            raise
         # a disk that is full does not say of which file
         raise OSError(error.errno, error.strerror, str(target)) from error
     return target

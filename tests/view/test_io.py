@@ -149,8 +149,8 @@ def test_parameters_from_toml(tmp_path):
     [
         ("[mass\n", FileError, "not a readable TOML"),
         ("[mass]\npanel_9 = 1.0\n", ModelError, r"mine\.toml.*mass\.panel_9"),
-        ('[mass]\npanel_7 = {value = 890, unit = "g"}\n', ModelError, "given in kg, not in g"),
-        ("[mass]\npanel_7 = {value = 1.0, units = 2}\n", ModelError, "unknown entries: units"),
+        ('[mass]\npanel_7 = {value = 890, unit = "g"}\n', ModelError, "given in kg, not in .g."),
+        ("[mass]\npanel_7 = {value = 1.0, units = 2}\n", ModelError, "no entry .units."),
         ("[mass]\npanel_7 = nan\n", ModelError, "finite"),
     ],
 )
