@@ -302,13 +302,13 @@ import sys
 sys.path.insert(0, {tests!r})
 from jobs.toy import Toy
 from stmuav_jax.jobs.local import run_study
+import time
 class Deaf(Toy):
     def run(self, first, count):
         if first == 20:
             # as in a callback of a library: the first exception is printed and forgotten
-            print("deaf", flush=True)
             try:
-                import time
+                print("deaf", flush=True)
                 time.sleep(30)
             except KeyboardInterrupt:
                 print("lost", flush=True)
