@@ -10,6 +10,17 @@ from pathlib import Path
 # tests run side by side; small factorisations lose time to threads that wait for each other
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Most programs here run once, and compiling is nearly all that the tests wait for. Those that the
+# package compiles itself have the options of `compiler_options` as everywhere; these are for the
+# rest, which would otherwise take three times as long.
+QUICK = {
+    "xla_backend_optimization_level": "0",
+    "xla_llvm_disable_expensive_passes": "true",
+    "xla_cpu_use_fusion_emitters": "false",
+}
+given = os.environ.get("XLA_FLAGS", "")
+os.environ["XLA_FLAGS"] = " ".join([*(f"--{k}={v}" for k, v in QUICK.items()), given]).strip()
+
 import jax
 import numpy as np
 import pytest
@@ -30,6 +41,9 @@ jax.config.update("jax_compilation_cache_dir", str(CACHE / "stmuav_jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 install_import_hook("stmuav_jax", "beartype.beartype")
+
+# Looking for cycles among all that JAX keeps takes a twentieth of the time.
+gc.set_threshold(20_000, 20, 100)
 
 # Linux gives a process 65,530 memory maps, and a compiled program takes some twenty for as long as
 # it is kept: without this a worker dies after a thousand tests.
