@@ -9,14 +9,16 @@ stage to the first,
 Accepted steps are kept with their slopes, so nothing is done again but the right-hand side that
 each derivative starts from, and rejected steps cost nothing. Where there are more step attempts
 than are kept, a landing goes by windows: the start of each is kept with what step control
-remembers there, and the steps of the last. On the way back a window before it is done again from
-its start to the start of the next, so that what differs by round-off does not add up. Step sizes
-count as given: by the end and the start of an integration it is differentiated as the flow is.
+remembers there, the times of all steps, and the steps of the last. On the way back the steps of a
+window before it are done again from its start, at the times kept, so that what differs by round-off
+does not add up. Step sizes count as given: by the end and the start of an integration it is
+differentiated as the flow is.
 
 Source: E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006), ch. VI.10.2
 (adjoint equations of Runge-Kutta methods).
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import diffrax
@@ -87,12 +89,14 @@ class _Windows(NamedTuple):
     """A landing by windows of at most n step attempts each.
 
     Attributes:
-        number: of windows. starts: what each starts from (windows, .): time, y, memory of the
-            solver and of the step control. last: the steps of the last one.
+        number: of windows. starts: y at the start of each (windows, k). taken: accepted steps of
+            each (windows,). ts: their times (windows, n + 1). last: the steps of the last one.
     """
 
     number: Int[Array, ""]
-    starts: Any
+    starts: Float[Array, "w k"]
+    taken: Int[Array, " w"]
+    ts: Float[Array, "w n+1"]
     last: _Steps
 
 
@@ -122,24 +126,26 @@ def _forward(
     most = min(-(-problem.method.max_steps // kept), WINDOWS)
     begin = (carry.t, carry.y, carry.solver_state, carry.controller_state)
     none = jnp.zeros((), int)
-    starts = jax.tree.map(lambda x: jnp.zeros((most, *jnp.shape(x)), jnp.result_type(x)), begin)
     _, steps = eqx.filter_eval_shape(_window, problem, begin, start.t1, kept)
     empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), steps)
+    of_each = lambda x: jnp.zeros((most, *x.shape), x.dtype)
+    rows = (of_each(carry.y), of_each(empty.taken), of_each(empty.ts))
 
     def unfinished(at: tuple[Any, ...]) -> Any:
-        number, _, _, result, _, _ = at
+        number, _, _, result, *_ = at
         return (number == 0) | ((result == _MORE) & (number < most))
 
     def window(at: tuple[Any, ...]) -> tuple[Any, ...]:
-        number, now, starts, _, counts, _ = at
-        starts = jax.tree.map(lambda rows, x: rows.at[number].set(x), starts, now)
+        number, now, rows, _, counts, _ = at
         end, steps = _window(problem, now, start.t1, kept)
+        new = (now[1], steps.taken, steps.ts)
+        rows = jax.tree.map(lambda rows, x: rows.at[number].set(x), rows, new)
         counts = (counts[0] + end.accepted, counts[1] + end.rejected)
         now = (end.t, end.y, end.solver_state, end.controller_state)
-        return number + 1, now, starts, end.result, counts, steps
+        return number + 1, now, rows, end.result, counts, steps
 
-    state = (none, begin, starts, diffrax.RESULTS.successful, (none, none), empty)
-    count, (t, y, solver_state, controller_state), starts, result, counts, last = (
+    state = (none, begin, rows, diffrax.RESULTS.successful, (none, none), empty)
+    count, (t, y, solver_state, controller_state), rows, result, counts, last = (
         jax.lax.while_loop(unfinished, window, state)
     )
     over = counts[0] + counts[1] > problem.method.max_steps
@@ -149,7 +155,7 @@ def _forward(
     if most * kept < problem.method.max_steps:
         # derivatives of part of the way would be wrong: not a number says so
         end = end._replace(y=jnp.where(result == _MORE, jnp.nan, y))
-    return end, _Windows(count, starts, last._replace(end=end.y))
+    return end, _Windows(count, *rows, last._replace(end=end.y))
 
 
 def _window(
@@ -165,6 +171,25 @@ def _window(
     inner = found.infos["inner"]
     end = landing(solution)
     return end, _Steps(end.accepted, found.ts, inner["y0"], inner["slopes"], end.y)
+
+
+def _again(problem: Problem, windows: _Windows, number: Any) -> _Steps:
+    """The steps of a window that was followed by another, done again."""
+    # their lengths and that they are kept is known: no bounds, no rejection
+    solver = dataclasses.replace(problem.solver(), far=None, guard=None)
+    term, ts = diffrax.ODETerm(problem.field), windows.ts[number]
+    memory = solver.init(term, ts[0], ts[1], windows.starts[number], problem.model)
+
+    def step(at: tuple[Any, ...]) -> tuple[Any, ...]:
+        i, y, ys, slopes = at
+        end, _, info, *_ = solver.step(term, ts[i], ts[i + 1], y, problem.model, memory, False)
+        return i + 1, end, ys.at[i].set(y), slopes.at[i].set(info["inner"]["slopes"])
+
+    taken, last = windows.taken[number], windows.last
+    rows = (jnp.zeros_like(last.ys), jnp.zeros_like(last.slopes))
+    begin = (jnp.zeros((), int), windows.starts[number], *rows)
+    _, end, ys, slopes = jax.lax.while_loop(lambda at: at[0] < taken, step, begin)
+    return _Steps(taken, ts, ys, slopes, end)
 
 
 @_recorded.def_bwd
@@ -185,17 +210,10 @@ def _backward(
     last = jnp.where(jnp.isnan(end), jnp.nan, last)
     whole = eqx.tree_at(lambda p: p.model, problem, start.model, is_leaf=lambda x: x is None)
 
-    def again(number: Any) -> _Steps:
-        """The steps of a window that was followed by another, done again."""
-        begin, after = (
-            jax.tree.map(lambda rows, k=k: rows[number + k], windows.starts) for k in (0, 1)
-        )
-        return _window(whole, begin, after[0], kept)[1]
-
     def back_window(at: tuple[Any, ...]) -> tuple[Any, ...]:
         number, by_end, by_model = at
         final = number == windows.number - 1
-        steps = jax.lax.cond(final, lambda: windows.last, lambda: again(number))
+        steps = jax.lax.cond(final, lambda: windows.last, lambda: _again(whole, windows, number))
 
         def back(at: tuple[Any, ...]) -> tuple[Any, ...]:
             i, by_end, by_model = at

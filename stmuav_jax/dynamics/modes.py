@@ -140,13 +140,19 @@ class Guard(eqx.Module):
         due = self.due(modes, h)
 
         def look() -> Modes:
-            base, away = field(t0, y0), self.away(y0)
+            away = self.away(y0)
 
-            def one(krylov: Krylov, j: Any) -> tuple[Krylov, None]:
-                change = (field(t0, y0 + away * krylov.basis[j]) - base) / away
-                return self.with_slope(krylov, j, change), None
+            # the slope at y0 itself first, in the same loop: one copy of the field to compile
+            def one(now: tuple[Krylov, Vector], j: Any) -> tuple[tuple[Krylov, Vector], None]:
+                krylov, base = now
+                first, j = j < 0, jnp.maximum(j, 0)
+                slope = field(t0, y0 + jnp.where(first, 0.0, away) * krylov.basis[j])
+                more = self.with_slope(krylov, j, (slope - base) / away)
+                kept = jax.tree.map(lambda a, b: jnp.where(first, a, b), krylov, more)
+                return (kept, jnp.where(first, slope, base)), None
 
-            krylov, _ = jax.lax.scan(one, self.first(y0), jnp.arange(self.directions))
+            begin = (self.first(y0), jnp.zeros_like(y0))
+            (krylov, _), _ = jax.lax.scan(one, begin, jnp.arange(-1, self.directions))
             return self.found(krylov, modes, t0)
 
         now = jax.lax.cond(eqxi.unvmap_any(due), look, lambda: modes)
