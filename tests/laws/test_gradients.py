@@ -58,7 +58,9 @@ def flight(values, adjoint, solver, tolerance):
     arms = scene.state0.r - scene.state0.r[0]
     turned = jax.vmap(lambda p: sj.rotation_matrix(p).T @ omega)(scene.state0.p)
     state = scene.state0
-    start = sj.State(state.r, state.p, state.v + v + jnp.cross(omega, arms), state.omega + turned)
+    moved = sj.State(state.r, state.p, state.v + v + jnp.cross(omega, arms), state.omega + turned)
+    # other joints need another start
+    start = sj.assemble(system, moved, throw=False).state
     method = sj.Method(solver=solver, rtol=tolerance, atol=tolerance, adjoint=adjoint)
     end = sj.integrate(system, start, jnp.array([0.0, END]), method).states
     return (
