@@ -46,13 +46,17 @@ install_import_hook("stmuav_jax", "beartype.beartype")
 gc.set_threshold(20_000, 20, 100)
 
 # Linux gives a process 65,530 memory maps, and a compiled program takes some twenty for as long as
-# it is kept: without this a worker dies after a thousand tests.
+# it is kept: without this a worker dies after a thousand tests. Memory is bounded likewise.
 MAPS, MOST_MAPS = Path("/proc/self/maps"), 20_000
+PAGES, MOST_BYTES = Path("/proc/self/statm"), 4e9
 
 
 def pytest_runtest_teardown() -> None:
     """Drop compiled programs when there are too many."""
-    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+    if not MAPS.exists():
+        return
+    used = int(PAGES.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    if used > MOST_BYTES or MAPS.read_bytes().count(b"\n") > MOST_MAPS:
         jax.clear_caches()
         gc.collect()
 

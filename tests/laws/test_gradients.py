@@ -91,6 +91,11 @@ def along(values, directions, h):
     return jax.tree.map(lambda v, d: v + h * d, values, directions)
 
 
+def compiled(function):
+    """For programs that run for longer than the tests' own options let them."""
+    return jax.jit(function, compiler_options=sj.compiler_options(quick=True))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "tolerance", "same", "apart"),
@@ -103,10 +108,10 @@ def test_forward_reverse_differences(solver, tolerance, same, apart):
     ways = directions(values)
     ahead = diffrax.ForwardMode()
     of = lambda v: flight(v, ahead, solver, tolerance)
-    run = jax.jit(jax.vmap(lambda d, h: of(along(values, d, h)), in_axes=(0, None)))
-    forward = jax.jit(jax.vmap(lambda d: jax.jvp(of, (values,), (d,))[1]))(ways)
+    run = compiled(jax.vmap(lambda d, h: of(along(values, d, h)), in_axes=(0, None)))
+    forward = compiled(jax.vmap(lambda d: jax.jvp(of, (values,), (d,))[1]))(ways)
     back = lambda v: flight(v, diffrax.RecursiveCheckpointAdjoint(), solver, tolerance)
-    gradient = jax.jit(jax.grad(back))(values)
+    gradient = compiled(jax.grad(back))(values)
     reverse = [
         sum(float(jnp.vdot(g, d[k])) for g, d in zip(*map(jax.tree.leaves, (gradient, ways)), strict=True))
         for k in range(len(GROUPS))
