@@ -1,5 +1,7 @@
 """Trim and linearisation with motors: their limits, their lag, the rotors' momentum."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,11 +74,12 @@ def test_limits_of_the_motors_are_kept():
 
 
 @pytest.fixture(scope="module")
-def pair(flyer):
-    """Linearised at hover, with motors and without."""
-    found = trim(flyer, hover(START))
+def pair():
+    """Linearised at hover, with motors of no inertia, whose lag is all that they add, and without."""
+    lagging = uav_flyer(motor=replace(MOTOR, inertia=0.0))
+    found = trim(lagging, hover(START))
     plain = linearize(uav_flyer(), found.coordinates, found.inputs)
-    return linearize(flyer, found.coordinates, found.inputs), plain
+    return linearize(lagging, found.coordinates, found.inputs), plain
 
 
 def test_lag_has_states_of_its_own(pair):
