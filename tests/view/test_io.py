@@ -152,6 +152,10 @@ def test_parameters_from_toml(tmp_path):
         ('[mass]\npanel_7 = {value = 890, unit = "g"}\n', ModelError, "given in kg, not in .g."),
         ("[mass]\npanel_7 = {value = 1.0, units = 2}\n", ModelError, "no entry .units."),
         ("[mass]\npanel_7 = nan\n", ModelError, "finite"),
+        ("[mass]\npanel_7 = -1.0\n", ModelError, r"mine\.toml.*must be positive"),
+        ("[mass]\npanel_7 = " + "9" * 400 + "\n", ModelError, "must be numbers"),
+        ("[mass]\npanel_7 = " + "9" * 5000 + "\n", FileError, "not a readable TOML"),
+        ("x = " + "[" * 3000 + "]" * 3000, FileError, "nested too deeply"),
     ],
 )
 def test_bad_parameter_files(tmp_path, text, error, words):
@@ -161,3 +165,5 @@ def test_bad_parameter_files(tmp_path, text, error, words):
         load_parameters(path, PART_II)
     with pytest.raises(FileError, match="There is no file"):
         load_parameters(tmp_path / "none.toml", PART_II)
+    with pytest.raises(FileError, match="is no file but a folder or a pipe"):
+        load_parameters("", PART_II)
