@@ -1,6 +1,7 @@
 """`simulate`: bad settings and starts, failures on the way, and what a run holds."""
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -85,6 +86,14 @@ def test_a_system_from_a_state(run):
     later = simulated(ts=[1.0, 1.1])
     assert (later.scene.t0, later.certificate.t_end) == (1.0, 1.1)
     assert len(simulated(t1=0.4).ts) == 101
+
+
+def test_a_traced_start_is_refused_by_the_name_of_what_serves():
+    """Not as an array that JAX cannot convert."""
+    height = lambda angle: simulated(state=swung(SYSTEM, angle, 0.5), t1=0.1).states.r[-1, 0, 2]
+    for through in (jax.grad, jax.jit, lambda f: lambda x: jax.vmap(f)(jnp.asarray([x]))):
+        with pytest.raises(sj.SettingError, match="Use stmuav_jax.integrate"):
+            through(height)(1.0)
 
 
 # --- starts
