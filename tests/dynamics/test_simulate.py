@@ -92,7 +92,7 @@ def test_a_traced_start_is_refused_by_the_name_of_what_serves():
     """Not as an array that JAX cannot convert."""
     height = lambda angle: simulated(state=swung(SYSTEM, angle, 0.5), t1=0.1).states.r[-1, 0, 2]
     for through in (jax.grad, jax.jit, lambda f: lambda x: jax.vmap(f)(jnp.asarray([x]))):
-        with pytest.raises(sj.SettingError, match="Use stmuav_jax.integrate"):
+        with pytest.raises(sj.SettingError, match=r"Use stmuav_jax\.integrate"):
             through(height)(1.0)
 
 
