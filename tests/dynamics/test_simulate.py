@@ -310,6 +310,18 @@ def test_an_event_ends_a_run():
     assert np.all(np.diff(run.ts) > 0)
 
 
+@pytest.mark.slow
+def test_an_event_that_is_no_number_is_named():
+    """With a direction, and a jump before it; what was reached is kept."""
+    lost = lambda t, state: jnp.where(t > 0.11, jnp.nan, -1.0)
+    with pytest.raises(sj.SimulationError, match="value of its event is not a number") as error:
+        sj.simulate(SCENE, event=lost, direction=True, jump_ts=[0.05], error_estimate=False)
+    run = error.value.run
+    assert isinstance(run, sj.Run)
+    assert 0.1 <= run.certificate.t_end < 0.4
+    assert np.all(np.isfinite(run.states.r[:5]))
+
+
 def test_a_span_of_no_length_gives_the_start():
     run = sj.simulate(SCENE, t1=0.0)
     assert run.successful

@@ -1,6 +1,7 @@
 """Results on disk: labelled, whole or absent, and never another program's file."""
 
 import dataclasses
+import errno
 import json
 
 import numpy as np
@@ -123,6 +124,18 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
+    """The operating system does not, where a write fails."""
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("stmuav_jax.view.io.os.fsync", full)
+    with pytest.raises(OSError, match=r"No space left on device.*run\.nc"):
+        write_atomically(tmp_path / "run.nc", b"new")
+    assert not list(tmp_path.iterdir())
 
 
 def test_certificate_as_json(short_run, tmp_path):
