@@ -29,7 +29,7 @@ def run(*arguments):
 def test_list_names_every_scene_and_case(capsys):
     assert run("list") == 0
     out = capsys.readouterr().out
-    for words in ("spin", "uav_tracker", "1, 2, 3", "Part II, 5.1"):
+    for words in ("spin", "uav_tracker", "1, 2, 3", "Part II, 5.1", "end [s]"):
         assert words in out
 
 

@@ -226,7 +226,8 @@ def identify(
     Raises:
         IdentifiabilityError: the record leaves a direction open; names it.
         ModelError: a record that is not finite or of another form than the predictions.
-        SettingError: deviations or sizes that are not positive.
+        SettingError: deviations or sizes that are not positive, or a start whose predictions, or
+            their derivatives, are not finite.
     """
     if isinstance(start, Mapping):
         labels, start = tuple(start), list(start.values())
@@ -235,7 +236,9 @@ def identify(
     _check(predict, record, sigma, q0, sizes, names)
     numbers = (jnp.asarray(x, dtype=float) for x in (record, sigma, q0, sizes))
     residuals = Misfit(predict, *numbers)
-    check_identifiable(np.asarray(_at(residuals, jnp.zeros_like(q0))[1]), names, weakest)
+    r, J = (np.asarray(x) for x in _at(residuals, jnp.zeros_like(q0)))
+    _check_start(r, J, q0, names)
+    check_identifiable(J, names, weakest)
     return _fitted(residuals, names, weakest, steps, report, resume)
 
 
@@ -289,6 +292,18 @@ def _fitted(
     values = np.asarray(residuals.start + scale * found.values)
     deviations = np.sqrt(np.diag(covariance))
     return Identified(names, values, covariance, deviations, strengths, misfit, found)
+
+
+def _check_start(r: np.ndarray, J: np.ndarray, q0: Array, names: Sequence[str]) -> None:
+    """Refuse a start that cannot be flown: its derivatives say nothing about the record."""
+    if np.all(np.isfinite(r)) and np.all(np.isfinite(J)):
+        return
+    what = "predictions" if not np.all(np.isfinite(r)) else "derivatives of the predictions"
+    values = ", ".join(f"{name} = {float(q):g}" for name, q in zip(names, q0, strict=True))
+    raise SettingError(
+        f"The {what} at the start of the search are not finite: the model cannot be evaluated with "
+        f"{values}. Start from values that it can have."
+    )
 
 
 def _numbered(count: int) -> tuple[str, ...]:

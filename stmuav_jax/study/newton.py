@@ -4,9 +4,11 @@ Residuals and Jacobian at the solution stay in its state: who wants them (a cond
 what is left) needs no second copy of the equations, which would double what is compiled.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import optimistix as optx
@@ -84,3 +86,41 @@ class Newton(optx.AbstractRootFinder):
     ) -> tuple[Any, Any, dict[str, Any]]:
         del fn, args, options, state, tags, result
         return y, aux, {}
+
+
+class Implicit(optx.AbstractAdjoint):
+    """Derivatives of a root by the implicit function, dy = -(dr/dy)^-1 dr: in both modes, of any order.
+
+    `optimistix.ImplicitAdjoint` looks at its linear solution by a host callback, and JAX keeps no
+    program with callbacks in its compilation cache: it would be compiled again by every process.
+    Here a singular Jacobian gives numbers that are not finite.
+    """
+
+    def apply(self, primal_fn: Any, rewrite_fn: Any, inputs: Any, tags: Any) -> Any:
+        del tags
+        inputs = (*inputs, partial(eqxi.while_loop, kind="lax"))
+        root, rest = _rooted(primal_fn, rewrite_fn, inputs)
+        return root, jax.tree.map(eqxi.nondifferentiable_backward, rest)
+
+
+@eqx.filter_custom_jvp
+def _rooted(primal_fn: Any, rewrite_fn: Any, inputs: Any) -> Any:
+    del rewrite_fn
+    return jax.tree.map(jnp.asarray, primal_fn(inputs))
+
+
+@_rooted.def_jvp
+def _rooted_jvp(primals: Any, tangents: Any) -> Any:
+    primal_fn, rewrite_fn, inputs = primals
+    moved = tangents[2]
+    none = jax.tree.map(lambda x: x is None, moved, is_leaf=lambda x: x is None)
+    still, varied = eqx.partition(inputs, none, is_leaf=lambda x: x is None)
+    # by `_rooted` again, so that this has derivatives too
+    root, rest = _rooted(primal_fn, rewrite_fn, inputs)
+    of = lambda y, given: rewrite_fn(y, rest, eqx.combine(given, still))
+    rate = jax.jvp(lambda given: of(root, given), (varied,), (moved,))[1]
+    J = jax.jacfwd(lambda y: of(y, varied))(root)
+    zeros = jax.tree.map(
+        lambda x: jax.custom_derivatives.zero_from_primal(x, symbolic_zeros=True), rest
+    )
+    return (root, rest), (-jnp.linalg.solve(J, rate), zeros)

@@ -43,7 +43,7 @@ from ..vehicle.motor import MotorRotors
 from ..vehicle.placement import turn_about
 from ..vehicle.pointing import why_outside
 from ..vehicle.workspace import Limits, measure, reasons, survey
-from .newton import Newton
+from .newton import Implicit, Newton
 from .steady import Wanted
 from .steady import climb as climb
 from .steady import cruise as cruise
@@ -255,6 +255,7 @@ def _found(setting: _Setting, limits: TrimLimits) -> Trim:
         Newton(atol=0.1 * TOLERANCE),
         start,
         args=setting,
+        adjoint=Implicit(),
         max_steps=_MOST_STEPS,
         throw=False,
     )

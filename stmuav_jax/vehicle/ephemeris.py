@@ -47,6 +47,8 @@ _PERTURBATIONS = np.array([
 _OBLIQUITY = 4.089567e-1  # [rad], of 2060
 _PARALLAX = 4.26e-5  # earth's radius over its distance from the sun [rad]
 
+ALTITUDES = (-500.0, 100_000.0)  # of places [m]
+
 # The sun's upper edge at the horizon, through air [rad]: below it, refraction is left out.
 _SUNSET = -math.radians(0.26667 + 0.5667)
 _ZENITH = 1e-12  # squared sine of the zenith angle below which refraction is linear in it
@@ -62,8 +64,8 @@ class Place(eqx.Module):
 
     Raises:
         SettingError: a single place with a latitude beyond a quarter turn, a longitude beyond
-            a full turn, or a number that is not finite. In arrays such places get a reason
-            code from `sun_position`.
+            a full turn, an altitude outside -500 m to 100 km, or a number that is not finite. In
+            arrays a latitude or a number of this kind gets a reason code from `sun_position`.
     """
 
     latitude: Float[Array, "*#s"]
@@ -91,6 +93,13 @@ def _check_place(place: Place) -> None:
     check_finite(place.latitude, "The latitude", "rad", SettingError)
     check_finite(place.longitude, "The longitude", "rad", SettingError)
     check_finite(place.altitude, "The altitude", "m", SettingError)
+    low, high = ALTITUDES
+    outside = (np.asarray(place.altitude) < low) | (np.asarray(place.altitude) > high)
+    if np.any(outside):
+        altitude = float(np.asarray(place.altitude)[outside].flat[0])
+        raise SettingError(
+            f"The altitude must lie within {low:g} and {high:g} m, but it is {altitude:g} m."
+        )
     latitude = math.degrees(float(place.latitude))
     # a last bit is allowed, for 90 degrees converted in float32
     if abs(latitude) > 90.0 + 1e-5:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from ..algebra.shapes import Numbers
 from ..algebra.stacked import apply
 from ..mechanics.errors import ModelError, check_finite
-from ..mechanics.load import AbstractForce, Load, Signal, evaluate, push, signal
+from ..mechanics.load import AbstractForce, Load, Signal, evaluate, nonnegative, push, signal
 from ..mechanics.state import Kinematics
 
 
@@ -24,6 +24,10 @@ class Rotors(AbstractForce):
         spin: +1 or -1 for every rotor (k,); u = omega^2 has lost the sign.
         k_f: [N s^2/rad^2]. k_tau: [N m s^2/rad^2].
         speed_squared: u (k,) [rad^2/s^2], or a function of (t, kinematics).
+
+    Raises:
+        ModelError: a number that is not finite, a coefficient below zero (the sense of turning is
+            `spin`'s), or another number of arms than of rotors.
 
     Source: report Part II, Eq. 4.4, 4.6, 4.24, corrected (no gravity in f).
     """
@@ -48,8 +52,9 @@ class Rotors(AbstractForce):
         self.body = body
         self.arms = jnp.asarray(arms, dtype=float)
         self.spin = jnp.asarray(spin, dtype=float)
-        self.k_f = jnp.asarray(k_f, dtype=float)
-        self.k_tau = jnp.asarray(k_tau, dtype=float)
+        of = f"of the rotors of body '{body}'"
+        self.k_f = nonnegative(k_f, f"The thrust coefficient k_f {of}", "N s^2/rad^2")
+        self.k_tau = nonnegative(k_tau, f"The torque coefficient k_tau {of}", "N m s^2/rad^2")
         count = self.spin.shape[0]
         what = f"The squared rotor speeds of body '{body}'"
         self.speed_squared = signal(speed_squared, what, (count,), "rad^2/s^2")
@@ -58,8 +63,7 @@ class Rotors(AbstractForce):
                 f"The rotors of body '{body}' need one arm (3,) per spin sign, but arms has shape "
                 f"{self.arms.shape} and spin {self.spin.shape}."
             )
-        for value, what in ((self.arms, "arms"), (self.k_f, "k_f"), (self.k_tau, "k_tau")):
-            check_finite(value, f"{what} of the rotors of body '{body}'", "")
+        check_finite(self.arms, f"The arms {of}", "m")
 
     def bodies(self) -> tuple[str, ...]:
         return (self.body,)

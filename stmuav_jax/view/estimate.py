@@ -37,8 +37,9 @@ def summary_table(summaries: Iterable[Summary]) -> Table:
     rows = list(summaries)
     title = f"Centre of mass: convergence, errors, consistency ({rows[0].seeds} seeds)"
     table = Table(title=title, title_justify="left", padding=(0, 0, 0, 1))
+    # in a narrow terminal numbers go over two lines and no word is cut
     for name in ("case", "tuning"):
-        table.add_column(name)
+        table.add_column(name, no_wrap=True)
     for name in ("to 2 cm\n[s]", "to 5 mm\n[s]", "RMSE x, y\n[mm]", "NEES\n(2)", "NEES\n(5)",
                  "NIS\n(3)", "flag-\nged"):  # fmt: skip
         table.add_column(Text(name), justify="right")
@@ -78,7 +79,7 @@ def _mean(value: float, window: tuple[float, float]) -> str:
 def hover_table(flights: dict[str, Hover]) -> Table:
     """How hovers went, by tuning: largest tilt and distance, errors, consistency at the end."""
     table = Table(title="Hover by a controller that sees the estimate", title_justify="left")
-    table.add_column("tuning")
+    table.add_column("tuning", no_wrap=True)
     for name in ("largest tilt\n[degrees]", "furthest\n[m]", "to 2 cm\n[s]", "RMSE x, y\n[mm]",
                  "NEES\n(2)", "NEES\n(14)", "failed"):  # fmt: skip
         table.add_column(Text(name), justify="right")

@@ -3,8 +3,10 @@
 import math
 
 from rich.table import Table
+from rich.text import Text
 
 from ..dynamics.run import Run
+from .terminal import row
 
 # Estimates below this, of motions of some metres, are differences of round-off.
 _ROUND_OFF = 1e-14
@@ -65,9 +67,10 @@ def certificate_rows(run: Run) -> list[tuple[str, str]]:
 
 def certificate_table(run: Run) -> Table:
     """The certificate as a table for the terminal."""
-    table = Table(title=run.scene.title, show_header=False, title_justify="left")
+    # names of bodies and joints are taken as they are: brackets in them are no markup
+    table = Table(title=Text(run.scene.title), show_header=False, title_justify="left")
     table.add_column(style="bold")
     table.add_column()
-    for row in certificate_rows(run):
-        table.add_row(*row)
+    for cells in certificate_rows(run):
+        row(table, *cells)
     return table

@@ -123,6 +123,35 @@ def test_one_boundary(error, code, words, monkeypatch, capsys, tmp_path):
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        ("trim --speed 1e10", "speed must lie within"),
+        ("trim --climb -1e300", "speed must lie within"),
+        ("trim --force nan", "limit of the force must be finite"),
+        ("trim --by", "--by needs at least one name"),
+        ("estimate --seed -1", "seed must lie within 0"),
+        (f"estimate --seed {'9' * 26}", "seed must lie within 0"),
+        ("estimate --seeds 10000000000", "number of runs must lie within 1"),
+        ("tune hold --segments 0", "number of segments must lie within 1"),
+        ("tune hold --segments 1000000000", "number of segments must lie within 1"),
+        ("tune hold --t1 nan", "end of the time span must be finite"),
+        ("tune slew --reaction -5", "limit of the force must be above 0"),
+        (f"simulate spin --max-steps {'9' * 23}", "max"),
+        ("simulate spin --save-every 5e-324", "save"),
+        ("montecarlo collapse --samples 0", "number of samples must lie within 1"),
+        ("sun --lat 0 --lon 0 --date 2024-03-21 --turbidity 1e300", "turbidity must lie within 1"),
+        ("sun --lat 0 --lon 0 --date 2024-03-21 --attitude-error 1e300 0 0", "must lie within"),
+    ],
+)
+def test_what_was_once_taken_in_silence_or_broke(words, what, stubbed, capsys, monkeypatch):
+    """One line of an independent verification each: refused before anything is computed."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    assert cli.main(words.split()) == 2
+    assert what in capsys.readouterr().err
+    assert not stubbed
+
+
 def test_words_of_a_range():
     number = Number("speed", "m/s", -1.0, 2.0)
     with pytest.raises(SettingError, match=r"speed must lie within -1 and 2 m/s, but it is 3 m/s"):

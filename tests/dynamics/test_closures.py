@@ -5,8 +5,10 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+import stmuav_jax as sj
 from stmuav_jax.dynamics.closures import Closure, opened
 
 
@@ -70,6 +72,25 @@ def of_itself(a):
 def test_differentiated(make):
     value, slope = jax.jit(jax.value_and_grad(lambda a: applied(opened(make(a)), 3.0)))(2.0)
     assert (float(value), float(slope)) == (6.0, 3.0)
+
+
+def test_a_force_written_as_a_lambda():
+    """x(t) of 2 kg on a rail under a sin 3 t, and its derivative by a; as a user writes it."""
+    body = sj.Body("m", 2.0, (1e-3,) * 3)
+    rail = sj.translational("h", "ground", "m", point=(0, 0, 0), axis=(1, 0, 0))
+
+    def end(a):
+        push = sj.AppliedForce("m", lambda t, kin: jnp.stack([a * jnp.sin(3 * t), 0.0, 0.0]))
+        system = sj.System([body], [rail], [push])
+        ts = jnp.array([0.0, 1.0])
+        return sj.integrate(system, system.reference, ts).states.r[-1, 0, 0]
+
+    value, slope = jax.jit(jax.value_and_grad(end))(1.5)
+    expected = (1.0 / 3 - np.sin(3.0) / 9) / 2
+    assert float(value) == pytest.approx(1.5 * expected, rel=1e-7)
+    assert float(slope) == pytest.approx(expected, rel=1e-7)
+    with pytest.raises(RuntimeError, match="take forward mode over reverse mode"):
+        jax.eval_shape(jax.grad(jax.grad(end)), 1.5)
 
 
 def test_nothing_to_open_stays_as_it_is():

@@ -1,6 +1,7 @@
 """`simulate`: bad settings and starts, failures on the way, and what a run holds."""
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -85,6 +86,14 @@ def test_a_system_from_a_state(run):
     later = simulated(ts=[1.0, 1.1])
     assert (later.scene.t0, later.certificate.t_end) == (1.0, 1.1)
     assert len(simulated(t1=0.4).ts) == 101
+
+
+def test_a_traced_start_is_refused_by_the_name_of_what_serves():
+    """Not as an array that JAX cannot convert."""
+    height = lambda angle: simulated(state=swung(SYSTEM, angle, 0.5), t1=0.1).states.r[-1, 0, 2]
+    for through in (jax.grad, jax.jit, lambda f: lambda x: jax.vmap(f)(jnp.asarray([x]))):
+        with pytest.raises(sj.SettingError, match=r"Use stmuav_jax\.integrate"):
+            through(height)(1.0)
 
 
 # --- starts
@@ -299,6 +308,18 @@ def test_an_event_ends_a_run():
     assert 0.11 <= run.certificate.t_end < 0.4
     assert run.ts[-1] == run.certificate.t_end
     assert np.all(np.diff(run.ts) > 0)
+
+
+@pytest.mark.slow
+def test_an_event_that_is_no_number_is_named():
+    """With a direction, and a jump before it; what was reached is kept."""
+    lost = lambda t, state: jnp.where(t > 0.11, jnp.nan, -1.0)
+    with pytest.raises(sj.SimulationError, match="value of its event is not a number") as error:
+        sj.simulate(SCENE, event=lost, direction=True, jump_ts=[0.05], error_estimate=False)
+    run = error.value.run
+    assert isinstance(run, sj.Run)
+    assert 0.1 <= run.certificate.t_end < 0.4
+    assert np.all(np.isfinite(run.states.r[:5]))
 
 
 def test_a_span_of_no_length_gives_the_start():

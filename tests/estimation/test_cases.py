@@ -30,6 +30,14 @@ def thrust_by_hand(case, t):
     }[case]
 
 
+def test_single_precision_runs_without_warnings():
+    """Warnings are errors here: JAX has one for every number that it must shorten."""
+    with jax.enable_x64(False):
+        record = simulate_case(4, seeds=2, t1=0.01)
+    assert record.y.dtype == np.float32
+    assert np.all(np.isfinite(record.y))
+
+
 @pytest.mark.parametrize("case", [4, 6])
 def test_truth_by_scipy(case):
     """Rates and attitude (rotation matrix here) after 0.2 s by DOP853, thrusts held."""

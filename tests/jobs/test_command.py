@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 from stmuav_jax.cli import main
+from stmuav_jax.jobs.progress import Outcome
 
 STUDY = """
 scene = "hexacopter"
@@ -90,6 +91,17 @@ def test_counts_are_not_defaults(study, tmp_path, name, value, capsys):
     assert main(["montecarlo", str(study), "--out", str(out), name, value]) == 2
     assert name.strip("-") in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_an_interrupted_study_has_its_exit_code(study, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    stopped = Outcome(out / "study.zarr", 10, 40, 10, 1.0, interrupted=True)
+    monkeypatch.setattr("stmuav_jax.commands.montecarlo._carried_out", lambda *_: stopped)
+    given = ["montecarlo", str(study), "--out", str(out), "--figures", "none", "--no-cache"]
+    assert main(given) == 130
+    said = " ".join(capsys.readouterr().out.split())
+    assert "keeps 10 of 40 samples" in said
+    assert "resume to go on" in said
 
 
 def test_errors_name_the_file(study, tmp_path, capsys):

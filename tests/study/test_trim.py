@@ -58,7 +58,7 @@ def start(many):
 
 
 def test_hover_speeds(many):
-    """The trimmed speeds at the initial posture, by an independent program (docs/geometry.md)."""
+    """The trimmed speeds at the initial posture, by a program written apart from this one."""
     angles, found = many
     expected = [1361.0, 1359.7, 1355.0, 1351.7, 1353.0, 1357.6]
     np.testing.assert_allclose(found.speeds[0], expected, atol=0.05)
@@ -289,6 +289,9 @@ def test_outputs_by_name(flyer, start):
     assert np.min(few.observability()) < 1e-6
     with pytest.raises(sj.SettingError, match="Did you mean 'omega_x'"):
         linearize(flyer, start.coordinates, start.inputs, outputs=["omega_xx"])
+    for none in ([], "omega_x", ["omega_x", 3]):
+        with pytest.raises(sj.SettingError, match=r"a list of names of states, such as .*, not "):
+            linearize(flyer, start.coordinates, start.inputs, outputs=none)
 
 
 def test_acceleration_upwards(flyer):

@@ -225,6 +225,12 @@ def test_records_refused():
         identify(line, np.ones((5, 1)), [0.0], [0.0], [1.0])
     with pytest.raises(sj.SettingError, match="1 positive sizes"):
         identify(line, np.ones((5, 1)), [0.1], [0.0], [-1.0])
+    # not as parameters that the record leaves open
+    heavy = lambda q: jnp.sqrt(q[0]) * jnp.ones((5, 1)) + q[1] * jnp.linspace(0, 1, 5)[:, None]
+    with pytest.raises(sj.SettingError, match=r"predictions at the start .* mass = -1, slope = 0"):
+        identify(heavy, np.ones((5, 1)), [0.1], {"mass": -1.0, "slope": 0.0}, [1.0, 1.0])
+    with pytest.raises(sj.SettingError, match="derivatives of the predictions at the start"):
+        identify(heavy, np.ones((5, 1)), [0.1], {"mass": 0.0, "slope": 0.0}, [1.0, 1.0])
     with pytest.raises(sj.ModelError, match="has no entry"):
         flight_model(
             uav_flyer, sj.PART_II, [Unknown("mass.panel_7", 0.1, ((0,),))], at_rest(START),

@@ -38,6 +38,11 @@ def test_replaced_keeps_units_and_says_who_gave_the_value():
         ({"mass.panel_7": (1.0, 2.0)}, r"shape \(\)"),
         ({"mass.panel_7": float("nan")}, "finite"),
         ({"mass.panel_7": "heavy"}, "numbers"),
+        ({"mass.panel_7": 0.0}, "is a mass and must be positive, but it is 0.0 kg"),
+        ({"mass.panel_7": -1.0}, "is a mass and must be positive"),
+        ({"mass.panel_7": 10**400}, "not a whole number of about 401 digits"),
+        ({"inertia.panel_7": -np.eye(3)}, "'inertia.panel_7' must be positive definite"),
+        ({"inertia.panel_7": np.diag([1.0, 1.0, 3.0])}, "triangle inequality"),
     ],
 )
 def test_bad_replacements_are_refused(values, words):

@@ -74,6 +74,17 @@ def test_rotors_need_one_arm_per_spin():
         )
 
 
+@pytest.mark.parametrize("name", ["k_f", "k_tau"])
+@pytest.mark.parametrize(("value", "words"), [(-6e-6, "not be negative"), (np.nan, "be finite")])
+def test_coefficients_below_zero_are_refused(name, value, words):
+    """Not as a rotor that would have to push downwards, where a trim is sought."""
+    given = {"k_f": 1.0, "k_tau": 1.0} | {name: value}
+    with pytest.raises(
+        ModelError, match=f"coefficient {name} of the rotors of body 'hull'.*{words}"
+    ):
+        Rotors("hull", arms=[[1.0, 0, 0]], spin=[1.0], speed_squared=[1.0], **given)
+
+
 def two_bodies():
     hull = Body("hull", 2.0, [0.1, 0.1, 0.1], free=True)
     slider = Body("slider", 0.2, [1e-4, 1e-4, 1e-4], position=(0.1, 0.02, 0.05), free=True)

@@ -207,11 +207,27 @@ def test_a_time_without_zone_is_refused():
         ((np.nan, 0.0), "latitude must be finite"),
         ((0.0, 400.0), "longitude must lie within"),
         ((0.0, 0.0, np.inf), "altitude must be finite"),
+        ((0.0, 0.0, 1e6), "altitude must lie within -500 and 100000 m, but it is 1e"),
     ],
 )
 def test_a_place_off_the_earth_is_refused(arguments, words):
     with pytest.raises(sj.SettingError, match=words):
         Place.degrees(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Air(np.nan), "air's pressure must be finite"),
+        (lambda: Air(-1.0), "pressure must not be below zero"),
+        (lambda: Air(1e5, 0.0), "temperature must be above"),
+        (lambda: Air.standard(1e5), "from -500 to 11000 m, not at 100000"),
+        (lambda: Air.standard(np.nan), "altitude must be finite"),
+    ],
+)
+def test_air_that_cannot_be_is_refused(make, words):
+    with pytest.raises(sj.SettingError, match=words):
+        make()
 
 
 def test_degrees_given_as_radians_are_refused_with_a_hint():

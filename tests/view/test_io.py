@@ -1,6 +1,7 @@
 """Results on disk: labelled, whole or absent, and never another program's file."""
 
 import dataclasses
+import errno
 import json
 
 import numpy as np
@@ -125,6 +126,18 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
+    """The operating system does not, where a write fails."""
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("stmuav_jax.view.io.os.fsync", full)
+    with pytest.raises(OSError, match=r"No space left on device.*run\.nc"):
+        write_atomically(tmp_path / "run.nc", b"new")
+    assert not list(tmp_path.iterdir())
+
+
 def test_certificate_as_json(short_run, tmp_path):
     content = json.loads(save_certificate(short_run, tmp_path / "c.json").read_text())
     assert content["certificate"]["rank"] == 34
@@ -152,6 +165,10 @@ def test_parameters_from_toml(tmp_path):
         ('[mass]\npanel_7 = {value = 890, unit = "g"}\n', ModelError, "given in kg, not in .g."),
         ("[mass]\npanel_7 = {value = 1.0, units = 2}\n", ModelError, "no entry .units."),
         ("[mass]\npanel_7 = nan\n", ModelError, "finite"),
+        ("[mass]\npanel_7 = -1.0\n", ModelError, r"mine\.toml.*must be positive"),
+        ("[mass]\npanel_7 = " + "9" * 400 + "\n", ModelError, "must be numbers"),
+        ("[mass]\npanel_7 = " + "9" * 5000 + "\n", FileError, "not a readable TOML"),
+        ("x = " + "[" * 3000 + "]" * 3000, FileError, "nested too deeply"),
     ],
 )
 def test_bad_parameter_files(tmp_path, text, error, words):
@@ -161,3 +178,5 @@ def test_bad_parameter_files(tmp_path, text, error, words):
         load_parameters(path, PART_II)
     with pytest.raises(FileError, match="There is no file"):
         load_parameters(tmp_path / "none.toml", PART_II)
+    with pytest.raises(FileError, match="is no file but a folder or a pipe"):
+        load_parameters("", PART_II)

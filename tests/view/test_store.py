@@ -467,6 +467,37 @@ def test_a_store_that_cannot_be_made(tmp_path, monkeypatch):
         create(tmp_path / "file" / "study.zarr", WORK, 10, 5)
 
 
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (errno.EROFS, "may not be written .* Have it made writable"),
+        (errno.EIO, "disk fails .* Repair"),
+    ],
+)
+def test_other_faults_of_a_disk_have_their_own_advice(tmp_path, monkeypatch, number, words):
+    path = tmp_path / "study.zarr"
+    create(path, WORK, 1000, 300).close()
+
+    def fail(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    with resume_store(path, WORK) as store:
+        monkeypatch.setattr(store_module, "flush", fail)
+        with pytest.raises(FileError, match=rf"{words} .*go on with the study") as error:
+            store.write(0, WORK.run(*store.todo(0)))
+    assert "keeps 0 of 1000 samples" in str(error.value)
+
+
+def test_a_file_in_place_of_a_store(tmp_path):
+    """It is not said to be missing."""
+    (tmp_path / "study.zarr").write_text("x")
+    for use in (open_store, lambda path: resume_store(path, WORK)):
+        with pytest.raises(FileError, match="is no folder, as a study's store is"):
+            use(tmp_path / "study.zarr")
+    with pytest.raises(FileError, match="does not exist"):
+        open_store(tmp_path / "none.zarr")
+
+
 def _full(*_, **__):
     raise OSError(errno.ENOSPC, "No space left on device")
 
