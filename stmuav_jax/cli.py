@@ -119,6 +119,8 @@ class Simulate:
     """Spacing of the saved times [s]."""
     max_steps: Annotated[int, count("steps allowed", 1e8)] = 100_000
     """Steps allowed between two saved times."""
+    error_estimate: bool = True
+    """Estimate the run's error by a second run beside it."""
     params: Annotated[Path | None, default("the report's values")] = None
     """TOML file with values that replace the table's."""
     actuators: Annotated[Literal["consistent", "printed"] | None, default("consistent")] = None
@@ -222,6 +224,7 @@ def run_scene(command: Simulate, console: Console) -> "Run":
             t1=command.t1,
             save_every=command.save_every,
             max_steps=command.max_steps,
+            error_estimate=command.error_estimate,
             throw=False,
             progress=report,
         )

@@ -75,14 +75,18 @@ def test_loads_are_written_if_asked_for(tmp_path, capsys):
     assert "peak force [N]" in capsys.readouterr().out
 
 
-def test_parameters_and_solver_reach_the_run(tmp_path):
+def test_parameters_and_solver_reach_the_run(tmp_path, capsys):
     table = tmp_path / "p.toml"
     table.write_text("[bare]\nlift_factor = 1.2\n")
     code = run(
         "simulate", "hexacopter", "--t1", "0.05", "--params", str(table), "--solver", "tsit5",
-        "--rtol", "1e-9", "--figures", "none", "--out", str(tmp_path),
+        "--rtol", "1e-9", "--no-error-estimate", "--figures", "none", "--out", str(tmp_path),
     )  # fmt: skip
     assert code == 0
+    certificate = json.loads((tmp_path / "certificate.json").read_text())["certificate"]
+    assert certificate["position_error"] is None
+    assert certificate["estimate_seconds"] == 0.0
+    assert "There is no error estimate: none was asked for." in capsys.readouterr().out
     data = load(tmp_path / "run.nc")
     assert json.loads(data.attrs["parameters"])["bare.lift_factor"]["value"] == 1.2
     assert json.loads(data.attrs["settings"])["solver"] == "Tsit5"

@@ -58,6 +58,7 @@ def certify(
         redundant=rank.redundant,
         accepted_steps=int(trajectory.counts.accepted[-1]),
         rejected_steps=int(trajectory.counts.rejected[-1]),
+        unsteered_steps=int(trajectory.counts.unsteered[-1]),
         compile_seconds=seconds.compile,
         run_seconds=seconds.run,
         estimate_seconds=seconds.estimate,

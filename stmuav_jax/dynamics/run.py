@@ -51,7 +51,8 @@ class Certificate:
         smallest_singular_value: of the constraint Jacobian along the saved path; None
             without joints.
         rank, rows: at the start. redundant: joints that own a dependent row.
-        accepted_steps, rejected_steps: over the whole run.
+        accepted_steps, rejected_steps: over the whole run. unsteered_steps: accepted with an error
+            so far below the tolerance that the next step could grow as much as a step may.
         compile_seconds, run_seconds: of the integration. estimate_seconds: of the second run.
             analysis_seconds: of the balances and reactions, compilation included.
     """
@@ -82,6 +83,7 @@ class Certificate:
     redundant: tuple[str, ...]
     accepted_steps: int
     rejected_steps: int
+    unsteered_steps: int
     compile_seconds: float
     run_seconds: float
     estimate_seconds: float

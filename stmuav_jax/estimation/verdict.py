@@ -18,8 +18,9 @@ set them off. The p-values are combined by Bonferroni's inequality: the verdict 
 right is therefore called inconsistent in at most about `level` of its records.
 
 The transient of a prior that does not fit is not counted as settled: unless a time is given, the settled
-part begins with the first window whose NIS is within its 99.9 % interval. The start, up to there, or the
-first window, has its own test.
+part begins with the first window whose NIS is within its 99.9 % interval, or has passed through it: a
+filter that starts far off and has too large an R comes from one side of it to the other within a
+window. The start, up to there, or the first window, has its own test.
 
 What no innovation shows is not seen: an error that the states absorb, such as a constant bias of
 a gyroscope below its noise, passes every test and can double the errors.
@@ -235,17 +236,20 @@ def judge(
 
 
 def _settled(z: np.ndarray, there: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
-    """The step (s,) at which the first window begins whose NIS is in its interval.
+    """The step (s,) at which the first window begins whose NIS is in its interval or beyond it.
 
-    Zero where none does in the first half, and whether that is so.
+    Beyond is the side on which the first window is not. Zero where there is none in the first half,
+    and whether that is so.
     """
     count = len(z) // window // 2
     if not count:
         return np.zeros(z.shape[2], dtype=int), np.zeros(z.shape[2], dtype=bool)
     cut = lambda a: a[: count * window].reshape(count, window * z.shape[1], -1)
-    inside = chi2_p_values(np.sum(cut(z) ** 2, axis=1), np.sum(cut(there), axis=1))[2] > WITHIN
-    some = np.asarray(np.any(inside, axis=0))
-    return np.where(some, np.argmax(inside, axis=0) * window, 0), ~some
+    below, above, p = chi2_p_values(np.sum(cut(z) ** 2, axis=1), np.sum(cut(there), axis=1))
+    side = np.where(p > WITHIN, 0, np.where(above < below, 1, -1))
+    over = (side == 0) | (side != side[0])
+    some = np.asarray(np.any(over, axis=0))
+    return np.where(some, np.argmax(over, axis=0) * window, 0), ~some
 
 
 def _sizes(name: str, total: np.ndarray, degrees: np.ndarray) -> dict[str, Any]:

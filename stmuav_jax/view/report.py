@@ -55,9 +55,16 @@ def certificate_rows(run: Run) -> list[tuple[str, str]]:
     rows.append(("Rank of the constraint Jacobian", rank))
     if c.smallest_singular_value is not None:
         rows.append(("Smallest singular value on the way", _number(c.smallest_singular_value, "")))
+    rows.append(("Steps accepted, rejected", f"{c.accepted_steps}, {c.rejected_steps}"))
+    if 2 * c.unsteered_steps > c.accepted_steps:
+        rows.append(
+            (
+                "Steps that grew at their limit",
+                f"{c.unsteered_steps}: not the error but the saved times, or nothing, chose most lengths",
+            )
+        )
     return [
         *rows,
-        ("Steps accepted, rejected", f"{c.accepted_steps}, {c.rejected_steps}"),
         ("Time to compile the integration", f"{c.compile_seconds:.2f} s"),
         ("Time to run it", f"{c.run_seconds:.2f} s"),
         ("Time for the second run, for the errors", f"{c.estimate_seconds:.2f} s"),

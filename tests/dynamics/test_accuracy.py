@@ -9,6 +9,7 @@ import stmuav_jax as sj
 from stmuav_jax.dynamics import simulate as module
 from stmuav_jax.dynamics.accuracy import LOST, ErrorEstimate, _growth
 from stmuav_jax.dynamics.march import March
+from stmuav_jax.view.report import certificate_rows
 
 SYSTEM = pendulum()
 SCENE = scene_of(SYSTEM, swung(SYSTEM, 1.0, 0.5), t1=4.0, save_every=0.25)
@@ -79,6 +80,17 @@ def test_without_an_estimate_the_certificate_says_so(reference):
     assert c.error_words == "There is no error estimate: none was asked for."
     assert np.all(np.isnan(reference.errors.position))
     assert c.estimate_seconds == 0.0
+
+
+def test_steps_that_nothing_steers_are_in_the_certificate(reference):
+    """At rest all steps grow at their limit, up to the saved times; in motion few do."""
+    at_rest = run(scene_of(SYSTEM, SYSTEM.reference, t1=4.0, save_every=0.25), error_estimate=False)
+    c = at_rest.certificate
+    assert c.unsteered_steps == c.accepted_steps
+    words = dict(certificate_rows(at_rest))["Steps that grew at their limit"]
+    assert words.startswith(f"{c.accepted_steps}: ")
+    assert reference.certificate.unsteered_steps < 0.5 * reference.certificate.accepted_steps
+    assert "Steps that grew at their limit" not in dict(certificate_rows(reference))
 
 
 def test_an_interrupted_run_has_an_estimate_of_what_was_done():

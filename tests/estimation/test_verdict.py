@@ -142,6 +142,23 @@ def test_one_record():
         inconsistent(out, window=0)
 
 
+def test_a_transient_that_ends_on_the_other_side():
+    """NIS far too large at first and too small afterwards, with no window between."""
+    z = np.random.default_rng(1).normal(size=(400, 2, 2)) * np.array([0.3, 3.0])
+    z[:100] = np.array([3.0, 0.3]) * z[:100] / np.array([0.3, 3.0])
+    for found, sign in zip(
+        judge(z, np.ones_like(z, bool), np.ones((400, 2), bool), 0.1), (1, -1), strict=True
+    ):
+        assert found.settled == pytest.approx(10.0)
+        assert (found.start > 1) == (found.size < 1) == (sign > 0)
+        assert "From 10 s" not in found.words
+        assert "In the settled part, from 10 s on" in found.words
+        assert ("smaller than" if sign > 0 else "larger than") in found.words
+    # all windows on one side: no settled part
+    found = judge(z[:100], np.ones((100, 2, 2), bool), np.ones((100, 2), bool), 0.1)
+    assert all(v.settled == 0 and "No window of the first half" in v.words for v in found)
+
+
 def test_failed():
     """A lost covariance is said, with its time."""
     z = np.random.default_rng(0).normal(size=(100, 2, 1))
@@ -203,7 +220,7 @@ def test_wrong_parameters_of_the_quadrotor(quadrotor):
 
 @pytest.mark.slow
 def test_report_tuning_is_seen_through(quadrotor):
-    """Case 8: its lag hides below too large an R, where the one-sided flag is silent."""
+    """Its lag hides below too large an R, where the one-sided flag is silent."""
     _, record, _ = quadrotor
     tuning = report_tuning("observable")
     found = of(tuning, record.y, record.u)
