@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..algebra.linalg import independent_rows
+from ..algebra.linalg import cholesky, independent_rows, solve_lower
 from ..mechanics.constraint import ROWS
 from .closing import TreeModel, rows_after
 from .coordinates import Coordinates
@@ -35,9 +35,13 @@ DEPENDENT = 1e-12
 AHEAD = 1e-4
 _SLOW = 1e-6
 
-# Squares of singular values below this are near a singular posture: round-off over the cube of
-# the singular value comes to the tolerances in use. Postures around are `_APART` [rad], [m] apart.
-NEAR = 5e-5
+# Postures are near a singular one where the smallest singular value is less than this share of
+# that in the postures around, `_APART` [rad], [m] apart: it goes through zero linearly, however
+# large the mechanism and however small the value itself. They are not looked at where the value
+# exceeds `_CLEAR`, and are of no use where it is below `_LOST` there too.
+NEARER = 0.5
+_CLEAR = 0.03
+_LOST = 1e-6
 _APART = 0.06
 _HALF = 5
 
@@ -101,10 +105,8 @@ def interpolated(
     return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), found)
 
 
-def independent(
-    constraints: Constraints, J: Float[Array, "m k"], tolerance: float
-) -> Bool[Array, " m"]:
-    """Independent rows, in terms of the longest row of their kind."""
+def _scaled(constraints: Constraints, J: Float[Array, "m k"]) -> Float[Array, "m k"]:
+    """Rows in terms of the longest row of their kind, as numbers without a derivative."""
     J = jax.lax.stop_gradient(J)
     square, sizes, start = jnp.sum(J**2, axis=1), [], 0
     for group in constraints.groups:
@@ -112,7 +114,29 @@ def independent(
         sizes.append(jnp.full(count, jnp.max(square[start : start + count])))
         start += count
     size = jnp.sqrt(jnp.concatenate(sizes))
-    J = J / jnp.where(size > 0, size, 1.0)[:, None]
+    return J / jnp.where(size > 0, size, 1.0)[:, None]
+
+
+def smallest(
+    constraints: Constraints, J: Float[Array, "m k"], kept: Bool[Array, " m"]
+) -> Float[Array, ""]:
+    """The smallest singular value of the kept rows, from below and to a factor sqrt(m).
+
+    It is 1 / |L^-1| in Frobenius' norm, with J J^T = L L^T; zero where that has no factor.
+    """
+    J = jnp.where(kept[:, None], _scaled(constraints, J), 0.0)
+    one = jnp.eye(len(J), dtype=J.dtype)
+    # rows that are left out get a large diagonal, and no share of the norm
+    inverse = solve_lower(cholesky(J @ J.T + jnp.where(kept, 0.0, 1.0) * one), one)
+    square = jnp.sum(jnp.where(kept[:, None], inverse, 0.0) ** 2)
+    return jnp.where(jnp.isfinite(square), 1 / jnp.sqrt(square), 0.0)
+
+
+def independent(
+    constraints: Constraints, J: Float[Array, "m k"], tolerance: float
+) -> Bool[Array, " m"]:
+    """Independent rows, in terms of the longest row of their kind."""
+    J = _scaled(constraints, J)
     return independent_rows(J @ J.T, tolerance)
 
 
@@ -130,19 +154,28 @@ def kept_rows(model: TreeModel, t: Float[Array, ""], at: Coordinates) -> Bool[Ar
 
 
 def is_near(model: TreeModel, t: Float[Array, ""], at: Coordinates) -> Bool[Array, ""]:
-    """Whether this posture is near a singular one, and those before and after are not."""
-    assert model.kept is not None
-    rank = jnp.sum(model.kept)
+    """Whether this posture is near a singular one, and those before and after are less so."""
+    kept = model.kept
+    assert kept is not None
     model, at = _still(model), _still(at)
     step = _APART * _along(at.u)
 
-    def full(place: Float[Array, ""]) -> Bool[Array, ""]:
-        J = rows_after(model, t, at, place * step)
-        return jnp.sum(independent(model.constraints, J, NEAR)) >= rank
+    def clearance(place: Float[Array, ""]) -> Float[Array, ""]:
+        return smallest(model.constraints, rows_after(model, t, at, place * step), kept)
 
-    places = jnp.asarray(_PLACES, at.u.dtype)
-    around = lambda: jnp.all(jax.lax.map(full, places[1:]))
-    return jax.lax.cond(full(places[0]), lambda: jnp.asarray(False), around)
+    here = clearance(jnp.zeros((), at.u.dtype))
+
+    def clear_of_it(places: np.ndarray) -> Bool[Array, ""]:
+        there = jax.lax.map(clearance, jnp.asarray(places, at.u.dtype))
+        return jnp.all((there > here / NEARER) & (there > _LOST))
+
+    no = lambda: jnp.asarray(False)
+    next_ones = np.abs(_PLACES) == 1
+    others = np.abs(_PLACES) > 1
+    around = lambda: jax.lax.cond(
+        clear_of_it(_PLACES[next_ones]), lambda: clear_of_it(_PLACES[others]), no
+    )
+    return jax.lax.cond(here < _CLEAR, around, no)
 
 
 def _still(tree: T) -> T:
