@@ -145,8 +145,8 @@ def _forward(
         return number + 1, now, rows, end.result, counts, steps
 
     state = (none, begin, rows, diffrax.RESULTS.successful, (none, none), empty)
-    count, (t, y, solver_state, controller_state), rows, result, counts, last = (
-        jax.lax.while_loop(unfinished, window, state)
+    count, (t, y, solver_state, controller_state), rows, result, counts, last = jax.lax.while_loop(
+        unfinished, window, state
     )
     over = counts[0] + counts[1] > problem.method.max_steps
     result = diffrax.RESULTS.where(over, _MORE, result)

@@ -231,7 +231,9 @@ class Tree(AbstractFormulation):
             closed_there = lambda: closed(
                 model, t, moved(model.chain.tree, at, by), 3, self._small
             )[0]
-            found = self._solve(model, t, jax.lax.cond(singular.near, closed_there, lambda: at), how)
+            found = self._solve(
+                model, t, jax.lax.cond(singular.near, closed_there, lambda: at), how
+            )
             return found.rate, _driven(found)
 
         return interpolated(singular, at.u, one, power=3)
