@@ -300,6 +300,7 @@ def test_a_posture_that_cannot_be_passed_is_named() -> None:
     with pytest.raises(sj.SimulationError, match="singular posture of drive A") as failed:
         sj.simulate(system, moving, t1=1.0, save_every=0.1, error_estimate=False, analysis=False)
     run = failed.value.run
+    assert isinstance(run, sj.Run)
     # the rest of the way takes less time than round-off leaves of the velocities
     assert run.certificate.t_end == pytest.approx(end, abs=1e-6)
     words = str(failed.value)
