@@ -15,8 +15,8 @@ from ..algebra.compiler import kept_jit
 from ..algebra.rotation import normalise
 from ..algebra.shapes import Numbers
 from ..mechanics.errors import ModelError, StateError, concrete
-from ..mechanics.joint import drive
-from ..mechanics.joint_coordinate import coordinate
+from ..mechanics.joint import LEAVES_FREE, drive
+from ..mechanics.joint_coordinate import Which, coordinate
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .augmented import Augmented, Model, displace
@@ -328,21 +328,40 @@ def weakest_rows(
     return float(values[rank - 1]), tuple(system.joints[k].name for k in named)
 
 
-def singular_posture(system: System, state: State, t: float, rank: int, values: np.ndarray) -> str:
+def singular_posture(system: System, states: State, t: float, rank: int) -> str:
     """In words that a run ended in a singular posture, with joints and drivers; "" if it did not.
 
     Args:
-        rank: at the start. values: singular values at the saved states, the last included (k, m).
+        states: the first and the last of the run (2, n, .). t: of the last [s].
+        rank: at the start.
     """
-    if not rank or not values[-1, rank - 1] < _SINGULAR * values[0, rank - 1]:
+    if not rank:
         return ""
-    smallest, names = weakest_rows(system, Augmented().prepare(system), state, t, rank)
+    model = Augmented().prepare(system)
+    values = np.asarray(_singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
+    if not values[-1, rank - 1] < _SINGULAR * values[0, rank - 1]:
+        return ""
+    state = State(*(x[-1] for x in (states.r, states.p, states.v, states.omega)))
+    smallest, names = weakest_rows(system, model, state, t, rank)
     return (
-        f"the mechanism comes to a singular posture of {', '.join(names)}: the smallest singular "
-        f"value of the constraint Jacobian is {smallest:.3g} there and {values[0, rank - 1]:.3g} at "
-        "the start. What these joints or drivers demand takes unbounded velocities or forces; lead "
-        "the motion around that posture"
+        f"the mechanism comes to a singular posture of {_standing(system, state, names)}: the "
+        f"smallest singular value of the constraint Jacobian is {smallest:.3g} there and "
+        f"{values[0, rank - 1]:.3g} at the start. What these joints or drivers demand takes "
+        "unbounded velocities or forces; lead the motion around that posture"
     )
+
+
+def _standing(system: System, state: State, names: tuple[str, ...]) -> str:
+    """Joints with their angles and shifts, where they leave one free."""
+    kin = system.kinematics(state)
+    units: dict[Which, str] = {"angle": "rad", "shift": "m"}
+    found = []
+    for name in names:
+        joint = system.joints[system.joint_index(name)]
+        free = [which for which in units if joint.kind in LEAVES_FREE[which]]
+        at = [f"{float(coordinate(kin, joint, w).value):.6g} {units[w]}" for w in free]
+        found.append(f"{name} (at {', '.join(at)})" if at else name)
+    return ", ".join(found)
 
 
 def jacobian(model: Model, state: State, t: float = 0.0) -> np.ndarray:

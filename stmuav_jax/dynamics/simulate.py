@@ -318,9 +318,8 @@ def _failure(run: Run, end: float) -> str:
     if event is not None and bool(jnp.any(jnp.isnan(jnp.asarray(event(jnp.asarray(t), state))))):
         reason = "the value of its event is not a number there"
     system = with_internal(run.scene.system, jnp.asarray(run.trajectory.internal[-1]))
-    if run.snapshot is not None:
-        values = np.asarray(run.snapshot.singular_values)
-        reason = singular_posture(system, state, t, run.certificate.rank, values) or reason
+    ends = jax.tree.map(lambda x: jnp.asarray(x)[np.array([0, -1])], run.states)
+    reason = singular_posture(system, ends, t, run.certificate.rank) or reason
     kin = system.kinematics(state)
     for force in system.forces:
         # a load may turn bad right after the last state that was still good

@@ -55,7 +55,7 @@ from .motion import (
 )
 from .pose import kinds
 from .reactions import Reactions, joint_reactions, tree_reactions
-from .singular import interpolated, is_near, kept_rows
+from .singular import interpolated, kept_rows, nearness
 from .stabilisation import AbstractStabilisation, Baumgarte
 from .topology import SpanningTree, spanning_tree
 
@@ -225,16 +225,18 @@ class Tree(AbstractFormulation):
         """Accelerations and the power of drivers, through singular postures too."""
         model = self.at_step(model, t, x) if model.kept is None else model
         at = split(model.chain.tree, x)
-        near = is_near(model, t, at)
+        singular = nearness(model, t, at)
 
         def one(by: Float[Array, " u"]) -> tuple[Float[Array, " u"], Float[Array, ""]]:
             closed_there = lambda: closed(
                 model, t, moved(model.chain.tree, at, by), 3, self._small
             )[0]
-            found = self._solve(model, t, jax.lax.cond(near, closed_there, lambda: at), how)
+            found = self._solve(
+                model, t, jax.lax.cond(singular.near, closed_there, lambda: at), how
+            )
             return found.rate, _driven(found)
 
-        return interpolated(near, at.u, one)
+        return interpolated(singular, at.u, one, power=3)
 
     def _passes(self, model: TreeModel) -> bool:
         """Whether rows may depend on each other."""
@@ -258,7 +260,8 @@ class Tree(AbstractFormulation):
             end, _ = closed(model, t, start, iterations, self._small)
             return jax.tree.map(jnp.subtract, end, start)
 
-        end = jax.tree.map(jnp.add, at, interpolated(is_near(model, t, at), at.u, one))
+        moves = interpolated(nearness(model, t, at), at.u, one, power=2)
+        end = jax.tree.map(jnp.add, at, moves)
         end = end._replace(balls=normalise(end.balls))
         return join(end), self.residuals(model, t, join(end))
 
