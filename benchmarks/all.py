@@ -39,6 +39,7 @@ BENCHMARKS: dict[str, tuple[str, ...]] = {
     "stiff": ("stiff.py",),
     "long_horizon": ("long_horizon.py",),
     "trims": ("trims.py",),
+    "errors": ("errors.py",),
     "estimation": ("estimation.py",),
     "first_result": ("first_result.py",),
     "failure": ("failure.py",),
