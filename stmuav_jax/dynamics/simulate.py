@@ -86,7 +86,7 @@ def simulate(
         max_steps: between two saved times.
         first_step: the first step tried [s]. max_step: no step is longer [s].
         error_estimate: estimate the global error at every saved time by a second run at smaller
-            tolerances, see `ErrorEstimate`. The second run takes 1.1 to 2.3 times as long as the
+            tolerances, see `ErrorEstimate`. The second run takes 1.1 to 2 times as long as the
             first; there is nothing more to compile.
         analysis: find accelerations, reactions, energies and balances at the saved times. Without
             it the run has no `snapshot`, and there is less to compile.
