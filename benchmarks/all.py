@@ -40,6 +40,7 @@ BENCHMARKS: dict[str, tuple[str, ...]] = {
     "long_horizon": ("long_horizon.py",),
     "trims": ("trims.py",),
     "singular": ("singular.py",),
+    "errors": ("errors.py",),
     "estimation": ("estimation.py",),
     "first_result": ("first_result.py",),
     "failure": ("failure.py",),

@@ -22,7 +22,7 @@ jax.config.update("jax_enable_x64", True)
 sys.path[:0] = [str(Path(__file__).parents[1] / "tests" / part) for part in ("", "published")]
 
 import jax.numpy as jnp
-from test_four_bar import (
+from test_four_bar import (  # pyright: ignore[reportMissingImports]
     LONG,
     TOLERANCES,
     closed_form,

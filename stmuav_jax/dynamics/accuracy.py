@@ -29,6 +29,13 @@ from .problem import Problem
 # Tolerances below these leave round-off no room for ten times less, and for any less.
 _SHARP, _SHARPEST = 1e-12, 3e-14
 
+# On tolerances of the size of round-off. The two runs' round-off differs by some 1.4 of each; the
+# difference of 1.5 errors lies between that and what proportionality gives.
+ROUND_OFF = 3.0
+
+# What replaces a run at smaller tolerances that cannot be met.
+LOOSER = 10.0
+
 # No tolerance is made smaller than this (one that is smaller already stays as it is).
 _SMALLEST = 1e-14
 
@@ -89,12 +96,17 @@ class SecondRun:
 
     Args:
         problem: of the first run. t0: [s]. state0: at t0.
-        looser: with larger tolerances instead of smaller ones, for where those cannot be met.
+        factor: on the tolerances; by default what `usual` gives. Above one it is for where smaller
+            tolerances cannot be met: cheaper, but rarely within a factor of three
+            (benchmarks/errors.py).
     """
 
-    def __init__(self, problem: Problem, t0: float, state0: State, *, looser: bool = False) -> None:
+    def __init__(
+        self, problem: Problem, t0: float, state0: State, *, factor: float | None = None
+    ) -> None:
         self.first = problem
-        factor, self.difference = _factors(problem, looser)
+        factor = usual(problem) if factor is None else factor
+        self.difference = 1.5 if factor == ROUND_OFF else abs(1 - factor)
         smaller = lambda x: jnp.maximum(x * factor, jnp.minimum(x, _SMALLEST))
         method = problem.method
         changes: dict[str, Any] = {"rtol": smaller(method.rtol), "atol": smaller(method.atol)}
@@ -133,18 +145,12 @@ class SecondRun:
         return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
-def _factors(problem: Problem, looser: bool) -> tuple[float, float]:
-    """Factor on the tolerances, and the two runs' difference in units of the first one's error.
-
-    Where round-off is of the size of the tolerance, the two runs' round-off differs by some 1.4
-    of each; there the second number lies between that and what proportionality gives.
-    """
+def usual(problem: Problem) -> float:
+    """The factor on the tolerances, where these can be met."""
     tolerance = max(float(problem.method.rtol), float(problem.method.atol))
-    if looser:
-        return 10.0, 9.0
     if tolerance >= _SHARP:
-        return 0.1, 0.9
-    return (1 / 3, 2 / 3) if tolerance >= _SHARPEST else (3.0, 1.5)
+        return 0.1
+    return 1 / 3 if tolerance >= _SHARPEST else ROUND_OFF
 
 
 def estimated(

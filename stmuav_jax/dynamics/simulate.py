@@ -16,7 +16,7 @@ from ..mechanics.errors import ModelError, SimulationError
 from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .accuracy import ErrorEstimate, SecondRun, estimated, without
+from .accuracy import LOOSER, ErrorEstimate, SecondRun, estimated, without
 from .analysis import Look, Snapshot, first_look, look, snapshots
 from .augmented import Augmented, Model
 from .certify import certify, violations
@@ -86,7 +86,7 @@ def simulate(
         max_steps: between two saved times.
         first_step: the first step tried [s]. max_step: no step is longer [s].
         error_estimate: estimate the global error at every saved time by a second run at smaller
-            tolerances, see `ErrorEstimate`. The second run takes 1.1 to 2.3 times as long as the
+            tolerances, see `ErrorEstimate`. The second run takes 1.1 to 2 times as long as the
             first; there is nothing more to compile.
         analysis: find accelerations, reactions, energies and balances at the saved times. Without
             it the run has no `snapshot`, and there is less to compile.
@@ -262,7 +262,7 @@ def _errors(scene: Scene, done: _Done, view: Snapshot | None) -> ErrorEstimate:
     found = estimated(first, second, rates)
     if not found.note or first.result == diffrax.RESULTS.event_occurred:
         return found
-    looser = SecondRun(second.first, float(first.ts[0]), scene.state0, looser=True)
+    looser = SecondRun(second.first, float(first.ts[0]), scene.state0, factor=LOOSER)
     with contextlib.suppress(KeyboardInterrupt):
         looser.follow(first)
     again = estimated(first, looser, rates)
