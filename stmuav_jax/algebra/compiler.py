@@ -66,7 +66,7 @@ def compiler_options(*, quick: bool = False) -> Options:
     return {name: value for name, value in options.items() if _known(name, value)}
 
 
-def _known(name: str, value: str | bool | int) -> bool:
+def _known(name: str, value: str | bool | float) -> bool:
     """Whether this version of XLA takes this option."""
     try:
         jax.jit(jnp.cos, compiler_options={name: value}).lower(0.0).compile()
@@ -78,6 +78,22 @@ def _known(name: str, value: str | bool | int) -> bool:
 def outer_jit(function: Callable[..., Any]) -> Any:
     """`eqx.filter_jit` with `compiler_options`, for the outermost function of a program."""
     return eqx.filter_jit(function, compiler_options=compiler_options())  # pyright: ignore[reportCallIssue]
+
+
+def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`eqx.filter_jit` with the quick `compiler_options`; a part of a larger program within one."""
+    within: Any = eqx.filter_jit(function)
+
+    @cache
+    def made() -> Any:
+        options = compiler_options(quick=True)
+        return eqx.filter_jit(function, compiler_options=options)  # pyright: ignore[reportCallIssue]
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        return within(*args) if transformed(args) else made()(*args)
+
+    return call
 
 
 _programs: OrderedDict[Hashable, Callable[..., Any]] = OrderedDict()

@@ -155,7 +155,8 @@ def _forward(
     if most * kept < problem.method.max_steps:
         # derivatives of part of the way would be wrong: not a number says so
         end = end._replace(y=jnp.where(result == _MORE, jnp.nan, y))
-    return end, _Windows(count, *rows, last._replace(end=end.y))
+    starts, taken, ts = rows
+    return end, _Windows(count, starts, taken, ts, last._replace(end=end.y))
 
 
 def _window(

@@ -23,6 +23,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import quick_jit
 from ..algebra.rotation import conjugate, product, to_rotation_vector
 from ..algebra.shapes import Numbers
 from ..dynamics.integrate import integrate
@@ -166,7 +167,7 @@ class Misfit(eqx.Module):
         return (self.predict(self.start + self.sizes * z) - self.record) / self.sigma
 
 
-@eqx.filter_jit
+@quick_jit
 def _at(residuals: Misfit, z: Float[Array, " p"]) -> tuple[Float[Array, " n"], Float[Array, "n p"]]:
     """Residuals and their Jacobian."""
     push = lambda e: jax.jvp(residuals, (z,), (e,))

@@ -18,6 +18,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from ..algebra.compiler import quick_jit
 from ..mechanics.errors import SettingError
 
 Method = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -102,13 +103,13 @@ class _Stepper(eqx.Module):
         function = all_at_once(self.function) if squares else self.function
         return function(values), None
 
-    @eqx.filter_jit
+    @quick_jit
     def begin(self, values: Any) -> tuple[Any, Any]:
         """The method's state: its arrays, and all else, which no step changes."""
         state = self.method.init(self.of, values, None, {}, self.shape, None, frozenset())
         return eqx.partition(state, eqx.is_array)
 
-    @eqx.filter_jit
+    @quick_jit
     def step(self, values: Any, arrays: Any, rest: Any) -> tuple[Any, Any, Any, Array, Array]:
         """Next values and state; values whose loss is known now, the loss, whether to end."""
         state = eqx.combine(arrays, rest)
@@ -121,7 +122,7 @@ class _Stepper(eqx.Module):
 
 
 # Jitted, so that a second search of a function of the same form does not trace it again.
-@eqx.filter_jit
+@quick_jit
 def _called(function: Callable[[Any], Any], values: Any) -> Any:
     return function(values)
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import quick_jit
 from ..algebra.rotation import to_rotation_vector
 from ..algebra.shapes import Numbers
 from ..dynamics.integrate import integrate
@@ -108,7 +109,7 @@ def hold(
     return Tuning(f"hold {horizon:g} s in {segments}", problem, problem.unknowns(values))
 
 
-@eqx.filter_jit
+@quick_jit
 def _departures(
     flyer: Flyer, inputs: Inputs, start: Coordinates, ts: Float[Array, " k"], method: Method
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
@@ -302,7 +303,7 @@ def peaks(tuning: Tuning, values: Any, samples: int = 200) -> Peaks:
     return _peaks(problem.flyer, cost, inputs, ts, problem.method)
 
 
-@eqx.filter_jit
+@quick_jit
 def _peaks(
     flyer: Flyer, cost: _Slew, inputs: Inputs, ts: Float[Array, " k"], method: Method
 ) -> Peaks:
@@ -347,7 +348,7 @@ def flown(
     }
 
 
-@eqx.filter_jit
+@quick_jit
 def _flown(
     flyer: Flyer, start: Coordinates, inputs: Inputs, ts: Float[Array, " k"], method: Method
 ) -> tuple[Coordinates, Float[Array, "k r"], Float[Array, "k 2"]]:
