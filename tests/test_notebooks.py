@@ -1,6 +1,7 @@
 """Every notebook runs, its last cell asserts its claim, and it shows what it gives today."""
 
 import math
+import os
 import re
 from pathlib import Path
 
@@ -18,6 +19,12 @@ LONG = (
     "08_parameters_from_a_record",
 )
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+QUICK = (
+    "--xla_backend_optimization_level=0",
+    "--xla_llvm_disable_expensive_passes",
+    "--xla_cpu_use_fusion_emitters",
+)
 
 # Notebooks whose stored outputs are not those of the present package, with the reason. A notebook
 # that is executed again has to be taken out.
@@ -38,6 +45,12 @@ MASKED = (
     r"<Figure size [^>]*>",
 )
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w]*[A-Za-z_])")
+
+
+def as_users_have_it() -> dict[str, str]:
+    """The environment without the tests' own options for XLA: figures of chaotic motion feel them."""
+    flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if not flag.startswith(QUICK)]
+    return os.environ | {"XLA_FLAGS": " ".join(flags)}
 
 
 def words_and_numbers(text: str) -> tuple[str, list[str]]:
@@ -105,7 +118,7 @@ def test_notebook(path):
     assert all(len(cell.source.splitlines()) <= 25 for cell in code)
     assert all(cell.outputs or cell is code[0] or "=" in cell.source for cell in code)
     assert path.stat().st_size < 300_000
-    NotebookClient(notebook, timeout=900, kernel_name="python3").execute()
+    NotebookClient(notebook, timeout=900, kernel_name="python3").execute(env=as_users_have_it())
     found = differences(stored, notebook)
     if path.stem in STALE:
         assert found, f"{path.stem} shows what runs today: take it out of STALE."
