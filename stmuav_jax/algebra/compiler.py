@@ -66,7 +66,7 @@ def compiler_options(*, quick: bool = False) -> Options:
     return {name: value for name, value in options.items() if _known(name, value)}
 
 
-def _known(name: str, value: str | bool | float) -> bool:
+def _known(name: str, value: str | bool | int | float) -> bool:
     """Whether this version of XLA takes this option."""
     try:
         jax.jit(jnp.cos, compiler_options={name: value}).lower(0.0).compile()
