@@ -57,11 +57,11 @@ class Method(eqx.Module):
         first_step: [s].
         max_steps: accepted and rejected steps between two output times.
         adjoint: how reverse-mode derivatives are taken. By default an explicit method without
-            events keeps every step with its slopes, see `adjoint`: up to `KEPT` steps over all
-            output times; states, and derivatives, of a run that takes more are not numbers. All else, and longer
-            runs, by those of diffrax: `diffrax.RecursiveCheckpointAdjoint(checkpoints=...)` does
-            steps again on the way back where there are more of them. Adaptive steps done again
-            differ by round-off in their sizes, which costs a gradient digits.
+            events keeps accepted steps with their slopes, some 4,096 of them at a time, and goes
+            back through them, see `adjoint`; a longer run is kept in windows whose steps are taken
+            again on the way back. Anything else is differentiated by diffrax's
+            `RecursiveCheckpointAdjoint`, which takes adaptive steps again; they then differ by
+            round-off in their sizes, which costs a gradient digits.
         event: (t, state) -> a number whose change of sign ends the integration, at that
             time; or a truth value, which ends it after the first step that makes it true. A run
             that starts where the number is zero starts after that event. An `equinox.Module`
