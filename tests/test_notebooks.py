@@ -11,12 +11,14 @@ from nbclient import NotebookClient
 
 # What the notebook shows is tested otherwise by default; its own run takes minutes.
 LONG = (
+    "01_first_flight",
     "02_what_fails_at_half_a_second",
     "04_a_day_of_pointing_at_the_sun",
     "05_centre_of_mass",
     "06_trim_and_small_motions",
     "07_inputs_by_gradients",
     "08_parameters_from_a_record",
+    "09_ten_thousand_collapses",
 )
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
