@@ -16,6 +16,13 @@ from stmuav_jax.dynamics.problem import begin, prepare
 
 GRAVITY = 9.81
 
+# XLA's own defaults, which conftest.py turns off: for tests that compute longer than they compile.
+THOROUGH: dict[str, Any] = {
+    "xla_backend_optimization_level": 3,
+    "xla_llvm_disable_expensive_passes": False,
+    "xla_cpu_use_fusion_emitters": True,
+}
+
 
 def np_skew(a: Any) -> np.ndarray:
     """Cross-product matrix."""

@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import THOROUGH
 from scipy.integrate import solve_ivp
 
+from stmuav_jax.algebra.compiler import compiler_options
 from stmuav_jax.algebra.rotation import rotation_matrix
 from stmuav_jax.estimation.assess import Estimates, estimate_case, study_case, summarise
 from stmuav_jax.estimation.bank import filter_bank
@@ -175,7 +177,8 @@ def surviving(dtype, u, y):
         out = filter_bank(model, prior, y, u=u, dt=single(1e-3))
         return out.ok[-1], out.mean[-1], out.factor[-1]
 
-    ok, mean, factor = jax.jit(run)(jnp.asarray(u, dtype), jnp.asarray(y, dtype))
+    compiled = jax.jit(run, compiler_options=compiler_options() | THOROUGH)
+    ok, mean, factor = compiled(jnp.asarray(u, dtype), jnp.asarray(y, dtype))
     assert mean.dtype == factor.dtype == dtype
     assert np.all(np.isfinite(mean))
     return int(np.sum(ok))
