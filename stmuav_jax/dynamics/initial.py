@@ -95,8 +95,8 @@ def assemble(
         raise StateError(
             f"The mechanism could not be assembled from this guess: after {max_steps} steps at the "
             f"most, joint '{names[k]}' is still open by {float(residuals[k]):.3g} m, or rad "
-            f"in its angles (tolerance {tolerance:.3g}). Start nearer to a posture that closes, hold less, or check the "
-            "lengths."
+            f"in its angles (tolerance {tolerance:.3g}). Start nearer to a posture "
+            "that closes, hold less, or check the lengths."
         )
     return result
 
