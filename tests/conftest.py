@@ -18,7 +18,8 @@ QUICK = {
     "xla_llvm_disable_expensive_passes": "true",
     "xla_cpu_use_fusion_emitters": "false",
 }
-given = os.environ.get("XLA_FLAGS", "")
+# what was given is kept for the notebooks; workers of pytest-xdist inherit both
+given = os.environ.setdefault("STMUAV_GIVEN_XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
 os.environ["XLA_FLAGS"] = " ".join([*(f"--{k}={v}" for k, v in QUICK.items()), given]).strip()
 
 import jax

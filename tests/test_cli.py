@@ -212,7 +212,9 @@ def test_trim_command(tmp_path, capsys):
     assert main([*given, "--phi", "3"]) == 2
     assert "not both" in capsys.readouterr().err
     assert main(["trim", "--phi", "70", "--no-cache"]) == 2
-    assert "70.98 degrees from the base's z axis, 11 more" in " ".join(capsys.readouterr().err.split())
+    assert "70.98 degrees from the base's z axis, 11 more" in " ".join(
+        capsys.readouterr().err.split()
+    )
     assert main([*given, "--turn", "10"]) == 2
     assert "no steady" in " ".join(capsys.readouterr().err.split())
 

@@ -22,12 +22,6 @@ LONG = (
 )
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
-QUICK = (
-    "--xla_backend_optimization_level=0",
-    "--xla_llvm_disable_expensive_passes",
-    "--xla_cpu_use_fusion_emitters",
-)
-
 # Notebooks whose stored outputs are not those of the present package, with the reason. A notebook
 # that is executed again has to be taken out.
 STALE: dict[str, str] = {}
@@ -51,8 +45,7 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w]
 
 def as_users_have_it() -> dict[str, str]:
     """The environment without the tests' own options for XLA: figures of chaotic motion feel them."""
-    flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if not flag.startswith(QUICK)]
-    return os.environ | {"XLA_FLAGS": " ".join(flags)}
+    return os.environ | {"XLA_FLAGS": os.environ["STMUAV_GIVEN_XLA_FLAGS"]}
 
 
 def words_and_numbers(text: str) -> tuple[str, list[str]]:

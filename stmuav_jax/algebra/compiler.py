@@ -63,13 +63,16 @@ def compiler_options(*, quick: bool = False) -> Options:
     if jax.default_backend() != "cpu":
         return {}
     options = _NO_LIBRARY | (_QUICK if quick else {})
-    return {name: value for name, value in options.items() if _known(name, value)}
+    # one by one only where it matters which are unknown: every process waits for this
+    if _known(options):
+        return options
+    return {name: value for name, value in options.items() if _known({name: value})}
 
 
-def _known(name: str, value: str | bool | int | float) -> bool:
-    """Whether this version of XLA takes this option."""
+def _known(options: Options) -> bool:
+    """Whether this version of XLA takes all of these options."""
     try:
-        jax.jit(jnp.cos, compiler_options={name: value}).lower(0.0).compile()
+        jax.jit(jnp.cos, compiler_options=dict(options)).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True
@@ -81,7 +84,14 @@ def outer_jit(function: Callable[..., Any]) -> Any:
 
 
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`eqx.filter_jit` with the quick `compiler_options`; a part of a larger program within one."""
+    """`eqx.filter_jit` with `compiler_options(quick=True)`, which are asked for at the first call.
+
+    Within a transformation (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a
+    larger program.
+
+    Args:
+        function: of positional arguments.
+    """
     within: Any = eqx.filter_jit(function)
 
     @cache

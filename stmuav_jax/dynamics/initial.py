@@ -355,11 +355,10 @@ def _standing(system: System, state: State, names: tuple[str, ...]) -> str:
     """Joints with their angles and shifts, where they leave one free."""
     kin = system.kinematics(state)
     units: dict[Which, str] = {"angle": "rad", "shift": "m"}
-    ways: tuple[Which, ...] = ("angle", "shift")
     found = []
     for name in names:
         joint = system.joints[system.joint_index(name)]
-        free: list[Which] = [which for which in ways if joint.kind in LEAVES_FREE[which]]
+        free: list[Which] = [which for which in units if joint.kind in LEAVES_FREE[which]]
         at = [f"{float(coordinate(kin, joint, w).value):.6g} {units[w]}" for w in free]
         found.append(f"{name} (at {', '.join(at)})" if at else name)
     return ", ".join(found)
