@@ -10,7 +10,6 @@ interrupted call goes on where it was, and committing results in between is no r
 again (`--again` is one). What fails is named at the end, and the others are run all the same.
 """
 
-import argparse
 import json
 import os
 import shutil
@@ -19,32 +18,22 @@ import sys
 import time
 from pathlib import Path
 
-from record import MEASURED, RESULTS, ROOT, add_options, begin, commit, moved
+from shared.command import begin, parser
+from shared.record import ALLOW, MEASURED, RESULTS, ROOT, commit, moved
 
 FOLDER = Path(__file__).parent
 SUITE = (
-    "work_precision",
-    "acceleration",
-    "batch",
-    "scaling",
-    "gradient",
-    "hexacopter",
-    "scenes",
-    "published",
-    "stiff",
-)
+    "work_precision", "acceleration", "batch", "scaling", "gradient", "hexacopter", "scenes",
+    "published", "stiff",
+)  # fmt: skip
+ALONE = (
+    "stiff", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "failure",
+    "montecarlo",
+)  # fmt: skip
 # Result -> the script that measures it, with its arguments, in the order of running.
 BENCHMARKS: dict[str, tuple[str, ...]] = {
     **{f"suite_{name}": ("suite.py", "--only", name, "--no-report") for name in SUITE},
-    "stiff": ("stiff.py",),
-    "long_horizon": ("long_horizon.py",),
-    "trims": ("trims.py",),
-    "singular": ("singular.py",),
-    "errors": ("errors.py",),
-    "estimation": ("estimation.py",),
-    "first_result": ("first_result.py",),
-    "failure": ("failure.py",),
-    "montecarlo": ("montecarlo.py",),
+    **{name: (f"{name}.py",) for name in ALONE},
 }
 # These measure more than one core, or the command line as a user starts it.
 ALL_CORES = ("montecarlo", "first_result")
@@ -77,8 +66,7 @@ def run(name: str, results: Path, *, allow_dirty: bool) -> tuple[bool, float]:
     if (os.cpu_count() or 1) < 2:
         pin = []
     command = [*pin, sys.executable, str(FOLDER / script), *arguments, "--results", str(results)]
-    # scripts that do not know the option read the variable
-    told = {"STMUAV_BENCHMARKS_ALLOW_DIRTY": "1"} if allow_dirty else {}
+    told = {ALLOW: "1"} if allow_dirty else {}
     clock = time.perf_counter()
     done = subprocess.run(command, cwd=ROOT, env={**os.environ, **THREADS, **told}, check=False)
     return done.returncode == 0, time.perf_counter() - clock
@@ -86,12 +74,9 @@ def run(name: str, results: Path, *, allow_dirty: bool) -> tuple[bool, float]:
 
 def main() -> None:
     """Run what is missing, then write the suite's page."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", nargs="+", choices=list(BENCHMARKS), default=list(BENCHMARKS))
-    parser.add_argument("--again", action="store_true", help="run also what is there")
-    parser.add_argument("--list", action="store_true", help="say what would be run, and end")
-    add_options(parser)
-    options = parser.parse_args()
+    made = parser(__doc__, again="run also what is there", list="say what would be run, and end")
+    made.add_argument("--only", nargs="+", choices=list(BENCHMARKS), default=list(BENCHMARKS))
+    options = made.parse_args()
     results = options.results.resolve()
     reasons = {name: why_again(name, results) for name in options.only}
     todo = [name for name, reason in reasons.items() if reason or options.again]

@@ -1,27 +1,24 @@
 """The estimate of the global error: how near it is to the true error, and what it costs.
 
-The runs of the slow test in `tests/dynamics/test_accuracy.py`, 2 s of the tracker and of the UAV at
+2 s of the tracker and of the UAV at
 tolerances from 1e-2 to 1e-10. The reference is a run at 3e-13. Beside the second run of `simulate`, at
 a tenth of the tolerances, others: tighter, and looser, which would cost less. One core:
 
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 taskset -c 1 python benchmarks/errors.py
 """
 
-import argparse
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
-from record import add_options, begin, write
+from shared.command import benchmark
 
-jax.config.update("jax_enable_x64", True)
-
-import stmuav_jax as sj
-from stmuav_jax.dynamics.accuracy import SecondRun, estimated
-from stmuav_jax.dynamics.march import March
-from stmuav_jax.dynamics.problem import prepare
+import stmuav_jax as stm
+from stmuav_jax.dynamics.error_estimate import SecondRun, estimated
+from stmuav_jax.dynamics.integration.march import March
+from stmuav_jax.dynamics.integration.problem import prepare
 
 REFERENCE = 3e-13
 CASES = (
@@ -46,11 +43,10 @@ class Size:
 QUICK = Size(cases=(("tracker", 1, 1e-2),), factors=(0.1,), repeats=1, t1=0.5)
 
 
-def simulated(scene: sj.Scene, tolerance: float, t1: float) -> sj.Run:
+def simulated(scene: stm.Scene, tolerance: float, t1: float) -> stm.Run:
     """Without an estimate: it is made here, where it can be timed."""
-    return sj.simulate(
-        scene, rtol=tolerance, atol=tolerance, t1=t1, error_estimate=False, analysis=False
-    )
+    method = stm.Method(rtol=tolerance, atol=tolerance)
+    return stm.simulate(scene, method=method, t1=t1, error_estimate=False, analysis=False)
 
 
 def attempts(march: March) -> int:
@@ -59,40 +55,39 @@ def attempts(march: March) -> int:
     return int(counts.accepted[-1] + counts.rejected[-1])
 
 
-def first_run(scene: sj.Scene, run: sj.Run, repeats: int) -> tuple[March, float]:
+def least(repeats: int, make: Callable[[], Any], go: Callable[[Any], Any]) -> tuple[Any, float]:
+    """What was made last, and the least processor seconds that `go` took with it."""
+    made, best = None, float("inf")
+    for _ in range(repeats):
+        made = make()
+        clock = time.process_time()
+        go(made)
+        best = min(best, time.process_time() - clock)
+    return made, best
+
+
+def first_run(scene: stm.Scene, run: stm.Run, repeats: int) -> tuple[March, float]:
     """The first run again, and the least processor seconds that it took."""
-    best = float("inf")
-    for _ in range(repeats):
-        march = March(prepare(scene.system, run.method), scene.t0, scene.state0)
-        clock = time.process_time()
-        march.to(run.ts)
-        best = min(best, time.process_time() - clock)
-    return march, best  # pyright: ignore[reportPossiblyUnboundVariable]
+    make = lambda: March(prepare(scene.system, run.method), scene.t0, scene.state0)
+    return least(repeats, make, lambda march: march.to(run.ts))
 
 
-def second_run(scene: sj.Scene, march: March, factor: float, repeats: int) -> dict[str, Any]:
+def second_run(scene: stm.Scene, march: March, factor: float, repeats: int) -> dict[str, Any]:
     """Largest estimated position error, step attempts and least processor seconds."""
-    best, first = float("inf"), march.trajectory()
-    for _ in range(repeats):
-        second = SecondRun(march.problem, scene.t0, scene.state0, factor=factor)
-        clock = time.process_time()
-        second.follow(first)
-        best = min(best, time.process_time() - clock)
-    found = estimated(first, second, None)  # pyright: ignore[reportPossiblyUnboundVariable]
-    return {
-        "factor": factor,
-        "estimate": float(np.nanmax(found.position)),
-        "attempts": attempts(second.march),  # pyright: ignore[reportPossiblyUnboundVariable]
-        "seconds": best,
-    }
+    first = march.trajectory()
+    make = lambda: SecondRun(march.problem, scene.t0, scene.state0, factor=factor)
+    second, seconds = least(repeats, make, lambda second: second.follow(first))
+    estimate = float(np.nanmax(estimated(first, second, None).position))
+    counted = attempts(second.march)
+    return {"factor": factor, "estimate": estimate, "attempts": counted, "seconds": seconds}
 
 
-def record(size: Size) -> dict[str, Any]:
+def record(size: Size) -> Iterator[dict[str, Any]]:
     """All cases, and how many estimates are within a factor of three."""
     rows: list[dict[str, Any]] = []
-    references: dict[tuple[str, int], sj.Run] = {}
+    references: dict[tuple[str, int], stm.Run] = {}
     for name, case, tolerance in size.cases:
-        scene = sj.make_scene(name, case)
+        scene = stm.make_scene(name, case)
         if (name, case) not in references:
             references[name, case] = simulated(scene, REFERENCE, size.t1)
         run = simulated(scene, tolerance, size.t1)
@@ -103,12 +98,15 @@ def record(size: Size) -> dict[str, Any]:
         row["second"] = [second_run(scene, march, f, size.repeats) for f in size.factors]
         rows.append(row)
         print(line(row), flush=True)
-    return {
+    factors = {str(f): summary(rows, k) for k, f in enumerate(size.factors)}
+    for factor, found in factors.items():
+        print(factor, found, flush=True)
+    yield {
         "what": "estimates of the largest position error [m] against the true one, and their cost",
         "seconds": "processor time of the process, the least of the repeats",
         "t1": size.t1,
         "rows": rows,
-        "factors": {str(f): summary(rows, k) for k, f in enumerate(size.factors)},
+        "factors": factors,
     }
 
 
@@ -132,18 +130,5 @@ def summary(rows: list[dict[str, Any]], k: int) -> dict[str, Any]:
     return {"within": within, "of": len(of), "cost": spread(cost), "attempts": spread(steps)}
 
 
-def main() -> None:
-    """Run and write `errors.json`."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="the smallest size")
-    add_options(parser)
-    arguments = parser.parse_args()
-    begin(arguments)
-    content = record(QUICK if arguments.quick else Size())
-    for factor, found in content["factors"].items():
-        print(factor, found, flush=True)
-    print(write("errors", content, arguments.results))
-
-
 if __name__ == "__main__":
-    main()
+    benchmark("errors", __doc__, record, (Size(), QUICK))

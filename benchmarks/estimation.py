@@ -11,24 +11,22 @@ jitter of 1e-9 is taken out, and its first entry is a measurement that is all pr
 before it predicts.
 """
 
-import argparse
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
-from record import RESULTS, write
-from timer import Timing, measure
-
-jax.config.update("jax_enable_x64", True)
-
 import jax.numpy as jnp
+import numpy as np
+from shared.clock import Timing, measure
+from shared.command import benchmark
 
 from stmuav_jax.algebra.compiler import compiler_options
 from stmuav_jax.estimation.bank import filter_bank
 from stmuav_jax.estimation.filter import kalman_filter
-from stmuav_jax.estimation.quadrotor import (
+from stmuav_jax.estimation.sigma import Unscented
+from stmuav_jax.estimation.update import DEFAULT, AbstractFilter, GaussianFilter
+from stmuav_jax.quadrotor.model import (
     PART_III,
     euler_angle_rates,
     observable_model,
@@ -36,8 +34,7 @@ from stmuav_jax.estimation.quadrotor import (
     report_model,
     report_prior,
     thrusts,
-)
-from stmuav_jax.estimation.sigma import AbstractRule, Cubature, Unscented
+)  # fmt: skip
 
 DT = 1e-3
 REPORT = Unscented(0.1, 2.0, 0.1)
@@ -75,20 +72,16 @@ def record_of_case(case: int, count: int, seed: int = 0) -> tuple[np.ndarray, np
 
 def per_step(timing: Timing, steps: int) -> dict[str, float]:
     """Microseconds per filter step."""
-    return {
-        "median_us": timing.median / steps * 1e6,
-        "best_us": timing.best / steps * 1e6,
-        "spread_us": timing.spread / steps * 1e6,
-    }
+    return {f"{k}_us": getattr(timing, k) / steps * 1e6 for k in ("median", "best", "spread")}
 
 
 def ours(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
     """One filter and the bank, in the forms that can be chosen."""
-    kinds: list[tuple[str, AbstractRule, Any, int]] = [
-        ("unscented_covariance", REPORT, "covariance", 8),
-        ("unscented_square_root", REPORT, "square_root", 8),
-        ("cubature_square_root", Cubature(), "square_root", 8),
-        ("cubature_square_root_5_states", Cubature(), "square_root", 5),
+    kinds = [
+        ("unscented_covariance", GaussianFilter(REPORT, "covariance"), 8),
+        ("unscented_square_root", GaussianFilter(REPORT), 8),
+        ("cubature_square_root", DEFAULT, 8),
+        ("cubature_square_root_5_states", DEFAULT, 5),
     ]
     rng = np.random.default_rng(1)
     spread = 0.01 * rng.normal(size=(size.bank_steps, 3, size.filters))
@@ -96,17 +89,18 @@ def ours(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
     ys, us = jnp.asarray(y[: size.steps]), jnp.asarray(u[: size.steps])
     ub = jnp.asarray(u[: size.bank_steps])
     found: dict[str, Any] = {}
-    for name, rule, form, states in kinds:
-        single, bank = programs(rule, form, states)
+    for name, method, states in kinds:
+        single, bank = programs(method, states)
+        timed = lambda call, *given: measure(lambda: call(*given), repeats=size.repeats)[0]
         found[name] = {
-            "single": per_step(timed(single, ys, us, size), size.steps),
-            "bank": per_step(timed(bank, yb, ub, size), size.bank_steps * size.filters),
+            "single": per_step(timed(single, ys, us), size.steps),
+            "bank": per_step(timed(bank, yb, ub), size.bank_steps * size.filters),
         }
         print(name, found[name], flush=True)
     return found
 
 
-def programs(rule: AbstractRule, form: Any, states: int) -> tuple[Any, Any]:
+def programs(method: AbstractFilter, states: int) -> tuple[Any, Any]:
     """Compiled functions of measurements and thrusts: a filter, and a bank.
 
     The filter returns all that it knows (means, roots, innovations), the bank means and NIS.
@@ -115,19 +109,14 @@ def programs(rule: AbstractRule, form: Any, states: int) -> tuple[Any, Any]:
     model = report_model(propagation="euler") if states == 8 else observable_model("euler")
 
     def single(y: Any, u: Any) -> Any:
-        return kalman_filter(model, prior, y, u=u, dt=DT, rule=rule, form=form)
+        return kalman_filter(model, prior, y, u=u, dt=DT, method=method)
 
     def bank(y: Any, u: Any) -> Any:
-        out = filter_bank(model, prior, y, u=u, dt=DT, rule=rule, form=form)
+        out = filter_bank(model, prior, y, u=u, dt=DT, method=method)
         return out.mean, out.nis, out.ok
 
     options = compiler_options()
     return jax.jit(single, compiler_options=options), jax.jit(bank, compiler_options=options)
-
-
-def timed(call: Any, y: Any, u: Any, size: Size) -> Timing:
-    """Seconds of one compiled call."""
-    return measure(lambda: call(y, u), repeats=size.repeats)[0]
 
 
 def with_filterpy(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
@@ -170,7 +159,7 @@ def _apart(size: Size, u: np.ndarray, y: np.ndarray, path: np.ndarray) -> float:
     count = size.peer_steps
     out = kalman_filter(
         report_model(propagation="euler"), report_prior(), y[:count], u=u[:count], dt=DT,
-        rule=REPORT, form="covariance",
+        method=GaussianFilter(REPORT, "covariance"),
     )  # fmt: skip
     return float(np.max(np.abs(np.asarray(out.mean) - path)))
 
@@ -196,17 +185,9 @@ def with_dynamax(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
 
     # it updates first: with our first prediction as its prior, and inputs one later
     model, start = report_model(propagation="euler"), report_prior()
-    from stmuav_jax.estimation.update import predict
-
-    first = predict(model, start, jnp.asarray(u[0]), DT, rule=REPORT)
-    parameters = ParamsNLGSSM(
-        first.mean,
-        first.covariance,
-        step,
-        jnp.diag(jnp.asarray(PART_III.value("filter.Q"))),
-        lambda q, u: q[3:6],
-        jnp.diag(jnp.asarray(PART_III.value("filter.R"))),
-    )
+    first = GaussianFilter(REPORT).predict(model, start, jnp.asarray(u[0]), DT)
+    Q, R = (jnp.diag(jnp.asarray(PART_III.value(f"filter.{name}"))) for name in "QR")
+    parameters = ParamsNLGSSM(first.mean, first.covariance, step, Q, lambda q, u: q[3:6], R)
     # its annotation says int for kappa
     settings = ukf.UKFHyperParams(0.1, 2, 0.1)  # pyright: ignore[reportArgumentType]
 
@@ -216,12 +197,9 @@ def with_dynamax(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
         )
         return out.filtered_means, out.filtered_covariances
 
-    def later(count: int) -> Any:
-        """dynamax takes the inputs of entry t + 1 for the step from t to t + 1."""
-        return jnp.asarray(u[:count])
-
     single, many = jax.jit(run), jax.jit(jax.vmap(lambda y, u: run(y, u)[0], in_axes=(0, None)))
-    ys, us = jnp.asarray(y[: size.steps]), later(size.steps)
+    # it takes the inputs of entry t + 1 for the step from t to t + 1
+    ys, us = jnp.asarray(y[: size.steps]), jnp.asarray(u[: size.steps])
     timing, out = measure(lambda: single(ys, us), repeats=size.repeats)
     found: dict[str, Any] = {
         "single": per_step(timing, size.steps),
@@ -229,20 +207,14 @@ def with_dynamax(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
     }
     if size.filters:
         yb = jnp.asarray(np.broadcast_to(y[: size.bank_steps], (size.filters, size.bank_steps, 3)))
-        ub = later(size.bank_steps)
-        banked, _ = measure(lambda: many(yb, ub), repeats=min(size.repeats, 3))
+        banked, _ = measure(lambda: many(yb, us[: size.bank_steps]), repeats=min(size.repeats, 3))
         found["bank"] = per_step(banked, size.bank_steps * size.filters)
     ukf.psd_solve = plain
     return found
 
 
-def main() -> None:
-    """Run and write `estimation.json`."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="the smallest size")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    arguments = parser.parse_args()
-    size = QUICK if arguments.quick else Size()
+def record(size: Size) -> Iterator[dict[str, Any]]:
+    """Our filters, and those of other programs that are installed."""
     u, y = record_of_case(2, size.steps)
     content: dict[str, Any] = {"ours": ours(size, u, y)}
     for name, peer in (("filterpy", with_filterpy), ("dynamax", with_dynamax)):
@@ -259,8 +231,8 @@ def main() -> None:
             kind: content["dynamax"][kind]["median_us"] / mine[kind]["median_us"]
             for kind in ("single", "bank")
         }
-    print(write("estimation", content, arguments.results))
+    yield content
 
 
 if __name__ == "__main__":
-    main()
+    benchmark("estimation", __doc__, record, (Size(), QUICK))

@@ -11,7 +11,6 @@ and measures (stiffness) the eigenvalues along the path and (g) when rod 5 lines
 axis of its universal joint, for the adopted geometry and for others within its uncertainty.
 """
 
-import argparse
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,33 +20,35 @@ from typing import Any
 
 import jax
 import numpy as np
-from failure_figures import draw
-from failure_measures import (
-    EVERY,
+from dense.tables import Variant
+from failing.figures import draw
+from failing.measures import (
+    ALL_MISPRINTS,
+    DEFAULT,
+    FIXED,
+    MAIN_CASE,
+    QUICK,
+    TIGHT,
     Reference,
+    Size,
     attempt,
     describe,
     eigenvalues,
+    grid,
     reduced_eigenvalues,
     reference,
-)
-from failure_model import Dense
-from failure_setup import ALL_MISPRINTS, DEFAULT, FIXED, MAIN_CASE, QUICK, TIGHT, Size, say
-from failure_steps import Scheme
-from failure_tables import Variant
-from failure_variations import alignment, alignment_methods, collapses, nature
-from record import add_options, begin, environment, write
+    say,
+)  # fmt: skip
+from failing.model import Report
+from failing.steps import Scheme
+from failing.variations import alignment, alignment_methods, collapses, nature
+from shared.command import begin, parser
+from shared.record import ROOT, environment, write
 
-from stmuav_jax import (
-    PRINTED_ORIENTATIONS,
-    Baumgarte,
-    Projection,
-    Unstabilised,
-    make_scene,
-    simulate,
-)
+from stmuav_jax import Baumgarte, Method, Projection, Unstabilised, make_scene, simulate
+from stmuav_jax.parameters import PRINTED_ORIENTATIONS
 
-FIGURES = Path(__file__).parents[1] / "docs" / "figures" / "failure"
+FIGURES = ROOT / "docs" / "figures" / "failure"
 
 # e1 of p4 has the wrong sign in print; |p7| = 0.9974
 SIGNED = {**PRINTED_ORIENTATIONS, "post_4": (0.9987, -0.0517, 0.0, 0.0)}
@@ -71,22 +72,12 @@ class Trial:
         return tuple(scheme for scheme in self.schemes if scheme.method not in others)
 
 
+EVERY_SCHEME = (
+    DEFAULT, TIGHT, Scheme("rk45"), Scheme("rk45", 1e-6, 1e-9), Scheme("radau"),
+    Scheme("radau", 1e-5, 1e-8), Scheme("dop853", 1e-6, 1e-9), *FIXED,
+)  # fmt: skip
 TRIALS = (
-    Trial(
-        "a",
-        "corrected",
-        Variant(),
-        (
-            DEFAULT,
-            TIGHT,
-            Scheme("rk45"),
-            Scheme("rk45", 1e-6, 1e-9),
-            Scheme("radau"),
-            Scheme("radau", 1e-5, 1e-8),
-            Scheme("dop853", 1e-6, 1e-9),
-            *FIXED,
-        ),
-    ),
+    Trial("a", "corrected", Variant(), EVERY_SCHEME),
     Trial("b", "gamma: lost dots", Variant(lost_dots=True), (DEFAULT, TIGHT, FIXED[0])),
     Trial("b", "lost dots, d~^T in gamma", Variant(lost_dots=True, transposed_gamma=True)),
     Trial("b", "d~^T in the Jacobian", Variant(transposed_jacobian=True)),
@@ -122,15 +113,12 @@ def arithmetic(ref: Reference) -> list[dict[str, float]]:
     rows = []
     for k in range(0, len(ref.times), max(1, len(ref.times) // 10)):
         t, row = float(ref.times[k]), {"t": float(ref.times[k])}
-        base = Dense(ref.scene)
+        base = Report(ref.scene)
         y = _start_at(base, ref, k)
         right, row["condition_m"] = base.accelerations(t, y), base.condition(t, y)
-        for name, metres, inverse in (
-            ("m_inv", 1.0, True),
-            ("mm", 1e-3, False),
-            ("mm_inv", 1e-3, True),
-        ):
-            model = Dense(ref.scene, Variant(metres=metres, inverse=inverse))
+        ways = (("m_inv", 1.0, True), ("mm", 1e-3, False), ("mm_inv", 1e-3, True))
+        for name, metres, inverse in ways:
+            model = Report(ref.scene, Variant(metres=metres, inverse=inverse))
             y = _start_at(model, ref, k)
             q = model.accelerations(t, y) * np.array([metres] * 3 + [1.0] * 4)
             row[f"error_{name}"] = float(np.max(np.abs(q - right)) / np.max(np.abs(right)))
@@ -142,7 +130,7 @@ def arithmetic(ref: Reference) -> list[dict[str, float]]:
 def long_run(size: Size) -> list[dict[str, Any]]:
     """Part f: drift over a long time, case 2."""
     scene = make_scene("uav_tracker", MAIN_CASE)
-    times = EVERY * np.arange(round(size.long / EVERY) + 1)
+    times = grid(size.long)
     rows: list[dict[str, Any]] = []
     for scheme in (DEFAULT, TIGHT):
         model, history = attempt(scene, times, scheme)
@@ -150,15 +138,8 @@ def long_run(size: Size) -> list[dict[str, Any]]:
         rows.append({"name": f"dense, {scheme.label}", **record})
     ways = (("none", Unstabilised()), ("Baumgarte", Baumgarte()), ("projection", Projection()))
     for name, how in ways:
-        run = simulate(
-            scene,
-            rtol=1e-6,
-            atol=1e-6,
-            stabilisation=how,
-            t1=size.long,
-            save_every=0.1,
-            throw=False,
-        )
+        method = Method(rtol=1e-6, atol=1e-6, stabilisation=how)
+        run = simulate(scene, method=method, t1=size.long, save_every=0.1, throw=False)
         rows.append({"name": f"package at 1e-6, {name}", **run.certificate.to_dict()})
     return rows
 
@@ -168,7 +149,7 @@ def stiffness(size: Size, ref: Reference, scheme: Scheme = DEFAULT) -> dict[str,
 
     "dense": all 98 of the system as it is integrated; "reduced": 16, see `reduced_eigenvalues`.
     """
-    times, model = np.asarray(ref.times), Dense(ref.scene)
+    times, model = np.asarray(ref.times), Report(ref.scene)
     pick = np.arange(0, len(times), min(2, size.eigenvalues_every))
     dense = np.array([eigenvalues(model, times[k], _start_at(model, ref, int(k))) for k in pick])
     reduced = reduced_eigenvalues(ref.scene, times, ref.states)[pick]
@@ -197,23 +178,24 @@ def stiffness(size: Size, ref: Reference, scheme: Scheme = DEFAULT) -> dict[str,
     return out
 
 
-def _start_at(model: Dense, ref: Reference, k: int) -> np.ndarray:
+def _start_at(model: Report, ref: Reference, k: int) -> np.ndarray:
     """The dense system's state at the k-th time of a reference."""
     state = jax.tree.map(lambda x: np.asarray(x)[k], ref.states)
-    return model.start(replace(ref.scene, state0=state))
+    return model.begin(replace(ref.scene, state0=state))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="the smallest size, for a smoke test")
-    add_options(parser)
-    parser.add_argument("--figures", type=Path, default=FIGURES)
-    parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--redraw", action="store_true", help="figures from a complete result")
-    options = parser.parse_args()
+    """Run parts and write `failure.json`, then the figures of a complete one."""
+    made = parser(
+        __doc__,
+        quick="the smallest size, for a smoke test",
+        redraw="figures from a complete result",
+    )
+    made.add_argument("--figures", type=Path, default=FIGURES)
+    made.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
+    options = made.parse_args()
     if not options.redraw:
         begin(options)
-    jax.config.update("jax_enable_x64", True)
     path = options.results / "failure.json"
     size = QUICK if options.quick else Size()
     for name in () if options.redraw else options.parts:

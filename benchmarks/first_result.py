@@ -5,10 +5,8 @@ program's own certificate; "rest" is what remains of the whole process: building
 results, figures.
 """
 
-import argparse
 import json
 import os
-import re
 import statistics
 import subprocess
 import sys
@@ -16,14 +14,15 @@ import tempfile
 import time
 from pathlib import Path
 
-from record import add_options, begin, write
+from shared.command import begin, parser
+from shared.record import write
 
 
 def one(cache: Path, out: Path, t1: float) -> dict[str, float]:
     """Wall times of one run of the command line [s]."""
     command = [sys.executable, "-m", "stmuav_jax.cli", "simulate", "uav_tracker", "--case", "2"]
     clock = time.perf_counter()
-    done = subprocess.run(
+    subprocess.run(
         [*command, "--t1", str(t1), "--out", str(out)],
         env={**os.environ, "XDG_CACHE_HOME": str(cache)},
         capture_output=True,
@@ -32,9 +31,7 @@ def one(cache: Path, out: Path, t1: float) -> dict[str, float]:
     )
     total = time.perf_counter() - clock
     c = json.loads((out / "certificate.json").read_text())["certificate"]
-    found = re.search(r"Imports ([\d.]+) s", done.stdout)
     split = {
-        "import": float(found.group(1)) if found else float("nan"),
         "compile": c["compile_seconds"],
         "run": c["run_seconds"],
         "checks": c["analysis_seconds"],
@@ -48,11 +45,11 @@ def median(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--t1", type=float, default=2.0)
-    add_options(parser)
-    options = parser.parse_args()
+    """Run and write `first_result.json`."""
+    made = parser(__doc__)
+    made.add_argument("--repeats", type=int, default=3)
+    made.add_argument("--t1", type=float, default=2.0)
+    options = made.parse_args()
     begin(options)
     cold, warm = [], []
     for _ in range(options.repeats):

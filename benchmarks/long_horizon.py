@@ -2,7 +2,7 @@
 
 Six problems, 60 s each. Projected, unstabilised and Baumgarte-stabilised Dopri8 and Tsit5 at
 tolerances 1e-4 to 1e-12, against Gauss-Legendre methods of order 2 and 4 with fixed steps, which
-are symmetric (benchmarks/gauss.py), with the same projection and without.
+are symmetric (benchmarks/horizons/gauss.py), with the same projection and without.
 
 Trajectories of the tracker diverge whatever the method, so energies are compared, not states. The
 energy error is (E - E0) / scale with the largest kinetic energy of the finest run as scale; its
@@ -10,22 +10,17 @@ drift is the slope of a straight line fitted over time. The fixed steps run in a
 step size control, which favours them.
 """
 
-import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
-from long_figures import draw
-from long_problems import PROBLEMS, Problem, simple_pendulum
-from long_runs import FAMILIES, Family, Runner
-from long_tables import tables
-from record import add_options, begin, write
-from trial import rounded
+from horizons.families import FAMILIES, Family, Runner
+from horizons.pages import show
+from problems.conservative import PROBLEMS, Problem, simple_pendulum
+from shared.clock import rounded
+from shared.command import benchmark
 
-FIGURES = Path(__file__).parents[1] / "docs" / "figures" / "benchmarks"
 LEVELS = (1e-3, 1e-6, 1e-9)
 
 
@@ -50,21 +45,14 @@ class Size:
 
 
 QUICK = Size(
-    problems=(simple_pendulum,),
-    families=tuple(f for f in FAMILIES if f.name in ("dopri8, projection", "gauss, projection")),
-    horizon=2.0,
-    tolerances=(1e-4, 1e-8),
-    counts=(10, 40),
-    repeats=1,
-)
+    (simple_pendulum,),
+    tuple(f for f in FAMILIES if f.name in ("dopri8, projection", "gauss, projection")),
+    horizon=2.0, tolerances=(1e-4, 1e-8), counts=(10, 40), repeats=1,
+)  # fmt: skip
 # The runs whose error over time is kept for the figure.
 SERIES = {
-    ("dopri8, projection", 1e-6),
-    ("dopri8, none", 1e-6),
-    ("dopri8, baumgarte", 1e-6),
-    ("gauss, projection", 40),
-    ("gauss, none", 40),
-    ("midpoint, projection", 40),
+    *((f"dopri8, {hold}", 1e-6) for hold in ("projection", "none", "baumgarte")),
+    *((family, 40) for family in ("gauss, projection", "gauss, none", "midpoint, projection")),
 }
 
 
@@ -153,55 +141,38 @@ def answer(runs: list[dict[str, Any]], cost: str) -> dict[str, Any]:
             for key in ("largest", "drift"):
                 below = abs(best[key])
                 ratios[key] = rounded(abs(row[key]) / below) if below else None
-        pairs.append(
-            {
-                "family": row["family"],
-                "step": row["step"],
-                "cost": row[cost],
-                "against": None if best is None else [best["family"], best["tolerance"]],
-                "ratio": ratios.get("largest"),
-                "drift_ratio": ratios.get("drift"),
-            }
-        )
+        against = None if best is None else [best["family"], best["tolerance"]]
+        ratio = {"ratio": ratios.get("largest"), "drift_ratio": ratios.get("drift")}
+        which = {"family": row["family"], "step": row["step"], "cost": row[cost]}
+        pairs.append({**which, "against": against, **ratio})
     compared = [pair for pair in pairs if pair["ratio"] is not None]
     return {
         "pairs": pairs,
         "compared": len(compared),
         "explicit_better": sum(pair["ratio"] > 1 for pair in compared),
-        "explicit_drifts_less": sum(
-            pair["drift_ratio"] is not None and pair["drift_ratio"] > 1 for pair in compared
-        ),
+        "explicit_drifts_less": sum((pair["drift_ratio"] or 0) > 1 for pair in compared),
     }
+
+
+def record(size: Size) -> Iterator[dict[str, Any]]:
+    """What there is after each problem, so that a long run leaves what it has."""
+    ts = np.linspace(0.0, size.horizon, round(size.horizon / size.every) + 1)
+    runner = Runner(ts, size.repeats)
+    problems: list[dict[str, Any]] = []
+    for make in size.problems:
+        problems.append(run_problem(make(), size, runner))
+        yield {
+            "what": "energy error of conservative systems over long times",
+            "seconds": "processor time of the process on one core",
+            "horizon": size.horizon,
+            "every": size.every,
+            "problems": problems,
+        }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="one problem, a few runs")
-    add_options(parser)
-    parser.add_argument("--figures", type=Path, default=FIGURES)
-    options = parser.parse_args()
-    begin(options)
-    size = QUICK if options.quick else Size()
-    jax.config.update("jax_enable_x64", True)
-    ts = np.linspace(0.0, size.horizon, round(size.horizon / size.every) + 1)
-    runner, path = Runner(ts, size.repeats), options.results / "long_horizon.json"
-    results: list[dict[str, Any]] = []
-    for make in size.problems:
-        results.append(run_problem(make(), size, runner))
-        # after each problem, so that a long run leaves what it has
-        path = write("long_horizon", {**about(size), "problems": results}, options.results)
-    print(tables(path))
-    print(path, *draw(path, options.figures))
-
-
-def about(size: Size) -> dict[str, Any]:
-    """What the record holds."""
-    return {
-        "what": "energy error of conservative systems over long times",
-        "seconds": "processor time of the process on one core",
-        "horizon": size.horizon,
-        "every": size.every,
-    }
+    """Run and write `long_horizon.json`."""
+    benchmark("long_horizon", __doc__, record, (Size(), QUICK), show)
 
 
 if __name__ == "__main__":

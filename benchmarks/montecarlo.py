@@ -20,21 +20,20 @@ from pathlib import Path
 from typing import Any
 
 import jax
-
-jax.config.update("jax_enable_x64", True)
-
 import jax.numpy as jnp
 import numpy as np
-from methods import peers
-from montecarlo_page import write_page
-from record import RESULTS, write
-from timer import measure
+from sections.ours import peers
+from sections.speed import errors, throughput
+from sections.throughput_page import write_page
+from shared.clock import compiled, measure
+from shared.command import begin, parser
+from shared.record import ROOT, write
 
-import stmuav_jax as sj
+import stmuav_jax as stm
+from stmuav_jax.dynamics.integration.lanes import fly
 from stmuav_jax.jobs.local import run_study
 from stmuav_jax.montecarlo.batch import FlightWork
-from stmuav_jax.montecarlo.flights import Drawn
-from stmuav_jax.montecarlo.lanes import fly
+from stmuav_jax.montecarlo.disturbed_flights import Drawn
 from stmuav_jax.montecarlo.study import study_from_plain
 
 # Largest error that counts [m]; peers get finer settings until they reach it.
@@ -58,7 +57,7 @@ FULL = Size()
 ONE = Size(flights=4, lanes=(2,), checked=2, t1=0.02, tolerances=(1e-6,), tight=1e-9, repeats=1)
 
 
-def study(size: Size, tolerance: float) -> sj.Study:
+def study(size: Size, tolerance: float) -> stm.montecarlo.Study:
     """The flights, with what a study of them would keep."""
     normal = {"distribution": "normal", "mean": 0.0, "deviation": 0.1}
     names = ("vx", "vy", "vz", "p", "q", "r")
@@ -81,9 +80,7 @@ class Bare:
         drawn = of.sampling.draw(0, size.flights)
         queue = Drawn(jnp.asarray(drawn), jnp.zeros(len(drawn), jnp.uint32))
         run = lambda queue, count: fly(plan, queue, count, lanes)
-        started = time.perf_counter()
-        self.program = sj.outer_jit(run).lower(queue, jnp.asarray(1)).compile()
-        self.compile_seconds = time.perf_counter() - started
+        self.program, self.compile_seconds = compiled(run, queue, jnp.asarray(1))
         self.queue, self.plan = queue, plan
 
     def fly(self, count: int) -> Any:
@@ -102,16 +99,10 @@ class Bare:
         first = jax.tree.map(lambda x: x[:count], self.queue)
         return np.asarray(jax.jit(jax.vmap(positions))(first, last))
 
-    def starts(self, count: int) -> sj.State:
+    def starts(self, count: int) -> stm.State:
         """Consistent starts (count, n, .)."""
         first = jax.tree.map(lambda x: x[:count], self.queue)
         return jax.jit(jax.vmap(lambda drawn: self.plan.make(drawn)[1]))(first)
-
-
-def errors(ends: np.ndarray, exact: np.ndarray) -> dict[str, float]:
-    """Median and largest error [m]."""
-    off = np.linalg.norm(ends[: len(exact)] - exact[: len(ends)], axis=-1).max(-1)
-    return {"median_error": float(np.median(off)), "largest_error": float(np.max(off))}
 
 
 def tolerance_for(size: Size, exact: np.ndarray) -> tuple[float, list[dict[str, Any]]]:
@@ -121,7 +112,8 @@ def tolerance_for(size: Size, exact: np.ndarray) -> tuple[float, list[dict[str, 
         ends = Bare(size, tolerance, 16).ends(len(exact))
         tried.append({"tolerance": tolerance, **errors(ends, exact)})
         print(f"  tolerance {tolerance:g}: {tried[-1]}", flush=True)
-        if tried[-1]["largest_error"] <= WANTED:
+        worst = tried[-1]["largest_error"]
+        if worst is not None and worst <= WANTED:
             break
     return tried[-1]["tolerance"], tried
 
@@ -133,51 +125,20 @@ def by_lanes(size: Size, tolerance: float) -> list[dict[str, Any]]:
         bare = Bare(size, tolerance, lanes)
         timing, flown = measure(lambda b=bare: b.fly(size.flights), repeats=size.repeats, warm_up=1)
         attempts = int(np.sum(flown.accepted) + np.sum(flown.rejected))
-        rows.append(
-            {
-                "lanes": lanes,
-                "per_second": size.flights / timing.median,
-                "seconds": timing.to_dict(),
-                "compile_seconds": bare.compile_seconds,
-                "microseconds_per_step": 1e6 * timing.median / attempts,
-                "failed": int(np.sum(np.asarray(flown.ending) != 1)),
-            }
-        )
+        rows.append({
+            "lanes": lanes, "per_second": size.flights / timing.median,
+            "seconds": timing.to_dict(), "compile_seconds": bare.compile_seconds,
+            "microseconds_per_step": 1e6 * timing.median / attempts,
+            "failed": int(np.sum(np.asarray(flown.ending) != 1)),
+        })  # fmt: skip
         print(f"  {lanes} lanes: {rows[-1]['per_second']:.1f} per second", flush=True)
     return rows
 
 
 def of_peers(size: Size, bare: Bare, exact: np.ndarray) -> list[dict[str, Any]]:
     """Throughput of peers that offer it, by their settings."""
-    rows: list[dict[str, Any]] = []
-    states, scene = bare.starts(size.checked), sj.make_scene("uav_tracker", 2)
-    for peer in peers()[0]:
-        offered = getattr(peer, "throughput", None)
-        if offered is None:
-            continue
-        for setting in peer.settings():
-            try:
-                rate, ends = offered(scene, states, size.t1, setting)
-            except Exception as error:
-                rows.append({"method": peer.name, "failure": str(error).splitlines()[0]})
-                break
-            found = errors(ends, exact)
-            lost = int(np.sum(~np.isfinite(ends).all((1, 2))))
-            failure = f"{lost} of {len(ends)} flights ended with a state that is not finite."
-            rows.append(
-                {
-                    "method": peer.name, "solver": setting.solver, "step": setting.step,
-                    "tolerance": setting.tolerance, "per_second": rate, "not_finite": lost,
-                    "failure": failure if lost else "", **found,
-                }
-            )  # fmt: skip
-            print(
-                f"  {peer.name} {setting.tolerance or setting.step}: {rate:.1f}, {found}",
-                flush=True,
-            )
-            if found["largest_error"] <= WANTED or len(exact) / rate > 30:
-                break
-    return rows
+    given = (stm.make_scene("uav_tracker", 2), bare.starts(size.checked), size.t1)
+    return [row for peer in peers()[0] for row in throughput(peer, given, exact, WANTED, 30.0)]
 
 
 def on_devices(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
@@ -242,22 +203,21 @@ def run(size: Size) -> dict[str, Any]:
 
 def main() -> None:
     """Run what was asked for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--size", choices=("full", "one"), default="full")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--page", type=Path)
-    parser.add_argument("--devices", type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--tolerance", type=float, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    made = parser((__doc__ or "").splitlines()[0])
+    made.add_argument("--size", choices=("full", "one"), default="full")
+    made.add_argument("--page", type=Path)
+    made.add_argument("--devices", type=int, help=argparse.SUPPRESS)
+    made.add_argument("--tolerance", type=float, help=argparse.SUPPRESS)
+    options = made.parse_args()
     size = FULL if options.size == "full" else ONE
     if options.devices:
         print(json.dumps(child(size, options.tolerance, options.devices)))
         return
+    begin(options)
     path = write("montecarlo", run(size), options.results)
     print(path)
-    page = options.page or (Path(__file__).parents[1] / "docs" / "throughput.md")
     if size == FULL or options.page:
-        print(write_page(path, page))
+        print(write_page(path, options.page or ROOT / "docs" / "throughput.md"))
 
 
 if __name__ == "__main__":

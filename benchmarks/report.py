@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from peers import PEERS
-from record import RESULTS
-from report_figures import draw
-from report_state import state
-from suite_tables import (
+from sections.figures import draw
+from sections.state import state
+from sections.tables import (
     acceleration,
     batch,
     curves,
@@ -22,14 +21,13 @@ from suite_tables import (
     hexacopter,
     scaling,
     scenes,
-    table,
-)
+)  # fmt: skip
+from shared.pages import Lines, table
+from shared.record import RESULTS, ROOT
 
-from stmuav_jax.view.io import write_atomically
+from stmuav_jax.files.netcdf import write_atomically
 
-PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
-
-Lines = list[str]
+PAGE = ROOT / "docs" / "benchmarks.md"
 # Section -> its title and what writes it, in the page's order.
 PARTS: dict[str, tuple[str, Callable[[dict[str, Any]], Lines]]] = {
     "work_precision": ("Time against error, seven-body UAV", curves),
@@ -66,8 +64,7 @@ def circumstances(results: dict[str, dict[str, Any]]) -> Lines:
     for name, result in results.items():
         e = result["environment"]
         commit = e["commit"][:10] + (" with changes" if e["dirty"] else "")
-        took = f"{result['took_seconds']:.0f}"
-        machine = result.get("machine", e["cpu"])
+        took, machine = f"{result['took_seconds']:.0f}", result.get("machine", e["cpu"])
         rows.append([name, e["date"], commit, machine, e["cores"], e["versions"]["device"], took])
     head = ["section", "date", "commit", "processor", "cores", "device", "took [s]"]
     versions = next(iter(results.values()))["environment"]["versions"]
@@ -100,12 +97,8 @@ def compared(results: dict[str, dict[str, Any]]) -> Lines:
     ]
     absent = [[p["method"], p["reason"]] for p in unique("skipped")]
     head = ["program", "version", "how it is run", "what is left out or done differently"]
-    lines = table(head, there)
-    if not there:
-        lines = ["No other program was run."]
-    if absent:
-        lines += ["", *table(["skipped", "why"], absent)]
-    return lines
+    lines = table(head, there) if there else ["No other program was run."]
+    return [*lines, *(["", *table(["skipped", "why"], absent)] if absent else [])]
 
 
 def build(results: Path, page: Path) -> Path:

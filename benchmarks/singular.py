@@ -7,22 +7,16 @@ with threads that wait for each other, so give OpenBLAS one:
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/singular.py
 """
 
-import argparse
-import sys
 import time
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import diffrax
 import jax
-import numpy as np
-from record import add_options, begin, write
-
-jax.config.update("jax_enable_x64", True)
-sys.path[:0] = [str(Path(__file__).parents[1] / "tests" / part) for part in ("", "published")]
-
 import jax.numpy as jnp
-from test_four_bar import (  # pyright: ignore[reportMissingImports]
+import numpy as np
+from problems.four_bar import (
     LONG,
     TOLERANCES,
     closed_form,
@@ -31,16 +25,26 @@ from test_four_bar import (  # pyright: ignore[reportMissingImports]
     kinetic_and_potential,
     missing,
     start,
-)
+)  # fmt: skip
+from shared.command import benchmark
 
-import stmuav_jax as sj
-
-LOOPS = (1, 2, 5, 20, 40)
-COUPLERS = (1e-4, 1e6)  # kg
-MISSES = (1e-3, 1e-4, 1e-5, 1e-7)  # m
+import stmuav_jax as stm
 
 
-def course_of(system: sj.System, state: sj.State, rtol: float) -> tuple[dict[str, Any], Any]:
+@dataclass(frozen=True)
+class Size:
+    """How much is run: numbers of loops, couplers [kg], misses [m], tolerances."""
+
+    loops: tuple[int, ...] = (1, 2, 5, 20, 40)
+    couplers: tuple[float, ...] = (1e-4, 1e6)
+    misses: tuple[float, ...] = (1e-3, 1e-4, 1e-5, 1e-7)
+    tolerances: tuple[float, ...] = TOLERANCES
+
+
+QUICK = Size((1,), (1e-4,), (1e-3,), TOLERANCES[:1])
+
+
+def course_of(system: stm.System, state: stm.State, rtol: float) -> tuple[dict[str, Any], Any]:
     """How one run went, and its trajectory."""
     began = time.process_time()
     path = jax.block_until_ready(course(system, state, jnp.asarray(rtol)))
@@ -74,33 +78,26 @@ def miss(by: float, rtol: float) -> dict[str, Any]:
     return {"missed_by": by, **how, "energy": float(np.nanmax(np.abs(energy - energy[0])))}
 
 
-def main() -> None:
-    """Run and write `singular.json`."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="one loop, one tolerance")
-    add_options(parser)
-    arguments = parser.parse_args()
-    begin(arguments)
-    few = arguments.quick
-    tolerances = TOLERANCES[:1] if few else TOLERANCES
+def record(size: Size) -> Iterator[dict[str, Any]]:
+    """All chains, couplers and misses."""
     content: dict[str, Any] = {"chains": [], "couplers": [], "misses": []}
 
     def add(to: str, row: dict[str, Any]) -> None:
         content[to].append(row)
         print(row, flush=True)
 
-    for rtol in tolerances:
-        for coupler in COUPLERS[:1] if few else COUPLERS:
+    for rtol in size.tolerances:
+        for coupler in size.couplers:
             add("couplers", chain(1, rtol, coupler))
-        for by in MISSES[:1] if few else MISSES:
+        for by in size.misses:
             add("misses", miss(by, rtol))
-    for loops in LOOPS[:1] if few else LOOPS:
+    for loops in size.loops:
         # the first run compiles
         chain(loops, 1e-6)
-        for rtol in tolerances:
+        for rtol in size.tolerances:
             add("chains", chain(loops, rtol))
-    print(write("singular", content, arguments.results))
+    yield content
 
 
 if __name__ == "__main__":
-    main()
+    benchmark("singular", __doc__, record, (Size(), QUICK))

@@ -5,24 +5,20 @@ end stops, by friction, or not at all: steps, run time and position error over 1
 Tsit5 (explicit) and Rodas5P and Kvaerno5 (implicit) at tolerances 1e-4 to 1e-8, with the largest
 eigenvalue of the equations of motion. The reference is Rodas5P at 1e-11, checked by Dopri8.
 
-All scenes share one compilation per solver (stiff_scenes.py says at what cost).
+All scenes share one compilation per solver (stiffness/scenes.py says at what cost).
 """
 
-import argparse
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from typing import Any
 
-import jax
 import numpy as np
-from record import add_options, begin, write
-from stiff_figures import draw
-from stiff_runs import EXPLICIT, IMPLICIT, TIGHT, Runner
-from stiff_scenes import SCENES, SERVOS, Build, StiffScene
-from stiff_tables import tables
-from trial import rounded
+from shared.clock import rounded
+from shared.command import benchmark
+from stiffness.pages import show
+from stiffness.runs import EXPLICIT, IMPLICIT, TIGHT, Runner
+from stiffness.scenes import SCENES, SERVOS, Build, StiffScene
 
-FIGURES = Path(__file__).parents[1] / "docs" / "figures" / "benchmarks"
 LEVELS = (1e-4, 1e-6)  # m
 
 
@@ -44,13 +40,7 @@ class Size:
 
 
 QUICK = Size(
-    build=StiffScene.slider,
-    scenes=SERVOS[::3],
-    solvers=("dopri8", "rodas5p"),
-    tolerances=(1e-6, 1e-8),
-    t1=0.1,
-    pieces=2,
-    repeats=1,
+    StiffScene.slider, SERVOS[::3], ("dopri8", "rodas5p"), (1e-6, 1e-8), t1=0.1, pieces=2, repeats=1
 )
 
 
@@ -62,18 +52,12 @@ def run_scene(held: StiffScene, size: Size, runner: Runner) -> dict[str, Any]:
     runs = []
     for solver in size.solvers:
         for tol in size.tolerances:
-            runs.append(runner.run(solver, tol, scene, exact))
-            row = runs[-1]
-            print(
-                f"{held.name}: {solver} {tol:g}: {row['seconds']:.3g} s, {row['error']} m",
-                flush=True,
-            )
+            row = runner.run(solver, tol, scene, exact)
+            runs.append(row)
+            said = f"{row['seconds']:.3g} s, {row['error']} m"
+            print(f"{held.name}: {solver} {tol:g}: {said}", flush=True)
     return {
-        "name": held.name,
-        "stiffness": held.stiffness,
-        "damping": held.damping,
-        "stops": held.stops,
-        "friction": held.friction,
+        **asdict(held),
         "reference": {"tolerance": TIGHT, "dopri8_apart": rounded(apart)},
         "eigenvalue": runner.eigenvalues(scene, size.pieces),
         "runs": runs,
@@ -85,11 +69,8 @@ def cheapest(runs: list[dict[str, Any]], level: float) -> dict[str, Any]:
     """The fastest explicit and implicit run with an error up to the level, and their ratio."""
 
     def best(solvers: tuple[str, ...]) -> dict[str, Any] | None:
-        fine = [
-            row
-            for row in runs
-            if row["solver"] in solvers and row["completed"] and row["error"] <= level
-        ]
+        mine = [row for row in runs if row["solver"] in solvers and row["completed"]]
+        fine = [row for row in mine if row["error"] <= level]
         return min(fine, key=lambda row: row["seconds"], default=None)
 
     explicit, implicit = best(EXPLICIT), best(IMPLICIT)
@@ -125,12 +106,11 @@ def crossover(scenes: list[dict[str, Any]], level: float) -> dict[str, Any]:
     return {"explicit_up_to": of(last), "implicit_from": of(first)}
 
 
-def record(size: Size) -> dict[str, Any]:
+def record(size: Size) -> Iterator[dict[str, Any]]:
     """All scenes."""
-    jax.config.update("jax_enable_x64", True)
     runner = Runner(size.t1, size.repeats)
     scenes = [run_scene(held, size, runner) for held in size.scenes]
-    return {
+    yield {
         "what": "explicit and implicit solvers on scenes of growing stiffness",
         "seconds": "processor time of the process on one core",
         "t1": size.t1,
@@ -141,15 +121,8 @@ def record(size: Size) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a stand-in of one body, few runs")
-    add_options(parser)
-    parser.add_argument("--figures", type=Path, default=FIGURES)
-    options = parser.parse_args()
-    begin(options)
-    path = write("stiff", record(QUICK if options.quick else Size()), options.results)
-    print(tables(path))
-    print(path, *draw(path, options.figures))
+    """Run and write `stiff.json`."""
+    benchmark("stiff", __doc__, record, (Size(), QUICK), show)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ Every section writes `results/suite_<section>.json` as soon as it is done, so th
 interrupted run keeps what it has; `report.py` makes the page from these files.
 """
 
-import argparse
 import platform
 import time
 from collections.abc import Callable
@@ -18,31 +17,25 @@ from typing import Any
 
 import jax
 
-jax.config.update("jax_enable_x64", True)
 # compile times are measured
 jax.config.update("jax_enable_compilation_cache", False)
 
 import report
-from adapter import Peer
-from methods import peers
-from record import add_options, begin, write
-from suite_gradient import gradient
-from suite_precision import describe, published_problems, stiff_variants, work_precision
-from suite_scenes import hexacopter, scenes
-from suite_size import FULL, ONE, Size
-from suite_speed import acceleration, batch, scaling
+from peers.adapter import Peer
+from sections.gradient import gradient
+from sections.ours import peers
+from sections.precision import describe, published_problems, stiff_variants, work_precision
+from sections.scenes import hexacopter, scenes
+from sections.size import FULL, ONE, Size
+from sections.speed import acceleration, batch, scaling
+from shared.command import begin, parser
+from shared.record import write
 
 SECTIONS: dict[str, Callable[[Size, list[Peer]], dict[str, Any]]] = {
-    "work_precision": work_precision,
-    "acceleration": acceleration,
-    "batch": batch,
-    "scaling": scaling,
-    "gradient": gradient,
-    "hexacopter": hexacopter,
-    "scenes": scenes,
-    "published": published_problems,
-    "stiff": stiff_variants,
-}
+    "work_precision": work_precision, "acceleration": acceleration, "batch": batch,
+    "scaling": scaling, "gradient": gradient, "hexacopter": hexacopter, "scenes": scenes,
+    "published": published_problems, "stiff": stiff_variants,
+}  # fmt: skip
 
 
 def machine() -> str:
@@ -55,14 +48,11 @@ def machine() -> str:
 
 def main() -> None:
     """Run what was asked for."""
-    parser = argparse.ArgumentParser(description="Run the benchmark suite.")
-    parser.add_argument("--only", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
-    parser.add_argument("--size", choices=("full", "one"), default="full")
-    parser.add_argument("--no-peers", action="store_true")
-    parser.add_argument("--no-report", action="store_true")
-    add_options(parser)
-    parser.add_argument("--page", type=Path, default=report.PAGE)
-    options = parser.parse_args()
+    made = parser(__doc__, **{"no-peers": "ours only", "no-report": "records only, no page"})
+    made.add_argument("--only", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
+    made.add_argument("--size", choices=("full", "one"), default="full")
+    made.add_argument("--page", type=Path, default=report.PAGE)
+    options = made.parse_args()
     begin(options)
     size = FULL if options.size == "full" else ONE
     there, absent = ([], []) if options.no_peers else peers()

@@ -6,23 +6,20 @@ one trim at a time. One core:
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 taskset -c 1 python benchmarks/trims.py
 """
 
-import argparse
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import jax
-import numpy as np
-from record import add_options, begin, write
-from scipy.optimize import root
-from timer import measure
-
-jax.config.update("jax_enable_x64", True)
-
 import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import root
+from shared.clock import measure
+from shared.command import benchmark
 
-import stmuav_jax as sj
-from stmuav_jax.study.trim import residual
+import stmuav_jax as stm
+from stmuav_jax.flight.flight_trim import residual
 
 # Panel angles are drawn up to this [rad] either way; some are out of the tracker's reach.
 REACH = 0.75
@@ -41,30 +38,32 @@ class Size:
 QUICK = Size(orientations=6, peer=1, group=2, repeats=1)
 
 
-def ours(size: Size, flyer: sj.Flyer, angles: Any) -> dict[str, Any]:
+def ours(size: Size, flyer: stm.flight.Flyer, angles: Any) -> dict[str, Any]:
     """All trims in one compiled call."""
-    one = lambda a: sj.trim(flyer, sj.hover(a), throw=False)
-    many = sj.outer_jit(lambda a: jax.lax.map(one, a, batch_size=size.group))
+    one = lambda a: stm.flight.trim_flight(flyer, stm.flight.hover(a), throw=False)
+    many = stm.algebra.outer_jit(lambda a: jax.lax.map(one, a, batch_size=size.group))
     started = time.perf_counter()
     found = jax.block_until_ready(many(angles))
     first = time.perf_counter() - started
     timing, found = measure(lambda: many(angles), repeats=size.repeats)
     reason = np.asarray(found.reason)
-    fine = reason == sj.TrimReason.VALID
+    fine = reason == stm.flight.TrimReason.VALID
     names, counts = np.unique(reason, return_counts=True)
     return {
         "seconds": timing.to_dict(),
         "first_call_seconds": first,
         "per_second": size.orientations / timing.median,
-        "reasons": {sj.TrimReason(int(k)).name: int(n) for k, n in zip(names, counts, strict=True)},
+        "reasons": {
+            stm.flight.TrimReason(int(k)).name: int(n) for k, n in zip(names, counts, strict=True)
+        },
         "largest_residual": float(np.max(np.asarray(found.residual)[fine])),
         "largest_steps": int(np.max(np.asarray(found.steps)[fine])),
     }
 
 
-def with_scipy(size: Size, flyer: sj.Flyer, angles: Any) -> dict[str, Any]:
+def with_scipy(size: Size, flyer: stm.flight.Flyer, angles: Any) -> dict[str, Any]:
     """The same residuals by SciPy, from the same start; compilation left out."""
-    of = jax.jit(lambda z, a: residual(flyer, sj.hover(a), z))
+    of = jax.jit(lambda z, a: residual(flyer, stm.flight.hover(a), z))
     mass = float(jnp.sum(flyer.system.bodies.mass))
     start = np.zeros(8)
     start[2] = 9.81 * mass
@@ -78,15 +77,9 @@ def with_scipy(size: Size, flyer: sj.Flyer, angles: Any) -> dict[str, Any]:
     return {"per_second": size.peer / seconds, "median_residual": float(np.median(left))}
 
 
-def main() -> None:
-    """Run and write `trims.json`."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="the smallest size")
-    add_options(parser)
-    arguments = parser.parse_args()
-    begin(arguments)
-    size = QUICK if arguments.quick else Size()
-    flyer = sj.uav_flyer()
+def record(size: Size) -> Iterator[dict[str, Any]]:
+    """Our trims and SciPy's."""
+    flyer = stm.scenes.uav_flyer()
     rng = np.random.default_rng(1)
     angles = jnp.asarray(rng.uniform(-REACH, REACH, (size.orientations, 2)))
     content: dict[str, Any] = {"ours": ours(size, flyer, angles)}
@@ -94,8 +87,8 @@ def main() -> None:
     content["scipy"] = with_scipy(size, flyer, angles)
     content["times_scipy"] = content["ours"]["per_second"] / content["scipy"]["per_second"]
     print(content["scipy"], content["times_scipy"], flush=True)
-    print(write("trims", content, arguments.results))
+    yield content
 
 
 if __name__ == "__main__":
-    main()
+    benchmark("trims", __doc__, record, (Size(), QUICK))

@@ -7,7 +7,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 import stmuav_jax as stm
-from stmuav_jax.view.plot import save_figures
+from stmuav_jax.figures import FIGURES, save_figures
 
 FOLDER = Path(__file__).parent
 
@@ -44,7 +44,7 @@ def main() -> None:
                 f"| {c.relative_energy_error:.1e} | {c.accepted_steps} |\n"
             )
             place = Path("figures") / run.scene.name
-            for path in save_figures(run, FOLDER / place, dpi=110):
+            for path in save_figures(FIGURES, FOLDER / place, "png", run, dpi=110):
                 if path.stem == "balances":
                     path.unlink()
             sections += f"\n## `{name}` case {case}\n\n{run.scene.title}.\n\n"

@@ -16,16 +16,18 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 
 import stmuav_jax as stm
-from stmuav_jax.algebra.compiler import outer_jit
-from stmuav_jax.view.estimate import (
-    Machine,
+from stmuav_jax.algebra import outer_jit
+from stmuav_jax.figures import (
+    CASE_FIGURES,
+    STYLES,
+    grid,
+    hover,
     hover_table,
-    save_case_figures,
-    save_hover_figure,
-    save_machine_figure,
+    save_figures,
     summary_table,
 )
 
@@ -34,21 +36,24 @@ FOLDER = Path(__file__).parent / "figures" / "estimation"
 
 def cases() -> tuple[list, dict]:
     """All cases with both tunings, 50 seeds, 2 s; figures of case 8; RMSE of smoother and filter."""
-    report = stm.report_tuning()
-    consistent = {False: stm.consistent_tuning(1), True: stm.consistent_tuning(5)}
+    report = stm.quadrotor.report_tuning()
+    consistent = {
+        False: stm.quadrotor.consistent_tuning(1),
+        True: stm.quadrotor.consistent_tuning(5),
+    }
     rows, smoothed = [], {}
     for case in range(1, 9):
         own = consistent[case > 4]
-        study = stm.study_case(case, [report, own])
+        study = stm.quadrotor.study_case(case, [report, own])
         rows += study.summaries.values()
         if case in (1, 8):
-            late = stm.estimate_case(study.record, own, smoothed=True)
+            late = stm.quadrotor.estimate_case(study.record, own, smoothed=True)
             rmse = lambda e: np.sqrt(np.mean(np.asarray(e.error)[1200:, 3:] ** 2, axis=(0, 2)))
             smoothed[case] = [
                 (1e3 * rmse(e)).tolist() for e in (study.estimates["consistent"], late)
             ]
         if case == 8:
-            save_case_figures(study, FOLDER, dpi=120)
+            save_figures(CASE_FIGURES, FOLDER, "png", study, dpi=120)
     out = Console(width=100)
     out.print(summary_table(rows))
     for row in rows:
@@ -58,23 +63,29 @@ def cases() -> tuple[list, dict]:
 
 def hovers() -> None:
     """Both tunings, 50 seeds, 2 s."""
-    flights = {name: stm.simulate_hover(1, name) for name in ("report", "consistent")}
+    flights = {name: stm.quadrotor.simulate_hover(1, name) for name in ("report", "consistent")}
     Console(width=130).print(hover_table(flights))
-    save_hover_figure(flights, FOLDER, dpi=120)
+    save_figures({"hover": hover}, FOLDER, "png", flights, dpi=120)
 
 
 def loads() -> dict:
     """What a filter with constant inertia makes of a load with mass: errors at the end [mm]."""
     found = {}
     for load, case, t1 in ((0.5, 1, 0.2), (1.0, 1, 0.2), (2.0, 1, 0.2), (1.0, 5, 1.0)):
-        record = stm.simulate_case(case, seeds=10, t1=t1, world=stm.World(load=load, walk=False))
+        record = stm.quadrotor.simulate_case(
+            case, seeds=10, t1=t1, world=stm.quadrotor.World(load=load, walk=False)
+        )
         start = {0.5: (0.07, 0.13), 1.0: (0.06, 0.13), 2.0: (0.07, 0.06)}[load]
         swing = 4 * (case > 4)
         mean = np.array([0.1, 0.2, 0.3, *start, *[0.0] * swing])
-        prior = stm.gaussian(mean, np.diag([0.1] * 3 + [0.04] * 2 + [0.05] * swing) ** 2)
+        prior = stm.estimation.gaussian(mean, np.diag([0.1] * 3 + [0.04] * 2 + [0.05] * swing) ** 2)
         for known in (False, True):
-            model = stm.extended_model(period=2.0 if swing else None, load=load if known else None)
-            run = lambda y, u, m=model, p=prior: stm.filter_bank(m, p, y, u=u, dt=1e-3).mean[-1]
+            model = stm.quadrotor.extended_model(
+                period=2.0 if swing else None, load=load if known else None
+            )
+            run = lambda y, u, m=model, p=prior: stm.estimation.filter_bank(
+                m, p, y, u=u, dt=1e-3
+            ).mean[-1]
             last = np.asarray(outer_jit(run)(record.y, record.u))
             offset = last[3:5] + (last[5:7] if swing else 0.0)
             error = np.mean(offset - np.asarray(record.offset)[-1], axis=1)
@@ -86,22 +97,39 @@ def loads() -> dict:
 
 def followed() -> dict:
     """The random walk that makes case 5 most likely: variance per step of the offset [m^2]."""
-    record = stm.simulate_case(5, seeds=8, t1=1.0)
-    value = stm.PART_III.value
+    record = stm.quadrotor.simulate_case(5, seeds=8, t1=1.0)
+    value = stm.quadrotor.PART_III.value
     first, R = list(value("true.Q")[3:6]), value("true.R")
-    prior = stm.gaussian(
+    prior = stm.estimation.gaussian(
         np.array([0.1, 0.2, 0.3, 0.05, 0.1]), np.diag([0.1, 0.1, 0.1, 0.01, 0.01]) ** 2
     )
 
-    def model_of(v: dict) -> stm.StateSpaceModel:
+    def model_of(v: dict) -> stm.estimation.StateSpaceModel:
         Q = jnp.concatenate([jnp.asarray(first), v["walk"]])
-        return stm.observable_model(Q=Q, R=R)
+        return stm.quadrotor.observable_model(Q=Q, R=R)
 
-    found = stm.tune(
+    found = stm.estimation.tune(
         model_of, {"walk": np.array([1e-8, 1e-8])}, prior, record.y, u=record.u, dt=1e-3
     )
     return {"variance": found.values["walk"].tolist(), "reason": found.reason,
             "gain of log-likelihood": found.log_likelihood - float(found.history[0])}  # fmt: skip
+
+
+def _machine_figure(t: np.ndarray, truth: np.ndarray, found: dict[str, np.ndarray]) -> Figure:
+    """The centre of mass (T, 2) [m] of the UAV with its moving tracker, estimates against truth."""
+    figure, axes = grid(2, 1, 4.6)
+    for row, axis in enumerate("xy"):
+        ax = axes[row, 0]
+        ax.plot(t, 1e3 * truth[:, row], color="0.6", linewidth=3.0, label="truth")
+        for (words, values), (color, dash) in zip(found.items(), STYLES[1::-1], strict=False):
+            ax.plot(t, 1e3 * values[:, row], color=color, linestyle=dash, lw=1.2, label=words)
+        middle = 1e3 * np.mean(truth[:, row])
+        ax.set_ylim(middle - 6, middle + 6)
+        ax.set_ylabel(f"centre of mass, {axis} [mm]", fontsize=9)
+    axes[0, 0].legend(fontsize=8)
+    axes[1, 0].set_xlabel("time [s]", fontsize=9)
+    figure.suptitle("UAV with its tracker moving: from gyroscope and rotor speeds", fontsize=11)
+    return figure
 
 
 def machine() -> dict:
@@ -111,31 +139,34 @@ def machine() -> dict:
         lambda t: 0.04 * (1 - jnp.cos(1.5 * jnp.pi * t)),
     )
     scene = stm.make_scene("uav_tracker", 1, strokes=strokes)
-    flight = stm.sensed_flight(scene.system, scene.state0)
-    rotors = next(f for f in scene.system.forces if isinstance(f, stm.Rotors))
+    flight = stm.flight.sensed_flight(scene.system, scene.state0)
+    rotors = next(f for f in scene.system.forces if isinstance(f, stm.rotorcraft.Rotors))
     rng = np.random.default_rng(0)
     y = np.asarray(flight.omega)[1:] + 1e-3 * rng.normal(size=(len(flight.squared), 3))
-    model = stm.rotorcraft_model(
+    model = stm.quadrotor.rotorcraft_model(
         rotors,
-        stm.inertia_about_centre(scene.system, scene.state0),
+        stm.flight.inertia_about_centre(scene.system, scene.state0),
         jnp.sum(scene.system.bodies.mass),
         height=flight.centre[0, 2],
         Q=[1e-8] * 3 + [4e-9] * 2,
         R=[1e-6] * 3,
     )
-    prior = stm.gaussian([0.0, 0.0, 0.0, 0.05, -0.05], np.diag([0.1] * 3 + [0.05] * 2) ** 2)
+    prior = stm.estimation.gaussian(
+        [0.0, 0.0, 0.0, 0.05, -0.05], np.diag([0.1] * 3 + [0.05] * 2) ** 2
+    )
     inputs = {
         "one rigid body": flight.squared,
-        "motion of the parts known": stm.moved(
+        "motion of the parts known": stm.quadrotor.moved(
             flight.squared, flight.J, flight.h, flight.centre[:, 2], 5e-3
         ),
     }
     truth = np.asarray(flight.centre)[1:, :2]
     found = {
-        words: np.asarray(stm.kalman_filter(model, prior, y, u=u, dt=5e-3).mean)[:, 3:]
+        words: np.asarray(stm.estimation.kalman_filter(model, prior, y, u=u, dt=5e-3).mean)[:, 3:]
         for words, u in inputs.items()
     }
-    save_machine_figure(Machine(np.asarray(flight.t)[1:], truth, found), FOLDER, dpi=120)
+    shown = _machine_figure(np.asarray(flight.t)[1:], truth, found)
+    save_figures({"machine": shown}, FOLDER, dpi=120)
     size = lambda e: {"rms mm": (1e3 * np.sqrt(np.mean(e[20:] ** 2, axis=0))).tolist(),
                       "largest mm": float(1e3 * np.max(np.abs(e[20:])))}  # fmt: skip
     return {words: size(values - truth) for words, values in found.items()}

@@ -4,8 +4,12 @@ import atexit
 import gc
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
+
+# Published problems are those of the benchmarks.
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 # tests run side by side; small factorisations lose time to threads that wait for each other
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -76,3 +80,11 @@ def seven():
     system, rng = seven_bodies(), np.random.default_rng(11)
     states = [random_seven(system, rng) for _ in range(6)]
     return system, jax.tree.map(lambda *x: jax.numpy.stack(x), *states)
+
+
+@pytest.fixture(scope="session")
+def short_run():
+    """One short run of the UAV, shared by the tests of files and figures."""
+    from stmuav_jax import make_scene, simulate
+
+    return simulate(make_scene("uav_tracker", 2), t1=0.05, save_every=0.01)

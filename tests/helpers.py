@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import stmuav_jax as sj
-from stmuav_jax.dynamics.problem import begin, prepare
+import stmuav_jax as stm
+from stmuav_jax.dynamics.integration.problem import begin, prepare
 
 GRAVITY = 9.81
 
@@ -76,11 +76,11 @@ def inertia_of(rng: np.random.Generator, size: float = 0.02) -> np.ndarray:
     return np.eye(3) * np.sum(points**2) / 6 - points.T @ points / 6
 
 
-def state_of(r: Any, p: Any, v: Any = None, omega: Any = None) -> sj.State:
+def state_of(r: Any, p: Any, v: Any = None, omega: Any = None) -> stm.State:
     """A `State` from arrays or lists; velocities are zero by default."""
     r = jnp.asarray(r, dtype=float)
     none = jnp.zeros_like(r)
-    return sj.State(
+    return stm.State(
         r,
         jnp.asarray(p, dtype=float),
         none if v is None else jnp.asarray(v, dtype=float),
@@ -88,15 +88,15 @@ def state_of(r: Any, p: Any, v: Any = None, omega: Any = None) -> sj.State:
     )
 
 
-def moving(system: sj.System, v: Any, omega: Any) -> sj.State:
+def moving(system: stm.System, v: Any, omega: Any) -> stm.State:
     """The reference posture with given velocities."""
     return state_of(system.reference.r, system.reference.p, v, omega)
 
 
-def scene_of(system: sj.System, state: sj.State | None = None, **more: Any) -> sj.Scene:
+def scene_of(system: stm.System, state: stm.State | None = None, **more: Any) -> stm.Scene:
     """A scene for tests."""
     state = system.reference if state is None else state
-    return sj.Scene("test", "A test", system, state, **more)
+    return stm.Scene("test", "A test", system, state, **more)
 
 
 def relative_error(got: Any, expected: Any) -> float:
@@ -110,7 +110,7 @@ def relative_error(got: Any, expected: Any) -> float:
     return worst / size if size else worst
 
 
-def derivative_size(system: sj.System) -> tuple[int, int]:
+def derivative_size(system: stm.System) -> tuple[int, int]:
     """Equations of one derivative, those inside others included; size of what is integrated."""
 
     def count(jaxpr: Any) -> int:
@@ -121,7 +121,7 @@ def derivative_size(system: sj.System) -> tuple[int, int]:
                     total += count(getattr(value, "jaxpr", value))
         return total
 
-    problem = prepare(system, sj.Method())
+    problem = prepare(system, stm.Method())
     y = begin(problem, jnp.zeros(()), system.reference).y
     found = jax.make_jaxpr(lambda t, y: problem.field(t, y, problem.model))(0.0, y)
     return count(found.jaxpr), y.shape[0]
@@ -135,18 +135,18 @@ def central(f: Callable[[float], Any], step: float) -> np.ndarray:
 
 def pendulum(
     *, length: Any = 0.5, mass: Any = 2.0, gravity: Any = GRAVITY, forces: tuple[Any, ...] = ()
-) -> sj.System:
+) -> stm.System:
     """A rod-like body that hangs in -z from a revolute joint (axis y) at the origin.
 
     Moment of inertia about the joint: mass length^2 + 0.02.
     """
-    body = sj.Body("bob", mass, [0.02, 0.02, 0.01], position=[0.0, 0.0, -length])
-    hinge = sj.revolute("hinge", "ground", "bob", point=[0.0, 0.0, 0.0], axis=[0, 1, 0])
-    pull = sj.Gravity(jnp.stack([jnp.zeros(()), jnp.zeros(()), -jnp.asarray(gravity, float)]))
-    return sj.System([body], [hinge], [pull, *forces])
+    body = stm.Body("bob", mass, [0.02, 0.02, 0.01], position=[0.0, 0.0, -length])
+    hinge = stm.revolute("hinge", "ground", "bob", point=[0.0, 0.0, 0.0], axis=[0, 1, 0])
+    pull = stm.Gravity(jnp.stack([jnp.zeros(()), jnp.zeros(()), -jnp.asarray(gravity, float)]))
+    return stm.System([body], [hinge], [pull, *forces])
 
 
-def swung(system: sj.System, angle: Any, rate: Any = 0.0, length: Any = 0.5) -> sj.State:
+def swung(system: stm.System, angle: Any, rate: Any = 0.0, length: Any = 0.5) -> stm.State:
     """The pendulum at `angle` [rad] from hanging about y, turning at `rate` [rad/s]."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     zero = jnp.zeros_like(s)
@@ -154,7 +154,7 @@ def swung(system: sj.System, angle: Any, rate: Any = 0.0, length: Any = 0.5) -> 
     r = length * jnp.stack([-s, zero, -c])
     p = jnp.stack([jnp.cos(angle / 2), zero, jnp.sin(angle / 2), zero])
     assert system.n_bodies == 1
-    return sj.State(r[None], p[None], jnp.cross(omega, r)[None], omega[None])
+    return stm.State(r[None], p[None], jnp.cross(omega, r)[None], omega[None])
 
 
 FOUR_BAR_POINTS = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.25], [0.6, 0.0, 0.45], [0.7, 0.0, 0.0]])
@@ -162,7 +162,7 @@ FOUR_BAR_POINTS = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.25], [0.6, 0.0, 0.45],
 
 def four_bar(
     *, redundant: bool = True, axes: tuple[float, float, float] = (0.0, 1.0, 0.0), **more: Any
-) -> sj.System:
+) -> stm.System:
     """A planar four-bar in the xz plane: crank, coupler, rocker.
 
     With four revolutes (20 rows, rank 17), or with a ball and a universal joint at the
@@ -170,38 +170,38 @@ def four_bar(
     """
     A, B, C, D = FOUR_BAR_POINTS
     bodies = [
-        sj.Body("crank", 0.8, [4e-3, 5e-3, 3e-3], position=(A + B) / 2),
-        sj.Body("coupler", 1.5, [2e-2, 3e-2, 2e-2], position=(B + C) / 2 + [0, 0, 0.05]),
-        sj.Body("rocker", 1.1, [1e-2, 9e-3, 5e-3], position=(C + D) / 2),
+        stm.Body("crank", 0.8, [4e-3, 5e-3, 3e-3], position=(A + B) / 2),
+        stm.Body("coupler", 1.5, [2e-2, 3e-2, 2e-2], position=(B + C) / 2 + [0, 0, 0.05]),
+        stm.Body("rocker", 1.1, [1e-2, 9e-3, 5e-3], position=(C + D) / 2),
     ]
     joints = [
-        sj.revolute("A", "ground", "crank", point=A, axis=axes),
-        sj.revolute("D", "ground", "rocker", point=D, axis=axes),
+        stm.revolute("A", "ground", "crank", point=A, axis=axes),
+        stm.revolute("D", "ground", "rocker", point=D, axis=axes),
     ]
     if redundant:
         joints += [
-            sj.revolute("B", "crank", "coupler", point=B, axis=axes),
-            sj.revolute("C", "coupler", "rocker", point=C, axis=axes),
+            stm.revolute("B", "crank", "coupler", point=B, axis=axes),
+            stm.revolute("C", "coupler", "rocker", point=C, axis=axes),
         ]
     else:
         across = np.cross(C - B, axes)
         joints += [
-            sj.spherical("B", "crank", "coupler", point=B),
-            sj.universal("C", "coupler", "rocker", point=C, axis_i=across, axis_j=axes),
+            stm.spherical("B", "crank", "coupler", point=B),
+            stm.universal("C", "coupler", "rocker", point=C, axis_i=across, axis_j=axes),
         ]
     joints += more.pop("joints", [])
-    forces = [sj.Gravity(), *more.pop("forces", [])]
-    return sj.System(bodies, joints, forces, **more)
+    forces = [stm.Gravity(), *more.pop("forces", [])]
+    return stm.System(bodies, joints, forces, **more)
 
 
-def four_bar_state(system: sj.System, rate: float) -> sj.State:
+def four_bar_state(system: stm.System, rate: float) -> stm.State:
     """The four-bar's reference posture, its crank turning at `rate` [rad/s]."""
     omega = np.zeros((3, 3))
     omega[0, 1] = rate
     v = np.zeros((3, 3))
     v[0] = np.cross(omega[0], FOUR_BAR_POINTS[1] / 2)
     hold = system.reference
-    model = sj.Augmented().prepare(system)
+    model = stm.Augmented().prepare(system)
     eq = model.constraints.equations(jnp.zeros(()), system.kinematics(hold))
     J = np.asarray(eq.matrix)
     u0 = np.concatenate([v, omega], axis=1).reshape(-1)
@@ -232,7 +232,7 @@ _SEVEN: Mapping[str, tuple[float, list[float], list[float], list[float]]] = {
 }  # fmt: skip
 
 
-def seven_bodies() -> sj.System:
+def seven_bodies() -> stm.System:
     """A free base, two sliders, a post, two rods and a platform: 34 rows, 8 degrees of freedom.
 
     The joint graph of AFRL-AFOSR-JP-TR-2019-0058, Part II, section 3.1, with rounded
@@ -240,7 +240,7 @@ def seven_bodies() -> sj.System:
     """
     tilt = np_rotation(turn([1, 2, 3], 0.2))
     bodies = [
-        sj.Body(
+        stm.Body(
             name, mass, tilt @ np.diag(J) @ tilt.T, position=r, orientation=unit(p),
             free=name == "uav",
         )
@@ -250,24 +250,24 @@ def seven_bodies() -> sj.System:
     rod_axis = [0.9989, 0.0, -0.0472]
     platform_axis = np.cross([1, 0, 0], [0, 0.2642, 0.9645])
     joints = [
-        sj.translational("T12", "uav", "slider2", axis=z),
-        sj.translational("T13", "uav", "slider3", axis=z),
-        sj.revolute("R14", "uav", "post", point=[-0.015, 0.015, 0.0632], axis=x),
-        sj.revolute("R26", "slider2", "rod6", point=[-0.107, 0.015, 0.0221], axis=y),
-        sj.universal(
+        stm.translational("T12", "uav", "slider2", axis=z),
+        stm.translational("T13", "uav", "slider3", axis=z),
+        stm.revolute("R14", "uav", "post", point=[-0.015, 0.015, 0.0632], axis=x),
+        stm.revolute("R26", "slider2", "rod6", point=[-0.107, 0.015, 0.0221], axis=y),
+        stm.universal(
             "U35", "slider3", "rod5", point=[-0.015, 0.107, 0.0214], axis_i=y, axis_j=rod_axis
         ),
-        sj.universal(
+        stm.universal(
             "U47", "post", "platform", point=[-0.015, 0.0243, 0.1467], axis_i=x,
             axis_j=platform_axis,
         ),
-        sj.spherical("S57", "rod5", "platform", point=[-0.0106, 0.0891, 0.1146]),
-        sj.spherical("S67", "rod6", "platform", point=[-0.0781, 0.015, 0.1126]),
+        stm.spherical("S57", "rod5", "platform", point=[-0.0106, 0.0891, 0.1146]),
+        stm.spherical("S67", "rod6", "platform", point=[-0.0781, 0.015, 0.1126]),
     ]  # fmt: skip
-    return sj.System(bodies, joints)
+    return stm.System(bodies, joints)
 
 
-def random_seven(system: sj.System, rng: np.random.Generator) -> sj.State:
+def random_seven(system: stm.System, rng: np.random.Generator) -> stm.State:
     """A random consistent state of `seven_bodies`: attitude, posture and rates all random."""
     q = random_quaternion(rng)
     R = np_rotation(q)
@@ -275,14 +275,16 @@ def random_seven(system: sj.System, rng: np.random.Generator) -> sj.State:
     r = np.asarray(system.reference.r) + 0.003 * rng.normal(size=(7, 3))
     p = np.stack(
         [
-            np.asarray(sj.product(sj.product(q, x), turn(s, float(np.linalg.norm(s)))))
+            np.asarray(
+                stm.rotation.product(stm.rotation.product(q, x), turn(s, float(np.linalg.norm(s))))
+            )
             for x, s in zip(system.reference.p, shake, strict=True)
         ]
     )
     v = rng.normal(size=(7, 3))
     omega = 5 * rng.normal(size=(7, 3))
     guess = state_of(r @ R.T + rng.normal(size=3), p, v, omega)
-    return sj.assemble(system, guess).state
+    return stm.assemble(system, guess).state
 
 
 def forked(floating):
@@ -291,14 +293,14 @@ def forked(floating):
     at = {"hub": [0, 0, 0], "a": [0, 0, 0.3], "b": [0.1, 0.2, 0.3], "c": [0.1, -0.2, 0.3]}
     at["d"] = [-0.3, 0, 0]
     bodies = [
-        sj.Body(name, 1.0 + k, unit, position=r, free=name == "hub")
+        stm.Body(name, 1.0 + k, unit, position=r, free=name == "hub")
         for k, (name, r) in enumerate(at.items())
     ]
-    hub = "hub" if floating else sj.GROUND
+    hub = "hub" if floating else stm.GROUND
     joints = [
-        sj.revolute("ra", hub, "a", point=[0, 0, 0.1], axis=[1, 0, 0]),
-        sj.revolute("rb", "a", "b", point=[0, 0, 0.3], axis=[0, 1, 0]),
-        sj.spherical("sc", "a", "c", point=[0, -0.1, 0.3]),
-        sj.translational("td", hub, "d", point=[-0.3, 0, 0], axis=[0, 0, 1]),
+        stm.revolute("ra", hub, "a", point=[0, 0, 0.1], axis=[1, 0, 0]),
+        stm.revolute("rb", "a", "b", point=[0, 0, 0.3], axis=[0, 1, 0]),
+        stm.spherical("sc", "a", "c", point=[0, -0.1, 0.3]),
+        stm.translational("td", hub, "d", point=[-0.3, 0, 0], axis=[0, 0, 1]),
     ]
-    return sj.System(bodies[0 if floating else 1 :], joints, [sj.Gravity()])
+    return stm.System(bodies[0 if floating else 1 :], joints, [stm.Gravity()])

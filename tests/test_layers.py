@@ -10,21 +10,35 @@ import stmuav_jax
 
 ROOT = Path(stmuav_jax.__file__).parent
 MODULES = sorted(ROOT.rglob("*.py"))
+# A room is a folder, or a folder within one that has a floor of its own.
 FLOORS = {
-    "algebra": 0,
-    "mechanics": 1,
-    "dynamics": 2,
-    "vehicle": 3,
-    "scenes": 4,
-    "estimation": 4,
-    "study": 4,
-    "montecarlo": 5,
-    "view": 6,
-    "jobs": 7,
-    "commands": 8,
-    "cli": 9,
+    "checks": 0,
+    "algebra": 1,
+    "estimation": 2,
+    "mechanics": 2,
+    "parameters": 2,
+    "mechanics.forces": 3,
+    "dynamics.formulations": 4,
+    "dynamics.tree": 5,
+    "dynamics.integration": 5,
+    "dynamics.assembly": 6,
+    "dynamics.statespace": 6,
+    "dynamics": 7,
+    "environment": 7,
+    "rotorcraft": 7,
+    "tracker": 8,
+    "sensing": 8,
+    "flight": 9,
+    "quadrotor": 9,
+    "scenes": 10,
+    "montecarlo": 11,
+    "files": 12,
+    "figures": 13,
+    "jobs": 13,
+    "commands": 14,
+    "cli": 15,
 }
-LINES, STEPS = 400, 60
+LINES, STEPS, IN_A_ROOM = 400, 60, 15
 
 
 @cache
@@ -76,9 +90,11 @@ def _type_checking(module: ast.Module) -> set[ast.AST]:
     return {inner for block in blocks for child in block.body for inner in ast.walk(child)}
 
 
-def folder(name: str) -> str:
-    parts = name.split(".")
-    return parts[1] if len(parts) > 1 else ""
+def room(name: str) -> str:
+    """The room of a module: the deepest folder around it that has a floor."""
+    parts = name.split(".")[1:]
+    inside = [".".join(parts[:k]) for k in range(len(parts), 0, -1)]
+    return next((place for place in inside if place in FLOORS), parts[0] if parts else "")
 
 
 each = pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
@@ -86,27 +102,34 @@ each = pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(
 
 def test_the_reader_of_imports_sees_them():
     """The other tests could not fail if this one did not hold."""
-    seen = imports(ROOT / "dynamics" / "augmented.py")
+    seen = imports(ROOT / "dynamics" / "formulations" / "augmented.py")
     assert "stmuav_jax.algebra.linalg" in seen
-    assert "stmuav_jax.dynamics.differential" in seen
+    assert "stmuav_jax.dynamics.formulations.constraints" in seen
     assert "stmuav_jax.mechanics.joint" in imports(ROOT / "mechanics" / "state.py")
     assert "stmuav_jax.mechanics.joint" not in imports(
         ROOT / "mechanics" / "state.py", runtime_only=True
     )
-    assert {folder(name) for name in NAMES} - {""} <= set(FLOORS)
+    assert {room(name) for name in NAMES} - {""} <= set(FLOORS)
 
 
 @each
 def test_imports_go_down(path):
-    """A floor sees those below; siblings (scenes, estimation, study) do not see each other."""
-    mine = folder(dotted(path))
+    """A room sees those on floors below; rooms of one floor do not see each other."""
+    mine = room(dotted(path))
     if mine in ("", "__main__"):
         return
     for name in imports(path):
-        other = folder(name)
+        other = room(name)
         assert other != "", f"{dotted(path)} imports the package's root"
         fine = other == mine or FLOORS[other] < FLOORS[mine]
         assert fine, f"{dotted(path)} ({mine}) imports {name} ({other})"
+
+
+def test_rooms_can_be_taken_in_at_a_glance():
+    """No folder has many modules."""
+    for place in {path.parent for path in MODULES}:
+        count = len([path for path in place.glob("*.py") if path.name != "__init__.py"])
+        assert count <= IN_A_ROOM, f"{place.relative_to(ROOT.parent)} has {count} modules"
 
 
 def test_no_cycles():

@@ -3,19 +3,16 @@
 Explicit methods refuse joints there, so the implicit one of second order is its only choice.
 """
 
-import importlib.util
 import math
-from importlib import metadata
 from typing import Any
 
 import numpy as np
-from adapter import Outcome, Peer, Prepared, Setting
+from problems.plain import Plain, PlainJoint, Start, plain, start, why_not
+from problems.tree import in_plane, span
 
+from peers.adapter import Outcome, Peer, Prepared, Setting
+from peers.mujoco_c import whole_steps
 from stmuav_jax import Scene
-
-from .mujoco_c import whole_steps
-from .plain import Plain, Start, plain, start, why_not
-from .tree import in_plane, span
 
 # Constrained axes (x, y, z, about x, about y, about z) of its generic joint.
 _AXES = {
@@ -44,16 +41,11 @@ class Mechanism:
         plane = in_plane(self.model)
         cut = span(self.model).cuts if plane is not None else ()
         for joint in self.model.joints:
-            ends = [
-                self._marker(joint.i, joint.point_i, joint.frame_i),
-                self._marker(joint.j, joint.point_j, joint.frame_j),
-            ]
             axes = [1, 1, 0, 0, 0, 0] if joint in cut else _AXES[joint.kind]
+            ends = self._ends(joint)
             self.mbs.AddObject(self.items.GenericJoint(markerNumbers=ends, constrainedAxes=axes))
         self._loads(self.model, self.first)
-        self.sensors = [
-            self._sensor(body, self.exu.OutputVariableType.Position) for body in self.bodies[:-1]
-        ]
+        self.sensors = self.sense(self.exu.OutputVariableType.Position)
         self.mbs.Assemble()
 
     def _body(self, k: int) -> Any:
@@ -78,10 +70,15 @@ class Mechanism:
             self.items.MarkerBodyRigid(bodyNumber=self.bodies[body], localHT=place)
         )
 
-    def _sensor(self, body: Any, quantity: Any) -> Any:
-        return self.mbs.AddSensor(
-            self.items.SensorBody(bodyNumber=body, outputVariableType=quantity, storeInternal=True)
-        )
+    def _ends(self, joint: PlainJoint) -> list[Any]:
+        """Markers on both bodies of a joint."""
+        ends = (joint.i, joint.point_i, joint.frame_i), (joint.j, joint.point_j, joint.frame_j)
+        return [self._marker(*end) for end in ends]
+
+    def sense(self, quantity: Any) -> list[Any]:
+        """Sensors of a quantity of all bodies."""
+        make, how = self.items.SensorBody, {"outputVariableType": quantity, "storeInternal": True}
+        return [self.mbs.AddSensor(make(bodyNumber=b, **how)) for b in self.bodies[:-1]]
 
     def _loads(self, model: Plain, first: Start) -> None:
         R = first.R_wb
@@ -118,10 +115,7 @@ class Mechanism:
             self.mbs.AddObject(spring)
         for servo in model.servos:
             joint = model.joints[servo.joint]
-            ends = [
-                self._marker(joint.i, joint.point_i, joint.frame_i),
-                self._marker(joint.j, joint.point_j, joint.frame_j),
-            ]
+            ends = self._ends(joint)
             spring = self.items.LinearSpringDamper(
                 markerNumbers=ends, axisMarker0=[0, 0, 1], offset=servo.target,
                 stiffness=servo.stiffness, damping=servo.damping,
@@ -161,12 +155,9 @@ class Mechanism:
     def solve(self, settings: Any) -> bool:
         """One run from the start; whether it reached the end."""
         try:
-            kind = self.exu.DynamicSolverType.GeneralizedAlpha
-            return bool(
-                self.mbs.SolveDynamic(
-                    settings, solverType=kind, showHints=False, showCausingItems=False
-                )
-            )
+            kind, quiet = self.exu.DynamicSolverType.GeneralizedAlpha, ("Hints", "CausingItems")
+            silence = {f"show{name}": False for name in quiet}
+            return bool(self.mbs.SolveDynamic(settings, solverType=kind, **silence))
         except (ValueError, RuntimeError):
             return False
 
@@ -179,7 +170,7 @@ class ExudynPeer(Peer):
     """Exudyn with its default generalised-alpha (spectral radius 0.9, index 3)."""
 
     name = "Exudyn, generalised-alpha"
-    packages = ("exudyn",)
+    packages = (("exudyn", "exudyn"),)
     caveats = (
         "Actuator forces are Python functions, called at every step.",
         "Joint residuals are not reported.",
@@ -190,14 +181,6 @@ class ExudynPeer(Peer):
         "default tolerances (relative 1e-8, absolute 1e-10), EigenSparse; springs and dampers are "
         "its own connectors, user functions of forces are Python and not compiled."
     )
-
-    def missing(self) -> str:
-        if importlib.util.find_spec("exudyn") is None:
-            return "The package exudyn is not installed."
-        return ""
-
-    def version(self) -> str:
-        return metadata.version("exudyn")
 
     def unsupported(self, scene: Scene) -> str:
         if reason := why_not(scene):
@@ -228,20 +211,15 @@ class ExudynPeer(Peer):
                 near = np.flatnonzero(np.abs(stored[0, :, 0] - t) < 0.1 * step)
                 if len(near):
                     positions[k] = stored[:, near[0], 1:]
-            return Outcome(
-                positions,
-                accepted=int(counts[-1]) if done else None,
-                rejected=0,
-                failure="" if done else "Newton's method did not converge.",
-            )
+            failure = "" if done else "Newton's method did not converge."
+            return Outcome(positions, None, int(counts[-1]) if done else None, 0, failure=failure)
 
         return Prepared(run)
 
     def start_accelerations(self, scene: Scene) -> np.ndarray:
-        """Of the centres of mass at the start, world (n, 3) [m/s^2]."""
+        """Accelerations of the centres of mass at the start, world (n, 3) [m/s^2]."""
         mechanism = Mechanism(scene)
-        kind = mechanism.exu.OutputVariableType.Acceleration
-        sensors = [mechanism._sensor(body, kind) for body in mechanism.bodies[:-1]]
+        sensors = mechanism.sense(mechanism.exu.OutputVariableType.Acceleration)
         mechanism.mbs.Assemble()
         step = 1e-6
         mechanism.solve(mechanism.settings(scene.t0, scene.t0 + step, 1, step))

@@ -5,18 +5,15 @@ time constant of two steps. Whole runs go through `mujoco.rollout`, without Pyth
 """
 
 import importlib
-import importlib.util
-from importlib import metadata
 from typing import Any
 
 import numpy as np
-from adapter import Outcome, Peer, Prepared, Setting
+from problems.plain import Sinus, Start, UnsupportedError, loop_seconds, plain, start, starts
+from problems.tree import Tree, coordinates, span
 
+from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at
+from peers.pinocchio_model import LinkModel, link_model, why_no_joint_forces
 from stmuav_jax import Scene, State
-
-from .pinocchio_model import LinkModel, link_model, why_no_joint_forces
-from .plain import Sinus, Start, UnsupportedError, loop_seconds, plain, start, starts
-from .tree import Tree, coordinates, span
 
 _AXES = {"turn": ("hinge", "z"), "slide": ("slide", "z"), "universal": ("hinge", "xy")}
 _UNIT = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
@@ -86,12 +83,10 @@ def _bodies(links: LinkModel, parent: int) -> list[str]:
 def _sites(links: LinkModel, link: int) -> list[str]:
     """Where cut joints and constant wrenches hold on a link."""
     out = []
-    for k, (a, x, b, y) in enumerate(links.cuts):
-        out += [f'<site name="cut{k}a" pos="{_text(x)}"/>'] if a == link else []
-        out += [f'<site name="cut{k}b" pos="{_text(y)}"/>'] if b == link else []
-    for k, (a, x, b, y, *_) in enumerate(links.springs):
-        out += [f'<site name="spring{k}a" pos="{_text(x)}"/>'] if a == link else []
-        out += [f'<site name="spring{k}b" pos="{_text(y)}"/>'] if b == link else []
+    for name, pairs in (("cut", links.cuts), ("spring", links.springs)):
+        for k, (a, x, b, y, *_) in enumerate(pairs):
+            out += [f'<site name="{name}{k}a" pos="{_text(x)}"/>'] if a == link else []
+            out += [f'<site name="{name}{k}b" pos="{_text(y)}"/>'] if b == link else []
     for k, (at, _, _) in enumerate(links.wrenches):
         out += [f'<site name="wrench{k}"/>'] if at == link else []
     return out
@@ -114,13 +109,10 @@ def _torques(links: LinkModel) -> list[tuple[int, float]]:
     found = []
     for k, moment in links.moments:
         link = links.links[k]
-        along = float(link.placement.R[:, 2] @ moment)
-        if (link.kind, link.parent) != ("turn", -1) or abs(along) < 0.999999 * np.linalg.norm(
-            moment
-        ):
-            raise UnsupportedError(
-                "A world moment that is not along a hinge on ground is not written."
-            )
+        along, whole = float(link.placement.R[:, 2] @ moment), np.linalg.norm(moment)
+        if (link.kind, link.parent) != ("turn", -1) or abs(along) < 0.999999 * whole:
+            said = "A world moment that is not along a hinge on ground is not written."
+            raise UnsupportedError(said)
         found.append((k, along))
     return found
 
@@ -224,7 +216,7 @@ class MujocoC(Peer):
     """MuJoCo's C engine through its Python bindings."""
 
     name = "MuJoCo (C), RK4"
-    packages = ("mujoco",)
+    packages = (("mujoco", "mujoco"),)
     caveats = (
         "Loop constraints are soft; the hardest admitted setting is used.",
         "Actuator forces are held at their mean over each step.",
@@ -234,14 +226,6 @@ class MujocoC(Peer):
         "start off; loops by `connect` with solref (2 h, 1) and solimp (0.9999, 0.9999); servos are "
         "joint springs and dampers; whole runs in `mujoco.rollout`."
     )
-
-    def missing(self) -> str:
-        if importlib.util.find_spec("mujoco") is None:
-            return "The package mujoco is not installed."
-        return ""
-
-    def version(self) -> str:
-        return metadata.version("mujoco")
 
     def unsupported(self, scene: Scene) -> str:
         return why_no_mujoco(scene)
@@ -268,21 +252,9 @@ class MujocoC(Peer):
             states, _ = rollout.rollout(
                 world.model, world.data, first[None], controls[None], nstep=len(controls)
             )
-            path = np.concatenate([first[None], states[0]])
-            positions, worst = np.full((len(times), len(world.order), 3), np.nan), 0.0
-            for k, count in enumerate(counts):
-                if np.all(np.isfinite(path[count])):
-                    positions[k], gap = world.positions(path[count])
-                    worst = max(worst, gap)
-            failed = not np.all(np.isfinite(positions))
-            return Outcome(
-                positions,
-                each * len(controls),
-                len(controls),
-                0,
-                residual=worst,
-                failure="The state is not finite." if failed else "",
-            )
+            path = np.concatenate([first[None], states[0]])[counts]
+            taken = (each * len(controls), len(controls), 0)
+            return looked_at(path, world.positions, len(world.order), taken)
 
         return Prepared(run)
 
@@ -292,19 +264,18 @@ class MujocoC(Peer):
         return loop_seconds(lambda: world.mujoco.mj_forward(world.model, world.data))
 
     def start_accelerations(self, scene: Scene) -> np.ndarray:
-        """Of the centres of mass at the start, world (n, 3) [m/s^2]."""
+        """Accelerations of the centres of mass at the start, world (n, 3) [m/s^2]."""
         world = World(scene, 1e-5)
         world.begin(start(scene))
         mujoco, model, data = world.mujoco, world.model, world.data
         # forces at the very start, not their mean over the first step
-        data.ctrl[:] = [1.0] * world.constant + [
-            np.sin(s.rate * scene.t0 + s.phase) for s in world.waves()
-        ]
+        waves = [np.sin(s.rate * scene.t0 + s.phase) for s in world.waves()]
+        data.ctrl[:] = [1.0] * world.constant + waves
         mujoco.mj_forward(model, data)
         mujoco.mj_rnePostConstraint(model, data)
         result, six = [], np.empty(6)
+        kind = mujoco.mjtObj.mjOBJ_BODY
         for body in world.order:
-            kind = mujoco.mjtObj.mjOBJ_BODY
             mujoco.mj_objectAcceleration(model, data, kind, body, six, 0)
             result.append(six[3:] + world.links.gravity)
         return np.stack(result)

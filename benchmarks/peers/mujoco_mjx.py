@@ -2,23 +2,21 @@
 
 import importlib.util
 import time
-from importlib import metadata
 from typing import Any
 
 import numpy as np
-from adapter import Outcome, Peer, Prepared, Setting
+from problems.plain import loop_seconds, start
 
+from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at
+from peers.mujoco_c import World, whole_steps, why_no_mujoco
 from stmuav_jax import Scene
-
-from .mujoco_c import World, whole_steps, why_no_mujoco
-from .plain import loop_seconds, start
 
 
 class MujocoMjx(Peer):
     """MJX with the same model as MuJoCo's C engine."""
 
     name = "MuJoCo MJX (CPU), RK4"
-    packages = ("mujoco-mjx",)
+    packages = (("mujoco.mjx", "mujoco-mjx"),)
     caveats = (
         "It leaves out the velocity term of loop constraints.",
         "Loop constraints are soft; the hardest admitted setting is used.",
@@ -32,12 +30,7 @@ class MujocoMjx(Peer):
     def missing(self) -> str:
         if importlib.util.find_spec("mujoco") is None:
             return "The package mujoco is not installed."
-        if importlib.util.find_spec("mujoco.mjx") is None:
-            return "The package mujoco-mjx is not installed."
-        return ""
-
-    def version(self) -> str:
-        return metadata.version("mujoco-mjx")
+        return super().missing()
 
     def unsupported(self, scene: Scene) -> str:
         return why_no_mujoco(scene)
@@ -71,20 +64,7 @@ class MujocoMjx(Peer):
                 done = int(count)
                 physics.append((data.qpos, data.qvel))
             path = [np.concatenate([[0.0], q, v]) for q, v in jax.device_get(physics)]
-            positions, worst = np.full((len(times), len(world.order), 3), np.nan), 0.0
-            for k, state in enumerate(path):
-                if np.all(np.isfinite(state)):
-                    positions[k], gap = world.positions(state)
-                    worst = max(worst, gap)
-            failed = not np.all(np.isfinite(positions))
-            return Outcome(
-                positions,
-                4 * int(counts[-1]),
-                int(counts[-1]),
-                0,
-                residual=worst,
-                failure="The state is not finite." if failed else "",
-            )
+            return looked_at(path, world.positions, len(world.order), (4 * done, done, 0))
 
         return Prepared(run, seconds)
 

@@ -16,27 +16,20 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
-from adapter import Outcome, Peer, Prepared, Setting
+from problems.plain import Start, plain, start, starts, why_not
+from problems.tree import span, why_no_tree
 
+from peers.adapter import Outcome, Peer, Prepared, Setting
+from peers.pinocchio_model import link_model, model_text, start_vectors, starts_text
 from stmuav_jax import Scene, State
-
-from .pinocchio_model import link_model, model_text, start_vectors, starts_text
-from .plain import Start, plain, start, starts, why_not
-from .tree import span, why_no_tree
 
 SOURCE = Path(__file__).with_suffix(".cpp")
 # The limits are those that Pinocchio's own build files ask for.
 FLAGS = (
-    "-std=c++17",
-    "-O3",
-    "-march=native",
-    "-DNDEBUG",
-    "-w",
-    "-DBOOST_MPL_LIMIT_LIST_SIZE=30",
-    "-DBOOST_MPL_LIMIT_VECTOR_SIZE=30",
-    "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
+    "-std=c++17", "-O3", "-march=native", "-DNDEBUG", "-w", "-DBOOST_MPL_LIMIT_LIST_SIZE=30",
+    "-DBOOST_MPL_LIMIT_VECTOR_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
     "-DBOOST_FUSION_INVOKE_MAX_ARITY=12",
-)
+)  # fmt: skip
 Words = dict[str, list[list[float]]]
 
 
@@ -140,7 +133,7 @@ class PinocchioCpp(Peer):
     """Pinocchio as a C++ user would write it; the program times itself."""
 
     name = "Pinocchio (C++), Boost rkf78"
-    packages = ("pin", "cmeel-eigen")
+    packages = (("pinocchio", "pin"),)
     how = (
         "CRBA, RNEA and a sparse Cholesky factor of the mass matrix, Cholesky of the cut joints' "
         "rows; g++ -O3 -march=native, header templates; controlled steps with absolute and relative "
@@ -150,15 +143,12 @@ class PinocchioCpp(Peer):
     repeats = 5
 
     def missing(self) -> str:
-        if importlib.util.find_spec("pinocchio") is None:
-            return "The package pin is not installed."
+        if reason := super().missing():
+            return reason
         if compiler() is None:
             return "There is no C++ compiler (g++, or what CXX names)."
         lacking = [name for name, folder in include_folders().items() if folder is None]
         return f"No headers of {', '.join(lacking)} were found." if lacking else ""
-
-    def version(self) -> str:
-        return metadata.version("pin")
 
     def unsupported(self, scene: Scene) -> str:
         return why_not(scene) or why_no_tree(plain(scene))
@@ -175,16 +165,13 @@ class PinocchioCpp(Peer):
             positions = np.full((len(times), texts.bodies, 3), np.nan)
             for k, row in enumerate(words.get("positions", [])):
                 positions[k] = np.reshape(row, (-1, 3))
-            failed = bool(words["failed"][0][0])
+            said = "The step became too small, or the state not finite."
+            counts = {k: int(words[k][0][0]) for k in ("evaluations", "accepted", "rejected")}
             return Outcome(
-                positions,
-                int(words["evaluations"][0][0]),
-                int(words["accepted"][0][0]),
-                int(words["rejected"][0][0]),
-                residual=words["residual"][0][0],
+                positions, **counts, residual=words["residual"][0][0],
                 seconds=[row[0] for row in words["seconds"]],
-                failure="The step became too small, or the state not finite." if failed else "",
-            )
+                failure=said if words["failed"][0][0] else "",
+            )  # fmt: skip
 
         return Prepared(run, seconds)
 
@@ -194,7 +181,7 @@ class PinocchioCpp(Peer):
         return float(np.median(words["seconds"]))
 
     def start_accelerations(self, scene: Scene) -> np.ndarray:
-        """Of the centres of mass at the start, world (n, 3) [m/s^2]."""
+        """Accelerations of the centres of mass at the start, world (n, 3) [m/s^2]."""
         program, _ = compile_program()
         words = Texts(scene).call(program, "cost", 1)
         return np.reshape(words["accelerations"][0], (-1, 3))

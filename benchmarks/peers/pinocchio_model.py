@@ -6,13 +6,13 @@ the joint, the joint, and a body behind it.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from problems.plain import Plain, Sinus, Start, UnsupportedError, plain
+from problems.tree import IDENTITY, Frame, Tree, coordinates, span
 
 from stmuav_jax import Scene
-
-from .plain import Plain, Sinus, Start, UnsupportedError, plain
-from .tree import IDENTITY, Frame, Tree, coordinates, span
 
 
 @dataclass(frozen=True)
@@ -70,16 +70,9 @@ def link_model(model: Plain, tree: Tree) -> LinkModel:
     links = []
     for one in tree.links:
         F = body[one.child]
-        links.append(
-            LinkBody(
-                one.kind,
-                one.ahead,
-                body[one.parent] @ one.on_parent,
-                float(model.mass[one.child]),
-                F.x,
-                F.R @ model.inertia[one.child] @ F.R.T,
-            )
-        )
+        place, mass = body[one.parent] @ one.on_parent, float(model.mass[one.child])
+        inertia = F.R @ model.inertia[one.child] @ F.R.T
+        links.append(LinkBody(one.kind, one.ahead, place, mass, F.x, inertia))
     wrenches = [
         (link[k], body[k].R @ f, body[k].R @ m + np.cross(body[k].x, body[k].R @ f))
         for k, f, m in model.wrenches
@@ -89,23 +82,18 @@ def link_model(model: Plain, tree: Tree) -> LinkModel:
         for a in model.actuators
     ]
     zero = np.zeros(3)
-    springs = [
-        (*at(s.i, s.point_i), *at(s.j, s.point_j), s.stiffness, s.damping, s.length)
-        for s in model.springs
-    ]
+    ends = lambda c: (*at(c.i, c.point_i), *at(c.j, c.point_j))
     return LinkModel(
-        tuple(links),
-        model.gravity,
-        tuple(at(k, zero) for k in range(model.n)),
-        tuple(wrenches),
-        tuple(actuators),
-        tuple((*at(k, zero), force) for k, force in model.forces),
-        tuple((*at(c.i, c.point_i), *at(c.j, c.point_j)) for c in tree.cuts),
-        np.eye(3) if tree.plane is None else tree.plane,
-        tuple((link[k], moment) for k, moment in model.moments),
-        tuple(springs),
-        tuple(_servos(model, tree)),
-    )
+        links=tuple(links), gravity=model.gravity,
+        bodies=tuple(at(k, zero) for k in range(model.n)),
+        wrenches=tuple(wrenches), actuators=tuple(actuators),
+        forces=tuple((*at(k, zero), force) for k, force in model.forces),
+        cuts=tuple(ends(c) for c in tree.cuts),
+        closed=np.eye(3) if tree.plane is None else tree.plane,
+        moments=tuple((link[k], moment) for k, moment in model.moments),
+        springs=tuple((*ends(s), s.stiffness, s.damping, s.length) for s in model.springs),
+        servos=tuple(_servos(model, tree)),
+    )  # fmt: skip
 
 
 def _servos(model: Plain, tree: Tree) -> Iterator[tuple[int, float, float, float]]:
@@ -123,10 +111,8 @@ def _servos(model: Plain, tree: Tree) -> Iterator[tuple[int, float, float, float
 WIDTH = {"free": 6, "ball": 3, "turn": 1, "slide": 1, "universal": 2}
 
 
-def generalised(
-    links: LinkModel,
-) -> tuple[np.ndarray, list[tuple[np.ndarray, tuple[float, float]]]]:
-    """Loads as joint forces: a constant, and (column, (rate, phase)) of what swings in time.
+def generalised(links: LinkModel) -> tuple[np.ndarray, list[tuple[np.ndarray, Sinus]]]:
+    """Loads as joint forces: a constant, and (column, signal) of what swings in time.
 
     Only loads that do not depend on the posture: a wrench in the axes of a free link, an
     actuator along the slide that it drives, a force on a body that can only slide.
@@ -141,7 +127,7 @@ def generalised(
     def wave(link: int, direction: np.ndarray, force: Sinus) -> None:
         column = np.zeros(ends[-1])
         column[ends[link]] = np.sum(links.links[link].placement.R[:, 2] * direction)
-        waves.append((column, (force.rate, force.phase)))
+        waves.append((column, force))
 
     for k, force, moment in links.wrenches:
         if links.links[k].kind != "free":
@@ -149,18 +135,14 @@ def generalised(
         constant[ends[k] : ends[k + 1]] += np.concatenate([force, moment])
     for base, slider, _, axis, force in links.actuators:
         link = links.links[slider]
-        if (
-            link.kind != "slide"
-            or link.parent != base
-            or abs(link.placement.R[:, 2] @ axis) < 1 - 1e-12
-        ):
+        along = abs(link.placement.R[:, 2] @ axis)
+        if (link.kind, link.parent) != ("slide", base) or along < 1 - 1e-12:
             raise UnsupportedError("An actuator across its slide is not written.")
         wave(slider, axis * force.amplitude, force)
     for k, _, force in links.forces:
         if links.links[k].kind != "slide" or links.links[k].parent != -1:
-            raise UnsupportedError(
-                "A force on a body that does not slide on ground is not written."
-            )
+            said = "A force on a body that does not slide on ground is not written."
+            raise UnsupportedError(said)
         wave(k, force.amplitude, force)
     return constant, waves
 
@@ -192,40 +174,34 @@ def start_vectors(tree: Tree, state: Start) -> tuple[np.ndarray, np.ndarray]:
 
 def model_text(model: LinkModel) -> str:
     """The model as words and numbers that the C++ program reads in turn."""
-    lines = [f"links {len(model.links)}"]
-    for link in model.links:
-        F = link.placement
-        numbers = [*F.R.ravel(), *F.x, link.mass, *link.com, *link.inertia.ravel()]
-        lines.append(f"{link.kind} {link.parent} {_text(numbers)}")
-    lines.append(f"gravity {_text(model.gravity)}")
-    lines.append(f"bodies {len(model.bodies)}")
-    lines += [f"{k} {_text(x)}" for k, x in model.bodies]
-    lines.append(f"wrenches {len(model.wrenches)}")
-    lines += [f"{k} {_text([*f, *m])}" for k, f, m in model.wrenches]
-    lines.append(f"actuators {len(model.actuators)}")
-    for base, slider, point, axis, s in model.actuators:
-        numbers = [*point, *axis, float(s.amplitude), s.rate, s.phase]
-        lines.append(f"{base} {slider} {_text(numbers)}")
-    lines.append(f"forces {len(model.forces)}")
-    for k, point, s in model.forces:
-        lines.append(f"{k} {_text([*point, *s.amplitude, s.rate, s.phase])}")
-    lines.append(f"cuts {len(model.cuts)}")
-    lines += [f"{a} {_text(x)} {b} {_text(y)}" for a, x, b, y in model.cuts]
+    links = [
+        f"{link.kind} {link.parent} "
+        + _text((link.placement.R, link.placement.x, link.mass, link.com, link.inertia))
+        for link in model.links
+    ]
+    lines = [f"links {len(links)}", *links, f"gravity {_text(model.gravity)}"]
+    for name in ("bodies", "wrenches", "actuators", "forces", "cuts"):
+        rows = getattr(model, name)
+        lines += [f"{name} {len(rows)}", *map(_text, rows)]
     lines += [f"closed {len(model.closed)}", _text(model.closed)]
-    lines.append(f"moments {len(model.moments)}")
-    lines += [f"{k} {_text(m)}" for k, m in model.moments]
-    lines.append(f"springs {len(model.springs)}")
-    lines += [f"{a} {_text(x)} {b} {_text(y)} {_text(n)}" for a, x, b, y, *n in model.springs]
-    lines.append(f"servos {len(model.servos)}")
-    lines += [f"{k} {_text(n)}" for k, *n in model.servos]
+    for name in ("moments", "springs", "servos"):
+        rows = getattr(model, name)
+        lines += [f"{name} {len(rows)}", *map(_text, rows)]
     return "\n".join(lines) + "\n"
 
 
 def starts_text(starts: list[tuple[float, np.ndarray, np.ndarray]]) -> str:
     """Start times and vectors (t0, q, v), one per line."""
-    lines = [str(len(starts)), *(f"{t!r} {_text([*q, *v])}" for t, q, v in starts)]
+    lines = [str(len(starts)), *(f"{t!r} {_text((q, v))}" for t, q, v in starts)]
     return "\n".join(lines) + "\n"
 
 
-def _text(numbers: object) -> str:
-    return " ".join(repr(float(x)) for x in np.ravel(np.asarray(numbers)))
+def _text(value: Any) -> str:
+    """Numbers one after the other, however they are nested."""
+    if isinstance(value, Sinus):
+        value = (value.amplitude, value.rate, value.phase)
+    if isinstance(value, int):
+        return str(value)
+    if not isinstance(value, tuple) and np.ndim(value) == 0:
+        return repr(float(value))
+    return " ".join(_text(part) for part in value)

@@ -1,20 +1,18 @@
 """Pinocchio from Python: a tree with cut joints, `constraintDynamics`, SciPy's DOP853."""
 
-import importlib.util
 import math
 from collections.abc import Callable
 from importlib import metadata
 from typing import Any
 
 import numpy as np
-from adapter import Outcome, Peer, Prepared, Setting
+from problems.plain import loop_seconds, plain, start
+from problems.tree import span
 
+from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at
+from peers.pinocchio_model import generalised, link_model, start_vectors, why_no_joint_forces
+from peers.scipy_dense import follow
 from stmuav_jax import Scene
-
-from .pinocchio_model import generalised, link_model, start_vectors, why_no_joint_forces
-from .plain import loop_seconds, plain, start
-from .scipy_run import follow
-from .tree import span
 
 
 class Dynamics:
@@ -127,7 +125,7 @@ class Dynamics:
         """Joint accelerations at q with unit quaternions."""
         tau = self.constant.copy()
         for column, force in self.waves:
-            tau += math.sin(force[0] * t + force[1]) * column
+            tau += math.sin(force.rate * t + force.phase) * column
         self._by_posture(q, v, tau)
         if not len(self.cuts[0]):
             return self.pin.aba(self.model, self.data, q, v, tau)
@@ -177,19 +175,13 @@ class PinocchioPython(Peer):
     """Pinocchio called from Python at every evaluation."""
 
     name = "Pinocchio (Python), SciPy DOP853"
-    packages = ("pin", "scipy")
+    packages = (("pinocchio", "pin"), ("scipy", "scipy"))
     caveats = ("Loads are written as joint forces; those of springs by joint Jacobians.",)
     how = (
         "ABA, or constraintDynamics with rigid 3-D point constraints without proximal term (in "
         "planar mechanisms, where a third of the rows is dependent, with mu = 1e-9), called from "
         "Python; SciPy's DOP853, rtol = atol = tolerance."
     )
-
-    def missing(self) -> str:
-        for package in ("pinocchio", "scipy"):
-            if importlib.util.find_spec(package) is None:
-                return f"The package {package} is not installed."
-        return ""
 
     def version(self) -> str:
         import pinocchio as pin  # pyright: ignore[reportMissingImports]
@@ -210,19 +202,7 @@ class PinocchioPython(Peer):
         def run() -> Outcome:
             path = follow(rate, x0, scene.t0, times, setting.solver, tolerance)
             n = len(dynamics.links.bodies)
-            positions, worst = np.full((len(times), n, 3), np.nan), 0.0
-            for k, x in enumerate(path.states):
-                if np.all(np.isfinite(x)):
-                    positions[k], gap = dynamics.positions(x)
-                    worst = max(worst, gap)
-            return Outcome(
-                positions,
-                path.evaluations,
-                path.accepted,
-                path.rejected,
-                residual=worst,
-                failure=path.failure,
-            )
+            return looked_at(path.states, dynamics.positions, n, path.counts(), path.failure)
 
         return Prepared(run)
 
@@ -232,7 +212,7 @@ class PinocchioPython(Peer):
         return loop_seconds(lambda: dynamics.acceleration(t, q, v))
 
     def start_accelerations(self, scene: Scene) -> np.ndarray:
-        """Of the centres of mass at the start, world (n, 3) [m/s^2]."""
+        """Accelerations of the centres of mass at the start, world (n, 3) [m/s^2]."""
         dynamics = Dynamics(scene)
         pin, model, data = dynamics.pin, dynamics.model, dynamics.data
         a = dynamics.acceleration(scene.t0, dynamics.q0, dynamics.v0)

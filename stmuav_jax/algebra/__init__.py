@@ -1,1 +1,5 @@
-"""Floor 0: rotations by Euler parameters, and the linear solves of constrained dynamics."""
+"""Rotations, linear solves, derivatives, root finding, and the compiler. Floor 1."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

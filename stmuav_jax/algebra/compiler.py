@@ -1,9 +1,9 @@
-"""Compiled programs: options for XLA, and how many of them a process keeps.
+"""Compiled programs: options for XLA, and a bound on the number that a process keeps.
 
-JAX keeps every program that it compiles. On Linux each takes some hundred memory maps, of which
-the kernel gives a process 65,530 by default; a process that needs more ends with a segmentation
-fault. What this package compiles for a system of new structure goes through `kept_jit`, which keeps
-the programs used last and releases the others.
+JAX keeps every program that it compiles. On Linux each takes some hundred memory maps, and by
+default the kernel allows a process 65,530; a process that needs more ends with a segmentation
+fault. This package compiles its programs for systems of new structure by `kept_jit`, which keeps
+the most recently used programs and releases the others.
 """
 
 import threading
@@ -18,27 +18,29 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import get_opaque_trace_state
 
 Options = dict[str, str | bool | int | float]
 
 # XLA's CPU compiler hands sums of products above some size to a library meant for large
-# single-precision matrices. The sums here are over three to thirteen terms, many at once.
+# single-precision matrices. The sums of this package are over three to thirteen terms, many at
+# once.
 _NO_LIBRARY: Options = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
-# With these it compiles twice as fast (one second of uav_tracker: 5.7 instead of 12.0 s of CPU
-# time) and a single flight takes 12 to 16 % longer. A batch of flights or a bank of filters would
-# take half as long again or twice as long.
+# These options halve the time of compilation (one second of uav_tracker: 5.7 instead of 12.0 s of
+# CPU time) and lengthen a single simulation by 12 to 16 %. A batch of simulations or a bank of
+# filters would take half as long again or twice as long.
 _QUICK: Options = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_llvm_disable_expensive_passes": True,
     "xla_backend_optimization_level": 1,
 }
 
-# Programs that `kept_jit` keeps: those of some twelve structures of systems.
+# Programs that `kept_jit` keeps: enough for some twelve structures of systems.
 MOST_PROGRAMS = 48
 
-# Of the kernel's limit of memory maps; beyond it `check_maps` warns.
+# Fraction of the kernel's limit of memory maps above which `check_maps` warns.
 _WARNING_SHARE = 0.5
 
 _MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
@@ -49,28 +51,29 @@ with jax.ensure_compile_time_eval():
 
 @cache
 def compiler_options(*, quick: bool = False) -> Options:
-    """For `jax.jit(..., compiler_options=...)` or `eqx.filter_jit`, of the outermost function.
+    """Options of XLA for `jax.jit(..., compiler_options=...)` of the outermost function.
 
-    On a CPU they make a batch of right-hand sides faster and leave a single one as it
-    is. Empty on other devices; without those that this version of XLA does not know. In a program
-    of your own use `outer_jit`, or set XLA_FLAGS=--xla_cpu_experimental_ynn_fusion_type= before JAX
-    is imported.
+    On a CPU they make a batch of right-hand sides faster and leave a single one unchanged. The
+    dictionary is empty on other devices and omits options that this version of XLA does not know. A
+    program of your own uses `outer_jit`, or sets
+    XLA_FLAGS=--xla_cpu_experimental_ynn_fusion_type= before JAX is imported. `eqx.filter_jit`
+    accepts the same argument.
 
     Args:
-        quick: with options that halve the time of compiling, for programs that run for less time
-            than they take to compile: `simulate` uses these. Batches become slower by them.
+        quick: add options that halve the time of compilation and slow batches down, for programs
+            that run for less time than they take to compile; `simulate` uses them.
     """
     if jax.default_backend() != "cpu":
         return {}
     options = _NO_LIBRARY | (_QUICK if quick else {})
-    # one by one only where it matters which are unknown: every process waits for this
+    # all options at once first: every process waits for this test
     if _known(options):
         return options
     return {name: value for name, value in options.items() if _known({name: value})}
 
 
 def _known(options: Options) -> bool:
-    """Whether this version of XLA takes all of these options."""
+    """Test whether this version of XLA accepts all of these options."""
     try:
         jax.jit(jnp.cos, compiler_options=dict(options)).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
@@ -84,13 +87,13 @@ def outer_jit(function: Callable[..., Any]) -> Any:
 
 
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`eqx.filter_jit` with `compiler_options(quick=True)`, which are asked for at the first call.
+    """`eqx.filter_jit` with `compiler_options(quick=True)`, determined at the first call.
 
     Within a transformation (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a
     larger program.
 
     Args:
-        function: of positional arguments.
+        function: function of positional arguments.
     """
     within: Any = eqx.filter_jit(function)
 
@@ -113,12 +116,12 @@ _lock = threading.Lock()
 def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """`eqx.filter_jit` of a function of arrays and structure, with a bounded number of programs.
 
-    Programs are kept by function, structure, and shapes of the arguments, at most `MOST_PROGRAMS` of
-    all functions together; those used longest ago are released. Within a transformation
+    Programs are kept by function, structure, and shapes of the arguments, at most `MOST_PROGRAMS`
+    of all functions together; the least recently used are released. Within a transformation
     (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a larger program.
 
     Args:
-        function: of positional arguments. Arrays are traced, all else must be hashable.
+        function: function of positional arguments; arrays are traced, all else must be hashable.
     """
     within: Any = eqx.filter_jit(function)
 
@@ -131,10 +134,30 @@ def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
-    """A function compiled quickly for arguments such as these; see `kept_jit`, `compiler_options`.
+def in_blocks(function: Callable[..., Any], size: int, *arguments: Any) -> Any:
+    """Results of a function for k >= 1 rows, as NumPy arrays stacked along the first axis.
 
-    It is to be called with arguments of the same structure, shapes and data types.
+    The function is called with blocks of `size` rows, so that it is compiled once; copies of the
+    last row fill up the last block.
+
+    Args:
+        function: function of pytrees with `size` rows.
+        arguments: pytrees with k rows.
+    """
+    count, found = len(jax.tree.leaves(arguments)[0]), []
+    for start in range(0, count, size):
+        pick = np.minimum(np.arange(start, start + size), count - 1)
+        block = function(*jax.tree.map(lambda x, pick=pick: np.asarray(x)[pick], arguments))
+        keep = min(size, count - start)
+        found.append(jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], block))
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+
+
+def program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
+    """Compiled program of a function for arguments of this structure, kept for later calls.
+
+    The program accepts arguments of the same structure, shapes and data types. It is compiled with
+    the quick options of `compiler_options`; `kept_jit` describes which programs are kept.
     """
     leaves, structure = jax.tree.flatten(args)
     setting = (jax.config.jax_enable_x64, jax.config.jax_default_device)  # pyright: ignore[reportAttributeAccessIssue]
@@ -174,7 +197,7 @@ def _compiled(function: Callable[..., Any], args: tuple[Any, ...]) -> Callable[.
 
 
 def _kind(leaf: Any) -> Hashable:
-    """What a program depends on: of an array all but its numbers, anything else itself."""
+    """Key of an argument's leaf: shape, data type and device of an array, any other leaf itself."""
     if not eqx.is_array(leaf):
         return type(leaf), leaf
     where = leaf.sharding if getattr(leaf, "committed", False) else None
@@ -182,13 +205,13 @@ def _kind(leaf: Any) -> Hashable:
 
 
 def transformed(args: Any) -> bool:
-    """Whether JAX is transforming what calls this, or one of the arguments."""
+    """Test whether JAX is transforming the caller or one of the arguments."""
     tracers = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(args))
     return tracers or get_opaque_trace_state() != _NO_TRANSFORMATION
 
 
 def memory_maps() -> tuple[int, int] | None:
-    """Memory maps of this process and the kernel's limit; None where there is no such count."""
+    """Number of memory maps of this process and the kernel's limit; None if not available."""
     try:
         return _MAPS.read_bytes().count(b"\n"), int(_MOST_MAPS.read_text())
     except (OSError, ValueError):
@@ -199,7 +222,7 @@ _warned = threading.Event()
 
 
 def check_maps() -> None:
-    """Warn, once in a process, when it has half as many memory maps as the kernel allows."""
+    """Warn, once per process, if it has at least half of the memory maps that the kernel allows."""
     maps = memory_maps()
     if maps is None or maps[0] < _WARNING_SHARE * maps[1] or _warned.is_set():
         return

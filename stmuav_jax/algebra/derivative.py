@@ -1,4 +1,4 @@
-"""Derivatives along some arguments only, and at places where there are none."""
+"""Derivatives along some of the arguments, and safe derivatives at singular points."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from .stacked import dot
 def directional(
     function: Callable[..., Any], primals: tuple[Any, ...], tangents: tuple[Any, ...]
 ) -> tuple[Any, Any]:
-    """function(*primals) and its derivative along tangents, None for leaves that do not change.
+    """Value of a function and its derivative along tangents, which are None for constant leaves.
 
     The form of `tangents` is that of `equinox.filter_custom_jvp`.
     """
@@ -26,7 +26,7 @@ def directional(
 
 @jax.custom_jvp
 def without_derivative(x: Float[Array, "*s"], there: Bool[Array, "..."]) -> Float[Array, "*s"]:
-    """x itself, which has no derivative where `there` is true: it is NaN, not a number made up."""
+    """Identity x -> x whose derivative is NaN where `there` is true, as x has none there."""
     del there
     return x
 
@@ -37,13 +37,25 @@ def _without_derivative_jvp(primals: Any, tangents: Any) -> Any:
     return x, tangents[0] * jnp.where(there, jnp.nan, 1.0).astype(x.dtype)
 
 
+def safe_sqrt(square: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """Square root that is zero, with zero derivatives, where `square` is <= 0; NaN stays NaN."""
+    none = square <= 0
+    return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, square)))
+
+
+def safe_norm(vectors: Float[Array, "..."], axis: int = 0) -> Float[Array, "..."]:
+    """Euclidean norm along an axis; its derivatives at zero are set to zero."""
+    return safe_sqrt(jnp.sum(vectors * vectors, axis=axis))
+
+
 def length_and_direction(
     d: Float[Array, "k"],
 ) -> tuple[Float[Array, ""], Float[Array, "k"], Bool[Array, ""]]:
-    """|d|, d / |d| and whether d is not zero; both are zero, with zero derivatives, where it is.
+    """Length |d|, unit vector d / |d|, and a flag that d is not zero.
 
-    Exact with all derivatives for any other d: the components are divided by the largest
-    first, so that no square over- or underflows.
+    At d = 0 length and vector are zero, with zero derivatives. For any other d they are exact with
+    all derivatives: the components are first divided by the largest, so that no square over- or
+    underflows.
     """
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(d)))
     apart = largest != 0

@@ -1,4 +1,4 @@
-"""The linear solves of constrained dynamics: small, dense, symmetric or general."""
+"""Linear solvers of constrained dynamics, for small full matrices, symmetric or general."""
 
 from typing import Literal
 
@@ -8,41 +8,41 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float
 
-from .shapes import Matrix, Vector
+from ..checks.shapes import Matrix, Vector
+from .stacked import transposed_multiply
 
-# Weight of the proximal term against rows of unit size, and steps of the iteration: what is
-# left of an error along a singular value s is (w / (w + s))^steps. Where a mechanism passes
-# through a singular posture s goes through zero, and while s < w accelerations are wrong: the
-# smaller w, the shorter. It has to be above the round-off of the matrix, no more: rows that are
-# dependent throughout have been left out.
+# Weight w of the proximal term relative to rows of unit size, and number of iterations. The error
+# that remains along a singular value s is (w / (w + s))^steps. In a singular posture of a mechanism
+# s goes through zero, and accelerations are wrong while s < w: a smaller w shortens that time. It
+# only has to exceed the round-off of the matrix, as rows that are always dependent are left out.
 _PROXIMAL_WEIGHT = 1e-15
 _PROXIMAL_STEPS = 4
 
 
-# Multiplications above which a matrix product is a library's.
+# Number of multiplications above which a matrix product is left to a library.
 _LARGE = 10_000
 
 
 class Factor(eqx.Module):
-    """A symmetric positive definite matrix S factorised once, for many right-hand sides.
+    """Cholesky factorisation of a symmetric positive definite matrix S, for many right-hand sides.
 
-    Rows of mixed units (m and rad) do no harm: what Cholesky's method loses does not depend
-    on how rows and columns are scaled.
+    Rows of mixed units (m and rad) do no harm: the relative round-off of Cholesky's method does not
+    depend on a scaling of rows and columns.
     """
 
     lower: Matrix
 
     def solve(self, b: Float[Array, "m *r"]) -> Float[Array, "m *r"]:
-        """x with S x = b, shape (m,) or (m, r)."""
+        """Solution x of S x = b, shape (m,) or (m, r)."""
         y = solve_lower(self.lower, b[:, None] if b.ndim == 1 else b)
         x = solve_lower(self.lower, y, transpose=True)
         return x[:, 0] if b.ndim == 1 else x
 
 
 class MinimumNorm(eqx.Module):
-    """A symmetric matrix S, singular or not, decomposed once.
+    """Singular value decomposition of a symmetric matrix S, singular or not.
 
-    It is not scaled: that would change which solution is the one of minimum norm.
+    S is not scaled: that would change which solution has minimum norm.
     """
 
     operator: lx.MatrixLinearOperator
@@ -50,16 +50,16 @@ class MinimumNorm(eqx.Module):
     state: object
 
     def solve(self, b: Vector) -> Vector:
-        """The x of minimum norm with S x = b, shape (m,)."""
+        """Minimum-norm solution x of S x = b, shape (m,)."""
         return lx.linear_solve(self.operator, b, self.solver, state=self.state, throw=False).value
 
 
 class Proximal(eqx.Module):
-    """A positive semi-definite matrix S, solved by x <- x + (S + w I)^-1 (b - S x) from x = 0.
+    """Proximal solver of a positive semi-definite matrix S: x <- x + (S + w I)^-1 (b - S x).
 
-    Much cheaper than a singular value decomposition. With b in the range of S, S x is b; x
-    itself is only determined up to what S maps to zero, and there it carries round-off
-    divided by w.
+    The iteration starts from x = 0 and is much cheaper than a singular value decomposition. For b
+    in the range of S, S x equals b; x is determined up to the null space of S only, in which it
+    carries round-off divided by w.
 
     Source: J. Carpentier, R. Budhiraja, N. Mansard, Proximal and sparse resolution of
     constrained dynamic equations, Robotics: Science and Systems (2021).
@@ -70,7 +70,7 @@ class Proximal(eqx.Module):
     scale: Vector
 
     def solve(self, b: Float[Array, "m *r"]) -> Float[Array, "m *r"]:
-        """x with S x = b, shape (m,) or (m, r)."""
+        """Solution x of S x = b, shape (m,) or (m, r)."""
         scale = self.scale[:, None]
         B = scale * (b[:, None] if b.ndim == 1 else b)
         x = jnp.zeros_like(B)
@@ -82,17 +82,17 @@ class Proximal(eqx.Module):
 
 
 def cholesky(S: Matrix) -> Matrix:
-    """The lower factor of a symmetric positive definite matrix; NaN for any other."""
+    """Lower Cholesky factor of a symmetric positive definite matrix; NaN for any other."""
     return jax.lax.linalg.cholesky(S, symmetrize_input=False)
 
 
 def solve_lower(L: Matrix, B: Matrix, *, transpose: bool = False) -> Matrix:
-    """L^-1 B, or L^-T B, for a lower triangular L."""
+    """Solution L^-1 B, or L^-T B, for a lower triangular matrix L."""
     return jax.lax.linalg.triangular_solve(L, B, left_side=True, lower=True, transpose_a=transpose)
 
 
 def _scaled(S: Matrix) -> tuple[Matrix, Vector]:
-    """S with a unit diagonal, and the factors that made it so."""
+    """Matrix S scaled to a unit diagonal, and its scale factors."""
     diagonal = jnp.diagonal(S)
     scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
     return scale[:, None] * S * scale[None, :], scale
@@ -101,9 +101,9 @@ def _scaled(S: Matrix) -> tuple[Matrix, Vector]:
 def factorise(S: Matrix, *, redundant: bool, rcond: float) -> Factor | MinimumNorm:
     """Factorise a symmetric positive (semi-)definite matrix, shape (m, m).
 
-    `redundant=False`: Cholesky; a singular S then gives NaN, never a wrong number.
-    `redundant=True`: singular value decomposition, values below `rcond` times the largest
-    counted as zero.
+    `redundant=False` uses Cholesky's method; a singular S gives NaN, never a wrong number.
+    `redundant=True` uses a singular value decomposition, in which values below `rcond` times the
+    largest count as zero.
     """
     if redundant:
         operator, solver = lx.MatrixLinearOperator(S), lx.SVD(rcond=rcond)
@@ -128,10 +128,10 @@ def _schur(S: Matrix, redundant: Redundant) -> Factor | Proximal | MinimumNorm:
 
 
 def independent_rows(S: Matrix, tolerance: float | Float[Array, ""]) -> Bool[Array, " m"]:
-    """Rows of J that make up its row space, from S = J J^T, shape (m,).
+    """Mask of rows of J that form a basis of its row space, from S = J J^T, shape (m,).
 
-    Cholesky's method with pivoting: always the row is taken that is farthest from the space of
-    those before it, until the square of this distance is below `tolerance`. It has no derivative.
+    Cholesky's method with pivoting adds the row that is farthest from the space of the rows before
+    it, until the square of this distance is below `tolerance`. The result has no derivative.
 
     Source: N. J. Higham, Accuracy and Stability of Numerical Algorithms (2002), ch. 10.3.
     """
@@ -145,7 +145,7 @@ def independent_rows(S: Matrix, tolerance: float | Float[Array, ""]) -> Bool[Arr
         column = rest[row]
         rest = rest - column[:, None] * (column / column[row])
         taken = taken.at[row].set(True)
-        # those taken have no distance left, whatever round-off says
+        # rows already taken have no distance left, apart from round-off
         keep = ~taken
         return jnp.where(keep[:, None] & keep, rest, 0.0), taken
 
@@ -154,9 +154,9 @@ def independent_rows(S: Matrix, tolerance: float | Float[Array, ""]) -> Bool[Arr
 
 
 def _gram(Y: Matrix) -> Matrix:
-    """Y^T Y; small ones as sums, which fuse and cost less to do than a product to call."""
+    """Gram matrix Y^T Y; small ones by sums, which fuse and avoid the cost of a library call."""
     k, m = Y.shape
-    return Y.T @ Y if k * m * m > _LARGE else jnp.sum(Y[:, :, None] * Y[:, None, :], axis=0)
+    return Y.T @ Y if k * m * m > _LARGE else transposed_multiply(Y, Y)
 
 
 def solve_saddle(
@@ -168,10 +168,10 @@ def solve_saddle(
     redundant: Redundant,
     kept: Bool[Array, " m"] | None = None,
 ) -> tuple[Vector, Vector]:
-    """x (k,) and y (m,) with M x - J^T y = f, J x = g; M symmetric positive definite.
+    """Solution x (k,), y (m,) of M x - J^T y = f, J x = g, with M symmetric positive definite.
 
-    Where rows of J are dependent, `redundant` says how y is chosen: x is the same. With `kept`
-    the other rows are left out, and their y is zero.
+    If rows of J are dependent, `redundant` determines the choice of y; x does not depend on it.
+    With `kept` the other rows are left out, and their y is zero.
     """
     L = cholesky(M)
     if not J.shape[0]:
@@ -188,16 +188,16 @@ def solve_saddle(
 
 
 def _with_ones(S: Matrix, kept: Bool[Array, " m"] | None) -> Matrix:
-    """S with a unit diagonal in the rows left out, where nothing else is."""
+    """Add ones to the diagonal of S in the rows left out, which are zero otherwise."""
     return S if kept is None else S + jnp.diag(1.0 - kept)
 
 
 def right_inverse(
     M: Matrix, J: Matrix, *, redundant: bool, kept: Bool[Array, " m"] | None = None
 ) -> Matrix:
-    """G = M^-1 J^T (J M^-1 J^T)^-1: of all x with J x = b, G b is the smallest in M.
+    """Right inverse G = M^-1 J^T (J M^-1 J^T)^-1: x = G b solves J x = b with minimum x^T M x.
 
-    With `kept` this is so for these rows; columns of the others are zero.
+    With `kept` it is the inverse for these rows; columns of the others are zero.
     """
     L = cholesky(M)
     Y = solve_lower(L, J.T)
@@ -208,7 +208,7 @@ def right_inverse(
 
 
 def solve_general(K: Matrix, b: Vector, *, redundant: bool, rcond: float) -> Vector:
-    """x with K x = b for a general square K, shape (k,): LU, or minimum norm if `redundant`."""
+    """Solution x (k,) of K x = b for a general square K: LU, or minimum norm if `redundant`."""
     operator = lx.MatrixLinearOperator(K)
     solver = lx.SVD(rcond=rcond) if redundant else lx.LU()
     return lx.linear_solve(operator, b, solver, throw=False).value

@@ -1,13 +1,13 @@
 """Symmetric positive definite systems of a few rows, solved in closed form.
 
-For up to six rows a library's factorisation costs more to call than to do, and it is
-called once per matrix of a batch. Written out, it fuses with what comes before and after,
-over all matrices of a stack (`stmuav_jax.algebra.stacked`): components first, the axes of a
-stack last. Up to three rows by cofactors, more by two blocks,
+For up to six rows the call of a library's factorisation costs more than its arithmetic, and there
+is one call per matrix of a batch. The closed form fuses with the operations before and after
+it, over all matrices of a stack (`stmuav_jax.algebra.stacked`): components first, the axes of a
+stack last. Up to three rows are solved by cofactors, more by two blocks,
 
     [P Q; Q^T R] [x; y] = [b; c]:    (R - Q^T P^-1 Q) y = c - Q^T P^-1 b,
 
-which needs no pivoting where the matrix is positive definite.
+which needs no pivoting as the matrix is positive definite.
 """
 
 import jax.numpy as jnp
@@ -15,14 +15,14 @@ from jaxtyping import Array, Float
 
 from .stacked import multiply
 
-# Rows up to which this is worth its traced operations.
+# Number of rows up to which the closed form is worth its traced operations.
 LARGEST = 6
 
 Square = Float[Array, "k k *#s"]
 
 
 def solve(A: Square, B: Float[Array, "k r *#s"]) -> Float[Array, "k r ..."]:
-    """X with A X = B for symmetric positive definite A, k <= 6; NaN for any other."""
+    """Solution X of A X = B for symmetric positive definite A, k <= 6; NaN for any other A."""
     k = A.shape[0]
     if k > LARGEST:
         raise ValueError(f"solve serves up to {LARGEST} rows, not {k}: use a factorisation.")
@@ -36,7 +36,7 @@ def solve(A: Square, B: Float[Array, "k r *#s"]) -> Float[Array, "k r ..."]:
 
 
 def inverse(A: Square) -> Float[Array, "k k ..."]:
-    """A^-1 of symmetric positive definite matrices (k, k, *s), k <= 3; NaN for any other."""
+    """Inverse of symmetric positive definite matrices (k, k, *s), k <= 3; NaN for any other."""
     k = A.shape[0]
     if k == 1:
         return jnp.where(A > 0, 1 / A, jnp.nan)
@@ -45,7 +45,7 @@ def inverse(A: Square) -> Float[Array, "k k ..."]:
         adjugate = signs * A[::-1, ::-1]
         fine = A[0, 0] > 0
     else:
-        # rows and columns repeated in a cycle: all cofactors at once
+        # rows and columns repeated in a cycle give all cofactors at once
         B = jnp.concatenate([A, A[:2]])
         B = jnp.concatenate([B, B[:, :2]], axis=1)
         adjugate = B[1:4, 1:4] * B[2:5, 2:5] - B[1:4, 2:5] * B[2:5, 1:4]

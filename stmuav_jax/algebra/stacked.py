@@ -1,8 +1,8 @@
-"""Products of small matrices and vectors whose further axes come last.
+"""Products of small matrices and vectors in stacks, whose axes come last.
 
-Components first, then any axes of a stack: bodies, joints, states of a batch. Sums over
-components are written out, so that they fuse with what comes before and after into loops
-over the last axes; a library's matrix product of 3x3 matrices costs more to call than to do.
+Components come first, then any axes of a stack: bodies, joints, states of a batch. Sums over
+components are written out, so that they fuse with the operations before and after them into loops
+over the last axes; the call of a library's product of 3x3 matrices costs more than its arithmetic.
 """
 
 import jax.numpy as jnp
@@ -11,31 +11,38 @@ from jaxtyping import Array, Float
 
 
 def dot(a: Float[Array, "k *#s"], b: Float[Array, "k *#s"]) -> Float[Array, "..."]:
-    """a . b."""
+    """Scalar product a . b of vectors."""
     return jnp.sum(a * b, axis=0)
 
 
 def apply(A: Float[Array, "i j *#s"], b: Float[Array, "j *#s"]) -> Float[Array, "i ..."]:
-    """A b."""
+    """Product A b of a matrix and a vector."""
     return jnp.sum(A * b[None], axis=1)
 
 
 def apply_transposed(A: Float[Array, "i j *#s"], b: Float[Array, "i *#s"]) -> Float[Array, "j ..."]:
-    """A^T b."""
+    """Product A^T b of a transposed matrix and a vector."""
     return jnp.sum(A * b[:, None], axis=0)
 
 
 def multiply(A: Float[Array, "i j *#s"], B: Float[Array, "j k *#s"]) -> Float[Array, "i k ..."]:
-    """A B."""
+    """Product A B of two matrices."""
     return jnp.sum(A[:, :, None] * B[None], axis=1)
 
 
+def transposed_multiply(
+    A: Float[Array, "r i *#s"], B: Float[Array, "r k *#s"]
+) -> Float[Array, "i k ..."]:
+    """Product A^T B of two matrices; exactly symmetric if A and B are the same array."""
+    return jnp.sum(A[:, :, None] * B[:, None], axis=0)
+
+
 def eye(like: Float[Array | np.ndarray, "3 *#s"]) -> Float[Array, "3 3 ..."]:
-    """The unit matrix, with axes of length one for those of a stack of vectors."""
+    """Unit matrix (3, 3), with axes of length one for those of a stack of vectors."""
     return jnp.eye(3, dtype=like.dtype).reshape(3, 3, *(1,) * (like.ndim - 1))
 
 
 def summed(rows: Float[Array, "w k *s"], table: np.ndarray) -> Float[Array, "w f *s"]:
-    """Sums of columns, with the weights (k, f) of a constant table."""
+    """Sums of columns, weighted by a constant table (k, f)."""
     weights = table.astype(float).reshape(*table.shape, *(1,) * (rows.ndim - 2))
     return jnp.sum(rows[:, :, None] * weights, axis=1)

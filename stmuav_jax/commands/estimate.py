@@ -1,4 +1,4 @@
-"""`stmuav estimate`: the report's eight cases, and the hover."""
+"""Command `stmuav estimate`: the report's eight cases of estimation, and the hover."""
 
 import dataclasses
 from pathlib import Path
@@ -46,16 +46,16 @@ class Estimate:
     """Keep compiled code in the user's cache folder for the next run."""
 
 
-# Exit code of a run that is done, but of which a filter cannot be trusted.
+# Exit code of a completed run with a filter that cannot be trusted.
 UNTRUSTED = 3
 
 
 def run_estimate(command: Estimate) -> int:
-    """Run the command, print its table; the exit code."""
-    from ..estimation.quadrotor import PART_III
-    from ..mechanics.errors import SettingError
-    from ..view.estimate import verdict_lines
-    from ..view.io import load_parameters
+    """Run the command and print its table; return the exit code."""
+    from ..checks.errors import SettingError
+    from ..figures.estimate import verdict_lines
+    from ..files.netcdf import load_parameters
+    from ..quadrotor.model import PART_III
 
     if command.case is not None and command.case not in range(1, 9):
         raise SettingError(f"The report has cases 1 to 8, not {command.case}.")
@@ -79,9 +79,11 @@ def run_estimate(command: Estimate) -> int:
 def _cases(
     command: Estimate, names: tuple, table: Any, believed: Any
 ) -> tuple[Table, list[Path], dict[str, Any]]:
-    from ..estimation.assess import study_case
-    from ..estimation.tuning import consistent_tuning, report_tuning
-    from ..view.estimate import case_dataset, save_case_figures, save_dataset, summary_table
+    from ..figures.estimate import CASE_FIGURES, case_dataset, summary_table
+    from ..figures.plot import save_figures
+    from ..files.netcdf import save_dataset
+    from ..quadrotor.assess import study_case
+    from ..quadrotor.tuning import consistent_tuning, report_tuning
 
     cases = range(1, 9) if command.case is None else (command.case,)
     own: Any = command.model != "default"
@@ -94,7 +96,7 @@ def _cases(
     for case in cases:
         tunings = []
         for name in names:
-            # compiled once for all cases that share it
+            # one tuning is compiled once for all cases that share it
             key = name, name == "consistent" and case > 4
             if key not in made:
                 kind = kinds[name]
@@ -113,7 +115,7 @@ def _cases(
             folder = command.out if len(cases) == 1 else command.out / f"case_{case}"
         paths.append(save_dataset(case_dataset(study), folder / "estimate.nc"))
         if command.figures != "none":
-            paths += save_case_figures(study, folder, command.figures)
+            paths += save_figures(CASE_FIGURES, folder, command.figures, study)
     verdicts = {f"Case {s.case}, {s.tuning} tuning": s.verdict for s in summaries}
     return summary_table(summaries), paths, verdicts
 
@@ -121,9 +123,11 @@ def _cases(
 def _hover(
     command: Estimate, names: tuple, table: Any, believed: Any
 ) -> tuple[Table, list[Path], dict[str, Any]]:
-    from ..estimation.hover import simulate_hover
-    from ..mechanics.errors import SettingError
-    from ..view.estimate import hover_dataset, hover_table, save_dataset, save_hover_figure
+    from ..checks.errors import SettingError
+    from ..figures.estimate import hover, hover_dataset, hover_table
+    from ..figures.plot import save_figures
+    from ..files.netcdf import save_dataset
+    from ..quadrotor.hover import simulate_hover
 
     if command.model != "default":
         raise SettingError("--hover has a model of its own (14 states): leave --model out.")
@@ -139,6 +143,6 @@ def _hover(
     folder = command.out if command.out is not None else Path("runs") / "hover"
     paths = [save_dataset(hover_dataset(flights), folder / "hover.nc")]
     if command.figures != "none":
-        paths += save_hover_figure(flights, folder, command.figures)
+        paths += save_figures({"hover": hover}, folder, command.figures, flights)
     verdicts = {f"Hover, {name} tuning": flight.verdict() for name, flight in flights.items()}
     return hover_table(flights), paths, verdicts

@@ -1,4 +1,4 @@
-"""`stmuav trim` and `stmuav linearize`: a steady flight, and small departures from it."""
+"""Commands `stmuav trim` and `stmuav linearize`: a steady flight, and its linear model."""
 
 import dataclasses
 import math
@@ -7,22 +7,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ..mechanics.errors import ModelError, SettingError
-from ..view.terminal import line, row, table
+from ..checks.errors import ModelError, SettingError
+from ..figures.terminal import line, row, table
 from .options import ANGLE, FORCE, SPEED, Number, default
 from .output import written
 
 if TYPE_CHECKING:
-    from ..vehicle.parameters import Parameters
+    from ..parameters.table import Parameters
 
 _ROTOR = Number("speed of the rotors", "rad/s", 0.0, 1e5)
 
 
 @dataclasses.dataclass
-class Flight:
+class SteadyFlight:
     """A steady flight of the UAV with its tracker."""
 
     phi: Annotated[float | None, ANGLE, default("the initial one")] = None
@@ -41,21 +42,20 @@ class Flight:
     """Rate of turn, from x towards y [degrees/s]."""
     yaw: Annotated[float, ANGLE] = 0.0
     """Heading of the UAV's x axis, from x towards y [degrees]."""
-    params: Annotated[Path | None, default("the report's values")] = None
-    """TOML file with values that replace the table's."""
-    out: Annotated[Path | None, default("runs/trim or runs/linearize")] = None
-    """Folder for the results."""
-    cache: bool = True
-    """Keep compiled code in the user's cache folder for the next run."""
+
+
+# Its options stand beside the command's own, without a prefix.
+_Flight = Annotated[SteadyFlight, tyro.conf.arg(name="")]
 
 
 @dataclasses.dataclass
-class Trim(Flight):
+class Trim:
     """Find attitude, rotor speeds and actuator forces of a steady flight; write trim.json.
 
     Example: stmuav trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods
     """
 
+    flight: _Flight = dataclasses.field(default_factory=SteadyFlight)
     highest: Annotated[float | None, _ROTOR, default("none")] = None
     """Limit of the rotors' speeds [rad/s]."""
     lowest: Annotated[float, _ROTOR] = 0.0
@@ -64,61 +64,74 @@ class Trim(Flight):
     """Limit of the actuators' forces either way [N]."""
     by: tuple[str, ...] = ()
     """Parameters to which the trim's sensitivity is wanted, such as mass.panel_7."""
+    params: Annotated[Path | None, default("the report's values")] = None
+    """TOML file with values that replace the table's."""
+    out: Annotated[Path | None, default("runs/trim")] = None
+    """Folder for the results."""
+    cache: bool = True
+    """Keep compiled code in the user's cache folder for the next run."""
 
 
 @dataclasses.dataclass
-class Linearize(Flight):
+class Linearize:
     """Linearise about a steady flight; write A, B, C, D with names to linear.npz.
 
     Example: stmuav linearize --sun 150 60 --outputs phi theta
     """
 
+    flight: _Flight = dataclasses.field(default_factory=SteadyFlight)
     outputs: Annotated[tuple[str, ...], default("all")] = ()
     """States that are measured, such as omega_x."""
+    params: Annotated[Path | None, default("the report's values")] = None
+    """TOML file with values that replace the table's."""
+    out: Annotated[Path | None, default("runs/linearize")] = None
+    """Folder for the results."""
+    cache: bool = True
+    """Keep compiled code in the user's cache folder for the next run."""
 
 
 def table_of(params: Path | None) -> "Parameters":
-    """Part II of the report, with the user's values."""
-    from ..vehicle.airframe import PART_II
-    from ..view.io import load_parameters
+    """Parameter table of the report's Part II, with the user's values."""
+    from ..files.netcdf import load_parameters
+    from ..parameters.airframe import PART_II
 
     return load_parameters(params, PART_II)
 
 
-def wanted_of(command: Flight, values: "Parameters") -> Any:
-    """The flight that the options describe."""
-    from ..study.trim import climb, cruise, steady_turn
-    from ..vehicle.geometry import initial_angles
+def wanted_of(given: SteadyFlight, values: "Parameters") -> Any:
+    """The flight condition that the options describe."""
+    from ..flight.flight_trim import climb, cruise, steady_turn
+    from ..tracker.geometry import initial_angles
 
-    if command.sun is not None and (command.phi is not None or command.theta is not None):
+    if given.sun is not None and (given.phi is not None or given.theta is not None):
         raise SettingError("Give --sun or --phi and --theta, not both.")
-    yaw, course = math.radians(command.yaw), math.radians(command.course)
+    yaw, course = math.radians(given.yaw), math.radians(given.course)
     angles, sun = None, None
-    if command.sun is not None:
-        if command.turn:
+    if given.sun is not None:
+        if given.turn:
             raise SettingError(
                 "In a turn the panel would have to move to stay on the sun, which is no steady "
                 "flight: give --phi and --theta with --turn."
             )
-        azimuth, height = (math.radians(x) for x in command.sun)
+        azimuth, height = (math.radians(x) for x in given.sun)
         level = math.cos(height)
         sun = [level * math.sin(azimuth), level * math.cos(azimuth), math.sin(height)]
     else:
         first = np.asarray(initial_angles(values))
-        given = (command.phi, command.theta)
-        angles = [a if x is None else math.radians(x) for a, x in zip(first, given, strict=True)]
-    if command.turn:
+        own = (given.phi, given.theta)
+        angles = [a if x is None else math.radians(x) for a, x in zip(first, own, strict=True)]
+    if given.turn:
         assert angles is not None
-        wanted = steady_turn(command.speed, math.radians(command.turn), angles, course, yaw)
+        wanted = steady_turn(given.speed, math.radians(given.turn), angles, course, yaw)
     else:
-        wanted = cruise(command.speed, course, angles, yaw, sun=sun)
-    up = climb(command.climb, angles, yaw, sun=sun)
+        wanted = cruise(given.speed, course, angles, yaw, sun=sun)
+    up = climb(given.climb, angles, yaw, sun=sun)
     return wanted._replace(v=wanted.v + up.v)
 
 
 def _limits(command: Trim) -> Any:
-    from ..study.trim import TrimLimits
-    from ..vehicle.allocation import RotorLimits
+    from ..flight.flight_trim import TrimLimits
+    from ..rotorcraft.allocation import RotorLimits
 
     rotors = None if command.highest is None else RotorLimits(command.lowest, command.highest)
     if rotors is None and command.lowest:
@@ -126,56 +139,33 @@ def _limits(command: Trim) -> Any:
     return TrimLimits(rotors, math.inf if command.force is None else command.force)
 
 
-def _unknowns(found: Any) -> Any:
-    """What a trim finds, as one vector: attitude (rotation vector, degrees), speeds, forces."""
-    import jax.numpy as jnp
-
-    from ..algebra.rotation import to_rotation_vector
-
-    turned = jnp.degrees(to_rotation_vector(found.coordinates.p))
-    return jnp.concatenate([turned, found.speeds, found.inputs.forces])
-
-
-def _labels(count: int) -> list[tuple[str, str]]:
-    """Names and units of `_unknowns`."""
-    names = [(f"turn_{k}", "degrees") for k in "xyz"]
-    names += [(f"speed_{k + 1}", "rad/s") for k in range(count)]
-    return [*names, ("force_2", "N"), ("force_3", "N")]
-
-
 def _solved(command: Trim, given: "Parameters", limits: Any) -> tuple[Any, dict[str, np.ndarray]]:
-    """The trim, and its derivatives by parameters of the table, by name: (unknowns, shape of it)."""
-    import jax
+    """The trim, and the derivatives of its values by parameters of the table, by name."""
     import jax.numpy as jnp
 
-    from ..algebra.compiler import outer_jit
+    from ..flight.flight_trim import TrimReason, trim_flight
+    from ..flight.slopes import trim_slopes
     from ..scenes.uav_tracker import uav_flyer
-    from ..study.trim import TrimReason, trim
 
-    wanted = wanted_of(command, given)
+    wanted = wanted_of(command.flight, given)
     values = {name: jnp.asarray(given.value(name), dtype=float) for name in command.by}
-
-    def of(values: Any) -> Any:
-        found = trim(uav_flyer(given.replaced(values)), wanted, limits, throw=False)
-        return _unknowns(found), found
-
     if values:
-        slopes, found = outer_jit(jax.jacfwd(of, has_aux=True))(values)
+        build = lambda values: uav_flyer(given.replaced(values))
+        found, slopes = trim_slopes(build, values, wanted, limits)
         if found.reason == TrimReason.VALID:
             return found, {k: np.asarray(v) for k, v in slopes.items()}
-    return trim(uav_flyer(given), wanted, limits), {}
+    return trim_flight(uav_flyer(given), wanted, limits), {}
 
 
 def run_trim(command: Trim) -> int:
-    """Find the trim, print it, write trim.json; the exit code."""
+    """Find the trim, print it and write trim.json; return the exit code."""
     import json
 
-    from ..view.io import versions, write_atomically
+    from ..files.netcdf import versions, write_atomically
 
     given = table_of(command.params)
     found, slopes = _solved(command, given, _limits(command))
-    unknowns = np.asarray(_unknowns(found))
-    labels = _labels(len(found.speeds))
+    unknowns, labels = np.asarray(found.vector), found.names
     out = Console()
     out.print(_trim_table(unknowns, labels))
     degrees = [math.degrees(float(a)) for a in found.coordinates.angles]
@@ -212,7 +202,7 @@ def _trim_table(unknowns: Any, labels: Sequence[tuple[str, str]]) -> Table:
 def _slope_table(
     name: str, given: "Parameters", slope: np.ndarray, labels: Sequence[tuple[str, str]]
 ) -> Table:
-    """Derivatives by one parameter; of a larger one for its first three entries."""
+    """Table of derivatives by one parameter; of an array by its first three entries."""
     unit = given[name].unit
     flat = slope.reshape(len(labels), -1)
     entries = list(np.ndindex(slope.shape[1:]))
@@ -225,7 +215,7 @@ def _slope_table(
 
 
 def modes_table(modes: Sequence[Any]) -> Table:
-    """Modes that are not those of a free rigid body: what grows, what decays, what oscillates."""
+    """Table of the modes other than those of a free rigid body, which have eigenvalue zero."""
     shown = table("s [1/s]", "doubles or halves in [s]", "states that take part", title="Modes")
     for mode in modes:
         if abs(mode.s) < 1e-3:
@@ -242,21 +232,24 @@ def modes_table(modes: Sequence[Any]) -> Table:
 
 
 def run_linearize(command: Linearize) -> int:
-    """Linearise, print the modes, write linear.npz; the exit code."""
-    from ..scenes.uav_tracker import uav_flyer
-    from ..study.linear import linearize
-    from ..study.trim import trim
-    from ..view.tuning import save_linear
+    """Linearise, print the modes and write linear.npz; return the exit code."""
+    import jax.numpy as jnp
 
-    if command.turn:
+    from ..figures.tuning import save_linear
+    from ..flight.flight_trim import trim_flight
+    from ..flight.linear import linearize
+    from ..scenes.uav_tracker import uav_flyer
+
+    if command.flight.turn:
         raise ModelError(
             "A turn has no constant matrices in the world's axes: linearise a straight flight."
         )
     given = table_of(command.params)
     flyer = uav_flyer(given)
-    found = trim(flyer, wanted_of(command, given))
+    found = trim_flight(flyer, wanted_of(command.flight, given))
     outputs = list(command.outputs) or None
-    linear = linearize(flyer, found.coordinates, found.inputs, outputs=outputs)
+    values = jnp.concatenate(found.inputs)
+    linear = linearize(flyer, found.coordinates, values=values, outputs=outputs)
     out = Console()
     out.print(modes_table(linear.modes()))
     line(

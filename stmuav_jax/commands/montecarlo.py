@@ -1,4 +1,4 @@
-"""`stmuav montecarlo` and `stmuav report`: many flights, and what they say."""
+"""Commands `stmuav montecarlo` and `stmuav report`: Monte Carlo studies and their reports."""
 
 import dataclasses
 import os
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from ..mechanics.errors import SettingError
+from ..checks.errors import SettingError
 from .options import SEED, count, default
 from .output import written
 
@@ -40,8 +40,6 @@ class Montecarlo:
     """Cores (or GPUs) to use; no number depends on it."""
     lanes: Annotated[int | None, count("lanes", 1e6), default("16")] = None
     """Flights that go on together on a device, a multiple of 8; part of the study."""
-    precision: Literal["float64", "float32"] | None = None
-    """float32 is an experiment: its error is measured on the first samples and printed."""
     scheduler: str | None = None
     """Address of a Dask scheduler, such as tcp://10.0.0.1:8786."""
     workers: Annotated[int | None, count("workers", 256), default("none")] = None
@@ -69,14 +67,14 @@ class Report:
 
 
 def cores() -> int:
-    """How many this process may use."""
+    """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def plain_of(command: Montecarlo) -> dict[str, Any]:
-    """The study's plain data with what the options change."""
-    from ..montecarlo.ready import READY, ready
-    from ..view.study_file import load_study
+    """Plain data of the study, with the changes by the options."""
+    from ..files.study_file import load_study
+    from ..montecarlo.examples import READY, ready
 
     if command.study in READY:
         plain = ready(command.study)
@@ -84,16 +82,14 @@ def plain_of(command: Montecarlo) -> dict[str, Any]:
         plain = load_study(command.study)
     else:
         plain = ready(command.study)
-    for name in ("seed", "precision"):
-        value = getattr(command, name)
-        if value is not None:
-            plain[name] = value
+    if command.seed is not None:
+        plain["seed"] = command.seed
     return plain
 
 
 def _table(command: Montecarlo, plain: Mapping[str, Any]) -> Any:
+    from ..files.netcdf import load_parameters
     from ..scenes.registry import SCENES
-    from ..view.io import load_parameters
 
     if command.params is None:
         return None
@@ -103,7 +99,7 @@ def _table(command: Montecarlo, plain: Mapping[str, Any]) -> Any:
 
 
 def _options(command: Montecarlo, plain: Mapping[str, Any]) -> dict[str, Any]:
-    """Of a work of flights."""
+    """Options of the `FlightWork` of a study of motions; none for other studies."""
     if plain.get("kind", "flights") != "flights":
         return {}
     import jax
@@ -116,8 +112,8 @@ def _options(command: Montecarlo, plain: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _work(command: Montecarlo) -> tuple[Any, dict[str, Any]]:
-    """The study's work and plain data; errors name the file."""
-    from ..montecarlo.ready import READY, make_work
+    """Work of the study and its plain data; errors name the file."""
+    from ..montecarlo.examples import READY, make_work
 
     plain = plain_of(command)
     try:
@@ -129,7 +125,7 @@ def _work(command: Montecarlo) -> tuple[Any, dict[str, Any]]:
 
 
 def run_montecarlo(command: Montecarlo) -> int:
-    """Run the command; the exit code."""
+    """Run the command; return the exit code."""
     if command.scheduler is not None and command.workers is not None:
         raise SettingError("Give --scheduler or --workers, not both.")
     from ..jobs.stop import stoppable
@@ -145,10 +141,7 @@ def run_montecarlo(command: Montecarlo) -> int:
         chunk = plain.get("chunk") if command.chunk is None else command.chunk
         outcome = _carried_out(command, work, folder / "study.zarr", total, chunk)
     out = Console()
-    say = lambda words: out.print(words, highlight=False, markup=False, emoji=False)
-    say(outcome.words())
-    if command.precision == "float32":
-        say(_precision(work, min(64, total)))
+    out.print(outcome.words(), highlight=False, markup=False, emoji=False)
     paths = [folder / "study.zarr"]
     if command.figures != "none":
         paths += _report(folder / "study.zarr", folder, command.figures, out)
@@ -159,7 +152,7 @@ def run_montecarlo(command: Montecarlo) -> int:
 def _carried_out(
     command: Montecarlo, work: Any, store: Path, total: int, chunk: int | None
 ) -> "Outcome":
-    """Compute what the store lacks, here or on a cluster."""
+    """Compute the missing samples of the store, here or on a cluster."""
     from ..jobs.cluster import run_on_cluster
     from ..jobs.local import run_study
     from ..jobs.watch import Watch
@@ -174,24 +167,13 @@ def _carried_out(
         )  # fmt: skip
 
 
-def _precision(work: Any, count: int) -> str:
-    from ..montecarlo.batch import FlightWork
-    from ..montecarlo.precision import precision_error
-
-    if not isinstance(work, FlightWork):
-        raise SettingError("Only studies of flights can be flown in single precision.")
-    rows = precision_error(work, count)
-    words = "; ".join(f"{name} {error:.2g} {unit}" for name, (error, unit) in rows.items())
-    return f"Largest error of single precision in the first {count} flights: {words}."
-
-
 def _report(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]:
     """Verify the store, write its report and print a summary."""
-    from ..view.store import open_store
-    from ..view.study_analysis import analyse
-    from ..view.study_data import study_data
-    from ..view.study_report import write_report
-    from ..view.study_table import summary_lines, summary_table
+    from ..figures.study_analysis import analyse
+    from ..figures.study_data import study_data
+    from ..figures.study_report import write_report
+    from ..figures.study_table import summary_lines, summary_table
+    from ..files.store import open_store
 
     with open_store(store) as opened:
         opened.verify()
@@ -205,7 +187,7 @@ def _report(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]
 
 
 def run_report(command: Report) -> int:
-    """Run the command; the exit code."""
+    """Run the command; return the exit code."""
     out = Console()
     folder = command.out if command.out is not None else command.store.resolve().parent
     written(out, _report(command.store, folder, command.figures, out))

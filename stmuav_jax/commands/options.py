@@ -1,4 +1,4 @@
-"""What the options of the command line may be: one description of a number, checked in one place."""
+"""Permitted values of the command line's options, described and checked in one place."""
 
 import dataclasses
 import math
@@ -8,16 +8,18 @@ from typing import Any, get_type_hints
 
 import tyro
 
-from ..mechanics.errors import SettingError
+from ..checks.errors import SettingError
 
 
 @dataclasses.dataclass(frozen=True)
 class Number:
-    """A finite number, or a tuple of them, within a range.
+    """Finite number within a range, or tuple of such numbers, as the value of an option.
 
     Attributes:
-        what: it is, for "The {what} must ...". unit: of it. low, high: the range, ends included.
-        above: the range's open lower end instead.
+        what: name of the number in the error message "The {what} must ...".
+        unit: unit of the number.
+        low, high: ends of the range, included.
+        above: open lower end of the range, instead of `low`.
     """
 
     what: str
@@ -27,7 +29,7 @@ class Number:
     above: float | int | None = None
 
     def check(self, value: Any, option: str) -> None:
-        """Raise SettingError unless a value, None, or every one of several is within the range."""
+        """Raise SettingError unless a value, or each of a tuple, is None or within the range."""
         for each in value if isinstance(value, tuple) else (value,):
             if each is not None:
                 self._check_one(each, option)
@@ -61,11 +63,11 @@ def _short(value: float | int) -> str:
 
 
 def default(words: str) -> Any:
-    """In an option's help, in place of "default: None"."""
+    """Annotation with a text in place of "default: None" in an option's help."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {words})")
 
 
-# What several commands have.
+# Options that several commands have.
 ANGLE = Number("angle", "degrees", -360.0, 360.0)
 SPEED = Number("speed", "m/s", -1000.0, 1000.0)
 END = Number("end of the time span", "s", above=0.0, high=1e5)
@@ -75,12 +77,12 @@ TOLERANCE = Number("tolerance", "", above=0.0, high=1.0)
 
 
 def count(what: str, high: float | int = 1e9) -> Number:
-    """At least one of something."""
+    """Range of a number of at least one of something."""
     return Number(f"number of {what}", "", 1, high)
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Raise SettingError for an argument that is empty, or that no name of a file can hold."""
+    """Raise SettingError for an argument that is empty or contains a zero byte."""
     for before, word in zip(["", *words], words, strict=False):
         if not word.strip():
             where = f" after {before}" if before.startswith("--") else ""
@@ -90,11 +92,13 @@ def check_words(words: Sequence[str]) -> None:
 
 
 def check_options(command: Any, words: Sequence[str]) -> None:
-    """Raise SettingError unless every option of a command is what its annotation says."""
+    """Raise SettingError unless every option of a command is in the range of its annotation."""
     hints = get_type_hints(type(command), include_extras=True)
     for field in dataclasses.fields(command):
         option = "--" + field.name.replace("_", "-")
         value = getattr(command, field.name)
+        if dataclasses.is_dataclass(value):
+            check_options(value, words)
         if value == () and option in words:
             raise SettingError(f"{option} needs at least one name after it.")
         for note in getattr(hints[field.name], "__metadata__", ()):
@@ -103,5 +107,5 @@ def check_options(command: Any, words: Sequence[str]) -> None:
 
 
 def arguments_of(given: Sequence[str] | None) -> list[str]:
-    """The arguments given, or else those of the process."""
+    """Return the given arguments, or else those of the process."""
     return list(sys.argv[1:] if given is None else given)

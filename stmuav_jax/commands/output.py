@@ -1,4 +1,4 @@
-"""What every command prints: files written, what it is doing, an error in one paragraph."""
+"""Output of every command: the files written, its activity, an error in one paragraph."""
 
 import contextlib
 import os
@@ -11,14 +11,14 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from ..view.terminal import line
+from ..figures.terminal import line
 
-# Longer messages are cut: they hold what the user gave, of any length.
+# Largest length of a message, which may quote the user's input of any length; longer ones are cut.
 _LONGEST = 2000
 
 
 def written(out: Console, paths: Iterable[Path]) -> None:
-    """Say which files there are now."""
+    """Print the paths of the written files."""
     line(out, "Written:")
     for path in paths:
         out.print(Text(f"  {path}"), soft_wrap=True, highlight=False)
@@ -26,7 +26,7 @@ def written(out: Console, paths: Iterable[Path]) -> None:
 
 @contextlib.contextmanager
 def working(words: str) -> Iterator[None]:
-    """Say on stderr what is being done, where a person is looking, until it is done."""
+    """Show the present activity on stderr, if that is a terminal, until the context ends."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield
@@ -39,9 +39,9 @@ def working(words: str) -> Iterator[None]:
 
 
 def explain(error: BaseException, debug: bool) -> int:
-    """Print one paragraph about an error on stderr; the exit code.
+    """Print one paragraph about an error on stderr; return the exit code.
 
-    2: bad input. 1: what was asked for has failed, or the program has a fault. 130: Ctrl-C.
+    The code is 2 for bad input, 1 for a failed run or a fault of the program, 130 for Ctrl-C.
     """
     out = Console(stderr=True)
     code, words = _code_and_words(error)
@@ -54,13 +54,15 @@ def explain(error: BaseException, debug: bool) -> int:
 
 
 def _code_and_words(error: BaseException) -> tuple[int | None, str]:
-    from ..mechanics.errors import ModelError, SettingError, SimulationError, StateError
+    from ..checks.errors import ModelError, SettingError, SimulationError, StateError
 
     if isinstance(error, KeyboardInterrupt):
         return 130, "interrupted before anything was reached."
     if isinstance(error, SimulationError) or _is(error, "filter", "EstimationError"):
         return 1, str(error)
-    if isinstance(error, ModelError | StateError | SettingError) or _is(error, "io", "FileError"):
+    if isinstance(error, ModelError | StateError | SettingError) or _is(
+        error, "netcdf", "FileError"
+    ):
         return 2, str(error)
     if isinstance(error, OSError):
         return 2, _file_words(error)
@@ -71,7 +73,7 @@ def _code_and_words(error: BaseException) -> tuple[int | None, str]:
 
 
 def _is(error: BaseException, module: str, name: str) -> bool:
-    """Whether an error is of a class of a module that may never have been loaded."""
+    """Test whether an error is of a class whose module may never have been imported."""
     return any(
         kind.__name__ == name and kind.__module__.endswith(f".{module}")
         for kind in type(error).__mro__
@@ -79,13 +81,13 @@ def _is(error: BaseException, module: str, name: str) -> bool:
 
 
 def _file_words(error: OSError) -> str:
-    """The operating system's words, with the file that they are about."""
+    """Message of the operating system, with the file concerned."""
     words = error.strerror or str(error)
     return f"{words}: {error.filename}" if error.filename is not None else words
 
 
 def _kept(error: BaseException, debug: bool) -> str:
-    """Where the traceback is."""
+    """Save the traceback, and return a sentence that says where it is."""
     if debug:
         return "Please report it with the traceback below."
     with contextlib.suppress(OSError):

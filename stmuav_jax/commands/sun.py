@@ -1,4 +1,4 @@
-"""`stmuav sun`: a day of pointing the panel at the sun."""
+"""Command `stmuav sun`: a day of pointing the panel at the sun."""
 
 import dataclasses
 import math
@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from rich.console import Console
 
-from ..mechanics.errors import SettingError
-from ..view.terminal import line
+from ..checks.errors import SettingError
+from ..figures.terminal import line
 from .options import ANGLE, Number, default
 from .output import written
 
@@ -61,17 +61,18 @@ class SunDay:
 
 
 def run_sun(command: SunDay) -> int:
-    """Follow the sun, print and write the day; the exit code."""
-    # pvlib and matplotlib are slow to import: only here
+    """Simulate the day, print and write the results; return the exit code."""
+    # pvlib and matplotlib are slow to import, and so are imported only here
     import numpy as np
 
-    from ..study.day import Flaws, day_zone, parse_date, track_day
-    from ..study.heading import best_heading
-    from ..vehicle.airframe import PART_II
-    from ..vehicle.ephemeris import Place
-    from ..vehicle.sun import attitude
-    from ..view.day import day_tables, load_attitude, save_day, save_day_figures
-    from ..view.io import load_parameters
+    from ..environment.ephemeris import Place
+    from ..environment.sun import attitude
+    from ..figures.day import DAY_FIGURES, day_dataset, day_tables, load_attitude
+    from ..figures.plot import save_figures
+    from ..files.netcdf import load_parameters, save_dataset
+    from ..parameters.airframe import PART_II
+    from ..tracker.day import Imperfections, day_zone, parse_date, track_day
+    from ..tracker.heading import best_heading
 
     if command.attitude is not None and (command.roll or command.pitch or command.yaw is not None):
         raise SettingError("Give --attitude or --roll, --pitch and --yaw, not both.")
@@ -80,7 +81,7 @@ def run_sun(command: SunDay) -> int:
     settings: dict[str, Any] = {
         "parameters": load_parameters(command.params, PART_II), "turbidity": command.turbidity,
     }  # fmt: skip
-    flaws = Flaws(command.stroke_step, math.radians(1) * np.array(command.attitude_error))
+    flaws = Imperfections(command.stroke_step, math.radians(1) * np.array(command.attitude_error))
     turn = lambda yaw: attitude(math.radians(command.roll), math.radians(command.pitch), yaw)
     chosen = ""
     if command.attitude is not None:
@@ -93,9 +94,9 @@ def run_sun(command: SunDay) -> int:
         R_wb = turn(yaw)
     day = track_day(place, day_of, zone, R_wb, step=command.step, flaws=flaws, **settings)
     folder = command.out if command.out is not None else Path("runs") / f"sun_{command.date}"
-    paths = [save_day(day, folder / "day.nc")]
+    paths = [save_dataset(day_dataset(day), folder / "day.nc")]
     if command.figures != "none":
-        paths += save_day_figures(day, folder, command.figures)
+        paths += save_figures(DAY_FIGURES, folder, command.figures, day)
     out = Console()
     for each in day_tables(day):
         out.print(each)

@@ -1,4 +1,4 @@
-"""`stmuav tune`: hold still, turn the panel, or identify parameters from a simulated record."""
+"""Command `stmuav tune`: hold still, turn the panel, or identify parameters from a record."""
 
 import dataclasses
 import math
@@ -11,20 +11,21 @@ from rich.console import Console
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from ..mechanics.errors import SettingError
-from ..view.terminal import line, row, table
+from ..checks.errors import SettingError
+from ..figures.terminal import line, row, table
 from .flight import table_of
 from .options import ANGLE, END, FORCE, SEED, Number, count, default
 from .output import written
 
 if TYPE_CHECKING:
-    from ..study.search import Search
-    from ..vehicle.parameters import Parameters
+    from ..algebra.least_squares import Search
+    from ..flight.tuning import InputTuning
+    from ..parameters.table import Parameters
 
 
 SEGMENTS = "hold: one in 0.05 s, slew: one in 0.2 s"
-# Time over which departures count, and for the turn [s]; the longest segment of each [s]. From rest
-# an untuned UAV falls far within 0.2 s: segments as long as that keep the search from its end.
+# Times over which departures count, and of the turn [s], and longest segments of both [s]. From
+# rest an untuned UAV falls far within 0.2 s: with segments so long the search does not converge.
 _TIMES = {"hold": 0.4, "slew": 1.0}
 # Loss below which inputs count as holding: departures of a millimetre or a milliradian.
 _HOLDS = 1e-6
@@ -71,7 +72,7 @@ class Tune:
 
 
 class _Watch:
-    """Progress on stderr, and a checkpoint after every step."""
+    """Display of progress on stderr, with a checkpoint after every step."""
 
     def __init__(self, problem: str, path: Path, steps: int) -> None:
         columns = (TextColumn("{task.description}"), TimeElapsedColumn())
@@ -80,7 +81,7 @@ class _Watch:
         self.problem, self.path, self.steps = problem, path, steps
 
     def __call__(self, now: "Search") -> None:
-        from ..view.tuning import save_search
+        from ..figures.tuning import save_search
 
         words = f"step {now.steps} of {self.steps}: loss {now.history[-1]:.4g}, best {now.loss:.4g}"
         self.bar.update(self.task, description=words)
@@ -88,8 +89,8 @@ class _Watch:
 
 
 def _watched(command: Tune, folder: Path, problem: str, start: Any, run: Any) -> Any:
-    """run(steps=, report=, resume=) with progress, checkpoints and what --resume goes on with."""
-    from ..view.tuning import load_search
+    """Call run(steps=, report=, resume=) with progress, checkpoints and the search to resume."""
+    from ..figures.tuning import load_search
 
     path = folder / "search.npz"
     before = load_search(path, problem, start) if command.resume else None
@@ -98,19 +99,14 @@ def _watched(command: Tune, folder: Path, problem: str, start: Any, run: Any) ->
         return run(steps=command.steps, report=watch, resume=before)
 
 
-def _search(command: Tune, folder: Path, problem: str, residuals: Any, start: Any) -> "Search":
-    import optimistix as optx
-
-    from ..study.search import search
-
-    method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
-    run = lambda **watched: search(residuals, start, method, patience=15, **watched)
-    return _watched(command, folder, problem, start, run)
+def _search(command: Tune, folder: Path, tuning: "InputTuning") -> "Search":
+    run = lambda **watched: tuning.search(patience=15, **watched)
+    return _watched(command, folder, tuning.name, tuning.start, run)
 
 
 def run_tune(command: Tune) -> int:
-    """Run the command; the exit code."""
-    from ..study.search import SearchReason
+    """Run the command; return the exit code."""
+    from ..algebra.least_squares import SearchReason
 
     given = table_of(command.params)
     folder = command.out if command.out is not None else Path("runs") / f"tune_{command.what}"
@@ -142,18 +138,18 @@ def _time(command: Tune) -> float:
 def _segments(command: Tune) -> int:
     if command.segments is not None:
         return command.segments
-    # 0.3 / 0.05 is a little less or more than 6
+    # the quotient may exceed a whole number by round-off, as 0.3 / 0.05
     return max(1, math.ceil(_time(command) / _LONGEST[command.what] - 1e-9))
 
 
 def _converged(found: "Search") -> bool:
-    from ..study.search import SearchReason
+    from ..algebra.least_squares import SearchReason
 
     return found.reason is SearchReason.CONVERGED
 
 
 def titled(title: str, found: "Search", done: bool) -> str:
-    """The title of a table of results, which says so where the search has not converged."""
+    """Title of a table of results; it says so where the search has not converged."""
     if done:
         return title
     return f"NOT CONVERGED: the best of {found.steps} steps ({title.lower()})"
@@ -164,24 +160,24 @@ def _hold(
 ) -> tuple["Search", Table, list[Path], bool]:
     import jax.numpy as jnp
 
+    from ..flight.flyer import RotorsAndForces, rotors_and_forces
+    from ..flight.uav_tuning import at_rest, hold, holding_time
+    from ..rotorcraft.rotor import hover_speed_squared
     from ..scenes.uav_tracker import uav_flyer
-    from ..study.tuning import at_rest, hold, holding_time
-    from ..vehicle.flyer import Inputs
-    from ..vehicle.geometry import initial_angles
-    from ..vehicle.rotor import hover_speed_squared
+    from ..tracker.geometry import initial_angles
 
     flyer = uav_flyer(given)
     rotors = flyer.propellers
     mass = jnp.sum(flyer.system.bodies.mass)
     count = rotors.spin.shape[0]
     equal = hover_speed_squared(mass, given.value("gravity"), rotors.k_f, count)
-    untuned = Inputs(equal, jnp.zeros(2))
+    untuned = RotorsAndForces(equal, jnp.zeros(2))
     angles = initial_angles(given)
     tuning = hold(flyer, angles, untuned, horizon=_time(command), segments=_segments(command))
-    found = _search(command, folder, tuning.name, tuning.residuals, tuning.start)
+    found = _search(command, folder, tuning)
     # a search may come to rest where nothing holds
     done = _converged(found) and found.loss < _HOLDS
-    inputs = tuning.inputs(found.values)
+    inputs = rotors_and_forces(tuning.inputs(found.values))
     start = at_rest(angles)
     times = [holding_time(flyer, each, start) for each in (untuned, inputs)]
     shown = table("", "untuned", "tuned", title=titled("Constant inputs that hold", found, done))
@@ -196,18 +192,18 @@ def _hold(
 
 
 def _speed(squared: float) -> str:
-    # a search that was cut short may not have come back to speeds yet
+    # an unfinished search may still have negative squares
     return f"{math.sqrt(squared):.4f}" if squared >= 0 else f"none: square {squared:.3g}"
 
 
 def _slew(
     command: Tune, given: "Parameters", folder: Path
 ) -> tuple["Search", Table, list[Path], bool]:
+    from ..figures.tuning import flight_figure, flown
+    from ..flight.uav_tuning import SlewLimits, peaks, slew
     from ..scenes.uav_tracker import uav_flyer
-    from ..study.tuning import SlewLimits, flown, peaks, slew
-    from ..vehicle.geometry import initial_angles
-    from ..vehicle.workspace import tracker_limits
-    from ..view.tuning import flight_figure
+    from ..tracker.geometry import initial_angles
+    from ..tracker.workspace import tracker_limits
 
     flyer = uav_flyer(given)
     stops = tracker_limits(given)
@@ -218,7 +214,7 @@ def _slew(
         flyer, initial_angles(given), after, _time(command), limits,
         knots=command.knots, segments=_segments(command),
     )  # fmt: skip
-    found = _search(command, folder, tuning.name, tuning.residuals, tuning.start)
+    found = _search(command, folder, tuning)
     done = _converged(found)
     shown = table(
         "", "straight inputs", "tuned", "limit", title=titled("Turn of the panel", found, done)
@@ -249,11 +245,11 @@ def _identify(
     import jax.numpy as jnp
     from scipy.stats import chi2
 
+    from ..algebra.least_squares import SearchReason
+    from ..flight.identification import identify
+    from ..flight.synthetic import experiment
     from ..scenes.uav_tracker import uav_flyer
-    from ..study.experiment import experiment
-    from ..study.identify import identify
-    from ..study.search import SearchReason
-    from ..vehicle.drive import Friction
+    from ..tracker.tracker_options import Friction
 
     make = lambda table: uav_flyer(table, friction=Friction())
     case = experiment(make, given, seed=command.seed)
@@ -262,7 +258,7 @@ def _identify(
         labels=case.labels, weakest=0.5, **watched,
     )  # fmt: skip
     found = _watched(command, folder, f"identify {case.name}", jnp.zeros(len(case.truth)), run)
-    # at the noise's floor a search may find nothing better without coming to rest
+    # at the level of the noise a search may stop improving without convergence
     freedom = case.record.size - len(case.truth)
     stopped = found.search.reason is SearchReason.PATIENCE
     noise = stopped and found.misfit * freedom <= chi2.ppf(0.999, freedom)
@@ -278,9 +274,10 @@ def _identify(
 
 
 def _figures(command: Tune, folder: Path, found: "Search", more: dict[str, Any]) -> list[Path]:
-    from ..view.tuning import loss_history, save_tuning_figures
+    from ..figures.plot import save_figures
+    from ..figures.tuning import loss_history
 
     if command.figures == "none":
         return []
     figures = {"loss": loss_history(found.history), **more}
-    return save_tuning_figures(figures, folder, command.figures)
+    return save_figures(figures, folder, command.figures)

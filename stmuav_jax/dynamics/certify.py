@@ -1,13 +1,13 @@
-"""From what a run left behind to its certificate."""
+"""Certificate of a finished run, from its trajectory and analysis."""
 
 import numpy as np
 
 from ..mechanics.system import System
-from .accuracy import ErrorEstimate
-from .analysis import Look, Snapshot
-from .differential import Constraints
-from .initial import Rank
-from .integrate import Trajectory
+from .assembly.initial import Rank
+from .error_estimate import ErrorEstimate
+from .evaluation import Snapshot, StartCheck
+from .formulations.constraints import Constraints
+from .integration.advance import Trajectory
 from .run import Certificate, Seconds, relative
 
 
@@ -21,11 +21,11 @@ def certify(
     result: str,
     seconds: Seconds,
 ) -> Certificate:
-    """The certificate of a finished run.
+    """Assemble the certificate of a finished run.
 
     Args:
-        view: `Snapshot`s of the saved states, if they were analysed. rank: at the start.
-        worst: from `violations`. result: in words.
+        view: `Snapshot`s of the saved states, if they were analysed. rank: rank at the start.
+        worst: result of `violations`. result: outcome of the run in words.
     """
     drift, relative_drift, momentum = _balances(system, trajectory, view)
     position, angle, velocity, angular_velocity = (
@@ -69,7 +69,7 @@ def certify(
 def _balances(
     system: System, trajectory: Trajectory, view: Snapshot | None
 ) -> tuple[float, float, tuple[float | None, float | None]]:
-    """Energy's error and over the largest energy; momentum's and angular momentum's, relative."""
+    """Largest energy error [J], its ratio to the largest energy, relative momentum errors."""
     if view is None:
         return float("nan"), float("nan"), (None, None)
     total = view.kinetic + view.potential
@@ -85,8 +85,10 @@ def _balances(
     return float(np.max(np.abs(drift))), ratio, momentum
 
 
-def violations(constraints: Constraints, trajectory: Trajectory, start: Look) -> dict[str, float]:
-    """The largest residuals over the accepted steps and the start, as a certificate has them."""
+def violations(
+    constraints: Constraints, trajectory: Trajectory, start: StartCheck
+) -> dict[str, float]:
+    """Largest residuals at the start and over the accepted steps, by name in a certificate."""
     angular, worst = constraints.angular, trajectory.worst
     over = lambda way, x: max(float(way[-1]), float(np.max(np.abs(x), initial=0.0)))
     return {
@@ -99,5 +101,5 @@ def violations(constraints: Constraints, trajectory: Trajectory, start: Look) ->
 
 
 def _over_all(errors: np.ndarray) -> float:
-    """The largest estimate; not a number where there is none."""
+    """Largest of the error estimates; NaN if there is none."""
     return float(np.nanmax(errors)) if np.any(np.isfinite(errors)) else float("nan")

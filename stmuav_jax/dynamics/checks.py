@@ -1,4 +1,4 @@
-"""What `simulate` refuses before it starts: settings, output times, starts, loads."""
+"""Checks of `simulate` before it starts: settings, output times, initial states, loads."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -6,57 +6,27 @@ from typing import Any
 import diffrax
 import numpy as np
 
-from ..mechanics.body import check_unit
+from ..checks.errors import ModelError, SettingError, StateError, concrete
+from ..checks.physical import check_unit
 from ..mechanics.constraint import ROWS
-from ..mechanics.errors import ModelError, SettingError, StateError, concrete, nearest_names
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
-from .augmented import Augmented, Model
-from .formulation import AbstractFormulation
-from .problem import Method
-from .rosenbrock import Rodas5P
+from .formulations.augmented import Model
+from .method import Method
 from .scene import Scene
-from .stabilisation import AbstractStabilisation, Baumgarte, Projection, Unstabilised
-from .tree import Tree
 
-# Initial residuals above these are refused: not round-off, and never repaired silently.
+# Larger initial residuals are refused: they are not round-off, and are never repaired silently.
 POSITION_TOLERANCE = 1e-8
 VELOCITY_TOLERANCE = 1e-7
 
-# Saved times of a run of which only the end is given.
+# Number of intervals between saved times of a run that is given by its end alone.
 _INTERVALS = 100
-
-_SOLVERS = (diffrax.Dopri8, diffrax.Tsit5, Rodas5P)
-_PARTS = (
-    ("solver", diffrax.AbstractSolver, _SOLVERS),
-    ("formulation", AbstractFormulation, (Tree, Augmented)),
-    ("stabilisation", AbstractStabilisation, (Projection, Baumgarte, Unstabilised)),
-)
-
-
-def check_parts(**parts: Any) -> None:
-    """Raise unless solver, formulation and stabilisation are objects of their kinds, or None."""
-    for name, kind, known in _PARTS:
-        given = parts[name]
-        if given is None or isinstance(given, kind) or (name == "solver" and given == "auto"):
-            continue
-        names = [each.__name__ for each in known]
-        valid = ", ".join(f"{each}()" for each in names) + (', or "auto"' * (name == "solver"))
-        if isinstance(given, str):
-            meant = [each for each in names if each.lower() == given.lower()]
-            hint = f": write {meant[0]}()." if meant else f".{nearest_names(given, names)}"
-            what = f"the text '{given}'{hint}"
-        elif isinstance(given, type):
-            what = f"the class {given.__name__}: write {given.__name__}()."
-        else:
-            what = f"of type {type(given).__name__}."
-        raise SettingError(f"{name} must be an object such as {valid}, but it is {what}")
 
 
 def scene_of(
     what: Scene | System, state: State | None, t1: float | None, every: float | None, ts: Any
 ) -> Scene:
-    """The scene given, or one made of a system, its state and the times given."""
+    """Scene as given, or made of a system, its state and the given times."""
     if isinstance(what, Scene):
         if state is not None:
             raise SettingError(
@@ -97,7 +67,7 @@ def _times(ts: Any) -> np.ndarray:
 def output_times(
     scene: Scene, t1: float | None, save_every: float | None, ts: Sequence[float] | Any
 ) -> np.ndarray:
-    """The saved times (k,) [s], the scene's t0 first."""
+    """Saved times (k,) [s], beginning with the scene's t0."""
     if ts is not None:
         times = _times(ts)
         if times[0] != scene.t0:
@@ -119,23 +89,12 @@ def output_times(
     return times
 
 
-def check_settings(method: Method) -> None:
-    """Raise unless tolerances, first step, number of steps and solver can be used."""
-    first = float(method.first_step)
-    if not (np.isfinite(first) and first > 0):
-        raise SettingError(f"first_step must be finite and positive, but it is {first} s.")
-    if not float(method.max_step) > 0:
-        raise SettingError(f"max_step must be positive, but it is {method.max_step} s.")
-    if method.max_steps < 1:
-        raise SettingError(f"max_steps must be at least 1, but it is {method.max_steps}.")
-    for name in ("rtol", "atol"):
-        value = float(getattr(method, name))
-        if not (np.isfinite(value) and value >= 1e-15):
-            raise SettingError(
-                f"{name} must be finite and at least 1e-15 (the round-off of double precision), "
-                f"but it is {value}."
-            )
-    if not isinstance(method.solver, diffrax.AbstractAdaptiveSolver):
+def check_method(method: Any) -> None:
+    """Raise `SettingError` unless the method is a `Method` with an adaptive or automatic solver."""
+    if not isinstance(method, Method):
+        given = f"the class {method.__name__}" if isinstance(method, type) else repr(method)
+        raise SettingError(f"method must be a Method(...), but it is {given:.80}.")
+    if not isinstance(method.solver, str | diffrax.AbstractAdaptiveSolver):
         raise SettingError(
             f"{type(method.solver).__name__} has no error estimate and cannot adapt its steps; "
             "choose Dopri8, Tsit5 or Rodas5P, or wrap it in diffrax.HalfSolver."
@@ -143,7 +102,7 @@ def check_settings(method: Method) -> None:
 
 
 def check_start(system: System, state: State) -> None:
-    """Raise unless the state fits the system's shapes, and is finite with unit Euler parameters."""
+    """Raise an error unless the state fits the system, is finite and has unit Euler parameters."""
     if not concrete(system, state):
         raise SettingError(
             "simulate looks at values and cannot be differentiated, batched or compiled by JAX: "
@@ -166,22 +125,21 @@ def check_start(system: System, state: State) -> None:
 
 
 def check_loads(system: System, finite: np.ndarray, t: float) -> None:
-    """Raise unless the load of every force element is finite."""
+    """Raise `ModelError` unless the load of every force element is finite."""
     for force, fine in zip(system.forces, finite, strict=True):
         if not fine:
-            where = ", ".join((*force.bodies(), *force.joint_names())) or "all bodies"
             raise ModelError(
-                f"The load of {type(force).__name__} on {where} is not finite at t = {t:.9g} s."
+                f"The load of {type(force).__name__} on {force.acts_on()} is not finite at t = {t:.9g} s."
             )
 
 
 def check_consistent(
     system: System, model: Model, residuals: np.ndarray, rates: np.ndarray
 ) -> None:
-    """Raise unless positions and velocities fit the joints.
+    """Raise `StateError` unless positions and velocities satisfy the joints.
 
     Args:
-        residuals, rates: of every row (m,), in the units of `_off`.
+        residuals, rates: residuals and rates of every row (m,), scaled as those of `Snapshot`.
     """
     owner = model.constraints.owner
     checks: tuple[tuple[Any, float, str, Callable[..., str]], ...] = (
@@ -189,7 +147,7 @@ def check_consistent(
         (rates, VELOCITY_TOLERANCE, "velocities", _off_rate),
     )
     for values, tolerance, words, shown in checks:
-        # a value that is not a number is not within the tolerance either
+        # NaN is not within the tolerance either
         if np.all(np.abs(values) <= tolerance):
             continue
         k = int(np.argmax(np.where(np.isnan(values), np.inf, np.abs(values))))
@@ -201,10 +159,10 @@ def check_consistent(
 
 
 def _off(model: Model, k: int, value: float) -> str:
-    """How far row k is off: a length, a cosine or an angle."""
+    """Text of the residual of row k: a length, a cosine or an angle."""
     kinds = [g.kind for g in model.constraints.groups for _ in range(len(g.i) * ROWS[g.kind])]
     if kinds[k] == "distance":
-        # the row is (d^2 - l^2) / (2 l): exact for small misfits only
+        # the row is (d^2 - l^2) / (2 l), which equals d - l for small residuals only
         length = 0.5 / float(np.asarray(model.constraints.scales())[k])
         return f"{abs(np.sqrt(max(length**2 + 2 * length * value, 0.0)) - length):.3g} m"
     if kinds[k] == "angle":

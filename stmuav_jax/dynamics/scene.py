@@ -1,4 +1,4 @@
-"""A scene: a system, where it starts, and for how long it is worth watching."""
+"""Scenes: a system, its initial state, and the time span of interest."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,16 +9,16 @@ from ..mechanics.system import System
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that `simulate` needs to know of what is simulated.
+    """Complete description of a simulation's subject: system, initial state, span and notes.
 
     Attributes:
-        name: short, for files. title: one line, for people.
+        name: short name, for files. title: one line, for people.
         system: bodies, joints, forces.
-        state0: at t0, consistent with the joints (see `assemble`).
-        t0, t1: the span [s]. save_every: spacing of the saved times [s].
-        parameters: the numbers that the scene was built from, by name: each a mapping
-            with "value", "unit" and "source"; kept with the results.
-        notes: what the reader of a result must know, one sentence each.
+        state0: state at t0 that satisfies the joints (see `assemble`).
+        t0, t1: time span [s]. save_every: spacing of the saved times [s].
+        parameters: numbers from which the scene was built, by name: each a mapping with "value",
+            "unit" and "source"; kept with the results.
+        notes: facts that the reader of a result must know, one sentence each.
         watch: names of the bodies that figures show.
     """
 

@@ -1,4 +1,4 @@
-"""How fast the fastest motions of a system are, and which solver that asks for."""
+"""Stiffness of a system: eigenvalues of its linearised motion, and the choice of a solver."""
 
 import diffrax
 import jax
@@ -7,16 +7,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.compiler import kept_jit
-from ..algebra.shapes import Numbers
-from ..mechanics.errors import StateError
+from ..checks.errors import StateError
+from ..checks.shapes import Numbers
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
-from .formulation import AbstractFormulation
-from .rosenbrock import Rodas5P
-from .stabilisation import Unstabilised
-from .tree import Tree
+from .formulations.base import AbstractFormulation
+from .formulations.stabilisation import Unstabilised
+from .integration.rosenbrock import Rodas5P
+from .tree.formulation import Tree
 
-# The crossover measured with servos lies between 430 and 1400 1/s: docs/stiff.md.
+# With servos explicit and implicit solvers take the same time near 430 1/s, and at 1400 1/s the
+# implicit one is 1.9 times as fast: docs/stiff.md.
 EXPLICIT_LIMIT = 1e3  # [1/s]
 
 
@@ -29,10 +30,10 @@ def spectrum(
 ) -> np.ndarray:
     """Eigenvalues [1/s] of the motion linearised at a state, largest magnitude first, (k,).
 
-    In the formulation's coordinates (default `Tree()`), so that the constraints, if any,
-    contribute zeros. An explicit method's steps cannot be longer than a few divided by the
-    first magnitude, whatever the tolerance; where that is far shorter than what the motion
-    itself needs, the scene is stiff.
+    The coordinates are those of the formulation (default `Tree()`), so that constraints contribute
+    zeros. Steps of an explicit method cannot be longer than a few divided by the first magnitude,
+    whatever the tolerance; if that is far shorter than what the motion itself needs, the scene is
+    stiff.
 
     Raises:
         SettingError: shapes or precision of the state do not fit the system.
@@ -67,10 +68,10 @@ def choose_solver(
     *,
     formulation: AbstractFormulation | None = None,
 ) -> diffrax.AbstractSolver:
-    """`Rodas5P` where the fastest motion at the state is above `EXPLICIT_LIMIT`, else Dopri8.
+    """`Rodas5P` if the largest |eigenvalue| at the state exceeds `EXPLICIT_LIMIT`, else `Dopri8`.
 
-    It looks at the start only, which misleads where something is stiff for moments: a stop
-    that is hit later is not seen, and friction is stiff at rest but not in motion.
+    Only the given state counts, which misleads if a system is stiff for moments: a stop that is hit
+    later is not seen, and friction is stiff at rest but not in motion.
     """
     fastest = np.abs(spectrum(system, state, t, formulation=formulation)[0])
     return Rodas5P() if fastest > EXPLICIT_LIMIT else diffrax.Dopri8()

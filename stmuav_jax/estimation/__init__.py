@@ -1,1 +1,5 @@
-"""State estimation: sigma-point Kalman filters, smoother, consistency, the report's quadrotor."""
+"""State estimation for any model: sigma-point filters, smoother, consistency. Floor 2."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,8 +1,8 @@
-"""Checks of a filter's parts by shape and precision, before anything runs.
+"""Checks of the shapes and precisions of a filter's parts, before anything runs.
 
 Functions are traced with `jax.eval_shape`, which computes nothing. Arrays that would fit only
-after broadcasting are refused: a filter that compares a measurement with the wrong component
-converges as well as any other.
+after broadcasting are refused, since a filter that compares a measurement with the wrong
+component may converge without any sign of it.
 """
 
 from collections.abc import Callable
@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..mechanics.errors import ModelError, SettingError, check_finite
-from .gaussian import Gaussian
+from ..checks.errors import ModelError, SettingError, check_finite
+from .gaussians import Gaussian
 from .model import Inputs, StateSpaceModel, widened
 from .sigma import AbstractRule
 
@@ -24,11 +24,12 @@ def check_filter(
     """Refuse a prior, a record, inputs or functions that do not belong together.
 
     Args:
-        y: measurements (T, m, *s). u: a pytree of arrays (T, k) or (T, k, *s).
+        y: measurements (T, m, *s).
+        u: inputs, a pytree of arrays (T, k) or (T, k, *s).
 
     Raises:
-        ModelError: the size of a part, or what a function returns, does not fit.
-        SettingError: parts of different precision, or a rule that does not serve.
+        ModelError: the size of a part or of a function's result does not fit.
+        SettingError: parts have different precision, or the rule cannot be used for them.
     """
     check_prior(model, prior, rule)
     lanes = prior.factor.shape[2:]
@@ -40,7 +41,7 @@ def check_filter(
 
 
 def check_prior(model: StateSpaceModel, prior: Gaussian, rule: AbstractRule) -> None:
-    """Refuse a prior or covariances that do not belong to the model; as `check_filter`."""
+    """Refuse a prior or covariances that do not belong to the model, as `check_filter` does."""
     n = model.space.size
     if prior.factor.ndim < 2 or prior.factor.shape[:2] != (n, n):
         size = " x ".join(str(length) for length in prior.factor.shape[:2])
@@ -67,7 +68,7 @@ def check_prior(model: StateSpaceModel, prior: Gaussian, rule: AbstractRule) -> 
 
 
 def check_record(model: StateSpaceModel, y: Array, u: Inputs, lanes: tuple[int, ...]) -> None:
-    """Refuse measurements or inputs of another shape; as `check_filter`."""
+    """Refuse measurements or inputs of the wrong shape, as `check_filter` does."""
     m = model.sensor.space.size
     shape = ", ".join(["T", str(m), *map(str, lanes)])
     if y.ndim < 2 or y.shape[2:] not in ((), lanes):
@@ -90,10 +91,11 @@ def check_record(model: StateSpaceModel, y: Array, u: Inputs, lanes: tuple[int, 
 def check_functions(
     model: StateSpaceModel, prior: Gaussian, u: Inputs, m: int | None = None
 ) -> None:
-    """Refuse f or h that return another shape or precision than they must.
+    """Refuse functions f or h whose results have the wrong shape or precision.
 
     Args:
-        u: shapes of the inputs of one step. m: components of a measurement; None leaves h out.
+        u: shapes of the inputs of one step.
+        m: number of components of a measurement; None leaves h out.
     """
     dtype, lanes = prior.factor.dtype, prior.factor.shape[2:]
     dt = jax.ShapeDtypeStruct((), dtype)
@@ -103,7 +105,7 @@ def check_functions(
     ):
         if part is model.sensor and m is None:
             return
-        # as many axes as the filter will give: sigma points, and filters of a bank
+        # the axes that the filter will use: sigma points, and filters of a bank
         stack = (2 * model.space.size + 1, *lanes) if part.stacked else ()
         x = jax.tree.map(lambda leaf, s=stack: _like(leaf, (leaf.shape[0], *s)), prior.mean)
         now = u
@@ -118,17 +120,17 @@ def check_functions(
 
 
 def _like(leaf: Any, shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
-    """The shape and precision of one step's part of an array."""
+    """Placeholder with a shape and the precision of an array."""
     return jax.ShapeDtypeStruct(shape, jnp.result_type(leaf))
 
 
 def _with_axes(leaf: jax.ShapeDtypeStruct, ndim: int) -> jax.ShapeDtypeStruct:
-    """As `widened` makes inputs for stacks of states."""
+    """Placeholder of an input with `ndim` axes, as `widened` makes it for stacks of states."""
     return jax.eval_shape(lambda a: widened(a, ndim), leaf)
 
 
 def _traced(function: Callable[..., Any], arguments: tuple, words: str, stacked: bool) -> Any:
-    """What a function returns, by shape; an exception of its own gets the user's words."""
+    """Shapes of a function's result; an exception in it becomes a `ModelError` with a hint."""
     try:
         return jax.eval_shape(function, *arguments)
     except (ModelError, SettingError):
@@ -150,7 +152,7 @@ def _traced(function: Callable[..., Any], arguments: tuple, words: str, stacked:
 
 
 def _compare(out: Any, expected: Any, x: Any, words: str) -> None:
-    """Refuse what has another structure, shape or precision."""
+    """Refuse a result of another structure, shape or precision than expected."""
     structure = jax.tree.structure(expected)
     if jax.tree.structure(out) == structure:
         pairs = list(zip(jax.tree.leaves(out), jax.tree.leaves(expected), strict=True))
@@ -169,7 +171,7 @@ def _compare(out: Any, expected: Any, x: Any, words: str) -> None:
 
 
 def _shown(tree: Any) -> str:
-    """Shapes of a pytree, in words."""
+    """Description of a pytree's shapes for messages."""
     if tree is None:
         return "None"
     if isinstance(tree, jax.ShapeDtypeStruct):
@@ -180,7 +182,7 @@ def _shown(tree: Any) -> str:
 
 
 def _precisions(words: str, array: Any, prior: Gaussian) -> str:
-    """The sentence about two precisions."""
+    """Message about two different precisions."""
     return (
         f"{words} {array.dtype}, but the prior's covariance {prior.factor.dtype}: "
         "use one precision."

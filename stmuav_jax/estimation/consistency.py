@@ -1,8 +1,8 @@
-"""Is an estimator as good as it says: NEES, NIS, whiteness, and their chi-squared intervals.
+"""Consistency tests of estimators: NEES, NIS, whiteness, and their chi-squared intervals.
 
     NEES = e^T P^-1 e, e the error of the state;    NIS = nu^T S^-1 nu, nu the innovation
 
-Over N independent runs N times the mean NEES is chi-squared with N n degrees of freedom.
+Over N independent runs, N times the mean NEES is chi-squared with N n degrees of freedom.
 
 Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with applications to tracking and
 navigation (2001), ch. 5.4.
@@ -10,14 +10,15 @@ navigation (2001), ch. 5.4.
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..mechanics.errors import SettingError
+from ..algebra.space import AbstractSpace, Point
+from ..checks.errors import SettingError
 from .factor import divide_lower, triangularise
 from .filter import Filtered
-from .space import AbstractSpace, Point
 
 
 def nees(
@@ -28,10 +29,10 @@ def nees(
     *,
     only: slice | None = None,
 ) -> Float[Array, "*s"]:
-    """Normalised estimation error squared, chi-squared with n degrees if the filter is right.
+    """Normalised estimation error squared, chi-squared with n degrees if the filter is consistent.
 
     Args:
-        only: consecutive components of the error to look at (their marginal covariance).
+        only: consecutive components of the error, with their marginal covariance; None for all.
     """
     error = space.difference(truth, mean)
     if only is not None:
@@ -44,22 +45,17 @@ def nees(
 def path_nees(
     filtered: Any, truth: Point, space: AbstractSpace, *, only: slice | None = None
 ) -> Float[Array, "T *s"]:
-    """NEES at each time of a `Filtered` or `Smoothed` path, truth with T first; with any bank."""
+    """NEES at each time of a `Filtered` or `Smoothed` path or bank; `truth` has T first."""
     # times become one more axis of the stack
     last = lambda leaf: jnp.moveaxis(leaf, 0, -1)
-    mean, true = (
-        jnp.moveaxis(a, 0, -1)
-        if not isinstance(a, dict)
-        else {name: last(leaf) for name, leaf in a.items()}
-        for a in (filtered.mean, truth)
-    )
+    mean, true = (jax.tree.map(last, a) for a in (filtered.mean, truth))
     each = nees(mean, last(filtered.factor), true, space, only=only)
     return jnp.moveaxis(each, -1, 0)
 
 
 def _quantile(degrees: Any, level: Any) -> np.ndarray:
-    """Of the chi-squared distribution."""
-    # slow to import: only where it is needed
+    """Quantile of the chi-squared distribution."""
+    # slow to import, hence imported only here
     from scipy.special import gammaincinv
 
     return 2 * gammaincinv(np.asarray(degrees) / 2, level)
@@ -68,10 +64,7 @@ def _quantile(degrees: Any, level: Any) -> np.ndarray:
 def chi2_p_values(
     total: np.ndarray, degrees: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Probabilities that a chi-squared variable is below, above, and as far out to either side.
-
-    Where there are no degrees of freedom all are one.
-    """
+    """Lower, upper and two-sided p-values of chi-squared sums; one without degrees of freedom."""
     from scipy.special import gammainc, gammaincc
 
     some = degrees > 0
@@ -82,7 +75,7 @@ def chi2_p_values(
 
 
 def chi2_interval(degrees: int | float, level: float = 0.999) -> tuple[float, float]:
-    """The two-sided interval in which a chi-squared variable lies with probability `level`."""
+    """Two-sided interval in which a chi-squared variable lies with probability `level`."""
     if not 0 < level < 1 or degrees <= 0:
         raise SettingError(f"A level in (0, 1) and degrees > 0, not {level} and {degrees}.")
     tail = (1 - level) / 2
@@ -91,22 +84,23 @@ def chi2_interval(degrees: int | float, level: float = 0.999) -> tuple[float, fl
 
 
 def mean_interval(degrees: int, count: int, level: float = 0.999) -> tuple[float, float]:
-    """The interval for the mean of `count` independent chi-squared variables.
+    """Two-sided interval for the mean of `count` independent chi-squared variables.
 
     Args:
-        degrees: of each: n for NEES, m for NIS.
+        degrees: degrees of freedom of each variable: n for NEES, m for NIS.
     """
     low, high = chi2_interval(degrees * count, level)
     return low / count, high / count
 
 
 def autocorrelation(scaled: Float[Array, "T m *s"], lag: int) -> Float[Array, "*s"]:
-    """Mean of nu_k . nu_(k + lag) / m of scaled innovations: near zero if they are white.
+    """Autocorrelation of scaled innovations, the mean of nu_k . nu_(k + lag) / m.
 
-    Its standard deviation is 1 / sqrt(m T): |value| < 3.3 / sqrt(m T) holds with 99.9 %.
+    For white innovations the mean is zero and the standard deviation 1 / sqrt(m T), so that
+    |value| < 3.3 / sqrt(m T) holds with a probability of 99.9 %.
 
     Raises:
-        SettingError: a lag outside 1 .. T - 1.
+        SettingError: `lag` is outside 1 to T - 1.
     """
     if not 0 < lag < scaled.shape[0]:
         raise SettingError(f"The lag must be in 1 to {scaled.shape[0] - 1}, not {lag}.")
@@ -115,12 +109,13 @@ def autocorrelation(scaled: Float[Array, "T m *s"], lag: int) -> Float[Array, "*
 
 
 def inconsistent(filtered: Filtered, *, window: int = 50, level: float = 0.999) -> np.ndarray:
-    """Where the NIS over the last `window` measurements is larger than chance allows (T, *s).
+    """Flags (T, *s) of times at which the NIS of the last `window` steps is larger than by chance.
 
-    True also from a failure on. Each time is tested by itself, at probability 1 - `level` / 2: of
-    records of 2000 healthy steps some 10 % have a flag somewhere. It sees only innovations that
-    are too large. A filter with too large an R lags without a flag, its innovations being small and
-    correlated; `verdict` looks at both sides and at correlation, and has a stated level.
+    The flag is True also from a failure on. Each time is tested by itself at a level of
+    (1 - `level`) / 2: of records of 2000 consistent steps some 10 % have a flag somewhere. The test
+    sees only innovations that are too large. A filter with too large an R lags without a flag,
+    because its innovations are small and correlated; `verdict` tests both sides and the
+    correlation, at a stated level.
 
     Raises:
         SettingError: a window of less than one step, or a level outside (0, 1).

@@ -1,38 +1,38 @@
-"""Square roots of covariances: lower triangular L with P = L L^T, and what is done to them.
+"""Square roots of covariances, lower triangular L with P = L L^T, and operations on them.
 
-Components first, the axes of a stack (the filters of a bank) last. One primitive makes roots
-without squaring: `triangularise`, the QR decomposition of rows whose Gram matrix is P. A rank-one
-change of a root has the closed form of Carlson and needs no decomposition: with
+Arrays have their components first and the axes of a stack (the filters of a bank) last. Roots are
+formed without squaring by `triangularise`, the QR decomposition of rows whose Gram matrix is P. A
+rank-one change of a root has the closed form of Carlson and needs no decomposition: with
 d_j = d_0 - a_1^2 - ... - a_j^2 the lower Cholesky factor T of I - a a^T / d_0 is
 
     T_jj = sqrt(d_j / d_(j-1)),    T_ij = -a_i a_j / sqrt(d_j d_(j-1)),  i > j.
 
-Where a matrix is not positive definite the result is NaN, which callers look for.
+The result for a matrix that is not positive definite is NaN, which callers test for.
 
 Source: N. A. Carlson, Fast triangular formulation of the square root filter, AIAA Journal 11
 (1973); Gram-Schmidt's R is as accurate as Householder's: N. J. Higham, Accuracy and Stability
 of Numerical Algorithms (2002), theorem 19.13.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.linalg import solve_lower
+from ..algebra import linalg
+from ..algebra.stacked import multiply
 
 Root = Float[Array, "k k *s"]
 
-# What rounding leaves of a pivot that is zero, in units of epsilon.
+# Round-off in a pivot that should be zero, in units of epsilon.
 _ROUND_OFF = 100
 
-# Columns up to which written-out code beats a call of LAPACK for a single matrix.
+# Number of columns up to which written-out code is faster than LAPACK for a single matrix.
 _FEW = 3
 
 
 def triangularise(rows: Float[Array, "r k *s"]) -> Root:
-    """Lower triangular L, its diagonal >= 0, with L L^T = rows^T rows.
+    """Lower triangular L with diagonal >= 0 and L L^T = rows^T rows.
 
-    Never squares the rows: the part of L that is small compared with the rest keeps its digits.
+    The rows are never squared, so parts of L that are small beside others keep their digits.
     """
     r, k = rows.shape[:2]
     if rows.ndim == 2 and k > _FEW:
@@ -44,10 +44,10 @@ def triangularise(rows: Float[Array, "r k *s"]) -> Root:
 
 
 def _gram_schmidt(rows: Float[Array, "r k *s"]) -> list[Float[Array, "_ *s"]]:
-    """The columns of L, from the diagonal down, by modified Gram-Schmidt.
+    """Columns of L, from the diagonal down, by modified Gram-Schmidt.
 
-    Every pair of columns is one pass over numbers that stay in registers: half the time of
-    updating all later columns at once.
+    Every pair of columns is one pass over numbers that stay in registers, which takes half the
+    time of updating all later columns at once.
     """
     left = [rows[:, j] for j in range(rows.shape[1])]
     columns = []
@@ -66,7 +66,7 @@ def _gram_schmidt(rows: Float[Array, "r k *s"]) -> list[Float[Array, "_ *s"]]:
 
 
 def _assemble(columns: list[Float[Array, "_ *s"]]) -> Root:
-    """A lower triangular matrix of its columns from the diagonal down."""
+    """Lower triangular matrix from its columns, each from the diagonal down."""
     k = len(columns)
     padded = [
         jnp.concatenate([jnp.zeros((j, *c.shape[1:]), c.dtype), c]) if j else c
@@ -76,10 +76,10 @@ def _assemble(columns: list[Float[Array, "_ *s"]]) -> Root:
 
 
 def cholesky(P: Root) -> Root:
-    """The lower factor of positive definite matrices; NaN for any other."""
+    """Lower Cholesky factor of positive definite matrices; NaN for any other."""
     k = P.shape[0]
     if P.ndim == 2 and k > _FEW:
-        return jax.lax.linalg.cholesky(P, symmetrize_input=False)
+        return linalg.cholesky(P)
     columns = []
     for _ in range(k):
         pivot = P[:1, 0]
@@ -90,11 +90,11 @@ def cholesky(P: Root) -> Root:
 
 
 def semidefinite(P: Root) -> Root:
-    """The lower factor of positive semi-definite matrices; NaN for any other.
+    """Lower Cholesky factor of positive semi-definite matrices; NaN for any other.
 
     A pivot of zero, within rounding of its diagonal entry, makes a column of zeros. The factor
-    is differentiable where the null directions stay: a variance of zero counts as a constant,
-    since its root has no derivative.
+    is differentiable as long as the null directions stay: a variance of zero is treated as a
+    constant, since its root has no derivative.
     """
     scale = jnp.stack([P[i, i] for i in range(P.shape[0])])
     allowed = _ROUND_OFF * jnp.finfo(P.dtype).eps * scale
@@ -102,7 +102,7 @@ def semidefinite(P: Root) -> Root:
     for k in range(P.shape[0]):
         pivot, below = P[0, 0], P[1:, 0]
         some = pivot > allowed[k]
-        # |P_ij| <= sqrt(P_ii P_jj): nothing is beside a pivot of zero
+        # |P_ij| <= sqrt(P_ii P_jj): the entries beside a pivot of zero are zero
         none = (pivot >= -allowed[k]) & jnp.all(below**2 <= allowed[k] * scale[k + 1 :], axis=0)
         inverse = jnp.where(some, 1 / jnp.sqrt(jnp.where(some, pivot, 1.0)), 0.0)
         inverse = jnp.where(some | none, inverse, jnp.nan)
@@ -112,34 +112,16 @@ def semidefinite(P: Root) -> Root:
     return _assemble(columns)
 
 
-def gram(rows: Float[Array, "r k *s"]) -> Root:
-    """rows^T rows, exactly symmetric."""
-    return cross_gram(rows, rows)
-
-
-def cross_gram(
-    rows: Float[Array, "r k *s"], others: Float[Array, "r i *s"]
-) -> Float[Array, "k i *s"]:
-    """rows^T others."""
-    A, B = jnp.swapaxes(rows, 0, 1), jnp.swapaxes(others, 0, 1)
-    return jnp.sum(A[:, None] * B[None], axis=2)
-
-
-def product(A: Float[Array, "i j *s"], B: Float[Array, "j k *s"]) -> Float[Array, "i k *s"]:
-    """A B."""
-    return cross_gram(jnp.swapaxes(A, 0, 1), B)
-
-
 def outer_square(L: Root) -> Root:
-    """L L^T, exactly symmetric."""
-    return gram(jnp.swapaxes(L, 0, 1))
+    """Product L L^T, exactly symmetric."""
+    return multiply(L, jnp.swapaxes(L, 0, 1))
 
 
 def divide_lower(L: Root, B: Float[Array, "k r *s"]) -> Float[Array, "k r *s"]:
-    """L^-1 B for lower triangular L."""
+    """Solution L^-1 B for lower triangular L."""
     k = L.shape[0]
     if L.ndim == 2 and B.ndim == 2 and k > _FEW:
-        return solve_lower(L, B)
+        return linalg.solve_lower(L, B)
     done: list[Array] = []
     for _ in range(k):
         row = B[0] / L[0, 0]
@@ -149,20 +131,12 @@ def divide_lower(L: Root, B: Float[Array, "k r *s"]) -> Float[Array, "k r *s"]:
     return jnp.stack(done)
 
 
-def divide_lower_transposed(L: Root, B: Float[Array, "k r *s"]) -> Float[Array, "k r *s"]:
-    """L^-T B for lower triangular L."""
-    if L.ndim == 2 and B.ndim == 2 and L.shape[0] > _FEW:
-        return solve_lower(L, B, transpose=True)
-    flipped = jnp.swapaxes(L[::-1, ::-1], 0, 1)
-    return divide_lower(flipped, B[::-1])[::-1]
-
-
 def reduce_root(
     M: Float[Array, "i k *s"], a: Float[Array, "k *s"], last: Float[Array, "*#s"]
 ) -> Float[Array, "i k *s"]:
-    """M T, T the lower Cholesky factor of I - a a^T / (last + a^T a); see the module.
+    """Product M T, T the lower Cholesky factor of I - a a^T / (last + a^T a); see the module.
 
-    With last > 0 all sums are of positive terms, so that nothing cancels.
+    With last > 0 all sums have positive terms, so that nothing cancels.
     """
     d = [jnp.broadcast_to(last, a.shape[1:])]
     for value in a[::-1]:
@@ -173,10 +147,10 @@ def reduce_root(
 def _columns(
     M: Float[Array, "i k *s"], a: Float[Array, "k *s"], d: Float[Array, "_ *s"]
 ) -> Float[Array, "i k *s"]:
-    """M T for T with the given d_0, ..., d_k."""
+    """Product M T for T with the given d_0, ..., d_k."""
     inverse = 1 / jnp.sqrt(d[1:] * d[:-1])
     kept, taken = d[1:] * inverse, a * inverse
-    # sums over later columns, from the last one on
+    # sums over later columns, in reverse order
     later, columns = jnp.zeros_like(M[:, 0]), []
     for j in reversed(range(a.shape[0])):
         columns.append(M[:, j] * kept[None, j] - taken[None, j] * later)
@@ -185,7 +159,7 @@ def _columns(
 
 
 def downdate(L: Root, v: Float[Array, "k *s"]) -> Root:
-    """The lower factor of L L^T - v v^T; NaN where that is not positive definite."""
+    """Lower Cholesky factor of L L^T - v v^T; NaN where that is not positive definite."""
     a = divide_lower(L, v[:, None])[:, 0]
     k = a.shape[0]
     upto = jnp.asarray([[float(i < j) for i in range(k)] for j in range(k + 1)], a.dtype)

@@ -1,16 +1,15 @@
-"""Kalman filters over a record of measurements: one, or a bank side by side.
+"""Kalman filters over a record of measurements, alone or in a bank.
 
-Each step predicts to the time of a measurement and updates with it. The rule (sigma points or
-linearisation), the form (square root or covariance) and what becomes of the sigma points between
-the two halves ("redraw": drawn anew from the predicted Gaussian; "reuse") are explicit choices,
-because libraries differ in them.
+Each step predicts to the time of a measurement and updates with it, by an `AbstractFilter`
+(update.py). Its rule (sigma points or linearisation), its form (square root or covariance) and the
+use of sigma points in the update are explicit choices, because libraries differ in them.
 
-A step that leaves numbers that are not finite (a covariance that is not positive definite makes
-NaN in JAX, silently) ends a filter: it keeps its last good estimate, `ok` is False from there on,
-and its NIS is infinite.
+A filter fails at a step whose numbers are not finite (JAX makes NaN, without notice, of a
+covariance that is not positive definite): it keeps its last good estimate, `ok` is False from
+there on, and its NIS is infinite.
 """
 
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,21 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..algebra.shapes import Numbers
-from ..mechanics.errors import SettingError, check_finite, concrete
+from ..algebra.space import Point
+from ..checks.errors import SettingError, check_finite, concrete
+from ..checks.shapes import Numbers
 from .check import check_filter
 from .factor import outer_square
-from .gaussian import Gaussian
+from .gaussians import Gaussian
 from .model import Inputs, StateSpaceModel
-from .sigma import AbstractRule, Cubature
-from .space import Point
-from .update import Form, Innovation, predict, predict_and_update, update
-
-Points = Literal["redraw", "reuse"]
+from .update import DEFAULT, AbstractFilter, Innovation
 
 
 class EstimationError(RuntimeError):
-    """A filter that could not go on; `filtered` holds what was reached."""
+    """Failure of a filter; `filtered` holds the estimates before it, if there are any."""
 
     def __init__(self, message: str, filtered: object = None) -> None:
         super().__init__(message)
@@ -40,15 +36,16 @@ class EstimationError(RuntimeError):
 
 
 class Filtered(eqx.Module):
-    """The estimates after each of T measurements.
+    """Filtered estimates, after each of T measurements.
 
     Attributes:
-        mean: points with T first: an array (T, n, *s), or a pytree of such.
+        mean: points with T first: an array (T, n, *s), or a pytree of such arrays.
         factor: roots of the covariances (T, n, n, *s).
-        innovations: error, scaled, factor and which were measured, of each step, T first.
-        ok: False from the step on at which a filter failed (T, *s).
-        u, dt: inputs and steps [s] (T,), as used.
-        prior: where it started.
+        innovations: innovations of all steps, T first.
+        ok: False from the step at which a filter failed (T, *s).
+        u, dt: inputs, and lengths of the steps (T,) [s].
+        prior: estimate before the first step.
+        method: filter that was used.
     """
 
     mean: Point
@@ -58,10 +55,11 @@ class Filtered(eqx.Module):
     u: Inputs
     dt: Float[Array, " T"]
     prior: Gaussian
+    method: AbstractFilter
 
     @property
     def covariance(self) -> Float[Array, "T n n *s"]:
-        """P after each measurement."""
+        """Covariances P after each measurement."""
         return jax.vmap(outer_square)(self.factor)
 
     @property
@@ -76,17 +74,17 @@ class Filtered(eqx.Module):
 
     @property
     def log_likelihood(self) -> Float[Array, "*s"]:
-        """Of all measurements; minus infinity where the filter failed."""
+        """Log-likelihood of all measurements; minus infinity for a filter that failed."""
         each = jax.vmap(lambda i: i.log_likelihood)(self.innovations)
         return jnp.sum(jnp.where(self.ok, each, -jnp.inf), axis=0)
 
     @property
     def missing(self) -> Int[Array, "*s"]:
-        """How many single measurements were missing (NaN)."""
+        """Number of missing (NaN) components of measurements."""
         return jnp.sum(~self.innovations.there, axis=(0, 1))
 
     def at(self, k: int) -> Gaussian:
-        """The estimate after measurement k."""
+        """Estimate after measurement k."""
         return Gaussian(jax.tree.map(lambda leaf: leaf[k], self.mean), self.factor[k])
 
 
@@ -98,44 +96,41 @@ def kalman_filter(
     u: Inputs = None,
     dt: Numbers | None = None,
     t: Numbers | None = None,
-    rule: AbstractRule | None = None,
-    form: Form = "square_root",
-    points: Points = "redraw",
+    method: AbstractFilter = DEFAULT,
     throw: bool = True,
 ) -> Filtered:
     """Estimate the states at the times of T measurements.
 
-    For a bank of filters give priors and measurements a last axis: mean (n, s), factor (n, n, s),
-    y (T, m, s); inputs, Q and R may have it too. There `throw` has no effect.
+    For a bank of filters, priors and measurements have a last axis: mean (n, s), factor (n, n, s),
+    y (T, m, s); inputs, Q and R may have it too. A bank ignores `throw`.
 
     Args:
-        prior: the state at the time before the first step.
-        y: measurements (T, m, *s); NaN is a missing one.
-        u: inputs held over each step: a pytree of arrays (T, k, *s).
-        dt: step [s], or steps (T,); or t: times (T + 1,) [s], that of the prior first.
-        rule: `Cubature()` by default. form: "square_root" or "covariance".
-        points: "redraw" or "reuse" of sigma points after the prediction.
-        throw: whether a failure raises (outside of jit) or is only flagged in `ok`.
+        prior: estimate before the first step.
+        y: measurements (T, m, *s), NaN where missing.
+        u: inputs held over each step, a pytree of arrays (T, k, *s).
+        dt: length of all steps [s], or of each (T,).
+        t: instead of dt, the times of the prior and of the measurements (T + 1,) [s].
+        method: filter, by default a `GaussianFilter` with cubature and square roots.
+        throw: True if a failure raises (outside of jit); otherwise it is only flagged in `ok`.
 
     Raises:
-        ModelError: shapes that do not fit. SettingError: times that go backwards, a rule that
-            cannot work in this precision. EstimationError: a covariance was lost.
+        ModelError: shapes do not fit.
+        SettingError: times go backwards, or the rule cannot work in this precision.
+        EstimationError: a covariance was lost.
     """
-    rule = Cubature() if rule is None else rule
     if not isinstance(y, jax.Array):
         y = jnp.asarray(y, dtype=prior.factor.dtype)
-    check_choices(form, points)
-    check_filter(model, prior, y, u, rule)
+    check_filter(model, prior, y, u, method.rule)
     steps = step_lengths(dt, t, y.shape[0], prior.factor.dtype)
     if u is not None:
         u = jax.tree.map(jnp.asarray, u)
     _, out = jax.lax.scan(
-        lambda carry, now: _step(model, carry, now, rule, form, points),
+        lambda carry, now: _step(model, carry, now, method),
         (prior, jnp.ones(prior.factor.shape[2:], bool)),
         (y, u, steps),
     )
     estimate, innovations, ok = out
-    filtered = Filtered(estimate.mean, estimate.factor, innovations, ok, u, steps, prior)
+    filtered = Filtered(estimate.mean, estimate.factor, innovations, ok, u, steps, prior, method)
     if throw and ok.ndim == 1 and concrete(ok) and not bool(ok[-1]):
         raise EstimationError(failure_message(filtered), filtered)
     return filtered
@@ -145,40 +140,20 @@ def _step(
     model: StateSpaceModel,
     carry: tuple[Gaussian, Bool[Array, "*s"]],
     now: tuple[Any, Inputs, Any],
-    rule: AbstractRule,
-    form: Form,
-    points: Points,
+    method: AbstractFilter,
 ) -> tuple[tuple[Gaussian, Bool[Array, "*s"]], tuple[Gaussian, Innovation, Bool[Array, "*s"]]]:
-    """One measurement; the carry is the estimate, and whether the filter still runs."""
+    """Step to one measurement; the carry is the estimate, and True while the filter runs."""
     before, running = carry
     y, u, dt = now
-    after, innovation = one_step(model, before, y, u, dt, rule=rule, form=form, points=points)
+    after, innovation = method.step(model, before, y, u, dt)
     ok = running & is_finite(after)
     kept = jax.tree.map(lambda new, old: jnp.where(ok, new, old), after, before)
     return (kept, ok), (kept, innovation, ok)
 
 
-def one_step(
-    model: StateSpaceModel,
-    before: Gaussian,
-    y: Point,
-    u: Inputs,
-    dt: Any,
-    *,
-    rule: AbstractRule,
-    form: Form,
-    points: Points = "redraw",
-) -> tuple[Gaussian, Innovation]:
-    """Predict to a measurement's time and update with it."""
-    if points == "reuse":
-        return predict_and_update(model, before, y, u, dt, rule=rule, form=form)
-    predicted = predict(model, before, u, dt, rule=rule, form=form)
-    return update(predicted, y, model.sensor, u, model=model, rule=rule, form=form)
-
-
 def is_finite(g: Gaussian) -> Bool[Array, "*s"]:
-    """Whether all numbers of a Gaussian are finite, for each of a bank."""
-    # one sum over everything: NaN and infinity come through it
+    """True if all numbers of a Gaussian are finite, for each filter of a bank."""
+    # one sum over all numbers, which NaN and infinity pass through
     L = g.factor
     total = jnp.sum(L.reshape(-1, *L.shape[2:]), axis=0)
     for leaf in jax.tree.leaves(g.mean):
@@ -187,7 +162,7 @@ def is_finite(g: Gaussian) -> Bool[Array, "*s"]:
 
 
 def failure_message(filtered: Filtered) -> str:
-    """When a single filter failed, and the usual reasons."""
+    """Message with the time at which a single filter failed, and the usual causes."""
     k = int(np.argmin(np.asarray(filtered.ok)))
     nis = np.asarray(filtered.nis)[max(k - 3, 0) : k]
     return (
@@ -199,18 +174,12 @@ def failure_message(filtered: Filtered) -> str:
     )
 
 
-def check_choices(form: str, points: str = "redraw") -> None:
-    """Raise `SettingError` for a form, or a treatment of sigma points, that there is not."""
-    for value, known in ((form, ("square_root", "covariance")), (points, ("redraw", "reuse"))):
-        if value not in known:
-            raise SettingError(f"'{value}' is not one of {known}.")
-
-
 def step_lengths(dt: Any, t: Any, count: int, dtype: Any) -> Float[Array, " T"]:
     """Lengths of the T steps [s].
 
     Raises:
-        SettingError: both or neither given, a wrong number of them, or time going backwards.
+        SettingError: both or none of dt and t are given, their shape is wrong, or time goes
+            backwards.
     """
     if (dt is None) == (t is None):
         raise SettingError("Give either dt, the step, or t, the times with the prior's first.")

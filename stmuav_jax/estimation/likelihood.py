@@ -1,9 +1,9 @@
-"""Covariances and other parameters from measurements alone: those that make a record most likely.
+"""Maximum-likelihood estimation of covariances and other parameters from measurements alone.
 
-The logarithms of the variances are moved along the gradient of the filter's log-likelihood
-(optax), so that they stay positive; parameters of either sign are moved themselves. The curvature
-at the optimum gives their standard errors: for independent records the estimate of ln(variance) has
-the covariance H^-1, H the Hessian of the negative log-likelihood.
+The unknowns are the logarithms of the variances, which therefore stay positive, and parameters
+of either sign themselves; optax moves them along the gradient of the filter's log-likelihood. The
+curvature at the optimum gives their standard errors: for independent records the covariance of
+the estimate is H^-1, with H the Hessian of the negative log-likelihood.
 
 Source: S. Sarkka, L. Svensson, Bayesian filtering and smoothing, 2nd ed. (2023), ch. 16.
 """
@@ -19,23 +19,22 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..algebra.compiler import outer_jit
-from ..mechanics.errors import SettingError
+from ..checks.errors import SettingError
 from .filter import kalman_filter, step_lengths
-from .gaussian import Gaussian
+from .gaussians import Gaussian
 from .model import Inputs, StateSpaceModel
-from .sigma import AbstractRule
-from .update import Form
+from .update import DEFAULT, AbstractFilter
 
 ModelOf = Callable[[Any], StateSpaceModel]
 
 
 class Tuned(NamedTuple):
-    """What maximising the likelihood has found.
+    """Result of maximising the likelihood.
 
     Attributes:
-        values: the best parameters, a pytree like the start's.
-        log_likelihood: of the records with them.
-        history: log-likelihood at every step, the start's first.
+        values: best parameters, a pytree like the start.
+        log_likelihood: log-likelihood of the records with them.
+        history: log-likelihood at every step, that of the start first.
         reason: "converged", "steps" (all used) or "not finite" (the best before that is kept).
     """
 
@@ -54,20 +53,18 @@ def record_likelihood(
     u: Inputs = None,
     dt: Any = None,
     t: Any = None,
-    rule: AbstractRule | None = None,
-    form: Form = "square_root",
+    method: AbstractFilter = DEFAULT,
 ) -> Float[Array, ""]:
-    """Log-likelihood of a record (T, m), or of independent ones (T, m, s), by the parameters.
+    """Log-likelihood of a record (T, m), or of independent ones (T, m, s), for given parameters.
 
     Args:
-        model_of: makes the model of `values`. The others as `kalman_filter`.
+        model_of: function that returns the model for `values`.
+        prior, y, u, dt, t, method: as in `kalman_filter`.
     """
     if y.ndim == 3 and prior.factor.ndim == 2:
         wide = lambda a: jnp.broadcast_to(a[..., None], (*a.shape, y.shape[2]))
         prior = jax.tree.map(wide, prior)
-    out = kalman_filter(
-        model_of(values), prior, y, u=u, dt=dt, t=t, rule=rule, form=form, throw=False
-    )
+    out = kalman_filter(model_of(values), prior, y, u=u, dt=dt, t=t, method=method, throw=False)
     return jnp.sum(out.log_likelihood)
 
 
@@ -80,31 +77,30 @@ def tune(
     u: Inputs = None,
     dt: Any = None,
     t: Any = None,
-    rule: AbstractRule | None = None,
-    form: Form = "square_root",
+    method: AbstractFilter = DEFAULT,
     optimiser: optax.GradientTransformation | None = None,
     signed: Any = False,
     steps: int = 100,
     tolerance: float = 1e-3,
     progress: Callable[[int, float], None] | None = None,
 ) -> Tuned:
-    """Variances that make the measurements most likely, from a start.
+    """Maximum-likelihood estimate of variances and other parameters, from an initial guess.
 
     Args:
-        model_of: makes the model of the variances, a pytree of positive numbers: of whole
-            diagonals of Q and R, of some of their entries, or of factors of them.
-        start: where to begin. prior, y, u, dt, t, rule, form: as `kalman_filter`; y may hold
-            independent records (T, m, s).
-        signed: True, or a pytree of booleans like `start`, for parameters that may have either sign
-            (a bias, an offset): they are moved themselves, variances by their logarithms.
-        optimiser: of optax; default L-BFGS with its line search.
-        steps: at most. tolerance: a gain of log-likelihood below this ends it, as does a
-            gradient (by ln variance) below it.
-        progress: called with the step and the log-likelihood so far.
+        model_of: function that returns the model for the parameters, a pytree of positive
+            numbers: whole diagonals of Q and R, some of their entries, or factors of them.
+        start: initial guess of the parameters.
+        prior, y, u, dt, t, method: as in `kalman_filter`; y may hold independent records (T, m, s).
+        optimiser: optimiser of optax; by default L-BFGS with its line search.
+        signed: True, or a pytree of booleans like `start`, for parameters that may have either
+            sign (a bias, an offset); the unknowns are they themselves and not their logarithms.
+        steps: largest number of steps.
+        tolerance: gain of log-likelihood, or norm of its gradient, below which the search ends.
+        progress: function called with the step and the log-likelihood so far.
 
     Raises:
-        SettingError: a start that is not positive and not `signed`, no step, or one that the filter
-            cannot run with.
+        SettingError: parameters of the start are neither positive nor `signed`, `steps` is less
+            than one, or the filter cannot run with the start.
     """
     signs = _signs(signed, start)
     for leaf, either in zip(jax.tree.leaves(start), jax.tree.leaves(signs), strict=True):
@@ -119,7 +115,7 @@ def tune(
 
     def loss(p: Any, y: Array, u: Inputs) -> Array:
         now = _given(p, signs)
-        return -record_likelihood(model_of, now, prior, y, u=u, dt=lengths, rule=rule, form=form)
+        return -record_likelihood(model_of, now, prior, y, u=u, dt=lengths, method=method)
 
     search = optax.with_extra_args_support(optax.lbfgs() if optimiser is None else optimiser)
 
@@ -139,7 +135,7 @@ def tune(
 
 
 def _signs(signed: Any, values: Any) -> Any:
-    """Whether each leaf of the parameters may have either sign."""
+    """Pytree of booleans, True for each leaf of the parameters that may have either sign."""
     if isinstance(signed, bool):
         return jax.tree.map(lambda leaf: signed, values)
     if jax.tree.structure(signed) != jax.tree.structure(values):
@@ -151,12 +147,12 @@ def _signs(signed: Any, values: Any) -> Any:
 
 
 def _free(values: Any, signs: Any) -> Any:
-    """What is moved: logarithms of positive parameters, the others themselves."""
+    """Unknowns of the search: logarithms of positive parameters, the others themselves."""
     return jax.tree.map(lambda leaf, either: leaf if either else jnp.log(leaf), values, signs)
 
 
 def _given(p: Any, signs: Any) -> Any:
-    """The parameters of what is moved."""
+    """Parameters from the unknowns of the search."""
     return jax.tree.map(lambda leaf, either: leaf if either else jnp.exp(leaf), p, signs)
 
 
@@ -169,7 +165,7 @@ def _climb(
     tolerance: float,
     progress: Callable[[int, float], None] | None,
 ) -> Tuned:
-    """Step until nothing is gained; the best so far is kept."""
+    """Repeat steps of the search until nothing is gained, and return the best parameters."""
     best, highest, history, reason = p, -np.inf, [], "steps"
     for k in range(steps + 1):
         after, state, value, slope = step(p, state, *record)
@@ -206,16 +202,13 @@ def standard_errors(
     u: Inputs = None,
     dt: Any = None,
     t: Any = None,
-    rule: AbstractRule | None = None,
-    form: Form = "square_root",
+    method: AbstractFilter = DEFAULT,
     signed: Any = False,
 ) -> Any:
-    """Standard errors, a pytree like `values`; NaN where nothing is known.
+    """Standard errors of ln(variance), and of `signed` parameters themselves.
 
-    They are those of ln(variance), and of `signed` parameters themselves.
-
-    Args:
-        as `tune`.
+    The result is a pytree like `values`, NaN where the curvature is not positive. The arguments
+    are those of `tune`, with `values` at the optimum.
     """
     signs = _signs(signed, values)
     lengths = step_lengths(dt, t, y.shape[0], prior.factor.dtype)
@@ -223,7 +216,7 @@ def standard_errors(
 
     def loss(p: Array, y: Array, u: Inputs) -> Array:
         now = _given(back(p), signs)
-        return -record_likelihood(model_of, now, prior, y, u=u, dt=lengths, rule=rule, form=form)
+        return -record_likelihood(model_of, now, prior, y, u=u, dt=lengths, method=method)
 
     curve = outer_jit(jax.jacfwd(jax.grad(loss)))
     H = np.asarray(curve(flat, jnp.asarray(y), jax.tree.map(jnp.asarray, u)))

@@ -1,11 +1,12 @@
-"""State-space models: how the state moves, what a sensor sees, and how uncertain both are.
+"""State-space models: process model, sensor, and the covariances of their noise.
 
     x_k = f(x_(k-1), u_k, dt) + w_k,   w_k ~ N(0, Q)
     y_k = h(x_k, u_k) + v_k,           v_k ~ N(0, R)
 
-u_k is held over the step to time t_k. On a manifold, noise is an error from f or h.
+The inputs u_k are held over the step to time t_k. On a manifold the noise is an error from f or h.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -14,24 +15,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.shapes import Numbers
-from ..mechanics.errors import ModelError
-from .gaussian import root
-from .space import AbstractSpace, Point, Vector
+from ..algebra.space import AbstractSpace, Point, Vector
+from ..checks.errors import ModelError
+from ..checks.shapes import Numbers
+from .gaussians import root
 
 Inputs = Any
 
 
 class Sensor(eqx.Module):
-    """y = h(x, u) + v, v ~ N(0, R).
+    """Measurement model y = h(x, u) + v, v ~ N(0, R).
 
     Attributes:
-        function: h(x, u) of a state and the inputs.
-        noise: the lower triangular root of R (m, m).
-        space: of the measurements.
-        names: of the measurements, for messages.
-        stacked: whether h takes stacks, components first and further axes last; where it does
-            not, it is vectorised.
+        function: function h(x, u) of a state and the inputs.
+        noise: lower triangular root of R (m, m).
+        space: space of the measurements.
+        names: names of the measurements, for messages.
+        stacked: True if h takes stacks, components first and further axes last; otherwise it
+            is vectorised.
     """
 
     function: Callable[[Point, Inputs], Point]
@@ -59,21 +60,22 @@ class Sensor(eqx.Module):
         _check_size(len(self.names), m, "R", "the list of names")
 
     def __call__(self, x: Point, u: Inputs) -> Point:
-        """h for any stack of states."""
+        """Measurements h(x, u) for any stack of states."""
         return over_stack(lambda x, u: self.function(x, u), x, u, stacked=self.stacked)
 
 
 class StateSpaceModel(eqx.Module):
-    """x_k = f(x_(k-1), u_k, dt) + w_k, seen by a sensor.
+    """State-space model: a process x_k = f(x_(k-1), u_k, dt) + w_k, measured by a sensor.
 
     Attributes:
-        function: f(x, u, dt) of a state, the inputs held over the step, and its length [s].
-        noise: the lower triangular root of Q (n, n).
-        sensor: what is measured.
-        space: of the states.
-        names: of the n error components, for messages and observability in words.
-        noise_per: "step", or "second": then the noise of a step is N(0, Q dt).
-        stacked: as for `Sensor`.
+        function: function f(x, u, dt) of a state, the inputs held over the step, and its
+            length [s].
+        noise: lower triangular root of Q (n, n).
+        sensor: measurement model.
+        space: space of the states.
+        names: names of the n error components, for messages and `Observability.words`.
+        noise_per: "step", or "second" if the noise of a step is N(0, Q dt).
+        stacked: True if f takes stacks, as for `Sensor`.
     """
 
     function: Callable[[Point, Inputs, Any], Point]
@@ -107,11 +109,11 @@ class StateSpaceModel(eqx.Module):
         _check_size(len(self.names), n, "Q", "the list of names")
 
     def __call__(self, x: Point, u: Inputs, dt: Any) -> Point:
-        """f for any stack of states."""
+        """States f(x, u, dt) for any stack of states."""
         return over_stack(lambda x, u: self.function(x, u, dt), x, u, stacked=self.stacked)
 
     def step_noise(self, dt: Any, ndim: int) -> Float[Array, "n n *s"]:
-        """The root of the noise of one step, with `ndim` axes."""
+        """Root of the covariance of one step's noise, with `ndim` axes."""
         noise = widened(self.noise, ndim, 2)
         return noise * jnp.sqrt(dt) if self.noise_per == "second" else noise
 
@@ -124,7 +126,7 @@ def _check_size(size: int, expected: int, matrix: str, what: str) -> None:
 
 
 def widened(a: Array, ndim: int, leading: int = 1) -> Array:
-    """An array with axes of length one after its leading ones, up to `ndim` axes."""
+    """Array with axes of length one inserted after its leading ones, up to `ndim` axes."""
     missing = ndim - a.ndim
     if missing <= 0:
         return a
@@ -134,9 +136,9 @@ def widened(a: Array, ndim: int, leading: int = 1) -> Array:
 def over_stack(
     function: Callable[[Point, Inputs], Point], x: Point, u: Inputs, *, stacked: bool
 ) -> Point:
-    """function(x, u) over the axes of x after the first; u may lack the first of these.
+    """Map function(x, u) over the axes of x after the first; u may lack the first of these.
 
-    Inputs are arrays with their components first, so that further axes are those of a bank.
+    Inputs are arrays with their components first and the axes of a filter bank last.
     """
     ndim = jax.tree.leaves(x)[0].ndim
     u = jax.tree.map(lambda leaf: widened(jnp.asarray(leaf), ndim), u)
@@ -146,7 +148,7 @@ def over_stack(
 
     def flat(leaf: Array) -> Array:
         wide = jnp.broadcast_to(leaf, (*leaf.shape[:1], *lanes))
-        return wide.reshape(leaf.shape[0], -1)
+        return wide.reshape(leaf.shape[0], math.prod(lanes))
 
     each = jax.vmap(function, in_axes=-1, out_axes=-1)
     out = each(jax.tree.map(flat, x), jax.tree.map(flat, u))

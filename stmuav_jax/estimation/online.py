@@ -1,16 +1,16 @@
-"""One measurement at a time, from Python: for use beside a machine that runs.
+"""Online filter, one measurement at a time from Python, for use beside a running machine.
 
 A call of a compiled function costs some microseconds for each array that goes in or comes out,
 more than the arithmetic of a small filter. All numbers of a step therefore go in as two
-arrays (estimate; step, measurement and inputs) and come out as one, which stays where the next step
-wants it; NumPy looks at it without a copy.
+arrays (estimate; step, measurement and inputs) and come out as one, which the next step takes
+as it is and NumPy reads without a copy.
 
-What is left is the runtime of JAX, which hands a computation to another thread and waits for it. A
-program that needs every microsecond calls, before anything else of JAX,
+The remaining overhead is the runtime of JAX, which hands a computation to another thread and
+waits for it. A program that needs every microsecond calls, before anything else of JAX,
 
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
-and the step then runs in the thread that asks for it, in two thirds of the time or less.
+and the step then runs in the calling thread, in two thirds of the time or less.
 """
 
 from collections.abc import Callable
@@ -22,15 +22,14 @@ import numpy as np
 from jaxtyping import Array
 
 from ..algebra.compiler import compiler_options
-from ..mechanics.errors import ModelError, SettingError
+from ..checks.errors import ModelError, SettingError
 from .check import check_functions, check_prior
-from .filter import EstimationError, check_choices, is_finite, one_step
-from .gaussian import Gaussian
+from .filter import EstimationError, is_finite
+from .gaussians import Gaussian
 from .model import Inputs, StateSpaceModel
-from .sigma import AbstractRule, Cubature
-from .update import Form
+from .update import DEFAULT, AbstractFilter
 
-# Numbers that a step tells of itself: its NIS, how many components were missing, whether it is fine.
+# Count of the numbers about a step itself: its NIS, missing components, and 1 if it is finite.
 TOLD = 3
 
 
@@ -39,7 +38,7 @@ _Made = tuple[Callable[..., Any], np.ndarray, tuple[np.ndarray, ...]]
 
 
 class _Layout:
-    """Where mean and factor are among the numbers of an estimate."""
+    """Layout of mean and factor in the flat array of an estimate."""
 
     def __init__(self, prior: Gaussian) -> None:
         leaves, self.structure = jax.tree.flatten(prior.mean)
@@ -48,11 +47,11 @@ class _Layout:
         self.size = self.ends[-1] + prior.factor.size
 
     def pack(self, g: Gaussian) -> Array:
-        """One array (size,)."""
+        """Flat array (size,) of a Gaussian."""
         return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves((g.mean, g.factor))])
 
     def mean(self, numbers: Any) -> Any:
-        """The mean's array, or its pytree of arrays."""
+        """Mean, an array or a pytree of arrays."""
         starts = [0, *self.ends]
         leaves = [
             numbers[a:b].reshape(shape)
@@ -61,22 +60,23 @@ class _Layout:
         return jax.tree.unflatten(self.structure, leaves)
 
     def factor(self, numbers: Any) -> Any:
-        """The factor (n, n)."""
+        """Root of the covariance (n, n)."""
         flat = numbers[self.ends[-1] : self.size]
         n = round(flat.shape[0] ** 0.5)
         return flat.reshape(n, n)
 
     def unpack(self, numbers: Any) -> Gaussian:
-        """The Gaussian."""
+        """Gaussian of a flat array."""
         return Gaussian(self.mean(numbers), self.factor(numbers))
 
 
-class Estimate:
-    """What is known after a measurement.
+class OnlineEstimate:
+    """Estimate after a measurement.
 
     Attributes:
-        t: its time [s]. nis: normalised innovation squared.
-        missing: how many of its components were NaN.
+        t: time of the measurement [s].
+        nis: normalised innovation squared.
+        missing: number of components of the measurement that were NaN.
     """
 
     __slots__ = ("_layout", "_numbers", "missing", "nis", "t")
@@ -89,7 +89,7 @@ class Estimate:
 
     @property
     def mean(self) -> Any:
-        """The mean as NumPy arrays, which cost no time."""
+        """Mean as NumPy arrays, views that cost no time."""
         return self._layout.mean(self._numbers)
 
     @property
@@ -99,23 +99,24 @@ class Estimate:
 
     @property
     def state(self) -> Gaussian:
-        """The Gaussian, of JAX arrays made when it is asked for."""
+        """Gaussian of JAX arrays, which each access creates."""
         return self._layout.unpack(jnp.asarray(self._numbers)[: self._layout.size])
 
 
 class OnlineFilter:
-    """A filter that waits for measurements.
+    """Filter that takes one measurement at a time.
 
-    The first call compiles (`warm_up` does it beforehand). Later ones evaluate the same equations
-    as `kalman_filter`; the numbers agree to rounding, because code compiled alone and code within
+    The first call compiles (`warm_up` does it beforehand). Steps evaluate the same equations as
+    `kalman_filter`; the numbers agree to rounding, because code compiled alone and code within
     a loop may take sums in another order.
 
     Attributes:
-        t: time of the estimate [s]. count, missing: measurements so far, and how many of their
-            components were NaN. nis: one number per measurement.
+        t: time of the estimate [s].
+        count, missing: numbers of measurements so far, and of their components that were NaN.
+        nis: normalised innovations squared, one number per measurement.
 
     Raises:
-        ModelError, SettingError: as `kalman_filter`; functions are checked at the first call.
+        ModelError, SettingError: as in `kalman_filter`; functions are checked at the first call.
     """
 
     def __init__(
@@ -124,12 +125,9 @@ class OnlineFilter:
         prior: Gaussian,
         *,
         t: float = 0.0,
-        rule: AbstractRule | None = None,
-        form: Form = "square_root",
+        method: AbstractFilter = DEFAULT,
     ) -> None:
-        rule = Cubature() if rule is None else rule
-        check_choices(form)
-        check_prior(model, prior, rule)
+        check_prior(model, prior, method.rule)
         if prior.factor.ndim != 2:
             raise ModelError(
                 "An online filter is a single one, but its prior's covariance has shape "
@@ -138,32 +136,34 @@ class OnlineFilter:
         self.model, self.t = model, float(t)
         self.count, self.missing = 0, 0
         self.nis: list[float] = []
-        self._prior, self._rule = prior, rule
-        self._form: Form = form
+        self._prior, self._method = prior, method
         self._layout, self._dtype = _Layout(prior), np.dtype(prior.factor.dtype)
-        # what a step returns: the estimate, and three numbers about the step, which the next ignores
+        # result of a step: the estimate, and numbers about the step, which the next one ignores
         self._now = jnp.concatenate([self._layout.pack(prior), jnp.zeros(TOLD, self._dtype)])
         self._programs: dict[Any, _Made] = {}
 
     @property
     def state(self) -> Gaussian:
-        """The estimate."""
+        """Current estimate."""
         return self._layout.unpack(self._now[:-TOLD])
 
     def warm_up(self, u: Inputs = None, *, y: Any = None) -> None:
-        """Compile, with inputs (and a measurement, by default one of m numbers) as they will be."""
+        """Compile the step for inputs and a measurement (by default m numbers) of these shapes."""
         y = np.full(self.model.sensor.space.size, np.nan) if y is None else y
         program, given = self._prepared(y, 0.0, u)
         jax.block_until_ready(program(self._now, given))
 
-    def step(self, y: Any, t: float, u: Inputs = None) -> Estimate:
+    def step(self, y: Any, t: float, u: Inputs = None) -> OnlineEstimate:
         """Predict to time t with inputs u held since the last measurement, and update with y.
 
         Args:
-            y: measurement (m,), NaN where missing. t: its time [s]. u: a pytree of arrays (k,).
+            y: measurement (m,), NaN where missing.
+            t: time of the measurement [s].
+            u: inputs, a pytree of arrays (k,).
 
         Raises:
-            ModelError: y has another size. SettingError: t before the last measurement.
+            ModelError: y has the wrong size.
+            SettingError: t is before the last measurement.
             EstimationError: the covariance was lost; the last good estimate stays.
         """
         if not t >= self.t:
@@ -181,13 +181,13 @@ class OnlineFilter:
         self.count += 1
         self.missing += int(missing)
         self.nis.append(nis)
-        return Estimate(self.t, numbers, self._layout, nis, int(missing))
+        return OnlineEstimate(self.t, numbers, self._layout, nis, int(missing))
 
     def _prepared(self, y: Any, dt: float, u: Inputs) -> tuple[Callable[..., Any], np.ndarray]:
-        """The compiled step for arrays of these shapes, and step, measurement, inputs in one.
+        """Compiled step for arrays of these shapes, and the array of step, measurement and inputs.
 
-        The array is the same one every time, which is quicker than a new one; whoever passes it to
-        the program waits for the result before it is filled again.
+        The array is reused, which is quicker than a new one; the caller waits for the program's
+        result before the array is filled again.
         """
         dtype = self._dtype
         y = np.asarray(y, dtype)
@@ -204,8 +204,8 @@ class OnlineFilter:
         return program, given
 
     def _made(self, y: np.ndarray, leaves: list[np.ndarray], structure: Any) -> _Made:
-        """The function of one step, compiled at its first call, and the array that it is given."""
-        model, rule, form, layout = self.model, self._rule, self._form, self._layout
+        """Function of one step, compiled at its first call, and the array that it takes."""
+        model, method, layout = self.model, self._method, self._layout
         model.sensor.space.check(y, "A measurement")
         m, shapes = y.shape[0], [leaf.shape for leaf in leaves]
         like = [jax.ShapeDtypeStruct(shape, self._dtype) for shape in shapes]
@@ -218,9 +218,8 @@ class OnlineFilter:
                 for a, b, shape in zip(ends, ends[1:], shapes, strict=False)
             ]
             u = jax.tree.unflatten(structure, parts)
-            after, seen = one_step(
-                model, layout.unpack(numbers), given[1 : 1 + m], u, given[0], rule=rule, form=form
-            )
+            before, y = layout.unpack(numbers), given[1 : 1 + m]
+            after, seen = method.step(model, before, y, u, given[0])
             told = jnp.stack([seen.nis, *[
                 jnp.asarray(value, seen.nis.dtype) for value in (seen.missing, is_finite(after))
             ]])  # fmt: skip

@@ -1,15 +1,15 @@
-"""How a Gaussian goes through a function: sigma-point rules, and linearisation.
+"""Transformation of a Gaussian by a function: sigma-point rules, and linearisation.
 
-Every rule here has a central point and pairs at m + s_j and m - s_j, s_j = L d_j, with weight w_j
-each. With the values relative to the central one, o_j = (f+ - f-) / 2 and e_j = (f+ + f-) / 2:
+Every sigma-point rule has a central point and pairs at m + s_j and m - s_j, s_j = L d_j, of weight
+w_j each. With the values relative to the central one, o_j = (f+ - f-) / 2 and e_j = (f+ + f-) / 2:
 
     mean = f0 + delta,   delta = sum 2 w_j e_j,   W = sum 2 w_j,   ebar = delta / W
     P = sum 2 w_j [o_j o_j^T + (e_j - ebar)(e_j - ebar)^T] + (g - 1 + 1 / W) delta delta^T
 
 with g the central weight of the covariance less that of the mean. This is the usual weighted
 sum, rearranged. For the scaled unscented transform the last factor is beta + alpha^2 kappa / n:
-a central weight of -95 (the report's) needs no subtraction at all, and P is a sum of squares
-unless kappa or beta is negative. Then a square root needs a downdate.
+even a central weight of -95 (the report's) needs no subtraction, and P is a sum of squares
+unless kappa or beta is negative; then its square root needs a downdate.
 
 Source: S. J. Julier, The scaled unscented transformation, ACC (2002); I. Arasaratnam, S. Haykin,
 Cubature Kalman filters, IEEE TAC 54 (2009); fifth degree: B. Jia, M. Xin, Y. Cheng, High-degree
@@ -28,9 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..mechanics.errors import SettingError
-from .gaussian import Gaussian
-from .space import AbstractSpace, Point, expanded
+from ..algebra.space import AbstractSpace, Point, expanded
+from ..checks.errors import SettingError
+from .gaussians import Gaussian
 
 Function = Callable[[Point], Point]
 
@@ -39,15 +39,15 @@ _LOST = 2e-5
 
 
 class Transformed(NamedTuple):
-    """What a Gaussian became: rows whose Gram matrix is the covariance.
+    """Transformed Gaussian, with the covariance rows^T rows - less less^T.
 
     Attributes:
-        mean: a point of the target.
-        rows: (r, m, *s), added squares.
-        less: (m, *s), one square to take away, or None.
-        inputs: (q, n, *s): the input's deviations, along the first q rows: the cross
+        mean: mean, a point of the target space.
+        rows: rows of deviations (r, m, *s).
+        less: vector of the subtracted square (m, *s), or None.
+        inputs: deviations of the input along the first q rows (q, n, *s), so that the cross
             covariance is inputs^T rows[:q].
-        triangular: whether `inputs` is the transposed root of the input (q = n).
+        triangular: True if `inputs` is the transposed root of the input's covariance (q = n).
     """
 
     mean: Point
@@ -58,7 +58,7 @@ class Transformed(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Directions (q, n) for a unit covariance, weight of each of a pair (q,), and g."""
+    """Directions d_j for unit covariance (q, n), weights w_j of their points (q,), and g."""
 
     directions: np.ndarray
     weights: np.ndarray
@@ -66,44 +66,53 @@ class Points(NamedTuple):
 
 
 class AbstractRule(eqx.Module):
-    """A way to send a Gaussian through a function."""
+    """Rule for the transformation of a Gaussian by a function."""
 
     @abstractmethod
     def transform(
         self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
     ) -> Transformed:
-        """The Gaussian of function(x), x from `prior`; the function takes stacks of points."""
+        """Gaussian of function(x) for x from `prior`; the function takes stacks of points."""
 
     @abstractmethod
     def check(self, n: int, dtype: jnp.dtype) -> None:
-        """Raise `SettingError` if the rule cannot serve n dimensions in this precision."""
+        """Raise `SettingError` if the rule cannot be used in n dimensions and this precision."""
 
 
-class Unscented(AbstractRule):
-    """The scaled unscented transform, c^2 = alpha^2 (n + kappa), points m +- c L e_j.
-
-    The report's parameters (Table 2.4.2) are alpha = 0.1, beta = 2, kappa = 0.1.
+class AbstractPointRule(AbstractRule):
+    """Rule that evaluates the function at a central point and at pairs of others.
 
     Attributes:
-        means: how often the mean on a manifold is improved; vectors need no improvement.
+        means: number of iterations for the mean on a manifold; vectors need none.
     """
 
-    alpha: float = eqx.field(static=True, default=1.0)
-    beta: float = eqx.field(static=True, default=2.0)
-    kappa: float = eqx.field(static=True, default=0.0)
-    means: int = eqx.field(static=True, default=3)
+    means: int = eqx.field(static=True, default=3, kw_only=True)
 
+    @abstractmethod
     def points(self, n: int) -> Points:
         """Directions and weights for n dimensions."""
-        square = self.alpha**2 * (n + self.kappa)
-        weights = np.full(n, 0.5 / square)
-        return Points(math.sqrt(square) * np.eye(n), weights, 1 - self.alpha**2 + self.beta)
 
     def transform(
         self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
     ) -> Transformed:
         points = self.points(prior.factor.shape[0])
         return _by_points(points, function, prior, source, target, means=self.means)
+
+
+class Unscented(AbstractPointRule):
+    """Scaled unscented transform, c^2 = alpha^2 (n + kappa), points m +- c L e_j.
+
+    The report's parameters (Table 2.4.2) are alpha = 0.1, beta = 2, kappa = 0.1.
+    """
+
+    alpha: float = eqx.field(static=True, default=1.0)
+    beta: float = eqx.field(static=True, default=2.0)
+    kappa: float = eqx.field(static=True, default=0.0)
+
+    def points(self, n: int) -> Points:
+        square = self.alpha**2 * (n + self.kappa)
+        weights = np.full(n, 0.5 / square)
+        return Points(math.sqrt(square) * np.eye(n), weights, 1 - self.alpha**2 + self.beta)
 
     def check(self, n: int, dtype: jnp.dtype) -> None:
         square = self.alpha**2 * (n + self.kappa)
@@ -122,36 +131,24 @@ class Unscented(AbstractRule):
             )
 
 
-class Cubature(AbstractRule):
-    """The spherical cubature rule of third degree: points m +- sqrt(n) L e_j, equal weights."""
-
-    means: int = eqx.field(static=True, default=3)
+class Cubature(AbstractPointRule):
+    """Spherical cubature rule of third degree: points m +- sqrt(n) L e_j, equal weights."""
 
     def points(self, n: int) -> Points:
-        """Directions and weights for n dimensions."""
         return Points(math.sqrt(n) * np.eye(n), np.full(n, 0.5 / n), 0.0)
 
-    def transform(
-        self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
-    ) -> Transformed:
-        points = self.points(prior.factor.shape[0])
-        return _by_points(points, function, prior, source, target, means=self.means)
-
     def check(self, n: int, dtype: jnp.dtype) -> None:
-        """Serves every n in every precision."""
+        """Accept every n and every precision."""
 
 
-class Cubature5(AbstractRule):
-    """The symmetric rule of fifth degree, 2 n^2 + 1 points.
+class Cubature5(AbstractPointRule):
+    """Symmetric cubature rule of fifth degree, with 2 n^2 + 1 points.
 
-    Exact for polynomials up to the fifth degree. From n = 5 on its axial weights are negative,
-    and the covariance may not be positive definite: it is refused there.
+    The rule is exact for polynomials up to the fifth degree. It is refused from n = 5 on, where
+    its axial weights are negative and the covariance need not be positive definite.
     """
 
-    means: int = eqx.field(static=True, default=3)
-
     def points(self, n: int) -> Points:
-        """Directions and weights for n dimensions."""
         axes = math.sqrt(n + 2) * np.eye(n)
         pairs = [
             math.sqrt((n + 2) / 2) * (np.eye(n)[i] + sign * np.eye(n)[j])
@@ -160,12 +157,6 @@ class Cubature5(AbstractRule):
         ]
         weights = [(4 - n) / (2 * (n + 2) ** 2)] * n + [1 / (n + 2) ** 2] * len(pairs)
         return Points(np.concatenate([axes, *[p[None] for p in pairs]]), np.array(weights), 0.0)
-
-    def transform(
-        self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
-    ) -> Transformed:
-        points = self.points(prior.factor.shape[0])
-        return _by_points(points, function, prior, source, target, means=self.means)
 
     def check(self, n: int, dtype: jnp.dtype) -> None:
         if n > 4:
@@ -176,7 +167,7 @@ class Cubature5(AbstractRule):
 
 
 class Linearised(AbstractRule):
-    """The first-order rule of the extended Kalman filter: the function's derivative along L."""
+    """First-order rule of the extended Kalman filter: the function's derivative along L."""
 
     def transform(
         self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
@@ -192,7 +183,7 @@ class Linearised(AbstractRule):
         return Transformed(centre, rows, None, jnp.swapaxes(prior.factor, 0, 1), True)
 
     def check(self, n: int, dtype: jnp.dtype) -> None:
-        """Serves every n in every precision."""
+        """Accept every n and every precision."""
 
 
 def _by_points(
@@ -204,7 +195,7 @@ def _by_points(
     *,
     means: int,
 ) -> Transformed:
-    """Send sigma points through the function."""
+    """Transform a Gaussian by the function's values at sigma points."""
     directions, weights, _ = points
     L = prior.factor
     n, q = L.shape[0], len(weights)
@@ -224,14 +215,14 @@ def _by_points(
 
 
 def _column(values: np.ndarray, like: Array) -> Array:
-    """Weights (q,) along the second axis of (n, q, *s)."""
+    """Weights (q,) shaped for the second axis of an array (n, q, *s)."""
     return jnp.asarray(values, like.dtype).reshape(1, -1, *(1,) * (like.ndim - 2))
 
 
 def _moments(
     images: Point, points: Points, target: AbstractSpace, means: int
 ) -> tuple[Point, Array, Array | None]:
-    """Mean, rows and the square to take away, of the images (m, 1 + 2 q, *s)."""
+    """Mean, rows and subtracted square of the images (m, 1 + 2 q, *s)."""
     _, weights, extra = points
     reference = jax.tree.map(lambda leaf: leaf[:, 0], images)
     odd, even, delta, centre = _parts(images, reference, weights, target)
@@ -257,7 +248,7 @@ def _moments(
 def _parts(
     images: Point, reference: Point, weights: np.ndarray, target: AbstractSpace
 ) -> tuple[Array, Array, Array, Array]:
-    """o_j, e_j (m, q, *s), their weighted sum delta, and the central error, seen from a point."""
+    """Odd and even parts o_j, e_j (m, q, *s), delta, and the central error from a reference."""
     q = len(weights)
     a = target.difference(images, expanded(reference))
     centre = a[:, :1]

@@ -1,10 +1,10 @@
-"""The unscented Rauch-Tung-Striebel smoother: estimates from all measurements, also later ones.
+"""Unscented Rauch-Tung-Striebel smoother: estimates from all measurements, also later ones.
 
 With the prediction's joint deviations of x_k and x_(k+1), triangularised to [L-, 0; D, T],
 
     G = D L-^-1,   mean <- mean + G (mean_s(k+1) - mean-),   P <- T T^T + (G L_s)(G L_s)^T
 
-so that a covariance is a sum of squares, without the subtraction of the usual form.
+so that each covariance is a sum of squares, without the subtraction of the usual form.
 
 Source: S. Sarkka, Unscented Rauch-Tung-Striebel smoother, IEEE TAC 53 (2008); square roots:
 S. Sarkka, L. Svensson, Bayesian filtering and smoothing, 2nd ed. (2023), ch. 12 and 14.
@@ -15,22 +15,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..algebra.space import Point
 from .check import check_functions, check_prior
 from .factor import divide_lower, downdate, outer_square, triangularise
 from .filter import Filtered
-from .gaussian import Gaussian
+from .gaussians import Gaussian
 from .model import Inputs, StateSpaceModel
-from .sigma import AbstractRule, Cubature
-from .space import Point
+from .sigma import AbstractRule
 
 
 class Smoothed(eqx.Module):
-    """Estimates given all T measurements.
+    """Smoothed estimates, given all T measurements.
 
     Attributes:
-        mean: T points: an array (T, n, *s) or a pytree of such.
+        mean: T points: an array (T, n, *s) or a pytree of such arrays.
         factor: roots of the covariances (T, n, n, *s).
-        start: the prior's state, smoothed.
+        start: smoothed estimate at the time of the prior.
     """
 
     mean: Point
@@ -39,7 +39,7 @@ class Smoothed(eqx.Module):
 
     @property
     def covariance(self) -> Float[Array, "T n n *s"]:
-        """P at each time."""
+        """Covariances P at each time."""
         return jax.vmap(outer_square)(self.factor)
 
     @property
@@ -51,15 +51,15 @@ class Smoothed(eqx.Module):
 def smooth(
     model: StateSpaceModel, filtered: Filtered, *, rule: AbstractRule | None = None
 ) -> Smoothed:
-    """Go back through what `kalman_filter` found.
+    """Smooth the estimates of `kalman_filter` in a backward pass.
 
     Args:
-        rule: `Cubature()` by default; use the filter's.
+        rule: rule for the transformation of Gaussians; by default the filter's.
 
     Raises:
-        ModelError, SettingError: a model that is not the record's; as `kalman_filter`.
+        ModelError, SettingError: the model does not fit the record, as in `kalman_filter`.
     """
-    rule = Cubature() if rule is None else rule
+    rule = filtered.method.rule if rule is None else rule
     prior = filtered.prior
     check_prior(model, prior, rule)
     now = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), filtered.u)
@@ -88,7 +88,7 @@ def _back(
     dt: Float[Array, ""],
     rule: AbstractRule,
 ) -> Gaussian:
-    """One step back: the estimate at k from the smoothed one at k + 1."""
+    """Smoothed estimate at k from the filter's at k and the smoothed one at k + 1 (`later`)."""
     space, n = model.space, model.space.size
     moved = rule.transform(lambda x: model(x, u, dt), estimate, space, space)
     both = triangularise(_joint(moved.rows, moved.inputs, model.step_noise(dt, moved.rows.ndim)))
@@ -97,7 +97,7 @@ def _back(
     root, cross, rest = both[:n, :n], both[n:, :n], both[n:, n:]
     apart = space.difference(later.mean, moved.mean)
     right = divide_lower(root, jnp.concatenate([apart[:, None], later.factor], axis=1))
-    # cross^T first: sums run over the leading axis
+    # transpose first, so that sums run over the leading axis
     turned = jnp.swapaxes(cross, 0, 1)
     move = jnp.sum(turned * right[:, :1], axis=0)
     spread = jnp.sum(turned[:, :, None] * right[:, None, 1:], axis=0)
@@ -106,7 +106,7 @@ def _back(
 
 
 def _joint(rows: Array, inputs: Array, noise: Array) -> Array:
-    """Rows of the deviations of (x_(k+1), x_k)."""
+    """Rows whose Gram matrix is the joint covariance of (x_(k+1), x_k)."""
     r, n = rows.shape[:2]
     lanes = rows.shape[2:]
     none = jnp.zeros((r - inputs.shape[0], n, *lanes), rows.dtype)

@@ -1,1 +1,5 @@
-"""Floor 7: carries out studies, here or on a cluster, and keeps their results."""
+"""Studies on many processes, interrupted and resumed. Floor 13."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

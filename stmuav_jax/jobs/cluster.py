@@ -1,8 +1,8 @@
-"""Carries out a study on a cluster of Dask distributed, its own or one that is there.
+"""Execution of a study on a cluster of Dask distributed, its own or an existing one.
 
-The work goes once to each worker; a task is a chunk's number. Results come back to this process,
-which alone writes the store, with two chunks for each worker on the way at a time: that bounds
-memory, and a worker that dies loses only what it was computing, which another computes again.
+The work is sent once to each worker; a task is a chunk's number. Results come back to this process,
+which alone writes the store, with at most two chunks per worker in progress: that bounds memory,
+and of a worker that dies only the chunks in progress are lost, which another one computes again.
 """
 
 import asyncio
@@ -15,22 +15,22 @@ from typing import Any
 
 import jax
 
-from ..mechanics.errors import SettingError, SimulationError
+from ..checks.errors import SettingError, SimulationError
+from ..files.store import Store
 from ..montecarlo.work import AbstractWork
-from ..view.store import Store
 from .compute import MEMORY, Piece, chunk_size
 from .keep import Keeper, New, Report, begin, there
-from .progress import Outcome, Standing
+from .progress import Outcome, StudyProgress
 from .stop import stoppable
 
-# Chunks on the way for each thread of a worker: one computed, one waiting.
+# Chunks in progress for each thread of a worker: one computed, one waiting.
 _AHEAD = 2
 _CACHE = (
     "jax_compilation_cache_dir",
     "jax_persistent_cache_min_compile_time_secs",
     "jax_persistent_cache_min_entry_size_bytes",
 )
-# Times that a chunk is tried again when it fails on a worker.
+# Number of repetitions of a chunk that fails on a worker.
 _RETRIES = 2
 
 
@@ -47,23 +47,25 @@ def run_on_cluster(
     memory: int = MEMORY,
     patience: float = 10.0,
 ) -> Outcome:
-    """`run_study` on the workers of a cluster; the store is the same, file by file.
+    """Compute a study on the workers of a cluster; its store is the same as that of `run_study`.
 
-    A script that has its own cluster started needs `if __name__ == "__main__":`, since new
-    processes import it.
+    A script that starts a cluster of its own needs `if __name__ == "__main__":`, since new
+    processes import it. Workers may join and leave at any time.
 
     Args:
+        work, path, total: as in `run_study`. A work of a user's module needs that module on the
+            workers.
         scheduler: address of a Dask scheduler, such as "tcp://10.0.0.1:8786"; None starts
-            `workers` processes with a thread each on this machine, default one for each core.
-        patience: seconds for the scheduler to answer. Workers may join and leave at any time.
-        work, path, total, chunk, resume, progress, memory: as in `run_study`. A work of a module
-            of yours needs that module on the workers.
+            `workers` processes with a thread each on this machine.
+        workers: number of processes to start, default one for each core.
+        chunk, resume, progress, memory: as in `run_study`.
+        patience: time for the scheduler to answer [s].
 
     Raises:
         FileError, SettingError: as in `run_study`; also no `distributed` here, no scheduler at the
             address, or a worker with other versions than the store's.
-        SimulationError: the scheduler was lost, a chunk's workers died again and again, or a
-            single sample does not fit in memory. What was written is kept.
+        SimulationError: the connection to the scheduler was lost, workers of the same chunk died
+            repeatedly, or a single sample does not fit in memory. Written chunks are kept.
     """
     there(path, resume=resume)
     interrupted = False
@@ -76,7 +78,7 @@ def run_on_cluster(
         def new() -> New:
             if not client.nthreads() and progress is not None:
                 note = f"Waiting for a worker of {client.scheduler.address}."
-                progress(Standing(0, total, 0.0, float("inf"), note))
+                progress(StudyProgress(0, total, 0.0, float("inf"), note))
             seconds, versions = _surveyed(client, name, total if chunk is None else None)
             return New(
                 chunk_size(work, total, seconds, memory) if chunk is None else chunk, versions
@@ -125,13 +127,13 @@ def _client(scheduler: str | None, workers: int | None, patience: float) -> Iter
 
 
 def _reached(scheduler: str, patience: float) -> Any:
-    """A client of a scheduler that is there."""
+    """Client of an existing scheduler."""
     distributed = _distributed()
     try:
         kind = _kind_at(scheduler, patience)
         if kind == "Scheduler":
             return distributed.Client(scheduler, timeout=patience, set_as_default=False)
-    # whatever answers there may answer anything
+    # an arbitrary service at the address may give any answer
     except Exception as error:
         why = f"{type(error).__name__} {error}".strip()
         raise SettingError(
@@ -141,7 +143,7 @@ def _reached(scheduler: str, patience: float) -> Any:
 
 
 def _kind_at(address: str, patience: float) -> str:
-    """What answers at an address; a Client would wait for ever for one that says nothing."""
+    """Kind of service at an address; a Client would wait for ever if it did not answer."""
     distributed = _distributed()
 
     async def identify() -> str:
@@ -149,7 +151,7 @@ def _kind_at(address: str, patience: float) -> str:
         async with distributed.rpc(address, connection_args=security) as remote:
             return str((await remote.identity())["type"])
 
-    # in a thread of its own, since that of a notebook has a loop already
+    # in a separate thread, since that of a notebook has an event loop already
     with ThreadPoolExecutor(1) as aside:
         return aside.submit(asyncio.run, asyncio.wait_for(identify(), patience)).result()
 
@@ -165,11 +167,11 @@ def _local_cluster(workers: int | None) -> Any:
         ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"), "1"
     )
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=1"
-    # what one worker compiles others find, where this process keeps compiled code
+    # workers share the compilation cache of this process
     kept = {name.upper(): str(value) for name in _CACHE if (value := getattr(jax.config, name))}
     return distributed.LocalCluster(
         n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1",
-        # a study's memory is bounded by its chunks; limits would have workers killed for JAX's own
+        # memory is bounded by the chunks; with a limit, JAX's own memory would get workers killed
         memory_limit=None, dashboard_address="127.0.0.1:0", silence_logs="ERROR",
         env=one | kept | {"XLA_FLAGS": flags.strip()},
     )  # fmt: skip
@@ -177,7 +179,7 @@ def _local_cluster(workers: int | None) -> Any:
 
 @contextlib.contextmanager
 def _shipped(client: Any, work: AbstractWork, *, ours: bool) -> Iterator[str]:
-    """The work on all workers, those that join later among them; the name it has there."""
+    """Send the work to all workers, later ones included; the context is its name there."""
     from .shipped import Shipped
 
     name = f"stmuav-{uuid.uuid4().hex}"
@@ -192,7 +194,7 @@ def _shipped(client: Any, work: AbstractWork, *, ours: bool) -> Iterator[str]:
     try:
         yield name
     finally:
-        # a scheduler that is gone has nothing left to forget
+        # a scheduler that has ended has nothing to unregister
         with contextlib.suppress(Exception):
             client.unregister_worker_plugin(name)
 
@@ -207,7 +209,7 @@ def _surveyed(client: Any, name: str, total: int | None) -> tuple[float, dict[st
 
 
 def _carry_out(client: Any, name: str, store: Store, keeper: Keeper) -> None:
-    """Compute the chunks that are missing, a bounded number at a time."""
+    """Compute the missing chunks, a bounded number at a time."""
     from distributed import as_completed
 
     from .shipped import computed
@@ -232,14 +234,14 @@ def _carry_out(client: Any, name: str, store: Store, keeper: Keeper) -> None:
         for future in running:
             piece: Piece = future.result()
             keeper.keep(chunks.pop(future.key), piece)
-            # its numbers on the worker are let go with it
+            # the worker releases its results with the future
             del future, piece
             feed()
 
 
 @contextlib.contextmanager
 def _explained(client: Any) -> Iterator[None]:
-    """Say in our own words what may befall a cluster."""
+    """Translate errors of the cluster into errors of this package."""
     from distributed import CancelledError, KilledWorker
     from distributed.comm.core import CommClosedError
 

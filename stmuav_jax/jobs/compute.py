@@ -1,4 +1,4 @@
-"""Computes the samples of a work, in pieces where memory asks for it, and sizes chunks."""
+"""Computation of a work's samples, in pieces where memory requires it, and sizes of chunks."""
 
 import math
 import time
@@ -6,30 +6,30 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.errors import SettingError, SimulationError
+from ..checks.errors import SettingError, SimulationError
+from ..files.layout import layout_of
 from ..montecarlo.work import AbstractWork
-from ..view.layout import layout_of
 
-# Bytes of a chunk's results, of which a run holds about three: computed, written, put together.
+# Bytes of a chunk's results, of which a run holds about three: computed, written, joined.
 MEMORY = 2**26
-# Seconds of work in a chunk: what a broken run loses, and enough to hide what storing costs.
+# Seconds of work in a chunk: the loss of an interrupted run, and long enough to hide storing.
 SECONDS = 4.0
-# A study may begin small and be extended: chunks no smaller than this save files later.
+# A chunk may be larger than the study's total up to this number, since the study may be extended.
 _LEAST = 1024
 
 
 class Piece(NamedTuple):
-    """Computed samples, and what there is to say about how."""
+    """Computed samples and a note on their computation, such as that memory was short."""
 
     arrays: dict[str, np.ndarray]
     note: str = ""
 
 
 class Pieces:
-    """Computes samples of a work; those that do not fit in memory together, in halves.
+    """Function that computes samples of a work, in halves where they do not fit in memory together.
 
     Attributes:
-        limit: samples that are known to be too many to be halved again; None before any were.
+        limit: largest number of samples to compute together after a lack of memory; None before.
     """
 
     def __init__(self, work: AbstractWork) -> None:
@@ -38,7 +38,7 @@ class Pieces:
         self._ready: dict[int, dict[str, np.ndarray]] = {}
 
     def __call__(self, first: int, count: int) -> Piece:
-        """Columns (count, ...) of the samples first, first + 1, ...
+        """Compute columns (count, ...) of the samples first, first + 1, ...
 
         Raises:
             SimulationError: not even a single sample fits in memory.
@@ -67,10 +67,10 @@ class Pieces:
         return Piece({n: np.concatenate([part[n] for part in parts]) for n in parts[0]}, note)
 
     def seconds(self, total: int) -> float:
-        """Seconds for a sample, from two small runs whose results are kept for the first chunks.
+        """Seconds per sample, from two small runs whose results are kept for the first chunks.
 
-        The first of them has code compiled; the second is timed. 0 where there are too few samples
-        for two runs, and no need to know.
+        The first run compiles code; the second is timed. The result is 0 where there are too few
+        samples for two runs, and no need to know.
         """
         unit = max(1, self.work.unit)
         if total < 2 * unit:
@@ -82,7 +82,7 @@ class Pieces:
 
 
 def _attempted(work: AbstractWork, first: int, count: int) -> dict[str, np.ndarray] | None:
-    """The samples, or None if they do not fit in memory; what was begun is let go by then."""
+    """Compute samples, or return None if they do not fit in memory, which is free again then."""
     try:
         return work.run(first, count)
     except (MemoryError, RuntimeError) as error:
@@ -92,7 +92,7 @@ def _attempted(work: AbstractWork, first: int, count: int) -> dict[str, np.ndarr
 
 
 def _halved(count: int, unit: int, first: int) -> int:
-    """About half, a multiple of the unit where there is room for one."""
+    """Number of samples after halving, a multiple of the unit where there is room for one."""
     if count == 1:
         raise SimulationError(f"Sample {first} does not fit in memory, though alone.")
     half = -(-count // 2)
@@ -102,12 +102,16 @@ def _halved(count: int, unit: int, first: int) -> int:
 def chunk_size(
     work: AbstractWork, total: int, seconds: float, memory: int = MEMORY, target: float = SECONDS
 ) -> int:
-    """Samples for a chunk: `target` seconds of work, as far as their results fit in `memory`.
+    """Number of samples in a chunk: `target` seconds of work, as far as results fit in `memory`.
 
-    A multiple of the work's unit, and a power of two of them.
+    The number is the work's unit times a power of two.
 
     Args:
-        seconds: for a sample. memory: bytes of a chunk's results.
+        work: work of the study.
+        total: number of samples of the study.
+        seconds: time per sample [s].
+        memory: largest size of a chunk's results in bytes.
+        target: wanted time per chunk [s].
 
     Raises:
         SettingError: memory for less than one sample.
@@ -119,5 +123,5 @@ def chunk_size(
     wanted = min(target / max(seconds, 1e-12), max(total, _LEAST), room)
     if wanted <= unit:
         return min(unit, room)
-    # no larger than what is wanted: a power of two of units, so that the size is coarse
+    # rounded down to a power of two of units, so that the size hardly depends on the timing
     return unit * 2 ** math.floor(math.log2(wanted / unit))

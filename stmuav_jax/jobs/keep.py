@@ -1,36 +1,35 @@
-"""Keeps what is computed: one chunk is written while the next is computed, and progress is told."""
+"""Storing of results: one chunk is written while the next is computed, and progress is reported."""
 
 import os
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple
 
-from ..mechanics.errors import SettingError
+from ..checks.errors import SettingError
+from ..files.layout import read_layout
+from ..files.netcdf import FileError
+from ..files.store import Store, create, resume_store
 from ..montecarlo.work import AbstractWork
-from ..view.io import FileError
-from ..view.layout import read_layout
-from ..view.store import Store, create, resume_store
 from .compute import Piece
-from .progress import Meter, Outcome, Standing
+from .progress import Meter, Outcome, StudyProgress
 
-Report = Callable[[Standing], object]
+Report = Callable[[StudyProgress], object]
 
 
 class New(NamedTuple):
-    """What a new store needs: samples in a chunk, and the versions of what computes."""
+    """Settings of a new store: samples in a chunk, and the versions that compute them."""
 
     chunk: int
     versions: Mapping[str, str]
 
 
 def there(path: str | os.PathLike[str], *, resume: bool) -> bool:
-    """Whether there is a store, or something else.
+    """Test whether there is a store, or anything else, at a path.
 
     Raises:
-        FileError: there is, and `resume` is not set.
+        FileError: there is something, and `resume` is not set.
     """
     target = Path(path)
     found = target.exists() and not (target.is_dir() and not any(target.iterdir()))
@@ -49,11 +48,12 @@ def begin(
     new: Callable[[], New],
     elsewhere: bool = False,
 ) -> Store:
-    """The store to write: a new one, or with `resume` the one that is there, extended if need be.
+    """Open the store to write: a new one, or with `resume` an existing one, extended if need be.
 
     Args:
-        chunk: asked for. new: called if there is no store yet.
-        elsewhere: another process computes, so that this one's versions do not matter.
+        chunk: wanted number of samples in a chunk, or None.
+        new: function that gives the settings of a new store, called if there is none yet.
+        elsewhere: true if another process computes, so that this one's versions do not matter.
 
     Raises:
         FileError: there is a store and `resume` is not set; or see `resume_store`.
@@ -77,7 +77,7 @@ def begin(
 
 
 class Keeper:
-    """Writes chunks in a thread of its own, one at a time, and reports as they are stored."""
+    """Writer of chunks, one at a time in a thread of its own, with progress after each."""
 
     def __init__(self, store: Store, report: Report | None) -> None:
         self.store = store
@@ -92,17 +92,12 @@ class Keeper:
         self.tell()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        # a chunk that is being written is written whole
+    def __exit__(self, *_: object) -> None:
+        # wait until the present chunk is written
         self._thread.shutdown(wait=True)
 
     def tell(self, note: str = "") -> None:
-        """Report where the study stands, with something to say."""
+        """Call the progress function, with a note if there is one."""
         if note:
             self._notes.append(note)
         standing = self._meter(self.store.finished, note)
@@ -110,10 +105,10 @@ class Keeper:
             self._report(standing)
 
     def keep(self, chunk: int, piece: Piece) -> None:
-        """Have a chunk written, once the one before is.
+        """Write a chunk in the background, after the previous one is written.
 
         Raises:
-            FileError: the chunk before could not be written.
+            FileError: the previous chunk could not be written.
         """
         self.settle()
         self._writing = self._thread.submit(self.store.write, chunk, piece.arrays)
@@ -121,18 +116,18 @@ class Keeper:
             self.tell(piece.note)
 
     def settle(self) -> None:
-        """Wait until what was given is written; raise what that raised."""
+        """Wait until the given chunk is written, and raise the error of its writing, if any."""
         if self._writing is None:
             return
-        # what is interrupted here is still being written, and can be waited for again
+        # after an interruption here the chunk is still being written, and can be awaited again
         wait([self._writing])
         writing, self._writing = self._writing, None
         writing.result()
         self.tell()
 
     def outcome(self, *, interrupted: bool) -> Outcome:
-        """What the run came to; nothing can be kept after it."""
-        # Ctrl-C may have come before a chunk that was handed over could be noted as such
+        """Outcome of the run; nothing can be stored after it."""
+        # Ctrl-C may have come before a submitted chunk was noted
         self._thread.shutdown(wait=True)
         done = self.store.finished
         return Outcome(

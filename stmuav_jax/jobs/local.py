@@ -1,9 +1,9 @@
-"""Carries out a study in this process."""
+"""Execution of a study in this process."""
 
 import os
 
+from ..files.layout import computing_versions
 from ..montecarlo.work import AbstractWork
-from ..view.layout import computing_versions
 from .compute import MEMORY, Pieces, chunk_size
 from .keep import Keeper, New, Report, begin
 from .progress import Outcome
@@ -20,27 +20,31 @@ def run_study(
     progress: Report | None = None,
     memory: int = MEMORY,
 ) -> Outcome:
-    """Compute the samples of a study that its store does not have yet, chunk by chunk.
+    """Compute the missing samples of a study, chunk by chunk.
 
-    Each chunk is written while the next is computed, and is there whole or not at all: a run that
-    is killed loses at most the two chunks at hand, and one that goes on with it ends with the same
+    Each chunk is written while the next is computed, and is stored whole or not at all: a run that
+    is killed loses at most the two chunks in progress, and a run that resumes it ends with the same
     files. Ctrl-C, or SIGTERM, ends the run after the chunk that is being written; a second one does
-    not wait for progress to be told.
+    not wait for the progress function.
 
     Args:
-        path: folder of the store. total: samples; more than the store has extend it.
-        chunk: samples computed and written together, settled when a store is made; default some
-            seconds' worth, measured, whose results fit in `memory` [bytes].
-        resume: go on with the store if there is one.
-        progress: called with a `Standing` at the start, after each chunk and with each note.
+        work: work of the study.
+        path: folder of the store.
+        total: number of samples; more than the store has extend it.
+        chunk: number of samples computed and written together, fixed when a store is created;
+            default some seconds' worth, measured, whose results fit in `memory`.
+        resume: continue the store if there is one.
+        progress: function called with a `Standing` at the start, after each chunk and with each
+            note.
+        memory: largest size of a chunk's results in bytes.
 
     Returns:
-        what came of it; `interrupted` if Ctrl-C has ended it.
+        outcome of the run; `interrupted` if Ctrl-C has ended it.
 
     Raises:
         FileError: the store exists and `resume` is not set, or it is damaged, of another study or
-            of other versions; or the disk is full (what was written is kept).
-        SettingError: settings that cannot be; columns that are not what the work says.
+            of other versions; or the disk is full (written chunks are kept).
+        SettingError: impossible settings, or columns other than those that the work declares.
         SimulationError: not even a single sample fits in memory.
     """
     pieces = Pieces(work)

@@ -1,4 +1,4 @@
-"""How far a study has come: while it runs, and at the end."""
+"""Progress of a study while it runs, and its outcome."""
 
 import math
 import time
@@ -6,19 +6,20 @@ from collections import deque
 from pathlib import Path
 from typing import NamedTuple
 
-# Chunks over which a rate is taken.
+# Number of chunks over which a rate is taken.
 _RECENT = 16
 
 
-class Standing(NamedTuple):
-    """Where a running study stands.
+class StudyProgress(NamedTuple):
+    """Progress of a running study.
 
     Attributes:
-        done: samples stored. total: samples of the study.
-        rate: samples stored in a second lately, without the first chunk, on the way to which code is
-            compiled; 0 before there are two.
-        remaining: seconds to go at this rate; inf while it is 0.
-        note: what there is to say, such as that memory was short; empty if nothing.
+        done: number of stored samples.
+        total: number of samples of the study.
+        rate: recent rate of storing [samples/s], without the first chunk, whose time includes
+            compilation; 0 before there are two chunks.
+        remaining: remaining time at this rate [s], infinite while the rate is 0.
+        note: message, such as that memory was short; empty if there is none.
     """
 
     done: int
@@ -28,7 +29,7 @@ class Standing(NamedTuple):
     note: str = ""
 
     def words(self) -> str:
-        """In one line."""
+        """Text of the progress in one line."""
         at = f"{self.done} of {self.total} samples"
         if not self.rate:
             return at
@@ -37,12 +38,15 @@ class Standing(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a run of a study came to.
+    """Outcome of a study's run.
 
     Attributes:
-        path: of the store. done, total: samples stored, of all.
-        computed: samples that this run computed. seconds: that it took.
-        interrupted: whether it was stopped. notes: what there was to say on the way.
+        path: folder of the store.
+        done, total: numbers of stored samples and of all samples.
+        computed: number of samples that this run computed.
+        seconds: duration of the run [s].
+        interrupted: true if the run was stopped.
+        notes: messages of the run.
     """
 
     path: Path
@@ -54,7 +58,7 @@ class Outcome(NamedTuple):
     notes: tuple[str, ...] = ()
 
     def words(self) -> str:
-        """In one sentence."""
+        """Text of the outcome in one sentence."""
         took = f"{self.computed} of them computed now, in {duration(self.seconds)}"
         if self.interrupted:
             return (
@@ -65,30 +69,30 @@ class Outcome(NamedTuple):
 
 
 class Meter:
-    """Takes the rate as samples are stored."""
+    """Measurement of the rate at which samples are stored."""
 
     def __init__(self, done: int, total: int) -> None:
         self.total = total
         self._seen = deque([(time.monotonic(), done)], _RECENT)
         self._first = True
 
-    def __call__(self, done: int, note: str = "") -> Standing:
-        """The standing when `done` samples are stored."""
+    def __call__(self, done: int, note: str = "") -> StudyProgress:
+        """Progress when `done` samples are stored."""
         now = time.monotonic()
         if done > self._seen[-1][1]:
             self._seen.append((now, done))
             if self._first:
-                # code is compiled on the way to the first chunk, and not on the way to others
+                # the time of the first chunk includes compilation, that of others does not
                 self._seen.popleft()
                 self._first = False
         begin, before = self._seen[0]
         rate = (self._seen[-1][1] - before) / max(self._seen[-1][0] - begin, 1e-9)
         remaining = (self.total - done) / rate if rate else math.inf
-        return Standing(done, self.total, rate, remaining, note)
+        return StudyProgress(done, self.total, rate, remaining, note)
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words, such as "3.2 s", "4 min 10 s" or "2 h 5 min"."""
+    """Text of a duration [s], such as "3.2 s", "4 min 10 s" or "2 h 5 min"."""
     if not math.isfinite(seconds):
         return "unknown time"
     if seconds < 60:

@@ -1,4 +1,4 @@
-"""What the workers of a cluster hold of a study. Imported only where `distributed` is installed."""
+"""Work of a study on the workers of a cluster; imported only where `distributed` is installed."""
 
 import functools
 import hashlib
@@ -11,18 +11,18 @@ import jax
 from distributed import Worker, get_worker
 from distributed.diagnostics.plugin import WorkerPlugin
 
-from ..mechanics.errors import SettingError
+from ..checks.errors import SettingError
+from ..files.layout import computing_versions
 from ..montecarlo.work import AbstractWork
-from ..view.layout import computing_versions
 from .compute import Piece, Pieces
 
-# The last work of this process: a study that is extended compiles nothing again.
+# The last work of this process, so that an extended study is not compiled again.
 _made: dict[str, "_Made"] = {}
 _making = threading.Lock()
 
 
 class _Made:
-    """A work in a worker's process."""
+    """Work unpickled in a worker's process, with the lock of its compilation."""
 
     def __init__(self, work: AbstractWork) -> None:
         self.pieces = Pieces(work)
@@ -32,7 +32,7 @@ class _Made:
     def __call__(self, first: int, count: int) -> Piece:
         if self.compiled:
             return self.pieces(first, count)
-        # threads of one process wait for the first, and do not compile the same once more
+        # threads of one process wait for the first, so that the program is compiled once
         with self.lock:
             piece = self.pieces(first, count)
             self.compiled = True
@@ -40,10 +40,11 @@ class _Made:
 
 
 class Shipped(WorkerPlugin):
-    """A study's work, sent once to each worker there is, and to each that joins later.
+    """Work of a study as a plugin, sent once to each present worker and to each later one.
 
     Attributes:
-        x64: whether JAX computes in double precision. ours: whether we have started the workers.
+        x64: true if JAX computes in double precision.
+        ours: true if this package has started the workers.
     """
 
     def __init__(self, work: AbstractWork, *, x64: bool, ours: bool) -> None:
@@ -52,13 +53,13 @@ class Shipped(WorkerPlugin):
         self.x64, self.ours = x64, ours
 
     def setup(self, worker: Worker) -> None:
-        """On a worker, as it is told of the study."""
+        """Prepare a worker when it receives the plugin."""
         if self.ours and threading.current_thread() is threading.main_thread():
             # Ctrl-C reaches all processes of a terminal; the one that owns the workers ends them
             signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def made(self) -> _Made:
-        """The work in this process, made when it is first asked for."""
+        """Work in this process, unpickled when it is first needed."""
         with _making:
             if self.key not in _made:
                 _made.clear()
@@ -74,9 +75,9 @@ def _held(name: str) -> Shipped:
 
 
 def surveyed(name: str, total: int | None) -> tuple[float, dict[str, str]]:
-    """On a worker: seconds for a sample, measured if `total` is given, and versions."""
+    """Measure the seconds per sample on a worker if `total` is given; also return its versions."""
     held = _held(name)
-    # precision is the client's, for this thread alone: what else the worker does is its own
+    # the client's precision holds for this thread only, and leaves other tasks of the worker alone
     with jax.enable_x64(held.x64):
         made = held.made()
         if total is None:
@@ -86,10 +87,10 @@ def surveyed(name: str, total: int | None) -> tuple[float, dict[str, str]]:
 
 
 def computed(name: str, first: int, count: int, versions: Mapping[str, str]) -> Piece:
-    """On a worker: samples first, first + 1, ...
+    """Compute the samples first, first + 1, ... on a worker.
 
     Raises:
-        SettingError: this worker's versions are not the store's.
+        SettingError: the versions of this worker differ from the store's.
     """
     mine = _versions()
     if mine != versions:

@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM that cannot get lost: a flag, and the exception until somebody hears it.
+"""Reliable handling of Ctrl-C and SIGTERM: a flag, and an exception repeated until acknowledged.
 
-Python raises KeyboardInterrupt wherever the main thread happens to be. Where that is a callback of
-a library, such as JAX's when memory is collected, the exception is printed and forgotten, and the
-program runs on. Here the signal is raised again until it has been heard.
+Python raises KeyboardInterrupt wherever the main thread happens to be. If that is a callback of a
+library, such as JAX's during garbage collection, the exception is printed and lost, and the program
+continues. Here the signal is raised again until it has been acknowledged.
 """
 
 import contextlib
@@ -12,15 +12,15 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
-# Seconds after which a signal that nobody has heard is raised again.
+# Seconds after which an unacknowledged signal is raised again.
 AGAIN = 0.5
 
 
 class Stop:
-    """Whether the run was asked to stop, and whether it knows.
+    """Request to stop a run, and its acknowledgement.
 
     Attributes:
-        asked: a signal has come.
+        asked: true once a signal has come.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class Stop:
         self._over = threading.Event()
 
     def heard(self) -> None:
-        """The run knows: the signal is not raised again."""
+        """Acknowledge the signal, so that it is not raised again."""
         self._heard.set()
 
     def _come(self, number: int, frame: FrameType | None) -> None:
@@ -50,10 +50,10 @@ _now: list[Stop] = []
 
 @contextlib.contextmanager
 def stoppable() -> Iterator[Stop]:
-    """Within it Ctrl-C and SIGTERM raise KeyboardInterrupt, again and again until `Stop.heard`.
+    """Context in which Ctrl-C and SIGTERM raise KeyboardInterrupt repeatedly until `Stop.heard`.
 
-    Inside another one it is that one; in threads other than the main one it does nothing. A
-    signal that was never heard raises KeyboardInterrupt at the end.
+    A nested context is the outer one; in threads other than the main one it has no effect. A
+    signal that was never acknowledged raises KeyboardInterrupt at the end.
     """
     if _now or threading.current_thread() is not threading.main_thread():
         yield _now[0] if _now else Stop()

@@ -1,18 +1,18 @@
 """Progress of a study on a terminal."""
 
-from types import TracebackType
-
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from .progress import Standing
+from .progress import StudyProgress
 
 
 class Watch:
-    """A bar on stderr with rate and remaining time, as `progress` of a run; notes stay above it.
+    """Progress bar on stderr with rate and remaining time, for `progress` of a run.
 
-    with Watch() as watch:
-        run_study(work, path, total, progress=watch)
+    Notes are printed above the bar. Example:
+
+        with Watch() as watch:
+            run_study(work, path, total, progress=watch)
     """
 
     def __init__(self, words: str = "samples") -> None:
@@ -27,15 +27,10 @@ class Watch:
         self.bar.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.bar.stop()
 
-    def __call__(self, now: Standing) -> None:
+    def __call__(self, now: StudyProgress) -> None:
         if now.note:
             self.bar.console.print(now.note, highlight=False, markup=False, emoji=False)
         self.bar.update(self.task, total=now.total, completed=now.done, standing=now.words())

@@ -1,9 +1,9 @@
-"""Forces with states of their own: motors that lag, for example.
+"""Forces with states of their own, the actuator states, such as motors that lag.
 
-Such a force holds its states z as a leaf: where a run starts as it is made, the states of
-the moment as an integrator sets them (`with_internal`). They are integrated beside those of
-the bodies and steer the step size alike; the constraints do not see them. A system without
-such forces has none and pays nothing.
+Such a force holds its actuator states z as a leaf: the initial values when it is made, and the
+present values that an integrator sets during a run (`with_internal`). The states are integrated
+beside those of the bodies and count in the error that controls the step size; the constraints do
+not depend on them. A system without such forces has none, at no cost.
 """
 
 from abc import abstractmethod
@@ -18,25 +18,25 @@ from .system import System
 
 
 class AbstractInternalForce(AbstractForce):
-    """A force with states z; its load may depend on them through `internal`.
+    """Force element with actuator states z; its load may depend on them through `internal`.
 
     Attributes:
-        internal: z (m,).
+        internal: actuator states z (m,).
     """
 
     internal: eqx.AbstractVar[Float[Array, " m"]]
 
     @abstractmethod
     def internal_rate(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " m"]:
-        """dz/dt at time t [s]."""
+        """Rate dz/dt of the actuator states at time t [s]."""
 
     @abstractmethod
     def internal_names(self) -> tuple[str, ...]:
-        """What each state is, with its unit in brackets."""
+        """Name of each actuator state, with its unit in brackets."""
 
 
 def _owners(system: System) -> list[tuple[int, AbstractInternalForce]]:
-    """The forces that have states, and their numbers."""
+    """Force elements that have actuator states, with their indices."""
     return [
         (k, force)
         for k, force in enumerate(system.forces)
@@ -45,22 +45,22 @@ def _owners(system: System) -> list[tuple[int, AbstractInternalForce]]:
 
 
 def internal_count(system: System) -> int:
-    """How many states the forces of a system have in all."""
+    """Number of actuator states of all forces of a system."""
     return sum(force.internal.shape[-1] for _, force in _owners(system))
 
 
 def internal_names(system: System) -> tuple[str, ...]:
-    """What they are."""
+    """Names of the actuator states of a system, with units in brackets."""
     return tuple(name for _, force in _owners(system) for name in force.internal_names())
 
 
 def internal_states(system: System) -> Float[Array, " m"]:
-    """All of them, as the forces hold them."""
+    """Actuator states (m,) of a system, as its forces hold them."""
     return _joined([force.internal for _, force in _owners(system)])
 
 
 def with_internal(system: System, z: Float[Array, " m"]) -> System:
-    """The system with the states of its forces set to z (m,)."""
+    """System whose forces have the actuator states z (m,)."""
     forces, start = list(system.forces), 0
     for k, force in _owners(system):
         count = force.internal.shape[-1]
@@ -70,7 +70,7 @@ def with_internal(system: System, z: Float[Array, " m"]) -> System:
 
 
 def internal_rates(system: System, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " m"]:
-    """Their rates, in the same order."""
+    """Rates dz/dt of the actuator states of a system (m,), in their order."""
     return _joined([force.internal_rate(t, kin) for _, force in _owners(system)])
 
 

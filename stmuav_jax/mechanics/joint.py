@@ -1,10 +1,10 @@
-"""The joint catalogue: one entry per joint, made of primitives.
+"""The joint catalogue: one entry per kind of joint, made of constraint primitives.
 
-A joint carries a frame on each of its two bodies. The frames coincide when the joint is at
-its zero; z is the axis of motion where there is one. An entry of `CATALOGUE` lists the
-primitives between the frames' axes, the same joint in the report's own rows (cross products
-with two of three rows kept), and the relative motion that the joint leaves. A new joint is
-one entry, one function and one row of tests.
+A joint has a frame on each of its two bodies. The frames coincide at the joint's zero; z is the
+axis of motion, if there is one. An entry of `CATALOGUE` lists the primitives between the frames'
+axes, the primitives of the report's own rows (cross products with two of three rows kept), and
+the relative motions that the joint leaves free. A new joint is one entry, one function and one row
+of tests; a new relative motion is one class, see `stmuav_jax.mechanics.motions.base`.
 
 Source: report Part I, section 3.4 (Eq. 3.11 to 3.14).
 """
@@ -19,10 +19,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import cross, rotation_matrix
-from ..algebra.shapes import Numbers
+from ..checks.errors import ModelError, check_finite, check_shape, concrete
+from ..checks.shapes import Numbers
 from .body import Body
 from .constraint import ROWS, Data
-from .errors import ModelError, check_finite, check_shape, concrete
+from .motions.axial import PRISMATIC, REVOLUTE, SCREW
+from .motions.base import AbstractRelativeMotion, MotionColumn
+from .motions.spherical import SPHERICAL
 
 Motion = Callable[[Float[Array, ""]], Float[Array, ""]]
 
@@ -30,7 +33,7 @@ X, Y, Z = 0, 1, 2
 
 
 class Term(NamedTuple):
-    """One primitive of a joint: columns of frame i, of frame j, and the side column."""
+    """One primitive of a joint: the columns of frame i and frame j that are its axes and side."""
 
     kind: str
     axis_i: int = Z
@@ -42,64 +45,94 @@ _PARALLEL = (Term("n1", X, Z), Term("n1", Y, Z))
 _ON_AXIS = (Term("n2", X), Term("n2", Y))
 
 
-class Coordinate(NamedTuple):
-    """One step of the relative motion that a joint leaves free, about or along a frame axis.
-
-    kind: "turn" or "slide" (one number), "ball" (Euler parameters), "shift" (three lengths).
-    """
-
-    kind: str
-    axis: int = Z
-
-
-class Entry(NamedTuple):
-    """What a joint constrains, and what motion it leaves.
+class Freedom(NamedTuple):
+    """One relative motion that a joint leaves free.
 
     Attributes:
-        terms: its primitives.
-        motion: the steps that lead from frame i to frame j, in turn; None for a joint that
-            has no such coordinates and can only close a loop.
-        report: the primitives in the report's own rows, where they are others.
+        motion: kind of relative motion. axis: axis of the joint's frame that is its z axis.
+        place: words that distinguish its coordinates from those of the joint's other motions.
+    """
+
+    motion: AbstractRelativeMotion
+    axis: int = Z
+    place: str = ""
+
+
+class JointKind(NamedTuple):
+    """Constraints of a kind of joint, and the relative motion that it leaves free.
+
+    Attributes:
+        terms: primitives of the joint.
+        motion: relative motions that lead from frame i to frame j, in sequence; None for a
+            joint without such coordinates, which can only close a loop.
+        report: primitives of the report's own rows, if they differ.
     """
 
     terms: tuple[Term, ...]
-    motion: tuple[Coordinate, ...] | None = None
+    motion: tuple[Freedom, ...] | None = None
     report: tuple[Term, ...] | None = None
+
+    @property
+    def columns(self) -> tuple[MotionColumn, ...]:
+        """Columns of the motion subspaces about or along the joint's z axis."""
+        own = (f for f in self.motion or () if f.axis == Z and len(f.motion.columns) == 1)
+        return tuple(column for freedom in own for column in freedom.motion.columns)
+
+    @property
+    def pitched(self) -> bool:
+        """True if the `length` of such a joint is a pitch [m/rad]."""
+        return any(column.linear is None for column in self.columns)
 
 
 _POINT = Term("point")
-_TURN, _SLIDE, _BALL = Coordinate("turn"), Coordinate("slide"), Coordinate("ball")
+_REVOLUTE, _PRISMATIC = Freedom(REVOLUTE), Freedom(PRISMATIC)
 
-CATALOGUE: dict[str, Entry] = {
-    "weld": Entry((_POINT, Term("n1", X, Y), Term("n1", Y, Z), Term("n1", Z, X)), ()),
-    "spherical": Entry((_POINT,), (_BALL,)),
-    "universal": Entry((_POINT, Term("n1", X, Y)), (Coordinate("turn", X), Coordinate("turn", Y))),
-    "revolute": Entry((_POINT, *_PARALLEL), (_TURN,), (_POINT, Term("p1"))),
-    "translational": Entry(
+CATALOGUE: dict[str, JointKind] = {
+    "weld": JointKind((_POINT, Term("n1", X, Y), Term("n1", Y, Z), Term("n1", Z, X)), ()),
+    "spherical": JointKind((_POINT,), (Freedom(SPHERICAL),)),
+    "universal": JointKind(
+        (_POINT, Term("n1", X, Y)),
+        (Freedom(REVOLUTE, X, " about axis_i"), Freedom(REVOLUTE, Y, " about axis_j")),
+    ),
+    "revolute": JointKind((_POINT, *_PARALLEL), (_REVOLUTE,), (_POINT, Term("p1"))),
+    "translational": JointKind(
         (*_PARALLEL, *_ON_AXIS, Term("n1", X, Y)),
-        (_SLIDE,),
+        (_PRISMATIC,),
         (Term("p1"), Term("p2"), Term("n1", X, Y)),
     ),
-    "cylindrical": Entry((*_PARALLEL, *_ON_AXIS), (_SLIDE, _TURN), (Term("p1"), Term("p2"))),
-    "distance": Entry((Term("distance"),)),
-    "revolute_spherical": Entry((Term("n2", Z), Term("distance"))),
-    "drive_angle": Entry((Term("angle", X, X, Y),)),
-    "drive_shift": Entry((Term("shift", Z),)),
+    "cylindrical": JointKind(
+        (*_PARALLEL, *_ON_AXIS), (_PRISMATIC, _REVOLUTE), (Term("p1"), Term("p2"))
+    ),
+    "screw": JointKind(
+        (*_PARALLEL, *_ON_AXIS, Term("screw", Z, X, X)),
+        (Freedom(SCREW),),
+        (Term("p1"), Term("p2"), Term("screw", Z, X, X)),
+    ),
+    "distance": JointKind((Term("distance"),)),
+    "revolute_spherical": JointKind((Term("n2", Z), Term("distance"))),
+    "drive_angle": JointKind((Term("angle", X, X, Y),)),
+    "drive_shift": JointKind((Term("shift", Z),)),
 }
 
-# The joints that leave an angle about their z axis, or a shift along it, free.
+# Name of a coordinate that a joint may leave free.
+Which = Literal["angle", "shift"]
+
+# Kinds of joints that leave free the angle about their z axis, or the displacement along it.
 LEAVES_FREE: dict[str, tuple[str, ...]] = {
-    which: tuple(kind for kind, entry in CATALOGUE.items() if step in (entry.motion or ()))
-    for which, step in (("angle", _TURN), ("shift", _SLIDE))
+    "angle": tuple(k for k, entry in CATALOGUE.items() if any(c.angular for c in entry.columns)),
+    "shift": tuple(
+        k for k, entry in CATALOGUE.items() if any(c.linear != 0 for c in entry.columns)
+    ),
 }
 
 
 class Joint(eqx.Module):
-    """A joint between two named bodies, either of which may be "ground".
+    """Joint between two named bodies, either of which may be "ground".
 
-    Made by the functions below. Once part of a `System`, points and frames are in the
-    bodies' reference frames: `point_i`, `point_j` (3,) [m], `frame_i`, `frame_j` (3, 3)
-    with the joint's x, y, z axes as columns; before, they are as given.
+    The functions below make joints. In a `System` points and frames are in the bodies' reference
+    frames: `point_i`, `point_j` (3,) [m], `frame_i`, `frame_j` (3, 3) with the joint's x, y, z
+    axes as columns; before that they are in the world at the reference posture. `length` is that
+    of a rod [m], or the pitch of a screw [m/rad].
     """
 
     name: str = eqx.field(static=True)
@@ -115,17 +148,22 @@ class Joint(eqx.Module):
     motion: Motion | None = None
 
     def terms(self, rows: Literal["body", "report"]) -> tuple[Term, ...]:
-        """The primitives of this joint, in the chosen rows."""
+        """Primitives of this joint, in the chosen rows."""
         entry = CATALOGUE[self.kind]
         return entry.report if rows == "report" and entry.report is not None else entry.terms
 
     @property
     def n_rows(self) -> int:
-        """How many constraint rows the joint has."""
+        """Number of the joint's constraint rows."""
         return sum(ROWS[term.kind] for term in self.terms("body"))
 
+    @property
+    def pitched(self) -> bool:
+        """True if the joint's `length` is the pitch of a screw [m/rad]."""
+        return CATALOGUE[self.kind].pitched
+
     def data(self, term: Term, com_i: Float[Array, "3"], com_j: Float[Array, "3"]) -> Data:
-        """The numbers of one primitive, points taken from the centres of mass."""
+        """Body-fixed parameters of one primitive, with points relative to the centres of mass."""
         return Data(
             point_i=self.point_i - com_i,
             point_j=self.point_j - com_j,
@@ -137,7 +175,7 @@ class Joint(eqx.Module):
 
 
 def resolve(joint: Joint, i: Body | None, j: Body | None) -> Joint:
-    """The joint with points and frames in its bodies' reference frames (None is ground)."""
+    """Joint with points and frames in its bodies' reference frames (None stands for ground)."""
     if not joint.in_world:
         return joint
 
@@ -165,7 +203,7 @@ def _unit(axis: Numbers, what: str) -> Float[Array, "3"]:
 
 
 def _frame_about(z: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """A right-handed frame with the given third column; x along the least aligned axis."""
+    """Right-handed frame with the given third column, its x axis near the least aligned axis."""
     other = jnp.eye(3, dtype=z.dtype)[jnp.argmin(jnp.abs(z))]
     x = other - (other @ z) * z
     x = x / jnp.sqrt(x @ x)
@@ -206,26 +244,26 @@ _ORIGIN = (0.0, 0.0, 0.0)
 
 
 def weld(name: str, body_i: str, body_j: str, *, point: Numbers = _ORIGIN) -> Joint:
-    """No relative motion; 6 rows. `point` (3,) [m]: where the reaction is reported."""
+    """Rigid connection of two bodies; 6 rows. `point` (3,) [m]: point of the reaction."""
     return _joint("weld", name, body_i, body_j, point, point, jnp.eye(3))
 
 
 def spherical(name: str, body_i: str, body_j: str, *, point: Numbers) -> Joint:
-    """A common point, world coordinates at the reference posture (3,) [m]; 3 rows."""
+    """Spherical joint at a point in world coordinates at the reference posture (3,) [m]; 3 rows."""
     return _joint("spherical", name, body_i, body_j, point, point, jnp.eye(3))
 
 
 def universal(
     name: str, body_i: str, body_j: str, *, point: Numbers, axis_i: Numbers, axis_j: Numbers
 ) -> Joint:
-    """A common point and two perpendicular axes, one fixed in each body; 4 rows.
+    """Universal joint: a common point and two perpendicular axes, one fixed in each body; 4 rows.
 
     Args:
         point: world coordinates at the reference posture (3,) [m].
-        axis_i, axis_j: the axes fixed in body i and in body j, world (3,), of any length.
+        axis_i, axis_j: axes fixed in body i and in body j, in the world (3,), of any length.
 
     Raises:
-        ModelError: an axis of zero length, or axes that are not perpendicular.
+        ModelError: an axis has zero length, or the axes are not perpendicular.
     """
     x = _unit(axis_i, f"axis_i of joint '{name}'")
     y = _unit(axis_j, f"axis_j of joint '{name}'")
@@ -241,7 +279,7 @@ def universal(
 
 
 def revolute(name: str, body_i: str, body_j: str, *, point: Numbers, axis: Numbers) -> Joint:
-    """Turning about one axis through `point` (3,) [m], world at reference; 5 rows."""
+    """Revolute joint about an axis through `point` (3,) [m], world at reference; 5 rows."""
     frame = _frame_about(_unit(axis, f"The axis of joint '{name}'"))
     return _joint("revolute", name, body_i, body_j, point, point, frame)
 
@@ -249,7 +287,7 @@ def revolute(name: str, body_i: str, body_j: str, *, point: Numbers, axis: Numbe
 def translational(
     name: str, body_i: str, body_j: str, *, axis: Numbers, point: Numbers = _ORIGIN
 ) -> Joint:
-    """Sliding along one axis through `point` (3,) [m], world at reference; 5 rows."""
+    """Prismatic joint along an axis through `point` (3,) [m], world at reference; 5 rows."""
     frame = _frame_about(_unit(axis, f"The axis of joint '{name}'"))
     return _joint("translational", name, body_i, body_j, point, point, frame)
 
@@ -257,9 +295,33 @@ def translational(
 def cylindrical(
     name: str, body_i: str, body_j: str, *, axis: Numbers, point: Numbers = _ORIGIN
 ) -> Joint:
-    """Sliding along and turning about one axis through `point` (3,) [m]; 4 rows."""
+    """Cylindrical joint about and along an axis through `point` (3,) [m]; 4 rows."""
     frame = _frame_about(_unit(axis, f"The axis of joint '{name}'"))
     return _joint("cylindrical", name, body_i, body_j, point, point, frame)
+
+
+def screw(
+    name: str, body_i: str, body_j: str, *, point: Numbers, axis: Numbers, pitch: Numbers
+) -> Joint:
+    """Screw joint: rotation about and displacement along an axis by one coordinate; 5 rows.
+
+    Args:
+        point, axis: the axis, world at the reference posture (3,) [m] and (3,), of any length.
+        pitch: displacement of body j along the axis per angle about it [m/rad], not zero, positive
+            for a right-handed thread; the lead of the thread is 2 pi times as much.
+
+    Raises:
+        ModelError: the axis has zero length, or the pitch is zero or not finite.
+    """
+    frame = _frame_about(_unit(axis, f"The axis of joint '{name}'"))
+    value = jnp.asarray(pitch, dtype=float)
+    check_shape(value, (), f"The pitch of joint '{name}'")
+    check_finite(value, f"The pitch of joint '{name}'", "m/rad")
+    if concrete(value) and float(value) == 0:
+        raise ModelError(
+            f"The pitch of joint '{name}' must not be zero; a joint without one is revolute."
+        )
+    return _joint("screw", name, body_i, body_j, point, point, frame, value)
 
 
 def _length(name: str, point_i: Numbers, point_j: Numbers, length: Numbers | None) -> Numbers:
@@ -279,11 +341,11 @@ def distance(
     point_j: Numbers,
     length: Numbers | None = None,
 ) -> Joint:
-    """A massless rod with a ball at each end; 1 row.
+    """Massless rod with a spherical joint at each end; 1 row.
 
     Args:
         point_i, point_j: its ends on the two bodies, world at reference (3,) [m].
-        length: [m]; by default the distance of the points.
+        length: length of the rod [m]; by default the distance of the points.
     """
     value = _length(name, point_i, point_j, length)
     return _joint("distance", name, body_i, body_j, point_i, point_j, jnp.eye(3), value)
@@ -299,13 +361,13 @@ def revolute_spherical(
     point_j: Numbers,
     length: Numbers | None = None,
 ) -> Joint:
-    """A massless link that turns about an axis of body i and ends in a ball on body j; 2 rows.
+    """Massless link with a revolute joint on body i and a spherical joint on body j; 2 rows.
 
     Args:
         point_i, axis: the axis in body i, world at reference (3,) [m] and (3,).
-        point_j: the ball's centre on body j (3,) [m], in the plane through `point_i`
+        point_j: centre of the spherical joint (3,) [m], in the plane through `point_i`
             perpendicular to the axis.
-        length: [m]; by default the distance of the points.
+        length: length of the link [m]; by default the distance of the points.
     """
     frame = _frame_about(_unit(axis, f"The axis of joint '{name}'"))
     value = _length(name, point_i, point_j, length)
@@ -318,13 +380,13 @@ def drive(
     """Prescribe a relative coordinate of a joint as a function of time; 1 row, rheonomic.
 
     Args:
-        joint: the joint whose frames define the coordinate (its z axis).
-        motion: t [s] to the coordinate: an angle [rad] from body i to body j about z, or a
-            displacement [m] of j's point along z from i's, zero at the reference posture.
-            Must be twice differentiable by JAX.
+        joint: joint whose frames define the coordinate (its z axis).
+        motion: function from t [s] to the coordinate: the angle [rad] from body i to body j about
+            z, or the displacement [m] of j's point along z from i's, zero at the reference
+            posture. JAX must be able to differentiate it twice.
 
     Raises:
-        ModelError: a joint that does not leave that coordinate free.
+        ModelError: the joint does not leave this coordinate free.
     """
     if joint.kind not in LEAVES_FREE[coordinate]:
         raise ModelError(

@@ -1,6 +1,4 @@
-"""One relative coordinate of a joint: its value, its rate, and the load that works on it."""
-
-from typing import Literal
+"""Relative coordinate of a joint: its value, its rate, and the load of an effort along it."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,22 +6,22 @@ from jaxtyping import Array, Float
 
 from ..algebra.rotation import cross
 from ..algebra.stacked import apply, dot, multiply
-from .errors import ModelError
-from .joint import LEAVES_FREE, Joint
+from ..checks.errors import ModelError
+from .joint import LEAVES_FREE, Joint, Which
 from .load import Load, couple, push
+from .motions.axial import whole_turns
 from .state import Kinematics
-
-Which = Literal["angle", "shift"]
 
 
 class JointCoordinate(eqx.Module):
-    """A joint's angle or shift at one state.
+    """Angle or displacement of a joint at one state.
 
     Attributes:
         which: "angle" or "shift". body_i, body_j: the joint's bodies.
-        value: angle about z from body i to body j, in (-pi, pi] [rad]; or displacement of
-            j's point along z from i's [m]. rate: its time derivative.
-        axis: the joint's z axis on body i, world (3,). point: j's point, world (3,) [m].
+        value: angle about z from body i to body j [rad], in (-pi, pi] except that of a screw, whose
+            displacement determines the whole turns; or displacement of j's point along z from i's
+            [m]. rate: its time derivative [rad/s] or [m/s].
+        axis: z axis of the joint on body i, world (3,). point: j's point, world (3,) [m].
     """
 
     which: Which = eqx.field(static=True)
@@ -35,7 +33,7 @@ class JointCoordinate(eqx.Module):
     point: Float[Array, "3"]
 
     def load(self, kin: Kinematics, effort: Float[Array, ""]) -> Load:
-        """`effort` ([N m] for an angle, [N] for a shift) on body j, its opposite on body i.
+        """Load of an effort ([N m] or [N] on the coordinate) on body j, and its opposite on body i.
 
         Its power is effort times rate. Both forces act at j's point, so that they have no
         net moment.
@@ -49,7 +47,7 @@ class JointCoordinate(eqx.Module):
 
 
 def coordinate(kin: Kinematics, joint: Joint, which: Which) -> JointCoordinate:
-    """The coordinate of a joint (resolved in a system) at a state."""
+    """Coordinate of a joint (resolved in a system) at a state."""
     i, j = kin.index(joint.body_i), kin.index(joint.body_j)
     F_i = multiply(kin.R_wb[i], joint.frame_i)
     axis = F_i[:, 2]
@@ -58,6 +56,8 @@ def coordinate(kin: Kinematics, joint: Joint, which: Which) -> JointCoordinate:
     if which == "angle":
         x_j = apply(kin.R_wb[j], joint.frame_j[:, 0])
         value = jnp.arctan2(dot(F_i[:, 1], x_j), dot(F_i[:, 0], x_j))
+        if joint.pitched:
+            value = value + whole_turns(value, dot(axis, b - a), joint.length)
         rate = dot(axis, kin.omega_w[j] - kin.omega_w[i])
     else:
         value = dot(axis, b - a)
@@ -65,16 +65,21 @@ def coordinate(kin: Kinematics, joint: Joint, which: Which) -> JointCoordinate:
     return JointCoordinate(which, joint.body_i, joint.body_j, value, rate, axis, b)
 
 
+def free_coordinates(joint: Joint) -> list[Which]:
+    """Coordinates that a joint leaves free: "angle" about its z axis, "shift" along it."""
+    return [which for which in ("angle", "shift") if joint.kind in LEAVES_FREE[which]]
+
+
 def choose(joint: Joint, which: Which | None, what: str) -> Which:
-    """The coordinate meant on a joint: the one named, or else the only one it leaves free.
+    """Select a free coordinate of a joint: the named one, or else the only one.
 
     Args:
-        what: who asks, for the message.
+        what: subject of the error's sentence.
 
     Raises:
         ModelError: the joint does not leave it free, or leaves both free and none is named.
     """
-    free: list[Which] = [c for c in ("angle", "shift") if joint.kind in LEAVES_FREE[c]]
+    free = free_coordinates(joint)
     if which in free:
         return which
     if which is None and len(free) == 1:

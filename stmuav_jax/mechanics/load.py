@@ -1,15 +1,15 @@
-"""What forces do: loads on bodies, and signals that say how large they are.
+"""Loads of forces on bodies, and signals that give the values of forces.
 
 A force maps the kinematics of all bodies and the time to a `Load`: world force and
-body-frame moment about the centre of mass for every body, the potential energy it has (if
-any), and the power of its part that has none. Values may be numbers or functions of
-(t, kinematics); numbers are leaves of the pytree, so they can be differentiated.
+body-frame moment about the centre of mass for every body, the potential energy of its
+conservative part, and the power of the rest. Values may be numbers or functions of (t, kinematics);
+numbers are leaves of the pytree, so that they can be differentiated.
 """
 
 import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import cross
-from ..algebra.shapes import Numbers
 from ..algebra.stacked import apply_transposed, dot
-from .errors import ModelError, check_finite, check_shape, concrete
+from ..checks.errors import ModelError, check_finite, check_shape
+from ..checks.shapes import Numbers
+from .joint import Which
 from .state import Kinematics
 
 Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Array, "..."]]
@@ -28,11 +29,11 @@ Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Ar
 def signal(
     value: "Numbers | Callable[..., object]", what: str, shape: tuple[int, ...], unit: str
 ) -> Signal:
-    """A constant as an array, or a function of (t, kinematics); both checked.
+    """Check a constant or a function of (t, kinematics); return the constant as an array.
 
     Raises:
-        ModelError: a shape that is not the given one, a number that is not finite, a function
-            that does not take these two arguments.
+        ModelError: the shape is not the given one, a number is not finite, or a function does not
+            take these two arguments.
     """
     if callable(value):
         check_arguments(value, what)
@@ -52,19 +53,19 @@ def check_arguments(function: Callable[..., object], what: str) -> None:
             f"(lambda t, kin: ...), but calling it with two is not possible: {error}."
         ) from None
     except ValueError:
-        pass  # a built-in function that does not say what it takes
+        pass  # a built-in function without a signature
 
 
 def evaluate(
     value: Signal, t: Float[Array, ""], kin: Kinematics, what: str, shape: tuple[int, ...]
 ) -> Float[Array, "..."]:
-    """The signal's value at time t [s].
+    """Value of a signal at time t [s].
 
     Args:
-        what: which signal, for the message. shape: what it must return.
+        what: name of the signal for the message. shape: shape of its value.
 
     Raises:
-        ModelError: a function that returns another shape, or nothing that is an array.
+        ModelError: the function returns another shape, or no array.
     """
     if not callable(value):
         return value
@@ -84,10 +85,10 @@ def evaluate(
 
 
 class Sine(eqx.Module):
-    """The signal amplitude sin(omega t), its numbers leaves like all others.
+    """Signal amplitude sin(omega t), whose numbers are differentiable leaves.
 
     Args:
-        amplitude: of any shape. angular_frequency: omega [rad/s].
+        amplitude: amplitude of any shape. angular_frequency: omega [rad/s].
     """
 
     amplitude: Float[Array, "*shape"]
@@ -104,13 +105,13 @@ class Sine(eqx.Module):
 
 
 class Load(eqx.Module):
-    """What a force does to all bodies, ground included as the last row.
+    """Load of a force on all bodies, with ground as the last row.
 
     Attributes:
-        force: world (n + 1, 3) [N], at the centres of mass.
-        moment: body axes (n + 1, 3) [N m], about the centres of mass.
-        potential: [J].
-        power: of the part of the force that has no potential [W].
+        force: forces in the world at the centres of mass (n + 1, 3) [N].
+        moment: moments in body axes about the centres of mass (n + 1, 3) [N m].
+        potential: potential energy [J].
+        power: power of the part of the force that has no potential [W].
     """
 
     force: Float[Array, "N 3"]
@@ -140,9 +141,9 @@ def push(
     arm_w: Float[Array, "3"] | None = None,
     moment_w: Float[Array, "3"] | None = None,
 ) -> Load:
-    """A world force [N] at `arm_w` [m] from the body's centre of mass, and a moment [N m].
+    """Load of a world force [N] at `arm_w` [m] from a body's centre of mass, and a moment [N m].
 
-    Its power is counted as that of a force without potential.
+    Its power counts as that of a force without potential.
     """
     k = kin.index(body)
     zero = jnp.zeros(3, kin.r.dtype)
@@ -157,11 +158,11 @@ def push(
 
 
 def total_load(forces: "Sequence[AbstractForce]", t: Float[Array, ""], kin: Kinematics) -> Load:
-    """The sum of all force elements at time t [s].
+    """Sum of the loads of all force elements at time t [s].
 
     Raises:
-        ModelError: a force whose load has not the shapes of `Load`; names its class and where
-            it acts.
+        ModelError: a force's load does not have the shapes of `Load`; the message names the class
+            of the force and the bodies and joints on which it acts.
     """
     total = no_load(kin)
     for force in forces:
@@ -176,64 +177,54 @@ def _check_load(force: "AbstractForce", found: object, expected: Load) -> None:
         must = jnp.shape(getattr(expected, name))
         shape = jnp.shape(getattr(found, name)) if isinstance(found, Load) else None
         if shape != must:
-            where = ", ".join((*force.bodies(), *force.joint_names())) or "all bodies"
             given = f"has {name} of shape {shape}" if shape is not None else "is none"
             raise ModelError(
-                f"The load of {type(force).__name__} on {where} must be a Load with {name} of "
+                f"The load of {type(force).__name__} on {force.acts_on()} must be a Load with {name} of "
                 f"shape {must}, a row for every body and one for ground, but it {given}."
                 if must
-                else f"The load of {type(force).__name__} on {where} must be a Load with {name} a "
+                else f"The load of {type(force).__name__} on {force.acts_on()} must be a Load with {name} a "
                 f"single number, but it {given}."
             )
 
 
+class ActsOn(NamedTuple):
+    """Names of bodies and joints that a force element uses; a `System` checks that they exist.
+
+    Attributes:
+        bodies: names of bodies, which may include "ground".
+        joints: names of joints.
+        coordinates: joints with the coordinate that they must leave free, "angle" or "shift";
+            None for the only free one.
+    """
+
+    bodies: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
+    coordinates: tuple[tuple[str, Which | None], ...] = ()
+
+    def __str__(self) -> str:
+        names = (*self.bodies, *self.joints, *(name for name, _ in self.coordinates))
+        return ", ".join(names) or "all bodies"
+
+
 class AbstractForce(eqx.Module):
-    """A force element. Subclasses define `load` and the names of the bodies they act on."""
+    """Force element, whose subclasses define its `load` and the objects on which it acts.
+
+    Attributes:
+        inputs: fields that are inputs of a system, with their units; see `inputs_of`.
+    """
+
+    inputs: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     @abstractmethod
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        """The load at time t [s] on all bodies."""
+        """Load on all bodies at time t [s]."""
 
     @abstractmethod
-    def bodies(self) -> tuple[str, ...]:
-        """The names that must be known bodies (or "ground") for this force to act."""
-
-    @abstractmethod
-    def joint_names(self) -> tuple[str, ...]:
-        """The names that must be known joints for this force to act."""
+    def acts_on(self) -> ActsOn:
+        """Names of the bodies and joints on which this force acts."""
 
 
 def couple(kin: Kinematics, body_i: str, body_j: str, moment_w: Float[Array, "3"]) -> Load:
-    """`moment_w` [N m] on body i and its opposite on body j."""
+    """Load of the moment `moment_w` [N m] on body i and its opposite on body j."""
     none = jnp.zeros_like(moment_w)
     return push(kin, body_i, none, moment_w=moment_w) + push(kin, body_j, none, moment_w=-moment_w)
-
-
-def vector(value: Numbers, what: str, unit: str) -> Float[Array, "3"]:
-    """A vector (3,) that a user gave; raises `ModelError` for a bad shape or number."""
-    check_shape(value, (3,), what)
-    check_finite(value, what, unit)
-    return jnp.asarray(value, dtype=float)
-
-
-def scalar(value: Numbers, what: str, unit: str) -> Float[Array, ""]:
-    """A number that a user gave; raises `ModelError` for a bad shape or number."""
-    check_shape(value, (), what)
-    check_finite(value, what, unit)
-    return jnp.asarray(value, dtype=float)
-
-
-def nonnegative(value: Numbers, what: str, unit: str) -> Float[Array, ""]:
-    """A number >= 0 that a user gave; raises `ModelError` for any other."""
-    number = scalar(value, what, unit)
-    if concrete(number) and float(number) < 0:
-        raise ModelError(f"{what} must not be negative, but it is {float(number):g} {unit}.")
-    return number
-
-
-def positive(value: Numbers, what: str, unit: str) -> Float[Array, ""]:
-    """A number > 0 that a user gave; raises `ModelError` for any other."""
-    number = scalar(value, what, unit)
-    if concrete(number) and float(number) <= 0:
-        raise ModelError(f"{what} must be positive, but it is {float(number):g} {unit}.")
-    return number

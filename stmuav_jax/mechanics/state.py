@@ -1,4 +1,4 @@
-"""The state of a system of rigid bodies, and what follows from it for every body."""
+"""State of a system of rigid bodies, and the kinematics of every body that follows from it."""
 
 from typing import TYPE_CHECKING
 
@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 
 from ..algebra.rotation import cross, rotation_matrix
 from ..algebra.stacked import apply
+from ..checks.errors import ModelError, nearest_names
 from .body import GROUND
-from .errors import ModelError, nearest_names
 
 if TYPE_CHECKING:
     from .joint import Joint
@@ -38,17 +38,17 @@ class State(eqx.Module):
 
 
 class Kinematics(eqx.Module):
-    """What a state says of every body, ground included as the last row.
+    """Kinematics of every body at one state, with ground as the last row.
 
     Attributes:
-        r, v: centre of mass and its velocity, world (n + 1, 3) [m], [m/s].
+        r, v: centres of mass and their velocities, world (n + 1, 3) [m], [m/s].
         R_wb: body-to-world rotations (n + 1, 3, 3).
         omega: angular velocities in body axes (n + 1, 3) [rad/s].
         omega_w: angular velocities in world axes (n + 1, 3) [rad/s].
-        mass: (n + 1,) [kg], zero for ground.
+        mass: masses (n + 1,) [kg], zero for ground.
         com: centres of mass in the bodies' reference frames (n + 1, 3) [m].
-        names: the bodies' names, "ground" last.
-        joints: the system's joints, for forces that act in one.
+        names: names of the bodies, "ground" last.
+        joints: joints of the system, for forces that act in one.
     """
 
     r: Float[Array, "N 3"]
@@ -68,7 +68,7 @@ class Kinematics(eqx.Module):
         return self.names.index(name)
 
     def joint(self, name: str) -> "Joint":
-        """The named joint; raises `ModelError` for an unknown name."""
+        """Joint of this name; raises `ModelError` for an unknown name."""
         for joint in self.joints:
             if joint.name == name:
                 return joint

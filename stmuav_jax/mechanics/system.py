@@ -1,4 +1,4 @@
-"""A system: bodies, joints and forces, connected by name and checked as a graph."""
+"""Systems: bodies, joints and forces, connected by name and checked as a graph."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,34 +9,35 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..checks.errors import ModelError, SettingError, nearest_names
 from .body import GROUND, Bodies, Body, stack_bodies
-from .errors import ModelError, SettingError, nearest_names
 from .joint import Joint, resolve
-from .joint_force import AbstractJointForce
+from .joint_coordinate import choose
 from .load import AbstractForce
 from .state import Kinematics, State, kinematics
 
 
 class System(eqx.Module):
-    """Bodies, joints and forces.
+    """Multibody system of bodies, joints and forces.
 
     Args:
-        bodies: the moving bodies; "ground" is there without being listed.
+        bodies: moving bodies; "ground" exists without being listed.
         joints: see `stmuav_jax.mechanics.joint`; geometry in the world at the bodies'
             reference posture.
-        forces: see `stmuav_jax.mechanics.force` and `stmuav_jax.mechanics.joint_force`.
+        forces: see `stmuav_jax.mechanics.forces.applied` and `stmuav_jax.mechanics.forces.joint`.
         allow_float32: accept single precision, in which closed loops lose most digits.
 
     Attributes:
         bodies: stacked masses, centres of mass and inertia tensors.
-        joints: with geometry in the bodies' reference frames.
-        forces: as given.
-        reference: the reference posture, at rest.
+        joints: joints with geometry in the bodies' reference frames.
+        forces: force elements as given.
+        reference: state of the reference posture, at rest.
 
     Raises:
-        ModelError: unknown or duplicate names, a body joined to nothing that is not
-            declared free, a force on a coordinate that its joint does not leave free.
-        SettingError: single precision without `allow_float32`.
+        ModelError: a name is unknown or occurs twice, a body that is not declared free has no
+            connection to ground, or a force acts on a coordinate that its joint does not leave
+            free.
+        SettingError: the numbers have single precision without `allow_float32`.
     """
 
     bodies: Bodies
@@ -84,7 +85,7 @@ class System(eqx.Module):
 
     @property
     def floating(self) -> bool:
-        """Whether no joint names ground, so that momentum is conserved but for forces."""
+        """True if no joint names ground, so that only forces change the total momentum."""
         return all(GROUND not in (j.body_i, j.body_j) for j in self.joints)
 
     def index(self, name: str) -> int:
@@ -94,7 +95,7 @@ class System(eqx.Module):
         return self.names.index(name)
 
     def joint_index(self, name: str) -> int:
-        """Place of the named joint; raises `ModelError` if unknown."""
+        """Index of the named joint; raises `ModelError` if unknown."""
         names = [j.name for j in self.joints]
         if name not in names:
             raise ModelError(f"There is no joint '{name}'.{nearest_names(name, names)}")
@@ -117,7 +118,7 @@ class System(eqx.Module):
 
 
 def check_precision(array: Float[Array, "..."], allow_float32: bool) -> None:
-    """Raise `SettingError` for single precision that was not asked for."""
+    """Raise `SettingError` for single precision that is not allowed."""
     if jnp.result_type(array) != jnp.float64 and not allow_float32:
         raise SettingError(
             "Mechanism dynamics need double precision, but this array is "
@@ -127,7 +128,7 @@ def check_precision(array: Float[Array, "..."], allow_float32: bool) -> None:
 
 
 def check_state(system: System, state: State) -> None:
-    """Raise if the state's shapes or precision do not fit the system (any batch axes)."""
+    """Raise `SettingError` if the state's shapes or precision do not fit (any batch axes)."""
     n = system.n_bodies
     for name, width in (("r", 3), ("p", 4), ("v", 3), ("omega", 3)):
         array = getattr(state, name)
@@ -167,23 +168,23 @@ def _check_references(
                     f"Joint '{joint.name}' names the unknown body '{name}'.{nearest_names(name, known)}"
                 )
     for force in forces:
-        kind = type(force).__name__
-        for name in force.bodies():
+        kind, named = type(force).__name__, force.acts_on()
+        for name in named.bodies:
             if name not in known:
                 raise ModelError(
                     f"A {kind} names the unknown body '{name}'.{nearest_names(name, known)}"
                 )
-        for name in force.joint_names():
+        for name in (*named.joints, *(name for name, _ in named.coordinates)):
             if name not in joint_names:
                 raise ModelError(
                     f"A {kind} names the unknown joint '{name}'.{nearest_names(name, joint_names)}"
                 )
-        if isinstance(force, AbstractJointForce):
-            force.choice(joints[joint_names.index(force.joint)])
+        for name, which in named.coordinates:
+            choose(joints[joint_names.index(name)], which, f"{kind} in joint '{name}'")
 
 
 def _check_connected(bodies: Sequence[Body], joints: Sequence[Joint]) -> None:
-    """Every body must reach ground, or a body declared free, through joints."""
+    """Raise `ModelError` for bodies that no joints connect to ground or to a body declared free."""
     neighbours: dict[str, set[str]] = {b.name: set() for b in bodies} | {GROUND: set()}
     for joint in joints:
         neighbours[joint.body_i].add(joint.body_j)

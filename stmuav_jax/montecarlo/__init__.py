@@ -1,1 +1,5 @@
-"""Floor 5: many flights at once: distributions, studies, the batched engine, statistics."""
+"""Monte Carlo studies: sampling, batches, statistics, sensitivity. Floor 11."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,8 +1,9 @@
-"""A study as work: blocks of flights through compiled lanes, on all cores or devices.
+"""Batch simulation of a study: blocks of runs through compiled batch slots, on all devices.
 
-A sample's numbers are its own. One program, compiled for one device and always of the same shape,
-flies every block; the cores of a CPU share it as threads, and other devices have a copy each. What
-is left that decides the last digits is the number of lanes, which is part of the study's identity.
+A sample's numbers do not depend on other samples. One program, compiled for one device and always
+of the same shape, simulates every block; the cores of a CPU share it as threads, and other devices
+have a copy each. The last digits depend only on the number of batch slots ("lanes"), which is part
+of the study's identity.
 """
 
 import itertools
@@ -18,47 +19,47 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..algebra.compiler import compiler_options
-from ..dynamics.problem import Method, Problem, prepare
-from ..dynamics.tree import Tree
-from ..mechanics.errors import SettingError, SimulationError
+from ..checks.errors import SettingError, SimulationError
+from ..dynamics.choices import solver_named
+from ..dynamics.integration.lanes import REASONS, Ending, Plan, RunResult, fly
+from ..dynamics.integration.problem import Problem, prepare
+from ..dynamics.method import Method
+from ..dynamics.tree.formulation import Tree
 from ..mechanics.state import State
-from .flights import Drawn
-from .lanes import REASONS, Ending, Flown, Plan, fly
+from .disturbed_flights import Drawn
 from .signal import Signal, View
 from .study import Quantity, Study, column_name
 from .work import AbstractWork, Axis, Column
 
-# Flights that go on together on one device: on a CPU as many as fit its cache, by measurement
-# (docs/throughput.md); a GPU wants thousands.
+# Runs integrated together on one device: on a CPU as many as fit its cache, by measurement
+# (docs/throughput.md); a GPU needs thousands.
 LANES = {"cpu": 16}
 LANES_ELSEWHERE = 4096
 
-# Lanes are computed so many at a time by one instruction of a processor (AVX-512, double
-# precision); lanes left over would be rounded otherwise, and a flight's lane would matter.
+# Number of batch slots computed by one vector instruction (AVX-512, double precision). Slots left
+# over would be rounded differently, and results would depend on the slot.
 TOGETHER = 8
 
-# Flights of one call of the compiled program; results do not depend on it.
+# Runs in one call of the compiled program; results do not depend on it.
 BLOCK = 512
 
 MOST_DEVICES = 1024
 
-_SOLVERS = {"dopri8": diffrax.Dopri8, "tsit5": diffrax.Tsit5}
-
 
 class FlightWork(AbstractWork):
-    """A study's flights by number.
+    """Work of a study: its simulations by sample number.
 
     Args:
-        lanes: flights that go on together on a device, a multiple of 8; default 16 on a CPU and
-            4096 elsewhere, whatever the number of cores. Part of the study's identity, as the last
-            digits depend on it.
-        block: flights of one call of the compiled program; at least the lanes.
-        devices: threads on a CPU, default one; GPUs elsewhere, default all. Numbers do not depend
-            on it.
+        lanes: batch slots, runs integrated together on a device, a multiple of 8; default 16 on a
+            CPU and 4096 elsewhere, whatever the number of cores. It is part of the study's
+            identity, as the last digits depend on it.
+        block: runs in one call of the compiled program; at least the lanes.
+        devices: number of threads on a CPU, default one; number of GPUs elsewhere, default all.
+            Results do not depend on it.
 
     Raises:
-        SettingError: numbers that are not positive, lanes that are not a multiple of 8, more
-            devices than there are, or a study in double precision without x64.
+        SettingError: numbers that are not positive, lanes that are not a multiple of 8, or more
+            devices than there are.
     """
 
     def __init__(
@@ -85,23 +86,23 @@ class FlightWork(AbstractWork):
         self._block, self._devices = max(block, self.lanes), devices
 
     def __getstate__(self) -> dict[str, Any]:
-        """Compiled programs stay here."""
+        """State without the compiled programs, which are not pickled."""
         keep = ("study", "lanes", "_block", "_devices")
         return {k: self.__dict__[k] for k in keep}
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        """The study's plain data, and the lanes."""
+        """Plain data of the study, and the number of lanes."""
         return {**self.study.plain(), "lanes": self.lanes}
 
     @property
     def unit(self) -> int:
-        """Flights that keep all devices busy: chunks of a store are best multiples of it."""
+        """Runs that keep all devices busy: chunks of a store are best multiples of this number."""
         return self._block * len(self._places)
 
     @property
     def columns(self) -> Mapping[str, Column]:
-        """Drawn numbers, quantities, what the integration says, and the status."""
+        """Columns of sampled factors, quantities, diagnostics of the integration, and status."""
         return self._columns
 
     @cached_property
@@ -127,20 +128,20 @@ class FlightWork(AbstractWork):
 
     @property
     def axes(self) -> Mapping[str, Axis]:
-        """The times of paths."""
+        """Time axis of the paths, if there are any."""
         paths = any(q.take == "path" for q in self.study.quantities.values())
         return {"time": Axis(self.study.times, "s")} if paths else {}
 
     @property
     def reasons(self) -> Mapping[int, str]:
-        """Of flights that failed."""
+        """Reasons of failed runs by code."""
         return {int(code): words for code, words in REASONS.items()}
 
     def run(self, first: int, count: int) -> dict[str, np.ndarray]:
-        """Columns of the flights first, first + 1, ...
+        """Columns of the samples first, first + 1, ...
 
         Raises:
-            SimulationError: JAX is not set up for the study's precision.
+            SimulationError: JAX cannot be switched to double precision.
         """
         study = self.study
         drawn = study.sampling.draw(first, count)
@@ -158,16 +159,16 @@ class FlightWork(AbstractWork):
         return {k: np.asarray(found[k], c.dtype) for k, c in self.columns.items()}
 
     def _on_all(self, parts: list[tuple[np.ndarray, int]]) -> list[dict[str, np.ndarray]]:
-        """The parts' columns: each device takes the next part that nobody has taken."""
+        """Columns of the parts; each device takes the next part that is not taken yet."""
         places = self._places[: len(parts)]
-        with self._precision():
-            # compiled here, once for each device, before threads ask for it
+        with _double():
+            # programs are compiled here, once for each device, before the threads need them
             programs = [self._programs(place) for place in places]
         found: list[Any] = [None] * len(parts)
         waiting, taking, stop = iter(enumerate(parts)), threading.Lock(), threading.Event()
 
         def carry_out(program: Any) -> None:
-            with self._precision():
+            with _double():
                 while not stop.is_set():
                     with taking:
                         number, part = next(waiting, (-1, None))
@@ -183,35 +184,25 @@ class FlightWork(AbstractWork):
                 for done in [pool.submit(carry_out, program) for program in programs]:
                     done.result()
             finally:
-                # after Ctrl-C or an error the parts at hand are the last
+                # after Ctrl-C or an error no further part is begun
                 stop.set()
         return found
 
-    def _precision(self) -> Any:
-        """The study's, for this thread."""
-        double = not self.study.flights.float32
-        context = jax.enable_x64(double)
-        with context:
-            if double and jnp.zeros(()).dtype != jnp.float64:
-                raise SimulationError("Double precision could not be switched on.")
-        return jax.enable_x64(double)
-
     def _fly(self, program: Any, drawn: np.ndarray, first: int) -> dict[str, np.ndarray]:
-        """One block, filled up to its size by flights that are not flown."""
+        """Columns of one block, filled up to its size with runs that are not simulated."""
         count, size = len(drawn), self._block
         possible = self.study.flights.possible(self.study.sampling.names, drawn)
-        # NaN is a start that cannot be made, which costs nothing
+        # NaN marks an impossible start, which costs nothing
         drawn = np.where(possible[:, None], drawn, np.nan)
         values = np.concatenate([drawn, np.zeros((size - count, drawn.shape[1]))])
         seeds = np.concatenate([self.seeds(first, count), np.zeros(size - count, np.uint32)])
-        real = np.float32 if self.study.flights.float32 else np.float64
-        flown = program(values.astype(real), seeds.astype(np.uint32), np.int32(count))
+        flown = program(values, seeds.astype(np.uint32), np.int32(count))
         found = {k: np.array(v[:count]) for k, v in jax.device_get(flown).items()}
         found["status"][~possible] = Ending.NOT_PHYSICAL
         return found
 
     def seeds(self, first: int, count: int) -> np.ndarray:
-        """Of the flights' own noise (count,): zeros where they have none."""
+        """Seeds of the runs' own noise (count,), zeros where they have none."""
         if not self.study.flights.gusts:
             return np.zeros(count, np.uint32)
         own = lambda k: np.random.SeedSequence((self.study.sampling.seed, k)).generate_state(1)[0]
@@ -219,14 +210,14 @@ class FlightWork(AbstractWork):
 
     @cached_property
     def _places(self) -> list[Any]:
-        """A device for each thread: the first, again and again, on a CPU; all of them elsewhere."""
+        """Device of each thread: on a CPU always the first; elsewhere all of them."""
         there = jax.local_devices()
         if there[0].platform == "cpu":
             return [there[0]] * (self._devices or 1)
         return there[: self._devices]
 
     def _programs(self, place: Any) -> Callable[..., dict[str, Any]]:
-        """The compiled program of a device: values (block, d), seeds (block,), count -> columns."""
+        """Program of a device, compiled: values (block, d), seeds (block,), count -> columns."""
         if place not in self._compiled:
             self._compiled[place] = self._program(place)
         return self._compiled[place]
@@ -236,10 +227,7 @@ class FlightWork(AbstractWork):
         return {}
 
     def _program(self, place: Any) -> Any:
-        single, plan = self.study.flights.float32, self.plan
-        if single:
-            # JAX keeps NumPy's constants of a trace in the precision of the first that had them
-            jax.clear_caches()
+        plan = self.plan
 
         def block(values: Any, seeds: Any, count: Any) -> dict[str, Any]:
             queue = Drawn(values, seeds)
@@ -247,18 +235,13 @@ class FlightWork(AbstractWork):
 
         at = jax.sharding.SingleDeviceSharding(place)
         of = lambda dtype, *shape: jax.ShapeDtypeStruct(shape, dtype, sharding=at)
-        values = of(
-            jnp.float32 if single else jnp.float64, self._block, len(self.study.sampling.names)
-        )
+        values = of(jnp.float64, self._block, len(self.study.sampling.names))
         program = jax.jit(block, compiler_options=compiler_options())
-        compiled = program.lower(values, of(jnp.uint32, self._block), of(jnp.int32)).compile()
-        if single:
-            jax.clear_caches()
-        return compiled
+        return program.lower(values, of(jnp.uint32, self._block), of(jnp.int32)).compile()
 
     @cached_property
     def direction(self) -> np.ndarray:
-        """That the panel should face, world (3,)."""
+        """Direction that the panel should face, world (3,)."""
         of = self.study
         return np.asarray(of.flights.facing() if of.direction is None else of.direction)
 
@@ -268,19 +251,17 @@ class FlightWork(AbstractWork):
 
     @cached_property
     def plan(self) -> Plan:
-        """What `lanes.fly` flies, for programs that want its bare results."""
+        """Plan of the batch integration, for programs that need its bare results."""
         study, direction = self.study, self.direction
         method = Method(
-            formulation=Tree(), solver=_SOLVERS[study.solver](), rtol=study.rtol, atol=study.atol,
+            formulation=Tree(), solver=solver_named(study.solver), rtol=study.rtol, atol=study.atol,
             max_steps=study.max_steps, adjoint=diffrax.ForwardMode(), steps="state",
         )  # fmt: skip
         names = study.sampling.names
 
         def make(drawn: Drawn) -> tuple[Problem, State]:
             system, state0 = study.flights.build(names, drawn)
-            # NumPy's arrays stay in double precision, whatever JAX is set to
-            plain = lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x
-            return jax.tree.map(plain, prepare(system, method)), state0
+            return prepare(system, method), state0
 
         watched, of = self._watched, self._signals
 
@@ -296,17 +277,17 @@ class FlightWork(AbstractWork):
 
         stops = tuple(q.stop for q in watched.values())
         times: Any = study.times
-        return Plan(make, times, 0.0, watch(True), watch(False), stops, study.step)
+        return Plan(make, times, 0.0, watch(True), watch(False), stops)
 
     @cached_property
     def _watched(self) -> dict[str, Quantity]:
-        """Quantities that need watching between the kept times, those with rates first."""
+        """Quantities that are monitored between the kept times, those with rates first."""
         chosen = self.study.quantities.items()
         found = [(k, q) for k, q in chosen if q.take not in ("final", "path")]
         return dict(sorted(found, key=lambda item: not self._signals[item[0]].smooth))
 
-    def _kept(self, drawn: Drawn, flown: Flown) -> dict[str, Any]:
-        """What the store keeps of one flight."""
+    def _kept(self, drawn: Drawn, flown: RunResult) -> dict[str, Any]:
+        """Stored columns of one run."""
         study, real = self.study, flown.last.dtype
         problem, _ = self.plan.make(drawn)
         direction = jnp.asarray(self.direction, real)
@@ -334,8 +315,16 @@ class FlightWork(AbstractWork):
         }
 
 
+def _double() -> Any:
+    """Context of double precision for this thread."""
+    with jax.enable_x64(True):
+        if jnp.zeros(()).dtype != jnp.float64:
+            raise SimulationError("Double precision could not be switched on.")
+    return jax.enable_x64(True)
+
+
 def _turned(quantity: Quantity, g: Any) -> Any:
-    """So that its maximum, or its rise above zero, is what is wanted."""
+    """Monitored signal, whose maximum or rise above zero is the wanted quantity."""
     if quantity.take == "smallest":
         return -g
     if quantity.take == "when_above":
@@ -344,15 +333,15 @@ def _turned(quantity: Quantity, g: Any) -> Any:
 
 
 def _most_devices() -> int:
-    """Threads, or devices that there are."""
+    """Largest number of threads, or of devices."""
     there = jax.local_devices()
     return MOST_DEVICES if there[0].platform == "cpu" else len(there)
 
 
 def _parts(count: int, block: int, lanes: int, devices: int) -> Iterator[tuple[int, int]]:
-    """(start, stop) of parts of up to a block, as many as keep the devices busy."""
+    """Ranges (start, stop) of parts of up to a block, as many as keep the devices busy."""
     least = -(-count // block)
-    # no part so small that lanes of it stand idle
+    # no part is so small that some of its batch slots are idle
     number = max(least, min(-(-least // devices) * devices, -(-count // lanes)))
     ends = [count * k // number for k in range(number + 1)]
     return itertools.pairwise(ends)

@@ -1,43 +1,42 @@
-"""Distributions of uncertain numbers: by name, checked, and as plain data. SciPy does the mathematics.
+"""Distributions of uncertain parameters: SciPy's frozen ones, and plain forms for files.
 
-A study's identity holds its distributions, so each has a plain form that TOML and JSON can hold:
+A study's identity contains its distributions, so each has a plain form for TOML and JSON:
 
     mass = {distribution = "normal", mean = 0.95, deviation = 0.02}
+    rate = {distribution = "scipy.gamma", a = 2.0, scale = 0.1}
+
+In Python the first is `scipy.stats.norm(0.95, 0.02)`. SciPy does the mathematics.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import pydantic
 from jaxtyping import Float
+from pydantic import Field
 
-from ..mechanics.errors import SettingError, nearest_names
-from ..mechanics.schema import SHOWN, named, shown
+from ..checks.errors import SettingError, nearest_names
+from ..checks.schema import SHOWN, Entries, Finite, Positive, Tuples, checked, named, shown
 
-# Whole numbers are fine wherever numbers are.
-Number = float | int
-
-# A parameter after its check: a number, or the numbers of a list.
-Parameter = float | tuple[float, ...]
-Given = Mapping[str, Any]
+_Limit = Annotated[float, Field(strict=True, allow_inf_nan=True)]
+_Values = Annotated[tuple[Finite, ...], Tuples, Field(min_length=1)]
+_Weights = Annotated[tuple[Positive, ...], Tuples]
 
 
 class _Kind(NamedTuple):
-    """What a distribution needs, what must hold between its parameters, and SciPy's name for it.
+    """Kind of distribution: its parameters, conditions on them, and SciPy's name for it.
 
     Attributes:
-        parameters: by name, the kind of number: "finite", "positive", "limit" (may be infinite),
-            "list" or "positives" (lists).
-        defaults: of those that may be left out.
-        relations: what must hold, and the words for it.
-        scipy: name in `scipy.stats`; "" for those that are tables of values.
-        arguments: SciPy's arguments from the parameters.
+        parameters: types by name, with the default where there is one.
+        relations: conditions on the parameters, and their words for error messages.
+        scipy: name in `scipy.stats`; "" for tables of values.
+        arguments: function from the parameters to SciPy's arguments.
     """
 
-    parameters: Mapping[str, str]
-    defaults: Mapping[str, Any] = {}
+    parameters: Mapping[str, Any]
     relations: tuple[tuple[Callable[[Any], bool], str], ...] = ()
     scipy: str = ""
     arguments: Callable[[Any], dict[str, float]] = lambda p: {}
@@ -55,58 +54,69 @@ def _truncated(p: Any) -> dict[str, float]:
     return {"a": a, "b": b, "loc": p["mean"], "scale": p["deviation"]}
 
 
+def _holds_draws(p: Any) -> bool:
+    """Test whether doubles can represent quantiles of a truncated normal distribution."""
+    import scipy.stats
+
+    middle = scipy.stats.truncnorm.ppf([0.25, 0.75], **_truncated(p))
+    return bool(p["low"] <= middle[0] < middle[1] <= p["high"])
+
+
 KINDS: Mapping[str, _Kind] = {
     "normal": _Kind(
-        {"mean": "finite", "deviation": "positive"},
+        {"mean": Finite, "deviation": Positive},
         scipy="norm", arguments=lambda p: {"loc": p["mean"], "scale": p["deviation"]},
     ),
+    # mean and standard deviation are those before the truncation
     "truncated_normal": _Kind(
-        {"mean": "finite", "deviation": "positive", "low": "limit", "high": "limit"},
-        {"low": -math.inf, "high": math.inf}, (_ORDERED,), "truncnorm", _truncated,
+        {"mean": Finite, "deviation": Positive, "low": (_Limit, -math.inf),
+         "high": (_Limit, math.inf)},
+        (_ORDERED, (_holds_draws, "the limits must not be too far from the mean")),
+        "truncnorm", _truncated,
     ),
-    "uniform": _Kind(
-        {"low": "finite", "high": "finite"}, {}, (_ORDERED,), "uniform", _between,
-    ),
+    "uniform": _Kind({"low": Finite, "high": Finite}, (_ORDERED,), "uniform", _between),
     "lognormal": _Kind(
-        {"median": "positive", "log_deviation": "positive"},
+        {"median": Positive, "log_deviation": Positive},
         scipy="lognorm", arguments=lambda p: {"s": p["log_deviation"], "scale": p["median"]},
     ),
     "loguniform": _Kind(
-        {"low": "positive", "high": "positive"}, {}, (_ORDERED,), "loguniform",
+        {"low": Positive, "high": Positive}, (_ORDERED,), "loguniform",
         lambda p: {"a": p["low"], "b": p["high"]},
     ),
     "triangular": _Kind(
-        {"low": "finite", "mode": "finite", "high": "finite"}, {},
+        {"low": Finite, "mode": Finite, "high": Finite},
         (_ORDERED, (lambda p: p["low"] <= p["mode"] <= p["high"], "mode must lie between low and high")),
         "triang", lambda p: _between(p, c=(p["mode"] - p["low"]) / (p["high"] - p["low"])),
     ),
     "beta": _Kind(
-        {"a": "positive", "b": "positive", "low": "finite", "high": "finite"},
-        {"low": 0.0, "high": 1.0}, (_ORDERED,), "beta", lambda p: _between(p, a=p["a"], b=p["b"]),
+        {"a": Positive, "b": Positive, "low": (Finite, 0.0), "high": (Finite, 1.0)},
+        (_ORDERED,), "beta", lambda p: _between(p, a=p["a"], b=p["b"]),
     ),
     "weibull": _Kind(
-        {"scale": "positive", "shape": "positive"},
+        {"scale": Positive, "shape": Positive},
         scipy="weibull_min", arguments=lambda p: {"c": p["shape"], "scale": p["scale"]},
     ),
-    "constant": _Kind({"value": "finite"}),
+    "constant": _Kind({"value": Finite}),
     "choice": _Kind(
-        {"values": "list", "weights": "positives"}, {"weights": ()},
+        {"values": _Values, "weights": (_Weights, ())},
         ((lambda p: len(p["weights"]) in (0, len(p["values"])), "every value needs one weight"),),
     ),
-    "empirical": _Kind({"values": "list"}),
+    "empirical": _Kind({"values": _Values}),
 }  # fmt: skip
 
+# Prefix of the names of SciPy's distributions with SciPy's own parameters.
+_SCIPY = "scipy."
 
-# Share of draws beyond those that are tried for being finite.
+# Tail probability at which quantiles are tested for being finite.
 _RARE = 1e-9
 
 
 @dataclasses.dataclass(frozen=True)
 class Distribution:
-    """A distribution by its name and parameters.
+    """Distribution by its name and parameters.
 
     Attributes:
-        name: one of `KINDS`.
+        name: one of `KINDS`, or "scipy." and the name of a distribution in `scipy.stats`.
         parameters: numbers, and tuples of numbers, by name; those left out have their defaults.
 
     Raises:
@@ -114,227 +124,116 @@ class Distribution:
     """
 
     name: str
-    parameters: Given
+    parameters: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if self.name not in KINDS:
-            near = nearest_names(str(self.name)[:SHOWN], KINDS)
-            raise SettingError(f"There is no distribution {named(self.name)}.{near}")
         object.__setattr__(self, "parameters", _checked(self.name, self.parameters))
-        self._check_draws()
-
-    def quantile(self, u: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-        """The values below which the shares u of all draws lie, 0 < u < 1."""
-        p = self.parameters
-        if self.name == "constant":
-            return np.full(np.shape(u), p["value"])
-        if not KINDS[self.name].scipy:
-            values, shares = self._steps()
-            return values[np.searchsorted(shares[:-1], u, side="left")]
-        return np.asarray(self._scipy().ppf(u, **KINDS[self.name].arguments(p)), dtype=float)
-
-    def _check_draws(self) -> None:
-        """Refuse parameters with which draws are beyond what doubles can hold."""
-        if not KINDS[self.name].scipy:
-            return
         with np.errstate(all="ignore"):
             drawn = self.quantile(np.array([_RARE, 0.5, 1 - _RARE]))
         if not np.all(np.isfinite(drawn)):
-            given = ", ".join(f"{k} = {_shown(v)}" for k, v in self.parameters.items())
             raise SettingError(
-                f"The distribution '{self.name}' with {given} has draws that are not finite."
+                f"The distribution '{self.name}' with {_words(self.parameters)} has draws that are "
+                "not finite."
             )
 
-    @property
-    def variance(self) -> float:
-        """The variance, in the square of the number's unit."""
-        if self.name == "constant":
-            return 0.0
-        if not KINDS[self.name].scipy:
-            values, shares = self._steps()
-            weights = np.diff(shares, prepend=0.0)
-            return float(weights @ (values - weights @ values) ** 2)
-        return float(self._scipy().var(**KINDS[self.name].arguments(self.parameters)))
-
-    def plain(self) -> dict[str, Any]:
-        """The plain form; infinite limits, being the default, are left out."""
-        found: dict[str, Any] = {"distribution": self.name}
-        for name, value in self.parameters.items():
-            if isinstance(value, tuple):
-                if value:
-                    found[name] = list(value)
-            elif math.isfinite(value):
-                found[name] = value
-        return found
-
-    def _scipy(self) -> Any:
-        import scipy.stats
-
-        return getattr(scipy.stats, KINDS[self.name].scipy)
-
-    def _steps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Values in rising order (k,), and the share of draws up to each (k,), the last 1."""
-        values = np.asarray(self.parameters["values"])
-        weights = np.asarray(self.parameters.get("weights") or np.ones(len(values)))
+    def quantile(self, u: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+        """Quantiles of the probabilities u, 0 < u < 1."""
+        p, kind = self.parameters, KINDS.get(self.name)
+        if kind is None:
+            return np.asarray(_of_scipy(self.name).ppf(u, **p), dtype=float)
+        if kind.scipy:
+            return np.asarray(_of_scipy(_SCIPY + kind.scipy).ppf(u, **kind.arguments(p)))
+        values = np.asarray(p.get("values", (p.get("value"),)), dtype=float)
+        weights = np.asarray(p.get("weights") or np.ones(len(values)))
         order = np.argsort(values, kind="stable")
         total = np.cumsum(weights[order])
-        return values[order], total / total[-1]
+        return values[order][np.searchsorted(total[:-1] / total[-1], u, side="left")]
+
+    def plain(self) -> dict[str, Any]:
+        """Plain form; infinite limits and absent weights, being the defaults, are left out."""
+        lists = {k: list(v) if isinstance(v, tuple) else v for k, v in self.parameters.items()}
+        kept = {k: v for k, v in lists.items() if v != [] and v not in (math.inf, -math.inf)}
+        return {"distribution": self.name} | kept
 
 
-def from_plain(plain: Given | Number, factor: str = "") -> Distribution:
-    """A distribution from its plain form; a number alone is a constant.
+def as_distribution(given: Any, factor: str = "") -> Distribution:
+    """Distribution from any of its forms.
 
     Args:
-        factor: whose distribution it is, for error messages.
+        given: a frozen distribution of `scipy.stats`, a number (a constant), a plain form, or a
+            `Distribution`.
+        factor: name of the factor with this distribution, for error messages.
 
     Raises:
-        SettingError: as `Distribution`, and no entry "distribution".
+        SettingError: as for `Distribution`; also no entry "distribution", or a user-defined
+            distribution, which has no plain form.
     """
     try:
-        if not isinstance(plain, Mapping):
-            return Distribution("constant", {"value": plain})
-        if "distribution" not in plain:
+        if isinstance(given, Distribution):
+            return given
+        if hasattr(given, "dist"):
+            return _frozen(given)
+        if not isinstance(given, Mapping):
+            return Distribution("constant", {"value": given})
+        if "distribution" not in given:
             raise SettingError(
                 f"An entry 'distribution' with its name is missing.{nearest_names('', KINDS)}"
             )
-        rest = {name: value for name, value in plain.items() if name != "distribution"}
-        if not isinstance(plain["distribution"], str):
-            raise SettingError(
-                f"'distribution' must be a name, but it is {shown(plain['distribution'])}."
-                f"{nearest_names('', KINDS)}"
-            )
-        return Distribution(plain["distribution"], rest)
+        rest = {name: value for name, value in given.items() if name != "distribution"}
+        name = given["distribution"]
+        return Distribution(name if isinstance(name, str) else shown(name), rest)
     except SettingError as error:
         raise SettingError(f"Factor {named(factor)}: {error}" if factor else str(error)) from None
 
 
-def normal(mean: Number, deviation: Number) -> Distribution:
-    """Normal, of a mean and a standard deviation > 0."""
-    return Distribution("normal", {"mean": mean, "deviation": deviation})
+def _frozen(given: Any) -> Distribution:
+    """Distribution from one of SciPy's frozen ones, by name and named parameters."""
+    name = f"{_SCIPY}{given.dist.name}"
+    if type(_of_scipy(name)) is not type(given.dist):
+        raise SettingError(f"The distribution {named(given.dist.name)} is not one of scipy.stats.")
+    arguments = dict(zip(_arguments(given.dist), given.args, strict=False)) | given.kwds
+    return Distribution(name, arguments)
 
 
-def truncated_normal(
-    mean: Number, deviation: Number, low: Number = -math.inf, high: Number = math.inf
-) -> Distribution:
-    """Normal between limits; mean and deviation are those before the truncation."""
-    given = {"mean": mean, "deviation": deviation, "low": low, "high": high}
-    return Distribution("truncated_normal", given)
+def _of_scipy(name: str) -> Any:
+    """Distribution of `scipy.stats` by its prefixed name; None for other names."""
+    import scipy.stats
+
+    if not name.startswith(_SCIPY):
+        return None
+    found = getattr(scipy.stats, name.removeprefix(_SCIPY), None)
+    return found if hasattr(found, "freeze") and hasattr(found, "ppf") else None
 
 
-def uniform(low: Number, high: Number) -> Distribution:
-    """Uniform between low and high."""
-    return Distribution("uniform", {"low": low, "high": high})
+def _arguments(of: Any) -> list[str]:
+    """Names of the parameters of a SciPy distribution, in its order."""
+    shapes = of.shapes.split(", ") if of.shapes else []
+    return [*shapes, "loc", *(["scale"] if hasattr(of, "pdf") else [])]
 
 
-def lognormal(median: Number, log_deviation: Number) -> Distribution:
-    """exp of a normal number: of a median > 0 and the deviation of the natural logarithm."""
-    return Distribution("lognormal", {"median": median, "log_deviation": log_deviation})
-
-
-def loguniform(low: Number, high: Number) -> Distribution:
-    """The logarithm is uniform, 0 < low < high."""
-    return Distribution("loguniform", {"low": low, "high": high})
-
-
-def triangular(low: Number, mode: Number, high: Number) -> Distribution:
-    """A triangle over low to high with its peak at the mode."""
-    return Distribution("triangular", {"low": low, "mode": mode, "high": high})
-
-
-def beta(a: Number, b: Number, low: Number = 0.0, high: Number = 1.0) -> Distribution:
-    """Beta of shapes a, b > 0, stretched over low to high."""
-    return Distribution("beta", {"a": a, "b": b, "low": low, "high": high})
-
-
-def weibull(scale: Number, shape: Number) -> Distribution:
-    """Weibull, as of wind speeds; shape 1 is exponential, 2 is Rayleigh."""
-    return Distribution("weibull", {"scale": scale, "shape": shape})
-
-
-def constant(value: Number) -> Distribution:
-    """Always the same number."""
-    return Distribution("constant", {"value": value})
-
-
-def choice(values: Any, weights: Any = ()) -> Distribution:
-    """One of some values, by relative weights > 0, or all alike."""
-    return Distribution("choice", {"values": values, "weights": weights})
-
-
-def empirical(values: Any) -> Distribution:
-    """One of the values of a sample, such as a column of a file, each as likely."""
-    return Distribution("empirical", {"values": values})
-
-
-# --- checks
-
-
-def _checked(kind: str, given: Given) -> dict[str, Parameter]:
-    """Parameters with defaults, as floats and tuples, after all checks."""
-    known = KINDS[kind]
-    for name in given:
-        if name not in known.parameters:
-            raise SettingError(
-                f"The distribution '{kind}' has no parameter {named(name)}."
-                f"{nearest_names(str(name)[:SHOWN], known.parameters)}"
-            )
-    found: dict[str, Parameter] = {}
-    for name, sort in known.parameters.items():
-        if name not in given and name not in known.defaults:
-            needed = [n for n in known.parameters if n not in known.defaults]
-            raise SettingError(
-                f"The distribution '{kind}' needs '{name}' (it needs {', '.join(needed)})."
-            )
-        value = given.get(name, known.defaults.get(name))
-        what = f"'{name}' of the distribution '{kind}'"
-        found[name] = _list(value, sort, what) if sort in _LISTS else _number(value, sort, what)
-    for holds, words in known.relations:
+def _checked(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Checked parameters with defaults, as floats and tuples."""
+    kind, of = KINDS.get(name), _of_scipy(name)
+    if kind is None and of is None:
+        near = nearest_names(name[:SHOWN], KINDS)
+        raise SettingError(f"There is no distribution {named(name)}.{near}")
+    if kind is None:
+        optional = {"loc": 0.0, "scale": 1.0}
+        types = {k: (Finite, optional.get(k, ...)) for k in _arguments(of)}
+        kind = _Kind(types)
+    fields: dict[str, Any] = {
+        k: t if isinstance(t, tuple) else (t, ...) for k, t in kind.parameters.items()
+    }
+    model = pydantic.create_model("Parameters", __base__=Entries, **fields)
+    found = checked(model, given, f"The distribution '{name}'").model_dump()
+    for holds, words in kind.relations:
         if not holds(found):
-            shown = ", ".join(f"{name} = {_shown(value)}" for name, value in found.items())
-            raise SettingError(f"In the distribution '{kind}' {words}, but it has {shown}.")
-    if kind == "truncated_normal":
-        _check_probability(found)
+            raise SettingError(f"In the distribution '{name}' {words}, but it has {_words(found)}.")
     return found
 
 
-_LISTS = ("list", "positives")
-
-
-def _shown(value: Parameter) -> str:
-    return f"{len(value)} numbers" if isinstance(value, tuple) else f"{value:g}"
-
-
-def _number(value: Any, sort: str, what: str) -> float:
-    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number):
-        raise SettingError(f"{what} must be a number, but it is {shown(value)}.")
-    try:
-        number = float(value)
-    except OverflowError:
-        raise SettingError(f"{what} is too large for a number: {shown(value)}.") from None
-    fine = not math.isnan(number) if sort == "limit" else math.isfinite(number)
-    if not fine:
-        raise SettingError(f"{what} must be finite, but it is {number}.")
-    if sort == "positive" and number <= 0:
-        raise SettingError(f"{what} must be positive, but it is {number:g}.")
-    return number
-
-
-def _list(values: Any, sort: str, what: str) -> tuple[float, ...]:
-    if not isinstance(values, list | tuple | np.ndarray):
-        raise SettingError(f"{what} must be a list of numbers, but it is {shown(values)}.")
-    if len(values) == 0 and sort == "list":
-        raise SettingError(f"{what} must have at least one number, but it is empty.")
-    one = "positive" if sort == "positives" else "finite"
-    return tuple(_number(value, one, f"Number {k} in {what}") for k, value in enumerate(values))
-
-
-def _check_probability(p: Mapping[str, Any]) -> None:
-    """Refuse limits so far from the mean that doubles hold no normal number between them."""
-    import scipy.stats
-
-    middle = scipy.stats.truncnorm.ppf([0.25, 0.75], **_truncated(p))
-    if not np.all((middle >= p["low"]) & (middle <= p["high"])) or middle[0] >= middle[1]:
-        raise SettingError(
-            f"The limits {p['low']:g} and {p['high']:g} are too far from the mean {p['mean']:g} of the "
-            f"distribution 'truncated_normal' for its deviation {p['deviation']:g}."
-        )
+def _words(found: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{name} = {shown(list(value)) if isinstance(value, tuple) else format(value, 'g')}"
+        for name, value in found.items()
+    )

@@ -1,4 +1,4 @@
-"""Centre-of-mass estimation over seeds as work: one of the report's cases, one filter, many runs."""
+"""Monte Carlo study of centre-of-mass estimation: one case, one filter, many noise seeds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,27 +8,30 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from ..estimation.assess import Estimates, convergence, estimate_case, settled_from
-from ..estimation.cases import CASES, Record, simulate_case
-from ..estimation.tuning import Tuning, consistent_tuning, report_tuning
-from ..mechanics.errors import SettingError
+from ..checks.schema import checked
+from ..quadrotor.assess import Estimates, convergence, estimate_case, settled_from
+from ..quadrotor.cases import CaseRecord, simulate_case
+from ..quadrotor.tuning import FilterTuning, consistent_tuning, report_tuning
+from .schema import EstimationFile
 from .work import FINE, AbstractWork, Axis, Column
 
 # Runs estimated together; a sample is always in the same place of the same block.
 BLOCK = 64
-# Every how many steps of the filter errors are kept.
+# Number of filter steps between kept errors.
 SPACING = 20
 LOST = 2
 
 
 @dataclass(frozen=True)
 class EstimationStudy:
-    """Runs of one case, each with noise of its own seed.
+    """Study of one case, with runs of different noise.
 
     Attributes:
-        name: short, for files. case: of the report, 1 to 8.
-        tuning: "report" (Table 2.4.2) or "consistent". t1: end [s].
-        seed: of the first run; sample i is that of seed + i.
+        name: short name for files.
+        case: case of the report, 1 to 8.
+        tuning: "report" (Table 2.4.2) or "consistent".
+        t1: final time [s].
+        seed: seed of the first run; sample i has seed + i.
 
     Raises:
         SettingError: another case or tuning, an impossible end or seed.
@@ -41,17 +44,11 @@ class EstimationStudy:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.case not in CASES:
-            raise SettingError(f"The report has cases 1 to 8, not {self.case}.")
-        if self.tuning not in ("report", "consistent"):
-            raise SettingError(f"The tuning is report or consistent, not '{self.tuning}'.")
-        if not 0.05 <= self.t1 <= 1e3:
-            raise SettingError(f"The end must lie between 0.05 and 1000 s, not {self.t1:g} s.")
-        if self.seed < 0:
-            raise SettingError(f"The seed must not be negative, but it is {self.seed}.")
+        given = {"kind": "estimation", **vars(self)}
+        checked(EstimationFile, given, "A study of estimation")
 
     def plain(self) -> dict[str, Any]:
-        """Everything that decides the numbers, as plain data."""
+        """Plain data of everything on which the numbers depend."""
         return {
             "kind": "estimation", "name": self.name, "case": self.case, "tuning": self.tuning,
             "t1": self.t1, "seed": self.seed, "settled": settled_from(self.t1),
@@ -59,28 +56,28 @@ class EstimationStudy:
 
 
 class EstimationWork(AbstractWork):
-    """An `EstimationStudy`'s runs by number."""
+    """Work of an `EstimationStudy`: its runs by number."""
 
     def __init__(self, study: EstimationStudy) -> None:
         self.study = study
 
     def __getstate__(self) -> dict[str, Any]:
-        """The tuning is made again where it is needed."""
+        """State without the tuning, which is made again where it is needed."""
         return {"study": self.study}
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        """The study's plain data."""
+        """Plain data of the study."""
         return self.study.plain()
 
     @property
     def unit(self) -> int:
-        """Runs estimated together."""
+        """Number of runs estimated together."""
         return BLOCK
 
     @property
     def columns(self) -> Mapping[str, Column]:
-        """The seed, how the offset converges, errors, consistency, and the status."""
+        """Columns of the seed, the offset's convergence, errors, consistency, and the status."""
         real, time, after = "float64", ("time",), f"after {settled_from(self.study.t1):g} s"
         return {
             "seed": Column("int64", "1", "seed of the noise", "input"),
@@ -97,12 +94,12 @@ class EstimationWork(AbstractWork):
 
     @property
     def axes(self) -> Mapping[str, Axis]:
-        """Times of the kept errors."""
+        """Time axis of the kept errors."""
         return {"time": Axis(self._times[SPACING::SPACING], "s")}
 
     @property
     def reasons(self) -> Mapping[int, str]:
-        """Of filters that failed."""
+        """Reasons of failed filters by code."""
         return {LOST: "the filter lost its covariance"}
 
     @cached_property
@@ -111,12 +108,12 @@ class EstimationWork(AbstractWork):
             return np.asarray(self._record(0, 1).t)
 
     @cached_property
-    def _tuning(self) -> Tuning:
+    def _tuning(self) -> FilterTuning:
         if self.study.tuning == "report":
             return report_tuning()
         return consistent_tuning(self.study.case)
 
-    def _record(self, first: int, count: int) -> Record:
+    def _record(self, first: int, count: int) -> CaseRecord:
         study = self.study
         return simulate_case(study.case, seeds=count, t1=study.t1, seed=study.seed + first)
 
@@ -150,7 +147,7 @@ def _wide(fine: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 
 def _measures(found: Estimates, t: np.ndarray) -> dict[str, np.ndarray]:
-    """Of every run (s,), and errors at the kept times (s, k)."""
+    """Measures of every run (s,), and errors at the kept times (s, k)."""
     settled = t[1:] > settled_from(t[-1])
     error = np.asarray(found.error)[:, 3:]
     never = lambda when: np.where(np.isnan(when), np.inf, when)

@@ -1,16 +1,17 @@
-"""Draws of a study's uncertain numbers: sample i depends on the seed and on i alone.
+"""Sampling of a study's uncertain parameters: sample i depends on the seed and on i alone.
 
 Designs:
-- random: independent draws, from a counter-based generator (Philox).
+- random: independent samples, from a counter-based generator (Philox).
 - latin: Latin hypercubes of a declared number of samples, one after the other.
 - sobol: a scrambled Sobol sequence; best in powers of two.
-- saltelli: base points of two independent draws A and B, each flown as A, B and A with one factor
-  after the other taken from B: d + 2 samples a point, for Sobol indices (`sensitivity.sobol`).
+- saltelli: base points, pairs of independent points A and B, simulated as A, B, and A with one
+  factor after the other taken from B: d + 2 samples per base point, for Sobol indices
+  (`sensitivity.sobol`).
 - table: the rows of given columns, in order.
 
-Correlated factors are joined by a Gaussian copula: the matrix is that of the normal numbers behind
-the factors. Factors keep their distributions; their rank correlation is (6 / pi) asin(rho / 2). A
-hypercube or Sobol sequence is less even after it than before.
+Correlated factors are joined by a Gaussian copula: the matrix is that of the normal variables
+behind the factors. Factors keep their distributions; their rank correlation is
+(6 / pi) asin(rho / 2). The copula makes a hypercube or Sobol sequence less even.
 
 Source: Owen (2020) arXiv:2008.08051 (why the first Sobol point stays in); Saltelli et al. (2010),
 Comput. Phys. Commun. 181, 259-270, the layout of A, B and AB.
@@ -18,76 +19,67 @@ Comput. Phys. Commun. 181, 259-270, the layout of A, B and AB.
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Float
 
-from ..mechanics.errors import SettingError, nearest_names
-from ..mechanics.schema import SHOWN, named, shown
-from .distribution import Distribution, Number, from_plain
+from ..checks.errors import SettingError, nearest_names
+from ..checks.schema import SHOWN, checked, named
+from .distribution import Distribution, as_distribution
+from .schema import Design, Drawing
 
-DESIGNS = ("random", "latin", "sobol", "saltelli", "table")
+DESIGNS = get_args(Design)
 
-# SciPy can go forward to a later point only in sequences of up to 32 bits.
+# SciPy can skip forward only in sequences of up to 32 bits.
 SOBOL_BITS = 31
 SOBOL_POINTS = 2**SOBOL_BITS
 
-# What a correlation matrix that was computed from data may lack in symmetry.
-_ROUND_OFF = 1e-12
-
-# Each design has random numbers of its own.
+# Index of the random stream of each design.
 _STREAM = {name: k for k, name in enumerate(DESIGNS)}
-
-Pairs = Sequence[tuple[str, str, Number]] | Mapping[tuple[str, str], Number] | np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
 class Sampling:
-    """How the numbers of a study are drawn.
+    """Sampling design of a study.
 
     Attributes:
-        factors: distributions by name, d of them; in a table, empirical ones (its columns) or
+        factors: distributions of the d factors by name: frozen ones of `scipy.stats`, numbers or
+            plain forms, kept as `Distribution`s; in a table, empirical ones (its columns) or
             constants.
         seed: a whole number >= 0.
         design: one of `DESIGNS`.
-        correlation: of the normal numbers behind the factors, as (name, name, rho), as a mapping
-            from pairs of names, or as a matrix (d, d); kept as the first.
-        stratum: samples of one Latin hypercube; only for that design.
+        correlation: correlations of the normal variables behind the factors, (name, name, rho).
+        stratum: number of samples of one Latin hypercube; only for that design.
 
     Raises:
         SettingError: no factors, an unknown design, a negative seed, a correlation that is not
             positive definite or that the design cannot have, a stratum where none belongs.
     """
 
-    factors: Mapping[str, Distribution]
+    factors: Mapping[str, Any]
     seed: int
     design: str = "random"
-    correlation: Pairs = ()
+    correlation: Sequence[tuple[str, str, float]] = ()
     stratum: int | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "factors", dict(self.factors))
-        object.__setattr__(self, "correlation", _triples(self.correlation, self.names))
+        made = {name: as_distribution(one, name) for name, one in self.factors.items()}
+        object.__setattr__(self, "factors", made)
+        object.__setattr__(self, "correlation", tuple(map(tuple, self.correlation)))
         _check(self)
         if self.correlation:
             self._root()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The factors, in the order of the columns that are drawn."""
+        """Names of the factors, in the order of the sampled columns."""
         return tuple(self.factors)
 
     @property
-    def pairs(self) -> tuple[tuple[str, str, float], ...]:
-        """Correlations as (name, name, rho)."""
-        return cast(tuple[tuple[str, str, float], ...], self.correlation)
-
-    @property
     def limit(self) -> int | None:
-        """How many samples there are at most; None where there is no end."""
+        """Largest number of samples; None for an unlimited design."""
         if self.design == "table":
             return _rows(self.factors)
         if self.design in ("sobol", "saltelli"):
@@ -96,17 +88,17 @@ class Sampling:
 
     @property
     def together(self) -> int:
-        """How many neighbouring samples belong together: a study has a multiple of it."""
+        """Number of consecutive samples that belong together; a study has a multiple of it."""
         if self.design == "latin":
             return self.stratum or 1
         return len(self.factors) + 2 if self.design == "saltelli" else 1
 
     def whole(self, count: int) -> int:
-        """The least number of samples >= count that breaks nothing that belongs together."""
+        """Smallest number of samples >= count that is a multiple of `together`."""
         return -(-count // self.together) * self.together
 
     def draw(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
-        """The factors of samples first, ..., first + count - 1, in their own units.
+        """Values of the factors in samples first, ..., first + count - 1, in their own units.
 
         Raises:
             SettingError: a negative number, or samples beyond the design's end.
@@ -131,24 +123,24 @@ class Sampling:
         return np.stack(columns, axis=1)
 
     def plain(self) -> dict[str, Any]:
-        """The plain form, which JSON and TOML can hold; `sampling_from_plain` reads it.
+        """Plain form for JSON and TOML; `sampling_from_plain` reads it.
 
-        Factors are a list, as their order decides on the draws of a Sobol sequence.
+        Factors are a list, as the points of a Sobol sequence depend on their order.
         """
         factors = [{"name": name} | one.plain() for name, one in self.factors.items()]
         found = {"design": self.design, "seed": self.seed, "factors": factors}
         if self.correlation:
-            found["correlation"] = [list(triple) for triple in self.pairs]
+            found["correlation"] = [list(triple) for triple in self.correlation]
         return found if self.stratum is None else found | {"stratum": self.stratum}
 
     def _root(self) -> np.ndarray:
-        """The Cholesky factor of the correlation matrix (d, d)."""
+        """Cholesky factor of the correlation matrix (d, d)."""
         matrix = np.eye(len(self.factors))
         place = {name: k for k, name in enumerate(self.names)}
-        for a, b, rho in self.pairs:
+        for a, b, rho in self.correlation:
             matrix[place[a], place[b]] = matrix[place[b], place[a]] = rho
         least = float(np.linalg.eigvalsh(matrix)[0])
-        # below, round-off could hide a negative one
+        # below this bound, round-off could hide a negative eigenvalue
         if least < len(matrix) * np.finfo(float).eps:
             raise SettingError(
                 "The correlations must form a positive definite matrix, but its smallest eigenvalue is "
@@ -158,48 +150,24 @@ class Sampling:
 
 
 def sampling_from_plain(plain: Mapping[str, Any]) -> Sampling:
-    """A sampling from its plain form; factors may also be tables by name, as TOML has them.
+    """Sampling design from its plain form; factors may also be tables by name, as in TOML.
 
     Raises:
-        SettingError: unknown or missing entries, and as `Sampling`.
+        SettingError: unknown or missing entries; also as for `Sampling`.
     """
-    known = tuple(field.name for field in dataclasses.fields(Sampling))
-    for name in plain:
-        if name not in known:
-            raise SettingError(f"A sampling has no entry '{name}'.{nearest_names(name, known)}")
-    for name in ("factors", "seed"):
-        if name not in plain:
-            raise SettingError(f"A sampling needs an entry '{name}'.")
-    for name in ("seed", "stratum"):
-        value = plain.get(name, 0)
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise SettingError(
-                f"'{name}' of a sampling must be a whole number, but it is {shown(value)}."
-            )
-    given = plain["factors"]
+    rest = {name: value for name, value in plain.items() if name != "factors"}
+    drawing = checked(Drawing, rest, "A sampling").model_dump()
+    given = plain.get("factors", {})
     if not isinstance(given, Mapping):
         given = {one["name"]: {k: v for k, v in one.items() if k != "name"} for one in given}
-    factors = {name: from_plain(one, name) for name, one in given.items()}
-    pairs = [_pair(triple) for triple in plain.get("correlation", [])]
-    design = str(plain.get("design", "random"))
-    return Sampling(factors, plain["seed"], design, pairs, plain.get("stratum"))
-
-
-def _pair(given: Any) -> tuple[str, str, float]:
-    try:
-        a, b, rho = given
-        return str(a), str(b), float(rho)
-    except (TypeError, ValueError):
-        raise SettingError(
-            f"A correlation is given as [name, name, number], but there is {shown(given)}."
-        ) from None
+    return Sampling(given, **drawing)
 
 
 # --- uniform numbers of each design, in (0, 1), as functions of the sampling and the numbers
 
 
 def _random(sampling: Sampling, first: int, count: int) -> np.ndarray:
-    """Philox gives four numbers a count; each sample has counts of its own."""
+    """Independent uniform numbers; Philox gives four a count, and each sample has own counts."""
     d = len(sampling.factors)
     counts = -(-d // 4)
     seeds = np.random.SeedSequence([sampling.seed, _STREAM["random"]])
@@ -222,7 +190,7 @@ def _latin(sampling: Sampling, first: int, count: int) -> np.ndarray:
 
 @functools.lru_cache(maxsize=2)
 def _hypercube(seed: int, b: int, size: int, d: int) -> np.ndarray:
-    """Stratum b (size, d). Kept, since chunks of one stratum are drawn one after the other."""
+    """Latin hypercube b (size, d), cached because its chunks are sampled one after the other."""
     from scipy.stats import qmc
 
     rng = np.random.default_rng([seed, _STREAM["latin"], b])
@@ -243,7 +211,7 @@ def _sequence(d: int, seed: int, first: int, count: int, design: str) -> np.ndar
     if count == 0:
         return np.empty((0, d))
     if first == 0:
-        # apart from the rest, as SciPy warns of first draws that are not a power of two
+        # the first point apart, as SciPy warns if the first call is not a power of two
         points = np.concatenate([engine.random(1), engine.random(count - 1)])
     else:
         points = engine.fast_forward(first).random(count)
@@ -277,7 +245,7 @@ def _joined(root: np.ndarray, u: np.ndarray) -> np.ndarray:
     for j in range(len(root)):
         for k in range(j + 1):
             joined[:, j] += root[j, k] * z[:, k]
-    # more than 8 deviations out doubles cannot tell the shares from 0 and 1
+    # beyond 8 standard deviations doubles cannot tell the probabilities from 0 and 1
     return np.clip(ndtr(joined), np.nextafter(0.0, 1.0), np.nextafter(1.0, 0.0))
 
 
@@ -294,71 +262,38 @@ def _rows(factors: Mapping[str, Distribution]) -> int:
 # --- checks
 
 
-def _triples(given: Pairs, names: tuple[str, ...]) -> tuple[tuple[str, str, float], ...]:
-    """Correlations as (name, name, rho), checked but for being positive definite."""
-    if isinstance(given, np.ndarray):
-        triples = _of_matrix(given, names)
-    elif isinstance(given, Mapping):
-        triples = [(a, b, rho) for (a, b), rho in given.items()]
-    else:
-        triples = [(a, b, rho) for a, b, rho in given]
+def _check_pairs(s: Sampling) -> None:
+    """Check that correlations name two factors, each pair once."""
     seen = set()
-    for a, b, rho in triples:
+    for a, b, _ in s.correlation:
         for name in (a, b):
-            if name not in names:
+            if name not in s.names:
                 raise SettingError(
                     f"A correlation names {named(name)}, which is no factor."
-                    f"{nearest_names(name[:SHOWN], [known[:SHOWN] for known in names])}"
+                    f"{nearest_names(name[:SHOWN], [known[:SHOWN] for known in s.names])}"
                 )
+            if s.factors[name].name == "constant":
+                raise SettingError(f"Factor '{name}' is constant: it cannot be correlated.")
         if a == b or frozenset((a, b)) in seen:
             raise SettingError(
                 f"The correlation of {named(a)} with {named(b)} is given twice or is its own."
             )
         seen.add(frozenset((a, b)))
-        if not -1 < rho < 1:
-            raise SettingError(
-                f"The correlation of '{a}' with '{b}' must lie between -1 and 1, but it is {rho:g}."
-            )
-    return tuple((a, b, float(rho)) for a, b, rho in triples)
-
-
-def _of_matrix(matrix: np.ndarray, names: tuple[str, ...]) -> list[tuple[str, str, float]]:
-    d = len(names)
-    if matrix.shape != (d, d):
-        raise SettingError(
-            f"A correlation matrix of {d} factors has shape ({d}, {d}), not {matrix.shape}."
-        )
-    skew, off = np.max(np.abs(matrix - matrix.T)), np.max(np.abs(np.diag(matrix) - 1))
-    if not max(skew, off) < _ROUND_OFF:
-        raise SettingError(
-            "A correlation matrix must be symmetric with ones on its diagonal, but its diagonal is up to "
-            f"{off:g} away from 1, and it differs from its transpose by up to {skew:g}."
-        )
-    pairs = itertools.combinations(range(d), 2)
-    return [(names[i], names[j], float(matrix[i, j])) for i, j in pairs if matrix[i, j] != 0]
 
 
 def _check(s: Sampling) -> None:
-    if s.design not in DESIGNS:
-        raise SettingError(f"There is no design '{s.design}'.{nearest_names(s.design, DESIGNS)}")
+    checked(Drawing, {name: getattr(s, name) for name in Drawing.model_fields}, "A sampling")
     if not s.factors:
         raise SettingError("A sampling needs at least one factor.")
-    if s.seed < 0:
-        raise SettingError(f"The seed must be a whole number from 0 on, but it is {s.seed}.")
     if (s.stratum is not None) != (s.design == "latin"):
         raise SettingError(
             "A design 'latin', and no other, needs 'stratum', the number of samples of one hypercube; "
             f"here the design is '{s.design}' and the stratum {s.stratum}."
         )
-    if s.stratum is not None and s.stratum < 1:
-        raise SettingError(f"The stratum must be at least 1 sample, but it is {s.stratum}.")
     if s.correlation and s.design in ("saltelli", "table"):
         why = "takes factors one by one" if s.design == "saltelli" else "has its rows as they are"
         raise SettingError(f"The design '{s.design}' {why}: it cannot have correlations.")
-    for a, b, _ in s.pairs:
-        for name in (a, b):
-            if s.factors[name].name == "constant":
-                raise SettingError(f"Factor '{name}' is constant: it cannot be correlated.")
+    _check_pairs(s)
     if s.design == "table":
         _check_table(s.factors)
 

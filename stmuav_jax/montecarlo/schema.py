@@ -1,7 +1,7 @@
-"""What a study's file may hold: names, types and ranges of all its entries.
+"""Schema of a study's file: names, types and ranges of all its entries.
 
-Distributions of factors are checked by `distribution.from_plain`, names of factors and signals by
-the scene that is flown.
+Distributions of factors are checked by `distribution.as_distribution`, names of factors and signals
+by the scene that is simulated.
 """
 
 import unicodedata
@@ -10,19 +10,32 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from ..mechanics.errors import SettingError
-from ..mechanics.schema import MOST, Count, Entries, Finite, Positive, checked, named, shown
+from ..checks.errors import SettingError, nearest_names
+from ..checks.schema import (
+    MOST,
+    SHOWN,
+    Count,
+    Entries,
+    Finite,
+    Positive,
+    Tuples,
+    checked,
+    named,
+    shown,
+)
+from ..dynamics.choices import STEP_TOLERANCE, ExplicitSolverName
+from ..scenes.registry import SCENES
 
-# A flight of more seconds is not meant.
+# Longest permitted run [s]; a longer one is taken for a mistake.
 LONGEST = 1e6
-# Numbers and rows that a column of the store's types can count.
+# Largest numbers that the store's column types can hold.
 MOST_STEPS = 2**31 - 1
 MOST_SEED = 2**63 - 1
 LONGEST_NAME = 100
 
 
 def name_fault(name: str) -> str | None:
-    """Why a text cannot name a study and so a folder: words that follow 'must'; None if it can."""
+    """Requirement that a study's name, used for a folder, breaks: words after 'must', or None."""
     if not 1 <= len(name) <= LONGEST_NAME:
         return f"have 1 to {LONGEST_NAME} characters"
     if name.startswith(".") or name != name.strip():
@@ -30,18 +43,6 @@ def name_fault(name: str) -> str | None:
     if any(c in '/\\:*?"<>|' or unicodedata.category(c).startswith("C") for c in name):
         return "have no separators of folders, no wildcards and no control characters"
     return None
-
-
-def check_name(name: Any) -> str:
-    """The name of a study.
-
-    Raises:
-        SettingError: not a text that can name a folder.
-    """
-    fault = name_fault(name) if isinstance(name, str) else "be text"
-    if fault:
-        raise SettingError(f"A study's name must {fault}, but it is {shown(name)}.")
-    return name
 
 
 def _name(name: str) -> str:
@@ -72,46 +73,74 @@ def _factor(given: Any) -> Any:
     return given
 
 
+def _scene(name: str) -> str:
+    if name not in SCENES:
+        raise ValueError(
+            f"must be one of {', '.join(SCENES)}, not {shown(name)}.{nearest_names(name[:SHOWN], SCENES)}"
+        )
+    return name
+
+
 Name = Annotated[str, AfterValidator(_name)]
+SceneName = Annotated[str, AfterValidator(_scene)]
 Factor = Annotated[Any, BeforeValidator(_factor)]
 Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
 Seconds = Annotated[float, Field(gt=0, le=LONGEST)]
-Tolerance = Annotated[float, Field(gt=0, le=1)]
+# The lower bound is the round-off of a step.
+Tolerance = Annotated[float, Field(ge=1e-15, le=1)]
+Take = Literal["final", "largest", "smallest", "path", "when_above", "when_below"]
+Design = Literal["random", "latin", "sobol", "saltelli", "table"]
 Pair = tuple[str, str, Annotated[float, Field(gt=-1, lt=1)]]
 
 
-def _tuples(given: Any) -> Any:
-    """Lists of a file as tuples, which strict models want."""
-    return tuple(_tuples(x) for x in given) if isinstance(given, list) else given
-
-
 class QuantityEntry(Entries):
-    """What is kept of each flight."""
+    """Entry for a quantity that is kept of each run."""
 
     signal: str
-    take: Literal["final", "largest", "smallest", "path", "when_above", "when_below"]
+    take: Take
     level: Finite | None = None
     stop: bool = False
 
 
 class FailureEntry(Entries):
-    """When a flight that was completed counts as a failure."""
+    """Entry for the condition under which a completed run counts as a failure."""
 
     quantity: str
     above: Finite | None = None
     below: Finite | None = None
 
 
-class FlightsFile(Entries):
-    """A study of flights."""
+class Drawing(Entries):
+    """Entries of a sampling design, except its factors."""
 
-    scene: Literal["tracker", "hexacopter", "uav_tracker"]
+    seed: Seed = 0
+    design: Design = "random"
+    stratum: Count | None = None
+    correlation: Annotated[tuple[Pair, ...], Tuples] = ()
+
+
+class Flying(Entries):
+    """Entries of a study for the integration and recording of each run."""
+
+    name: Name = "study"
+    t1: Seconds = 1.0
+    every: Positive | None = None
+    rtol: Tolerance = STEP_TOLERANCE
+    atol: Annotated[float, Field(ge=1e-15)] = STEP_TOLERANCE
+    solver: ExplicitSolverName = "dopri8"
+    max_steps: Annotated[int, Field(ge=1, le=MOST_STEPS)] = 20_000
+    direction: Annotated[tuple[Finite, Finite, Finite], Tuples] | None = None
+
+
+class FlightsFile(Drawing, Flying):
+    """Entries of a study of simulated motions."""
+
+    scene: SceneName
     factors: Annotated[dict[str, Factor], Field(min_length=1, max_length=1000)]
     quantities: Annotated[
         dict[Annotated[str, AfterValidator(_column)], QuantityEntry], Field(max_length=1000)
     ]
     kind: Literal["flights"] = "flights"
-    name: Name = "study"
     case: Annotated[int, Field(ge=1, le=100)] | None = None
     samples: Count | None = None
     chunk: Annotated[int, Field(ge=1, le=MOST_STEPS)] | None = None
@@ -119,39 +148,25 @@ class FlightsFile(Entries):
     inputs: Literal["case", "trim"] = "case"
     drag: bool = False
     gusts: bool = False
-    precision: Literal["float64", "float32"] = "float64"
-    t1: Seconds = 1.0
-    every: Positive | None = None
-    rtol: Tolerance = 1e-8
-    atol: Positive = 1e-8
-    solver: Literal["dopri8", "tsit5"] = "dopri8"
-    step: Positive | None = None
-    max_steps: Annotated[int, Field(ge=1, le=MOST_STEPS)] = 20_000
-    direction: (
-        Annotated[tuple[Finite, Finite, Finite], BeforeValidator(_tuples)] | None
-    ) = None  # fmt: skip
-    seed: Seed = 0
-    design: Literal["random", "latin", "sobol", "saltelli", "table"] = "random"
-    stratum: Count | None = None
-    correlation: Annotated[tuple[Pair, ...], BeforeValidator(_tuples)] = ()
+    options: dict[str, Any] = Field(default_factory=dict)
     failure: FailureEntry | None = None
 
 
 class EstimationFile(Entries):
-    """A study of Part III's estimation over seeds."""
+    """Entries of a study of Part III's estimation over noise seeds."""
 
     kind: Literal["estimation"]
     case: Annotated[int, Field(ge=1, le=8)]
     name: Name = "estimation"
     tuning: Literal["report", "consistent"] = "consistent"
-    t1: Annotated[float, Field(gt=0, le=1000)] = 2.0
+    t1: Annotated[float, Field(ge=0.05, le=1000)] = 2.0
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
     samples: Count | None = None
     chunk: Annotated[int, Field(ge=1, le=MOST_STEPS)] | None = None
 
 
 def flights_file(plain: Mapping[str, Any]) -> FlightsFile:
-    """A study of flights from its plain data, with all types and ranges checked.
+    """Study of motions from its plain data, with all types and ranges checked.
 
     Raises:
         SettingError: an entry that is unknown, missing, of another type or out of range.
@@ -160,15 +175,15 @@ def flights_file(plain: Mapping[str, Any]) -> FlightsFile:
 
 
 def estimation_file(plain: Mapping[str, Any]) -> EstimationFile:
-    """A study of estimation, as `flights_file`."""
+    """Study of estimation from its plain data, checked as by `flights_file`."""
     return checked(EstimationFile, plain, "A study of estimation")
 
 
 def check_count(value: Any, what: str, most: int = MOST) -> int:
-    """A whole number from 1 on.
+    """Check that a value is a whole number from 1 to `most`, and return it.
 
     Raises:
-        SettingError: another number, or one that is too large to be meant.
+        SettingError: any other value.
     """
     if type(value) is int and value < 1:
         raise SettingError(f"{what} must be 1 or more, not {shown(value)}.")

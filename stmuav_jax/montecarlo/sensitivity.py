@@ -1,32 +1,30 @@
-"""Which uncertain numbers decide: Sobol indices, shares from any random study, correlations, gradients.
+"""Sensitivity analysis: Sobol indices, first-order indices of any study, rank correlations.
 
-The first-order index of a factor is the share of a quantity's variance that its mean at fixed factor
-has, the total index the share that is left on average when all other factors are fixed:
+The first-order index of a factor is the share of a quantity's variance explained by its conditional
+mean at fixed factor; the total index is the share that is left on average when all other factors
+are fixed:
 
     S_j = V[E(f | x_j)] / V[f],   T_j = E(V[f | x_others]) / V[f]
 
-for independent factors. `sobol` needs a study of the design "saltelli"; `binned` estimates first-order
-indices from the samples of any other.
+for independent factors. `sobol` needs a study of the design "saltelli"; `binned` estimates
+first-order indices from the samples of any other.
 """
 
-import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer, Shaped
 
-from ..mechanics.errors import SettingError
-from .distribution import Distribution
-from .statistics import LEVEL, Estimate, mean
+from ..checks.errors import SettingError
+from .statistics import LEVEL
 from .work import FINE, MISSING
 
-# Numbers that one batch of the bootstrap may hold at once, 128 MiB of doubles.
+# Largest number of doubles in one batch of the bootstrap, 128 MiB.
 _BATCH = 2**24
 
 
-class Shares(NamedTuple):
-    """A number per factor with the ends of its confidence interval, each (d,)."""
+class IndexIntervals(NamedTuple):
+    """Estimates for d factors with the ends of their confidence intervals, each (d,)."""
 
     value: Float[np.ndarray, " d"]
     low: Float[np.ndarray, " d"]
@@ -34,42 +32,32 @@ class Shares(NamedTuple):
 
 
 class SobolIndices(NamedTuple):
-    """First-order and total indices, and how many base points were used, lost to failures, pending."""
+    """Sobol indices, first-order and total, and numbers of base points.
 
-    first: Shares
-    total: Shares
+    Attributes:
+        first, total: first-order and total indices (d,).
+        used, lost, pending: numbers of base points used, lost to failures, and not computed yet.
+    """
+
+    first: IndexIntervals
+    total: IndexIntervals
     used: int
     lost: int
     pending: int
 
 
 class Binned(NamedTuple):
-    """First-order indices (d,) from samples, and what a factor without influence stays below."""
+    """First-order indices estimated from bins of samples.
+
+    Attributes:
+        value: first-order indices (d,).
+        chance: bound that the index of a factor without influence exceeds with small probability.
+        bins: number of bins.
+    """
 
     value: Float[np.ndarray, " d"]
     chance: float
     bins: int
-
-
-class Regression(NamedTuple):
-    """Standardised coefficients (d,) of a linear fit, and the share of the variance that it explains."""
-
-    coefficients: Float[np.ndarray, " d"]
-    explained: float
-
-
-class DerivativeMeasures(NamedTuple):
-    """From gradients, one per factor.
-
-    Attributes:
-        square: means of the squared derivatives, with intervals [(unit / factor's unit)^2].
-        bound: what the total index does not exceed (d,); not a number where no bound is known.
-        share: of each factor in the linearised variance (d,); they sum to 1.
-    """
-
-    square: tuple[Estimate, ...]
-    bound: Float[np.ndarray, " d"]
-    share: Float[np.ndarray, " d"]
 
 
 def sobol(
@@ -82,24 +70,27 @@ def sobol(
     seed: int = 0,
     allowed: float = 0.1,
 ) -> SobolIndices:
-    """Sobol indices of a quantity of a study of the design "saltelli", from its first sample on.
+    """Sobol indices of a quantity in a study of the design "saltelli".
 
         S_j = mean(f_B (f_ABj - f_A)) / V,   T_j = mean((f_A - f_ABj)^2) / (2 V)
 
-    with V the variance over A and B together, values taken from their mean. Intervals are percentiles
-    of a bootstrap over base points, as if these were random; from about 1000 points on the errors of a
-    Sobol sequence are smaller than that.
+    with V the variance over A and B together, values taken from their mean. Intervals are
+    percentiles of a bootstrap over base points, as if these were random; from about 1000 points on
+    the errors of a Sobol sequence are smaller than that.
 
     Args:
-        values: (n,), status: (n,) codes: of samples 0, 1, ..., n - 1.
-        factors: d. resamples, seed: of the bootstrap.
+        values: values of samples 0, 1, ..., n - 1 (n,).
+        status: status codes of these samples (n,).
+        factors: number d of factors.
+        level: confidence level of the intervals.
+        resamples, seed: number of resamples and seed of the bootstrap.
         allowed: share of base points that may be lost because one of their samples failed.
 
     Raises:
         SettingError: too many points lost, too few left, values not finite or all the same.
 
-    Source: Saltelli et al. (2010), Comput. Phys. Commun. 181, 259-270, table 2 (b) and (f), the latter
-    by Jansen (1999).
+    Source: Saltelli et al. (2010), Comput. Phys. Commun. 181, 259-270, table 2 (b) and (f), the
+    latter by Jansen (1999).
     """
     import scipy.stats
 
@@ -120,11 +111,13 @@ def sobol(
     )  # fmt: skip
     found = np.stack([_indices(*y, axis=-1), *result.confidence_interval])
     first, total = np.split(found, 2, axis=1)
-    return SobolIndices(Shares(*first), Shares(*total), used, lost, int(np.sum(pending)))
+    return SobolIndices(
+        IndexIntervals(*first), IndexIntervals(*total), used, lost, int(np.sum(pending))
+    )
 
 
 def _indices(a: np.ndarray, b: np.ndarray, *mixed: np.ndarray, axis: int) -> np.ndarray:
-    """First-order indices, then total ones, on the first axis."""
+    """First-order indices, then total ones, stacked on the first axis."""
     middle = (np.mean(a, axis, keepdims=True) + np.mean(b, axis, keepdims=True)) / 2
     a, b = a - middle, b - middle
     variance = (np.mean(a**2, axis) + np.mean(b**2, axis)) / 2
@@ -153,21 +146,24 @@ def binned(
     bins: int | None = None,
     level: float = LEVEL,
 ) -> Binned:
-    """First-order indices from any independent samples: variance of the means over bins of a factor.
+    """First-order indices from any independent samples, by the variance of the means over bins.
 
         S_j = 1 - (n - 1) / (n - M) V_within / V
 
-    with M bins of equally many samples. It is 0 on average where a factor has no influence (and may
-    then be negative), and sees influences that are not monotonic.
+    with M bins of equally many samples. The index is 0 on average where a factor has no influence
+    (and may then be negative), and includes influences that are not monotonic.
 
     Args:
-        bins: M; by default n^(1/3), from 4 to 50.
+        inputs: values of the factors (n, d).
+        values: values of the quantity (n,).
+        bins: number M of bins; by default n^(1/3), from 4 to 50.
+        level: probability that `chance` is not exceeded by a factor without influence.
 
     Raises:
         SettingError: fewer than 2 samples a bin, values not finite or all the same.
 
-    Source: Pearson's correlation ratio, corrected for the bins (Kelley 1935); Plischke, Borgonovo and
-    Smith (2013), Eur. J. Oper. Res. 226, 536-550.
+    Source: Pearson's correlation ratio, corrected for the bins (Kelley 1935); Plischke, Borgonovo
+    and Smith (2013), Eur. J. Oper. Res. 226, 536-550.
     """
     import scipy.stats
 
@@ -195,7 +191,7 @@ def binned(
 
 def spearman(
     inputs: Float[np.ndarray, "n d"], values: Shaped[np.ndarray, " n"], level: float = LEVEL
-) -> Shares:
+) -> IndexIntervals:
     """Rank correlation of each factor with a quantity; infinite values have ranks too.
 
     Raises:
@@ -209,50 +205,20 @@ def spearman(
     if n < 4:
         raise SettingError(f"A rank correlation needs at least 4 samples, but there are {n}.")
     ranks = [_varying(scipy.stats.rankdata(x), "Rank correlations") for x in (*inputs.T, values)]
-    r = np.clip(np.corrcoef(np.stack(ranks))[-1, :-1], -1.0, 1.0)  # round-off
+    r = np.clip(np.corrcoef(np.stack(ranks))[-1, :-1], -1.0, 1.0)  # against round-off
     half = scipy.stats.norm.ppf(0.5 + level / 2) * np.sqrt((1 + r**2 / 2) / (n - 3))
-    # whole correlations have infinite arctanh, and no interval but themselves
+    # correlations of +-1 have infinite arctanh, and an interval of zero length
     with np.errstate(divide="ignore"):
         z = np.arctanh(r)
-    return Shares(r, np.tanh(z - half), np.tanh(z + half))
-
-
-def regression(
-    inputs: Float[np.ndarray, "n d"], values: Shaped[np.ndarray, " n"], *, ranks: bool = False
-) -> Regression:
-    """Standardised coefficients of a linear fit by least squares, of the numbers or of their ranks.
-
-    For independent factors and a linear quantity the square of a coefficient is its Sobol index.
-
-    Raises:
-        SettingError: not more samples than factors, numbers not finite or all the same, factors that
-            depend on each other linearly.
-    """
-    import scipy.stats
-
-    n, d = inputs.shape
-    if n <= d + 1:
-        raise SettingError(
-            f"A fit of {d} factors needs more than {d + 1} samples, but there are {n}."
-        )
-    columns = [*inputs.T, values]
-    if ranks:
-        columns = [scipy.stats.rankdata(x) for x in columns]
-    checked = [_varying(x, "Linear fits") for x in columns]
-    scaled = np.stack([(x - np.mean(x)) / np.std(x) for x in checked], axis=1)
-    solution, _, rank, _ = np.linalg.lstsq(scaled[:, :-1], scaled[:, -1])
-    if rank < d:
-        raise SettingError(f"Of {d} factors only {rank} are linearly independent; leave some out.")
-    rest = scaled[:, -1] - scaled[:, :-1] @ solution
-    return Regression(solution, float(1 - np.mean(rest**2)))
+    return IndexIntervals(r, np.tanh(z - half), np.tanh(z + half))
 
 
 def separation(
     inputs: Float[np.ndarray, "n d"], hits: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, " d"]:
-    """How differently each factor is distributed in hits, such as failures, and elsewhere: 0 to 1.
+    """Kolmogorov-Smirnov distance, 0 to 1, of each factor's distributions in hits and elsewhere.
 
-    Kolmogorov and Smirnov's distance between the two.
+    Hits are samples with a certain outcome, such as failures.
 
     Raises:
         SettingError: no hits, or hits only.
@@ -264,57 +230,9 @@ def separation(
     k, n = int(np.sum(hits)), len(hits)
     if k in (0, n):
         raise SettingError(f"A comparison needs hits and others, but {k} of {n} samples are hits.")
-    # the first of the result is the distance
+    # the first entry of the result is the distance
     compare = lambda x: scipy.stats.ks_2samp(x[hits], x[~hits], method="asymp")[0]
     return np.array([float(compare(x)) for x in inputs.T])
-
-
-def derivative_measures(
-    gradients: Float[np.ndarray, "n d"],
-    factors: Sequence[Distribution],
-    variance: float,
-    level: float = LEVEL,
-) -> DerivativeMeasures:
-    """What gradients at random samples say of total Sobol indices.
-
-        nu_j = E((df/dx_j)^2),   T_j <= C_j nu_j / V[f],   share_j = sigma_j^2 nu_j / sum_k sigma_k^2 nu_k
-
-    C_j is Poincare's constant of the factor: sigma^2 of a normal one, which bounds that of a truncated
-    one of the same sigma too, and (high - low)^2 / pi^2 of a uniform one. For a linear quantity of normal
-    factors the bound is the index itself.
-
-    Args:
-        gradients: (n, d), by the factors in their own units. factors: the d distributions.
-        variance: V[f] > 0, such as `deviation(...).value**2`.
-
-    Raises:
-        SettingError: numbers of another shape, not finite, a variance that is not positive.
-
-    Source: Sobol and Kucherenko (2009), Math. Comput. Simul. 79, 3009-3017, uniform and normal factors;
-    Lamboni et al. (2013), Math. Comput. Simul. 87, 45-54, log-concave ones.
-    """
-    n, d = gradients.shape
-    if d != len(factors):
-        raise SettingError(f"Gradients have {d} columns, but there are {len(factors)} factors.")
-    if not (math.isfinite(variance) and variance > 0):
-        raise SettingError(f"The variance must be positive and finite, but it is {variance:g}.")
-    square = tuple(mean(g**2, level) for g in gradients.T)
-    nu = np.array([one.value for one in square])
-    weighted = np.array([one.variance for one in factors]) * nu
-    if not np.sum(weighted) > 0:
-        raise SettingError(f"All {n} gradients are zero: there are no shares of the variance.")
-    constants = np.array([_poincare(one) for one in factors])
-    return DerivativeMeasures(square, constants * nu / variance, weighted / np.sum(weighted))
-
-
-def _poincare(one: Distribution) -> float:
-    """Poincare's constant [unit^2]; not a number where none is known here."""
-    p = one.parameters
-    if one.name in ("normal", "truncated_normal"):
-        return p["deviation"] ** 2
-    if one.name == "uniform":
-        return (p["high"] - p["low"]) ** 2 / math.pi**2
-    return 0.0 if one.name == "constant" else math.nan
 
 
 def _varying(values: np.ndarray, what: str) -> np.ndarray:

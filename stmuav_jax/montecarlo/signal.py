@@ -1,4 +1,4 @@
-"""Signals of a flight by name: numbers of time and state that quantities are made from."""
+"""Signals of a run by name: scalar functions of time and state, from which quantities are made."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,24 +9,26 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import rotation_matrix
-from ..dynamics.energy import energy
-from ..dynamics.formulation import Reactions
-from ..dynamics.problem import Problem, at_internal
-from ..mechanics.errors import SettingError, nearest_names
-from ..mechanics.schema import SHOWN, named
+from ..checks.errors import SettingError, nearest_names
+from ..checks.schema import SHOWN, named
+from ..dynamics.conserved import energy
+from ..dynamics.formulations.base import Reactions
+from ..dynamics.integration.problem import Problem, at_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
-from ..vehicle.kinematics import panel_angles
+from ..tracker.kinematics import panel_angles
 
 PANEL, SLIDERS = "panel_7", ("slider_2", "slider_3")
 
 
 class View:
-    """A flight at one time, as signals see it; what several need is found once.
+    """State of a run at one time, with values that several signals need, each computed once.
 
     Args:
-        problem: prepared. t: [s]. y: the integrated vector (n,).
-        direction: that the panel should face, world (3,), a unit vector.
+        problem: prepared problem.
+        t: time [s].
+        y: integrated vector (n,).
+        direction: unit vector that the panel should face, world (3,).
     """
 
     def __init__(self, problem: Problem, t: Array, y: Array, direction: Array) -> None:
@@ -34,7 +36,7 @@ class View:
 
     @cached_property
     def model(self) -> Any:
-        """With the states of forces that have some."""
+        """Model of the problem with the present internal states of forces."""
         problem = self.problem
         if not problem.n_internal:
             return problem.model
@@ -47,28 +49,28 @@ class View:
 
     @cached_property
     def state(self) -> State:
-        """Of all bodies."""
+        """State of all bodies."""
         x = self.y[: self.problem.n_state]
         return self.problem.method.formulation.to_state(self.model, x)
 
     @cached_property
     def R_wb(self) -> Float[Array, "3 3"]:
-        """Of the base; the world's axes where the mechanism stands on the ground."""
+        """Attitude of the base; the world's axes where the mechanism stands on the ground."""
         return rotation_matrix(self.state.p[0]) if self.system.floating else jnp.eye(3)
 
     @cached_property
     def normal_w(self) -> Float[Array, "3"]:
-        """The panel's, world."""
+        """Normal of the panel, world."""
         return rotation_matrix(self.state.p[self.system.index(PANEL)])[:, 2]
 
     @cached_property
     def angles(self) -> Float[Array, "2"]:
-        """Of the panel in the base (phi, theta)."""
+        """Panel angles (phi, theta) relative to the base [rad]."""
         return panel_angles(self.R_wb.T @ self.normal_w)
 
     @cached_property
     def reactions(self) -> Reactions:
-        """At all joints."""
+        """Reactions at all joints."""
         method = self.problem.method
         found = method.formulation.accelerations(
             self.model, self.t, self.state, method.stabilisation
@@ -76,7 +78,7 @@ class View:
         return method.formulation.reactions(self.model, self.t, self.state, found)
 
     def stroke(self, name: str) -> Float[Array, ""]:
-        """How far a slider is above its place in the reference posture."""
+        """Height of a slider above its place in the reference posture, base axes [m]."""
         k, now, then = self.system.index(name), self.state, self.system.reference
         base = (now.r[0], then.r[0]) if self.system.floating else (jnp.zeros(3), jnp.zeros(3))
         return (self.R_wb.T @ (now.r[k] - base[0]))[2] - (then.r[k] - base[1])[2]
@@ -84,11 +86,13 @@ class View:
 
 @dataclass(frozen=True)
 class Signal:
-    """One number of a flight's view.
+    """Scalar signal of a run.
 
     Attributes:
-        of: what it is. unit: SI. words: for tables and figures.
-        smooth: whether its rate is worth its cost; reactions are evaluated within steps instead.
+        of: function from a view to the signal's value.
+        unit: SI unit.
+        words: description for tables and figures.
+        smooth: true if its rate is computed too; reactions are evaluated within steps instead.
     """
 
     of: Callable[[View], Array]
@@ -98,13 +102,13 @@ class Signal:
 
 
 def length(x: Float[Array, " k"]) -> Float[Array, ""]:
-    """Of a vector; at zero, the tip of a cone, its derivative is taken as zero."""
+    """Length of a vector, whose derivative at zero is set to zero."""
     square = jnp.sum(x * x)
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 def angle_between(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
-    """Of two vectors [rad]; exact for small angles and near pi, derivatives of zero at both."""
+    """Angle between two vectors [rad], exact near 0 and pi, with derivatives set to zero there."""
     return jnp.arctan2(length(jnp.cross(a, b)), a @ b)
 
 
@@ -147,7 +151,7 @@ def _at_joint(kind: str, k: int) -> Callable[[View], Array]:
 
 
 def signals(system: System) -> dict[str, Signal]:
-    """The signals that a system has, by name."""
+    """Signals of a system, by name."""
     found = dict(_ANY)
     if system.floating:
         found |= _BASE
@@ -165,10 +169,10 @@ def signals(system: System) -> dict[str, Signal]:
 
 
 def signal(system: System, name: str) -> Signal:
-    """The named signal of a system.
+    """Signal of a system by its name.
 
     Raises:
-        SettingError: it has no such signal.
+        SettingError: the system has no such signal.
     """
     known = signals(system)
     if name not in known:

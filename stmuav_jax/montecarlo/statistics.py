@@ -1,14 +1,15 @@
-"""What samples tell, with confidence intervals; failed samples are left out by the caller and counted.
+"""Statistics of samples with confidence intervals; the caller leaves out and counts failed ones.
 
-Intervals hold for independent samples. Latin hypercubes and Sobol sequences estimate means at least as
-well as those, as a rule much better: there the intervals are too wide rather than too narrow.
+Intervals hold for independent samples. Latin hypercubes and Sobol sequences estimate means at least
+as well as those, as a rule much better: there the intervals are too wide rather than too narrow.
 
-Numbers that are infinite ("never") have an order, so they have quantiles, but no mean. Numbers that are
-not a number are left out and counted.
+Infinite values ("never") are ordered, so they have quantiles, but no mean. NaN values are left out
+and counted.
 
-Source: Student's t (mean); Bonett (2006), Comput. Stat. Data Anal. 50, 775-782 (deviation, not only of
-normal numbers); order statistics and the binomial distribution (quantiles, David and Nagaraja, Order
-Statistics, 3rd ed., section 7.1); Wilson (1927), J. Am. Stat. Assoc. 22, 209-212 (probabilities).
+Source: Student's t (mean); Bonett (2006), Comput. Stat. Data Anal. 50, 775-782 (standard deviation,
+not only of normal variables); order statistics and the binomial distribution (quantiles, David and
+Nagaraja, Order Statistics, 3rd ed., section 7.1); Wilson (1927), J. Am. Stat. Assoc. 22, 209-212
+(probabilities).
 """
 
 import functools
@@ -19,7 +20,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from ..mechanics.errors import SettingError
+from ..checks.errors import SettingError
 from .work import FINE, MISSING
 
 LEVEL = 0.95
@@ -28,8 +29,8 @@ SHARES = (0.05, 0.25, 0.5, 0.75, 0.95)
 Values = Shaped[np.ndarray, " n"]
 
 
-class Estimate(NamedTuple):
-    """A number with the ends of its confidence interval; None where there are too few samples."""
+class IntervalEstimate(NamedTuple):
+    """Estimate with the ends of its confidence interval, None where there are too few samples."""
 
     value: float
     low: float | None
@@ -37,10 +38,11 @@ class Estimate(NamedTuple):
 
 
 class Outcomes(NamedTuple):
-    """How samples ended.
+    """Counts of samples by their status.
 
     Attributes:
-        missing: not computed yet. fine, failed: number of each.
+        missing: number of samples not computed yet.
+        fine, failed: numbers of successful and failed samples.
         codes: number of failed samples by their code.
         failure: probability that a sample fails; None if none is computed.
         reasons: words and probability by code, for every code that has words or samples.
@@ -50,39 +52,40 @@ class Outcomes(NamedTuple):
     fine: int
     failed: int
     codes: dict[int, int]
-    failure: Estimate | None
-    reasons: dict[int, tuple[str, Estimate | None]]
+    failure: IntervalEstimate | None
+    reasons: dict[int, tuple[str, IntervalEstimate | None]]
 
 
-class Summary(NamedTuple):
-    """One quantity over the fine samples.
+class SampleSummary(NamedTuple):
+    """Statistics of one quantity over the successful samples.
 
     Attributes:
-        values: how many are numbers, infinite ones included.
-        undefined: values that are not a number, left out of all else.
-        never, below: how many are +infinity and -infinity.
-        infinite: share of both; None if there are none.
-        least, most: None without values.
-        mean, deviation: None with infinite values, or with fewer than one or two values.
-        quantiles: by the share of samples at or below.
+        values: number of values that are not NaN, infinite ones included.
+        undefined: number of NaN values, left out of all else.
+        never, below: numbers of values +infinity and -infinity.
+        infinite: probability of either; None if there are none.
+        least, most: smallest and largest value; None without values.
+        mean: mean; None with infinite values or without values.
+        deviation: standard deviation; None with infinite values or fewer than two values.
+        quantiles: quantiles by their probability.
     """
 
     values: int
     undefined: int
     never: int
     below: int
-    infinite: Estimate | None
+    infinite: IntervalEstimate | None
     least: float | None
     most: float | None
-    mean: Estimate | None
-    deviation: Estimate | None
-    quantiles: dict[float, Estimate]
+    mean: IntervalEstimate | None
+    deviation: IntervalEstimate | None
+    quantiles: dict[float, IntervalEstimate]
 
 
 class Bands(NamedTuple):
-    """Quantiles at every place of an axis, over the samples; each (q, k).
+    """Quantiles over the samples at every point of an axis; each (q, k).
 
-    low and high, the ends of their intervals, are not a number where there are too few samples.
+    The ends `low` and `high` of the intervals are NaN where there are too few samples.
     """
 
     value: Float[np.ndarray, "q k"]
@@ -91,9 +94,9 @@ class Bands(NamedTuple):
 
 
 class Convergence(NamedTuple):
-    """An estimate from the first 2, 4, 8, ... samples and from all; each (k,).
+    """Convergence of an estimate: from the first 1, 2, 4, 8, ... samples and from all; each (k,).
 
-    low and high are not a number where there are too few samples.
+    The ends `low` and `high` of the intervals are NaN where there are too few samples.
     """
 
     sizes: Int[np.ndarray, " k"]
@@ -102,8 +105,8 @@ class Convergence(NamedTuple):
     high: Float[np.ndarray, " k"]
 
 
-def probability(hits: int, count: int, level: float = LEVEL) -> Estimate:
-    """Share of hits with Wilson's interval.
+def probability(hits: int, count: int, level: float = LEVEL) -> IntervalEstimate:
+    """Probability of hits with Wilson's interval.
 
     Raises:
         SettingError: no samples, or a level outside (0, 1).
@@ -114,7 +117,7 @@ def probability(hits: int, count: int, level: float = LEVEL) -> Estimate:
     if count < 1:
         raise SettingError("A probability needs at least one sample, but there is none.")
     ends = scipy.stats.binomtest(hits, count).proportion_ci(level, method="wilson")
-    return Estimate(hits / count, float(ends.low), float(ends.high))
+    return IntervalEstimate(hits / count, float(ends.low), float(ends.high))
 
 
 def outcomes(
@@ -132,7 +135,7 @@ def outcomes(
     return Outcomes(missing, fine, failed, counts, share(failed), each)
 
 
-def mean(values: Values, level: float = LEVEL) -> Estimate:
+def mean(values: Values, level: float = LEVEL) -> IntervalEstimate:
     """Mean with Student's interval.
 
     Raises:
@@ -144,17 +147,18 @@ def mean(values: Values, level: float = LEVEL) -> Estimate:
     y, n = _finite(values, "A mean", 1), len(values)
     middle = float(np.mean(y))
     if n == 1:
-        return Estimate(middle, None, None)
+        return IntervalEstimate(middle, None, None)
     half = scipy.stats.t.ppf(0.5 + level / 2, n - 1) * _spread(y) / math.sqrt(n)
-    return Estimate(middle, middle - float(half), middle + float(half))
+    return IntervalEstimate(middle, middle - float(half), middle + float(half))
 
 
-def deviation(values: Values, level: float = LEVEL) -> Estimate:
-    """Standard deviation (of n - 1) with Bonett's interval, from 5 values on.
+def deviation(values: Values, level: float = LEVEL) -> IntervalEstimate:
+    """Standard deviation (divisor n - 1) with Bonett's interval, which needs 5 values.
 
         s sqrt(c) exp(+-(z c / 2) sqrt((g - (n - 3) / n) / (n - 1))),  c = n / (n - z)
 
-    with z of the normal distribution and the kurtosis g about a mean trimmed by 1 / (2 sqrt(n - 4)).
+    with z of the normal distribution and the kurtosis g about a mean trimmed by
+    1 / (2 sqrt(n - 4)).
 
     Raises:
         SettingError: fewer than 2 values, values that are not finite, a level outside (0, 1).
@@ -166,23 +170,23 @@ def deviation(values: Values, level: float = LEVEL) -> Estimate:
     spread = _spread(y)
     z = float(scipy.stats.norm.ppf(0.5 + level / 2))
     if n < 5 or n <= z or np.ptp(y) == 0:
-        return Estimate(spread, None, None)
+        return IntervalEstimate(spread, None, None)
     scaled = (y - np.mean(y)) / np.max(np.abs(y - np.mean(y)))
     trimmed = scipy.stats.trim_mean(scaled, 0.5 / math.sqrt(n - 4))
     kurtosis = n * np.sum((scaled - trimmed) ** 4) / np.sum(scaled**2) ** 2
     c = n / (n - z)
     half = z * c * math.sqrt((kurtosis - (n - 3) / n) / (n - 1)) / 2
     middle = spread * math.sqrt(c)
-    return Estimate(spread, middle * math.exp(-half), middle * math.exp(half))
+    return IntervalEstimate(spread, middle * math.exp(-half), middle * math.exp(half))
 
 
 def quantiles(
     values: Values, shares: Sequence[float] = SHARES, level: float = LEVEL
-) -> dict[float, Estimate]:
-    """Quantiles by their shares, with intervals that hold for every distribution.
+) -> dict[float, IntervalEstimate]:
+    """Quantiles by their probabilities, with intervals that hold for every distribution.
 
-    A quantile is the least value that at least this share of the values does not exceed; its interval
-    lies between two values by rank. Infinite values are values.
+    A quantile is the smallest value that at least this share of the values does not exceed; its
+    interval lies between two order statistics. Infinite values are included.
 
     Raises:
         SettingError: no values, one that is not a number, a share or level outside (0, 1).
@@ -192,7 +196,7 @@ def quantiles(
         raise SettingError("Quantiles need values, but there are none, or some are not a number.")
     optional = lambda x: None if math.isnan(x) else float(x)
     return {
-        share: Estimate(
+        share: IntervalEstimate(
             float(found.value[i, 0]), optional(found.low[i, 0]), optional(found.high[i, 0])
         )
         for i, share in enumerate(shares)
@@ -202,9 +206,9 @@ def quantiles(
 def bands(
     values: Float[np.ndarray, "n k"], shares: Sequence[float] = SHARES, level: float = LEVEL
 ) -> Bands:
-    """Quantiles at each of k places; not a number where a value is not a number, or without values.
+    """Quantiles at each of k points; NaN where a value is NaN, or without values.
 
-    Intervals hold at each place, not at all places at once.
+    Intervals hold at each point, not at all points simultaneously.
 
     Raises:
         SettingError: a share or level outside (0, 1).
@@ -217,9 +221,9 @@ def bands(
     _check_level(level)
     if n == 0:
         return found
-    ranked = np.sort(values, axis=0)  # with what is not a number last
+    ranked = np.sort(values, axis=0)  # NaN comes last
     for i, share in enumerate(shares):
-        # the product may be rounded up over a whole number
+        # the product may exceed a whole number by round-off
         found.value[i] = ranked[max(math.ceil(n * share * (1 - 1e-14)), 1) - 1]
         low, high = _ranks(n, share, level)
         if low >= 1:
@@ -234,9 +238,9 @@ def bands(
 
 @functools.lru_cache(maxsize=256)
 def _ranks(n: int, share: float, level: float) -> tuple[int, int]:
-    """Ranks (from 1) whose values enclose the quantile with at least the level's probability.
+    """Ranks (from 1) of the values that enclose the quantile with at least the given probability.
 
-    The number of values below the quantile is binomial. Ranks 0 and n + 1 mean no end.
+    The number of values below the quantile is binomial. Ranks 0 and n + 1 stand for an open end.
     """
     import scipy.stats
 
@@ -244,14 +248,16 @@ def _ranks(n: int, share: float, level: float) -> tuple[int, int]:
     return int(ends[0]), int(ends[1]) + 1
 
 
-def summarise(values: Values, shares: Sequence[float] = SHARES, level: float = LEVEL) -> Summary:
-    """All of one quantity's statistics, as far as its values allow them."""
+def summarise(
+    values: Values, shares: Sequence[float] = SHARES, level: float = LEVEL
+) -> SampleSummary:
+    """Statistics of one quantity, as far as its values allow them."""
     y = np.asarray(values, dtype=float)
     known = y[~np.isnan(y)]
     count, undefined = len(known), len(y) - len(known)
     never, below = (int(np.sum(known == end)) for end in (np.inf, -np.inf))
     finite = count > 0 and never + below == 0
-    return Summary(
+    return SampleSummary(
         count, undefined, never, below,
         infinite=probability(never + below, count, level) if never + below else None,
         least=float(np.min(known)) if count else None,
@@ -267,13 +273,15 @@ def convergence(
     of: Literal["mean", "probability"] | float = "mean",
     level: float = LEVEL,
 ) -> Convergence:
-    """How an estimate settles with the number of samples, taken in their order.
+    """Convergence of an estimate with the number of samples, taken in their order.
 
     Args:
-        of: the mean; the probability of values that are true; or the share of a quantile.
+        values: values of the samples (n,).
+        of: "mean"; "probability" of values that are true; or the probability of a quantile.
+        level: confidence level of the intervals.
 
     Raises:
-        SettingError: as the estimates.
+        SettingError: as for the estimates.
     """
     n = len(values)
     sizes = sorted({2**k for k in range(n.bit_length()) if 2**k <= n} | ({n} if n else set()))
@@ -292,9 +300,9 @@ def convergence(
 
 
 def independent(count: int, together: int, design: str) -> Bool[np.ndarray, " n"]:
-    """Which samples are draws of the distributions that do not share numbers with each other.
+    """Mask of the samples that share no factor values with each other.
 
-    In the design "saltelli" these are A and B; the rest repeat their numbers. Elsewhere all are.
+    In the design "saltelli" these are A and B, whose values the rest repeat; elsewhere all are.
     """
     if design != "saltelli":
         return np.ones(count, dtype=bool)
@@ -302,7 +310,7 @@ def independent(count: int, together: int, design: str) -> Bool[np.ndarray, " n"
 
 
 def _spread(y: np.ndarray) -> float:
-    """Standard deviation (of n - 1), 0 for equal numbers; without overflow of the squares."""
+    """Standard deviation (divisor n - 1), 0 for equal values, without overflow of the squares."""
     away = y - np.mean(y)
     scale = float(np.max(np.abs(away)))
     if np.ptp(y) == 0 or scale == 0:

@@ -1,27 +1,26 @@
-"""Studies of many flights: what is drawn, what is flown, what is kept of each flight."""
+"""Monte Carlo studies: sampled factors, simulated runs, and the quantities kept of each run."""
 
 import hashlib
 import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 
-from ..mechanics.errors import SettingError, nearest_names
-from ..mechanics.schema import SHOWN, named
-from ..vehicle.parameters import Parameters
-from .flights import Flights, flights
-from .sampling import Sampling, sampling_from_plain
-from .schema import check_name, flights_file
+from ..checks.errors import SettingError, nearest_names
+from ..checks.schema import SHOWN, checked, named
+from ..dynamics.choices import STEP_TOLERANCE, ExplicitSolverName
+from ..parameters.table import Parameters
+from .disturbed_flights import Flights, flights
+from .sampling import Sampling
+from .schema import Drawing, FailureEntry, Flying, QuantityEntry, flights_file
 from .signal import Signal, signal
 
-TAKES = ("final", "largest", "smallest", "path", "when_above", "when_below")
-SOLVERS = ("dopri8", "tsit5")
-# Kept times of a flight, which every flight's memory must hold.
+# Largest number of kept times of a run, all of which are held in memory.
 MOST_TIMES = 100_000
 # Columns that every study has.
 OWN = {"status", "sample", "time", "end", "steps", "rejected", "residual", "records"}
@@ -29,16 +28,16 @@ OWN = {"status", "sample", "time", "end", "steps", "rejected", "residual", "reco
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number, or a history, that is kept of each flight.
+    """Quantity, a number or a history, that is kept of each run.
 
     Attributes:
-        signal: see `stmuav_jax.montecarlo.signal`.
-        take: "final" value; "largest", "smallest" over the flight; "path": values every
-            `Study.every` seconds; "when_above", "when_below": time at which it first crosses
-            `level` [s], infinite if it never does.
-        level: in the signal's unit.
-        stop: end the flight when it crosses; what is kept at the end is then of that moment's
-            step, and paths have no numbers from there on.
+        signal: name of a signal, see `stmuav_jax.montecarlo.signal`.
+        take: "final" value; "largest", "smallest" over the run; "path": values every
+            `Study.every` seconds; "when_above", "when_below": time at which the signal first
+            crosses `level` [s], infinite if it never does.
+        level: level in the signal's unit.
+        stop: end the run when the signal crosses the level; final values are then those of that
+            step, and paths are NaN from there on.
 
     Raises:
         SettingError: an unknown take, a level where none belongs or none where one does.
@@ -50,23 +49,16 @@ class Quantity:
     stop: bool = False
 
     def __post_init__(self) -> None:
-        if self.take not in TAKES:
-            raise SettingError(
-                f"Quantities take {', '.join(TAKES)}; not '{self.take}'.{nearest_names(self.take, TAKES)}"
-            )
+        checked(QuantityEntry, vars(self), "A quantity")
         crossing = self.take.startswith("when_")
         if crossing != (self.level is not None):
             words = "needs a level" if crossing else "has no level"
             raise SettingError(f"'{self.take}' of signal {named(self.signal)} {words}.")
-        if self.level is not None and not np.isfinite(self.level):
-            raise SettingError(
-                f"The level of {named(self.signal)} must be finite, not {self.level}."
-            )
         if self.stop and not crossing:
             raise SettingError(f"Only a crossing can stop a flight, not '{self.take}'.")
 
     def column(self, of: Signal) -> tuple[str, str]:
-        """Unit and words of the column that it fills."""
+        """Unit and description of the column that holds the quantity."""
         level = f"{self.level:g} {of.unit}" if self.level is not None else ""
         words = {
             "final": f"{of.words}, at the end",
@@ -79,12 +71,12 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Failure:
-    """When a flight that was completed counts as a failure; the report gives its probability.
+    """Condition under which a completed run counts as a failure; reports give its probability.
 
     Attributes:
-        quantity: one of the study's, no path.
-        above, below: it fails if the quantity is above or below these, in the quantity's unit. A
-            crossing without them fails if it happens at all.
+        quantity: name of one of the study's quantities, not a path.
+        above, below: limits in the quantity's unit: a run above the one or below the other has
+            failed. A crossing without limits is a failure if it happens at all.
 
     Raises:
         SettingError: limits that are not finite.
@@ -95,35 +87,35 @@ class Failure:
     below: float | None = None
 
     def __post_init__(self) -> None:
-        for limit in (self.above, self.below):
-            if limit is not None and not np.isfinite(limit):
-                raise SettingError(f"The limits of a failure must be finite, not {limit}.")
+        checked(FailureEntry, vars(self), "A failure")
 
     def plain(self) -> dict[str, Any]:
-        """As a file holds it."""
+        """Plain data, as in a study's file."""
         limits = {"above": self.above, "below": self.below}
         return {"quantity": self.quantity} | {k: v for k, v in limits.items() if v is not None}
 
 
 @dataclass(frozen=True)
 class Study:
-    """Many flights of one scene.
+    """Monte Carlo study of one scene.
 
     Attributes:
-        name: short, for files.
-        flights: what they have in common: scene, case, parameters, inputs, wind.
-        sampling: how their factors are drawn.
-        quantities: by the names of their columns.
-        t1: end [s]. every: spacing of the kept times of paths [s]; default one thirtieth of t1.
-        rtol, atol: tolerances of a step. solver: one of `SOLVERS`.
-        step: constant step [s] instead of adaptive ones.
-        max_steps: of a flight, after which it has failed.
-        direction: that the panel should face, world; default the one it faces at the start.
-        failure: which completed flights count as failures; default none.
+        name: short name for files.
+        flights: settings common to all runs: scene, case, parameters, inputs, wind.
+        sampling: sampling design of the factors.
+        quantities: quantities by the names of their columns.
+        t1: final time [s].
+        every: spacing of the kept times of paths [s]; default one thirtieth of t1.
+        rtol, atol: relative and absolute tolerances of a step.
+        solver: "dopri8" or "tsit5".
+        max_steps: number of steps after which a run has failed.
+        direction: unit vector that the panel should face, world; default its direction at the
+            start.
+        failure: condition under which completed runs count as failures; default none.
 
     Raises:
         SettingError: no quantities, names that clash or are no names, impossible numbers, a failure
-            of a quantity that there is not.
+            of an unknown quantity.
     """
 
     name: str
@@ -132,17 +124,17 @@ class Study:
     quantities: Mapping[str, Quantity]
     t1: float = 1.0
     every: float | None = None
-    rtol: float = 1e-8
-    atol: float = 1e-8
-    solver: Literal["dopri8", "tsit5"] = "dopri8"
-    step: float | None = None
+    rtol: float = STEP_TOLERANCE
+    atol: float = STEP_TOLERANCE
+    solver: ExplicitSolverName = "dopri8"
     max_steps: int = 20_000
     direction: tuple[float, float, float] | None = field(default=None)
     failure: Failure | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "quantities", dict(self.quantities))
-        check_name(self.name)
+        flying = {name: getattr(self, name) for name in Flying.model_fields}
+        checked(Flying, flying, "A study")
         if not self.quantities:
             raise SettingError(f"Study '{self.name}' keeps nothing: give it quantities.")
         _check_factors(self)
@@ -157,7 +149,7 @@ class Study:
 
     @property
     def times(self) -> np.ndarray:
-        """Of paths and of the end, after the start [s]."""
+        """Times of paths and of the end, after the start [s]."""
         if not any(q.take == "path" for q in self.quantities.values()):
             return np.array([self.t1])
         every = self.t1 / 30 if self.every is None else self.every
@@ -167,38 +159,32 @@ class Study:
         return times if times[-1] == self.t1 else np.append(times, self.t1)
 
     def plain(self) -> dict[str, Any]:
-        """Everything that decides the numbers, as plain data."""
+        """Plain data of everything on which the numbers depend."""
         table = self.flights.table
         numbers = {name: np.asarray(table.value(name)).tolist() for name in table}
         text = json.dumps(numbers, sort_keys=True)
-        of = self.flights
         failure = {} if self.failure is None else {"failure": self.failure.plain()}
-        return failure | {
-            "kind": "flights",
-            "name": self.name,
-            "scene": of.scene,
-            "case": of.case,
-            "parameters": hashlib.sha256(text.encode()).hexdigest()[:16],
-            "relative": sorted(of.relative),
-            "inputs": of.inputs,
-            "drag": of.drag,
-            "gusts": of.gusts,
-            "precision": "float32" if of.float32 else "float64",
-            "sampling": self.sampling.plain(),
-            "quantities": {k: _plain(q) for k, q in self.quantities.items()},
-            "t1": self.t1,
-            "times": self.times.tolist(),
-            "rtol": self.rtol,
-            "atol": self.atol,
-            "solver": self.solver,
-            "step": self.step,
-            "max_steps": self.max_steps,
-            "direction": None if self.direction is None else list(self.direction),
-        }
+        of_flights = ("scene", "case", "inputs", "drag", "gusts")
+        own = ("name", "t1", "rtol", "atol", "solver", "max_steps")
+        return (
+            {name: getattr(self.flights, name) for name in of_flights}
+            | {name: getattr(self, name) for name in own}
+            | failure
+            | ({"options": self.flights.options} if self.flights.options else {})
+            | {
+                "kind": "flights",
+                "parameters": hashlib.sha256(text.encode()).hexdigest()[:16],
+                "relative": sorted(self.flights.relative),
+                "sampling": self.sampling.plain(),
+                "quantities": {k: _plain(q) for k, q in self.quantities.items()},
+                "times": self.times.tolist(),
+                "direction": None if self.direction is None else list(self.direction),
+            }
+        )
 
     def signals(self) -> dict[str, Signal]:
-        """The signal of each quantity."""
-        # names are all that is needed of the system
+        """Signal of each quantity."""
+        # only the names of the system are needed
         system, _ = eqx.filter_eval_shape(self.flights.nominal)
         return {name: signal(system, q.signal) for name, q in self.quantities.items()}
 
@@ -211,13 +197,13 @@ def _plain(quantity: Quantity) -> dict[str, Any]:
 
 
 def _check_factors(study: Study) -> None:
-    """Every factor has a place and a column of its own."""
+    """Check that every factor has a target and a column of its own."""
     places: dict[Any, str] = {}
     columns: dict[str, str] = {}
     for name in study.sampling.names:
         entry = study.flights.entry(name)
         column = column_name(name)
-        # a whole array's factor and one of an entry of it would both write the entry
+        # a factor of a whole array and one of its entries would both set the entry
         for place in entry.places or ((),):
             if (other := places.get((entry.name, place))) is not None:
                 raise SettingError(f"'{other}' and '{name}' are the same number; give one of them.")
@@ -242,35 +228,9 @@ def _check_failure(failure: Failure, quantities: Mapping[str, Quantity]) -> None
 
 
 def _check_numbers(study: Study) -> None:
-    numbers = {"t1": study.t1, "rtol": study.rtol, "atol": study.atol}
-    optional = {"every": study.every, "step": study.step}
-    numbers |= {k: v for k, v in optional.items() if v is not None}
-    for name, value in numbers.items():
-        if not (np.isfinite(value) and value > 0):
-            raise SettingError(f"{name} must be finite and positive, but it is {value}.")
-    least = 1e-7 if study.flights.float32 else 1e-15
-    for name in ("rtol", "atol"):
-        if numbers[name] < least:
-            raise SettingError(
-                f"{name} must be at least {least:g}, the round-off of this precision, but it is "
-                f"{numbers[name]:g}."
-            )
-    if study.solver not in SOLVERS:
-        raise SettingError(f"Studies integrate by {' or '.join(SOLVERS)}, not '{study.solver}'.")
-    if study.max_steps < 1:
-        raise SettingError(f"max_steps must be at least 1, but it is {study.max_steps}.")
-    if study.step is not None and study.step > study.t1:
-        raise SettingError(
-            f"A step of {study.step:g} s is longer than the flight of {study.t1:g} s."
-        )
     if study.every is not None and study.every > study.t1:
         raise SettingError(
             f"Times {study.every:g} s apart do not fit into a flight of {study.t1:g} s."
-        )
-    if study.step is not None and study.t1 / study.step > study.max_steps:
-        raise SettingError(
-            f"Steps of {study.step:g} s need more than the {study.max_steps} of max_steps for "
-            f"{study.t1:g} s."
         )
     if study.every is not None and study.t1 / study.every > MOST_TIMES:
         raise SettingError(
@@ -285,17 +245,19 @@ def _check_numbers(study: Study) -> None:
 
 
 def column_name(factor: str) -> str:
-    """A factor's name as that of a column: "inertia.hexacopter_1[0, 1]" has no dots and brackets."""
+    """Column name of a factor, in which dots and brackets are replaced by underscores."""
     return re.sub(r"\W+", "_", factor).strip("_")
 
 
 def study_from_plain(
     plain: Mapping[str, Any], table: Parameters | None = None, name: str = "study"
 ) -> Study:
-    """A study from plain data, as a TOML file holds it (see docs/studies.md).
+    """Study from plain data in the form of its TOML file (see docs/studies.md).
 
     Args:
-        table: of the scene's parameters, where the user has changed some.
+        plain: plain data of the study.
+        table: parameter table of the scene, where the user has changed some.
+        name: name of a study whose plain data have none.
 
     Raises:
         SettingError: an unknown entry (with the nearest known one), or numbers that do not fit.
@@ -304,23 +266,20 @@ def study_from_plain(
     factors, relative = _factors(given.factors)
     of = flights(
         given.scene, given.case, table, relative=relative, inputs=given.inputs, drag=given.drag,
-        gusts=given.gusts, duration=given.t1, float32=given.precision == "float32",
+        gusts=given.gusts, options=given.options, duration=given.t1,
     )  # fmt: skip
-    drawn: dict[str, Any] = {"seed": given.seed, "design": given.design, "factors": factors}
-    if given.stratum is not None:
-        drawn["stratum"] = given.stratum
-    sampling = sampling_from_plain(drawn | {"correlation": list(given.correlation)})
+    drawing = given.model_dump(include=set(Drawing.model_fields))
+    sampling = Sampling(factors, **drawing)
     quantities = {k: Quantity(**dict(q)) for k, q in given.quantities.items()}
     failure = None if given.failure is None else Failure(**dict(given.failure))
-    return Study(
-        given.name if "name" in plain else name, of, sampling, quantities, t1=given.t1,
-        every=given.every, rtol=given.rtol, atol=given.atol, solver=given.solver, step=given.step,
-        max_steps=given.max_steps, direction=given.direction, failure=failure,
-    )  # fmt: skip
+    flying = given.model_dump(include=set(Flying.model_fields))
+    if "name" not in plain:
+        flying["name"] = name
+    return Study(flights=of, sampling=sampling, quantities=quantities, failure=failure, **flying)
 
 
 def _factors(given: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[str]]:
-    """Their distributions in plain form, and which are relative."""
+    """Distributions of the factors in plain form, and the names of relative ones."""
     found: dict[str, Any] = {}
     relative = set()
     for name, what in given.items():
@@ -330,8 +289,3 @@ def _factors(given: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[str]]:
                 relative.add(name)
         found[name] = what
     return found, frozenset(relative)
-
-
-def with_precision(study: Study, *, float32: bool, **tolerances: float) -> Study:
-    """The same study in the given precision, with other tolerances if there are some."""
-    return replace(study, flights=replace(study.flights, float32=float32), **tolerances)

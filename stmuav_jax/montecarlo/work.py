@@ -1,4 +1,4 @@
-"""What a store and a scheduler know of a study: samples by number, and named columns of results."""
+"""Interface of a study to stores and schedulers: samples by number, named columns of results."""
 
 import abc
 from collections.abc import Mapping
@@ -11,13 +11,14 @@ MISSING, FINE = 0, 1
 
 
 class Column(NamedTuple):
-    """One column of a study's results, a number or an array for each sample.
+    """Column of a study's results, with a number or an array for each sample.
 
     Attributes:
-        dtype: of its numbers, such as "float64" or "int8".
-        unit: in SI units; "1" where there is none. words: what it is, for tables and figures.
-        role: "input" was drawn, "quantity" was computed, "diagnostic" is kept but not reported,
-            "status" says how the sample ended.
+        dtype: type of its numbers, such as "float64" or "int8".
+        unit: SI unit; "1" where there is none.
+        words: description for tables and figures.
+        role: "input" for sampled factors, "quantity" for results, "diagnostic" for numbers that
+            reports leave out, "status" for the code with which the sample ended.
         dims: names of further axes after the samples', which `Axis` gives.
     """
 
@@ -29,23 +30,23 @@ class Column(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """A further axis of columns: its values (k,) and their unit."""
+    """Axis of columns in addition to that of the samples: its values (k,) and their unit."""
 
     values: np.ndarray
     unit: str
 
 
 class AbstractWork(abc.ABC):
-    """Samples that can be computed by number, in any order and anywhere.
+    """Work of a study: samples that can be computed by number, in any order and anywhere.
 
-    A work pickles small: what is expensive, such as compiled code, is made when it is first needed
-    in a process and left out of the pickle.
+    Its pickle is small: expensive parts, such as compiled code, are made when they are first
+    needed in a process, and are left out of the pickle.
     """
 
     @property
     @abc.abstractmethod
     def identity(self) -> Mapping[str, Any]:
-        """Everything that decides the numbers, as plain data that JSON can hold."""
+        """Plain data, for JSON, of everything on which the numbers depend."""
 
     @property
     @abc.abstractmethod
@@ -55,17 +56,17 @@ class AbstractWork(abc.ABC):
     @property
     @abc.abstractmethod
     def axes(self) -> Mapping[str, Axis]:
-        """Further axes by name."""
+        """Axes of the columns by name, in addition to that of the samples."""
 
     @property
     @abc.abstractmethod
     def reasons(self) -> Mapping[int, str]:
-        """What codes of "status" from 2 on mean: why a sample failed."""
+        """Reasons of failed samples, by their codes of "status" from 2 on."""
 
     @property
     @abc.abstractmethod
     def unit(self) -> int:
-        """Samples best computed together, 1 or more; `run` is quickest for multiples of it."""
+        """Number of samples best computed together, 1 or more; `run` is quickest for multiples."""
 
     @abc.abstractmethod
     def run(self, first: int, count: int) -> dict[str, np.ndarray]:

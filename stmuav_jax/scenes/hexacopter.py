@@ -1,22 +1,24 @@
-"""`hexacopter`: one free body and six rotors (report Part II, section 5.1)."""
+"""Scene `hexacopter`: one free body and six rotors (report Part II, section 5.1)."""
 
 from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from ..algebra.shapes import Numbers
+from ..checks.shapes import Numbers
 from ..dynamics.scene import Scene
 from ..mechanics.body import Body
-from ..mechanics.force import Gravity
+from ..mechanics.forces.applied import Gravity
 from ..mechanics.system import System
-from ..vehicle.airframe import PART_II
-from ..vehicle.flight import Drag, Motor, Wind, flight
-from ..vehicle.parameters import Parameters
-from ..vehicle.rotor import Rotors, hover_speed_squared
+from ..parameters.airframe import PART_II
+from ..parameters.table import Parameters
+from ..rotorcraft.rotor import Rotors, hover_speed_squared
+from .flight_options import BaseStart, Drag, Motor, Wind
+from .rotors_and_air import flight
+from .starts import STARTED, base_state
 
 
 def rotors(body: str, parameters: Parameters, speed_squared: object) -> Rotors:
-    """The six rotors of the tables on a body."""
+    """Six rotors of the parameter table on a body."""
     return Rotors(
         body,
         arms=parameters.value("rotor.arms"),
@@ -33,18 +35,19 @@ def hexacopter(
     drag: Drag | None = None,
     wind: Wind | Numbers | Callable[..., object] | None = None,
     motor: Motor | None = None,
-    allow_float32: bool = False,
+    start: BaseStart | None = None,
 ) -> Scene:
-    """The bare hexacopter rising with constant, equal rotor speeds; no joints at all.
+    """Scene of the bare hexacopter rising with constant, equal rotor speeds; it has no joints.
 
     The arms' centroid lies 1.1 mm off the centre of mass (Table 5.2), so equal speeds also
     turn it slowly.
 
     Args:
-        drag: of the airframe; the report has none. wind: a `Wind`, or the air's velocity,
-            world (3,) [m/s], or a function of (t, kinematics); needs drag.
+        drag: drag of the airframe; the report has none.
+        wind: a `Wind`, or the air's velocity, world (3,) [m/s], or a function of
+            (t, kinematics); it needs drag.
         motor: lag, inertia and limits of the rotors; the report has none.
-        allow_float32: see `System`.
+        start: of the flight; the report's is level and at rest at the origin.
 
     Raises:
         ModelError: numbers of the options that make no sense.
@@ -61,7 +64,6 @@ def hexacopter(
     system = System(
         [Body("hexacopter", mass, parameters.value("bare.inertia"), free=True)],
         forces=[Gravity(gravity), *air.forces],
-        allow_float32=allow_float32,
     )
     options = tuple(g for g in ("drag.", "wind.", "gust.", "motor.") if g not in air.unused)
     keep = ("bare.", "rotor.", "gravity", *options)
@@ -69,12 +71,13 @@ def hexacopter(
         name="hexacopter",
         title="Bare hexacopter, constant equal rotor speeds",
         system=system,
-        state0=system.reference,
+        state0=system.reference if start is None else base_state(start),
         parameters={k: v for k, v in air.parameters.to_dict().items() if k.startswith(keep)},
         notes=(
             "The report prints no rotor speeds: 1.1 times the weight is chosen here.",
             "J_zz of section 5.1 is printed ten times too large; corrected to 86.6e-3 kg m^2.",
             *air.notes,
+            *((STARTED,) if start is not None else ()),
         ),
         watch=("hexacopter",),
     )

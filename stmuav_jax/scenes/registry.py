@@ -1,66 +1,154 @@
-"""The scenes by name, for the command line and for those who loop over them."""
+"""The scenes by name, for the command line, for studies and for those who loop over them.
 
-from collections.abc import Callable
+A scene is one file with a function, and one line here. Cases, parameters and options are those of
+the function's signature (`signature.py`). JAX is imported when a scene is built.
+"""
+
+import inspect
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from ..dynamics.scene import Scene
-from ..mechanics.errors import SettingError, nearest_names
-from ..vehicle.airframe import PART_I, PART_II
-from ..vehicle.parameters import Parameters
-from . import hexacopter, spin, tracker, uav_tracker
+from ..checks.errors import SettingError, nearest_names
+from ..checks.quantity import option_from_plain
+from .signature import SceneOption, Signature, signature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ..dynamics.scene import Scene
+    from ..parameters.table import Parameters
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One scene of the registry.
+class RegisteredScene:
+    """Entry of the registry for one scene.
 
     Attributes:
-        build: makes the scene. cases: of the report, empty where there is one only.
-        default_case: the one that is run if none is named.
-        parameters: the table it is built from. summary: one line. source: in the report.
+        module: dotted name of the module whose function of the same last name builds the scene.
+        summary: one line. source: in the report. t1: end of the scene [s].
     """
 
-    build: Callable[..., Scene]
-    cases: tuple[int, ...]
-    default_case: int | None
-    parameters: Parameters
+    module: str
     summary: str
     source: str
+    t1: float
+
+    @property
+    def function(self) -> str:
+        """Name of the function that builds the scene."""
+        return self.module.rpartition(".")[2]
+
+    @property
+    def signature(self) -> Signature:
+        """Cases, parameters and options, read without JAX."""
+        return signature_of(self.module, self.function)
+
+    @property
+    def cases(self) -> tuple[int, ...]:
+        """Cases of the report, empty where there is one only."""
+        return self.signature.cases
+
+    @property
+    def default_case(self) -> int | None:
+        """The case that is run if none is named."""
+        return self.signature.default_case
+
+    @property
+    def options(self) -> Mapping[str, SceneOption]:
+        """Options that text can give, by name."""
+        return self.signature.options
+
+    @property
+    def build(self) -> "Callable[..., Scene]":
+        """The function that builds the scene."""
+        return getattr(import_module(self.module), self.function)
+
+    @property
+    def parameters(self) -> "Parameters":
+        """The table that the scene is built from."""
+        module, name = self.signature.table
+        return getattr(import_module(module), name)
 
 
-SCENES: dict[str, Entry] = {
-    "spin": Entry(
-        spin.spin, (), None, PART_I, "a body on a ball joint, with a closed form", "Part I, 4.3"
+_HERE = __package__
+
+SCENES: dict[str, RegisteredScene] = {
+    "spin": RegisteredScene(
+        f"{_HERE}.spin", "a body on a ball joint, with a closed form", "Part I, 4.3", 5.0
     ),
-    "tracker": Entry(
-        tracker.tracker, (1, 2, 3), 1, PART_I, "the tracker on fixed ground", "Part I, ch. 5"
+    "tracker": RegisteredScene(
+        f"{_HERE}.tracker", "the tracker on fixed ground", "Part I, ch. 5", 2.0
     ),
-    "hexacopter": Entry(
-        hexacopter.hexacopter, (), None, PART_II, "one free body, six rotors", "Part II, 5.1"
+    "hexacopter": RegisteredScene(
+        f"{_HERE}.hexacopter", "one free body, six rotors", "Part II, 5.1", 2.0
     ),
-    "uav_tracker": Entry(
-        uav_tracker.uav_tracker, (1, 2, 3), 2, PART_II, "hexacopter with tracker", "Part II, 5.2"
+    "uav_tracker": RegisteredScene(
+        f"{_HERE}.uav_tracker", "hexacopter with tracker", "Part II, 5.2", 2.0
     ),
 }
 
 
-def make_scene(
-    name: str, case: int | None = None, parameters: Parameters | None = None, **options: Any
-) -> Scene:
-    """Build a scene by name.
-
-    Args:
-        case: of the report; default the entry's.
-        parameters: default the scene's table.
-        options: passed on, e.g. actuators="printed" for uav_tracker.
+def entry_of(name: str) -> RegisteredScene:
+    """The line of a scene.
 
     Raises:
-        SettingError: an unknown name, or a case that the scene does not have.
+        SettingError: an unknown name.
     """
     if name not in SCENES:
         raise SettingError(f"There is no scene '{name}'.{nearest_names(name, SCENES)}")
-    entry = SCENES[name]
+    return SCENES[name]
+
+
+def unknown_option(scene: str, option: str) -> SettingError:
+    """The error about an option that a scene does not have."""
+    have = ", ".join(entry_of(scene).options) or "none"
+    return SettingError(f"Scene {scene} has no {option}; its options: {have}.")
+
+
+def options_from_plain(name: str, plain: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a scene from plain data, such as {"drag": {}, "motor": {"time_constant": 0.04}}.
+
+    Raises:
+        SettingError: an unknown scene, option or field, or a value of another type.
+    """
+    known, found = entry_of(name).options, {}
+    for option, value in plain.items():
+        if option not in known:
+            raise unknown_option(name, option)
+        own = known[option]
+        if own.is_group:
+            found[option] = option_from_plain(own.kind, value, option)
+            continue
+        if own.choices and value not in own.choices:
+            words = ", ".join(map(str, own.choices))
+            raise SettingError(f"Option '{option}' must be one of {words}, not {value!r}.")
+        if not own.choices and not isinstance(
+            value, (int, float) if own.kind is float else own.kind
+        ):
+            raise SettingError(f"Option '{option}' must be a {own.kind.__name__}, not {value!r}.")
+        found[option] = value
+    return found
+
+
+def make_scene(
+    name: str, case: int | None = None, parameters: "Parameters | None" = None, **options: Any
+) -> "Scene":
+    """Build a scene by name.
+
+    Args:
+        case: case of the report; by default that of the entry.
+        parameters: parameter table; by default that of the entry.
+        options: options of the scene, such as actuators="printed" for uav_tracker.
+
+    Raises:
+        SettingError: an unknown name or option, or a case that the scene does not have.
+    """
+    entry = entry_of(name)
+    for option in options:
+        if option not in inspect.signature(entry.build).parameters:
+            raise unknown_option(name, option)
     if case is not None and case not in entry.cases:
         have = ", ".join(map(str, entry.cases)) or "none"
         raise SettingError(f"Scene '{name}' has no case {case}; its cases: {have}.")

@@ -1,7 +1,7 @@
-"""`spin`: a body on a ball, spun by a constant moment (report Part I, section 4.3).
+"""Scene `spin`: a body on a ball joint, spun by a constant moment (report Part I, section 4.3).
 
-Closed form, Eq. 4.28: phi = n t^2 / (2 J_zz), p = (cos phi/2, 0, 0, sin phi/2). It holds
-where the ball lies on the body's zeta axis and there is no gravity.
+The closed-form solution, Eq. 4.28, is phi = n t^2 / (2 J_zz), p = (cos phi/2, 0, 0, sin phi/2).
+It holds where the ball joint lies on the body's zeta axis and there is no gravity.
 """
 
 import jax.numpy as jnp
@@ -9,15 +9,15 @@ from jaxtyping import Array, Float
 
 from ..dynamics.scene import Scene
 from ..mechanics.body import GROUND, Body
-from ..mechanics.force import AppliedMoment
+from ..mechanics.forces.applied import AppliedMoment
 from ..mechanics.joint import spherical
 from ..mechanics.system import System
-from ..vehicle.airframe import PART_I
-from ..vehicle.parameters import Parameters
+from ..parameters.airframe import PART_I
+from ..parameters.table import Parameters
 
 
 def spin(parameters: Parameters = PART_I) -> Scene:
-    """The report's verification problem, 5 s."""
+    """Scene of the report's verification problem, 5 s long."""
     ball = jnp.asarray(parameters.value("spin.joint"), dtype=float)
     body = Body(
         "top", parameters.value("spin.mass"), parameters.value("spin.inertia"), position=-ball
@@ -42,7 +42,7 @@ def spin(parameters: Parameters = PART_I) -> Scene:
 
 
 def spin_exact(t: Float[Array, ""], parameters: Parameters = PART_I) -> Float[Array, "4"]:
-    """Euler parameters of the closed form at t [s], shape (4,). Source: Eq. 4.28."""
+    """Euler parameters of the closed-form solution at t [s], shape (4,). Source: Eq. 4.28."""
     inertia = jnp.asarray(parameters.value("spin.inertia"), dtype=float)[2]
     half = 0.25 * parameters.value("spin.moment") / inertia * t**2
     zero = jnp.zeros_like(half)

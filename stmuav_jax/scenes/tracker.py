@@ -1,20 +1,22 @@
-"""`tracker`: the tracker on fixed ground, three loads (report Part I, chapter 5)."""
+"""Scene `tracker`: the tracker on fixed ground, three loads (report Part I, chapter 5)."""
 
 from typing import Literal
 
 import jax.numpy as jnp
 
+from ..checks.errors import SettingError
 from ..dynamics.scene import Scene
 from ..mechanics.body import GROUND
-from ..mechanics.errors import SettingError
-from ..mechanics.force import AppliedForce, AppliedMoment
+from ..mechanics.forces.applied import AppliedForce, AppliedMoment
 from ..mechanics.joint import Motion
 from ..mechanics.load import AbstractForce, Sine
 from ..mechanics.system import System
-from ..vehicle.airframe import PART_I
-from ..vehicle.drive import Friction, Servo, Stops, slider_drive, stroke_drivers
-from ..vehicle.parameters import Parameters
-from ..vehicle.tracker import tracker_bodies, tracker_joints
+from ..parameters.airframe import PART_I
+from ..parameters.table import Parameters
+from ..tracker.bodies import tracker_bodies, tracker_joints
+from ..tracker.drive import slider_drive, stroke_drivers
+from ..tracker.tracker_options import Friction, PanelStart, Servo, Stops, Strokes
+from .starts import STARTED, panel_state
 
 TITLES = {
     1: "Tracker on ground, both sliders pushed by 4 sin(4 pi t) N",
@@ -30,19 +32,19 @@ def tracker(
     servo: Servo | None = None,
     stops: Stops | None = None,
     friction: Friction | None = None,
-    strokes: tuple[Motion, Motion] | None = None,
-    allow_float32: bool = False,
+    strokes: Strokes | tuple[Motion, Motion] | None = None,
+    start: PanelStart | None = None,
 ) -> Scene:
-    """The report's tracker on ground; the base has no coordinates, and there is no gravity.
+    """Scene of the report's tracker on the ground, which has no coordinates, without gravity.
 
     Args:
         case: 1 slider forces, 2 panel force, 3 panel moment.
         servo: holds both sliders, beside the case's forces; the report has none.
         stops: at the ends of both sliders' strokes. friction: in both slider joints.
-        strokes: prescribe both sliders' displacements from the initial posture, functions of
-            t [s] to [m] (see `stmuav_jax.vehicle.drive.stroke_drivers`); the case's own
-            forces then only load the drivers.
-        allow_float32: see `System`.
+        strokes: prescribe both sliders' displacements from the initial posture: a `Strokes`, or
+            functions of t [s] to [m] (see `stmuav_jax.tracker.drive.stroke_drivers`); the
+            case's own forces then only load the drivers.
+        start: of the panel; the report's is at rest in the initial posture.
 
     Raises:
         SettingError: another case.
@@ -55,15 +57,14 @@ def tracker(
     joints = tracker_joints(parameters, GROUND)
     system = System(
         tracker_bodies(parameters),
-        (*joints, *stroke_drivers(joints, strokes)) if strokes is not None else joints,
+        (*joints, *stroke_drivers(joints, strokes)),
         (*_loads(case, parameters), *drive.forces),
-        allow_float32=allow_float32,
     )
     return Scene(
         name=f"tracker_{case}",
         title=TITLES[case],
         system=system,
-        state0=system.reference,
+        state0=system.reference if start is None else panel_state(start, parameters),
         parameters={
             k: v for k, v in drive.parameters.to_dict().items() if not k.startswith(unused)
         },
@@ -71,6 +72,7 @@ def tracker(
             "Joint positions are reconstructed, not printed (docs/geometry.md).",
             "J'_7 of Table 6.2 breaks the triangle inequality by 0.7 % through rounding; admitted.",
             f"{drive.note} No gravity, as printed.",
+            *((STARTED,) if start is not None else ()),
         ),
         watch=("slider_2", "slider_3", "panel_7"),
     )

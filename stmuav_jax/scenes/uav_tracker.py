@@ -1,29 +1,32 @@
-"""`uav_tracker`: the hexacopter with the tracker, seven bodies (report Part II, section 5.2)."""
+"""Scene `uav_tracker`: hexacopter with tracker, seven bodies (report Part II, section 5.2)."""
 
 from collections.abc import Callable
 from typing import Any, Literal
 
 import jax.numpy as jnp
 
-from ..algebra.shapes import Numbers
+from ..checks.errors import SettingError
+from ..checks.shapes import Numbers
 from ..dynamics.scene import Scene
+from ..flight.flyer import Flyer
 from ..mechanics.body import Body
-from ..mechanics.errors import SettingError
-from ..mechanics.force import Gravity
+from ..mechanics.forces.applied import Gravity
 from ..mechanics.joint import Motion
 from ..mechanics.load import AbstractForce, Sine
 from ..mechanics.system import System
-from ..vehicle.actuator import LinearActuator
-from ..vehicle.airframe import PART_II
-from ..vehicle.drive import Friction, Servo, Stops, slider_drive, stroke_drivers
-from ..vehicle.flight import Drag, Flight, Motor, Wind, flight
-from ..vehicle.flyer import Flyer
-from ..vehicle.geometry import tracker_geometry
-from ..vehicle.parameters import Parameters
-from ..vehicle.rotor import hover_speed_squared
-from ..vehicle.tracker import TRACKER_BODIES, tracker_bodies, tracker_joints
-from ..vehicle.workspace import tracker_limits
+from ..parameters.airframe import PART_II
+from ..parameters.table import Parameters
+from ..rotorcraft.rotor import hover_speed_squared
+from ..tracker.actuator import LinearActuator
+from ..tracker.bodies import TRACKER_BODIES, tracker_bodies, tracker_joints
+from ..tracker.drive import slider_drive, stroke_drivers
+from ..tracker.geometry import tracker_geometry
+from ..tracker.tracker_options import Friction, Servo, Stops, Strokes
+from ..tracker.workspace import tracker_limits
+from .flight_options import Drag, FlightStart, Motor, Wind
 from .hexacopter import rotors
+from .rotors_and_air import RotorsAndAir, flight
+from .starts import STARTED, flight_state
 
 BASE = "hexacopter_1"
 
@@ -42,13 +45,13 @@ def uav_tracker(
     servo: Servo | None = None,
     stops: Stops | None = None,
     friction: Friction | None = None,
-    strokes: tuple[Motion, Motion] | None = None,
+    strokes: Strokes | tuple[Motion, Motion] | None = None,
     drag: Drag | None = None,
     wind: Wind | Numbers | Callable[..., object] | None = None,
     motor: Motor | None = None,
-    allow_float32: bool = False,
+    start: FlightStart | None = None,
 ) -> Scene:
-    """The report's seven-body UAV.
+    """Scene of the report's seven-body UAV.
 
     Args:
         case: 1 hover thrust; 2 with actuator forces; 3 with these and the thrust raised by
@@ -57,13 +60,13 @@ def uav_tracker(
             the report's, which adds a net couple.
         servo: holds both sliders, beside the actuators' forces; the report has none.
         stops: at the ends of both sliders' strokes. friction: in both slider joints.
-        strokes: prescribe both sliders' displacements from the initial posture, functions of
-            t [s] to [m] (see `stmuav_jax.vehicle.drive.stroke_drivers`); the case's own
-            forces then only load the drivers.
+        strokes: prescribe both sliders' displacements from the initial posture: a `Strokes`, or
+            functions of t [s] to [m] (see `stmuav_jax.tracker.drive.stroke_drivers`); the
+            case's own forces then only load the drivers.
         drag: of the hexacopter's airframe; the report has none. wind: a `Wind`, or the air's
             velocity, world (3,) [m/s], or a function of (t, kinematics); needs drag.
         motor: lag, inertia and limits of the rotors; the report has none.
-        allow_float32: see `System`.
+        start: of base and panel; the report's is level and at rest in the initial posture.
 
     Raises:
         SettingError: another case or couple.
@@ -81,15 +84,14 @@ def uav_tracker(
     joints = tracker_joints(parameters, BASE, shift)
     system = System(
         [base, *tracker_bodies(parameters, shift)],
-        (*joints, *stroke_drivers(joints, strokes)) if strokes is not None else joints,
+        (*joints, *stroke_drivers(joints, strokes)),
         (*_forces(case, air, actuators), *drive.forces),
-        allow_float32=allow_float32,
     )
     return Scene(
         name=f"uav_tracker_{case}",
         title=TITLES[case],
         system=system,
-        state0=system.reference,
+        state0=system.reference if start is None else flight_state(start, parameters),
         parameters={k: v for k, v in air.parameters.to_dict().items() if not k.startswith(unused)},
         notes=(
             "Joint positions are reconstructed, not printed (docs/geometry.md).",
@@ -97,23 +99,25 @@ def uav_tracker(
             f"Actuator couple: {actuators}. Equal rotor speeds are not a trim.",
             drive.note,
             *air.notes,
+            *((STARTED,) if start is not None else ()),
         ),
         watch=(BASE, "slider_2", "slider_3", "panel_7"),
     )
 
 
 def uav_flyer(parameters: Parameters = PART_II, **options: Any) -> Flyer:
-    """The UAV in independent coordinates, for trim and linearisation.
+    """State space of the UAV in independent coordinates, for trim and linearisation.
 
     Args:
-        options: of `uav_tracker`, such as friction or drag; its case is 2, which has actuators.
+        options: options of `uav_tracker`, such as friction or drag; the case is 2, which has
+            actuators.
     """
     scene = uav_tracker(2, parameters, **options)
     shift, limits = parameters.value("mount.shift"), tracker_limits(parameters)
     return Flyer(scene.system, tracker_geometry(parameters), shift, limits)
 
 
-def _flight(case: int, parameters: Parameters, **options: Any) -> Flight:
+def _flight(case: int, parameters: Parameters, **options: Any) -> RotorsAndAir:
     names = (BASE, *TRACKER_BODIES)
     gravity = jnp.asarray(parameters.value("gravity"), dtype=float)
     total = sum(jnp.asarray(parameters.value(f"mass.{name}"), dtype=float) for name in names)
@@ -123,7 +127,7 @@ def _flight(case: int, parameters: Parameters, **options: Any) -> Flight:
     return flight(rotors(BASE, parameters, lift * hover), weight, parameters, **options)
 
 
-def _forces(case: int, air: Flight, couple: Any) -> tuple[AbstractForce, ...]:
+def _forces(case: int, air: RotorsAndAir, couple: Any) -> tuple[AbstractForce, ...]:
     parameters = air.parameters
     forces: list[AbstractForce] = [Gravity(parameters.value("gravity")), *air.forces]
     if case == 1:

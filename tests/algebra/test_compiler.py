@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 from stmuav_jax.algebra import compiler
-from stmuav_jax.algebra.compiler import check_maps, kept_jit, memory_maps, transformed
+from stmuav_jax.algebra.compiler import check_maps, in_blocks, kept_jit, memory_maps, transformed
 
 traced: list[str] = []
 
@@ -99,10 +99,10 @@ def test_a_warning_comes_once_and_long_before_the_limit(monkeypatch):
 
 def simulated(name, **settings):
     """A falling body: the cheapest system; its name is its structure."""
-    system = sj.System([sj.Body(name, 1.0, (1e-3,) * 3, free=True)], [], [sj.Gravity()])
-    settings |= {"solver": diffrax.Heun(), "rtol": 1e-3, "atol": 1e-3, "analysis": False}
-    return sj.simulate(
-        system, system.reference, ts=[0.0, 0.1], error_estimate=False, **settings
+    system = stm.System([stm.Body(name, 1.0, (1e-3,) * 3, free=True)], [], [stm.Gravity()])
+    method = stm.Method(solver=diffrax.Heun(), rtol=1e-3, atol=1e-3, **settings)
+    return stm.simulate(
+        system, system.reference, method=method, ts=[0.0, 0.1], error_estimate=False, analysis=False
     ).states.r[-1, 0, 2]
 
 
@@ -111,7 +111,7 @@ def test_two_hundred_systems_of_different_structure_leave_nothing_behind(monkeyp
     """Each needs some 150 to 220 memory maps while its programs are kept."""
     monkeypatch.setattr(compiler, "MOST_PROGRAMS", 8)
     # every tenth as by default, the others with fewer programs to trace
-    quick = {"formulation": sj.Augmented(), "stabilisation": sj.Unstabilised()}
+    quick = {"formulation": stm.Augmented(), "stabilisation": stm.Unstabilised()}
     counts = []
     for k in range(200):
         height = simulated(f"body {k}", **({} if k % 10 == 0 else quick))
@@ -124,3 +124,19 @@ def test_two_hundred_systems_of_different_structure_leave_nothing_behind(monkeyp
     before = list(compiler._programs)
     simulated("body 199", **quick)
     assert list(compiler._programs) == before
+
+
+@pytest.mark.parametrize("count", [1, 4, 9])
+def test_blocks_have_one_size(count):
+    """The last one is filled up, and what that adds is left out of the result."""
+    sizes = []
+
+    def function(x, tree):
+        sizes.append(len(x))
+        return {"sum": x[:, 0] + tree["y"], "double": 2 * jnp.asarray(x)}
+
+    x, y = np.arange(2.0 * count).reshape(count, 2), np.arange(count)
+    found = in_blocks(function, 4, x, {"y": y})
+    assert set(sizes) == {4}
+    np.testing.assert_array_equal(found["sum"], x[:, 0] + y)
+    np.testing.assert_array_equal(found["double"], 2 * x)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 from stmuav_jax.algebra.small import LARGEST, inverse, solve
 
 
@@ -58,7 +58,7 @@ def test_too_large_is_refused():
 
 
 def test_compiler_options_compile():
-    options = sj.compiler_options()
+    options = stm.algebra.compiler_options()
     f = jax.jit(lambda x: jnp.sum(x[:, :, None] * x[:, None], axis=1), compiler_options=options)
     x = jnp.ones((512, 8))
     assert "__ynn_fusion" not in str(f.lower(x).compile().as_text())

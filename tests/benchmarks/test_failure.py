@@ -9,16 +9,14 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dense.tables import Variant, g_and_l
+from failing.geometry import adopted, geometry, sample, varied_scene
+from failing.model import Report
+from failing.steps import Limits, Scheme, integrate
 
 import stmuav_jax as stm
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
-sys.path.append(str(FOLDER))
-
-from failure_geometry import adopted, geometry, sample, varied_scene  # noqa: E402
-from failure_model import Dense  # noqa: E402
-from failure_steps import Limits, Scheme, integrate  # noqa: E402
-from failure_tables import Variant, g_and_l  # noqa: E402
 
 MISPRINTS = [
     Variant(lost_dots=True),
@@ -42,8 +40,8 @@ def moving():
 
 
 def accelerations(scene, variant, t=0.1):
-    model = Dense(scene, variant)
-    y = model.start(scene)
+    model = Report(scene, variant)
+    y = model.begin(scene)
     q = model.accelerations(t, y)
     L = g_and_l(np.asarray(scene.state0.p))[1]
     return q[:, :3] * variant.metres, 2 * (L @ q[:, 3:, None])[..., 0]
@@ -58,7 +56,7 @@ def accelerations(scene, variant, t=0.1):
 def test_accelerations_are_those_of_the_package(moving, variant, couple):
     system = stm.make_scene("uav_tracker", 2, actuators=couple).system
     scene = dataclasses.replace(moving, system=system)
-    want = stm.evaluate(system, scene.state0, 0.1).accelerations
+    want = stm.dynamics.evaluate(system, scene.state0, 0.1).accelerations
     v_rate, omega_rate = accelerations(scene, variant)
     assert np.max(np.abs(v_rate - want.v_rate)) <= 1e-10 * np.max(np.abs(want.v_rate))
     assert np.max(np.abs(omega_rate - want.omega_rate)) <= 1e-10 * np.max(np.abs(want.omega_rate))
@@ -72,9 +70,9 @@ def test_misprints_change_the_accelerations(moving, variant):
 
 def test_energy_and_residuals_of_the_start(moving):
     for metres in (1.0, 1e-3):
-        model = Dense(moving, Variant(metres=metres))
-        y = model.start(moving)
-        want = stm.energy(moving.system, moving.state0, jnp.zeros(())).total
+        model = Report(moving, Variant(metres=metres))
+        y = model.begin(moving)
+        want = stm.dynamics.energy(moving.system, moving.state0, jnp.zeros(())).total
         assert abs(model.energy(y) - want) <= 1e-12 * abs(want)
         assert model.violation(y) < 1e-10
         assert model.norm_error(y) < 1e-15

@@ -2,23 +2,18 @@
 
 import json
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import diffrax
 import jax
 import jax.numpy as jnp
+import long_horizon
 import numpy as np
 import pytest
+from horizons.gauss import Gauss
+from problems import conservative
 
-import stmuav_jax as sj
-
-FOLDER = Path(__file__).parents[2] / "benchmarks"
-sys.path.append(str(FOLDER))
-
-import long_horizon  # noqa: E402
-import long_problems  # noqa: E402
-from gauss import Gauss  # noqa: E402
+import stmuav_jax as stm
 
 
 def march(stages, y0, h, count):
@@ -99,11 +94,11 @@ def test_equal_cost():
     assert (found["compared"], found["explicit_better"]) == (2, 1)
 
 
-@pytest.mark.parametrize("make", [long_problems.heavy_top, long_problems.four_bar])
+@pytest.mark.parametrize("make", [conservative.heavy_top, conservative.four_bar])
 def test_problems_start_consistent(make):
     """Exact class: velocities that the joints allow; the others start at rest or assembled."""
     problem = make()
-    found = sj.assemble(problem.system, problem.state)
+    found = stm.assemble(problem.system, problem.state)
     np.testing.assert_allclose(found.state.v, problem.state.v, rtol=0, atol=1e-12)
     np.testing.assert_allclose(found.state.omega, problem.state.omega, rtol=0, atol=1e-10)
 

@@ -5,25 +5,19 @@ compiled (two minutes, at its first use), MJX's motion among the slow tests.
 """
 
 import functools
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from peers import PEERS, MujocoC, PinocchioCpp
+from peers.adapter import Setting
+from peers.pinocchio_cpp import program_path
+from problems import compared
+from problems.plain import plain, start
+from problems.tree import coordinates, span
 
 import stmuav_jax as stm
-
-FOLDER = Path(__file__).parents[2] / "benchmarks"
-sys.path.append(str(FOLDER))
-
-import problems  # noqa: E402
-from adapter import Setting  # noqa: E402
-from peers import PEERS, MujocoC, PinocchioCpp  # noqa: E402
-from peers.pinocchio_cpp import program_path  # noqa: E402
-from peers.plain import plain, start  # noqa: E402
-from peers.tree import coordinates, span  # noqa: E402
 
 TIMES = np.array([0.02, 0.04])
 
@@ -47,7 +41,9 @@ def scene():
 @pytest.fixture(scope="module")
 def reference(scene):
     """Positions at `TIMES`, with far more digits than any program is asked for."""
-    return np.asarray(stm.simulate(scene, rtol=1e-12, atol=1e-12, ts=[0.0, *TIMES]).states.r)[1:]
+    return np.asarray(
+        stm.simulate(scene, method=stm.Method(rtol=1e-12, atol=1e-12), ts=[0.0, *TIMES]).states.r
+    )[1:]
 
 
 def ready(peer):
@@ -79,7 +75,10 @@ def test_every_peer_has_a_case_and_settings_from_coarse_to_fine():
 
 @pytest.mark.parametrize("peer", some(slow=()))
 def test_accelerations_at_the_start(peer, scene):
-    one, expected = ready(peer), stm.evaluate(scene.system, scene.state0).accelerations.v_rate
+    one, expected = (
+        ready(peer),
+        stm.dynamics.evaluate(scene.system, scene.state0).accelerations.v_rate,
+    )
     assert one.unsupported(scene) == ""
     difference = one.start_accelerations(scene) - np.asarray(expected)
     assert np.abs(difference).max() <= CASES[peer.__name__][2]
@@ -98,7 +97,10 @@ def test_motion(peer, scene, reference):
 @pytest.mark.parametrize("peer", some(slow=()))
 def test_scene_without_joints(peer):
     scene = stm.make_scene("hexacopter")
-    one, expected = ready(peer), stm.evaluate(scene.system, scene.state0).accelerations.v_rate
+    one, expected = (
+        ready(peer),
+        stm.dynamics.evaluate(scene.system, scene.state0).accelerations.v_rate,
+    )
     assert one.unsupported(scene) == ""
     np.testing.assert_allclose(one.start_accelerations(scene), expected, atol=1e-11)
 
@@ -126,7 +128,7 @@ def test_tree_coordinates_of_a_moved_mechanism(scene):
     """Joint coordinates and rates do not see where the whole mechanism is or goes."""
     state, tree = scene.state0, span(plain(scene))
     w = np.array([0.3, -0.2, 0.5])
-    r, R = np.asarray(state.r), np.stack([stm.rotation_matrix(p) for p in state.p])
+    r, R = np.asarray(state.r), np.stack([stm.rotation.rotation_matrix(p) for p in state.p])
     moved = type(start(scene))(
         r=r + np.array([1.0, 2.0, 3.0]),
         p=np.asarray(state.p),
@@ -164,9 +166,9 @@ def problem(key):
     """A scene of joints and forces beside those of the UAV."""
     if key == "servo":
         # away from its target at the start, so that the servo pulls
-        servo = stm.Servo(stiffness=1e4, damping=50.0, targets=(0.001, -0.002))
+        servo = stm.tracker.Servo(stiffness=1e4, damping=50.0, targets=(0.001, -0.002))
         return stm.make_scene("uav_tracker", 2, servo=servo)
-    return next(p.scene for p in problems.published() if p.key == key)
+    return next(p.scene for p in compared.published() if p.key == key)
 
 
 @functools.cache
@@ -175,13 +177,15 @@ def ours(key):
     scene = problem(key)
     redundant = key in ("squeezer", "four_bar_1")
     formulation = stm.Augmented(redundant=redundant)
-    found = stm.evaluate(scene.system, scene.state0, formulation=formulation)
+    found = stm.dynamics.evaluate(scene.system, scene.state0, formulation=formulation)
     t1 = MOTION[key][0]
     if key == "four_bar_1":
-        exact = problems.chain(1).exact
+        exact = compared.chain(1).exact
         assert exact is not None
         return np.asarray(found.accelerations.v_rate), exact(t1)
-    run = stm.simulate(scene, ts=[0.0, t1], rtol=1e-11, atol=1e-11, formulation=formulation)
+    run = stm.simulate(
+        scene, method=stm.Method(rtol=1e-11, atol=1e-11, formulation=formulation), ts=[0.0, t1]
+    )
     return np.asarray(found.accelerations.v_rate), np.asarray(run.states.r)[-1]
 
 
@@ -206,7 +210,7 @@ def test_other_joints_and_forces(peer, key):
 
 def test_loads_that_no_adapter_hands_over_are_refused():
     """Of the adapter, not of the program; and an end stop is such a load."""
-    scene = stm.make_scene("uav_tracker", 2, stops=stm.Stops())
+    scene = stm.make_scene("uav_tracker", 2, stops=stm.tracker.Stops())
     for peer in (p() for p in PEERS if not p().missing()):
         reason = peer.unsupported(scene)
         assert "EndStop" in reason

@@ -4,37 +4,18 @@ Also the guard that keeps it so: results are not overwritten from a tree with ch
 """
 
 import json
-import sys
 from pathlib import Path
 
+import all as everything
 import pytest
+from shared import record
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
-sys.path.append(str(FOLDER))
-
-import all as everything  # noqa: E402
-import record  # noqa: E402
 
 RESULTS = sorted(record.RESULTS.glob("*.json"))
 
-# Results whose commit is not in the history, each with the reason. This list may only become
-# shorter: a result measured again on a commit of the history has to be taken out of it.
-REWRITTEN = "Measured on a branch that was rewritten before it came into the history."
-KNOWN_STALE = {
-    "estimation": REWRITTEN,
-    "failure": REWRITTEN,
-    "first_result": REWRITTEN,
-    "long_horizon": REWRITTEN,
-    "stiff": REWRITTEN,
-    "suite_acceleration": REWRITTEN,
-    "suite_batch": REWRITTEN,
-    "suite_hexacopter": REWRITTEN,
-    "suite_published": REWRITTEN,
-    "suite_scaling": REWRITTEN,
-    "suite_scenes": REWRITTEN,
-    "suite_stiff": REWRITTEN,
-    "suite_work_precision": REWRITTEN,
-}
+# Results whose commit is not in the history, each with the reason. There is none, and none may come.
+KNOWN_STALE: dict[str, str] = {}
 
 
 def commits(path: Path) -> set[str]:
@@ -93,8 +74,8 @@ def test_results_are_written_from_a_clean_tree(tree):
 
 def test_results_are_not_overwritten_from_a_tree_with_changes(tree, tmp_path):
     path = record.write("one", {"what": "before"}, record.RESULTS)
-    tree.append("stmuav_jax/dynamics/integrate.py")
-    with pytest.raises(record.DirtyTreeError, match=r"integrate\.py.*build/results/one\.json"):
+    tree.append("stmuav_jax/dynamics/trajectory.py")
+    with pytest.raises(record.DirtyTreeError, match=r"trajectory\.py.*build/results/one\.json"):
         record.write("one", {"what": "after"}, record.RESULTS)
     assert json.loads(path.read_text())["what"] == "before"
     # nothing is lost, and another folder takes it
@@ -104,7 +85,7 @@ def test_results_are_not_overwritten_from_a_tree_with_changes(tree, tmp_path):
 
 
 def test_dirty_results_are_written_where_that_is_asked_for_and_say_so(tree, monkeypatch):
-    tree.append("stmuav_jax/dynamics/integrate.py")
+    tree.append("stmuav_jax/dynamics/trajectory.py")
     monkeypatch.setenv(record.ALLOW, "1")
     about = json.loads(record.write("one", {}, record.RESULTS).read_text())["environment"]
     assert (about["dirty"], about["changed"], about["allow_dirty"]) == (True, tree, True)

@@ -2,21 +2,16 @@
 
 import json
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import stiff
+from stiffness.runs import as_given
+from stiffness.scenes import FREE, SCENES
 
-import stmuav_jax as sj
-
-FOLDER = Path(__file__).parents[2] / "benchmarks"
-sys.path.append(str(FOLDER))
-
-import stiff  # noqa: E402
-from stiff_runs import as_given  # noqa: E402
-from stiff_scenes import FREE, SCENES  # noqa: E402
+import stmuav_jax as stm
 
 
 def test_scenes_share_a_compilation():
@@ -32,11 +27,11 @@ def test_scenes_share_a_compilation():
 
 def test_elements_that_are_not_there_do_nothing():
     """Exact class: with the sliders off their zero and in motion, no force at all."""
-    plain, free = sj.make_scene("uav_tracker", 2), FREE.uav()
+    plain, free = stm.make_scene("uav_tracker", 2), FREE.uav()
     start = plain.state0
     rng = np.random.default_rng(3)
     r, v = start.r + 1e-3 * rng.normal(size=(7, 3)), jnp.asarray(rng.normal(size=(7, 3)))
-    kin = free.system.kinematics(sj.State(r, start.p, v, start.omega))
+    kin = free.system.kinematics(stm.State(r, start.p, v, start.omega))
     added = free.system.forces[len(plain.system.forces) :]
     assert len(added) == 6
     for force in added:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
+
 # Section -> keys of its record, and keys of its first row.
 WANTED = {
     "acceleration": ({"rows"}, {"method", "batch", "seconds", "operations", "failure"}),

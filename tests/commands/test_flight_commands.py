@@ -6,7 +6,7 @@ import numpy as np
 from rich.console import Console
 
 from stmuav_jax.commands.flight import modes_table
-from stmuav_jax.study.linear import Mode
+from stmuav_jax.flight.linear import Mode
 
 
 def printed(table):

@@ -5,9 +5,9 @@ import random
 import pytest
 
 from stmuav_jax import cli
-from stmuav_jax.commands import flight, tune
+from stmuav_jax.checks.errors import SettingError
+from stmuav_jax.commands import flight, simulate, tune
 from stmuav_jax.commands.options import Number
-from stmuav_jax.mechanics.errors import SettingError
 
 NUMBERS = (
     "0", "-1", "1e-300", "5e-324", "1e308", "1e400", "nan", "-inf", "inf", "hello", "", " ",
@@ -18,7 +18,8 @@ OPTIONS = {
     "list": (), "report": ("--out", "--figures"),
     "simulate": ("--case", "--t1", "--rtol", "--atol", "--save-every", "--max-steps", "--solver",
                  "--params", "--actuators", "--out", "--figures", "--loads", "--no-error-estimate",
-                 "--nope"),
+                 "--nope", "--servo", "--servo.stiffness", "--stops.lower", "--strokes.to",
+                 "--start.phi", "--start.phi-rate", "--start.nope", "--wind.mean"),
     "sun": ("--lat", "--lon", "--date", "--timezone", "--altitude", "--roll", "--pitch", "--yaw",
             "--step", "--stroke-step", "--turbidity", "--attitude-error", "--attitude"),
     "trim": ("--phi", "--theta", "--sun", "--climb", "--speed", "--course", "--turn", "--yaw",
@@ -60,12 +61,13 @@ def stubbed(monkeypatch):
         raise SettingError("The work would begin.")
 
     for module, name in (
-        (cli, "run_scene"), (cli, "run_montecarlo"), (cli, "run_estimate"), (cli, "run_report"),
-        (flight, "_solved"), (flight, "table_of"), (tune, "table_of"),
+        (simulate, "run_scene"), (flight, "_solved"), (flight, "table_of"), (tune, "table_of"),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, stop)
-    monkeypatch.setattr("stmuav_jax.study.heading.best_heading", stop)
-    monkeypatch.setattr("stmuav_jax.study.day.track_day", stop)
+    for name in ("montecarlo", "estimate", "report"):
+        monkeypatch.setitem(cli.COMMANDS, name, cli.COMMANDS[name]._replace(run=stop))
+    monkeypatch.setattr("stmuav_jax.tracker.heading.best_heading", stop)
+    monkeypatch.setattr("stmuav_jax.tracker.day.track_day", stop)
     monkeypatch.setattr(cli, "_configure", lambda _: None)
     return reached
 
@@ -108,7 +110,7 @@ def test_one_boundary(error, code, words, monkeypatch, capsys, tmp_path):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
 
-    def run(command, started):
+    def run(name, given):
         raise error
 
     monkeypatch.setattr(cli, "_run", run)

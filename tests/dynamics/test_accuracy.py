@@ -5,18 +5,19 @@ import numpy as np
 import pytest
 from helpers import pendulum, scene_of, swung
 
-import stmuav_jax as sj
-from stmuav_jax.dynamics import simulate as module
-from stmuav_jax.dynamics.accuracy import LOST, ErrorEstimate, _growth
-from stmuav_jax.dynamics.march import March
-from stmuav_jax.view.report import certificate_rows
+import stmuav_jax as stm
+from stmuav_jax.dynamics import simulation as module
+from stmuav_jax.dynamics.error_estimate import LOST, ErrorEstimate, _growth
+from stmuav_jax.dynamics.integration.march import March
+from stmuav_jax.figures.report import certificate_rows
 
 SYSTEM = pendulum()
 SCENE = scene_of(SYSTEM, swung(SYSTEM, 1.0, 0.5), t1=4.0, save_every=0.25)
 
 
-def run(scene=SCENE, tolerance=1e-8, **settings):
-    return sj.simulate(scene, rtol=tolerance, atol=tolerance, analysis=False, **settings)
+def run(scene=SCENE, tolerance=1e-8, event=None, **settings):
+    method = stm.Method(rtol=tolerance, atol=tolerance, event=event)
+    return stm.simulate(scene, method=method, analysis=False, **settings)
 
 
 def sharp(scene):
@@ -192,7 +193,7 @@ def test_the_estimate_in_the_scenes():
     """Within a factor of three in nine of ten cases, however the errors grow."""
     references, fine = {}, []
     for name, case, tolerance in CASES:
-        scene = sj.make_scene(name, case)
+        scene = stm.make_scene(name, case)
         if (name, case) not in references:
             references[name, case] = run(scene, 3e-13, error_estimate=False)
         found = run(scene, tolerance)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from helpers import pendulum
 
-from stmuav_jax import Scene, SettingError, State, simulate, states_at
+from stmuav_jax import Method, Scene, SettingError, State, simulate
+from stmuav_jax.dynamics import states_at
 
 
 @pytest.fixture(scope="module")
@@ -14,13 +15,13 @@ def swing():
     rest = system.reference
     moving = State(rest.r, rest.p, jnp.array([[-1.0, 0, 0]]), jnp.array([[0, 2.0, 0]]))
     scene = Scene("p", "p", system, moving, t1=0.5, save_every=0.1)
-    return simulate(scene, rtol=1e-11, atol=1e-11)
+    return simulate(scene, method=Method(rtol=1e-11, atol=1e-11))
 
 
 def test_between_saved_times_as_accurate_as_on_them(swing):
     times = np.array([0.0, 0.05, 0.123, swing.ts[3], 0.49, 0.5])
     found = states_at(swing, times)
-    direct = simulate(swing.scene, ts=times, rtol=1e-11, atol=1e-11)
+    direct = simulate(swing.scene, method=Method(rtol=1e-11, atol=1e-11), ts=times)
     for name in ("r", "p", "v", "omega"):
         np.testing.assert_allclose(
             getattr(found, name), getattr(direct.states, name), rtol=0, atol=1e-9

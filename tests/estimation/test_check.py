@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from stmuav_jax.estimation.attitude import attitude_model
+from stmuav_jax.checks.errors import ModelError, SettingError
 from stmuav_jax.estimation.bank import filter_bank
 from stmuav_jax.estimation.filter import kalman_filter
-from stmuav_jax.estimation.gaussian import Gaussian, gaussian
+from stmuav_jax.estimation.gaussians import Gaussian, gaussian
 from stmuav_jax.estimation.likelihood import record_likelihood, tune
 from stmuav_jax.estimation.model import Sensor, StateSpaceModel
 from stmuav_jax.estimation.online import OnlineFilter
-from stmuav_jax.estimation.quadrotor import observable_model, report_prior
 from stmuav_jax.estimation.smoother import smooth
-from stmuav_jax.mechanics.errors import ModelError, SettingError
+from stmuav_jax.quadrotor.attitude import attitude_model
+from stmuav_jax.quadrotor.model import observable_model, report_prior
 
 NOISE = 0.01 * np.eye(2)
 Y = np.tile([1.0, 5.0], (4, 1))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stmuav_jax.estimation import factor
-from stmuav_jax.estimation.trigonometry import sine_cosine
+from stmuav_jax.quadrotor.trigonometry import sine_cosine
 
 RNG = np.random.default_rng(0)
 triangularise, cholesky = jax.jit(factor.triangularise), jax.jit(factor.cholesky)
@@ -43,7 +43,6 @@ def test_cholesky_and_division():
     B = RNG.normal(size=(6, 2, 3))
     L = stacked(factor.cholesky, P)
     quotient = stacked(factor.divide_lower, np.moveaxis(L, 0, -1), B)
-    other = stacked(factor.divide_lower_transposed, np.moveaxis(L, 0, -1), B)
     for i in range(3):
         expected = np.linalg.cholesky(P[..., i])
         np.testing.assert_allclose(L[i], expected, atol=1e-13)
@@ -51,7 +50,6 @@ def test_cholesky_and_division():
             np.asarray(cholesky(jnp.asarray(P[..., i]))), expected, atol=1e-13
         )
         np.testing.assert_allclose(quotient[i], np.linalg.solve(expected, B[..., i]), atol=1e-12)
-        np.testing.assert_allclose(other[i], np.linalg.solve(expected.T, B[..., i]), atol=1e-12)
 
 
 def test_rank_one_changes():

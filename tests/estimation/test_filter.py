@@ -1,22 +1,22 @@
 """Filters on linear systems against the textbook; D1, D4, D8 of the reference figures."""
 
-from typing import Any
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from linear import random_linear, textbook, textbook_smoother
 
+from stmuav_jax.checks.errors import ModelError, SettingError
 from stmuav_jax.estimation import sigma
 from stmuav_jax.estimation.bank import filter_bank
 from stmuav_jax.estimation.filter import EstimationError, kalman_filter
-from stmuav_jax.estimation.gaussian import Gaussian, gaussian, log_density
+from stmuav_jax.estimation.gaussians import Gaussian, gaussian
 from stmuav_jax.estimation.model import Sensor, StateSpaceModel
 from stmuav_jax.estimation.online import OnlineFilter
+from stmuav_jax.estimation.sigma import AbstractRule
 from stmuav_jax.estimation.smoother import smooth
-from stmuav_jax.estimation.update import predict, update
-from stmuav_jax.mechanics.errors import ModelError, SettingError
+from stmuav_jax.estimation.update import DEFAULT, AbstractFilter, GaussianFilter, ReusingFilter
 
 CASE = random_linear()
 MEANS, COVARIANCES, LIKELIHOOD, NIS = textbook(CASE)
@@ -36,7 +36,9 @@ MEANS, COVARIANCES, LIKELIHOOD, NIS = textbook(CASE)
 )
 def test_linear_system_is_a_kalman_filter(rule, form, tol):
     """D1: full random Q, R, P0, 200 steps; with kappa = -3 a central weight is negative."""
-    out = kalman_filter(CASE.model(), CASE.prior(), CASE.y, dt=1.0, rule=rule, form=form)
+    out = kalman_filter(
+        CASE.model(), CASE.prior(), CASE.y, dt=1.0, method=GaussianFilter(rule, form)
+    )
     np.testing.assert_allclose(out.mean, MEANS, rtol=0, atol=tol)
     np.testing.assert_allclose(out.covariance, COVARIANCES, rtol=0, atol=tol)
     np.testing.assert_allclose(out.nis, NIS, rtol=0, atol=1e3 * tol)
@@ -45,11 +47,11 @@ def test_linear_system_is_a_kalman_filter(rule, form, tol):
 
 def test_fifth_degree():
     case = random_linear(seed=1, n=3, m=2, count=50)
-    rule = sigma.Cubature5()
-    out = kalman_filter(case.model(), case.prior(), case.y, dt=1.0, rule=rule)
+    fifth = GaussianFilter(sigma.Cubature5())
+    out = kalman_filter(case.model(), case.prior(), case.y, dt=1.0, method=fifth)
     np.testing.assert_allclose(out.mean, textbook(case)[0], rtol=0, atol=1e-10)
     with pytest.raises(SettingError, match="negative weights for n = 6"):
-        kalman_filter(CASE.model(), CASE.prior(), CASE.y, dt=1.0, rule=rule)
+        kalman_filter(CASE.model(), CASE.prior(), CASE.y, dt=1.0, method=fifth)
 
 
 def test_invariants_and_likelihood():
@@ -59,7 +61,9 @@ def test_invariants_and_likelihood():
     assert np.array_equal(P, np.swapaxes(P, 1, 2))
     least = np.linalg.eigvalsh(P)[:, 0]
     assert np.all(least >= -1e-14 * np.trace(P, axis1=1, axis2=2))
-    each = jax.vmap(log_density)(out.innovations.error, out.innovations.factor)
+    error, L = out.innovations.error, out.innovations.factor
+    density = jax.scipy.stats.multivariate_normal.logpdf
+    each = jax.vmap(lambda e, L: density(e, jnp.zeros_like(e), L @ L.T))(error, L)
     np.testing.assert_allclose(out.log_likelihood, jnp.sum(each), rtol=1e-12)
 
 
@@ -71,7 +75,7 @@ def test_missing_measurements(form):
     y[20, 1] = np.nan
     y[30, 0] = y[31, 2] = np.nan
     means, covariances, likelihood, _ = textbook(CASE, y)
-    out = kalman_filter(CASE.model(), CASE.prior(), y, dt=1.0, form=form)
+    out = kalman_filter(CASE.model(), CASE.prior(), y, dt=1.0, method=GaussianFilter(form=form))
     np.testing.assert_allclose(out.mean, means, rtol=0, atol=1e-10)
     np.testing.assert_allclose(out.covariance, covariances, rtol=0, atol=1e-10)
     np.testing.assert_allclose(out.log_likelihood, likelihood, rtol=1e-10)
@@ -85,15 +89,16 @@ def test_sequential_measurements_in_any_order():
     alone = [Sensor(lambda x, u, i=i: H[i : i + 1] @ x, [[variances[i]]]) for i in range(3)]
     whole = Sensor(lambda x, u: H @ x, np.diag(variances))
     model, y = CASE.model(), jnp.asarray(CASE.y[0])
-    first = jax.jit(lambda g: predict(model, g))(CASE.prior())
-    together = jax.jit(lambda g: update(g, y, whole, model=model)[0])(first)
+    first = jax.jit(lambda g: DEFAULT.predict(model, g))(CASE.prior())
+    together = jax.jit(lambda g: DEFAULT.update(g, y, whole, model=model)[0])(first)
 
     @jax.jit
     def one_by_one(state, order):
         for i in range(3):
             # the sensor of this turn, chosen without compiling another program
             branches = [
-                lambda g, i=i: update(g, y[i : i + 1], alone[i], model=model)[0] for i in range(3)
+                lambda g, i=i: DEFAULT.update(g, y[i : i + 1], alone[i], model=model)[0]
+                for i in range(3)
             ]
             state = jax.lax.switch(order[i], branches, state)
         return state
@@ -118,21 +123,21 @@ def pendulum():
 
 
 @pytest.mark.parametrize(
-    ("points", "mean", "P"),
+    ("kind", "mean", "P"),
     [
         (
-            "redraw",
+            GaussianFilter,
             (1.5029754602711, -0.11622200002662),
             (0.099604026563276, 0.00042517479266623, 0.10027379155236),
         ),
-        ("reuse", (1.5029755883481, -0.11673295239971), None),
+        (ReusingFilter, (1.5029755883481, -0.11673295239971), None),
     ],
 )
-def test_pendulum(points, mean, P):
+def test_pendulum(kind, mean, P):
     """D4: the first step by both conventions."""
     model, prior, y, dt = pendulum()
-    rule = sigma.Unscented(1.0, 2.0, 1.0)
-    out = kalman_filter(model, prior, y, dt=dt, rule=rule, points=points)
+    method = kind(sigma.Unscented(1.0, 2.0, 1.0))
+    out = kalman_filter(model, prior, y, dt=dt, method=method)
     np.testing.assert_allclose(out.mean[0], mean, rtol=0, atol=1e-10)
     if P:
         found = np.asarray(out.covariance[0])
@@ -141,13 +146,12 @@ def test_pendulum(points, mean, P):
 
 def test_forms_agree_where_the_system_is_not_linear():
     model, prior, y, dt = pendulum()
-    for rule, points in (
-        (sigma.Unscented(0.5, 0.0, -1.5), "redraw"),
-        (sigma.Cubature5(), "reuse"),
+    for kind, rule in (
+        (GaussianFilter, sigma.Unscented(0.5, 0.0, -1.5)),
+        (ReusingFilter, sigma.Cubature5()),
     ):
-        settings: dict[str, Any] = {"dt": dt, "rule": rule, "points": points}
-        a = kalman_filter(model, prior, y, **settings)
-        b = kalman_filter(model, prior, y, form="covariance", **settings)
+        a = kalman_filter(model, prior, y, dt=dt, method=kind(rule))
+        b = kalman_filter(model, prior, y, dt=dt, method=kind(rule, "covariance"))
         np.testing.assert_allclose(a.mean, b.mean, rtol=0, atol=1e-12)
         np.testing.assert_allclose(a.covariance, b.covariance, rtol=0, atol=1e-12)
 
@@ -202,6 +206,37 @@ def test_online_is_the_same_filter():
     assert online.missing == 3
 
 
+class Fading(AbstractFilter):
+    """Kalman filter that forgets: the covariance grows by a factor before each step."""
+
+    growth: float
+    rule: AbstractRule = eqx.field(default_factory=sigma.Cubature)
+
+    def step(self, model, before, y, u, dt):
+        wider = Gaussian(before.mean, jnp.sqrt(self.growth) * before.factor)
+        return DEFAULT.step(model, wider, y, u, dt)
+
+
+def test_a_filter_of_ones_own_is_one_class():
+    """A single one, banks and the online filter take it; against the equations in NumPy."""
+    case, fading = random_linear(n=3, m=2, count=6), Fading(growth=1.3)
+    out = kalman_filter(case.model(), case.prior(), case.y, dt=1.0, method=fading)
+    m, P = case.m0, case.P0
+    for y, mean, covariance in zip(case.y, out.mean, out.covariance, strict=True):
+        m, P = case.F @ m, 1.3 * case.F @ P @ case.F.T + case.Q
+        K = P @ case.H.T @ np.linalg.inv(case.H @ P @ case.H.T + case.R)
+        m, P = m + K @ (y - case.H @ m), P - K @ case.H @ P
+        np.testing.assert_allclose(mean, m, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(covariance, P, rtol=0, atol=1e-12)
+    y = jnp.asarray(case.y)
+    bank = filter_bank(case.model(), case.prior(), y[..., None], dt=1.0, method=fading)
+    np.testing.assert_allclose(bank.mean[..., 0], out.mean, rtol=0, atol=1e-12)
+    online = OnlineFilter(case.model(), case.prior(), method=fading)
+    for k in range(6):
+        online.step(case.y[k], t=float(k + 1))
+    np.testing.assert_allclose(online.state.mean, out.mean[-1], rtol=0, atol=1e-14)
+
+
 def test_likelihood_gradient():
     """By R's scale, against central differences."""
     case = random_linear(n=2, m=1, count=6)
@@ -247,9 +282,9 @@ def test_single_precision_refuses_a_small_alpha():
     prior = gaussian(single(CASE.m0), P0)
     assert prior.factor.dtype == jnp.float32
     with pytest.raises(SettingError, match=r"alpha = 0.001 cannot work in float32"):
-        kalman_filter(model, prior, CASE.y, dt=1.0, rule=sigma.Unscented(1e-3))
+        kalman_filter(model, prior, CASE.y, dt=1.0, method=GaussianFilter(sigma.Unscented(1e-3)))
     for rule in (sigma.Unscented(0.1), sigma.Cubature()):
-        out = kalman_filter(model, prior, CASE.y, dt=1.0, rule=rule)
+        out = kalman_filter(model, prior, CASE.y, dt=1.0, method=GaussianFilter(rule))
         np.testing.assert_allclose(out.mean, MEANS, rtol=0, atol=1e-4)
 
 

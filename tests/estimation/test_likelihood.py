@@ -6,10 +6,10 @@ import numpy as np
 import optax
 import pytest
 
-from stmuav_jax.estimation.gaussian import gaussian
+from stmuav_jax.checks.errors import SettingError
+from stmuav_jax.estimation.gaussians import gaussian
 from stmuav_jax.estimation.likelihood import record_likelihood, standard_errors, tune
 from stmuav_jax.estimation.model import Sensor, StateSpaceModel
-from stmuav_jax.mechanics.errors import SettingError
 
 F = np.array([[1.0, 0.1], [0.0, 0.98]])
 TRUE = {"Q": np.array([0.02, 0.05]), "R": np.array([0.3])}

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from stmuav_jax.algebra.rotation import from_rotation_vector, product
+from stmuav_jax.algebra.space import Vector
+from stmuav_jax.algebra.stacked import transposed_multiply
 from stmuav_jax.estimation import sigma
-from stmuav_jax.estimation.attitude import attitude_model, attitude_space
-from stmuav_jax.estimation.factor import cross_gram, gram
-from stmuav_jax.estimation.filter import one_step
-from stmuav_jax.estimation.gaussian import Gaussian, gaussian
-from stmuav_jax.estimation.quadrotor import PART_III, rates
-from stmuav_jax.estimation.space import Vector
+from stmuav_jax.estimation.gaussians import Gaussian, gaussian
+from stmuav_jax.estimation.update import DEFAULT, GaussianFilter
+from stmuav_jax.quadrotor.attitude import attitude_model, attitude_space
+from stmuav_jax.quadrotor.model import PART_III, rates
 
 
 def moments(out):
     less = 0.0 if out.less is None else np.outer(out.less, out.less)
-    return np.asarray(out.mean), np.asarray(gram(out.rows)) - less
+    return np.asarray(out.mean), np.asarray(transposed_multiply(out.rows, out.rows)) - less
 
 
 def sent(rule, function, mean, P):
@@ -100,7 +100,7 @@ def test_weighted_sum_of_the_textbook():
         found, covariance = moments(out)
         np.testing.assert_allclose(found, mean, rtol=0, atol=1e-11)
         np.testing.assert_allclose(covariance, cov, rtol=0, atol=1e-9)
-        seen = cross_gram(out.inputs, out.rows[: out.inputs.shape[0]])
+        seen = transposed_multiply(out.inputs, out.rows[: out.inputs.shape[0]])
         np.testing.assert_allclose(seen, cross, rtol=0, atol=1e-11)
 
 
@@ -150,7 +150,7 @@ def prior(p, scale=1.0):
 
 @jax.jit
 def stepped(start):
-    return one_step(MODEL, start, Y, U, 0.01, rule=sigma.Cubature(), form="square_root")[0]
+    return DEFAULT.step(MODEL, start, Y, U, 0.01)[0]
 
 
 Q0 = from_rotation_vector(jnp.array([0.3, -0.4, 0.9]))
@@ -175,7 +175,7 @@ def test_mean_of_rotations():
     mean, rows = jax.jit(send)(start)
     difference, retract = jax.jit(SPACE.difference), jax.jit(SPACE.retract)
     np.testing.assert_allclose(difference(mean, start.mean), 0, atol=1e-12)
-    np.testing.assert_allclose(gram(rows), P0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(transposed_multiply(rows, rows), P0, rtol=0, atol=1e-12)
     moves = jnp.concatenate([start.factor, -start.factor], axis=1)
     points = retract(jax.tree.map(lambda a: a[:, None], start.mean), moves)
     np.testing.assert_allclose(jnp.linalg.norm(points["p"], axis=0), 1, atol=1e-14)
@@ -186,9 +186,7 @@ def test_mean_of_rotations():
 
 def test_small_covariance_is_an_extended_filter():
     small = prior(Q0, 1e-6)
-    extended = jax.jit(
-        lambda g: one_step(MODEL, g, Y, U, 0.01, rule=sigma.Linearised(), form="square_root")[0]
-    )
+    extended = jax.jit(lambda g: GaussianFilter(sigma.Linearised()).step(MODEL, g, Y, U, 0.01)[0])
     a, b = stepped(small), extended(small)
     np.testing.assert_allclose(SPACE.difference(a.mean, b.mean), 0, atol=1e-6)
     np.testing.assert_allclose(a.factor, b.factor, rtol=0, atol=1e-9)

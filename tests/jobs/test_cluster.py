@@ -15,13 +15,13 @@ import pytest
 from jobs.toy import Precise, Toy, contents
 
 import stmuav_jax
+from stmuav_jax.checks.errors import SettingError, SimulationError
+from stmuav_jax.files import layout
+from stmuav_jax.files.netcdf import FileError
+from stmuav_jax.files.store import create, open_store
 from stmuav_jax.jobs.cluster import run_on_cluster
 from stmuav_jax.jobs.local import run_study
-from stmuav_jax.jobs.progress import Standing
-from stmuav_jax.mechanics.errors import SettingError, SimulationError
-from stmuav_jax.view import layout
-from stmuav_jax.view.io import FileError
-from stmuav_jax.view.store import create, open_store
+from stmuav_jax.jobs.progress import StudyProgress
 
 distributed = pytest.importorskip("distributed")
 
@@ -81,7 +81,7 @@ def test_a_cluster_of_our_own(tmp_path, whole):
     """Three processes; one kills itself in a chunk, and another takes its place."""
     path, marker = tmp_path / "study.zarr", tmp_path / "marker"
     marker.touch()
-    seen: list[Standing] = []
+    seen: list[StudyProgress] = []
     work = Toy(seed=7, pause=0.05, fall=(500, str(marker)), log=str(tmp_path / "log"))
     outcome = run_on_cluster(work, path, 900, workers=3, chunk=30, progress=seen.append)
     assert not marker.exists()
@@ -104,7 +104,7 @@ def test_a_worker_is_killed(tmp_path, whole, outside):
     path = tmp_path / "study.zarr"
     victim = outside.workers[0]
 
-    def kill(now: Standing) -> None:
+    def kill(now: StudyProgress) -> None:
         if now.done >= 300 and victim.poll() is None:
             victim.send_signal(signal.SIGKILL)
             victim.wait()
@@ -145,7 +145,7 @@ def test_double_precision_goes_along(tmp_path, outside):
 def test_interrupted_and_gone_on_with_here(tmp_path, whole, outside):
     path = tmp_path / "study.zarr"
 
-    def stop(now: Standing) -> None:
+    def stop(now: StudyProgress) -> None:
         if now.done == 300:
             raise KeyboardInterrupt
 
@@ -229,9 +229,9 @@ def test_workers_that_come_later(tmp_path, whole):
     port = str(free_port())
     address, path = f"tcp://127.0.0.1:{port}", tmp_path / "study.zarr"
     processes = [spawned("scheduler", "--host", "127.0.0.1", "--port", port)]
-    seen: list[Standing] = []
+    seen: list[StudyProgress] = []
 
-    def come(now: Standing) -> None:
+    def come(now: StudyProgress) -> None:
         seen.append(now)
         if now.note or now.done == 300:
             processes.append(spawned("worker", address, "--nthreads", "1", "--no-nanny"))
@@ -244,7 +244,7 @@ def test_workers_that_come_later(tmp_path, whole):
         for process in processes:
             process.kill()
             process.wait()
-    assert seen[0] == Standing(0, 900, 0.0, np.inf, f"Waiting for a worker of {address}.")
+    assert seen[0] == StudyProgress(0, 900, 0.0, np.inf, f"Waiting for a worker of {address}.")
     assert outcome.done == 900
     assert contents(path) == whole
 
@@ -258,7 +258,7 @@ def test_a_scheduler_that_is_lost(tmp_path, whole):
     with distributed.Client(address, timeout=60, set_as_default=False) as client:
         client.wait_for_workers(1, timeout=60)
 
-    def kill(now: Standing) -> None:
+    def kill(now: StudyProgress) -> None:
         if now.done == 300:
             scheduler.kill()
 

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from jobs.toy import Toy, contents
 
+from stmuav_jax.checks.errors import SettingError, SimulationError
+from stmuav_jax.files.netcdf import FileError
+from stmuav_jax.files.store import open_store
 from stmuav_jax.jobs.compute import Pieces, chunk_size
 from stmuav_jax.jobs.local import run_study
-from stmuav_jax.jobs.progress import Meter, Standing, duration
+from stmuav_jax.jobs.progress import Meter, StudyProgress, duration
 from stmuav_jax.jobs.watch import Watch
-from stmuav_jax.mechanics.errors import SettingError, SimulationError
-from stmuav_jax.view.io import FileError
-from stmuav_jax.view.store import open_store
 
 HERE = Path(__file__).parent
 WORK = Toy(seed=7)
@@ -34,7 +34,7 @@ def whole(tmp_path_factory):
 
 
 def test_a_run(tmp_path, whole):
-    seen: list[Standing] = []
+    seen: list[StudyProgress] = []
     path = tmp_path / "deep" / "study.zarr"
     outcome = run_study(WORK, path, 1000, chunk=150, progress=seen.append)
     assert outcome[:4] == (path, 1000, 1000, 1000)
@@ -65,7 +65,7 @@ def test_the_chunk_does_not_matter(tmp_path):
 def test_interrupted_and_resumed(tmp_path, whole):
     path = tmp_path / "study.zarr"
 
-    def stop(now: Standing) -> None:
+    def stop(now: StudyProgress) -> None:
         if now.done == 450:
             raise KeyboardInterrupt
 
@@ -93,7 +93,7 @@ def test_interrupted_twice(tmp_path, whole):
                 raise KeyboardInterrupt
             return Toy.run(self, first, count)
 
-    def stop(now: Standing) -> None:
+    def stop(now: StudyProgress) -> None:
         if now.done == 450:
             raise KeyboardInterrupt
 
@@ -127,7 +127,7 @@ def test_extended(tmp_path, whole):
     ("most", "limits"), [(149, [80]), (40, [80, 40]), (3, [80, 40, 20, 10, 5, 3])]
 )
 def test_chunks_that_do_not_fit(tmp_path, whole, words, most, limits):
-    seen: list[Standing] = []
+    seen: list[StudyProgress] = []
     path = tmp_path / "study.zarr"
     work = Toy(seed=7, most=most, words=words, together=20, log=str(tmp_path / "log"))
     outcome = run_study(work, path, 1000, chunk=150, progress=seen.append)
@@ -177,7 +177,7 @@ def test_a_work_that_fails_keeps_what_was_done(tmp_path, whole):
 
 
 def test_a_disk_that_fails_ends_the_run(tmp_path, whole, monkeypatch):
-    from stmuav_jax.view import store
+    from stmuav_jax.files import store
 
     path, calls = tmp_path / "study.zarr", []
 
@@ -222,7 +222,7 @@ def test_chunks_by_default(tmp_path):
 
 def test_writing_and_computing_overlap(tmp_path, monkeypatch):
     """Each takes 50 ms; one after the other they would take twice as long."""
-    from stmuav_jax.view.store import Store
+    from stmuav_jax.files.store import Store
 
     real, threads = Store.write, set()
 
@@ -253,9 +253,9 @@ def test_standings_in_words(monkeypatch):
     assert meter(200)[:4] == (200, 1000, 0.0, np.inf)
     assert meter(300).rate == 50.0
     assert meter(400).words() == "400 of 1000 samples, 50/s, 12.0 s to go"
-    assert meter(400, "memory is short") == Standing(400, 1000, 50.0, 12.0, "memory is short")
-    assert Standing(0, 5, 0.0, np.inf).words() == "0 of 5 samples"
-    assert Standing(1, 5, 0.125, 32.0).words() == "1 of 5 samples, 0.12/s, 32.0 s to go"
+    assert meter(400, "memory is short") == StudyProgress(400, 1000, 50.0, 12.0, "memory is short")
+    assert StudyProgress(0, 5, 0.0, np.inf).words() == "0 of 5 samples"
+    assert StudyProgress(1, 5, 0.125, 32.0).words() == "1 of 5 samples, 0.12/s, 32.0 s to go"
     assert [duration(s) for s in (59.94, 250.0, 7500.0, np.inf)] == [
         "59.9 s", "4 min 10 s", "2 h 5 min", "unknown time",
     ]  # fmt: skip
@@ -435,7 +435,7 @@ def test_changes_of_devices_give_the_same_files(tmp_path):
         work = FlightWork(study, block=16, lanes=8, devices=devices)
         vars(work)["_compiled"] = first._compiled  # pyright: ignore[reportIndexIssue]
 
-        def stop(now: Standing, end: int = end) -> None:
+        def stop(now: StudyProgress, end: int = end) -> None:
             if end <= now.done < now.total:
                 raise KeyboardInterrupt
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import inertia_of, np_rotation, pendulum, random_quaternion, scene_of, swung, unit
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 
 TOLERANCE = 1e-10
 X, Y, Z = np.eye(3)
@@ -15,14 +15,14 @@ MIDDLE, FAR = np.array([0.0, 0.0, 0.2]), np.array([0.1, 0.3, 0.4])
 
 # joint between "a" at the origin and "b" near (0, 0, 0.4); names filled in below
 PAIRS = {
-    "weld": lambda *n, at: sj.weld(*n, point=at + MIDDLE),
-    "spherical": lambda *n, at: sj.spherical(*n, point=at + MIDDLE),
-    "universal": lambda *n, at: sj.universal(*n, point=at + MIDDLE, axis_i=X, axis_j=Y + Z),
-    "revolute": lambda *n, at: sj.revolute(*n, point=at + MIDDLE, axis=X + Y),
-    "translational": lambda *n, at: sj.translational(*n, point=at + MIDDLE, axis=X + 2 * Z),
-    "cylindrical": lambda *n, at: sj.cylindrical(*n, point=at + MIDDLE, axis=X + 2 * Z),
-    "distance": lambda *n, at: sj.distance(*n, point_i=at + MIDDLE, point_j=at + FAR),
-    "revolute_spherical": lambda *n, at: sj.revolute_spherical(
+    "weld": lambda *n, at: stm.weld(*n, point=at + MIDDLE),
+    "spherical": lambda *n, at: stm.spherical(*n, point=at + MIDDLE),
+    "universal": lambda *n, at: stm.universal(*n, point=at + MIDDLE, axis_i=X, axis_j=Y + Z),
+    "revolute": lambda *n, at: stm.revolute(*n, point=at + MIDDLE, axis=X + Y),
+    "translational": lambda *n, at: stm.translational(*n, point=at + MIDDLE, axis=X + 2 * Z),
+    "cylindrical": lambda *n, at: stm.cylindrical(*n, point=at + MIDDLE, axis=X + 2 * Z),
+    "distance": lambda *n, at: stm.distance(*n, point_i=at + MIDDLE, point_j=at + FAR),
+    "revolute_spherical": lambda *n, at: stm.revolute_spherical(
         *n, point_i=at, axis=Z, point_j=at + 0.3 * unit(X - Y)
     ),
     "free": None,
@@ -38,7 +38,7 @@ def pairs():
         at = np.array([2.0 * k, 0, 0])
         for letter, place in (("a", at), ("b", at + 0.4 * Z)):
             bodies.append(
-                sj.Body(
+                stm.Body(
                     letter + kind,
                     1 + rng.random(),
                     inertia_of(rng),
@@ -50,7 +50,7 @@ def pairs():
             )
         if build is not None:
             joints.append(build(kind, "a" + kind, "b" + kind, at=at))
-    system = sj.System(bodies, joints)
+    system = stm.System(bodies, joints)
     return system, consistent(system, rng)
 
 
@@ -58,14 +58,14 @@ def consistent(system, rng):
     """Random velocities, projected onto the joints in the mass metric."""
     n = system.n_bodies
     u = np.concatenate([rng.normal(size=(n, 3)), 4 * rng.normal(size=(n, 3))], axis=1).reshape(-1)
-    model = sj.Augmented().prepare(system)
+    model = stm.Augmented().prepare(system)
     eq = model.constraints.equations(jnp.zeros(()), system.kinematics(system.reference))
     J = np.asarray(eq.matrix)
     W = np.asarray(model.weigh(eq.J)).reshape(J.shape)
     for _ in range(3):
         u = u - W.T @ np.linalg.solve(W @ J.T, J @ u)
     u = jnp.asarray(u.reshape(n, 6))
-    return sj.State(system.reference.r, system.reference.p, u[:, :3], u[:, 3:])
+    return stm.State(system.reference.r, system.reference.p, u[:, :3], u[:, 3:])
 
 
 def accounts(system, states):
@@ -88,9 +88,9 @@ def accounts(system, states):
 def floating():
     """Per pair and saved time: momentum (k, pair, 3), angular momentum, kinetic energy."""
     system, start = pairs()
-    method = sj.Method(rtol=TOLERANCE, atol=TOLERANCE, adjoint=diffrax.ForwardMode())
+    method = stm.Method(rtol=TOLERANCE, atol=TOLERANCE, adjoint=diffrax.ForwardMode())
     ts = jnp.linspace(0.0, 1.0, 5)
-    found = jax.jit(lambda s: sj.integrate(system, s, ts, method))(start)
+    found = jax.jit(lambda s: stm.integrate(system, s, ts, method))(start)
     assert found.result == diffrax.RESULTS.successful
     assert float(found.worst.position[-1]) < 1e-13
     per_body = accounts(system, found.states)
@@ -121,23 +121,24 @@ def test_a_chain_under_gravity_with_a_spring():
     """Three bodies on revolute, universal and ball joints: energy 1e-8; its certificate agrees."""
     rng = np.random.default_rng(31)
     bodies = [
-        sj.Body(f"b{k}", 1.0 + k, inertia_of(rng), position=[0.15 + 0.3 * k, 0, 0])
+        stm.Body(f"b{k}", 1.0 + k, inertia_of(rng), position=[0.15 + 0.3 * k, 0, 0])
         for k in range(3)
     ]
     joints = [
-        sj.revolute("A", "ground", "b0", point=[0, 0, 0], axis=[0, 1, 1]),
-        sj.universal("B", "b0", "b1", point=[0.3, 0, 0], axis_i=Y, axis_j=Z),
-        sj.spherical("C", "b1", "b2", point=[0.6, 0, 0]),
+        stm.revolute("A", "ground", "b0", point=[0, 0, 0], axis=[0, 1, 1]),
+        stm.universal("B", "b0", "b1", point=[0.3, 0, 0], axis_i=Y, axis_j=Z),
+        stm.spherical("C", "b1", "b2", point=[0.6, 0, 0]),
     ]
-    spring = sj.LinearSpringDamper(
+    spring = stm.LinearSpringDamper(
         "ground", "b2", point_i=[0.5, 0.5, 0], stiffness=40.0, length=0.1
     )
-    coil = sj.TorsionalSpringDamper("A", stiffness=3.0)
-    system = sj.System(bodies, joints, [sj.Gravity(), spring, coil])
-    run = sj.simulate(
-        scene_of(system, consistent(system, rng)), rtol=TOLERANCE, atol=TOLERANCE,
+    coil = stm.TorsionalSpringDamper("A", stiffness=3.0)
+    system = stm.System(bodies, joints, [stm.Gravity(), spring, coil])
+    run = stm.simulate(
+        scene_of(system, consistent(system, rng)),
+        method=stm.Method(rtol=TOLERANCE, atol=TOLERANCE),
         ts=np.linspace(0, 1, 9),
-    )  # fmt: skip
+    )
     kinetic = accounts(system, run.states)[2].sum(axis=1)
     np.testing.assert_allclose(kinetic, run.snapshot.kinetic, rtol=1e-12)
     total = kinetic + run.snapshot.potential
@@ -149,14 +150,14 @@ def test_a_chain_under_gravity_with_a_spring():
 
 def test_a_motor_pays_for_the_energy():
     """Work of a driver and of dampers: T + V - work is constant; the motor's moment does it."""
-    body = sj.Body("bob", 2.0, [0.02, 0.02, 0.01], position=[0, 0, -0.5])
-    hinge = sj.revolute("hinge", "ground", "bob", point=[0, 0, 0], axis=Y)
+    body = stm.Body("bob", 2.0, [0.02, 0.02, 0.01], position=[0, 0, -0.5])
+    hinge = stm.revolute("hinge", "ground", "bob", point=[0, 0, 0], axis=Y)
     swing = lambda t: 0.8 * t**2 * jnp.sin(3 * t)
-    motor = sj.drive("motor", hinge, swing, coordinate="angle")
-    drag = sj.JointDamping("hinge", turning=0.5)
-    system = sj.System([body], [hinge, motor], [sj.Gravity(), drag])
+    motor = stm.drive("motor", hinge, swing, coordinate="angle")
+    drag = stm.JointDamping("hinge", turning=0.5)
+    system = stm.System([body], [hinge, motor], [stm.Gravity(), drag])
     ts = np.linspace(0, 1, 201)
-    run = sj.simulate(scene_of(system), rtol=TOLERANCE, atol=TOLERANCE, ts=ts)
+    run = stm.simulate(scene_of(system), method=stm.Method(rtol=TOLERANCE, atol=TOLERANCE), ts=ts)
     total = run.snapshot.kinetic + run.snapshot.potential
     work = np.asarray(run.trajectory.work)
     size = np.max(np.abs(run.snapshot.kinetic))
@@ -180,8 +181,8 @@ def drift(how, tolerance=1e-6):
     """Largest residuals of a fast pendulum in maximal coordinates, up to 2 s and from 6 to 8 s."""
     system = pendulum()
     start = swung(system, 2.5, 1.0)
-    formulation = sj.Augmented()
-    method = sj.Method(
+    formulation = stm.Augmented()
+    method = stm.Method(
         formulation=formulation,
         rtol=tolerance,
         atol=tolerance,
@@ -193,7 +194,7 @@ def drift(how, tolerance=1e-6):
 
     def run(state):
         # at many times: at one moment they depend on where in its swing the pendulum is
-        found = sj.integrate(system, state, jnp.linspace(0.0, 8.0, 81), method)
+        found = stm.integrate(system, state, jnp.linspace(0.0, 8.0, 81), method)
         model = formulation.prepare(system)
         left = jax.vmap(
             lambda s: formulation.residuals(model, jnp.zeros(()), formulation.to_vector(model, s))
@@ -210,9 +211,9 @@ def drift(how, tolerance=1e-6):
 @pytest.fixture(scope="module")
 def drifts():
     return {
-        "none": drift(sj.Unstabilised()),
-        "feedback": drift(sj.Baumgarte(5.0, 5.0, 5.0)),
-        "projection": drift(sj.Projection()),
+        "none": drift(stm.Unstabilised()),
+        "feedback": drift(stm.Baumgarte(5.0, 5.0, 5.0)),
+        "projection": drift(stm.Projection()),
     }
 
 

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import stmuav_jax as sj
-from stmuav_jax.vehicle.rotor import Rotors
+import stmuav_jax as stm
+from stmuav_jax.rotorcraft.rotor import Rotors
 
 END = 0.5
 GROUPS = ("start", "inputs", "masses", "inertias", "lengths", "joints", "rotors")
@@ -24,10 +24,10 @@ def numbers(scene):
     of = lambda kind: next(f for f in system.forces if isinstance(f, kind))
     return {
         "start": jnp.zeros(6),
-        "inputs": (of(Rotors).speed_squared, jnp.asarray(sj.PART_II.value("actuator.force"))),
+        "inputs": (of(Rotors).speed_squared, jnp.asarray(stm.PART_II.value("actuator.force"))),
         "masses": system.bodies.mass,
         "inertias": system.bodies.inertia,
-        "lengths": jnp.asarray(sj.PART_II.value("geometry.rods")),
+        "lengths": jnp.asarray(stm.PART_II.value("geometry.rods")),
         "joints": [j.point_j for j in system.joints],
         "rotors": (of(Rotors).k_f, of(Rotors).k_tau, of(Rotors).arms),
     }
@@ -37,7 +37,7 @@ def flight(values, adjoint, solver, tolerance):
     """Position and angular velocity of the panel at the end, weighted to one number."""
     amplitude = values["inputs"][1]
     table = {"actuator.force": amplitude, "geometry.rods": values["lengths"]}
-    scene = sj.make_scene("uav_tracker", 2, sj.PART_II.replaced(table))
+    scene = stm.make_scene("uav_tracker", 2, stm.PART_II.replaced(table))
     system = scene.system
     place = next(k for k, f in enumerate(system.forces) if isinstance(f, Rotors))
     where = lambda s: (
@@ -56,19 +56,19 @@ def flight(values, adjoint, solver, tolerance):
     system = eqx.tree_at(where, system, new)
     v, omega = values["start"][:3], values["start"][3:]
     arms = scene.state0.r - scene.state0.r[0]
-    turned = jax.vmap(lambda p: sj.rotation_matrix(p).T @ omega)(scene.state0.p)
+    turned = jax.vmap(lambda p: stm.rotation.rotation_matrix(p).T @ omega)(scene.state0.p)
     state = scene.state0
-    moved = sj.State(state.r, state.p, state.v + v + jnp.cross(omega, arms), state.omega + turned)
+    moved = stm.State(state.r, state.p, state.v + v + jnp.cross(omega, arms), state.omega + turned)
     # other joints need another start
-    start = sj.assemble(system, moved, throw=False).state
-    method = sj.Method(solver=solver, rtol=tolerance, atol=tolerance, adjoint=adjoint)
-    end = sj.integrate(system, start, jnp.array([0.0, END]), method).states
+    start = stm.assemble(system, moved, throw=False).state
+    method = stm.Method(solver=solver, rtol=tolerance, atol=tolerance, adjoint=adjoint)
+    end = stm.integrate(system, start, jnp.array([0.0, END]), method).states
     return (
         jnp.array([1.0, -2.0, 0.5]) @ end.r[-1, 6] + jnp.array([0.1, 0.2, -0.1]) @ end.omega[-1, 6]
     )
 
 
-POINTS = [j.point_j for j in sj.make_scene("uav_tracker", 2).system.joints]
+POINTS = [j.point_j for j in stm.make_scene("uav_tracker", 2).system.joints]
 
 
 def directions(values):
@@ -93,24 +93,24 @@ def along(values, directions, h):
 
 def compiled(function):
     """For programs that run for longer than the tests' own options let them."""
-    return jax.jit(function, compiler_options=sj.compiler_options(quick=True))
+    return jax.jit(function, compiler_options=stm.algebra.compiler_options(quick=True))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "tolerance", "same", "apart"),
-    [(diffrax.Dopri8(), 1e-11, 1e-9, 1e-6), (sj.kvaerno5(), 1e-10, 1e-8, 1e-5)],
+    [(diffrax.Dopri8(), 1e-11, 1e-9, 1e-6), (stm.dynamics.kvaerno5(), 1e-10, 1e-8, 1e-5)],
     ids=["explicit", "implicit"],
 )
 def test_forward_reverse_differences(solver, tolerance, same, apart):
     """The implicit solver's stages are solved to its tolerance, which both modes feel apart."""
-    values = numbers(sj.make_scene("uav_tracker", 2))
+    values = numbers(stm.make_scene("uav_tracker", 2))
     ways = directions(values)
     ahead = diffrax.ForwardMode()
     of = lambda v: flight(v, ahead, solver, tolerance)
     run = compiled(jax.vmap(lambda d, h: of(along(values, d, h)), in_axes=(0, None)))
     forward = compiled(jax.vmap(lambda d: jax.jvp(of, (values,), (d,))[1]))(ways)
-    back = lambda v: flight(v, diffrax.RecursiveCheckpointAdjoint(), solver, tolerance)
+    back = lambda v: flight(v, stm.dynamics.DiscreteAdjoint(), solver, tolerance)
     gradient = compiled(jax.grad(back))(values)
     reverse = [
         sum(float(jnp.vdot(g, d[k])) for g, d in zip(*map(jax.tree.leaves, (gradient, ways)), strict=True))

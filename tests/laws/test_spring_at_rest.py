@@ -8,26 +8,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 
 # short enough for 1e-10 whatever the step control makes of a mass at rest
 TS = jnp.linspace(0.0, 0.2, 21)
-METHOD = sj.Method(rtol=1e-12, atol=1e-12, balances=False)
+METHOD = stm.Method(rtol=1e-12, atol=1e-12, balances=False)
 AHEAD = replace(METHOD, adjoint=diffrax.ForwardMode())
 AT = [0.0, 0.1]
 
 
 def system(damping=0.0):
-    spring = sj.LinearSpringDamper("ground", "mass", stiffness=100.0, damping=damping)
-    return sj.System([sj.Body("mass", 1.0, [0.1, 0.1, 0.1], free=True)], (), (spring,))
+    spring = stm.LinearSpringDamper("ground", "mass", stiffness=100.0, damping=damping)
+    return stm.System([stm.Body("mass", 1.0, [0.1, 0.1, 0.1], free=True)], (), (spring,))
 
 
 def end(x0, method):
     """Where the mass is at the end [m], started at rest at x0 on the x axis."""
     free = system()
     rest = [getattr(free.reference, name) for name in ("p", "v", "omega")]
-    start = sj.State(jnp.array([[1.0, 0.0, 0.0]]) * x0, *rest)
-    return sj.integrate(free, start, TS, method).states.r[-1, 0, 0]
+    start = stm.State(jnp.array([[1.0, 0.0, 0.0]]) * x0, *rest)
+    return stm.integrate(free, start, TS, method).states.r[-1, 0, 0]
 
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
@@ -45,7 +45,7 @@ def test_derivative_with_respect_to_the_start(mode):
 def test_spectrum(damping):
     """s^2 + c s + 100 = 0 three times, and zeros of the rotation."""
     free = system(damping)
-    values = sj.spectrum(free, free.reference)
+    values = stm.dynamics.spectrum(free, free.reference)
     pair = np.roots([1.0, damping, 100.0])
     np.testing.assert_allclose(
         np.sort_complex(values[:6]), np.sort_complex([*pair] * 3), atol=1e-12
@@ -54,7 +54,7 @@ def test_spectrum(damping):
 
 
 def test_a_spring_with_a_length_has_no_spectrum_where_its_ends_meet():
-    spring = sj.LinearSpringDamper("ground", "mass", stiffness=100.0, length=0.2)
-    bad = sj.System([sj.Body("mass", 1.0, [0.1, 0.1, 0.1], free=True)], (), (spring,))
-    with pytest.raises(sj.StateError, match="a force jumps there"):
-        sj.spectrum(bad, bad.reference)
+    spring = stm.LinearSpringDamper("ground", "mass", stiffness=100.0, length=0.2)
+    bad = stm.System([stm.Body("mass", 1.0, [0.1, 0.1, 0.1], free=True)], (), (spring,))
+    with pytest.raises(stm.StateError, match="a force jumps there"):
+        stm.dynamics.spectrum(bad, bad.reference)

@@ -15,7 +15,10 @@ from stmuav_jax.mechanics import constraint
 FORMS = ("omega", "p")
 IN_TABLES = ("point", "n1", "n2", "p1", "p2", "distance", "shift")
 ALL_ROWS = {
-    **{k: constraint.PRIMITIVES[k] for k in ("point", "n1", "n2", "distance", "angle", "shift")},
+    **{
+        k: constraint.PRIMITIVES[k]
+        for k in ("point", "n1", "n2", "distance", "angle", "shift", "screw")
+    },
     "p1": constraint.p1_all,
     "p2": constraint.p2_all,
 }

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from helpers import np_rotation, random_quaternion, relative_error, state_of, unit
 
-import stmuav_jax as sj
-from stmuav_jax.mechanics.force import _frame
-from stmuav_jax.mechanics.load import AbstractForce, total_load
+import stmuav_jax as stm
+from stmuav_jax.mechanics.forces.applied import _frame
+from stmuav_jax.mechanics.load import AbstractForce, ActsOn, total_load
 
 COM = {"a": np.array([0.1, -0.2, 0.05]), "b": np.array([-0.3, 0.1, 0.2])}
 POINT_A, POINT_B = np.array([0.3, 0.1, -0.4]), np.array([0.2, -0.5, 0.6])
@@ -19,10 +19,10 @@ AXIS = np.array([1.0, 1.0, 0.5]) / 1.5
 
 def system_with(*forces, joint=None):
     bodies = [
-        sj.Body(n, m, [0.1, 0.1, 0.1], com=COM[n], free=True) for n, m in (("a", 2), ("b", 3))
+        stm.Body(n, m, [0.1, 0.1, 0.1], com=COM[n], free=True) for n, m in (("a", 2), ("b", 3))
     ]
-    joint = sj.revolute("J", "a", "b", point=HINGE, axis=AXIS) if joint is None else joint
-    return sj.System(bodies, [joint], forces)
+    joint = stm.revolute("J", "a", "b", point=HINGE, axis=AXIS) if joint is None else joint
+    return stm.System(bodies, [joint], forces)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def check(load, force, moment, potential, power):
 
 def test_gravity(state):
     a = np.array([0.5, -1.0, -9.0])
-    load = load_of(sj.Gravity(a), state)
+    load = load_of(stm.Gravity(a), state)
     check(load, [2 * a, 3 * a], np.zeros((2, 3)), -(2 * state.r[0] + 3 * state.r[1]) @ a, 0)
     assert not np.any(load.force[2])
 
@@ -91,7 +91,7 @@ def test_gravity(state):
 @pytest.mark.parametrize("frame", ["world", "body"])
 def test_applied_force(state, frame, point):
     world, value = World(state), np.array([1.0, -2.0, 0.5])
-    load = load_of(sj.AppliedForce("a", value, frame=frame, point=point), state)
+    load = load_of(stm.AppliedForce("a", value, frame=frame, point=point), state)
     force = world.R[0] @ value if frame == "body" else value
     arm = np.zeros(3) if point is None else world.arm("a", point)
     at = world.r[0] + arm
@@ -104,17 +104,17 @@ def test_applied_force(state, frame, point):
 @pytest.mark.parametrize("frame", ["world", "body"])
 def test_applied_moment(state, frame):
     world, value = World(state), np.array([1.0, -2.0, 0.5])
-    load = load_of(sj.AppliedMoment("b", value, frame=frame), state)
+    load = load_of(stm.AppliedMoment("b", value, frame=frame), state)
     inside = value if frame == "body" else world.R[1].T @ value
     check(load, np.zeros((2, 3)), [0 * value, inside], 0, inside @ state.omega[1])
 
 
 def test_signals_see_time_and_kinematics(state):
     value = lambda t, kin: t * kin.v[kin.index("b")]
-    load = load_of(sj.AppliedForce("a", value), state, t=2.5)
+    load = load_of(stm.AppliedForce("a", value), state, t=2.5)
     np.testing.assert_allclose(load.force[0], 2.5 * state.v[1])
     moment = load_of(
-        sj.AppliedMoment("a", lambda t, kin: [t, 0.0, 2 * t], frame="body"), state, 3.0
+        stm.AppliedMoment("a", lambda t, kin: [t, 0.0, 2 * t], frame="body"), state, 3.0
     )
     np.testing.assert_allclose(moment.moment[0], [3, 0, 6], atol=1e-14)
 
@@ -123,7 +123,7 @@ def test_signals_see_time_and_kinematics(state):
 def test_spring_between_bodies(state, damping):
     world = World(state)
     (A, A1), (B, B1) = world.point("a", POINT_A), world.point("b", POINT_B)
-    spring = sj.LinearSpringDamper(
+    spring = stm.LinearSpringDamper(
         "a", "b", point_i=POINT_A, point_j=POINT_B, stiffness=50.0, damping=damping, length=0.4
     )
     load = load_of(spring, state)
@@ -140,7 +140,7 @@ def test_spring_between_bodies(state, damping):
 
 def test_spring_to_ground(state):
     world, anchor = World(state), np.array([1.0, 2.0, 3.0])
-    spring = sj.LinearSpringDamper("ground", "b", point_i=anchor, point_j=POINT_B, stiffness=9.0)
+    spring = stm.LinearSpringDamper("ground", "b", point_i=anchor, point_j=POINT_B, stiffness=9.0)
     load = load_of(spring, state)
     B = world.point("b", POINT_B)[0]
     np.testing.assert_allclose(load.force[1], -9 * (B - anchor), atol=1e-13)
@@ -152,14 +152,14 @@ def test_torsional_spring(state):
     """On a closed joint: the moment on a is k (phi - phi_0) + c rate about the common axis."""
     phi, rate = 2.0, -3.0
     quarter = np.concatenate([[np.cos(phi / 2)], np.sin(phi / 2) * AXIS])
-    p = np.asarray(sj.product(state.p[0], jnp.asarray(quarter)))
+    p = np.asarray(stm.rotation.product(state.p[0], jnp.asarray(quarter)))
     R = np_rotation(p)
     R_a = np_rotation(np.asarray(state.p[0]))
     w_a = R_a @ np.asarray(state.omega[0])
     closed = state_of(
         state.r, [state.p[0], p], state.v, [state.omega[0], R.T @ (w_a + rate * R_a @ AXIS)]
     )
-    spring = sj.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5)
+    spring = stm.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5)
     load = load_of(spring, closed)
     moment = (5 * (phi - 0.5) + 0.3 * rate) * (R_a @ AXIS)
     check(
@@ -169,8 +169,8 @@ def test_torsional_spring(state):
 
 def test_joint_damping(state):
     """Sliding acts on the velocity of b's point relative to a, along a's axis; turning on all."""
-    joint = sj.cylindrical("J", "a", "b", axis=AXIS, point=HINGE)
-    load = load_of(sj.JointDamping("J", turning=0.7, sliding=4.0), state, joint=joint)
+    joint = stm.cylindrical("J", "a", "b", axis=AXIS, point=HINGE)
+    load = load_of(stm.JointDamping("J", turning=0.7, sliding=4.0), state, joint=joint)
     world = World(state)
     z = world.R[0] @ AXIS
     (A, A1), (B, B1) = world.point("a", HINGE), world.point("b", HINGE)
@@ -185,11 +185,11 @@ def test_joint_damping(state):
 
 
 INTERNAL = {
-    "spring": sj.LinearSpringDamper(
+    "spring": stm.LinearSpringDamper(
         "a", "b", point_i=POINT_A, point_j=POINT_B, stiffness=50.0, damping=7.0, length=0.4
     ),
-    "torsional": sj.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5),
-    "damping": sj.JointDamping("J", turning=0.7, sliding=4.0),
+    "torsional": stm.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5),
+    "damping": stm.JointDamping("J", turning=0.7, sliding=4.0),
 }
 
 
@@ -203,9 +203,9 @@ def test_internal_forces_have_no_net_force_or_moment(state, name):
 
 
 CONSERVATIVE = {
-    "gravity": sj.Gravity([0.5, -1.0, -9.0]),
+    "gravity": stm.Gravity([0.5, -1.0, -9.0]),
     "spring": INTERNAL["spring"],
-    "to ground": sj.LinearSpringDamper("ground", "b", stiffness=9.0, damping=2.0, length=0.3),
+    "to ground": stm.LinearSpringDamper("ground", "b", stiffness=9.0, damping=2.0, length=0.3),
 }
 
 
@@ -213,12 +213,12 @@ CONSERVATIVE = {
 def test_power_is_minus_the_rate_of_the_potential(state, name):
     force, world = CONSERVATIVE[name], World(state)
     load = load_of(force, state)
-    p_rate = jax.vmap(sj.euler_parameter_rate)(state.p, state.omega)
+    p_rate = jax.vmap(stm.rotation.euler_parameter_rate)(state.p, state.omega)
 
     def potential(h):
         p = state.p + h * p_rate
         p = p / jnp.sqrt(jnp.sum(p**2, axis=1, keepdims=True))
-        moved = sj.State(state.r + h * state.v, p, state.v, state.omega)
+        moved = stm.State(state.r + h * state.v, p, state.v, state.omega)
         return float(load_of(force, moved).potential)
 
     rate = (potential(1e-5) - potential(-1e-5)) / 2e-5
@@ -228,7 +228,7 @@ def test_power_is_minus_the_rate_of_the_potential(state, name):
 
 def test_power_of_a_torsional_spring():
     """On a closed revolute joint that turns."""
-    rate, force = 1.7, sj.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5)
+    rate, force = 1.7, stm.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5)
     at = lambda phi: state_of(
         [COM["a"], COM["b"]],
         [[1, 0, 0, 0], np.concatenate([[np.cos(phi / 2)], np.sin(phi / 2) * AXIS])],
@@ -246,12 +246,12 @@ SAME = [[1.0, 0, 0, 0]] * 2
 
 def pull_on_a(x, length, damping=0.0, stiffness=50.0):
     """Force on a [N] and potential [J] of a spring between centres of mass b - a = x[:3]."""
-    spring = sj.LinearSpringDamper(
+    spring = stm.LinearSpringDamper(
         "a", "b", point_i=COM["a"], point_j=COM["b"],
         stiffness=stiffness, damping=damping, length=length,
     )  # fmt: skip
     none = jnp.zeros(3)
-    state = sj.State(
+    state = stm.State(
         jnp.stack([none, x[:3]]), jnp.asarray(SAME), jnp.stack([none, x[3:]]), jnp.zeros((2, 3))
     )
     load = spring.load(jnp.zeros(()), system_with(spring).kinematics(state))
@@ -321,55 +321,55 @@ def test_loads_add_up(state):
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: sj.Gravity([0, 0, np.nan]), "gravity must be finite"),
-        (lambda: sj.AppliedForce("a", [np.inf, 0, 0]), "force on body 'a' must be finite"),
-        (lambda: sj.AppliedMoment("a", [0, np.nan, 0]), "moment on body 'a' must be finite"),
+        (lambda: stm.Gravity([0, 0, np.nan]), "gravity must be finite"),
+        (lambda: stm.AppliedForce("a", [np.inf, 0, 0]), "force on body 'a' must be finite"),
+        (lambda: stm.AppliedMoment("a", [0, np.nan, 0]), "moment on body 'a' must be finite"),
         # by itself: the type check that the tests switch on refuses the word earlier
         (lambda: _frame("tool"), "must be 'world' or 'body', not 'tool'"),
-        (lambda: sj.LinearSpringDamper("a", "a", stiffness=1.0), "joins body 'a' to itself"),
-        (lambda: sj.LinearSpringDamper("a", "", stiffness=1.0), "needs two bodies"),
-        (lambda: sj.LinearSpringDamper("a", "b", stiffness=np.nan), "stiffness of the spring"),
-        (lambda: sj.LinearSpringDamper("a", "b", stiffness=1.0, length=np.inf), "length of the"),
+        (lambda: stm.LinearSpringDamper("a", "a", stiffness=1.0), "joins body 'a' to itself"),
+        (lambda: stm.LinearSpringDamper("a", "", stiffness=1.0), "needs two bodies"),
+        (lambda: stm.LinearSpringDamper("a", "b", stiffness=np.nan), "stiffness of the spring"),
+        (lambda: stm.LinearSpringDamper("a", "b", stiffness=1.0, length=np.inf), "length of the"),
         (
-            lambda: sj.LinearSpringDamper("a", "b", stiffness=-1.0),
+            lambda: stm.LinearSpringDamper("a", "b", stiffness=-1.0),
             "stiffness .*'a' and 'b' must not",
         ),
         (
-            lambda: sj.LinearSpringDamper("a", "b", stiffness=1.0, damping=-1.0),
+            lambda: stm.LinearSpringDamper("a", "b", stiffness=1.0, damping=-1.0),
             "but it is -1 N s/m",
         ),
-        (lambda: sj.LinearSpringDamper("a", "b", stiffness=1.0, length=-2.0), "but it is -2 m"),
-        (lambda: sj.TorsionalSpringDamper("J", stiffness=np.nan), "torsional spring in joint 'J'"),
-        (lambda: sj.TorsionalSpringDamper("J", stiffness=-1.0), "must not be negative"),
+        (lambda: stm.LinearSpringDamper("a", "b", stiffness=1.0, length=-2.0), "but it is -2 m"),
+        (lambda: stm.TorsionalSpringDamper("J", stiffness=np.nan), "torsional spring in joint 'J'"),
+        (lambda: stm.TorsionalSpringDamper("J", stiffness=-1.0), "must not be negative"),
         (
-            lambda: sj.TorsionalSpringDamper("J", stiffness=1.0, damping=-1.0),
+            lambda: stm.TorsionalSpringDamper("J", stiffness=1.0, damping=-1.0),
             "must not be negative",
         ),
-        (lambda: sj.JointDamping("J", turning=-1.0), "joint 'J' must not be negative"),
-        (lambda: sj.JointDamping("J", sliding=-1.0), "joint 'J' must not be negative"),
-        (lambda: sj.JointDamping("J", turning=np.nan), "damping of joint 'J' must be finite"),
+        (lambda: stm.JointDamping("J", turning=-1.0), "joint 'J' must not be negative"),
+        (lambda: stm.JointDamping("J", sliding=-1.0), "joint 'J' must not be negative"),
+        (lambda: stm.JointDamping("J", turning=np.nan), "damping of joint 'J' must be finite"),
     ],
 )
 def test_bad_input_is_refused(build, words):
-    with pytest.raises(sj.ModelError, match=words):
+    with pytest.raises(stm.ModelError, match=words):
         build()
 
 
 @pytest.mark.parametrize(
     "build",
     [
-        lambda: sj.AppliedForce("a", [0, 0, 1], point=[0, np.nan, 0]),
-        lambda: sj.AppliedForce("a", [0, 1]),
-        lambda: sj.AppliedForce("a", [0, 0, 1], point=[0, 1]),
-        lambda: sj.AppliedMoment("a", [1.0]),
-        lambda: sj.Gravity([0, -9.81]),
-        lambda: sj.LinearSpringDamper("a", "b", point_i=[0, np.nan, 0], stiffness=1.0),
-        lambda: sj.LinearSpringDamper("a", "b", point_i=[0, 1], stiffness=1.0),
-        lambda: sj.LinearSpringDamper("a", "b", stiffness=[1.0, 2.0]),
+        lambda: stm.AppliedForce("a", [0, 0, 1], point=[0, np.nan, 0]),
+        lambda: stm.AppliedForce("a", [0, 1]),
+        lambda: stm.AppliedForce("a", [0, 0, 1], point=[0, 1]),
+        lambda: stm.AppliedMoment("a", [1.0]),
+        lambda: stm.Gravity([0, -9.81]),
+        lambda: stm.LinearSpringDamper("a", "b", point_i=[0, np.nan, 0], stiffness=1.0),
+        lambda: stm.LinearSpringDamper("a", "b", point_i=[0, 1], stiffness=1.0),
+        lambda: stm.LinearSpringDamper("a", "b", stiffness=[1.0, 2.0]),
     ],
 )
 def test_bad_shapes_and_points_are_refused_in_the_users_words(build):
-    with pytest.raises(sj.ModelError, match=r"must (be finite|have shape)"):
+    with pytest.raises(stm.ModelError, match=r"must (be finite|have shape)"):
         build()
 
 
@@ -380,15 +380,18 @@ def test_bad_shapes_and_points_are_refused_in_the_users_words(build):
     ("build", "words"),
     [
         (
-            lambda: sj.AppliedForce("a", lambda t: jnp.zeros(3)),
+            lambda: stm.AppliedForce("a", lambda t: jnp.zeros(3)),
             r"AppliedForce: the force on body 'a' .* two arguments, .*lambda t, kin",
         ),
-        (lambda: sj.AppliedMoment("b", lambda t, kin, more: 0), "AppliedMoment: .* body 'b'"),
-        (lambda: sj.AirframeDrag("a", linear=[1.0] * 3, wind=lambda: 0.0), "wind on body 'a'"),
+        (lambda: stm.AppliedMoment("b", lambda t, kin, more: 0), "AppliedMoment: .* body 'b'"),
+        (
+            lambda: stm.rotorcraft.AirframeDrag("a", linear=[1.0] * 3, wind=lambda: 0.0),
+            "wind on body 'a'",
+        ),
     ],
 )
 def test_functions_of_other_arguments_are_refused_as_they_are_given(build, words):
-    with pytest.raises(sj.ModelError, match=words):
+    with pytest.raises(stm.ModelError, match=words):
         build()
 
 
@@ -397,43 +400,40 @@ class Crooked(AbstractForce):
 
     rows: int = eqx.field(static=True)
 
-    def bodies(self):
-        return ("a",)
-
-    def joint_names(self):
-        return ()
+    def acts_on(self):
+        return ActsOn(bodies=("a",))
 
     def load(self, t, kin):  # pyright: ignore[reportIncompatibleMethodOverride]
         if not self.rows:
             return None
         force = jnp.zeros((self.rows, 3))
-        return sj.Load(force, force, jnp.zeros(()), jnp.zeros(()))
+        return stm.mechanics.Load(force, force, jnp.zeros(()), jnp.zeros(()))
 
 
 @pytest.mark.parametrize(
     ("force", "words"),
     [
         (
-            sj.AppliedForce("a", lambda t, kin: jnp.zeros(2)),
+            stm.AppliedForce("a", lambda t, kin: jnp.zeros(2)),
             r"'a' must have shape \(3,\), .*\(2,\)",
         ),
-        (sj.AppliedMoment("b", lambda t, kin: 1.0), r"'b' must have shape \(3,\), .* shape \(\)"),
-        (sj.AppliedForce("b", lambda t, kin: None), "'b' must be numbers .* returns NoneType"),
-        (sj.AppliedForce("b", lambda t, kin: [1.0, [2.0], 3.0]), "'b' must be numbers .* list"),
+        (stm.AppliedMoment("b", lambda t, kin: 1.0), r"'b' must have shape \(3,\), .* shape \(\)"),
+        (stm.AppliedForce("b", lambda t, kin: None), "'b' must be numbers .* returns NoneType"),
+        (stm.AppliedForce("b", lambda t, kin: [1.0, [2.0], 3.0]), "'b' must be numbers .* list"),
         (Crooked(2), r"load of Crooked on a must be .* shape \(3, 3\).* shape \(2, 3\)"),
         (Crooked(0), "load of Crooked on a must be a Load .* it is none"),
     ],
 )
 def test_loads_of_other_shapes_are_refused_where_they_are_traced(state, force, words):
     kin = system_with(force).kinematics(state)
-    with pytest.raises(sj.ModelError, match=words):
-        total_load((sj.Gravity(), force), jnp.zeros(()), kin)
+    with pytest.raises(stm.ModelError, match=words):
+        total_load((stm.Gravity(), force), jnp.zeros(()), kin)
 
 
 def test_a_formulation_says_which_force_is_of_another_shape():
-    bad = sj.System(
-        [sj.Body("a", 1.0, [1.0] * 3, free=True)],
-        forces=[sj.AppliedForce("a", lambda t, kin: jnp.zeros(2))],
+    bad = stm.System(
+        [stm.Body("a", 1.0, [1.0] * 3, free=True)],
+        forces=[stm.AppliedForce("a", lambda t, kin: jnp.zeros(2))],
     )
-    with pytest.raises(sj.ModelError, match="AppliedForce: the force on body 'a' must have shape"):
-        sj.evaluate(bad, bad.reference, formulation=sj.Augmented())
+    with pytest.raises(stm.ModelError, match="AppliedForce: the force on body 'a' must have shape"):
+        stm.dynamics.evaluate(bad, bad.reference, formulation=stm.Augmented())

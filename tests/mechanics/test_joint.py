@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from helpers import np_rotation, random_quaternion, state_of, turn, unit
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 
 POINT, OTHER = np.array([0.3, -0.2, 0.5]), np.array([0.7, 0.4, 0.1])
 Z = unit([1.0, 2.0, -1.0])
@@ -25,27 +25,32 @@ def across(axis):
 
 
 JOINTS = {
-    "weld": (lambda i, j: sj.weld("J", i, j, point=POINT), 6, []),
-    "spherical": (lambda i, j: sj.spherical("J", i, j, point=POINT), 3, ROLL),
+    "weld": (lambda i, j: stm.weld("J", i, j, point=POINT), 6, []),
+    "spherical": (lambda i, j: stm.spherical("J", i, j, point=POINT), 3, ROLL),
     "universal": (
-        lambda i, j: sj.universal("J", i, j, point=POINT, axis_i=2 * X, axis_j=3 * Z),
+        lambda i, j: stm.universal("J", i, j, point=POINT, axis_i=2 * X, axis_j=3 * Z),
         4,
         [(X, NONE), (Z, NONE)],
     ),
-    "revolute": (lambda i, j: sj.revolute("J", i, j, point=POINT, axis=5 * Z), 5, REVOLVE),
-    "translational": (lambda i, j: sj.translational("J", i, j, axis=Z, point=POINT), 5, SLIDE),
+    "revolute": (lambda i, j: stm.revolute("J", i, j, point=POINT, axis=5 * Z), 5, REVOLVE),
+    "translational": (lambda i, j: stm.translational("J", i, j, axis=Z, point=POINT), 5, SLIDE),
     "cylindrical": (
-        lambda i, j: sj.cylindrical("J", i, j, axis=Z, point=POINT),
+        lambda i, j: stm.cylindrical("J", i, j, axis=Z, point=POINT),
         4,
         REVOLVE + SLIDE,
     ),
+    "screw": (
+        lambda i, j: stm.screw("J", i, j, point=POINT, axis=2 * Z, pitch=0.3),
+        5,
+        [(Z, 0.3 * Z)],
+    ),
     "distance": (
-        lambda i, j: sj.distance("J", i, j, point_i=POINT, point_j=OTHER),
+        lambda i, j: stm.distance("J", i, j, point_i=POINT, point_j=OTHER),
         1,
         ROLL + across(OTHER - POINT),
     ),
     "revolute_spherical": (
-        lambda i, j: sj.revolute_spherical("J", i, j, point_i=POINT, axis=Z, point_j=LINK),
+        lambda i, j: stm.revolute_spherical("J", i, j, point_i=POINT, axis=Z, point_j=LINK),
         2,
         [*ROLL, (NONE, np.cross(Z, X))],
     ),
@@ -55,7 +60,7 @@ MOVING_POINT = {"distance": OTHER, "revolute_spherical": LINK}
 
 def bodies_at_random(rng):
     return [
-        sj.Body(
+        stm.Body(
             name,
             1.0,
             [0.1, 0.1, 0.1],
@@ -69,7 +74,7 @@ def bodies_at_random(rng):
 
 
 def equations_of(system, rows, state=None, t=0.0):
-    model = sj.Augmented(rows=rows).prepare(system)
+    model = stm.Augmented(rows=rows).prepare(system)
     kin = system.kinematics(system.reference if state is None else state)
     return model.constraints.equations(jnp.asarray(t), kin)
 
@@ -83,13 +88,13 @@ def test_rows_rank_and_freedom(kind, grounded, rows):
     bodies = bodies_at_random(rng)
     joint = build("ground" if grounded else "one", "two")
     assert joint.n_rows == count
-    system = sj.System(bodies, [joint])
+    system = stm.System(bodies, [joint])
     eq = equations_of(system, rows)
     J = np.asarray(eq.matrix)
     assert J.shape == (count, 12)
     np.testing.assert_allclose(eq.value, 0, atol=1e-14)
     assert np.linalg.matrix_rank(J, tol=1e-6) == count
-    found = sj.rank(system, system.reference)
+    found = stm.dynamics.rank(system, system.reference)
     assert (found.rows, found.rank, found.dof, found.redundant) == (count, count, 12 - count, ())
     # the motions that the joint leaves: i moves at random (not ground), j with it and relative
     R = [np_rotation(p) for p in np.asarray(system.reference.p)]
@@ -112,7 +117,7 @@ def test_points_and_frames_are_kept_in_the_bodies(kind):
     """What is given in the world at the reference posture comes back from both bodies."""
     bodies = bodies_at_random(np.random.default_rng(8))
     joint = JOINTS[kind][0]("one", "two")
-    inside = sj.System(bodies, [joint]).joints[0]
+    inside = stm.System(bodies, [joint]).joints[0]
     for body, point, frame, given in (
         (bodies[0], inside.point_i, inside.frame_i, POINT),
         (bodies[1], inside.point_j, inside.frame_j, MOVING_POINT.get(kind, POINT)),
@@ -123,30 +128,30 @@ def test_points_and_frames_are_kept_in_the_bodies(kind):
     F = np.asarray(joint.frame_i)
     np.testing.assert_allclose(F.T @ F, np.eye(3), atol=1e-15)
     assert np.linalg.det(F) == pytest.approx(1)
-    if kind in ("revolute", "translational", "cylindrical", "revolute_spherical"):
+    if kind in ("revolute", "translational", "cylindrical", "screw", "revolute_spherical"):
         np.testing.assert_allclose(F[:, 2], Z, atol=1e-15)
     if kind == "universal":
         np.testing.assert_allclose(F[:, :2].T, [X, Z], atol=1e-15)
 
 
 def one_joint(joint, *more):
-    body = sj.Body("b", 1.0, [0.1, 0.1, 0.1])
-    return sj.System([body], [joint, *more])
+    body = stm.Body("b", 1.0, [0.1, 0.1, 0.1])
+    return stm.System([body], [joint, *more])
 
 
 def hinge(**more):
-    return sj.revolute("hinge", "ground", "b", point=NONE, axis=[0, 0, 1], **more)
+    return stm.revolute("hinge", "ground", "b", point=NONE, axis=[0, 0, 1], **more)
 
 
 def rail():
-    return sj.translational("rail", "ground", "b", axis=[0, 0, 2])
+    return stm.translational("rail", "ground", "b", axis=[0, 0, 2])
 
 
 @pytest.mark.parametrize("angle", [0.4, -2.0, np.pi, 4.0, 25.0])
 def test_driven_angle(angle):
     """Positive from body i to body j about z, and any number of turns."""
     joint = hinge()
-    system = one_joint(joint, sj.drive("motor", joint, lambda t: angle * t**2, coordinate="angle"))
+    system = one_joint(joint, stm.drive("motor", joint, lambda t: angle * t**2, coordinate="angle"))
     state = state_of([[0, 0, 0]], [turn([0, 0, 1], angle)], None, [[0, 0, 2 * angle]])
     eq = equations_of(system, "body", state, 1.0)
     np.testing.assert_allclose(eq.value, 0, atol=1e-14)
@@ -161,7 +166,7 @@ def test_driven_angle(angle):
 
 def test_driven_shift():
     joint = rail()
-    system = one_joint(joint, sj.drive("jack", joint, jnp.sin, coordinate="shift"))
+    system = one_joint(joint, stm.drive("jack", joint, jnp.sin, coordinate="shift"))
     state = state_of([[0, 0, np.sin(0.3)]], [[1, 0, 0, 0]], [[0, 0, np.cos(0.3)]])
     eq = equations_of(system, "body", state, 0.3)
     np.testing.assert_allclose(eq.value, 0, atol=1e-15)
@@ -172,8 +177,8 @@ def test_driven_shift():
 
 def test_a_driver_takes_one_degree_of_freedom():
     joint = hinge()
-    system = one_joint(joint, sj.drive("motor", joint, lambda t: t, coordinate="angle"))
-    assert sj.rank(system, system.reference)[:3] == (6, 6, 0)
+    system = one_joint(joint, stm.drive("motor", joint, lambda t: t, coordinate="angle"))
+    assert stm.dynamics.rank(system, system.reference)[:3] == (6, 6, 0)
 
 
 @pytest.mark.parametrize(
@@ -181,51 +186,59 @@ def test_a_driver_takes_one_degree_of_freedom():
     [
         (hinge(), "shift", "'motor' prescribes the shift of joint 'hinge', but a revolute"),
         (rail(), "angle", "but a translational joint does not leave it free"),
-        (sj.spherical("ball", "ground", "b", point=NONE), "angle", "revolute, cylindrical"),
+        (stm.spherical("ball", "ground", "b", point=NONE), "angle", "revolute, cylindrical"),
     ],
 )
 def test_a_driver_needs_a_free_coordinate(joint, coordinate, words):
-    with pytest.raises(sj.ModelError, match=words):
-        sj.drive("motor", joint, lambda t: t, coordinate=coordinate)
+    with pytest.raises(stm.ModelError, match=words):
+        stm.drive("motor", joint, lambda t: t, coordinate=coordinate)
 
 
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: sj.revolute("J", "a", "b", point=NONE, axis=NONE), "'J' has zero length"),
-        (lambda: sj.translational("J", "a", "b", axis=NONE), "'J' has zero length"),
-        (lambda: sj.cylindrical("J", "a", "b", axis=[0, np.nan, 1]), "'J' must be finite"),
-        (lambda: sj.revolute("J", "a", "b", point=NONE, axis=[0, 1]), r"'J' must have shape \(3,\)"),
+        (lambda: stm.revolute("J", "a", "b", point=NONE, axis=NONE), "'J' has zero length"),
+        (lambda: stm.translational("J", "a", "b", axis=NONE), "'J' has zero length"),
+        (lambda: stm.cylindrical("J", "a", "b", axis=[0, np.nan, 1]), "'J' must be finite"),
+        (lambda: stm.revolute("J", "a", "b", point=NONE, axis=[0, 1]), r"'J' must have shape \(3,\)"),
         (
-            lambda: sj.universal("J", "a", "b", point=NONE, axis_i=NONE, axis_j=Z),
+            lambda: stm.universal("J", "a", "b", point=NONE, axis_i=NONE, axis_j=Z),
             "axis_i of joint 'J' has zero length",
         ),
         (
-            lambda: sj.universal("J", "a", "b", point=NONE, axis_i=[1, 0, 0], axis_j=[1, 1, 0]),
+            lambda: stm.universal("J", "a", "b", point=NONE, axis_i=[1, 0, 0], axis_j=[1, 1, 0]),
             "'J' must be perpendicular, but they are 45 degrees",
         ),
         (
-            lambda: sj.universal("J", "a", "b", point=NONE, axis_i=[1, 0, 0], axis_j=[1e-6, 1, 0]),
+            lambda: stm.universal("J", "a", "b", point=NONE, axis_i=[1, 0, 0], axis_j=[1e-6, 1, 0]),
             "must be perpendicular",
         ),
-        (lambda: sj.spherical("J", "a", "a", point=NONE), "'J' joins body 'a' to itself"),
-        (lambda: sj.weld("J", "ground", "ground"), "'J' joins body 'ground' to itself"),
-        (lambda: sj.spherical("J", "a", "b", point=[0, np.inf, 0]), "point of joint 'J' must be fin"),
-        (lambda: sj.spherical("J", "a", "b", point=[0, 1]), "point of joint 'J' must have shape"),
         (
-            lambda: sj.distance("J", "a", "b", point_i=POINT, point_j=POINT),
+            lambda: stm.screw("J", "a", "b", point=NONE, axis=Z, pitch=0.0),
+            "pitch of joint 'J' must not be zero; a joint without one is revolute",
+        ),
+        (
+            lambda: stm.screw("J", "a", "b", point=NONE, axis=Z, pitch=np.inf),
+            "pitch of joint 'J' must be finite",
+        ),
+        (lambda: stm.spherical("J", "a", "a", point=NONE), "'J' joins body 'a' to itself"),
+        (lambda: stm.weld("J", "ground", "ground"), "'J' joins body 'ground' to itself"),
+        (lambda: stm.spherical("J", "a", "b", point=[0, np.inf, 0]), "point of joint 'J' must be fin"),
+        (lambda: stm.spherical("J", "a", "b", point=[0, 1]), "point of joint 'J' must have shape"),
+        (
+            lambda: stm.distance("J", "a", "b", point_i=POINT, point_j=POINT),
             "length of joint 'J' must be positive",
         ),
         (
-            lambda: sj.distance("J", "a", "b", point_i=POINT, point_j=OTHER, length=-1.0),
+            lambda: stm.distance("J", "a", "b", point_i=POINT, point_j=OTHER, length=-1.0),
             "must be positive, but it is -1.0",
         ),
         (
-            lambda: sj.distance("J", "a", "b", point_i=POINT, point_j=OTHER, length=np.nan),
+            lambda: stm.distance("J", "a", "b", point_i=POINT, point_j=OTHER, length=np.nan),
             "length of joint 'J' must be positive",
         ),
         (
-            lambda: sj.revolute_spherical(
+            lambda: stm.revolute_spherical(
                 "J", "a", "b", point_i=POINT, axis=Z, point_j=LINK, length=0.0
             ),
             "must be positive",
@@ -233,5 +246,5 @@ def test_a_driver_needs_a_free_coordinate(joint, coordinate, words):
     ],
 )  # fmt: skip
 def test_bad_input_is_refused(build, words):
-    with pytest.raises(sj.ModelError, match=words):
+    with pytest.raises(stm.ModelError, match=words):
         build()

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from helpers import central, np_rotation, random_quaternion, state_of, turn
 
-import stmuav_jax as sj
-from stmuav_jax.mechanics.joint_force import ramp, ramp_area, ramp_slope
+import stmuav_jax as stm
+from stmuav_jax.mechanics.forces.joint import ramp, ramp_area, ramp_slope
 
 COM = {"a": np.array([0.1, -0.2, 0.05]), "b": np.array([-0.3, 0.1, 0.2])}
 POINT = np.array([0.2, 0.3, -0.1])
@@ -28,26 +28,34 @@ def swing(t):
 
 # on a shift; the numbers make each of them act at the states below
 FORCES = {
-    "servo": sj.JointServo("J", stiffness=40.0, damping=3.0, target=0.1, coordinate="shift"),
-    "led servo": sj.JointServo("J", stiffness=40.0, damping=3.0, target=swing, coordinate="shift"),
-    "upper stop": sj.EndStop("J", upper=-4.0, coordinate="shift", **STOP),
-    "lower stop": sj.EndStop("J", lower=4.0, coordinate="shift", **STOP),
-    "friction": sj.JointFriction("J", coulomb=2.0, viscous=0.5, speed=0.7, coordinate="shift"),
+    "servo": stm.mechanics.JointServo(
+        "J", stiffness=40.0, damping=3.0, target=0.1, coordinate="shift"
+    ),
+    "led servo": stm.mechanics.JointServo(
+        "J", stiffness=40.0, damping=3.0, target=swing, coordinate="shift"
+    ),
+    "upper stop": stm.mechanics.EndStop("J", upper=-4.0, coordinate="shift", **STOP),
+    "lower stop": stm.mechanics.EndStop("J", lower=4.0, coordinate="shift", **STOP),
+    "friction": stm.mechanics.JointFriction(
+        "J", coulomb=2.0, viscous=0.5, speed=0.7, coordinate="shift"
+    ),
 }
 ANGULAR = {
-    "servo": sj.JointServo("J", stiffness=40.0, damping=3.0, target=swing, coordinate="angle"),
-    "stop": sj.EndStop("J", lower=0.1, upper=0.5, coordinate="angle", **STOP),
-    "friction": sj.JointFriction("J", coulomb=2.0, speed=0.7, coordinate="angle"),
-    "spring": sj.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5),
+    "servo": stm.mechanics.JointServo(
+        "J", stiffness=40.0, damping=3.0, target=swing, coordinate="angle"
+    ),
+    "stop": stm.mechanics.EndStop("J", lower=0.1, upper=0.5, coordinate="angle", **STOP),
+    "friction": stm.mechanics.JointFriction("J", coulomb=2.0, speed=0.7, coordinate="angle"),
+    "spring": stm.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5),
 }
 
 
 def system_with(force):
     bodies = [
-        sj.Body(n, m, [0.1, 0.1, 0.1], com=COM[n], free=True) for n, m in (("a", 2), ("b", 3))
+        stm.Body(n, m, [0.1, 0.1, 0.1], com=COM[n], free=True) for n, m in (("a", 2), ("b", 3))
     ]
-    joint = sj.cylindrical("J", "a", "b", point=POINT, axis=AXIS)
-    return sj.System(bodies, [joint], [force])
+    joint = stm.cylindrical("J", "a", "b", point=POINT, axis=AXIS)
+    return stm.System(bodies, [joint], [force])
 
 
 @eqx.filter_jit
@@ -100,8 +108,8 @@ def advanced(state, h):
     """The state after a time h at its velocities."""
     omega = np.asarray(state.omega)
     turns = [turn(o if np.any(o) else AXIS, np.linalg.norm(o) * h) for o in omega]
-    p = [sj.product(q, jnp.asarray(d)) for q, d in zip(state.p, turns, strict=True)]
-    return sj.State(state.r + h * state.v, jnp.stack(p), state.v, state.omega)
+    p = [stm.rotation.product(q, jnp.asarray(d)) for q, d in zip(state.p, turns, strict=True)]
+    return stm.State(state.r + h * state.v, jnp.stack(p), state.v, state.omega)
 
 
 @pytest.mark.parametrize("name", FORCES)
@@ -165,7 +173,9 @@ def test_the_servo_follows_the_rate_of_its_target():
 @pytest.mark.parametrize(("angle", "target", "lag"), [(3.0, 3.3, -0.3), (-3.0, 15.7, 2.8673706)])
 def test_an_angle_is_counted_around_its_target(angle, target, lag):
     """Over the half turn where the joint's own angle jumps, and after turns of the target."""
-    servo = sj.JointServo("J", stiffness=2.0, damping=0.0, target=target, coordinate="angle")
+    servo = stm.mechanics.JointServo(
+        "J", stiffness=2.0, damping=0.0, target=target, coordinate="angle"
+    )
     load = load_of(servo, turned(angle, 0.0))
     away = (angle - target + np.pi) % (2 * np.pi) - np.pi
     assert away == pytest.approx(-0.3 if lag < 0 else away)
@@ -175,7 +185,7 @@ def test_an_angle_is_counted_around_its_target(angle, target, lag):
 
 def test_limits_of_an_angle_may_lie_around_half_a_turn():
     """Between 2.5 and 3.9 rad: -3 is 3.28 and free, -2 is 4.28 and beyond."""
-    stop = sj.EndStop("J", lower=2.5, upper=3.9, coordinate="angle", **STOP)
+    stop = stm.mechanics.EndStop("J", lower=2.5, upper=3.9, coordinate="angle", **STOP)
     assert not np.any(load_of(stop, turned(-3.0, 0.5)).moment)
     depth = 2 * np.pi - 2 - 3.9
     expected = -50 * (depth - 0.15)
@@ -198,7 +208,9 @@ def test_the_ramp_is_a_line_that_starts_smoothly():
     np.testing.assert_allclose(over(jax.grad(ramp_area)), value, atol=1e-15)
 
 
-STIFF = sj.EndStop("J", upper=0.0, stiffness=1e5, damping=100.0, width=2e-4, coordinate="shift")
+STIFF = stm.mechanics.EndStop(
+    "J", upper=0.0, stiffness=1e5, damping=100.0, width=2e-4, coordinate="shift"
+)
 _hessians = jax.jit(jax.vmap(jax.hessian(lambda y: STIFF.law(y[0], y[1], jnp.zeros(())))))
 
 
@@ -239,7 +251,7 @@ def test_a_stop_never_pulls_and_only_takes_energy_out():
 
 
 def test_a_stop_mirrors():
-    lower = sj.EndStop("J", lower=0.0, stiffness=1e5, damping=100.0, width=2e-4)
+    lower = stm.mechanics.EndStop("J", lower=0.0, stiffness=1e5, damping=100.0, width=2e-4)
     for x, v in ((1e-4, 0.2), (3e-4, -0.1), (-1e-4, 0.3)):
         there = STIFF.law(jnp.asarray(x), jnp.asarray(v), T)
         here = lower.law(jnp.asarray(-x), jnp.asarray(-v), T)
@@ -261,7 +273,7 @@ def test_gradients_are_finite_everywhere():
     """At rest, at the limit, at depths whose powers underflow: all of them, up to the second."""
     x = [0.0, 5e-324, 1e-200, 1e-60, 1e-20, -1.0, 2e-4, 1.0]
     y = jnp.asarray([[d, v, 0.3] for d in x for v in (0.0, 1.0, -1.0)])
-    friction = sj.JointFriction("J", coulomb=2.0, speed=1e-3, coordinate="shift")
+    friction = stm.mechanics.JointFriction("J", coulomb=2.0, speed=1e-3, coordinate="shift")
     for force in (STIFF, friction, FORCES["led servo"]):
         for leaf in jax.tree.leaves(_derivatives(y, force)):
             assert np.all(np.isfinite(leaf))
@@ -277,22 +289,22 @@ def sliders():
     along = {"held": [1, 0, 0], "led": [1, 0, 0], "rubbed": [1, 0, 0]}
     along |= {"bounced": [0, 0, 1], "damped": [0, 0, 1]}
     bodies = [
-        sj.Body(name, MASS, [0.1, 0.1, 0.1], position=[0, k, 0]) for k, name in enumerate(along)
+        stm.Body(name, MASS, [0.1, 0.1, 0.1], position=[0, k, 0]) for k, name in enumerate(along)
     ]
     joints = [
-        sj.translational(f"J_{name}", "ground", name, axis=axis, point=[0, k, 0])
+        stm.translational(f"J_{name}", "ground", name, axis=axis, point=[0, k, 0])
         for k, (name, axis) in enumerate(along.items())
     ]
     stop: dict[str, Any] = {"lower": -DROP, "stiffness": 5e4, "width": 1e-3}
     forces = [
-        sj.Gravity(),
-        sj.JointServo("J_held", stiffness=500.0, damping=12.0, target=0.1),
-        sj.JointServo("J_led", stiffness=500.0, damping=12.0, target=swing),
-        sj.JointFriction("J_rubbed", coulomb=3.0, speed=0.5),
-        sj.EndStop("J_bounced", damping=0.0, **stop),
-        sj.EndStop("J_damped", damping=200.0, **stop),
+        stm.Gravity(),
+        stm.mechanics.JointServo("J_held", stiffness=500.0, damping=12.0, target=0.1),
+        stm.mechanics.JointServo("J_led", stiffness=500.0, damping=12.0, target=swing),
+        stm.mechanics.JointFriction("J_rubbed", coulomb=3.0, speed=0.5),
+        stm.mechanics.EndStop("J_bounced", damping=0.0, **stop),
+        stm.mechanics.EndStop("J_damped", damping=200.0, **stop),
     ]
-    system = sj.System(bodies, joints, forces)
+    system = stm.System(bodies, joints, forces)
     v = np.zeros((5, 3))
     v[2, 0] = 2.0
     reference = system.reference
@@ -303,12 +315,12 @@ def sliders():
 def run():
     system, start = sliders()
     # nothing drifts along fixed axes, and projections take long to compile
-    method = sj.Method(
-        formulation=sj.Augmented(), solver=diffrax.Tsit5(), rtol=1e-11, atol=1e-11,
-        adjoint=diffrax.ForwardMode(), stabilisation=sj.Unstabilised(), balances=True,
+    method = stm.Method(
+        formulation=stm.Augmented(), solver=diffrax.Tsit5(), rtol=1e-11, atol=1e-11,
+        adjoint=diffrax.ForwardMode(), stabilisation=stm.Unstabilised(), balances=True,
     )  # fmt: skip
     ts = jnp.linspace(0, 0.5, 101)
-    found = jax.jit(lambda s: sj.integrate(system, s, ts, method))(start)
+    found = jax.jit(lambda s: stm.integrate(system, s, ts, method))(start)
     assert found.result == diffrax.RESULTS.successful
     return system, found
 
@@ -317,7 +329,7 @@ def test_energy_balance_of_a_run(run):
     """Motor, dampers, friction and stops: what they give and take is all that changes."""
     system, found = run
     kinetic = 0.5 * MASS * np.sum(np.asarray(found.states.v) ** 2, axis=(1, 2))
-    potential = jax.jit(jax.vmap(lambda s, t: sj.energy(system, s, t).potential))
+    potential = jax.jit(jax.vmap(lambda s, t: stm.dynamics.energy(system, s, t).potential))
     total = kinetic + potential(found.states, found.ts)
     size = np.max(kinetic)
     assert np.max(np.abs(total - total[0] - found.work)) < 1e-8 * size
@@ -370,40 +382,42 @@ def test_stops_bounce(run):
 
 
 def build(joint, force):
-    bodies = [sj.Body("a", 1.0, [0.1, 0.1, 0.1]), sj.Body("b", 1.0, [0.1, 0.1, 0.1])]
-    return sj.System(bodies, [sj.weld("W", "ground", "a"), joint], [force])
+    bodies = [stm.Body("a", 1.0, [0.1, 0.1, 0.1]), stm.Body("b", 1.0, [0.1, 0.1, 0.1])]
+    return stm.System(bodies, [stm.weld("W", "ground", "a"), joint], [force])
 
 
-UNIVERSAL = sj.universal("U", "a", "b", point=[0, 0, 0], axis_i=[1, 0, 0], axis_j=[0, 1, 0])
-SLIDE = sj.translational("S", "a", "b", axis=[0, 0, 1])
-SCREW = sj.cylindrical("C", "a", "b", axis=[0, 0, 1])
+UNIVERSAL = stm.universal("U", "a", "b", point=[0, 0, 0], axis_i=[1, 0, 0], axis_j=[0, 1, 0])
+SLIDE = stm.translational("S", "a", "b", axis=[0, 0, 1])
+SCREW = stm.cylindrical("C", "a", "b", axis=[0, 0, 1])
 RUB: dict[str, Any] = {"coulomb": 1.0, "speed": 0.1}
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: build(UNIVERSAL, sj.JointFriction("U", **RUB)),
+        (lambda: build(UNIVERSAL, stm.mechanics.JointFriction("U", **RUB)),
          r"JointFriction in joint 'U' acts on an angle or a shift, but a universal joint"),
-        (lambda: build(SLIDE, sj.JointFriction("S", coordinate="angle", **RUB)),
+        (lambda: build(SLIDE, stm.mechanics.JointFriction("S", coordinate="angle", **RUB)),
          r"in joint 'S' acts on the angle, but a translational joint.*angle needs one of: revol"),
-        (lambda: build(SCREW, sj.EndStop("C", lower=0.0, **STOP)),
+        (lambda: build(SCREW, stm.mechanics.EndStop("C", lower=0.0, **STOP)),
          r"EndStop in joint 'C': a cylindrical joint leaves both.*say which by coordinate="),
-        (lambda: build(SLIDE, sj.TorsionalSpringDamper("S", stiffness=1.0)), "needs one of: revol"),
-        (lambda: build(SLIDE, sj.JointFriction("T", **RUB)), "JointFriction names the unknown joint"),
+        (lambda: build(SLIDE, stm.TorsionalSpringDamper("S", stiffness=1.0)), "needs one of: revol"),
+        (lambda: build(SLIDE, stm.mechanics.JointFriction("T", **RUB)), "JointFriction names the unknown joint"),
     ],
 )  # fmt: skip
 def test_joints_without_the_coordinate_are_refused(make, words):
-    with pytest.raises(sj.ModelError, match=words):
+    with pytest.raises(stm.ModelError, match=words):
         make()
 
 
 def servo(**more: Any):
-    return sj.JointServo("J", **{"stiffness": 1.0, "damping": 1.0, "target": 0.0, **more})
+    return stm.mechanics.JointServo(
+        "J", **{"stiffness": 1.0, "damping": 1.0, "target": 0.0, **more}
+    )
 
 
 def stop(**more: Any):
-    return sj.EndStop("J", **{"lower": 0.0, **STOP, **more})
+    return stm.mechanics.EndStop("J", **{"lower": 0.0, **STOP, **more})
 
 
 @pytest.mark.parametrize(
@@ -414,7 +428,7 @@ def stop(**more: Any):
         (lambda: servo(stiffness=np.nan), "stiffness of the servo in joint 'J' must be finite"),
         (lambda: servo(damping=-1.0, coordinate="angle"), r"damping of.*it is -1 N m s/rad\."),
         (lambda: servo(target=np.inf), "target of the servo in joint 'J' must be finite"),
-        (lambda: servo(target=sj.Sine(0.1, 2.0)), "function of the time t .* alone .* calling it"),
+        (lambda: servo(target=stm.mechanics.Sine(0.1, 2.0)), "function of the time t .* alone .* calling it"),
         (lambda: servo(target=lambda t: jnp.stack([t, t])), r"returns an array of shape \(2,\)"),
         (lambda: stop(upper=-0.1), r"must be lower < upper, but they are 0\.0 and -0\.1 m or rad"),
         (lambda: stop(lower=None), "needs a lower or an upper limit"),
@@ -422,12 +436,12 @@ def stop(**more: Any):
         (lambda: stop(width=0.0), "width of the end stop in joint 'J' must be positive"),
         (lambda: stop(stiffness=0.0), "stiffness of the end stop.* must be positive, but it is 0"),
         (lambda: stop(damping=-1.0), "damping of the end stop in joint 'J' must not be negative"),
-        (lambda: sj.JointFriction("J", coulomb=-1.0, speed=1.0), "Coulomb force .* not be neg"),
-        (lambda: sj.JointFriction("J", coulomb=1.0, speed=0.0), "speed .* must be positive"),
-        (lambda: sj.JointFriction("J", coulomb=1.0, viscous=np.nan, speed=1.0), "viscous .* finite"),
+        (lambda: stm.mechanics.JointFriction("J", coulomb=-1.0, speed=1.0), "Coulomb force .* not be neg"),
+        (lambda: stm.mechanics.JointFriction("J", coulomb=1.0, speed=0.0), "speed .* must be positive"),
+        (lambda: stm.mechanics.JointFriction("J", coulomb=1.0, viscous=np.nan, speed=1.0), "viscous .* finite"),
         (lambda: servo(stiffness=[1.0, 2.0]), r"must have shape \(\)"),
     ],
 )  # fmt: skip
 def test_bad_numbers_are_refused(make, words):
-    with pytest.raises(sj.ModelError, match=words):
+    with pytest.raises(stm.ModelError, match=words):
         make()

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from stmuav_jax.montecarlo.monitor import (
+from stmuav_jax.dynamics.integration.monitor import (
     Span,
-    Step,
     cubic,
     follow,
     follow_parts,
@@ -104,7 +103,7 @@ def test_signals_without_rates_are_watched_within_steps(count):
     first = signals(ts[0], state(ts[0]))
     monitor = start(ts[0], first, jnp.zeros(3))
     for t0, t1 in itertools.pairwise(ts):
-        step = Step(t0, t1, state(t0), state(t1), slope(t0), slope(t1))
+        step = Span(t0, t1, state(t0), state(t1), slope(t0), slope(t1))
         monitor = follow_parts(monitor, step, signals)
     bound = 2 * (6.0 / count) ** 4 / 384
     assert np.max(np.abs(np.asarray(monitor.extreme) - 0.3)) < bound
@@ -114,7 +113,7 @@ def test_signals_without_rates_are_watched_within_steps(count):
     assert np.max(np.abs(np.asarray(monitor.crossings.times()) - exact)) < bound / slope_there
     assert np.array_equal(monitor.g, signals(ts[-1], state(ts[-1])))
     # a step that was not taken changes nothing
-    still = Step(ts[-1], ts[-1], state(ts[-1]), state(ts[-1]), slope(ts[-1]), slope(ts[-1]))
+    still = Span(ts[-1], ts[-1], state(ts[-1]), state(ts[-1]), slope(ts[-1]), slope(ts[-1]))
     again = follow_parts(monitor, still, signals)
     assert np.array_equal(again.extreme, monitor.extreme)
     assert np.array_equal(again.crossings.times(), monitor.crossings.times())

@@ -9,39 +9,34 @@ import pytest
 import scipy.stats as st
 from scipy.stats import qmc
 
-from stmuav_jax.mechanics.errors import SettingError
-from stmuav_jax.montecarlo.distribution import (
-    beta,
-    choice,
-    constant,
-    empirical,
-    lognormal,
-    loguniform,
-    normal,
-    triangular,
-    truncated_normal,
-    uniform,
-    weibull,
-)
-from stmuav_jax.montecarlo.sampling import (
-    SOBOL_POINTS,
-    Sampling,
-    sampling_from_plain,
-)
+from stmuav_jax.checks.errors import SettingError
+from stmuav_jax.montecarlo.sampling import SOBOL_POINTS, Sampling, sampling_from_plain
 
 FACTORS = {
-    "a": normal(1.0, 0.1),
-    "b": truncated_normal(0.0, 1.0, low=-0.5, high=2.0),
-    "c": lognormal(2.0, 0.3),
-    "d": loguniform(0.1, 1.0),
-    "e": triangular(0.0, 1.0, 2.0),
-    "f": beta(2.0, 3.0),
-    "g": weibull(5.0, 2.0),
-    "h": choice([1.0, 2.0, 4.0]),
-    "i": uniform(-1.0, 1.0),
+    "a": st.norm(1.0, 0.1),
+    "b": {
+        "distribution": "truncated_normal",
+        "mean": 0.0,
+        "deviation": 1.0,
+        "low": -0.5,
+        "high": 2.0,
+    },
+    "c": {"distribution": "lognormal", "median": 2.0, "log_deviation": 0.3},
+    "d": st.loguniform(0.1, 1.0),
+    "e": {"distribution": "triangular", "low": 0.0, "mode": 1.0, "high": 2.0},
+    "f": st.beta(2.0, 3.0),
+    "g": {"distribution": "weibull", "scale": 5.0, "shape": 2.0},
+    "h": {"distribution": "choice", "values": [1.0, 2.0, 4.0]},
+    "i": {"distribution": "uniform", "low": -1.0, "high": 1.0},
 }
 CORRELATION = [("a", "c", 0.6), ("a", "g", -0.5), ("c", "i", 0.3)]
-TABLE = {"x": empirical(np.arange(600.0)[::-1]), "y": constant(2.0)}
+
+
+def empirical(values):
+    return {"distribution": "empirical", "values": values}
+
+
+TABLE = {"x": empirical(np.arange(600.0)[::-1]), "y": 2.0}
 SAMPLINGS = {
     "random": Sampling(FACTORS, 7),
     "random, correlated": Sampling(FACTORS, 7, correlation=CORRELATION),
@@ -118,13 +113,13 @@ def test_marginals(name):
 def test_random_samples_are_independent():
     """Neighbouring samples and neighbouring factors: correlations within 4.5 deviations of 0."""
     n = 20000
-    x = Sampling({str(k): uniform(0.0, 1.0) for k in range(5)}, 1).draw(0, n)
+    x = Sampling({str(k): st.uniform() for k in range(5)}, 1).draw(0, n)
     table = np.corrcoef(np.concatenate([x[:-1], x[1:]], axis=1).T)
     assert np.max(np.abs(table - np.eye(10))) < 4.5 / np.sqrt(n)
 
 
 def test_random_keeps_away_from_zero_and_one():
-    x = Sampling({"x": uniform(0.0, 1.0)}, 1).draw(0, 10**6)[:, 0]
+    x = Sampling({"x": st.uniform()}, 1).draw(0, 10**6)[:, 0]
     assert 0 < x.min() < 1e-5
     assert 1 - 1e-5 < x.max() < 1
 
@@ -143,17 +138,15 @@ def test_correlation_in_ranks():
 
 
 def test_correlated_normals_have_the_covariance():
-    rho, factors = 0.8, {"x": normal(1.0, 2.0), "y": normal(-3.0, 0.5)}
-    for given in ([("x", "y", rho)], {("y", "x"): rho}, np.array([[1, rho], [rho, 1]])):
-        sampling = Sampling(factors, 4, correlation=given)
-        x = sampling.draw(0, 40000)
-        # deviation of a correlation: (1 - rho^2) / sqrt(n) = 0.0018
-        assert np.corrcoef(x.T)[0, 1] == pytest.approx(rho, abs=0.008)
-        assert np.std(x, axis=0) == pytest.approx([2.0, 0.5], rel=0.02)
+    rho, factors = 0.8, {"x": st.norm(1.0, 2.0), "y": st.norm(-3.0, 0.5)}
+    x = Sampling(factors, 4, correlation=[("y", "x", rho)]).draw(0, 40000)
+    # deviation of a correlation: (1 - rho^2) / sqrt(n) = 0.0018
+    assert np.corrcoef(x.T)[0, 1] == pytest.approx(rho, abs=0.008)
+    assert np.std(x, axis=0) == pytest.approx([2.0, 0.5], rel=0.02)
 
 
 def test_latin_fills_every_stratum_and_is_extended_by_whole_ones():
-    sampling = Sampling({"x": uniform(0.0, 1.0), "y": uniform(0.0, 1.0)}, 3, "latin", stratum=50)
+    sampling = Sampling({"x": st.uniform(), "y": st.uniform()}, 3, "latin", stratum=50)
     x = sampling.draw(0, 150).reshape(3, 50, 2)
     cells = np.sort((x * 50).astype(int), axis=1)
     np.testing.assert_array_equal(cells, np.broadcast_to(np.arange(50)[:, None], (3, 50, 2)))
@@ -164,7 +157,7 @@ def test_latin_fills_every_stratum_and_is_extended_by_whole_ones():
 
 def test_latin_means_are_better_than_random_ones():
     """For a sum the variance all but vanishes."""
-    factors = {str(k): uniform(0.0, 1.0) for k in range(3)}
+    factors = {str(k): st.uniform() for k in range(3)}
     latin = Sampling(factors, 1, "latin", stratum=100).draw(0, 10000).reshape(100, 100, 3)
     plain = Sampling(factors, 1).draw(0, 10000).reshape(100, 100, 3)
     spread = [np.std(x.sum(axis=2).mean(axis=1)) for x in (latin, plain)]
@@ -173,16 +166,16 @@ def test_latin_means_are_better_than_random_ones():
 
 def test_sobol_is_a_net():
     """Of 2^m scrambled points each of 2^m slices of a factor holds one; low discrepancy."""
-    x = Sampling({str(k): uniform(0.0, 1.0) for k in range(4)}, 3, "sobol").draw(0, 256)
+    x = Sampling({str(k): st.uniform() for k in range(4)}, 3, "sobol").draw(0, 256)
     cells = np.sort((x * 256).astype(int), axis=0)
     np.testing.assert_array_equal(cells, np.broadcast_to(np.arange(256)[:, None], (256, 4)))
-    random = Sampling({str(k): uniform(0.0, 1.0) for k in range(4)}, 3).draw(0, 256)
+    random = Sampling({str(k): st.uniform() for k in range(4)}, 3).draw(0, 256)
     assert qmc.discrepancy(x) < 0.2 * qmc.discrepancy(random)
 
 
 def test_saltelli_layout():
     """A, B, then A with one factor after the other from B; the halves of one Sobol sequence."""
-    factors = {"x": uniform(0.0, 1.0), "y": uniform(0.0, 2.0), "z": normal(0.0, 1.0)}
+    factors = {"x": st.uniform(), "y": st.uniform(0.0, 2.0), "z": st.norm(0.0, 1.0)}
     sampling = Sampling(factors, 3, "saltelli")
     rows = sampling.draw(0, 64 * 5).reshape(64, 5, 3)
     a, b = rows[:, 0], rows[:, 1]
@@ -207,7 +200,7 @@ def test_table_gives_its_rows_and_ends():
 
 
 def test_sobol_ends():
-    sampling = Sampling({"x": uniform(0.0, 1.0)}, 0, "sobol")
+    sampling = Sampling({"x": st.uniform()}, 0, "sobol")
     assert sampling.limit == SOBOL_POINTS
     with pytest.raises(SettingError, match="has 2147483648 samples"):
         sampling.draw(SOBOL_POINTS - 1, 2)
@@ -228,20 +221,20 @@ REFUSED = {
     "no factors": ({"factors": {}}, "at least one factor"),
     "factor": (
         {"factors": {"mass": {"distribution": "normal", "mean": 0.0, "deviation": -1}}},
-        "Factor 'mass': 'deviation' of the distribution 'normal' must be positive, but it is -1",
+        "Factor 'mass': 'deviation' must be finite and positive, but it is -1",
     ),
-    "design": ({"design": "sobel"}, "no design 'sobel'. Did you mean 'sobol'"),
-    "seed": ({"seed": -1}, "seed must be a whole number from 0 on, but it is -1"),
-    "seed of words": ({"seed": "one"}, "'seed' of a sampling must be a whole number"),
+    "design": ({"design": "sobel"}, "not 'sobel'. Did you mean 'sobol'"),
+    "seed": ({"seed": -1}, "'seed' must be at least 0, but it is -1"),
+    "seed of words": ({"seed": "one"}, "'seed' must be a whole number"),
     "stratum missing": ({"design": "latin"}, "needs 'stratum'"),
     "stratum of another": ({"stratum": 10}, "design is 'random' and the stratum 10"),
-    "stratum": ({"design": "latin", "stratum": 0}, "at least 1 sample"),
+    "stratum": ({"design": "latin", "stratum": 0}, "'stratum' must be at least 1"),
     "eigenvalue": ({"correlation": BAD_MATRIX}, "smallest eigenvalue is -0.8"),
     "unknown pair": ({"correlation": [["x", "w", 0.1]]}, "names 'w', which is no factor"),
-    "range": ({"correlation": [["x", "y", 1.0]]}, "must lie between -1 and 1, but it is 1"),
+    "range": ({"correlation": [["x", "y", 1.0]]}, "'correlation.0.2' must be less than 1"),
     "twice": ({"correlation": [["x", "y", 0.1], ["y", "x", 0.1]]}, "given twice"),
     "itself": ({"correlation": [["x", "x", 0.1]]}, "its own"),
-    "form": ({"correlation": [["x", 0.1]]}, "given as [name, name, number]"),
+    "form": ({"correlation": [["x", 0.1]]}, "'correlation.0.1' must be text, but it is 0.1"),
     "constant": ({"correlation": [["x", "k", 0.1]]}, "'k' is constant"),
     "saltelli": ({"correlation": [["x", "y", 0.1]], "design": "saltelli"}, "cannot have corr"),
     "table": ({"design": "table"}, "Factor 'x': in a table factors are columns"),
@@ -260,20 +253,6 @@ def test_what_is_refused(case):
     sampling_from_plain(PLAIN)
     with pytest.raises(SettingError) as caught:
         sampling_from_plain(PLAIN | change)
-    assert words in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("matrix", "words"),
-    [
-        (np.eye(3), "has shape (2, 2), not (3, 3)"),
-        (np.array([[1.0, 0.2], [0.1, 1.0]]), "differs from its transpose by up to 0.1"),
-        (np.array([[2.0, 0.2], [0.2, 1.0]]), "up to 1 away from 1"),
-    ],
-)
-def test_matrices_that_are_refused(matrix, words):
-    with pytest.raises(SettingError) as caught:
-        Sampling({"x": normal(0.0, 1.0), "y": normal(0.0, 1.0)}, 1, correlation=matrix)
     assert words in str(caught.value)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats as st
 
-from stmuav_jax.mechanics.errors import SettingError
+from stmuav_jax.checks.errors import SettingError
 from stmuav_jax.montecarlo.statistics import (
     bands,
     convergence,

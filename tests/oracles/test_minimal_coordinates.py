@@ -9,7 +9,7 @@ from helpers import GRAVITY, np_rotation, np_skew, state_of, turn
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 
 TS = np.linspace(0.0, 1.0, 5)
 TOLERANCE = 1e-8
@@ -22,8 +22,8 @@ def solved(f, x0):
 
 
 def integrated(system, state):
-    method = sj.Method(rtol=1e-11, atol=1e-11, adjoint=diffrax.ForwardMode())
-    found = jax.jit(lambda s: sj.integrate(system, s, jnp.asarray(TS), method))(state)
+    method = stm.Method(rtol=1e-11, atol=1e-11, adjoint=diffrax.ForwardMode())
+    found = jax.jit(lambda s: stm.integrate(system, s, jnp.asarray(TS), method))(state)
     assert found.result == diffrax.RESULTS.successful
     return jax.tree.map(np.asarray, found.states)
 
@@ -81,18 +81,18 @@ def test_double_pendulum():
         v = np.array([np.cross(w[0], r[0]), elbow + np.cross(w[1], c2 * out[1])])
         return r, np.array([turn([0, 1, 0], b) for b in a]), v, np.array(w)
 
-    system = sj.System(
+    system = stm.System(
         [
-            sj.Body("upper", m1, [J1, J1, J1], position=[0, 0, -c1]),
-            sj.Body("lower", m2, [J2, J2, J2], position=[0, 0, -l1 - c2]),
+            stm.Body("upper", m1, [J1, J1, J1], position=[0, 0, -c1]),
+            stm.Body("lower", m2, [J2, J2, J2], position=[0, 0, -l1 - c2]),
         ],
         [
-            sj.revolute("shoulder", "ground", "upper", point=[0, 0, 0], axis=[0, 1, 0]),
-            sj.revolute("elbow", "upper", "lower", point=[0, 0, -l1], axis=[0, 1, 0]),
+            stm.revolute("shoulder", "ground", "upper", point=[0, 0, 0], axis=[0, 1, 0]),
+            stm.revolute("elbow", "upper", "lower", point=[0, 0, -l1], axis=[0, 1, 0]),
         ],
         [
-            sj.Gravity(),
-            sj.TorsionalSpringDamper("elbow", stiffness=stiffness, damping=damping, angle=rest),
+            stm.Gravity(),
+            stm.TorsionalSpringDamper("elbow", stiffness=stiffness, damping=damping, angle=rest),
         ],
     )
     found = integrated(system, state_of(*bodies_at(a0, u0)))
@@ -150,27 +150,27 @@ def test_slider_crank():
         return r, p, v, [[0, u, 0], [0, tilt_rate * u, 0], [0, 0, 0]]
 
     r0, _, _, _ = bodies_at(0.0, 0.0)
-    system = sj.System(
+    system = stm.System(
         [
-            sj.Body("crank", m1, [J1, J1, J1], position=r0[0]),
-            sj.Body("rod", m2, [J2, J2, J2], position=r0[1]),
-            sj.Body("slider", m3, [0.01, 0.01, 0.01], position=r0[2]),
+            stm.Body("crank", m1, [J1, J1, J1], position=r0[0]),
+            stm.Body("rod", m2, [J2, J2, J2], position=r0[1]),
+            stm.Body("slider", m3, [0.01, 0.01, 0.01], position=r0[2]),
         ],
         [
-            sj.revolute("A", "ground", "crank", point=[0, 0, 0], axis=[0, 1, 0]),
-            sj.spherical("B", "crank", "rod", point=[crank, 0, 0]),
-            sj.universal(
+            stm.revolute("A", "ground", "crank", point=[0, 0, 0], axis=[0, 1, 0]),
+            stm.spherical("B", "crank", "rod", point=[crank, 0, 0]),
+            stm.universal(
                 "C", "rod", "slider", point=r0[2], axis_i=[0, 0, 1], axis_j=[0, 1, 0]
             ),
-            sj.translational("D", "ground", "slider", axis=[1, 0, 0]),
+            stm.translational("D", "ground", "slider", axis=[1, 0, 0]),
         ],
         [
-            sj.Gravity(),
-            sj.LinearSpringDamper("ground", "slider", stiffness=k, length=rest),
+            stm.Gravity(),
+            stm.LinearSpringDamper("ground", "slider", stiffness=k, length=rest),
         ],
     )  # fmt: skip
     start = state_of(*bodies_at(0.6, 5.0))
-    assert sj.rank(system, start)[:3] == (17, 17, 1)
+    assert stm.dynamics.rank(system, start)[:3] == (17, 17, 1)
     found = integrated(system, start)
     for n in range(len(TS)):
         r, _, v, w = bodies_at(*x[n])
@@ -198,9 +198,9 @@ def test_heavy_top():
     p0, w0 = turn([1, 0.3, 0], 0.5), np.array([0.5, -1.0, 25.0])
     R0 = np_rotation(p0)
     x = solved(f, np.concatenate([R0.reshape(-1), w0]))
-    body = sj.Body("top", mass, inertia, com=arm)
-    ball = sj.spherical("tip", "ground", "top", point=[0, 0, 0])
-    system = sj.System([body], [ball], [sj.Gravity()])
+    body = stm.Body("top", mass, inertia, com=arm)
+    ball = stm.spherical("tip", "ground", "top", point=[0, 0, 0])
+    system = stm.System([body], [ball], [stm.Gravity()])
     found = integrated(system, state_of([R0 @ arm], [p0], [R0 @ np.cross(w0, arm)], [w0]))
     for k in range(len(TS)):
         R = x[k, :9].reshape(3, 3)
@@ -219,3 +219,42 @@ def test_complex_step_lagrange_against_a_known_equation():
     )  # fmt: skip
     rate = f(0.0, np.array([0.8, 2.0]))
     assert rate[1] == pytest.approx(-GRAVITY / 0.5 * np.sin(0.8), rel=1e-14)
+
+
+# --- a body on a screw, whose axis is vertical and does not go through its centre of mass
+
+
+@pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=["tree", "augmented"])
+def test_screw(formulation):
+    """Falling over six turns: z'' = -m g h^2 / (I + m e^2 + m h^2), and energy is kept."""
+    mass, inertia, offset, pitch = 1.3, 0.01, 0.03, -0.02
+    body = stm.Body("nut", mass, [0.02, 0.015, inertia], position=[offset, 0, 0])
+    screw = stm.screw("S", "ground", "nut", point=np.zeros(3), axis=[0, 0, 1], pitch=pitch)
+    system = stm.System([body], [screw], [stm.Gravity()])
+    about = inertia + mass * offset**2
+    a = -mass * GRAVITY * pitch**2 / (about + mass * pitch**2)
+    ts = np.linspace(0.0, 2.0, 9)
+    method = stm.Method(
+        formulation=formulation, rtol=1e-11, atol=1e-11, adjoint=diffrax.ForwardMode()
+    )
+
+    @jax.jit
+    def run(state):
+        found = stm.dynamics.evaluate(system, state, jnp.zeros(()), formulation=formulation)
+        return found.accelerations, stm.integrate(system, state, jnp.asarray(ts), method)
+
+    rates, found = run(system.reference)
+    start = np.array([[0.0, offset * a / pitch, a]])
+    np.testing.assert_allclose(rates.v_rate, start, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(rates.omega_rate, [[0, 0, a / pitch]], rtol=1e-13, atol=1e-13)
+    assert found.result == diffrax.RESULTS.successful
+    z, turned = 0.5 * a * ts**2, 0.5 * a * ts**2 / pitch
+    assert abs(turned[-1]) > 12 * np.pi
+    expected = np.stack([offset * np.cos(turned), offset * np.sin(turned), z], axis=1)
+    close(found.states.r[:, 0], expected)
+    motion = stm.mechanics.joint_motion(system, found.states, "S")
+    close(motion.angle, turned)
+    close(motion.rates[:, 0], a * ts / pitch)
+    omega, v = np.asarray(found.states.omega[:, 0, 2]), np.asarray(found.states.v[:, 0])
+    energy = 0.5 * inertia * omega**2 + 0.5 * mass * np.sum(v**2, axis=1) + mass * GRAVITY * z
+    np.testing.assert_allclose(energy, 0, atol=1e-8)

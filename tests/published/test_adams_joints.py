@@ -19,7 +19,7 @@ import pytest
 from closed_forms import attitude, scene
 from scipy.spatial.transform import Rotation
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 
 GRAVITY = 9.80665  # m/s^2
 TABLE = json.loads((Path(__file__).parent / "adams_joints.json").read_text())
@@ -44,18 +44,18 @@ def about(axis: str, degrees: float) -> Rotation:
 ALIGNED = about("x", 0)
 # Cases on one point: joint, its point, orientation of joint frame and body.
 ON_A_POINT = {
-    "Revolute_Case01": (sj.revolute, ORIGIN, about("x", -90)),
-    "Revolute_Case02": (sj.revolute, CORNER, about("x", -45)),
-    "Spherical_Case01": (sj.spherical, ORIGIN, ALIGNED),
-    "Spherical_Case02": (sj.spherical, CORNER, about("x", -45)),
-    "Prismatic_Case01": (sj.translational, ORIGIN, ALIGNED),
-    "Prismatic_Case02": (sj.translational, CORNER, about("x", -45)),
-    "Prismatic_Case03": (sj.translational, CORNER, about("x", -90)),
-    "Cylindrical_Case01": (sj.cylindrical, ORIGIN, ALIGNED),
-    "Cylindrical_Case02": (sj.cylindrical, ORIGIN, about("x", -90)),
-    "Cylindrical_Case03": (sj.cylindrical, CORNER, about("x", -45)),
-    "Universal_Case01": (sj.universal, ORIGIN, about("x", 90)),
-    "Universal_Case02": (sj.universal, ORIGIN, about("y", 90)),
+    "Revolute_Case01": (stm.revolute, ORIGIN, about("x", -90)),
+    "Revolute_Case02": (stm.revolute, CORNER, about("x", -45)),
+    "Spherical_Case01": (stm.spherical, ORIGIN, ALIGNED),
+    "Spherical_Case02": (stm.spherical, CORNER, about("x", -45)),
+    "Prismatic_Case01": (stm.translational, ORIGIN, ALIGNED),
+    "Prismatic_Case02": (stm.translational, CORNER, about("x", -45)),
+    "Prismatic_Case03": (stm.translational, CORNER, about("x", -90)),
+    "Cylindrical_Case01": (stm.cylindrical, ORIGIN, ALIGNED),
+    "Cylindrical_Case02": (stm.cylindrical, ORIGIN, about("x", -90)),
+    "Cylindrical_Case03": (stm.cylindrical, CORNER, about("x", -45)),
+    "Universal_Case01": (stm.universal, ORIGIN, about("x", 90)),
+    "Universal_Case02": (stm.universal, ORIGIN, about("y", 90)),
 }
 # Massless links from ground: joint, centre of mass, orientation and inertia of the body.
 ON_A_LINK = {
@@ -66,40 +66,42 @@ ON_A_LINK = {
 CASES = [*ON_A_POINT, *ON_A_LINK]
 
 
-def on_a_point(name: str) -> tuple[sj.Body, sj.Joint]:
+def on_a_point(name: str) -> tuple[stm.Body, stm.Joint]:
     """A body 2 m from its joint; the joint from body to ground, so it tells what acts there."""
     make, point, turned = ON_A_POINT[name]
-    hangs = make is sj.universal
+    hangs = make is stm.universal
     arm, inertia = (-2.0 * Z, HANGING) if hangs else (2.0 * X, LYING)
     orientation = turned.as_quat(scalar_first=True)
-    body = sj.Body(name, 1.0, inertia, position=point + turned.apply(arm), orientation=orientation)
+    body = stm.Body(name, 1.0, inertia, position=point + turned.apply(arm), orientation=orientation)
     how: dict[str, Any] = {"point": point}
     if hangs:
         how |= {"axis_i": turned.apply(Y), "axis_j": turned.apply(X)}
-    elif make is not sj.spherical:
+    elif make is not stm.spherical:
         how |= {"axis": turned.apply(Z)}
     return body, make(name, name, "ground", **how)
 
 
-def on_a_link(name: str) -> tuple[sj.Body, sj.Joint]:
+def on_a_link(name: str) -> tuple[stm.Body, stm.Joint]:
     """A body on a massless link of 2 m from the origin; the joint from ground to body."""
     com, turned, inertia = ON_A_LINK[name]
     orientation = turned.as_quat(scalar_first=True)
-    body = sj.Body(name, 1.0, inertia, position=com, orientation=orientation)
+    body = stm.Body(name, 1.0, inertia, position=com, orientation=orientation)
     if name.startswith("Distance"):
-        return body, sj.distance(name, "ground", name, point_i=ORIGIN, point_j=2.0 * Y)
-    link = sj.revolute_spherical(name, "ground", name, point_i=ORIGIN, axis=Z, point_j=2.0 * X)
+        return body, stm.distance(name, "ground", name, point_i=ORIGIN, point_j=2.0 * Y)
+    link = stm.revolute_spherical(name, "ground", name, point_i=ORIGIN, axis=Z, point_j=2.0 * X)
     return body, link
 
 
 @pytest.fixture(scope="module")
-def run() -> sj.Run:
+def run() -> stm.Run:
     """All cases for 5 s at 1e-9: a tenth of the default, as many bodies at rest share the norm."""
     pairs = [on_a_point(name) for name in ON_A_POINT] + [on_a_link(name) for name in ON_A_LINK]
     bodies, joints = zip(*pairs, strict=True)
-    system = sj.System(bodies, joints, [sj.Gravity((0.0, 0.0, -GRAVITY))])
-    return sj.simulate(
-        scene(system, t1=5.0), ts=np.array([0.0, *TABLE["times_s"]]), rtol=1e-9, atol=1e-9
+    system = stm.System(bodies, joints, [stm.Gravity((0.0, 0.0, -GRAVITY))])
+    return stm.simulate(
+        scene(system, t1=5.0),
+        method=stm.Method(rtol=1e-9, atol=1e-9),
+        ts=np.array([0.0, *TABLE["times_s"]]),
     )
 
 
@@ -109,7 +111,7 @@ def rows(name: str, quantity: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_motion_is_that_of_adams(run: sj.Run, name: str) -> None:
+def test_motion_is_that_of_adams(run: stm.Run, name: str) -> None:
     """Published class: 2e-5 m, 2e-5 and 1e-3 rad/s, and half of the last printed digit."""
     k = CASES.index(name)
     position, quaternion = (DRIFT, DRIFT) if name in DRIFTED else (POSITION, QUATERNION)
@@ -124,7 +126,7 @@ def test_motion_is_that_of_adams(run: sj.Run, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_reactions_are_those_of_adams(run: sj.Run, name: str) -> None:
+def test_reactions_are_those_of_adams(run: stm.Run, name: str) -> None:
     """Published class: 1e-3 N and N m, and half of the last printed digit.
 
     Moments are about the joint's point of ground, which a sliding body leaves by 123 m: they
@@ -146,7 +148,7 @@ def test_reactions_are_those_of_adams(run: sj.Run, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_reactions_balance_the_motion(run: sj.Run, name: str) -> None:
+def test_reactions_balance_the_motion(run: stm.Run, name: str) -> None:
     """Exact class: the joint's force on the body is m (a - g), to 1e-9 N of some 30 N."""
     k = CASES.index(name)
     needed = run.snapshot.accelerations.v_rate[:, k] + GRAVITY * Z
@@ -155,7 +157,7 @@ def test_reactions_balance_the_motion(run: sj.Run, name: str) -> None:
     np.testing.assert_allclose(force, needed, rtol=0, atol=1e-9)
 
 
-def test_joints_and_energy_are_kept(run: sj.Run) -> None:
+def test_joints_and_energy_are_kept(run: stm.Run) -> None:
     """1e-8 m and 1e-7 m/s over all steps; energy to 1e-8 of the largest."""
     assert run.certificate.rank == run.certificate.rows
     assert run.certificate.position_violation <= 1e-8

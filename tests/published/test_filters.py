@@ -15,13 +15,13 @@ from scipy.integrate import quad
 
 from stmuav_jax.algebra.compiler import outer_jit
 from stmuav_jax.algebra.rotation import from_rotation_vector, product
+from stmuav_jax.algebra.space import Vector
+from stmuav_jax.algebra.stacked import transposed_multiply
 from stmuav_jax.estimation import sigma
-from stmuav_jax.estimation.attitude import attitude_model
 from stmuav_jax.estimation.bank import filter_bank
 from stmuav_jax.estimation.consistency import autocorrelation, chi2_interval, mean_interval, nees
-from stmuav_jax.estimation.factor import gram
-from stmuav_jax.estimation.gaussian import gaussian
-from stmuav_jax.estimation.space import Vector
+from stmuav_jax.estimation.gaussians import gaussian
+from stmuav_jax.quadrotor.attitude import attitude_model
 
 # --- D2: weights
 
@@ -52,7 +52,7 @@ def polar_moments(rule, s=S, r=0.02):
     prior = gaussian(np.array([1.0, math.pi / 2]), np.diag([r**2, s**2]))
     out = rule.transform(polar, prior, Vector(2), Vector(2))
     less = 0.0 if out.less is None else np.outer(out.less, out.less)
-    return np.asarray(out.mean), np.asarray(gram(out.rows)) - less
+    return np.asarray(out.mean), np.asarray(transposed_multiply(out.rows, out.rows)) - less
 
 
 def test_exact_moments_by_quadrature():

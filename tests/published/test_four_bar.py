@@ -15,22 +15,28 @@ As spatial revolute joints the loops have dependent rows: three per loop.
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_forms import jacobi_negative, scene, turned_about_z
+from closed_forms import scene, turned_about_z
+from problems.four_bar import (
+    GRAVITY,
+    LONG,
+    ROD,
+    SPEED,
+    THIN,
+    TOLERANCES,
+    Z,
+    closed_form,
+    course,
+    four_bar,
+    kinetic_and_potential,
+    missing,
+    start,
+)
 
-import stmuav_jax as sj
-
-GRAVITY = 9.81  # m/s^2
-SPEED = 1.0  # m/s, of B_0 at the start
-ROD = 1 / 12  # kg m^2, across a rod of 1 m and 1 kg
-THIN = 1e-3  # kg m^2, along it; plays no part in the plane
-Z = (0.0, 0.0, 1.0)
-LONG = np.linspace(0.0, 20.0, 81)  # s
-TOLERANCES = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+import stmuav_jax as stm
 
 # Closed form for N = 2 by independent code: t [s]; B_0 [m]; its velocity [m/s].
 EXACT = {
@@ -50,105 +56,30 @@ GRADIENT = {
 }
 
 
-def four_bar(loops: int, gravity: Any = GRAVITY, coupler: float = 1.0) -> sj.System:
-    """The mechanism with N loops of spatial revolute joints and couplers of so many kg."""
-    places = [float(i) for i in range(loops + 1)]
-    cranks = [
-        sj.Body(f"crank{i}", 1.0, (ROD, THIN, ROD), position=(x, 0.5, 0.0))
-        for i, x in enumerate(places)
-    ]
-    couplers = [
-        sj.Body(
-            f"coupler{i}",
-            coupler,
-            (coupler * THIN, coupler * ROD, coupler * ROD),
-            position=(x + 0.5, 1.0, 0.0),
-        )
-        for i, x in enumerate(places[:-1])
-    ]
-    joints = [
-        sj.revolute(f"A{i}", "ground", f"crank{i}", point=(x, 0.0, 0.0), axis=Z)
-        for i, x in enumerate(places)
-    ]
-    for i, x in enumerate(places[:-1]):
-        left, right = (x, 1.0, 0.0), (x + 1.0, 1.0, 0.0)
-        joints += [
-            sj.revolute(f"B{i} left", f"crank{i}", f"coupler{i}", point=left, axis=Z),
-            sj.revolute(f"B{i} right", f"crank{i + 1}", f"coupler{i}", point=right, axis=Z),
-        ]
-    zero = jnp.zeros(())
-    pull = sj.Gravity(jnp.stack([zero, -jnp.asarray(gravity), zero]))
-    return sj.System([*cranks, *couplers], joints, [pull])
-
-
-def start(system: sj.System, speed: Any = SPEED) -> sj.State:
-    """Upright, with B_0 moving at `speed` [m/s] in x."""
-    rest = system.reference
-    crank = np.array([name.startswith("crank") for name in system.names])[:, None]
-    v = jnp.where(crank, 0.5 * speed, 1.0 * speed) * jnp.array([1.0, 0.0, 0.0])
-    omega = jnp.where(crank, -1.0 * speed, 0.0) * jnp.array([0.0, 0.0, 1.0])
-    return sj.State(rest.r, rest.p, v, omega)
-
-
-def missing(by: float) -> tuple[sj.System, sj.State]:
-    """One loop whose last crank stands `by` [m] farther away and is longer by by^2 / 2.
-
-    With its rods nearly in line it comes within some sqrt(by) of a singular posture, and folds or
-    unfolds there: it has no parallel branch. The system is of the same structure as `four_bar(1)`.
-    """
-    length, lean = np.hypot(1.0, by), np.arctan(by)
-    turned = (np.cos(lean / 2), 0.0, 0.0, np.sin(lean / 2))
-    inertia = (ROD * length**2, THIN, ROD * length**2)
-    bodies = [
-        sj.Body("crank0", 1.0, (ROD, THIN, ROD), position=(0.0, 0.5, 0.0)),
-        sj.Body("crank1", 1.0, inertia, position=(1 + by / 2, 0.5, 0.0), orientation=turned),
-        sj.Body("coupler0", 1.0, (THIN, ROD, ROD), position=(0.5, 1.0, 0.0)),
-    ]
-    joints = [
-        sj.revolute("A0", "ground", "crank0", point=(0.0, 0.0, 0.0), axis=Z),
-        sj.revolute("A1", "ground", "crank1", point=(1 + by, 0.0, 0.0), axis=Z),
-        sj.revolute("B0 left", "crank0", "coupler0", point=(0.0, 1.0, 0.0), axis=Z),
-        sj.revolute("B0 right", "crank1", "coupler0", point=(1.0, 1.0, 0.0), axis=Z),
-    ]
-    system = sj.System(bodies, joints, [sj.Gravity((0.0, -GRAVITY, 0.0))])
-    rest = system.reference
-    # the end of the longer crank moves across it, (1, by), and the coupler makes up for that
-    v = SPEED * jnp.array([[0.5, 0.0, 0.0], [0.5, by / 2, 0.0], [1.0, by / 2, 0.0]])
-    omega = SPEED * jnp.array([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 0.0, by]])
-    return system, sj.State(rest.r, rest.p, v, omega)
-
-
-def closed_form(loops: int, t: np.ndarray, coupler: float = 1.0) -> np.ndarray:
-    """B_0 [m] and its velocity [m/s] at times t [s], (k, 4)."""
-    couplers = loops * coupler
-    c = GRAVITY * ((loops + 1) / 2 + couplers) / ((loops + 1) / 3 + couplers)
-    sn, cn, dn = jacobi_negative(0.5 * SPEED * t, 4 * c / SPEED**2)
-    x, y, rate = 2 * sn * cn, 1 - 2 * sn**2, SPEED * dn
-    return np.stack([x, y, rate * y, -rate * x], axis=1)
-
-
-def tip(run: sj.Run) -> np.ndarray:
+def tip(run: stm.Run) -> np.ndarray:
     """B_0 [m] and its velocity [m/s]: twice those of the first crank's centre (A_0 = 0)."""
     return 2 * np.concatenate([run.states.r[:, 0, :2], run.states.v[:, 0, :2]], axis=1)
 
 
 @pytest.fixture(scope="module", params=[1, 2], ids=["N=1", "N=2"])
-def run(request: pytest.FixtureRequest) -> sj.Run:
+def run(request: pytest.FixtureRequest) -> stm.Run:
     """10 s at tolerances of 1e-9; `simulate` finds the dependent rows itself."""
     system = four_bar(request.param)
     how = {"t1": 10.0, "save_every": 0.125}
-    return sj.simulate(scene(system, start(system), **how), rtol=1e-9, atol=1e-9)
+    return stm.simulate(
+        scene(system, start(system), **how), method=stm.Method(rtol=1e-9, atol=1e-9)
+    )
 
 
-def loops_of(run: sj.Run) -> int:
+def loops_of(run: stm.Run) -> int:
     """N."""
     return (run.scene.system.n_bodies - 1) // 2
 
 
-def test_rank_and_redundant_joints(run: sj.Run) -> None:
+def test_rank_and_redundant_joints(run: stm.Run) -> None:
     """Exact class: 5 rows a revolute, rank 6 n - 1, and joints named that own dependent rows."""
     system, loops = run.scene.system, loops_of(run)
-    found = sj.rank(system, run.scene.state0)
+    found = stm.dynamics.rank(system, run.scene.state0)
     assert (found.rows, found.rank, found.dof) == {1: (20, 17, 1), 2: (35, 29, 1)}[loops]
     assert found.smallest > 0.1
     assert found.redundant
@@ -158,7 +89,7 @@ def test_rank_and_redundant_joints(run: sj.Run) -> None:
     assert certificate.redundant == found.redundant
 
 
-def test_tip_follows_the_closed_form(run: sj.Run) -> None:
+def test_tip_follows_the_closed_form(run: stm.Run) -> None:
     """Solver class: 1e-5 m for 10 s at rtol 1e-8; the library's "high precision" is 1e-3."""
     got, expected = tip(run), closed_form(loops_of(run), run.ts)
     np.testing.assert_allclose(got[:, :2], expected[:, :2], rtol=0, atol=1e-5)
@@ -166,7 +97,7 @@ def test_tip_follows_the_closed_form(run: sj.Run) -> None:
     np.testing.assert_allclose(got[:, 2:], expected[:, 2:], rtol=0, atol=1e-4)
 
 
-def test_tip_is_where_other_codes_put_it(run: sj.Run) -> None:
+def test_tip_is_where_other_codes_put_it(run: stm.Run) -> None:
     """Published class: exact values to 1e-5 m, EXUDYN's end to its own distance from them."""
     if loops_of(run) != 2:
         pytest.skip("published for N = 2")
@@ -178,14 +109,14 @@ def test_tip_is_where_other_codes_put_it(run: sj.Run) -> None:
     np.testing.assert_allclose(got[-1], EXUDYN, rtol=0, atol=EXUDYN_ERROR)
 
 
-def test_energy_is_kept(run: sj.Run) -> None:
+def test_energy_is_kept(run: stm.Run) -> None:
     """1e-3 J; the published limit is 0.1 J, EXUDYN has 1.8e-5 J at h = 1.25e-4 s."""
     assert run.snapshot.kinetic[0] == pytest.approx({1: 5 / 6, 2: 1.5}[loops_of(run)], rel=1e-12)
     assert run.certificate.energy_error <= 1e-3
     assert run.certificate.position_violation <= 1e-8
 
 
-def test_cranks_stay_parallel(run: sj.Run) -> None:
+def test_cranks_stay_parallel(run: stm.Run) -> None:
     """Solver class: no branch is lost in the singular postures; all angles equal to 1e-6 rad."""
     turned = turned_about_z(run)
     cranks, couplers = turned[:, : loops_of(run) + 1], turned[:, loops_of(run) + 1 :]
@@ -194,20 +125,6 @@ def test_cranks_stay_parallel(run: sj.Run) -> None:
     # it turned over and over, through many singular postures
     assert np.max(np.abs(cranks)) > 4 * np.pi
     assert np.all(np.isfinite(run.snapshot.accelerations.multipliers))
-
-
-@eqx.filter_jit
-def course(system: sj.System, state: sj.State, rtol: Any) -> sj.Trajectory:
-    """20 s, at tolerances that are data: a program for each N."""
-    method = sj.Method(
-        formulation=sj.Tree(redundant=True),
-        adjoint=diffrax.ForwardMode(),
-        steps="state",
-        rtol=rtol,
-        atol=rtol,
-        max_steps=3000,
-    )
-    return sj.integrate(system, state, jnp.asarray(LONG), method)
 
 
 def passes(loops: int, rtol: float, coupler: float = 1.0) -> None:
@@ -260,14 +177,6 @@ def test_a_linkage_that_misses_the_singular_posture_goes_on(by: float) -> None:
         assert np.max(np.abs(energy - energy[0])) <= 1e3 * rtol, rtol
 
 
-def kinetic_and_potential(system: sj.System, states: sj.State) -> np.ndarray:
-    """Energy of bodies that move in the plane [J], (k,)."""
-    r, v, omega = (np.asarray(x) for x in (states.r, states.v, states.omega))
-    mass, inertia = np.asarray(system.bodies.mass), np.asarray(system.bodies.inertia)[:, 2, 2]
-    each = mass * (0.5 * np.sum(v**2, axis=2) + GRAVITY * r[:, :, 1])
-    return np.sum(each + 0.5 * inertia * omega[:, :, 2] ** 2, axis=1)
-
-
 @slow
 def test_a_posture_that_cannot_be_passed_is_named() -> None:
     """A crank driven beyond its reach: with 1 m of crank, coupler and rocker, 1.5 m of ground.
@@ -285,22 +194,22 @@ def test_a_posture_that_cannot_be_passed_is_named() -> None:
         (x, y), (i, j) = np.mean([a, b], axis=0), np.subtract(b, a)
         half = np.arctan2(j, i) / 2
         turned = (np.cos(half), 0.0, 0.0, np.sin(half))
-        bodies.append(sj.Body(name, 1.0, (THIN, ROD, ROD), position=(x, y, 0), orientation=turned))
+        bodies.append(stm.Body(name, 1.0, (THIN, ROD, ROD), position=(x, y, 0), orientation=turned))
     ends = {
         "A": ("ground", "crank", (0.0, 0.0, 0.0)),
         "B": ("crank", "coupler", (0.0, 1.0, 0.0)),
         "C": ("rocker", "coupler", (*knee, 0.0)),
         "D": ("ground", "rocker", (d, 0.0, 0.0)),
     }
-    joints = [sj.revolute(name, i, j, point=p, axis=Z) for name, (i, j, p) in ends.items()]
-    system = sj.driven(sj.System(bodies, joints), {"A": lambda t: t})
+    joints = [stm.revolute(name, i, j, point=p, axis=Z) for name, (i, j, p) in ends.items()]
+    system = stm.dynamics.driven(stm.System(bodies, joints), {"A": lambda t: t})
     rest = system.reference
-    guess = sj.State(rest.r, rest.p, rest.v, rest.omega.at[0, 2].set(1.0))
-    moving = sj.assemble(system, guess).state
-    with pytest.raises(sj.SimulationError, match="singular posture of drive A") as failed:
-        sj.simulate(system, moving, t1=1.0, save_every=0.1, error_estimate=False, analysis=False)
+    guess = stm.State(rest.r, rest.p, rest.v, rest.omega.at[0, 2].set(1.0))
+    moving = stm.assemble(system, guess).state
+    with pytest.raises(stm.SimulationError, match="singular posture of drive A") as failed:
+        stm.simulate(system, moving, t1=1.0, save_every=0.1, error_estimate=False, analysis=False)
     run = failed.value.run
-    assert isinstance(run, sj.Run)
+    assert isinstance(run, stm.Run)
     # the rest of the way takes less time than round-off leaves of the velocities
     assert run.certificate.t_end == pytest.approx(end, abs=1e-6)
     words = str(failed.value)
@@ -323,8 +232,8 @@ def test_gradient_is_the_closed_forms() -> None:
     compile, is tested on the simple pendulum.
     """
     # steps are chosen for the state's error, not the sensitivities', hence the tighter steps
-    method = sj.Method(
-        formulation=sj.Tree(redundant=True),
+    method = stm.Method(
+        formulation=stm.Tree(redundant=True),
         adjoint=diffrax.ForwardMode(),
         rtol=1e-10,
         atol=1e-10,
@@ -333,7 +242,7 @@ def test_gradient_is_the_closed_forms() -> None:
 
     def tip_x(parameters: Any) -> Any:
         system = four_bar(2, parameters[0])
-        path = sj.integrate(system, start(system, parameters[1]), ts, method)
+        path = stm.integrate(system, start(system, parameters[1]), ts, method)
         return 2 * path.states.r[1:, 0, 0]
 
     got = jax.jit(jax.jacfwd(tip_x))(jnp.array([GRAVITY, SPEED]))

@@ -15,16 +15,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_forms import moving, scene
+from closed_forms import scene
 from jax import Array
+from problems.conservative import FAST, MASS, SLOW, top
 
-import stmuav_jax as sj
-from stmuav_jax.dynamics.problem import begin, prepare
+import stmuav_jax as stm
+from stmuav_jax.dynamics.integration.problem import begin, prepare
 
-MASS = 15.0  # kg
-INERTIA = (0.234375, 0.46875, 0.234375)  # kg m^2
-FAST = (0.0, 150.0, -4.61538)  # rad/s, body axes
-SLOW = (0.0, 1.5, -0.0461538)
 TIMES = np.array([0.0, 0.1, 0.2])  # s
 ENERGY = 5435.696790865547  # J, fast, at the start
 
@@ -37,33 +34,25 @@ EXUDYN_RK4 = (-0.70828, 0.43878, 0.54573, 0.0894)
 EXUDYN_ALPHA = (-0.70813, 0.43881, 0.54593, 0.089251)
 
 
-def top(omega: tuple[float, float, float]) -> tuple[sj.System, sj.State]:
-    """The top with its axis along y, and its start."""
-    body = sj.Body("top", MASS, INERTIA, com=(0.0, 1.0, 0.0))
-    tip = sj.spherical("tip", "ground", "top", point=(0.0, 0.0, 0.0))
-    system = sj.System([body], [tip], [sj.Gravity((0.0, 0.0, -9.81))])
-    return system, moving(system, [np.cross(omega, (0.0, 1.0, 0.0))], [omega])
-
-
 @pytest.fixture(scope="module", params=[FAST, SLOW], ids=["fast", "slow"])
-def run(request: pytest.FixtureRequest) -> sj.Run:
+def run(request: pytest.FixtureRequest) -> stm.Run:
     """0.2 s at the default tolerances of 1e-8."""
     system, state = top(request.param)
-    return sj.simulate(scene(system, state, t1=0.2), ts=TIMES)
+    return stm.simulate(scene(system, state, t1=0.2), ts=TIMES)
 
 
-def is_fast(run: sj.Run) -> bool:
+def is_fast(run: stm.Run) -> bool:
     return float(run.scene.state0.omega[0, 1]) == FAST[1]
 
 
-def test_position_is_the_converged_one(run: sj.Run) -> None:
+def test_position_is_the_converged_one(run: stm.Run) -> None:
     """Solver class: 1e-5 m at 0.1 and 0.2 s at rtol 1e-8, after 30 rad of spin."""
     if not is_fast(run):
         pytest.skip("published for the fast top")
     np.testing.assert_allclose(run.states.r[1:, 0], FAST_X, rtol=0, atol=1e-5)
 
 
-def test_attitude_is_the_published_one(run: sj.Run) -> None:
+def test_attitude_is_the_published_one(run: stm.Run) -> None:
     """Published class: RK4 to half of the last digit, generalised alpha to its own 2.1e-4."""
     if not is_fast(run):
         pytest.skip("published for the fast top")
@@ -74,7 +63,7 @@ def test_attitude_is_the_published_one(run: sj.Run) -> None:
     np.testing.assert_allclose(p, EXUDYN_ALPHA, rtol=0, atol=2.5e-4)
 
 
-def test_invariants(run: sj.Run) -> None:
+def test_invariants(run: stm.Run) -> None:
     """Spin about the axis to 1e-6 rad/s (it is exact), energy to 1e-8 relative."""
     spin = run.states.omega[:, 0, 1]
     np.testing.assert_allclose(spin, spin[0], rtol=0, atol=1e-6)
@@ -85,7 +74,7 @@ def test_invariants(run: sj.Run) -> None:
     assert run.certificate.position_violation <= 1e-8
 
 
-def test_tip_force_is_the_motions(run: sj.Run) -> None:
+def test_tip_force_is_the_motions(run: stm.Run) -> None:
     """Exact class: the tip carries m (a - g), to 1e-6 N of some 340 N; no moment."""
     needed = MASS * (np.asarray(run.snapshot.accelerations.v_rate)[:, 0] + [0.0, 0.0, 9.81])
     np.testing.assert_allclose(run.snapshot.reactions.force[:, 0], needed, rtol=0, atol=1e-6)
@@ -98,7 +87,7 @@ Steps = Callable[[float, int], np.ndarray]
 def by_fixed_steps(omega: tuple[float, float, float], solver: Any) -> Steps:
     """(t1 [s], count) -> centre of mass at t1 by that many equal steps, one compilation."""
     system, state = top(omega)
-    method = sj.Method(solver=solver, adjoint=diffrax.ForwardMode(), steps="state")
+    method = stm.Method(solver=solver, adjoint=diffrax.ForwardMode(), steps="state")
     problem = prepare(system, method)
     y0 = begin(problem, jnp.zeros(()), state).y
 
@@ -150,7 +139,7 @@ def test_order_of_tsit5(fine: Steps) -> None:
     assert abs(order - 5) <= 0.3
 
 
-def test_slow_top_by_adaptive_steps(run: sj.Run, fine: Steps) -> None:
+def test_slow_top_by_adaptive_steps(run: stm.Run, fine: Steps) -> None:
     """Solver class: no figure is published for the slow top; 100 steps of Dopri8 serve."""
     if is_fast(run):
         pytest.skip("compared with published figures")
@@ -160,6 +149,6 @@ def test_slow_top_by_adaptive_steps(run: sj.Run, fine: Steps) -> None:
 def test_slow_top_by_an_implicit_method(fine: Steps) -> None:
     """Solver class: Kvaerno5 at rtol 1e-8 meets the same acceptance, 1e-5 m at 0.2 s."""
     system, state = top(SLOW)
-    run = sj.simulate(scene(system, state), ts=TIMES, solver=diffrax.Kvaerno5())
+    run = stm.simulate(scene(system, state), method=stm.Method(solver=diffrax.Kvaerno5()), ts=TIMES)
     np.testing.assert_allclose(run.states.r[-1, 0], fine(0.2, 100), rtol=0, atol=1e-5)
     assert run.certificate.position_violation <= 1e-8

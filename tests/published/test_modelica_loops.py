@@ -10,7 +10,7 @@ from closed_forms import attitude, scene, turned_about_z
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 
 GRAVITY = 9.81  # m/s^2
 DOWN = (0.0, -GRAVITY, 0.0)
@@ -32,31 +32,31 @@ DAMPING = 0.1  # N m s/rad, in joint 1
 
 
 @pytest.fixture(scope="module")
-def free_body() -> sj.Run:
+def free_body() -> stm.Run:
     """A body of 1 kg and 1 kg m^2 hung on two springs of 20 N/m and no length, for 10 s."""
     tilt = Rotation.from_euler("XYZ", [10, 10, 10], degrees=True)
-    body = sj.Body(
+    body = stm.Body(
         "body", 1.0, (1.0, 1.0, 1.0), com=(0.2, 0.0, 0.0), position=(0.2, -0.5, 0.1),
         orientation=tilt.as_quat(scalar_first=True), free=True,
     )  # fmt: skip
     springs = [
-        sj.LinearSpringDamper(
+        stm.LinearSpringDamper(
             "ground", "body", point_i=(fixed, 0.0, 0.0), point_j=(end, 0.0, 0.0), stiffness=20.0
         )
         for fixed, end in ((0.0, 0.0), (0.8, 0.4))
     ]
-    system = sj.System([body], [], [sj.Gravity(DOWN), *springs])
-    return sj.simulate(scene(system, t1=10.0, save_every=1.0))
+    system = stm.System([body], [], [stm.Gravity(DOWN), *springs])
+    return stm.simulate(scene(system, t1=10.0, save_every=1.0))
 
 
-def test_free_body(free_body: sj.Run) -> None:
+def test_free_body(free_body: stm.Run) -> None:
     """Published class: the file's own error of 1.7e-4 in metres and rad/s."""
     frame = free_body.states.r[-1, 0] - attitude(free_body, 0)[-1].apply([0.2, 0.0, 0.0])
     np.testing.assert_allclose(frame, FRAME_A, rtol=0, atol=DASSL_ERROR)
     np.testing.assert_allclose(free_body.states.omega[-1, 0], OMEGA, rtol=0, atol=DASSL_ERROR)
 
 
-def test_free_body_balances(free_body: sj.Run) -> None:
+def test_free_body_balances(free_body: stm.Run) -> None:
     """Energy to 1e-6 J of some 5 J; no turning about the line of the springs' ends."""
     assert free_body.certificate.energy_error <= 1e-6
     assert free_body.certificate.momentum_error is not None
@@ -65,20 +65,20 @@ def test_free_body_balances(free_body: sj.Run) -> None:
 
 
 @pytest.fixture(scope="module")
-def double_pendulum() -> sj.Run:
+def double_pendulum() -> stm.Run:
     """Two boxes in line, horizontal and at rest, for 3 s."""
     boxes = [
-        sj.Body(f"box{k}", BOX, (ALONG, ACROSS, ACROSS), com=(LENGTH / 2, 0.0, 0.0),
+        stm.Body(f"box{k}", BOX, (ALONG, ACROSS, ACROSS), com=(LENGTH / 2, 0.0, 0.0),
                 position=(LENGTH * (k - 1), 0.0, 0.0))
         for k in (1, 2)
     ]  # fmt: skip
     axis = (0.0, 0.0, 1.0)
     joints = [
-        sj.revolute("joint1", "ground", "box1", point=(0.0, 0.0, 0.0), axis=axis),
-        sj.revolute("joint2", "box1", "box2", point=(LENGTH, 0.0, 0.0), axis=axis),
+        stm.revolute("joint1", "ground", "box1", point=(0.0, 0.0, 0.0), axis=axis),
+        stm.revolute("joint2", "box1", "box2", point=(LENGTH, 0.0, 0.0), axis=axis),
     ]
-    forces = [sj.Gravity(DOWN), sj.JointDamping("joint1", turning=DAMPING)]
-    return sj.simulate(scene(sj.System(boxes, joints, forces), t1=3.0, save_every=0.1))
+    forces = [stm.Gravity(DOWN), stm.JointDamping("joint1", turning=DAMPING)]
+    return stm.simulate(scene(stm.System(boxes, joints, forces), t1=3.0, save_every=0.1))
 
 
 def minimal(t: float, y: np.ndarray) -> np.ndarray:
@@ -103,7 +103,7 @@ def minimal(t: float, y: np.ndarray) -> np.ndarray:
     return np.array([a_rate, b_rate, *np.linalg.solve(mass, force)])
 
 
-def test_double_pendulum(double_pendulum: sj.Run) -> None:
+def test_double_pendulum(double_pendulum: stm.Run) -> None:
     """Solver class, 1e-6: converged values of joint 1, and both angles by SciPy's DOP853.
 
     The second code works in minimal coordinates at 1e-12 and shares nothing with the package.
@@ -119,7 +119,7 @@ def test_double_pendulum(double_pendulum: sj.Run) -> None:
     np.testing.assert_allclose(rates, other.y[2:].T, rtol=0, atol=1e-5)
 
 
-def test_double_pendulum_balances(double_pendulum: sj.Run) -> None:
+def test_double_pendulum_balances(double_pendulum: stm.Run) -> None:
     """Energy with the damper's work to 1e-8 relative; the damper takes what its torque does."""
     assert double_pendulum.certificate.relative_energy_error <= 1e-8
     assert double_pendulum.certificate.position_violation <= 1e-8

@@ -12,9 +12,10 @@ here by quadrature.
 
 import numpy as np
 import pytest
-from closed_forms import moving, scene
+from closed_forms import scene
+from problems.conservative import moving
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 
 GRAVITY = 9.81  # m/s^2
 SPEED = 1.5  # m/s
@@ -32,32 +33,32 @@ SWINGS = 18
 
 
 @pytest.fixture(scope="module")
-def run() -> sj.Run:
+def run() -> stm.Run:
     """20 s at the default tolerances of 1e-8, saved at all times that are asked for."""
     start = (np.sin(TILT), 0.0, -np.cos(TILT))
-    bob = sj.Body("bob", 1.0, (1e-3, 1e-3, 1e-3), position=start)
-    rod = sj.distance("rod", "ground", "bob", point_i=(0.0, 0.0, 0.0), point_j=start)
-    system = sj.System([bob], [rod], [sj.Gravity((0.0, 0.0, -GRAVITY))])
+    bob = stm.Body("bob", 1.0, (1e-3, 1e-3, 1e-3), position=start)
+    rod = stm.distance("rod", "ground", "bob", point_i=(0.0, 0.0, 0.0), point_j=start)
+    system = stm.System([bob], [rod], [stm.Gravity((0.0, 0.0, -GRAVITY))])
     state = moving(system, [[0.0, SPEED, 0.0]], [[0.0, 0.0, 0.0]])
     halves = 0.5 * PERIOD * np.arange(2 * SWINGS + 1)
     ts = np.sort(np.concatenate([halves, list(EXACT)]))
-    return sj.simulate(scene(system, state), ts=ts)
+    return stm.simulate(scene(system, state), ts=ts)
 
 
-def at(run: sj.Run, t: float) -> np.ndarray:
+def at(run: stm.Run, t: float) -> np.ndarray:
     """Position [m] at a saved time [s]."""
     k = int(np.argmin(np.abs(run.ts - t)))
     assert run.ts[k] == pytest.approx(t, abs=1e-12)
     return np.asarray(run.states.r[k, 0])
 
 
-def test_position(run: sj.Run) -> None:
+def test_position(run: stm.Run) -> None:
     """Solver class: 1e-6 m for 20 s at rtol 1e-8."""
     for t, row in EXACT.items():
         np.testing.assert_allclose(at(run, t), row, rtol=0, atol=1e-6, err_msg=f"t = {t} s")
 
 
-def test_turning_points(run: sj.Run) -> None:
+def test_turning_points(run: stm.Run) -> None:
     """Solver class: 1e-6 m at every half period, high and low in turn, for 18 periods."""
     heights = [at(run, 0.5 * PERIOD * k)[2] for k in range(2 * SWINGS + 1)]
     np.testing.assert_allclose(heights[0::2], HIGH, rtol=0, atol=1e-6)
@@ -66,7 +67,7 @@ def test_turning_points(run: sj.Run) -> None:
     assert LOW - 1e-6 <= z.min() <= z.max() <= HIGH + 1e-6
 
 
-def test_azimuth_advances(run: sj.Run) -> None:
+def test_azimuth_advances(run: stm.Run) -> None:
     """Solver class: the azimuth of every start of a period, to 1e-6 rad."""
     tops = np.stack([at(run, PERIOD * k) for k in range(SWINGS + 1)])
     off = np.arctan2(tops[:, 1], tops[:, 0]) - ADVANCE * np.arange(SWINGS + 1)
@@ -74,7 +75,7 @@ def test_azimuth_advances(run: sj.Run) -> None:
     np.testing.assert_allclose(off, 0, rtol=0, atol=2e-6)
 
 
-def test_invariants_and_rod(run: sj.Run) -> None:
+def test_invariants_and_rod(run: stm.Run) -> None:
     """Energy and the moment of momentum about z to 1e-6, the length to 1e-8 m.
 
     Solver class, the problem's own figure: over 18 swings both drift by some 5 rtol.

@@ -16,33 +16,11 @@ turns 2.5 times.
 import equinox as eqx
 import numpy as np
 import pytest
-from closed_forms import about_z, scene, turned_about_z
+from closed_forms import scene, turned_about_z
+from problems.squeezer import START, TORQUE, squeezer
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 
-NAMES: tuple[str, ...] = ("K1", "K2", "K3", "K4", "K5", "K6", "K7")
-MASS = (0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498)  # kg
-INERTIA = (2.194e-6, 4.410e-7, 5.255e-6, 5.667e-7, 1.169e-5, 5.667e-7, 1.912e-5)  # kg m^2
-A, B, C = (-0.06934, -0.00227), (-0.03635, 0.03273), (0.014, 0.072)  # m, fixed points
-STIFFNESS, UNSTRETCHED = 4530.0, 0.07785  # N/m, m
-TORQUE = 0.033  # N m
-
-# Lengths [m] and places of the centres of mass, by the source's letters.
-D, DA, E, EA, RR, RA = 0.028, 0.0115, 0.02, 0.01421, 0.007, 0.00092
-SS, SA, SB, SC, SD = 0.035, 0.01874, 0.01043, 0.018, 0.02
-TA, TB, U, UA, UB = 0.02308, 0.00916, 0.04, 0.01228, 0.00449
-ZF, ZT, FA = 0.02, 0.04, 0.01421
-
-# beta, Theta, gamma, Phi, delta, Omega, epsilon [rad] at the start, at rest.
-START = (
-    -0.0617138900142764496358948458001,
-    0.0,
-    0.455279819163070380255912382449,
-    0.222668390165885884674473185609,
-    0.487364979543842550225598953530,
-    -0.222668390165885884674473185609,
-    1.23054744454982119249735015568,
-)
 # beta'', Theta'' [rad/s^2] at the start; the others are zero.
 ACCELERATION = (14222.4439199541138705911625887, -10666.8329399655854029433719415)
 # At 0.03 s. PSIDE at 1e-14, as printed; its digits are good to 2.7e-10 relative in q [rad]
@@ -77,91 +55,27 @@ CONVERGED_Q = (
 )
 
 
-def absolute(q: np.ndarray) -> np.ndarray:
-    """Angles of K1 to K7 from the x axis, of the seven relative ones (..., 7)."""
-    beta, theta, gamma, phi, delta, omega, epsilon = np.moveaxis(np.asarray(q), -1, 0)
-    angles = (beta, beta + theta, gamma, phi + delta, delta, omega + epsilon, epsilon)
-    return np.stack(angles, axis=-1)
-
-
 def relative(angles: np.ndarray) -> np.ndarray:
     """The inverse of `absolute`, for angles and for their rates."""
     k1, k2, k3, k4, k5, k6, k7 = np.moveaxis(angles, -1, 0)
     return np.stack([k1, k2 - k1, k3, k4 - k5, k5, k6 - k7, k7], axis=-1)
 
 
-def flat(point: tuple[float, float] | np.ndarray) -> np.ndarray:
-    """A point of the plane in space."""
-    return np.array([point[0], point[1], 0.0])
-
-
-def at(place: np.ndarray, angle: float, point: tuple[float, float]) -> np.ndarray:
-    """World position of a body's point, the body at `place` and `angle` [rad]."""
-    c, s = np.cos(angle), np.sin(angle)
-    return place + np.array([c * point[0] - s * point[1], s * point[0] + c * point[1], 0.0])
-
-
-def squeezer() -> sj.System:
-    """The mechanism at its start, bodies of equal moments of inertia about all axes."""
-    angle: dict[str, float] = dict(zip(NAMES, absolute(np.array(START)), strict=True))
-    place = {"K1": np.zeros(3), "K3": flat(B), "K5": flat(A), "K7": flat(A)}
-    place["K2"] = at(place["K1"], angle["K1"], (RR, 0.0))
-    place["K4"] = at(place["K5"], angle["K5"], (ZT, 0.0))
-    place["K6"] = at(place["K7"], angle["K7"], (0.0, -U))
-    com = {
-        "K1": (RA, 0.0),
-        "K2": (-DA, 0.0),
-        "K3": (SB, -SA),
-        "K4": (0.0, -(E - EA)),
-        "K5": (TA, TB),
-        "K6": (ZF - FA, 0.0),
-        "K7": (-UB, -UA),
-    }
-    bodies = [
-        sj.Body(
-            name, mass, 3 * (inertia,), com=flat(com[name]), position=place[name],
-            orientation=about_z(angle[name]),
-        )
-        for name, mass, inertia in zip(NAMES, MASS, INERTIA, strict=True)
-    ]  # fmt: skip
-    meet = at(place["K2"], angle["K2"], (-D, 0.0))
-    ends = {"K3": (0.0, -SS), "K4": (0.0, -E), "K6": (ZF, 0.0)}
-    for name, end in ends.items():
-        assert np.allclose(at(place[name], angle[name], end), meet, rtol=0, atol=1e-16)
-    hinges = {
-        "O": ("ground", "K1", place["K1"]),
-        "P": ("K1", "K2", place["K2"]),
-        "B": ("ground", "K3", place["K3"]),
-        "A5": ("ground", "K5", place["K5"]),
-        "A7": ("ground", "K7", place["K7"]),
-        "G": ("K5", "K4", place["K4"]),
-        "H": ("K7", "K6", place["K6"]),
-        **{f"E{name[1]}": ("K2", name, meet) for name in ends},
-    }
-    joints = [
-        sj.revolute(name, i, j, point=point, axis=(0.0, 0.0, 1.0))
-        for name, (i, j, point) in hinges.items()
-    ]
-    spring = sj.LinearSpringDamper(
-        "ground", "K3", point_i=flat(C), point_j=(SD, -SC, 0.0), stiffness=STIFFNESS,
-        length=UNSTRETCHED,
-    )  # fmt: skip
-    return sj.System(bodies, joints, [sj.AppliedMoment("K1", (0.0, 0.0, TORQUE)), spring])
-
-
-REDUNDANT = sj.Augmented(redundant=True)
+REDUNDANT = stm.Augmented(redundant=True)
 
 
 @pytest.fixture(scope="module")
-def run() -> sj.Run:
+def run() -> stm.Run:
     """0.03 s at rtol 1e-8, saved so often that no body makes half a turn in between."""
     ends = scene(squeezer(), t1=0.03, save_every=1e-3)
-    return sj.simulate(ends, formulation=REDUNDANT, rtol=1e-8, atol=1e-8, first_step=1e-6)
+    return stm.simulate(
+        ends, method=stm.Method(formulation=REDUNDANT, rtol=1e-8, atol=1e-8, first_step=1e-6)
+    )
 
 
-def test_rank(run: sj.Run) -> None:
+def test_rank(run: stm.Run) -> None:
     """Exact class: 50 rows of spatial joints, rank 6 * 7 - 1, three dependent rows a loop."""
-    found = sj.rank(run.scene.system, run.scene.state0)
+    found = stm.dynamics.rank(run.scene.system, run.scene.state0)
     assert (found.rows, found.rank, found.dof) == (50, 41, 1)
     assert run.certificate.redundant == found.redundant != ()
 
@@ -172,7 +86,7 @@ def test_initial_accelerations() -> None:
     Exact class, times the condition of the equations with such small inertias: 2e-11 is seen.
     """
     system = squeezer()
-    look = eqx.filter_jit(lambda s: sj.evaluate(s, s.reference, formulation=REDUNDANT))
+    look = eqx.filter_jit(lambda s: stm.dynamics.evaluate(s, s.reference, formulation=REDUNDANT))
     found = look(system)
     got = relative(np.asarray(found.accelerations.omega_rate[:, 2]))
     np.testing.assert_allclose(got[:2], ACCELERATION, rtol=1e-9)
@@ -180,7 +94,7 @@ def test_initial_accelerations() -> None:
     np.testing.assert_allclose(found.accelerations.omega_rate[:, :2], 0, rtol=0, atol=1e-6)
 
 
-def test_angles_at_the_end(run: sj.Run) -> None:
+def test_angles_at_the_end(run: stm.Run) -> None:
     """Solver class: 1e-8 relative at rtol 1e-8, where 1e-6 is asked.
 
     Against PSIDE's printed figures 2e-9 rad more: 2.7e-10 relative is what they are good for.
@@ -190,13 +104,13 @@ def test_angles_at_the_end(run: sj.Run) -> None:
     np.testing.assert_allclose(got, PSIDE_Q, rtol=1e-8, atol=2e-9)
 
 
-def test_rates_at_the_end(run: sj.Run) -> None:
+def test_rates_at_the_end(run: stm.Run) -> None:
     """Solver class: PSIDE's rates to 1e-6 relative; printed, they are good to 5e-8."""
     got = relative(np.asarray(run.states.omega[-1, :, 2]))
     np.testing.assert_allclose(got, PSIDE_V, rtol=1e-6)
 
 
-def test_energy_balance(run: sj.Run) -> None:
+def test_energy_balance(run: stm.Run) -> None:
     """T + V - E_0 - torque (beta - beta_0) vanishes to 1e-7 J, of 1.1 J that flow."""
     work = TORQUE * turned_about_z(run)[:, 0]
     total = run.snapshot.kinetic + run.snapshot.potential

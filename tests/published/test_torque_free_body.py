@@ -14,10 +14,11 @@ flips twice a period.
 
 import numpy as np
 import pytest
-from closed_forms import attitude, moving, scene
+from closed_forms import attitude, scene
+from problems.conservative import moving
 from scipy.special import ellipj, ellipk
 
-import stmuav_jax as sj
+import stmuav_jax as stm
 
 I1, I2, I3 = 1.0, 2.0, 2.5  # kg m^2
 SQUARE = 0.99  # k^2
@@ -30,23 +31,25 @@ PERIODS = 5
 PER_HALF = 4  # saved times per half period
 
 
-def spin(tolerance: float) -> sj.Run:
+def spin(tolerance: float) -> stm.Run:
     """Five periods."""
-    body = sj.Body("body", 1.0, (I1, I2, I3), free=True)
-    system = sj.System([body])
+    body = stm.Body("body", 1.0, (I1, I2, I3), free=True)
+    system = stm.System([body])
     start = moving(system, [[0.0, 0.0, 0.0]], [[A1, 0.0, A3]])
     ts = np.linspace(0.0, PERIODS * PERIOD, 2 * PERIODS * PER_HALF + 1)
-    return sj.simulate(scene(system, start), ts=ts, rtol=tolerance, atol=tolerance)
+    return stm.simulate(
+        scene(system, start), method=stm.Method(rtol=tolerance, atol=tolerance), ts=ts
+    )
 
 
 @pytest.fixture(scope="module")
-def run() -> sj.Run:
+def run() -> stm.Run:
     """At the default tolerances."""
     return spin(1e-8)
 
 
 @pytest.fixture(scope="module")
-def sharp() -> sj.Run:
+def sharp() -> stm.Run:
     """At 1e-12."""
     return spin(1e-12)
 
@@ -57,14 +60,14 @@ def closed_form(t: np.ndarray) -> np.ndarray:
     return np.stack([A1 * cn, A2 * sn, A3 * dn], axis=1)
 
 
-def test_angular_velocity_is_the_closed_form(run: sj.Run, sharp: sj.Run) -> None:
+def test_angular_velocity_is_the_closed_form(run: stm.Run, sharp: stm.Run) -> None:
     """Solver class: 1e-6 rad/s for five periods at rtol 1e-8, 1e-9 at 1e-12."""
     exact = closed_form(run.ts)
     np.testing.assert_allclose(run.states.omega[:, 0], exact, rtol=0, atol=1e-6)
     np.testing.assert_allclose(sharp.states.omega[:, 0], exact, rtol=0, atol=1e-9)
 
 
-def test_flips_on_time(run: sj.Run) -> None:
+def test_flips_on_time(run: stm.Run) -> None:
     """Solver class: every half period to 1e-5 s.
 
     There omega_2 passes zero in turn upwards and downwards, and the body's first axis has
@@ -77,7 +80,7 @@ def test_flips_on_time(run: sj.Run) -> None:
     assert along.tolist() == [(-1.0) ** k for k in range(2 * PERIODS + 1)]
 
 
-def test_angular_momentum_stays_in_the_world(sharp: sj.Run) -> None:
+def test_angular_momentum_stays_in_the_world(sharp: stm.Run) -> None:
     """1e-9 kg m^2/s in every world component, of 5.5, over five periods at 1e-12.
 
     The method keeps it as well as its tolerance, not exactly: at rtol 1e-8 it drifts by

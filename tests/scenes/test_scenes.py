@@ -10,29 +10,30 @@ import pytest
 from stmuav_jax import (
     PART_I,
     PART_II,
-    PRINTED_ORIENTATIONS,
     SCENES,
     Augmented,
+    Method,
     ModelError,
-    Rotors,
     SettingError,
     State,
     StateError,
     Unstabilised,
     assemble,
     make_scene,
-    normalise,
-    rank,
     simulate,
-    spin_exact,
 )
+from stmuav_jax.algebra.rotation import normalise
+from stmuav_jax.dynamics import rank
+from stmuav_jax.parameters import PRINTED_ORIENTATIONS
+from stmuav_jax.rotorcraft import Rotors
+from stmuav_jax.scenes import spin_exact
 
 CASES = [(name, case) for name in ("tracker", "uav_tracker") for case in (1, 2, 3)]
 
 
 @pytest.fixture(scope="module")
 def spin_run():
-    return simulate(make_scene("spin"), rtol=1e-13, atol=1e-13)
+    return simulate(make_scene("spin"), method=Method(rtol=1e-13, atol=1e-13))
 
 
 def test_spin_against_closed_form(spin_run):
@@ -67,7 +68,7 @@ def test_two_seconds_with_default_settings(name, case):
 @pytest.mark.parametrize(("name", "case"), CASES)
 def test_energy_balance(name, case):
     """At rtol 1e-10: at most 1e-8 of the largest energy, work of rotors and actuators counted."""
-    c = simulate(make_scene(name, case), rtol=1e-10, atol=1e-10).certificate
+    c = simulate(make_scene(name, case), method=Method(rtol=1e-10, atol=1e-10)).certificate
     assert c.relative_energy_error <= 1e-8
     if name == "uav_tracker":
         assert c.momentum_error is not None
@@ -118,7 +119,7 @@ def test_hexacopter_has_no_constraint_code():
 
 def test_hexacopter_rises_by_its_excess_thrust():
     """1.1 times the weight: z = 0.1 g t^2 / 2 while it is level (0.2 s: the arms turn it)."""
-    run = simulate(make_scene("hexacopter"), t1=0.2, rtol=1e-10, atol=1e-10)
+    run = simulate(make_scene("hexacopter"), method=Method(rtol=1e-10, atol=1e-10), t1=0.2)
     assert float(run.states.r[-1, 0, 2]) == pytest.approx(0.5 * 0.1 * 9.81 * 0.04, rel=1e-3)
 
 

@@ -1,0 +1,138 @@
+"""Gradients of the seven-body UAV: what they cost, and how far they are from the truth."""
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from peers.adapter import Peer
+from problems.compared import moving_base, tracker
+from sections.precision import reason
+from sections.size import Size
+from shared.clock import compiled, measure
+from shared.methods import trajectory
+
+import stmuav_jax as stm
+from stmuav_jax.rotorcraft.rotor import Rotors
+
+DIFFERENCES = (4e-3, 2e-3, 1e-3)
+PARAMETERS = (
+    "seven masses, the base's first velocity and angular velocity (three each), six squared "
+    "rotor speeds, gravity; relative changes, but m/s and rad/s"
+)
+
+
+def disturb(scene: stm.Scene, change: Any) -> tuple[stm.System, stm.State]:
+    """System and start for changes (20,), in the order of `PARAMETERS`."""
+    system = scene.system
+    gravity = next(k for k, f in enumerate(system.forces) if isinstance(f, stm.Gravity))
+    rotors = next(k for k, f in enumerate(system.forces) if isinstance(f, Rotors))
+    of = lambda s: (s.bodies.mass, s.forces[rotors].speed_squared, s.forces[gravity].acceleration)
+    mass, speeds, pull = of(system)
+    new = mass * (1 + change[:7]), speeds * (1 + change[13:19]), pull * (1 + change[19])
+    changed = eqx.tree_at(of, system, new)
+    tree = stm.Tree()
+    model = tree.prepare(system)
+    x = moving_base(model, tree.to_vector(model, scene.state0), change[7:10], change[10:13])
+    return changed, tree.to_state(model, x)
+
+
+def functional(scene: stm.Scene, end: float, count: int, adjoint: Any, steps: int) -> Any:
+    """(changes (count,), tolerance) -> final position of the panel (3,) [m]."""
+    run = trajectory(stm.Tree(), diffrax.Dopri8(), adjoint, steps)
+    ts = jnp.array([scene.t0, end])
+    panel = scene.system.index("panel_7")
+
+    def of(change: Any, tolerance: Any) -> Any:
+        everything = jnp.zeros(20).at[:count].set(change)
+        system, state = disturb(scene, everything)
+        return run(system, state, ts, tolerance).states.r[-1, panel]
+
+    return of
+
+
+def differences(of: Callable[[Any], Any], count: int) -> tuple[np.ndarray, float]:
+    """Jacobian (3, count) by central differences, twice extrapolated; and its last change."""
+    levels = []
+    for h in DIFFERENCES:
+        columns = []
+        for k in range(count):
+            step = jnp.zeros(count).at[k].set(h)
+            columns.append((np.asarray(of(step)) - np.asarray(of(-step))) / (2 * h))
+        levels.append(np.stack(columns, axis=1))
+    once = [(4 * b - a) / 3 for a, b in itertools.pairwise(levels)]
+    twice = (16 * once[1] - once[0]) / 15
+    return twice, float(np.max(np.abs(twice - once[1])) / np.max(np.abs(twice)))
+
+
+# What a mode's value is to be, of the whole Jacobian (3, count); None for the simulation itself.
+Wanted = Callable[[np.ndarray], np.ndarray] | None
+
+
+def modes(scene: stm.Scene, size: Size) -> dict[str, tuple[Callable[..., Any], Wanted]]:
+    """Name -> (changes, tolerance) -> value, and what that is to be."""
+    n, end = size.parameters, size.gradient_horizon
+    ahead = functional(scene, end, n, diffrax.ForwardMode(), 100_000)
+    back = functional(scene, end, n, stm.dynamics.DiscreteAdjoint(), 100_000)
+    height = lambda change, tolerance: back(change, tolerance)[2]
+    one = jnp.ones(n)
+    along = lambda change, tolerance: jax.jvp(lambda c: ahead(c, tolerance), (change,), (one,))[1]
+    return {
+        "simulation": (ahead, None),
+        "forward (jvp), one direction": (along, lambda exact: exact.sum(axis=1)),
+        "forward (jacfwd), all three components": (jax.jacfwd(ahead), lambda exact: exact),
+        "reverse (grad), height": (jax.grad(height), lambda exact: exact[2]),
+    }
+
+
+def compared(value: Any, want: np.ndarray) -> float:
+    """Largest difference over the largest entry."""
+    return float(np.max(np.abs(np.asarray(value) - want)) / np.max(np.abs(want)))
+
+
+def gradient(size: Size, others: list[Peer]) -> dict[str, Any]:
+    """Forward and reverse mode against one simulation and against central differences."""
+    del others
+    scene = tracker(size.horizons).scene
+    zero, tight = jnp.zeros(size.parameters), jnp.asarray(max(size.reference, 1e-13))
+    rows: list[dict[str, Any]] = []
+    exact, own = np.zeros((3, size.parameters)), float("nan")
+    base: dict[float, float] = {}
+    for name, (of, wanted) in modes(scene, size).items():
+        try:
+            program, seconds = compiled(of, zero, tight)
+        except Exception as error:
+            rows.append({"mode": name, "failure": reason(error)})
+            continue
+        if wanted is None:
+            exact, own = differences(lambda c, p=program: p(c, tight), size.parameters)
+        for tolerance in size.gradient_tolerances:
+            at = jnp.asarray(tolerance)
+            timing, value = measure(
+                lambda p=program, at=at: p(zero, at), repeats=size.repeats, budget=size.budget
+            )
+            base.setdefault(tolerance, timing.median)
+            row = {
+                "mode": name, "tolerance": tolerance, "seconds": timing.to_dict(),
+                "compile_seconds": seconds, "cost_in_simulations": timing.median / base[tolerance],
+                "error": None if wanted is None else compared(value, wanted(exact)),
+                "failure": "" if np.all(np.isfinite(value)) else "The gradient is not finite.",
+            }  # fmt: skip
+            rows.append(row)
+            print(
+                f"  {name} {tolerance:.0e}: {1e3 * timing.median:.1f} ms, "
+                f"{row['cost_in_simulations']:.1f} simulations, error {row['error']}",
+                flush=True,
+            )
+    return {
+        "what": "gradient of the panel's final position, uav_tracker case 2, tree, Dopri8",
+        "horizon": size.gradient_horizon,
+        "parameters": PARAMETERS,
+        "count": size.parameters,
+        "differences": {"steps": DIFFERENCES, "own_error": own},
+        "rows": rows,
+    }

@@ -1,0 +1,116 @@
+"""Our methods behind the same adapter as the peers, and compilation timed apart from running."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+from peers import PEERS
+from peers.adapter import Outcome, Peer, Prepared, Setting
+from shared.clock import compiled
+from shared.methods import evaluations, trajectory, words
+
+import stmuav_jax as stm
+from stmuav_jax.dynamics.integration.rosenbrock import Rodas5P
+
+
+def label(formulation: Any) -> str:
+    """A formulation in words."""
+    if isinstance(formulation, stm.Tree):
+        return "tree"
+    return "augmented" if formulation.solve == "structured" else "augmented, dense"
+
+
+def watched(run: Any) -> Any:
+    """A `trajectory` that also returns whether it reached the end, found out inside the program."""
+
+    def both(*arguments: Any) -> tuple[stm.dynamics.Trajectory, Any]:
+        path = run(*arguments)
+        return path, path.result == diffrax.RESULTS.successful
+
+    return both
+
+
+def outcome(path: stm.dynamics.Trajectory, fine: Any, solver: Any) -> Outcome:
+    """A trajectory in the suite's words, the start left out.
+
+    In NumPy: what is asked of JAX's arrays here would be compiled, and timed, with the first run.
+    """
+    accepted, rejected = (
+        int(np.asarray(count)[-1]) for count in (path.counts.accepted, path.counts.rejected)
+    )
+    positions = np.asarray(path.states.r)[1:]
+    failure = "" if bool(np.asarray(fine)) else words(path.result)
+    if not failure and not np.all(np.isfinite(positions)):
+        failure = "The state is not finite."
+    residual = float(np.asarray(path.worst.position)[-1])
+    counted = evaluations(solver, accepted + rejected)
+    return Outcome(positions, counted, accepted, rejected, residual, failure=failure)
+
+
+class Ours(Peer):
+    """One formulation with one solver; compiled once for all tolerances and horizons."""
+
+    def __init__(self, formulation: Any, solver: Any, tolerances: tuple[float, ...]) -> None:
+        self.formulation, self.solver = formulation, solver
+        self.solver_name = type(solver).__name__
+        self.name = f"stmuav-jax, {label(formulation)}"
+        self._settings = [Setting(self.solver_name, tolerance=x) for x in tolerances]
+        self._kept: dict[str, tuple[Any, float]] = {}
+        if isinstance(solver, Rodas5P):
+            self.caveats = ("Jacobians, one a step, are not counted as evaluations.",)
+
+    def version(self) -> str:
+        return stm.__version__
+
+    def settings(self) -> list[Setting]:
+        return self._settings
+
+    def prepare(self, scene: stm.Scene, times: np.ndarray, setting: Setting) -> Prepared:
+        ts = jnp.asarray([scene.t0, *times], float)
+        tolerance = jnp.asarray(setting.tolerance, float)
+        arguments = (scene.system, scene.state0, ts, tolerance)
+        key = scene.name
+        if key not in self._kept:
+            run = watched(trajectory(self.formulation, self.solver))
+            self._kept[key] = compiled(run, *arguments)
+        program, seconds = self._kept[key]
+
+        def run() -> Outcome:
+            path, fine = program(*arguments)
+            return outcome(path, fine, self.solver)
+
+        return Prepared(run, seconds)
+
+
+def explicit(tolerances: tuple[float, ...], *, redundant: bool = False) -> list[Ours]:
+    """Both formulations with both explicit solvers."""
+    return [
+        Ours(formulation, solver, tolerances)
+        for formulation in (stm.Tree(redundant=redundant), stm.Augmented(redundant=redundant))
+        for solver in (diffrax.Dopri8(), diffrax.Tsit5())
+    ]
+
+
+def for_stiff(tolerances: tuple[float, ...]) -> list[Ours]:
+    """Explicit and implicit solvers on the spanning tree."""
+    solvers = (diffrax.Tsit5(), Rodas5P(), stm.dynamics.kvaerno5())
+    return [Ours(stm.Tree(), solver, tolerances) for solver in solvers]
+
+
+def peers() -> tuple[list[Peer], list[dict[str, str]]]:
+    """Installed peers, and those that are not, with the reason."""
+    there: list[Peer] = []
+    absent = []
+    for kind in PEERS:
+        try:
+            peer = kind()
+            reason = peer.missing()
+        except Exception as error:
+            absent.append({"method": kind.__name__, "reason": f"{type(error).__name__}: {error}"})
+            continue
+        if reason:
+            absent.append({"method": peer.name, "reason": reason})
+        else:
+            there.append(peer)
+    return there, absent

@@ -1,0 +1,205 @@
+"""Work against precision: problems x methods x tolerances, ours and the peers alike."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from peers.adapter import Outcome, Peer, Setting
+from problems.compared import Problem, published, stiff, tracker
+from sections.ours import Ours, explicit, for_stiff
+from sections.size import Size
+from shared.clock import Timing, measure, summary
+
+TARGETS = (1e-3, 1e-6, 1e-9)
+# A method whose run took longer than this is not tried with finer settings [s].
+PATIENCE = 3.0
+# Codes that share nothing with ours and converge far enough to check the reference.
+SECOND_CODES = ("Pinocchio", "NumPy")
+
+
+def reason(error: Exception) -> str:
+    """An exception as one short line."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0] if lines else ''}"[:160]
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float | None:
+    """Largest distance between the same bodies' centres of mass [m]; None if not finite."""
+    if a.shape != b.shape or not np.all(np.isfinite(a)):
+        return None
+    return float(np.max(np.linalg.norm(a - b, axis=-1)))
+
+
+def timed(run: Callable[[], Outcome], size: Size) -> tuple[Timing, Outcome]:
+    """Time a run; the first call is a warm-up unless it failed or took longer than the budget."""
+    first, outcome = measure(run, repeats=1, warm_up=0)
+    if outcome.seconds:
+        return summary(outcome.seconds), outcome
+    if outcome.failure or first.median > size.budget:
+        return first, outcome
+    return measure(run, repeats=size.repeats, warm_up=0, budget=size.budget)
+
+
+def empty(peer: Peer, setting: Setting, end: float, failure: str = "") -> dict[str, Any]:
+    """The row of a run of which nothing is known yet."""
+    how = {"solver": setting.solver, "tolerance": setting.tolerance, "step": setting.step}
+    measured = {"horizon": end, "error": None, "seconds": None, "failure": failure}
+    return {"method": peer.name, **how, **measured}
+
+
+def point(
+    peer: Peer, problem: Problem, end: float, setting: Setting, exact: np.ndarray, size: Size
+) -> dict[str, Any]:
+    """One run: its cost, its error, or why it failed."""
+    row = empty(peer, setting, end)
+    try:
+        prepared = peer.prepare(problem.scene, np.array([end]), setting)
+        timing, outcome = timed(prepared.run, size)
+    except Exception as error:
+        return row | {"failure": reason(error)}
+    return row | {
+        "error": distance(np.asarray(outcome.positions)[-1], exact),
+        "seconds": timing.to_dict(),
+        "compile_seconds": prepared.compile_seconds,
+        **outcome.figures(),
+    }
+
+
+def line(
+    peer: Peer, problem: Problem, end: float, exact: np.ndarray, size: Size
+) -> list[dict[str, Any]]:
+    """A method's runs from coarse to fine; those left out are rows too."""
+    rows: list[dict[str, Any]] = []
+    slow: dict[str, str] = {}
+    for setting in peer.settings_for(problem.scene):
+        if setting.solver in slow:
+            rows.append(empty(peer, setting, end, slow[setting.solver]))
+            continue
+        rows.append(point(peer, problem, end, setting, exact, size))
+        say(rows[-1])
+        seconds = rows[-1]["seconds"]
+        if seconds and seconds["median"] > PATIENCE:
+            said = f"Left out: the coarser setting took {seconds['median']:.1f} s."
+            slow[setting.solver] = said
+    return rows
+
+
+def say(row: dict[str, Any]) -> None:
+    """One line of progress."""
+    seconds = row["seconds"]["median"] if row["seconds"] else float("nan")
+    error = float("nan") if row["error"] is None else row["error"]
+    size = row["tolerance"] if row["tolerance"] is not None else row["step"]
+    print(
+        f"  {row['method']:34s} {row['solver']:18s} {size:7.0e} {row['horizon']:5g} s: "
+        f"{1e3 * seconds:9.2f} ms, error {error:8.1e} m {row['failure']}",
+        flush=True,
+    )
+
+
+def reference(problem: Problem, ours: Ours, size: Size) -> dict[float, np.ndarray]:
+    """Positions at every horizon: the closed form, or one of our methods at its tightest."""
+    if problem.exact is not None:
+        return {end: problem.exact(end) for end in problem.horizons}
+    # explicit steps on stiff problems are short because of stability, so errors stay small
+    tolerance = max(size.reference, 1e-11) if problem.stiff else size.reference
+    found = {}
+    for end in problem.horizons:
+        setting = Setting(ours.solver_name, tolerance=tolerance)
+        done = ours.prepare(problem.scene, np.array([end]), setting).run()
+        if done.failure:
+            raise RuntimeError(f"The reference run failed: {done.failure}")
+        found[end] = done.positions[-1]
+    return found
+
+
+def check(rows: list[dict[str, Any]], end: float) -> dict[str, Any]:
+    """How closely independent codes, and our other formulation, meet the reference."""
+    near = [row for row in rows if row["horizon"] == end and row["error"] is not None]
+
+    def best(wanted: Callable[[str], bool]) -> dict[str, Any] | None:
+        found = [row for row in near if wanted(row["method"]) and not row["failure"]]
+        if not found:
+            return None
+        row = min(found, key=lambda row: row["error"])
+        return {k: row[k] for k in ("method", "solver", "tolerance", "error")}
+
+    return {
+        "horizon": end,
+        "second_code": best(lambda name: name.startswith(SECOND_CODES)),
+        "other_formulation": best(lambda name: name.startswith("stmuav-jax, augmented")),
+    }
+
+
+def cheapest(rows: list[dict[str, Any]], end: float) -> list[dict[str, Any]]:
+    """For every method the least time that reaches each target, and the ratio to our best."""
+    whole = [row for row in rows if row["error"] is not None and not row["failure"]]
+    good = [row for row in whole if row["horizon"] == end]
+    methods = dict.fromkeys((row["method"], row["solver"]) for row in rows)
+
+    def least(target: float, wanted: Callable[[dict[str, Any]], bool]) -> float | None:
+        fits = (row for row in good if wanted(row) and row["error"] <= target)
+        return min((row["seconds"]["median"] for row in fits), default=None)
+
+    table = []
+    for name, solver in methods:
+        entry: dict[str, Any] = {"method": name, "solver": solver, "horizon": end}
+        for target in TARGETS:
+            key = (name, solver)
+            mine = least(target, lambda row, key=key: (row["method"], row["solver"]) == key)
+            ours = least(target, lambda row: row["method"].startswith("stmuav-jax"))
+            ratio = mine / ours if mine is not None and ours is not None else None
+            entry[f"{target:.0e}"] = {"seconds": mine, "ratio_to_ours": ratio}
+        table.append(entry)
+    return table
+
+
+def curve(problem: Problem, ours: list[Ours], others: list[Peer], size: Size) -> dict[str, Any]:
+    """All methods on one problem, against `reference`."""
+    print(f"{problem.key}: {problem.title}", flush=True)
+    result: dict[str, Any] = {
+        "problem": problem.key, "title": problem.title, "horizons": problem.horizons,
+        "closed_form": problem.exact is not None, "rows": [], "unsupported": [],
+    }  # fmt: skip
+    try:
+        exact = reference(problem, ours[0], size)
+    except Exception as error:
+        return result | {"failure": reason(error), "references": [], "cheapest": []}
+    rows = result["rows"]
+    for method in (*ours[: size.methods], *others):
+        if why := method.unsupported(problem.scene):
+            result["unsupported"].append({"method": method.name, "reason": why})
+            continue
+        for end in problem.horizons:
+            rows += line(method, problem, end, exact[end], size)
+    result["references"] = [check(rows, end) for end in problem.horizons]
+    result["cheapest"] = [x for end in problem.horizons for x in cheapest(rows, end)]
+    return result | {"failure": ""}
+
+
+def describe(others: list[Peer]) -> list[dict[str, Any]]:
+    """Versions, settings and caveats of what is compared with."""
+    about = lambda peer: {"how": peer.how, "caveats": list(peer.caveats)}
+    return [{"method": p.name, "version": p.version(), **about(p)} for p in others]
+
+
+def work_precision(size: Size, others: list[Peer]) -> dict[str, Any]:
+    """The seven-body UAV, ours and all peers."""
+    curves = [curve(tracker(size.horizons), explicit(size.tolerances), others, size)]
+    return {"what": "time against error, uav_tracker case 2", "curves": curves}
+
+
+def published_problems(size: Size, others: list[Peer]) -> dict[str, Any]:
+    """Problems of the literature."""
+    curves = []
+    for problem in published()[: size.problems]:
+        # Dopri8 with both formulations; Tsit5 is compared on the seven bodies
+        ours = explicit(size.tolerances, redundant=problem.redundant)[::2]
+        curves.append(curve(problem, ours, others, size))
+    return {"what": "time against error, published problems", "curves": curves}
+
+
+def stiff_variants(size: Size, others: list[Peer]) -> dict[str, Any]:
+    """Sliders held by stiff servos, explicit and implicit methods."""
+    problems = stiff(size.horizons[-1])[-size.stiff_problems :]
+    curves = [curve(p, for_stiff(size.stiff_tolerances), others, size) for p in problems]
+    return {"what": "time against error, stiff variants", "curves": curves}

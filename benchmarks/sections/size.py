@@ -1,0 +1,56 @@
+"""How much of everything the suite runs: the measured run, and the smallest for tests."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Size:
+    """Extents of all sections.
+
+    Attributes:
+        horizons: [s]. tolerances, stiff_tolerances: from coarse to fine.
+        reference: tolerance of the reference run. methods: how many of our methods.
+        problems: how many of a list of problems; stiff_problems: from its end.
+        repeats: timed calls, as far as `budget` [s] allows.
+        evaluations: in a loop, to time one. batches: states evaluated together.
+        trajectories: in one batch, the middle one for all block sizes in `blocks`.
+        peer_trajectories: for the peers' throughput.
+        batch_tolerances: tried for `batch_error` [m] against runs at `tight`.
+        loops: of the four-bar chains; run_loops: those that are integrated, too.
+        gradient_horizon: [s]. parameters: of the gradient.
+        scenes: how many. span: of scenes and hexacopter [s].
+    """
+
+    horizons: tuple[float, ...] = (0.5, 1.0)
+    tolerances: tuple[float, ...] = tuple(10.0**-k for k in range(4, 13))
+    stiff_tolerances: tuple[float, ...] = (1e-4, 1e-6, 1e-8)
+    reference: float = 1e-13
+    methods: int = 9
+    problems: int = 9
+    stiff_problems: int = 1
+    repeats: int = 5
+    budget: float = 1.5
+    evaluations: int = 5000
+    batches: tuple[int, ...] = (64, 256, 1024)
+    trajectories: tuple[int, ...] = (64, 256, 1024)
+    blocks: tuple[int, ...] = (16, 64, 256)
+    peer_trajectories: int = 64
+    batch_tolerances: tuple[float, ...] = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
+    batch_error: float = 1e-6
+    tight: float = 1e-11
+    loops: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
+    run_loops: tuple[int, ...] = (1, 4, 16, 64)
+    gradient_horizon: float = 0.3
+    gradient_tolerances: tuple[float, ...] = (1e-6, 1e-8, 1e-10)
+    parameters: int = 20
+    scenes: int = 99
+    span: float = 2.0
+
+
+FULL = Size()
+ONE = Size(
+    horizons=(0.02,), tolerances=(1e-4, 1e-6), stiff_tolerances=(1e-4,), reference=1e-9, methods=1,
+    problems=1, repeats=1, budget=0.1, evaluations=10, batches=(2,), trajectories=(2,), blocks=(2,),
+    peer_trajectories=2, batch_tolerances=(1e-6,), tight=1e-9, loops=(1, 2), run_loops=(1,),
+    gradient_horizon=0.02, gradient_tolerances=(1e-6,), parameters=2, scenes=1, span=0.02,
+)  # fmt: skip

@@ -1,0 +1,101 @@
+"""The page docs/throughput.md from results/montecarlo.json, with its figure."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from shared.pages import Row, listed, save
+
+from stmuav_jax.files.netcdf import write_atomically
+
+PROGRAM = ("program", "tolerance or step", "per second", "median [m]", "largest [m]", "failure")
+
+
+def comparable(content: Row) -> list[Row]:
+    """Each program's fastest setting whose largest error is at most twice ours."""
+    ours = content["tried"][-1]["largest_error"]
+    found: dict[str, Row] = {}
+    for row in content["peers"]:
+        error = row.get("largest_error")
+        if error is None or not error <= 2 * ours:
+            continue
+        if row["per_second"] > found.get(row["method"], {"per_second": 0.0})["per_second"]:
+            found[row["method"]] = row
+    return list(found.values())
+
+
+def of_peer(row: Row) -> tuple[Any, ...]:
+    """A row of the table of other programs; flights that were lost have no throughput.
+
+    A rate of flights that stopped early says nothing, so it is left out, and the reason told.
+    """
+    figures = [row.get(key) for key in ("per_second", "median_error", "largest_error")]
+    setting = row.get("tolerance") or row.get("step") or "-"
+    failure = row["failure"]
+    if not all(x is not None and math.isfinite(x) for x in figures):
+        lost = row.get("not_finite")
+        who = "Some flights (how many was not recorded)" if lost is None else f"{lost} flights"
+        failure = failure or f"{who} ended with a state that is not finite."
+        return (row["method"], setting, "-", "-", "-", failure)
+    rate, median, largest = figures
+    return (row["method"], setting, f"{rate:.1f}", f"{median:.1e}", f"{largest:.1e}", failure)
+
+
+def figure(content: Row) -> Figure:
+    """Flights per second by lanes."""
+    drawn = Figure(figsize=(7.0, 3.2), layout="constrained")
+    ax = drawn.subplots()
+    lanes = [row["lanes"] for row in content["rows"]]
+    ax.plot(lanes, [row["per_second"] for row in content["rows"]], "o-", color="#0072B2")
+    ax.axhline(content["one_lane_per_second"], color="0.5", linestyle=":", label="one by one")
+    for peer, color in zip(comparable(content), ("#D55E00", "#009E73"), strict=False):
+        ax.axhline(peer["per_second"], color=color, linestyle="--", label=peer["method"])
+    ax.set_xscale("log", base=2)
+    ax.set_xticks(lanes, [str(k) for k in lanes])
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("flights that go on together (lanes)", fontsize=9)
+    ax.set_ylabel("flights per second, one core", fontsize=9)
+    ax.grid(True, color="0.85", linewidth=0.6)
+    ax.legend(fontsize=8)
+    return drawn
+
+
+def write_page(result: Path, page: Path) -> Path:
+    """Write page and figure; the page's path."""
+    content = json.loads(result.read_text())
+    about, rows, cores = content["environment"], content["rows"], content["cores"]
+    tried, one = content["tried"], "{:.1f}".format
+    (picture,) = save({"lanes": figure(content)}, page.parent / "figures" / "benchmarks", dpi=160)
+    dirty = " with changes" if about["dirty"] else ""
+    rate, error = max(row["per_second"] for row in rows), tried[-1]["largest_error"]
+    spent = lambda r: f"{100 * r['per_second'] / (r['devices'] * cores[0]['per_second']):.0f} %"
+    peers: list[Row] = [dict(zip(PROGRAM, of_peer(r), strict=True)) for r in content["peers"]]
+    lines = [
+        "# Throughput of studies", "",
+        "Made by `python benchmarks/montecarlo.py` from `benchmarks/results/montecarlo.json`; do not edit.",
+        "",
+        f"Flights of uav_tracker case 2 to {content['t1']:g} s, {content['flights']} of them, Dopri8 at "
+        f"{content['tolerance']:g}; medians. {about['cores']} cores, commit {about['commit'][:10]}"
+        f"{dirty}, {about['date'][:10]}.",
+        "", f"![lanes]({picture.relative_to(page.parent)})", "", "## One core", "",
+        *listed(rows, "lanes", ("flights per second", "per_second", one),
+                ("us per step and flight", "microseconds_per_step", one),
+                ("compile [s]", "compile_seconds", one), "failed"),
+        "", f"One by one: {one(content['one_lane_per_second'])} per second.", "", "## Error", "",
+        *listed(tried, ("tolerance", "tolerance", "{:g}".format),
+                ("median [m]", "median_error", "{:.1e}".format),
+                ("largest [m]", "largest_error", "{:.1e}".format)),
+        "", "## Other programs, one core", "", *listed(peers, *PROGRAM), "",
+        *(f"stmuav-jax completes {one(rate)} flights per second at a largest error of "
+          f"{error:.1e} m. {p['method']} completes "
+          f"{one(p['per_second'])} at {p['largest_error']:.1e} m, its fastest setting with at most twice "
+          f"that error: a ratio of {rate / p['per_second']:.2f}." for p in comparable(content)),
+        "", "## More cores, and the store", "",
+        *listed(cores, ("cores", "devices"), "flights", ("per second", "per_second", one),
+                ("efficiency", None, spent), ("with study and store", "per_second_stored", one),
+                ("overhead", "overhead", lambda x: f"{100 * x:.1f} %")),
+        "",
+    ]  # fmt: skip
+    return write_atomically(page, "\n".join(lines).encode())

@@ -1,0 +1,117 @@
+"""Timers of the benchmarks, on the clock and on the processor, and compilation apart from runs.
+
+Seconds of processor time are what the clock shows on an idle core, whatever else runs: for them
+run on one core (`taskset -c 1`, with OMP_NUM_THREADS=1).
+"""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+import stmuav_jax as stm
+
+# A call that `timed` measures is not repeated once this much is spent on it [s of the clock].
+BUDGET = 1.0
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of repeated calls, the first (warm-up) calls left out.
+
+    Attributes:
+        median, best: [s]. spread: from the first to the third quartile [s].
+        repeats: how many calls were timed.
+    """
+
+    median: float
+    best: float
+    spread: float
+    repeats: int
+
+    def to_dict(self) -> dict[str, float]:
+        """As plain numbers, for JSON."""
+        return asdict(self)
+
+
+class Cost(NamedTuple):
+    """Seconds of the processor and of the clock."""
+
+    processor: Timing
+    clock: Timing
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain numbers, for JSON."""
+        return {"processor": self.processor.to_dict(), "clock": self.clock.to_dict()}
+
+
+def summary(seconds: list[float]) -> Timing:
+    """Median, best and spread of measured seconds."""
+    ordered = sorted(seconds)
+    if len(ordered) < 2:
+        return Timing(ordered[0], ordered[0], 0.0, 1)
+    low, _, high = statistics.quantiles(ordered, n=4, method="inclusive")
+    return Timing(statistics.median(ordered), ordered[0], high - low, len(ordered))
+
+
+def measure(
+    call: Callable[[], Any], *, repeats: int = 5, warm_up: int = 1, budget: float = 20.0
+) -> tuple[Timing, Any]:
+    """Time `call`, and return its last output.
+
+    The clock stops when every array of the output is there (`jax.block_until_ready`, which
+    passes NumPy arrays and plain objects). No more calls are made once `budget` [s] is spent.
+    """
+    output = None
+    for _ in range(warm_up):
+        output = jax.block_until_ready(call())
+    seconds: list[float] = []
+    while len(seconds) < repeats and (not seconds or sum(seconds) < budget):
+        start = time.perf_counter()
+        output = jax.block_until_ready(call())
+        seconds.append(time.perf_counter() - start)
+    return summary(seconds), output
+
+
+def timed(call: Callable[..., Any], *arguments: Any, repeats: int = 3) -> tuple[Cost, Any]:
+    """Cost and output of a compiled call; slow calls are made once."""
+    seconds: list[float] = []
+
+    def once() -> Any:
+        start = time.process_time()
+        output = jax.block_until_ready(call(*arguments))
+        seconds.append(time.process_time() - start)
+        return output
+
+    clock, output = measure(once, repeats=repeats, warm_up=0, budget=BUDGET)
+    return Cost(summary(seconds), clock), output
+
+
+def compiled(
+    function: Callable[..., Any], *arguments: Any, clock: Callable[[], float] = time.perf_counter
+) -> tuple[Any, float]:
+    """The function compiled for arguments of these shapes, and the seconds for trace and all.
+
+    What JAX remembers of traces is dropped first: another function's would shorten this one's.
+    """
+    jax.clear_caches()
+    start = clock()
+    call: Any = stm.algebra.outer_jit(function)
+    done = call.lower(*arguments).compile()
+    return done, clock() - start
+
+
+def rounded(value: Any, digits: int = 4) -> Any:
+    """Significant digits of an array as a list, for JSON; what is not finite as None."""
+    flat = [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in np.ravel(value)]
+    return flat if np.ndim(value) else flat[0]
+
+
+def ready(tree: Any) -> Any:
+    """All arrays as NumPy arrays."""
+    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)

@@ -1,0 +1,23 @@
+"""Public names of this folder; `__init__.py` imports each when it is first used."""
+
+from . import rotation as rotation
+from .compiler import (
+    compiler_options as compiler_options,
+    outer_jit as outer_jit,
+)
+from .least_squares import (
+    Search as Search,
+    SearchReason as SearchReason,
+    search as search,
+)
+from .native import use_native_loops as use_native_loops
+from .sampled import (
+    Sampled as Sampled,
+)
+from .space import (
+    Angle as Angle,
+    Composite as Composite,
+    CyclicVector as CyclicVector,
+    Rotation as Rotation,
+    Vector as Vector,
+)

@@ -1,0 +1,235 @@
+"""Iterative minimisation of a loss, with progress, the best values so far, and restarts.
+
+The methods are those of optimistix, and through `optimistix.OptaxMinimiser` those of optax. This
+module adds what long searches need: every step can be observed, the best values are kept, a loss
+that is not finite ends the search, and a search can be interrupted and resumed.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
+
+from ..checks.errors import SettingError
+from ..checks.reason import AbstractReason
+from .compiler import quick_jit
+
+Method = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
+
+
+class SearchReason(AbstractReason):
+    """Reason why a search has ended."""
+
+    CONVERGED = 0
+    STEPS = 1
+    PATIENCE = 2
+    NOT_FINITE = 3
+    INTERRUPTED = 4
+
+
+@dataclass(frozen=True)
+class Search:
+    """State of a search: the best values so far and the history of the loss.
+
+    Attributes:
+        values: best values so far. loss: loss at these values.
+        history: losses at the start and after every step. best: step of the best values.
+        reason: reason for the end of the search if it stops at this step.
+    """
+
+    values: PyTree[Array]
+    loss: float
+    history: tuple[float, ...]
+    best: int
+    reason: SearchReason
+
+    @property
+    def steps(self) -> int:
+        """Number of steps taken, including those before a restart."""
+        return len(self.history) - 1
+
+    def words(self) -> str:
+        """Sentence that says how the search has ended."""
+        at = f"the best loss is {self.loss:.6g}, at step {self.best}"
+        return {
+            SearchReason.CONVERGED: f"Converged after {self.steps} steps; {at}.",
+            SearchReason.STEPS: f"Stopped after the {self.steps} steps allowed; {at}.",
+            SearchReason.PATIENCE: f"Stopped at step {self.steps}, no better for long; {at}.",
+            SearchReason.NOT_FINITE: (
+                f"The loss is not finite at step {self.steps}; what came before is kept: {at}."
+            ),
+            SearchReason.INTERRUPTED: f"Interrupted after {self.steps} steps; {at}.",
+        }[self.reason]
+
+
+def all_at_once(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Wrap a function so that its directional derivatives come from its whole Jacobian.
+
+    Methods that need the whole Jacobian get values and all columns in one pass; linearising first
+    would compile and evaluate the function, such as a simulation, once more.
+    """
+
+    @jax.custom_jvp
+    def of(values: Any) -> Any:
+        return function(values)
+
+    @of.defjvp
+    def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+        flat, unravel = ravel_pytree(primals[0])
+        along = ravel_pytree(tangents[0])[0]
+        push = lambda e: jax.jvp(function, primals, (unravel(e),))
+        out, columns = jax.vmap(push, out_axes=(0, -1))(jnp.eye(flat.shape[0], dtype=flat.dtype))
+        return jax.tree.map(lambda x: x[0], out), jax.tree.map(lambda J: J @ along, columns)
+
+    return of
+
+
+class _Stepper(eqx.Module):
+    """Optimisation method together with the function and the shape of its result."""
+
+    function: Callable[[Any], Any]
+    method: Method
+    shape: Any = eqx.field(static=True)
+
+    def of(self, values: Any, _: Any) -> tuple[Any, None]:
+        squares = isinstance(self.method, optx.AbstractLeastSquaresSolver)
+        function = all_at_once(self.function) if squares else self.function
+        return function(values), None
+
+    @quick_jit
+    def begin(self, values: Any) -> tuple[Any, Any]:
+        """Initial state of the method: its arrays, and the other leaves, which stay constant."""
+        state = self.method.init(self.of, values, None, {}, self.shape, None, frozenset())
+        return eqx.partition(state, eqx.is_array)
+
+    @quick_jit
+    def step(self, values: Any, arrays: Any, rest: Any) -> tuple[Any, Any, Any, Array, Array]:
+        """Next values and state, the values of known loss, their loss, and the flag of the end."""
+        state = eqx.combine(arrays, rest)
+        after, state, _ = self.method.step(self.of, values, None, {}, state, frozenset())
+        done, _ = self.method.terminate(self.of, after, None, {}, state, frozenset())
+        # a minimiser of optax knows the loss before its step, all other methods the loss after it
+        behind = isinstance(self.method, optx.OptaxMinimiser)
+        known, loss = (values, state.f) if behind else (after, state.f_info.as_min())
+        return after, eqx.filter(state, eqx.is_array), known, loss, done
+
+
+# Jitted, so that a second search for a function of the same form does not trace it again.
+@quick_jit
+def _called(function: Callable[[Any], Any], values: Any) -> Any:
+    return function(values)
+
+
+def search(
+    function: Callable[[Any], Any],
+    start: PyTree[Any],
+    method: Method,
+    *,
+    steps: int = 100,
+    patience: int = 20,
+    gain: float = 1e-3,
+    report: Callable[[Search], None] | None = None,
+    resume: Search | None = None,
+) -> Search:
+    """Minimise a loss, or the sum of squares of residuals, over the leaves of a pytree.
+
+    Args:
+        function: for a least-squares method such as `optimistix.LevenbergMarquardt`, a function
+            from values to residuals (any pytree); for a minimiser such as
+            `optimistix.OptaxMinimiser(optax.adam(1e-2), rtol, atol)`, from values to a loss ().
+        steps: largest number of steps in all.
+        patience: number of steps without a relative gain of `gain` after which the search ends.
+        report: progress callback at the start and after every step; a `KeyboardInterrupt` in it
+            or in a step ends the search.
+        resume: earlier search for the same function, continued from its best values.
+
+    Raises:
+        SettingError: steps or patience are not positive, the loss at the start is not finite, or
+            `resume` has values of another form.
+    """
+    for name, count in (("steps", steps), ("patience", patience)):
+        if count < 1:
+            raise SettingError(f"A search needs at least one of {name}, not {count}.")
+    values = jax.tree.map(lambda x: jnp.asarray(x, dtype=float), start)
+    if resume is not None:
+        _check_form(resume.values, values)
+        values = resume.values
+    shape = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype),
+        eqx.filter_eval_shape(_called, function, values),
+    )
+    stepper = _Stepper(function, method, shape)
+    return _go(stepper, values, resume, steps, patience, gain, report)
+
+
+def _go(
+    stepper: _Stepper,
+    values: Any,
+    now: Search | None,
+    steps: int,
+    patience: int,
+    gain: float,
+    report: Callable[[Search], None] | None,
+) -> Search:
+    begun = now is not None
+    mark, mark_loss = (now.steps, now.loss) if now is not None else (0, np.inf)
+    reason = SearchReason.STEPS
+    try:
+        arrays, rest = stepper.begin(values)
+        while now is None or now.steps < steps:
+            values, arrays, known, loss, done = stepper.step(values, arrays, rest)
+            if begun:
+                # the first step of a resumed search only evaluates the loss where it starts
+                begun = False
+                continue
+            now = _seen(now, known, float(loss))
+            if now.reason is SearchReason.NOT_FINITE:
+                return now
+            if report is not None:
+                report(now)
+            if now.loss < (1 - gain) * mark_loss:
+                mark, mark_loss = now.steps, now.loss
+            if bool(done):
+                reason = SearchReason.CONVERGED
+                break
+            if now.steps - mark >= patience:
+                reason = SearchReason.PATIENCE
+                break
+    except KeyboardInterrupt:
+        if now is None:
+            raise
+        reason = SearchReason.INTERRUPTED
+    assert now is not None
+    return Search(now.values, now.loss, now.history, now.best, reason)
+
+
+def _seen(now: Search | None, values: Any, loss: float) -> Search:
+    """Search after one more value of the loss."""
+    if now is None:
+        if not np.isfinite(loss):
+            raise SettingError(
+                f"The loss at the start of the search is {loss}: choose another start."
+            )
+        return Search(values, loss, (loss,), 0, SearchReason.STEPS)
+    history = (*now.history, loss)
+    if not np.isfinite(loss):
+        return Search(now.values, now.loss, history, now.best, SearchReason.NOT_FINITE)
+    if loss < now.loss:
+        return Search(values, loss, history, len(history) - 1, SearchReason.STEPS)
+    return Search(now.values, now.loss, history, now.best, SearchReason.STEPS)
+
+
+def _check_form(found: Any, wanted: Any) -> None:
+    shapes = lambda tree: jax.tree.map(jnp.shape, tree)
+    if jax.tree.structure(found) != jax.tree.structure(wanted) or shapes(found) != shapes(wanted):
+        raise SettingError(
+            "The search to go on with has values of another form: "
+            f"{shapes(found)}, where {shapes(wanted)} is wanted."
+        )

@@ -1,0 +1,224 @@
+"""`stmuav simulate`: one run of a scene, with its certificate, figures and loads."""
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+
+from ..checks.errors import SettingError, SimulationError
+from ..dynamics.choices import (
+    STEP_TOLERANCE,
+    STEPS_ALLOWED,
+    FormulationName,
+    SolverName,
+    StabilisationName,
+    formulation_named,
+    solver_named,
+    stabilisation_named,
+)
+from ..figures.terminal import line
+from ..scenes.registry import SCENES
+from .options import END, TOLERANCE, Number, count, default
+from .output import written
+from .scene_options import check_known, options_class, plain_of, scene_among
+
+if TYPE_CHECKING:
+    from ..dynamics.run import Run
+    from ..dynamics.scene import Scene
+
+# Saved times are kept in memory: a spacing far below a step's would ask for too many.
+SPACING = Number("spacing of the saved times", "s", above=1e-7, high=1e5)
+
+
+@dataclasses.dataclass
+class Settings:
+    """Options of a run and of its files, which all scenes share."""
+
+    case: Annotated[int | None, default("the scene's first choice")] = None
+    """Case of the report."""
+    t1: Annotated[float | None, END, default("the scene's own")] = None
+    """End [s]."""
+    rtol: Annotated[float, dataclasses.replace(TOLERANCE, what="relative tolerance")] = (
+        STEP_TOLERANCE
+    )
+    """Relative tolerance of a step."""
+    atol: Annotated[float, dataclasses.replace(TOLERANCE, what="absolute tolerance")] = (
+        STEP_TOLERANCE
+    )
+    """Absolute tolerance of a step [m, m/s, rad/s]."""
+    solver: SolverName = "dopri8"
+    """Explicit, or implicit for stiff scenes (kvaerno, rodas5p); auto looks at the start."""
+    formulation: FormulationName = "tree"
+    """Relative coordinates; or all bodies' by structure, densely, in the report's rows."""
+    stabilisation: StabilisationName = "projection"
+    """What keeps the constraints from drifting."""
+    save_every: Annotated[float | None, SPACING, default("the scene's own")] = None
+    """Spacing of the saved times [s]."""
+    max_steps: Annotated[int, count("steps allowed", 1e8)] = STEPS_ALLOWED
+    """Steps allowed between two saved times."""
+    error_estimate: bool = True
+    """Estimate the run's error by a second run beside it."""
+    params: Annotated[Path | None, default("the report's values")] = None
+    """TOML file with values that replace the table's."""
+    out: Annotated[Path | None, default("runs/SCENE")] = None
+    """Folder for the results."""
+    figures: Literal["png", "pdf", "svg", "none"] = "png"
+    """Format of the figures."""
+    loads: bool = False
+    """Also find the joints' reaction loads, peaks between saved times too; loads.csv, figure."""
+    cache: bool = True
+    """Keep compiled code in the user's cache folder for the next run."""
+
+
+ABOUT = """Simulate a scene; write run.nc, certificate.json and figures.
+
+Example: stmuav simulate uav_tracker --case 2 --t1 1 --loads. A scene has options of its own, such as
+--drag or --servo.stiffness 1e6: `stmuav simulate SCENE --help` lists them with these.
+"""
+
+_FIELDS = tuple(field.name for field in dataclasses.fields(Settings))
+_FLAGS = tuple(field.name for field in dataclasses.fields(Settings) if field.type is bool)
+
+
+def simulate_class(words: Sequence[str]) -> type:
+    """The command for tyro, with the options of the scene that the words after `simulate` name.
+
+    Its fields are scene, settings (a `Settings`) and, if the scene is known, options.
+
+    Raises:
+        SettingError: an option that the scene does not have.
+    """
+    flags = [f"--{no}{name}".replace("_", "-") for name in _FLAGS for no in ("", "no-")]
+    scene = scene_among(words, flags)
+    about = tyro.conf.arg(help="Which scene; see `stmuav list`.")
+    flat = tyro.conf.arg(name="")
+    fields: list[Any] = [
+        ("scene", Annotated[tyro.conf.Positional[Literal[tuple(SCENES)]], about]),  # pyright: ignore[reportInvalidTypeForm]
+        ("settings", Annotated[Settings, flat]),
+    ]
+    if scene is not None:
+        own = [f"--{name}".replace("_", "-") for name in _FIELDS]
+        check_known(scene, words, [*own, *flags, "--help"])
+        titled = tyro.conf.arg(name=scene)
+        own = options_class(scene)
+        fields.append(("options", Annotated[own, titled, tyro.conf.OmitArgPrefixes]))
+    cache = property(lambda command: command.settings.cache)
+    return dataclasses.make_dataclass(
+        "Simulate", fields, namespace={"__doc__": ABOUT, "cache": cache}
+    )
+
+
+def scene_of(command: Any) -> "Scene":
+    """The scene with its case, parameters and options."""
+    from ..files.netcdf import load_parameters
+    from ..scenes.registry import make_scene, options_from_plain
+
+    settings: Settings = command.settings
+    table = load_parameters(settings.params, SCENES[command.scene].parameters)
+    options = options_from_plain(command.scene, plain_of(command.scene, command.options))
+    scene = make_scene(command.scene, settings.case, table, **options)
+    if settings.loads and not scene.system.joints:
+        raise SettingError(f"--loads is for scenes with joints; {command.scene} has none.")
+    return scene
+
+
+def run_scene(scene: "Scene", settings: Settings, console: Console) -> "Run":
+    """Simulate the scene with a progress bar on stderr."""
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from ..dynamics.method import Method
+    from ..dynamics.simulation import simulate
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(f"{scene.name}: compiling", total=1.0)
+
+        def report(done: float) -> None:
+            bar.update(task, completed=done, description=f"{scene.name}: {100 * done:.0f} %")
+
+        method = Method(
+            formulation=formulation_named(settings.formulation),
+            solver=solver_named(settings.solver),
+            stabilisation=stabilisation_named(settings.stabilisation),
+            rtol=settings.rtol,
+            atol=settings.atol,
+            max_steps=settings.max_steps,
+        )
+        return simulate(
+            scene,
+            method=method,
+            t1=settings.t1,
+            save_every=settings.save_every,
+            error_estimate=settings.error_estimate,
+            throw=False,
+            progress=report,
+        )
+
+
+def write_results(run: "Run", settings: Settings) -> list[Path]:
+    """Write results, certificate and figures; their paths."""
+    from ..files.netcdf import save, save_certificate
+
+    folder = settings.out if settings.out is not None else Path("runs") / run.scene.name
+    paths = [save(run, folder / "run.nc"), save_certificate(run, folder / "certificate.json")]
+    if settings.figures != "none":
+        # matplotlib is slow to import: only where figures are drawn
+        from ..figures.plot import FIGURES, save_figures
+
+        paths += save_figures(FIGURES, folder, settings.figures, run)
+    return paths
+
+
+def write_loads(run: "Run", settings: Settings, folder: Path, out: Console) -> list[Path]:
+    """Write the joints' reaction loads, resolved between saved times; print their peaks."""
+    from ..dynamics.loads import resolved_loads
+    from ..figures.loads import loads_figure, loads_table, save_loads
+
+    loads = resolved_loads(run)
+    out.print(loads_table(run.scene, loads))
+    paths = [save_loads(run.scene, loads, folder / "loads.csv")]
+    if settings.figures != "none":
+        from ..figures.plot import save_figures
+
+        draw = {"loads": loads_figure}
+        paths += save_figures(draw, folder, settings.figures, run.scene, loads)
+    return paths
+
+
+def run_simulate(command: Any) -> int:
+    """Build and simulate the scene, print and write what comes out; the exit code."""
+    from ..figures.report import certificate_table
+
+    settings: Settings = command.settings
+    run = run_scene(scene_of(command), settings, Console(stderr=True))
+    clock = time.perf_counter()
+    paths = write_results(run, settings)
+    writing = time.perf_counter() - clock
+    out = Console()
+    out.print(certificate_table(run))
+    if settings.loads:
+        paths += write_loads(run, settings, paths[0].parent, out)
+    for note in run.scene.notes:
+        line(out, f"Note: {note}")
+    out.print(f"Results and figures {writing:.2f} s.", highlight=False)
+    written(out, paths)
+    if run.certificate.result == "interrupted":
+        return 130
+    if not run.successful:
+        raise SimulationError(f"{run.failure} What was reached is in {paths[0].parent}.")
+    return 0

@@ -1,0 +1,377 @@
+"""Consistent initial conditions: assembly of positions, projection of velocities, rank of rows."""
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from ...algebra.compiler import kept_jit
+from ...algebra.rotation import normalise
+from ...checks.errors import ModelError, StateError, concrete
+from ...checks.shapes import Numbers
+from ...mechanics.joint import CATALOGUE, Which, drive
+from ...mechanics.joint_coordinate import coordinate, free_coordinates
+from ...mechanics.state import State
+from ...mechanics.system import System, check_state
+from ..formulations.augmented import Augmented, Model, displace
+
+# A run ended in a singular posture if the smallest singular value is below this fraction of that at
+# its start.
+_SINGULAR = 1e-3
+
+Held = Literal["position", "orientation", "all"]
+
+
+class Assembly(eqx.Module):
+    """Result of the assembly of a mechanism by `assemble`.
+
+    Attributes:
+        state: positions on the constraints, and velocities compatible with them.
+        converged: true if the residuals are below the tolerance.
+        residuals: largest absolute position residual of each joint (joints,) [m] or [rad].
+        moved: largest displacement of a centre of mass [m].
+    """
+
+    state: State
+    converged: Bool[Array, ""]
+    residuals: Float[Array, " joints"]
+    moved: Float[Array, ""]
+
+
+def assemble(
+    system: System,
+    guess: State,
+    t: Numbers = 0.0,
+    *,
+    hold: Mapping[str, Held] | None = None,
+    hold_joints: tuple[str, ...] = (),
+    tolerance: float = 1e-11,
+    max_steps: int = 64,
+    throw: bool = True,
+) -> Assembly:
+    """Nearest state to a guess that satisfies the constraints.
+
+    Positions minimise the mass-weighted displacement from the guess,
+
+        sum_i m_i |dr_i|^2 + dtheta_i . J'_i dtheta_i,   subject to Phi = 0,
+
+    by Newton's method on the Lagrange conditions; the velocities with J qdot = target are the
+    nearest in the mass metric. Euler parameters of the guess are first divided by their norms.
+    The function may be jitted, vmapped and differentiated (implicit function theorem).
+
+    Args:
+        guess: state near the wanted one.
+        t: time of the drivers [s].
+        hold: fixed coordinates by body: its "position", its "orientation" or "all".
+        hold_joints: joints whose angle or displacement keeps its value; both of a cylindrical one.
+        tolerance: bound of the position residuals [m].
+        throw: raise an error without convergence, if values are concrete (not inside `jit`).
+
+    Raises:
+        StateError: there is no convergence; the message names the joint with the largest residual.
+            Or the guess is not finite, or has Euler parameters that are all zero.
+        ModelError: a name is unknown.
+    """
+    check_state(system, guess)
+    _check_guess(system, guess)
+    free = _free_coordinates(system, hold or {})
+    normal = State(guess.r, jax.vmap(normalise)(guess.p), guess.v, guess.omega)
+    locked = _lock(system, normal, hold_joints)
+    time = jnp.asarray(t, dtype=guess.r.dtype)
+    state, residuals = _assembled(locked, time, normal, jnp.asarray(free), max_steps)
+    worst = jnp.max(residuals, initial=0.0)
+    converged = jnp.isfinite(worst) & (worst <= tolerance)
+    moved = jnp.max(jnp.sqrt(jnp.sum((jax.lax.stop_gradient(state.r) - guess.r) ** 2, axis=1)))
+    result = Assembly(state, converged, residuals[: len(system.joints)], moved)
+    if throw and concrete(result) and not bool(converged):
+        names = [joint.name for joint in locked.joints]
+        k = int(np.nanargmax(np.where(np.isfinite(residuals), residuals, np.inf)))
+        raise StateError(
+            f"The mechanism could not be assembled from this guess: after {max_steps} steps at the "
+            f"most, joint '{names[k]}' is still open by {float(residuals[k]):.3g} m, or rad "
+            f"in its angles (tolerance {tolerance:.3g}). Start nearer to a posture "
+            "that closes, hold less, or check the lengths."
+        )
+    return result
+
+
+@kept_jit
+def _assembled(
+    system: System, t: Float[Array, ""], guess: State, free: Bool[Array, " k"], max_steps: int
+) -> tuple[State, Float[Array, " joints"]]:
+    """Assembled state and the largest position residual of each joint."""
+    model = Augmented().prepare(system)
+    state = velocities(model, t, _positions(model, t, guess, free, max_steps), free)
+    kin = system.kinematics(state)
+    value = jnp.abs(model.constraints.scales() * model.constraints.equations(t, kin).value)
+    owner = np.array(model.constraints.owner, dtype=int)
+    belongs = np.eye(len(system.joints))[owner].reshape(owner.size, len(system.joints))
+    return state, jnp.max(value[:, None] * belongs, axis=0, initial=0.0)
+
+
+def _check_guess(system: System, guess: State) -> None:
+    if not concrete(guess):
+        return
+    for k, name in enumerate(system.names):
+        parts = [np.asarray(x)[k] for x in (guess.r, guess.p, guess.v, guess.omega)]
+        if not all(np.all(np.isfinite(part)) for part in parts):
+            raise StateError(f"The guess for body '{name}' must be finite.")
+        if not np.any(parts[1]):
+            raise StateError(f"The Euler parameters of body '{name}' are all zero.")
+
+
+def _free_coordinates(system: System, hold: Mapping[str, Held]) -> np.ndarray:
+    """Mask of the 6 n coordinates that may move."""
+    free = np.ones((system.n_bodies, 6), dtype=bool)
+    columns = {"position": slice(0, 3), "orientation": slice(3, 6), "all": slice(0, 6)}
+    for name, what in hold.items():
+        if what not in columns:
+            raise ModelError(
+                f"What to hold of body '{name}' must be one of {', '.join(columns)}, not '{what}'."
+            )
+        free[system.index(name), columns[what]] = False
+    return free.reshape(-1)
+
+
+def _lock(system: System, state: State, names: tuple[str, ...]) -> System:
+    """System with the coordinates of the named joints locked at their present values."""
+    if not names:
+        return system
+    kin = system.kinematics(state)
+    locks = []
+    for name in names:
+        joint = system.joints[system.joint_index(name)]
+        free = free_coordinates(joint) or ["angle"]
+        # a screw's angle and displacement are one freedom; the driver refuses a joint that
+        # leaves none free
+        for which in free[-max(len(CATALOGUE[joint.kind].motion or ()), 1) :]:
+            value = coordinate(kin, joint, which).value
+            locks.append(drive(f"hold {name}", joint, _Constant(value), coordinate=which))
+    return eqx.tree_at(lambda s: s.joints, system, (*system.joints, *locks))
+
+
+class _Constant(eqx.Module):
+    value: Float[Array, ""]
+
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        del t
+        return self.value
+
+
+def _positions(
+    model: Model, t: Float[Array, ""], guess: State, free: Bool[Array, " k"], max_steps: int
+) -> State:
+    """Newton's method on M step - J^T multipliers = 0, Phi = 0 for the step from the guess."""
+    m = model.constraints.n_rows
+    if not m:
+        return guess
+    bodies = model.system.bodies
+
+    def moved(step: Array, base: State) -> State:
+        r, p = displace(base.r, base.p, step.reshape(-1, 6))
+        return State(r, p, guess.v, guess.omega)
+
+    def residual(unknown: tuple[Array, Array], args: tuple[Model, State]) -> tuple[Array, Array]:
+        step, multipliers = unknown
+        within, base = args
+        phi = lambda s: (
+            within.constraints.equations(t, within.system.kinematics(moved(s, base))).value
+        )
+        value, pull = jax.vjp(phi, step)
+        by_body = step.reshape(-1, 6)
+        mass = within.system.bodies
+        weighed = jnp.concatenate(
+            [
+                mass.mass[:, None] * by_body[:, :3],
+                jnp.einsum("nab,nb->na", mass.inertia, by_body[:, 3:]),
+            ],
+            axis=1,
+        ).reshape(-1)
+        gradient = (weighed - pull(multipliers)[0]) / size
+        return jnp.where(free, gradient, step), value
+
+    # one scale for the gradient rows gives both parts the unit of a length
+    size = jnp.sum(bodies.mass)
+    start = (jnp.zeros(6 * model.system.n_bodies, guess.r.dtype), jnp.zeros(m, guess.r.dtype))
+    solver = optx.Newton(rtol=1e-12, atol=1e-13, linear_solver=lx.SVD(rcond=1e-11))
+    adjoint = optx.ImplicitAdjoint(linear_solver=lx.SVD(rcond=1e-11))
+    solution = optx.root_find(
+        residual,
+        solver,
+        start,
+        args=(model, guess),
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=False,
+    )
+    return moved(solution.value[0], guess)
+
+
+def velocities(model: Model, t: Float[Array, ""], state: State, free: Bool[Array, " k"]) -> State:
+    """Velocities with J qdot = target that are nearest in the mass metric."""
+    if not model.constraints.n_rows:
+        return state
+    eq = model.constraints.equations(t, model.system.kinematics(state))
+    weighed = model.weigh(eq.J * free.reshape(-1, 6)).reshape(eq.matrix.shape) * free
+    u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
+    S = lx.MatrixLinearOperator(weighed @ (eq.matrix * free).T)
+    # the second pass removes the round-off of the first
+    for _ in range(2):
+        off = eq.matrix @ u - eq.target
+        u = u - weighed.T @ lx.linear_solve(S, off, lx.SVD(rcond=1e-11), throw=False).value
+    u = u.reshape(-1, 6)
+    return State(state.r, state.p, u[:, :3], u[:, 3:])
+
+
+class Rank(NamedTuple):
+    """Rank of the constraint Jacobian at one posture.
+
+    Attributes:
+        rows: number of constraint rows. rank: number of independent rows.
+        dof: degrees of freedom, 6 n - rank.
+        smallest: smallest non-zero singular value of the velocity Jacobian.
+        redundant: names of joints that own a dependent row, by pivoting.
+    """
+
+    rows: int
+    rank: int
+    dof: int
+    smallest: float
+    redundant: tuple[str, ...]
+
+
+def rank(system: System, state: State, t: float = 0.0) -> Rank:
+    """Rank and redundant rows of the constraint Jacobian in (v, omega'), for concrete values."""
+    return rank_of(system, Augmented().prepare(system), state, t)
+
+
+def rank_of(
+    system: System,
+    model: Model,
+    state: State,
+    t: float = 0.0,
+    values: np.ndarray | None = None,
+    *,
+    tolerance: float = 1e-9,
+) -> Rank:
+    """Rank as by `rank`, for a prepared model and with the singular values if they are known.
+
+    Singular values below `tolerance` times the largest count as zero.
+    """
+    owner, columns = model.constraints.owner, 6 * system.n_bodies
+    if not owner:
+        return Rank(0, 0, columns, float("inf"), ())
+    if values is None:
+        values = np.linalg.svd(jacobian(model, state, t), compute_uv=False)
+    count = int(np.sum(values > tolerance * values[0]))
+    names: tuple[str, ...] = ()
+    if count < len(owner):
+        dependent = _dependent_rows(jacobian(model, state, t), count)
+        names = tuple(dict.fromkeys(system.joints[owner[k]].name for k in dependent))
+    return Rank(len(owner), count, columns - count, float(values[count - 1]), names)
+
+
+def ranks(
+    system: System, states: State, t: float = 0.0, *, tolerance: float = 1e-9
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rank, and the smallest non-zero singular value, of the constraint Jacobian at k postures.
+
+    Args:
+        states: states (k, n, .). tolerance: values below it times the largest count as zero.
+
+    Returns:
+        Integers (k,) and values (k,), for the unscaled Jacobian in (v, omega').
+    """
+    model = Augmented().prepare(system)
+    values = np.asarray(_singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
+    count = np.sum(values > tolerance * values[:, :1], axis=1)
+    return count, np.take_along_axis(values, count[:, None] - 1, axis=1)[:, 0]
+
+
+@kept_jit
+def _singular_values(model: Model, states: State, t: Float[Array, ""]) -> Float[Array, "k m"]:
+    matrices = jax.vmap(lambda state: _jacobian(model, state, t))(states)
+    return jnp.linalg.svd(matrices, compute_uv=False)
+
+
+def _dependent_rows(J: np.ndarray, count: int) -> list[int]:
+    """Rows that Gram-Schmidt orthogonalisation with row pivoting leaves after `count` rows."""
+    rest = J.copy()
+    order = list(range(len(J)))
+    for k in range(count):
+        sizes = np.linalg.norm(rest[order[k:]], axis=1)
+        pick = k + int(np.argmax(sizes))
+        order[k], order[pick] = order[pick], order[k]
+        direction = rest[order[k]] / np.linalg.norm(rest[order[k]])
+        rest = rest - np.outer(rest @ direction, direction)
+    return sorted(order[count:])
+
+
+def weakest_rows(
+    system: System, model: Model, state: State, t: float, rank: int
+) -> tuple[float, tuple[str, ...]]:
+    """Singular value number `rank` of the constraint Jacobian, and the joints of its rows.
+
+    Returns:
+        The value, and the names of joints: drivers first, then those that own at least a tenth
+        of the corresponding combination of rows, the largest share first.
+    """
+    vectors, values, _ = np.linalg.svd(jacobian(model, state, t), full_matrices=False)
+    share = np.zeros(len(system.joints))
+    np.add.at(share, np.array(model.constraints.owner), vectors[:, rank - 1] ** 2)
+    driver = np.array([joint.kind.startswith("drive") for joint in system.joints])
+    order = np.lexsort((-share, ~driver))
+    named = [k for k in order if share[k] >= (1e-6 if driver[k] else 0.1)]
+    return float(values[rank - 1]), tuple(system.joints[k].name for k in named)
+
+
+def singular_posture(system: System, states: State, t: float, rank: int) -> str:
+    """Text on a run that ended in a singular posture, with joints and drivers; else "".
+
+    Args:
+        states: first and last state of the run (2, n, .). t: time of the last [s].
+        rank: rank at the start.
+    """
+    if not rank:
+        return ""
+    model = Augmented().prepare(system)
+    values = np.asarray(_singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
+    if not values[-1, rank - 1] < _SINGULAR * values[0, rank - 1]:
+        return ""
+    state = State(*(x[-1] for x in (states.r, states.p, states.v, states.omega)))
+    smallest, names = weakest_rows(system, model, state, t, rank)
+    return (
+        f"the mechanism comes to a singular posture of {_standing(system, state, names)}: the "
+        f"smallest singular value of the constraint Jacobian is {smallest:.3g} there and "
+        f"{values[0, rank - 1]:.3g} at the start. What these joints or drivers demand takes "
+        "unbounded velocities or forces; lead the motion around that posture"
+    )
+
+
+def _standing(system: System, state: State, names: tuple[str, ...]) -> str:
+    """Names of joints with their present angles and displacements, where one is free."""
+    kin = system.kinematics(state)
+    units: dict[Which, str] = {"angle": "rad", "shift": "m"}
+    found = []
+    for name in names:
+        joint = system.joints[system.joint_index(name)]
+        free = free_coordinates(joint)
+        at = [f"{float(coordinate(kin, joint, w).value):.6g} {units[w]}" for w in free]
+        found.append(f"{name} (at {', '.join(at)})" if at else name)
+    return ", ".join(found)
+
+
+def jacobian(model: Model, state: State, t: float = 0.0) -> np.ndarray:
+    """Constraint Jacobian in (v, omega') as a NumPy matrix (m, 6 n)."""
+    return np.asarray(_jacobian(model, state, jnp.asarray(t, dtype=state.r.dtype)))
+
+
+@kept_jit
+def _jacobian(model: Model, state: State, t: Float[Array, ""]) -> Float[Array, "m k"]:
+    return model.constraints.equations(t, model.system.kinematics(state)).matrix

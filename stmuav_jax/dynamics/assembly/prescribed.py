@@ -1,0 +1,301 @@
+"""Prescribed motion of mechanisms: kinematics on three levels, and the efforts of the drivers.
+
+With as many drivers as there are degrees of freedom, positions follow from Phi(q, t) = 0
+by Newton's method, velocities and accelerations from J qdot = target and J qddot = gamma.
+The multiplier of a driver's row is the effort that its motor needs.
+
+Source: report Part I, Eq. 4.1 to 4.6; P. E. Nikravesh, Computer-Aided Analysis of
+Mechanical Systems (1988), ch. 5 (kinematic) and 11 (inverse dynamic analysis).
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ...algebra.compiler import kept_jit
+from ...checks.errors import ModelError, StateError, concrete
+from ...checks.reason import AbstractReason, first_reason
+from ...mechanics.joint import Motion, drive
+from ...mechanics.joint_coordinate import choose
+from ...mechanics.state import State
+from ...mechanics.system import System, check_state
+from ..formulations.augmented import Augmented, Model, displace
+from ..formulations.stabilisation import Unstabilised
+
+_MOST_STEPS = 30
+# Newton's steps are limited to this displacement [m] or rotation [rad].
+_LONGEST_STEP = 0.1
+# Singular values below this fraction of the largest count as zero.
+_SINGULAR = 1e-8
+
+
+class PathReason(AbstractReason):
+    """Reason why a path of prescribed motion stops; the first that applies."""
+
+    VALID = 0
+    NOT_CONVERGED = 1
+    SINGULAR = 2
+    BRANCH = 3
+    AFTER_FAILURE = 4
+
+
+class KinematicPath(eqx.Module):
+    """Positions, velocities and accelerations of all bodies under prescribed motion.
+
+    Attributes:
+        ts: times (k,) [s]. states: states (k, n, .), NaN after a failure.
+        v_rate: accelerations, world (k, n, 3) [m/s^2]. omega_rate: body axes [rad/s^2].
+        reason: codes of `PathReason` (k,).
+        residual: largest constraint residual (k,).
+        smallest: ratio of the smallest to the largest singular value of the Jacobian in
+            (v, omega') (k,), zero at a singularity.
+    """
+
+    ts: Float[Array, " k"]
+    states: State
+    v_rate: Float[Array, "k n 3"]
+    omega_rate: Float[Array, "k n 3"]
+    reason: Int[Array, " k"]
+    residual: Float[Array, " k"]
+    smallest: Float[Array, " k"]
+
+
+def driven(system: System, motions: Mapping[str, Motion]) -> System:
+    """System with a driver in each of the named joints, called "drive <joint>".
+
+    Args:
+        motions: functions by joint, from t [s] to its angle [rad] or displacement [m], which is
+            zero at the system's reference posture.
+
+    Raises:
+        ModelError: a joint is unknown, or leaves no coordinate free, or two.
+    """
+    drivers = []
+    for name, motion in motions.items():
+        joint = system.joints[system.joint_index(name)]
+        which = choose(joint, None, f"The driver in joint '{name}'")
+        drivers.append(drive(f"drive {name}", joint, motion, coordinate=which))
+    return eqx.tree_at(lambda s: s.joints, system, (*system.joints, *drivers))
+
+
+def kinematic_path(
+    system: System,
+    guess: State,
+    ts: Float[Array, " k"],
+    *,
+    hold: tuple[str, ...] = (),
+    tolerance: float = 1e-12,
+    longest: float = 0.2,
+    throw: bool = True,
+) -> KinematicPath:
+    """Motion that a system's drivers determine, continued along the times ts.
+
+    Newton's method computes every posture from the one before, extrapolated by its velocities and
+    accelerations. The result is accepted only if it is no further than `longest` from the
+    extrapolation and, for equal numbers of rows and unknowns, the determinant of the Jacobian
+    keeps its sign: a path ends where that fails and never continues on another branch. The path
+    is differentiable (implicit function theorem), and the function may be jitted.
+
+    Args:
+        guess: state near the posture at ts[0]; it determines the branch.
+        hold: bodies that keep their pose of the guess.
+        tolerance: bound of the residuals [m]. longest: bound [m] or [rad].
+        throw: raise an error if the path stops, for concrete values.
+
+    Raises:
+        ModelError: the motion is not determined; says how many degrees of freedom are left.
+        StateError: the path stops; says at which time and why.
+    """
+    check_state(system, guess)
+    held = {system.index(name) for name in hold}
+    free = tuple(6 * b + k for b in range(system.n_bodies) if b not in held for k in range(6))
+    times = jnp.asarray(ts, dtype=guess.r.dtype)
+    path = _path(system, guess, times, free, jnp.asarray(tolerance), jnp.asarray(longest))
+    if throw and concrete(path):
+        _check(system, path, guess, free)
+    return path
+
+
+def _check(system: System, path: KinematicPath, guess: State, free: tuple[int, ...]) -> None:
+    bad = np.flatnonzero(np.asarray(path.reason))
+    if not len(bad):
+        return
+    k, code = int(bad[0]), PathReason(int(path.reason[bad[0]]))
+    if code is PathReason.SINGULAR and k == 0:
+        model = Augmented().prepare(system)
+        J = model.constraints.equations(path.ts[0], system.kinematics(guess)).matrix[
+            :, np.array(free)
+        ]
+        rank = int(np.linalg.matrix_rank(np.asarray(J), tol=_SINGULAR))
+        left = len(free) - rank
+        raise ModelError(
+            f"The motion is not determined: {left} degree(s) of freedom are left. Give as many "
+            "drivers as there are (stmuav_jax.driven), or hold a body."
+        )
+    why = {
+        PathReason.NOT_CONVERGED: "no posture satisfies the joints and drivers near the one before",
+        PathReason.SINGULAR: "the mechanism is in a singular posture",
+        PathReason.BRANCH: "the posture found belongs to another branch",
+    }[code]
+    raise StateError(
+        f"The path stops at t = {float(path.ts[k]):.6g} s: {why} (largest residual "
+        f"{float(path.residual[k]):.3g}, smallest singular value {float(path.smallest[k]):.3g} of the "
+        "largest). Take closer times, another path, or throw=False to keep what was reached."
+    )
+
+
+class _At(NamedTuple):
+    """Posture on the path, with its rates and the sign of the determinant."""
+
+    state: State
+    rate: Float[Array, "n 6"]
+    acceleration: Float[Array, "n 6"]
+    t: Float[Array, ""]
+    sign: Float[Array, ""]
+    lost: Bool[Array, ""]
+
+
+@kept_jit
+def _path(
+    system: System, guess: State, ts: Any, free: tuple[int, ...], tolerance: Any, longest: Any
+) -> KinematicPath:
+    model = Augmented().prepare(system)
+    n = system.n_bodies
+    columns = np.array(free)
+
+    def spread(x: Array) -> Array:
+        return jnp.zeros(6 * n, x.dtype).at[columns].set(x).reshape(n, 6)
+
+    def next_one(at: _At, t: Array) -> tuple[_At, Any]:
+        h = t - at.t
+        ahead = h * at.rate + 0.5 * h**2 * at.acceleration
+        r, p = displace(at.state.r, at.state.p, ahead)
+        found, moved, residual = _closed(
+            model, t, State(r, p, at.rate[:, :3], at.rate[:, 3:]), columns, tolerance
+        )
+        now, smallest, sign = _rates(model, t, found, columns, spread)
+        reason = first_reason(
+            (at.lost, PathReason.AFTER_FAILURE),
+            (~(residual <= tolerance), PathReason.NOT_CONVERGED),
+            (~(smallest > _SINGULAR), PathReason.SINGULAR),
+            ((moved > longest) | (sign * at.sign < 0), PathReason.BRANCH),
+        )
+        fine = reason == 0
+        keep = lambda x, y: jax.tree.map(lambda a, b: jnp.where(fine, a, b), x, y)
+        state, rate, acceleration = keep(now, (at.state, at.rate, at.acceleration))
+        hide = lambda x: jnp.where(fine, x, jnp.nan)
+        out = (jax.tree.map(hide, (now[0], now[2])), reason, residual, smallest)
+        after = _At(state, rate, acceleration, t, jnp.where(fine, sign, at.sign), ~fine)
+        return after, out
+
+    none = jnp.zeros((n, 6), guess.r.dtype)
+    first = _At(guess, none, none, ts[0], jnp.zeros(()), jnp.asarray(False))
+    _, (found, reason, residual, smallest) = jax.lax.scan(next_one, first, ts)
+    states, rates = found
+    return KinematicPath(ts, states, rates[..., :3], rates[..., 3:], reason, residual, smallest)
+
+
+def _closed(
+    model: Model, t: Array, start: State, columns: np.ndarray, tolerance: Any
+) -> tuple[State, Array, Array]:
+    """Nearest posture that satisfies all rows, the largest displacement, the largest residual."""
+    n = start.r.shape[0]
+
+    def look(model: Model, t: Array, state: State) -> tuple[Array, Array]:
+        eq = model.constraints.equations(t, model.system.kinematics(state))
+        return eq.value, eq.matrix[:, columns]
+
+    def step(value: Array, J: Array) -> Array:
+        return jnp.zeros(6 * n, value.dtype).at[columns].set(_solve(J, -value)).reshape(n, 6)
+
+    def move(state: State, by: Array) -> State:
+        r, p = displace(state.r, state.p, by)
+        return State(r, p, state.v, state.omega)
+
+    def size(model: Model, value: Array) -> Array:
+        return jnp.max(jnp.abs(model.constraints.scales() * value), initial=0.0)
+
+    arrays, rest = eqx.partition((model, t, start), eqx.is_array)
+    fixed, t_fixed, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
+    # stopped once more on the results: a driver's function may hold traced numbers of its own
+    still = lambda state: jax.lax.stop_gradient(look(fixed, t_fixed, state))
+
+    def more(now: tuple[State, Array, Array]) -> Array:
+        return (now[2] < _MOST_STEPS) & (now[1] > tolerance)
+
+    def again(now: tuple[State, Array, Array]) -> tuple[State, Array, Array]:
+        by = step(*still(now[0]))
+        by = by * jnp.minimum(1.0, _LONGEST_STEP / jnp.maximum(jnp.max(jnp.abs(by)), 1e-300))
+        new = move(now[0], by)
+        return new, size(fixed, still(new)[0]), now[2] + 1
+
+    worst = size(fixed, still(begin)[0])
+    state, _, _ = jax.lax.while_loop(more, again, (begin, worst, jnp.asarray(0)))
+    # one more step, with the derivatives that the iteration does not propagate
+    value, J = look(model, t, state)
+    state = move(state, step(value, jax.lax.stop_gradient(J)))
+    residual = size(model, look(model, t, state)[0])
+    away = jnp.abs(state.r - start.r)
+    turned = 2 * jnp.sqrt(jnp.maximum(0.0, 2 * (1 - jnp.abs(jnp.sum(state.p * start.p, axis=1)))))
+    moved = jnp.maximum(jnp.max(away), jnp.max(turned))
+    return state, moved, residual
+
+
+def _solve(J: Float[Array, "m k"], b: Float[Array, " m"]) -> Float[Array, " k"]:
+    """Least-squares solution of J x = b, of minimum norm if J does not determine it."""
+    return lx.linear_solve(lx.MatrixLinearOperator(J), b, lx.SVD(rcond=1e-12), throw=False).value
+
+
+def _rates(
+    model: Model, t: Array, state: State, columns: np.ndarray, spread: Any
+) -> tuple[tuple[State, Array, Array], Array, Array]:
+    """State with velocities, rates and accelerations; smallest singular value; sign of det J."""
+
+    def level(state: State) -> Any:
+        eq = model.constraints.equations(t, model.system.kinematics(state))
+        return eq, eq.matrix[:, columns]
+
+    eq, J = level(state)
+    u = spread(_solve(J, eq.target))
+    moving = State(state.r, state.p, u[:, :3], u[:, 3:])
+    a = spread(_solve(J, level(moving)[0].gamma))
+    values = jnp.linalg.svd(jax.lax.stop_gradient(J), compute_uv=False)
+    enough = J.shape[0] >= J.shape[1]
+    smallest = values[-1] / values[0] if enough else jnp.zeros(())
+    square = J.shape[0] == J.shape[1]
+    sign = jnp.linalg.slogdet(jax.lax.stop_gradient(J))[0] if square else jnp.zeros(())
+    return (moving, u, a), smallest, sign
+
+
+def driver_efforts(system: System, states: State, ts: Float[Array, " k"]) -> dict[str, Array]:
+    """Effort of every driver along a motion, by the driver's name: (k,) [N] or [N m].
+
+    It acts on body j of the driven joint and with the opposite sign on body i, in the direction
+    of the coordinate, like that of `JointEffort`. The function is pure: it may be jitted and
+    differentiated.
+
+    Args:
+        states: states that satisfy joints and drivers (k, n, .), from `simulate`, `integrate` or
+            `kinematic_path`. ts: their times [s].
+
+    Raises:
+        ModelError: the system has no drivers.
+    """
+    drivers = {j.name: k for k, j in enumerate(system.joints) if j.kind.startswith("drive_")}
+    if not drivers:
+        raise ModelError("The system has no drivers: add them with stmuav_jax.driven.")
+    formulation = Augmented()
+    model = formulation.prepare(system)
+    owner = list(model.constraints.owner)
+
+    def one(state: State, t: Array) -> Array:
+        return formulation.accelerations(model, t, state, Unstabilised()).multipliers
+
+    found = jax.vmap(one)(states, jnp.asarray(ts, dtype=states.r.dtype))
+    return {name: found[:, owner.index(k)] for name, k in drivers.items()}

@@ -1,0 +1,1 @@
+"""Integration in time of any formulation, on top of diffrax. Floor 5."""

@@ -1,0 +1,212 @@
+"""Reaction loads for the sizing of joints: histories, envelopes and peaks.
+
+A reaction is the load of body i on body j at a joint: force, and moment about the joint's point on
+body j, in the axes of the joint's frame fixed in body i (z along the joint's axis, if it has one).
+Loads along one or many time histories can be differentiated, and mapped over runs. Peaks may be far
+shorter than the spacing of saved times: `resolved_loads` adds times until every visible peak is
+resolved.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..algebra.compiler import in_blocks, kept_jit
+from ..algebra.derivative import safe_norm
+from ..checks.errors import SettingError, concrete
+from ..checks.shapes import Numbers
+from ..mechanics.state import State
+from ..mechanics.system import System
+from .formulations.base import AbstractFormulation, Reactions
+from .formulations.reactions import in_joint_axes
+from .formulations.stabilisation import Unstabilised
+from .integration.problem import at_internal
+from .interpolation import between
+from .run import Run
+from .tree.formulation import Tree
+
+# Load components that size a joint; the last axis of `JointLoads.components`, with units.
+COMPONENTS = ("F_x", "F_y", "F_z", "|F|", "M_x", "M_y", "M_z", "|M|")
+UNITS = ("N",) * 4 + ("N m",) * 4
+
+_BLOCK = 64  # number of times in one call, so that all calls share one compilation
+_ROUNDS = 12  # largest number of halvings of the spacing of saved times
+
+
+class JointLoads(eqx.Module):
+    """Reaction loads at every joint over time, with optional leading axes (runs).
+
+    Attributes:
+        ts: times (*b, k) [s].
+        force: force on body j, axes of the joint's frame on body i (*b, k, joints, 3) [N].
+        moment: moment about the joint's point on body j, same axes (*b, k, joints, 3) [N m].
+        joints: names of the joints.
+    """
+
+    ts: Float[Array, "*b k"]
+    force: Float[Array, "*b k joints 3"]
+    moment: Float[Array, "*b k joints 3"]
+    joints: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def components(self) -> Float[Array, "*b k joints 8"]:
+        """Force and its magnitude [N], moment and its magnitude [N m]: see `COMPONENTS`."""
+        parts = []
+        for vector in (self.force, self.moment):
+            parts += [vector, safe_norm(vector, axis=-1)[..., None]]
+        return jnp.concatenate(parts, axis=-1)
+
+
+class Envelope(eqx.Module):
+    """Minimum and maximum of each load component at every joint, and where they occur.
+
+    Attributes:
+        least, most: minimum and maximum (joints, 8) [N], [N m], columns as in `COMPONENTS`.
+        t_least, t_most: times of the extremes (joints, 8) [s].
+        run_least, run_most: indices of their runs in a flattened batch (joints, 8).
+        joints: names of the joints.
+    """
+
+    least: Float[Array, "joints 8"]
+    most: Float[Array, "joints 8"]
+    t_least: Float[Array, "joints 8"]
+    t_most: Float[Array, "joints 8"]
+    run_least: Int[Array, "joints 8"]
+    run_most: Int[Array, "joints 8"]
+    joints: tuple[str, ...] = eqx.field(static=True)
+
+
+def joint_loads(
+    system: System,
+    ts: Float[Array, " k"],
+    states: State,
+    formulation: AbstractFormulation | None = None,
+    internal: Float[Array, "k m"] | None = None,
+) -> JointLoads:
+    """Reaction loads of states (k, n, .) at times ts (k,) [s], such as those of `integrate`.
+
+    The function is pure: it may be jitted, vmapped and differentiated. With dependent rows in a
+    loop the reactions are not determined: `Tree(redundant=True)` gives those of minimum norm.
+
+    Args:
+        formulation: default `Tree()`.
+        internal: actuator states of the forces (k, m), if any; by default those that they hold.
+    """
+    how = formulation if formulation is not None else Tree()
+    model: Any = how.prepare(system)
+
+    def one(t: Float[Array, ""], state: State, z: Float[Array, " m"] | None) -> Reactions:
+        now = model if z is None else at_internal(model, z)
+        result = how.accelerations(now, t, state, Unstabilised())
+        return in_joint_axes(system, state, how.reactions(now, t, state, result))
+
+    found = jax.vmap(one)(ts, states, internal)
+    return JointLoads(ts, found.force, found.moment, tuple(j.name for j in system.joints))
+
+
+def run_loads(run: Run) -> JointLoads:
+    """Reaction loads at the saved times of a run, from its analysis."""
+    system, ts = run.scene.system, jnp.asarray(run.ts)
+    states, world = jax.tree.map(jnp.asarray, (run.states, run.snapshot.reactions))
+    found = _turned(system, states, world)
+    return JointLoads(ts, found.force, found.moment, tuple(j.name for j in system.joints))
+
+
+@kept_jit
+def _turned(system: System, states: State, world: Reactions) -> Reactions:
+    return jax.vmap(lambda state, found: in_joint_axes(system, state, found))(states, world)
+
+
+def resolved_loads(run: Run, rtol: float = 0.01) -> JointLoads:
+    """Reaction loads of a run at its saved times and at further times that resolve the peaks.
+
+    Every interval is quartered, and halved further until the load at its middle is within rtol of
+    the joint's largest force and moment from the straight line between its ends. A peak shorter
+    than a quarter of the spacing of saved times, invisible at these times, is missed.
+
+    Raises:
+        SettingError: rtol is not positive.
+    """
+    if not rtol > 0:
+        raise SettingError(f"The loads' rtol must be positive, but it is {rtol}.")
+    first = run_loads(run)
+    ts = np.asarray(run.ts)
+    values = np.concatenate([np.asarray(first.force), np.asarray(first.moment)], axis=-1)
+    todo = np.stack([ts[:-1], ts[1:]], axis=1)[: len(ts) * len(first.joints)]
+    for turn in range(_ROUNDS):
+        if not len(todo):
+            break
+        middle = todo.mean(axis=1)
+        fresh = _between(run, middle)
+        ends = values[np.searchsorted(ts, todo)]
+        order = np.argsort(np.concatenate([ts, middle]), kind="stable")
+        ts = np.concatenate([ts, middle])[order]
+        values = np.concatenate([values, fresh])[order]
+        off = np.abs(fresh - ends.mean(axis=1)).reshape(*fresh.shape[:2], 2, 3)
+        peak = np.linalg.norm(values.reshape(-1, *off.shape[1:]), axis=-1).max(axis=0)
+        # a joint whose load is mere round-off needs no further times
+        scale = np.maximum(peak, 1e-9 * peak.max(axis=0, initial=1e-300))[:, :, None]
+        curved = np.any(off > rtol * scale, axis=(1, 2, 3)) | (turn < 2)
+        halves = np.stack([todo[:, 0], middle, middle, todo[:, 1]], axis=1)
+        todo = halves[curved].reshape(-1, 2)
+    return JointLoads(
+        jnp.asarray(ts), jnp.asarray(values[..., :3]), jnp.asarray(values[..., 3:]), first.joints
+    )
+
+
+def _between(run: Run, ts: np.ndarray) -> np.ndarray:
+    """Force and moment at all joints, at any times of a run (k, joints, 6)."""
+
+    def block(ts: np.ndarray) -> np.ndarray:
+        states, own = jax.tree.map(jnp.asarray, between(run, ts))
+        loads = _compiled(run.scene.system, jnp.asarray(ts), states, run.method.formulation, own)
+        return np.concatenate([np.asarray(loads.force), np.asarray(loads.moment)], axis=-1)
+
+    return in_blocks(block, _BLOCK, ts)
+
+
+_compiled = kept_jit(joint_loads)
+
+
+def envelope(loads: JointLoads) -> Envelope:
+    """Extreme load components over all times and runs, with their times and runs.
+
+    The derivative of an extreme is that of the load at its time and run.
+    """
+    values = loads.components
+    count, joints = loads.ts.shape[-1], len(loads.joints)
+    rows = values.reshape(loads.ts.size, joints, len(COMPONENTS))
+    times = loads.ts.reshape(-1)
+
+    def at(index: Int[Array, "joints 8"]) -> tuple[Array, Array, Array]:
+        value = jnp.take_along_axis(rows, index[None], axis=0)[0]
+        return value, times[index], index // count
+
+    least, t_least, run_least = at(jnp.argmin(rows, axis=0))
+    most, t_most, run_most = at(jnp.argmax(rows, axis=0))
+    return Envelope(least, most, t_least, t_most, run_least, run_most, loads.joints)
+
+
+def smooth_peaks(loads: JointLoads, order: Numbers = 64.0) -> Float[Array, "*b joints 2"]:
+    """Peaks over time of |F| [N] and |M| [N m] as norms of order p: (sum_k |F_k|^p)^(1/p).
+
+    The norm is smooth even where the true peak jumps from one time to another. For k times it lies
+    between the peak and k^(1/p) times the peak.
+
+    Raises:
+        SettingError: the order is below 1.
+    """
+    if concrete(order) and not np.all(np.asarray(order) >= 1):
+        raise SettingError(f"The order of a smooth peak must be at least 1, but it is {order}.")
+    p = jnp.asarray(order, dtype=float)
+    sizes = jnp.stack([safe_norm(part, axis=-1) for part in (loads.force, loads.moment)], axis=-1)
+    top = jax.lax.stop_gradient(jnp.max(sizes, axis=-3, keepdims=True))
+    scale = jnp.where(top > 0, top, 1.0)
+    total = jnp.sum((sizes / scale) ** p, axis=-3)
+    some = total > 0
+    norm = jnp.where(some, total, 1.0) ** (1.0 / p)
+    return jnp.where(some, scale[..., 0, :, :] * norm, 0.0)

@@ -1,0 +1,1 @@
+"""Independent coordinates and velocities of mechanisms, and the motion in them. Floor 6."""

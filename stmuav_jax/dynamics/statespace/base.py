@@ -1,0 +1,149 @@
+"""State spaces of mechanisms: independent coordinates, velocities, and the motion in them.
+
+A point of a state space is a posture and motion of a mechanism that satisfy its joints. Its errors
+are vectors
+
+    v = (dq, du, dz):   independent coordinates (dof,), their velocities (dof,), and actuator states
+                        of the forces (m,),
+
+such that dq/dt = u: the dq of a rotation is a rotation vector in body axes, and its u the angular
+velocity in these axes. Trim, linearisation, shooting and filters use mechanisms by this interface.
+"""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ...algebra.space import AbstractSpace, Point
+from ...checks.errors import StateError, concrete, named_places
+from ...mechanics.state import State
+from ...mechanics.system import System
+
+Time = Float[Array, ""] | float
+
+# A conditioning below this number means a singular posture.
+SINGULAR = 1e-9
+
+
+class AbstractStateSpace(AbstractSpace):
+    """Manifold of the states of a system in independent coordinates, with differentiable methods.
+
+    Attributes:
+        system: mechanism with its forces.
+        names: name and unit of every component of an error (size,).
+        dof: number of degrees of freedom; the size is 2 dof + m.
+    """
+
+    system: eqx.AbstractVar[System]
+    names: eqx.AbstractVar[tuple[tuple[str, str], ...]]
+    dof: eqx.AbstractVar[int]
+
+    @abstractmethod
+    def to_state(self, x: Point, t: Time = 0.0) -> State:
+        """Positions and velocities of all bodies (n, .), on the constraints at time t [s]."""
+
+    @abstractmethod
+    def from_state(self, state: State) -> Point:
+        """Point that belongs to a state of all bodies on the joints."""
+
+    @abstractmethod
+    def rates(self, x: Point, t: Time = 0.0, system: System | None = None) -> Float[Array, " size"]:
+        """Velocities u, accelerations du/dt and rates of the actuator states at a point (size,).
+
+        Args:
+            system: mechanism with other forces; see `Inputs.applied`.
+        """
+
+    @abstractmethod
+    def settled(self, x: Point, t: Time = 0.0) -> Point:
+        """Equal point with closed loops, from which other points can be reached."""
+
+    @abstractmethod
+    def conditioning(self, x: Point, t: Time = 0.0) -> Float[Array, ""]:
+        """Smallest singular value of the rows in the dependent velocities, over the largest in all.
+
+        It is zero in a singular posture, where the independent coordinates do not determine the
+        others; it is 1 for a mechanism without loops, and NaN if the loops do not close.
+        """
+
+
+def error_rates(
+    space: AbstractStateSpace,
+    x: Point,
+    v: Float[Array, " size"],
+    t: Time = 0.0,
+    system: System | None = None,
+    still: System | None = None,
+) -> Float[Array, " size"]:
+    """Rate dv/dt of the error v between a motion from retract(x, v) and the motion from x.
+
+    Args:
+        system: system with the forces of the first motion. still: that of the motion from x.
+    """
+    return _departure(space, x, v, space.rates(x, t, still), t, system)
+
+
+def motion_rates(
+    space: AbstractStateSpace,
+    x: Point,
+    v: Float[Array, " size"],
+    t: Time = 0.0,
+    system: System | None = None,
+) -> Float[Array, " size"]:
+    """Rate dv/dt (size,) of the error v of a motion relative to a fixed point x.
+
+    Args:
+        system: system with the forces of the motion.
+    """
+    return _departure(space, x, v, jnp.zeros_like(v), t, system)
+
+
+def _departure(
+    space: AbstractStateSpace,
+    x: Point,
+    v: Float[Array, " size"],
+    rate_x: Float[Array, " size"],
+    t: Time,
+    system: System | None,
+) -> Float[Array, " size"]:
+    """Rate dv/dt of the error v relative to a reference point x that moves at rate_x."""
+    y = space.retract(x, v)
+    rate_y = space.rates(y, t, system)
+
+    def apart(s: Float[Array, ""]) -> Float[Array, " size"]:
+        return space.difference(space.retract(y, s * rate_y), space.retract(x, s * rate_x))
+
+    zero = jnp.zeros((), rate_y.dtype)
+    return jax.jvp(apart, (zero,), (jnp.ones_like(zero),))[1]
+
+
+def check_regular(space: AbstractStateSpace, x: Point, t: Time = 0.0) -> None:
+    """Raise `StateError` if the independent coordinates do not determine the others.
+
+    Traced values are not checked.
+    """
+    found = space.conditioning(x, t)
+    if concrete(found) and not float(found) > SINGULAR:
+        own = ", ".join(name for name, _ in space.names[: space.dof])
+        raise StateError(
+            f"The posture is singular for the independent coordinates {own}: they do not determine "
+            f"the others there (conditioning {float(found):.2g}, at least {SINGULAR:.0e} is wanted). "
+            "Choose others, by the names in TreeSpace(system, state, independent=...), or another posture."
+        )
+
+
+def places_of(space: AbstractStateSpace, names: Any, what: str) -> tuple[int, ...]:
+    """Indices of the named components of an error.
+
+    Args:
+        what: subject of the error's sentence, such as "The free states".
+
+    Raises:
+        SettingError: `names` is not a list of names, or has an unknown or a repeated name.
+    """
+    known = [name for name, _ in space.names]
+    return named_places(names, known, what, "state")

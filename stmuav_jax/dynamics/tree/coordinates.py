@@ -1,0 +1,272 @@
+"""Coordinates of a spanning tree: flat vectors, small motions, and conversion from a state."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...algebra.rotation import (
+    conjugate,
+    cross,
+    euler_parameter_rate,
+    normalise,
+    product,
+    rotation_matrix,
+)
+from ...algebra.stacked import apply, apply_transposed, dot, multiply
+from ...mechanics.motions.base import CYCLIC, RelativeFrames
+from ...mechanics.state import State
+from .frames import columns, levels, motion_groups, pick
+from .parameters import TreeParameters, shares
+from .poses import Pose, by_group
+from .topology import SpanningTree
+
+
+class TreeCoordinates(NamedTuple):
+    """Positions and velocities of a tree; b is 1 for a floating system and 0 otherwise.
+
+    Attributes:
+        r, p: position of the base's centre of mass in the world (3, b) [m], and the base's Euler
+            parameters (4, b).
+        q: positions of the steps by class of motion (`motion_groups`), (*positions of one, k):
+            revolute [rad], prismatic [m] and helical [rad] ones as one class, translations [m],
+            Euler parameters of spherical ones.
+        v, omega: velocity of the base's centre of mass in the world (3, b) [m/s], and the base's
+            angular velocity in its axes (3, b) [rad/s].
+        u: velocities of the steps, in the order of the frames (m,).
+    """
+
+    r: Float[Array, "3 b *s"]
+    p: Float[Array, "4 b *s"]
+    q: tuple[Float[Array, "..."], ...]
+    v: Float[Array, "3 b *s"]
+    omega: Float[Array, "3 b *s"]
+    u: Float[Array, "m *s"]
+
+
+def filled(tree: SpanningTree, make: Callable[[tuple[int, ...]], Array]) -> TreeCoordinates:
+    """Coordinates whose parts `make` creates from their shapes, in the flat vector's order."""
+    b = int(tree.floating)
+    r, p = make((3, b)), make((4, b))
+    q = tuple(make((*g.motion.positions, len(g.steps))) for g in motion_groups(tree))
+    v, omega = make((3, b)), make((3, b))
+    return TreeCoordinates(r, p, q, v, omega, make((len(columns(tree).frame),)))
+
+
+def split(tree: SpanningTree, x: Float[Array, "k *s"]) -> TreeCoordinates:
+    """Coordinates from a flat vector, with the axes of a batch last."""
+    start = 0
+
+    def part(shape: tuple[int, ...]) -> Array:
+        nonlocal start
+        first, start = start, start + math.prod(shape)
+        return x[first:start].reshape(*shape, *x.shape[1:])
+
+    return filled(tree, part)
+
+
+def join(parts: TreeCoordinates) -> Float[Array, "k *s"]:
+    """Flat vector of the coordinates."""
+    batch = parts.u.shape[1:]
+    return jnp.concatenate([part.reshape(-1, *batch) for part in jax.tree.leaves(parts)])
+
+
+def unit_vectors(tree: SpanningTree, at: TreeCoordinates) -> list[Float[Array, "..."]]:
+    """Unit vectors (c, k, *s) among the positions: Euler parameters of the base and of steps."""
+    groups = zip(motion_groups(tree), at.q, strict=True)
+    return [at.p, *(q for group, q in groups if group.motion.unit_norm)]
+
+
+def normalised(tree: SpanningTree, at: TreeCoordinates) -> TreeCoordinates:
+    """Coordinates with their unit vectors normalised."""
+    return with_unit_vectors(tree, at, normalise)
+
+
+def with_unit_vectors(
+    tree: SpanningTree, at: TreeCoordinates, change: Callable[..., Array], *more: TreeCoordinates
+) -> TreeCoordinates:
+    """Coordinates with each unit vector v replaced by change(v, *those in its place in `more`)."""
+    q = tuple(
+        change(*own) if group.motion.unit_norm else own[0]
+        for group, *own in zip(motion_groups(tree), at.q, *(x.q for x in more), strict=True)
+    )
+    return at._replace(p=change(at.p, *(x.p for x in more)), q=q)
+
+
+def moved(tree: SpanningTree, at: TreeCoordinates, step: Float[Array, "k *s"]) -> TreeCoordinates:
+    """Coordinates after a small motion along the velocities of the steps."""
+    parts = zip(motion_groups(tree), at.q, by_group(tree, step), strict=True)
+    return at._replace(q=tuple(group.motion.retract(q, own) for group, q, own in parts))
+
+
+def rates(tree: SpanningTree, at: TreeCoordinates, u_rate: Float[Array, "l *s"]) -> TreeCoordinates:
+    """Rates of all coordinates at the given accelerations, in the order of `mass_matrix`."""
+    parts = zip(motion_groups(tree), at.q, by_group(tree, at.u), strict=True)
+    q = tuple(group.motion.rates(q, own) for group, q, own in parts)
+    if not tree.floating:
+        return TreeCoordinates(at.r, at.p, q, at.v, at.omega, u_rate)
+    return TreeCoordinates(
+        r=at.v,
+        p=euler_parameter_rate(at.p, at.omega),
+        q=q,
+        v=apply(rotation_matrix(at.p), u_rate[3:6, None]),
+        omega=u_rate[:3, None],
+        u=u_rate[6:],
+    )
+
+
+def read(parameters: TreeParameters, state: State) -> TreeCoordinates:
+    """Coordinates of a state of all bodies that satisfies the tree's joints.
+
+    Angles are in (-pi, pi], except those of screws, whose displacement counts whole turns.
+    """
+    tree = parameters.tree
+    base = slice(tree.root, tree.root + tree.floating)
+    own = filled(tree, lambda shape: jnp.zeros(shape, state.r.dtype))
+    own = own._replace(
+        r=state.r[base].T, p=state.p[base].T, v=state.v[base].T, omega=state.omega[base].T
+    )
+    if not tree.steps:
+        return own
+    ends = _ends(parameters, state)
+    pose, q = _positions(parameters, ends, state)
+    return own._replace(q=q, u=_velocities(parameters, pose, ends))
+
+
+class _Ends(NamedTuple):
+    """Bodies and ground in the axes of frame 0: axes of their frames, positions, velocities.
+
+    The positions are those of the centres of mass from the root's; the velocities are absolute.
+    """
+
+    E: Float[Array, "3 3 N"]
+    r: Float[Array, "3 N"]
+    v: Float[Array, "3 N"]
+    omega: Float[Array, "3 N"]
+
+
+def _ends(parameters: TreeParameters, state: State) -> _Ends:
+    tree = parameters.tree
+    none = jnp.zeros((3, 1), state.r.dtype)
+    unit = jnp.eye(3, dtype=state.r.dtype)[:, :, None]
+    R_wb = jnp.concatenate([rotation_matrix(state.p.T), unit], axis=2)
+    r, v = (jnp.concatenate([x.T, none], axis=1) for x in (state.r, state.v))
+    omega = apply(R_wb, jnp.concatenate([state.omega.T, none], axis=1))
+    at = slice(tree.root, tree.root + 1)
+    R_w0 = R_wb[:, :, at]
+    E = multiply(jnp.swapaxes(R_w0, 0, 1), multiply(R_wb, jnp.swapaxes(parameters.B, 0, 1)))
+    seen = lambda x: apply_transposed(R_w0, x)
+    return _Ends(E, seen(r - r[:, at]), seen(v), seen(omega))
+
+
+def _references(tree: SpanningTree) -> tuple[np.ndarray, np.ndarray]:
+    """Reference directions (3, f) of all steps, which later steps of the joint leave alone.
+
+    They are in the axes of the joint's last frame, and at zero of the step in its own frame.
+    """
+    behind = np.tile([[1.0], [0.0], [0.0]], (1, len(tree.steps)))
+    own = behind.copy()
+    for step in tree.steps:
+        turning = [c.axis for c in step.motion.columns if c.angular]
+        if not step.first and turning == [2]:
+            # a reference for the preceding step: the axis of this step, which this step leaves
+            # alone, in the axes of the preceding frame
+            behind[:, step.parent - 1] = [0.0, 0.0, 1.0]
+            assert step.before is not None
+            own[:, step.parent - 1] = np.eye(3)[list(CYCLIC[step.before])] @ np.eye(3)[step.axis]
+    return behind, own
+
+
+def _positions(
+    parameters: TreeParameters, ends: _Ends, state: State
+) -> tuple[Pose, tuple[Array, ...]]:
+    """Poses of all frames, and the positions of every class of motion."""
+    tree = parameters.tree
+    groups = motion_groups(tree)
+    behind, zero = _references(tree)
+    between = _relative_parameters(parameters, state)
+    E, o = [jnp.eye(3, dtype=ends.r.dtype)[:, :, None]], [jnp.zeros((3, 1), ends.r.dtype)]
+    values: list[list[Array]] = [[] for _ in groups]
+    for level in levels(tree):
+        at = np.arange(level.frames.start, level.frames.stop) - 1
+        body = np.array([tree.steps[f].body for f in at])
+        before = pick(E[-1], level.parents, 2)
+        G = multiply(before, pick(parameters.K, at, 2))
+        origin = pick(o[-1], level.parents, 1) + apply(before, pick(parameters.k, at, 1))
+        end = pick(ends.E, body, 2)
+        point = pick(ends.r, body, 1) - apply(end, pick(parameters.com, body, 1))
+        turned = multiply(jnp.swapaxes(G, 0, 1), end)
+        offset = apply_transposed(G, point - origin)
+        X, along = [], []
+        # frames of a level are sorted by class
+        for group, found in zip(groups, values, strict=True):
+            own = np.flatnonzero(np.isin(at, group.steps))
+            if not len(own):
+                continue
+            part = group.restricted(at[own])
+            seen = RelativeFrames(
+                pick(turned, own, 2),
+                behind[:, at[own]],
+                zero[:, at[own]],
+                pick(offset, own, 1),
+                lambda part=part: between(part.steps),
+            )
+            q, *moved = group.motion.read(seen, shares(parameters, part, 0))
+            found.append(q)
+            X.append(moved[0])
+            along.append(moved[1])
+        E.append(multiply(G, _together(X)))
+        o.append(origin + apply(G, _together(along)))
+    pose = Pose(jnp.concatenate(E, axis=2), jnp.concatenate(o, axis=1))
+    return pose, tuple(_together(parts) for parts in values)
+
+
+def _together(parts: list[Array]) -> Array:
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
+
+
+def _relative_parameters(
+    parameters: TreeParameters, state: State
+) -> Callable[[np.ndarray], Float[Array, "4 k"]]:
+    """Function of steps that gives their motions' Euler parameters, with the bodies' signs."""
+    front, behind = _neighbours(parameters.tree)
+
+    @functools.cache
+    def of_bodies() -> Float[Array, "4 N"]:
+        """Euler parameters of the bodies' frames in the world."""
+        unit = jnp.array([[1.0, 0.0, 0.0, 0.0]], state.p.dtype)
+        return product(jnp.concatenate([state.p, unit]).T, conjugate(parameters.B_p))
+
+    def between(steps: np.ndarray) -> Float[Array, "4 k"]:
+        before = pick(of_bodies(), front[steps], 1)
+        before = product(before, pick(parameters.K_p, steps, 1))
+        return product(conjugate(before), pick(of_bodies(), behind[steps], 1))
+
+    return between
+
+
+def _velocities(parameters: TreeParameters, pose: Pose, ends: _Ends) -> Array:
+    """Velocities of all steps: those of the child relative to the parent body, along the axes."""
+    tree = parameters.tree
+    front, behind = _neighbours(tree)
+    table = columns(tree)
+    frame = table.frame
+    axis, at = pose.E[:, table.axis, frame], pick(pose.o, frame, 1)
+    b, f = behind[frame - 1], front[frame - 1]
+    omega_b, omega_f = pick(ends.omega, b, 1), pick(ends.omega, f, 1)
+    v_b = pick(ends.v, b, 1) + cross(omega_b, at - pick(ends.r, b, 1))
+    v_f = pick(ends.v, f, 1) + cross(omega_f, at - pick(ends.r, f, 1))
+    turning, sliding = dot(axis, omega_b - omega_f), dot(axis, v_b - v_f)
+    return jnp.where(table.angular > 0, turning, sliding)
+
+
+def _neighbours(tree: SpanningTree) -> tuple[np.ndarray, np.ndarray]:
+    """Parent and child bodies of the joint of every step."""
+    parent = {link.child: link.parent for link in tree.links}
+    behind = [step.body for step in tree.steps]
+    return np.array([parent[b] for b in behind]), np.array(behind)

@@ -1,0 +1,228 @@
+"""Velocities, velocity-product accelerations and inertias of a tree."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...algebra.rotation import cross, rotation_matrix
+from ...algebra.stacked import apply, apply_transposed, multiply
+from .coordinates import TreeCoordinates
+from .frames import aligned, backward_pass, columns, forward_pass, gathered, pick, support
+from .parameters import TreeParameters
+from .poses import Pose, axes, by_frame, place, rest
+from .topology import SpanningTree
+
+
+class TreeMotion(NamedTuple):
+    """Motion of a tree with f frames and n bodies, in the axes and about the origin of frame 0.
+
+    Attributes:
+        pose: poses of all frames.
+        S: spatial axes (angular, linear) of the velocities u (6, m, *s).
+        V: spatial velocities of the frames (6, f + 1, *s).
+        A: spatial accelerations of the frames at du/dt = 0 (6, f + 1, *s).
+        R, c: axes (3, 3, n + 1, *s) and centres of mass (3, n + 1, *s) [m] of the bodies.
+        w: angular velocities of the bodies (3, n + 1, *s) [rad/s].
+        v: velocities of the centres of mass relative to the base's (3, n + 1, *s) [m/s].
+    """
+
+    pose: Pose
+    S: Float[Array, "6 m *s"]
+    V: Float[Array, "6 f *s"]
+    A: Float[Array, "6 f *s"]
+    R: Float[Array, "3 3 N *s"]
+    c: Float[Array, "3 N *s"]
+    w: Float[Array, "3 N *s"]
+    v: Float[Array, "3 N *s"]
+
+
+def motion(parameters: TreeParameters, at: TreeCoordinates) -> TreeMotion:
+    """Motion of a tree at the given positions and velocities."""
+    tree = parameters.tree
+    if not tree.steps:
+        return _of_base(parameters, at)
+    pose = place(parameters, at.q)
+    S = axes(parameters, pose)
+    dV = by_frame(tree, S * at.u)
+    root = jnp.zeros((6, 1, *at.u.shape[1:]), at.u.dtype)
+    if tree.floating:
+        root = jnp.concatenate([at.omega, jnp.zeros_like(at.omega)])
+    V = forward_pass(tree, root, dV)
+    A = forward_pass(tree, jnp.zeros_like(root), _spatial_cross(V[:, 1:], dV))
+    frame = np.array(tree.frame)
+    E, o = pick(pose.E, frame, 2), pick(pose.o, frame, 1)
+    c = o + apply(E, parameters.com)
+    moved = pick(V, frame, 1)
+    return TreeMotion(
+        pose, S, V, A, multiply(E, parameters.B), c, moved[:3], moved[3:] + cross(moved[:3], c)
+    )
+
+
+def _of_base(parameters: TreeParameters, at: TreeCoordinates) -> TreeMotion:
+    """Motion of a tree without steps, whose bodies are all fixed to frame 0."""
+    pose = rest(at.u.shape[1:], at.u.dtype)
+    root = jnp.zeros((6, 1, *at.u.shape[1:]), at.u.dtype)
+    V = jnp.concatenate([at.omega, root[:3]]) if parameters.tree.floating else root
+    w = jnp.broadcast_to(V[:3], (3, *parameters.com.shape[1:2], *at.u.shape[1:]))
+    none = jnp.zeros((6, 0, *at.u.shape[1:]), at.u.dtype)
+    return TreeMotion(
+        pose, none, V, root, parameters.B, parameters.com, w, cross(w, parameters.com)
+    )
+
+
+def _spatial_cross(V: Float[Array, "6 f *s"], S: Float[Array, "6 f *s"]) -> Float[Array, "6 f *s"]:
+    """Spatial cross product V x S: the rate of a vector S fixed in a frame that moves with V."""
+    return jnp.concatenate([cross(V[:3], S[:3]), cross(V[:3], S[3:]) + cross(V[3:], S[:3])])
+
+
+class Inertia(NamedTuple):
+    """Composite inertias of all bodies that each frame supports, about the origin of frame 0.
+
+    Attributes:
+        mass: masses (f + 1, *s) [kg].
+        moment: masses times centres of mass (3, f + 1, *s) [kg m].
+        tensor: inertia tensors (3, 3, f + 1, *s) [kg m^2].
+        wrench: moment and force for the motion at du/dt = 0, less the loads (6, f + 1, *s).
+    """
+
+    mass: Float[Array, "f *s"]
+    moment: Float[Array, "3 f *s"]
+    tensor: Float[Array, "3 3 f *s"]
+    wrench: Float[Array, "6 f *s"]
+
+
+def inertia(
+    parameters: TreeParameters, moving: TreeMotion, load: Float[Array, "6 F *s"]
+) -> Inertia:
+    """Composite inertias, and bias wrenches under loads on the frames (`wrenches_by_frame`)."""
+    tree, E = parameters.tree, moving.pose.E
+    c = moving.pose.o + apply(E, parameters.centre)
+    tensor = multiply(multiply(E, parameters.inertia), jnp.swapaxes(E, 0, 1))
+    turning, f = _bias_of_frames(parameters, moving, c, tensor)
+    mc = parameters.mass * c
+    x, y, z = mc * c
+    square = aligned(np.eye(3), 2 + x.ndim) * (x + y + z)
+    about = tensor + square - mc[:, None] * c[None]
+    rows = [mc, about.reshape(9, *x.shape), turning - load[:3], f - load[3:]]
+    total = backward_pass(tree, jnp.concatenate(rows))
+    tensors = total[3:12].reshape(3, 3, *total.shape[1:])
+    return Inertia(parameters.subtree_mass, total[:3], tensors, total[12:])
+
+
+def wrenches_by_frame(
+    tree: SpanningTree,
+    moving: TreeMotion,
+    force: Float[Array, "3 n *s"],
+    moment: Float[Array, "3 n *s"],
+) -> Float[Array, "6 F *s"]:
+    """Wrench (moment about the origin, force) of the loads on the bodies of each frame.
+
+    Args:
+        force: forces at the bodies' centres of mass [N].
+        moment: moments about the bodies' centres of mass [N m].
+    """
+    n = len(tree.frame) - 1
+    rows = jnp.concatenate([moment + cross(moving.c[:, :n], force), force])
+    bodies: list[list[int]] = [[] for _ in range(len(tree.steps) + 1)]
+    for body in range(n):
+        bodies[tree.frame[body]].append(body)
+    return gathered(rows, bodies)
+
+
+def _bias_of_frames(
+    parameters: TreeParameters,
+    moving: TreeMotion,
+    c: Float[Array, "3 F *s"],
+    tensor: Float[Array, "3 3 F *s"],
+) -> tuple[Float[Array, "3 F *s"], Float[Array, "3 F *s"]]:
+    """Moment about the origin and force that the bodies of each frame need at du/dt = 0."""
+    w, A = moving.V[:3], moving.A
+    v = moving.V[3:] + cross(w, c)
+    f = parameters.mass * (A[3:] + cross(A[:3], c) + cross(w, v))
+    return apply(tensor, A[:3]) + cross(w, apply(tensor, w)) + cross(c, f), f
+
+
+def bias_of_base(
+    parameters: TreeParameters, moving: TreeMotion, load: Float[Array, "6 F *s"]
+) -> Float[Array, "6 *s"]:
+    """Bias force h of M du/dt + h = 0 for a tree without steps."""
+    c, w = parameters.centre, moving.V[:3]
+    f = parameters.mass * cross(w, cross(w, c))
+    needed = jnp.concatenate([cross(w, apply(parameters.inertia, w)) + cross(c, f), f])
+    return (needed - load)[:, 0]
+
+
+def needed_wrenches(
+    parameters: TreeParameters, moving: TreeMotion, A: Float[Array, "6 F *s"]
+) -> Float[Array, "6 F *s"]:
+    """Wrenches (moment about the origin, force) that frames with spatial accelerations A need."""
+    E, w = moving.pose.E, moving.V[:3]
+    c = moving.pose.o + apply(E, parameters.centre)
+    turned = lambda x: apply(E, apply(parameters.inertia, apply_transposed(E, x)))
+    v = moving.V[3:] + cross(w, c)
+    f = parameters.mass * (A[3:] + cross(A[:3], c) + cross(w, v))
+    return jnp.concatenate([turned(A[:3]) + cross(w, turned(w)) + cross(c, f), f])
+
+
+def momenta(frame: np.ndarray, S: Float[Array, "6 m *s"], at: Inertia) -> Float[Array, "6 m *s"]:
+    """Spatial momenta (angular about the origin, linear) per unit of the frames' velocities."""
+    h, tensor = pick(at.moment, frame, 1), pick(at.tensor, frame, 2)
+    linear = pick(at.mass, frame, 0) * S[3:] - cross(h, S[:3])
+    return jnp.concatenate([apply(tensor, S[:3]) + cross(h, S[3:]), linear])
+
+
+def base_inertia(at: Inertia) -> Float[Array, "6 6 *s"]:
+    """Composite spatial inertia of the floating system about the base's centre of mass."""
+    x, y, z = at.moment[:, 0]
+    zero = jnp.zeros_like(x)
+    lever = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3, *x.shape)
+    mass = aligned(np.eye(3), 2 + x.ndim) * (at.mass[0] + zero)
+    upper = jnp.concatenate([at.tensor[:, :, 0], lever], axis=1)
+    return jnp.concatenate([upper, jnp.concatenate([-lever, mass], axis=1)])
+
+
+def mass_matrix(
+    tree: SpanningTree, S: Float[Array, "6 m *s"], at: Inertia
+) -> Float[Array, "k k *s"]:
+    """Mass matrix in the velocities (omega and v of a floating base in its axes, u)."""
+    frame = columns(tree).frame
+    F = momenta(frame, S, at)
+    above = support(tree)[np.ix_(frame, frame)]
+    product = sum(S[i][:, None] * F[i][None] for i in range(6))
+    product = jnp.asarray(product)
+    batch = product.ndim
+    flipped = jnp.swapaxes(product, 0, 1)
+    M = jnp.where(aligned(above, batch), product, jnp.where(aligned(above.T, batch), flipped, 0.0))
+    if not tree.floating:
+        return M
+    upper = jnp.concatenate([base_inertia(at), F], axis=1)
+    return jnp.concatenate([upper, jnp.concatenate([jnp.swapaxes(F, 0, 1), M], axis=1)])
+
+
+def bias(tree: SpanningTree, S: Float[Array, "6 m *s"], at: Inertia) -> Float[Array, "k *s"]:
+    """Bias force h of M du/dt + h = J^T lambda, in the order of `mass_matrix`."""
+    wrench = pick(at.wrench, columns(tree).frame, 1)
+    own = jnp.asarray(sum(S[i] * wrench[i] for i in range(6)))
+    return jnp.concatenate([at.wrench[:, 0], own]) if tree.floating else own
+
+
+def body_accelerations(
+    parameters: TreeParameters,
+    at: TreeCoordinates,
+    moving: TreeMotion,
+    u_rate: Float[Array, "k *s"],
+) -> tuple[Float[Array, "3 n *s"], Float[Array, "3 n *s"]]:
+    """Accelerations in the world [m/s^2] and angular ones in body axes [rad/s^2] of all bodies."""
+    tree = parameters.tree
+    base = 6 * tree.floating
+    own = by_frame(tree, moving.S * u_rate[base:])
+    root = u_rate[:6, None] if tree.floating else jnp.zeros((6, 1, *own.shape[2:]), own.dtype)
+    n = len(tree.frame) - 1
+    A = pick(moving.A + forward_pass(tree, root, own), np.array(tree.frame[:n]), 1)
+    c, w, v = moving.c[:, :n], moving.w[:, :n], moving.v[:, :n]
+    a = A[3:] + cross(A[:3], c) + cross(w, v)
+    if tree.floating:
+        a = apply(rotation_matrix(at.p), a)
+    return a, apply_transposed(moving.R[:, :, :n], A[:3])

@@ -1,0 +1,150 @@
+"""Irradiance under a clear sky on panels of any orientation, by pvlib; not traceable.
+
+The clear sky is the model of Ineichen and Perez with Linke's turbidity, by default from pvlib's
+table of monthly means. A panel receives the beam times the cosine of incidence, diffuse light of
+the sky by Hay and Davies' model (part of it comes from around the sun), and light reflected by
+uniform ground.
+
+Source: P. Ineichen, R. Perez, Solar Energy 73 (2002) 151; J. E. Hay, J. A. Davies (1980);
+both as implemented in pvlib.
+"""
+
+import math
+import warnings
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..checks.errors import SettingError
+from .ephemeris import Air, Place
+from .sun import Sun
+
+Samples = Float[np.ndarray, " n"]
+Normals = Float[np.ndarray, "3 n"]
+
+
+class ClearSky(NamedTuple):
+    """Irradiances under a clear sky at n times (n,) [W/m^2], and the turbidity.
+
+    Attributes:
+        beam: beam irradiance of a plane that faces the sun (DNI).
+        diffuse: diffuse irradiance of a horizontal plane (DHI).
+        level: total irradiance of a horizontal plane (GHI).
+        outside: beam irradiance outside the atmosphere.
+        turbidity: Linke's turbidity (n,) [1].
+    """
+
+    beam: Samples
+    diffuse: Samples
+    level: Samples
+    outside: Samples
+    turbidity: Samples
+
+
+def clear_sky(
+    unix: Samples, place: Place, sun: Sun, air: Air, *, turbidity: float | None = None
+) -> ClearSky:
+    """Clear-sky irradiances at one place and Unix times (n,) [s], the sun seen through `air`.
+
+    Args:
+        turbidity: Linke's turbidity [1]; by default pvlib's monthly mean for the place.
+
+    Raises:
+        SettingError: a turbidity below 1, the value of clean dry air.
+    """
+    import pandas as pd
+    import pvlib
+
+    if turbidity is not None and not turbidity >= 1.0:
+        raise SettingError(
+            f"Linke's turbidity must be at least 1 (clean, dry air), but it is {turbidity}."
+        )
+    times = pd.DatetimeIndex(pd.to_datetime(unix, unit="s", utc=True))
+    zenith = 90.0 - np.degrees(np.asarray(sun.elevation))
+    with warnings.catch_warnings():
+        # pvlib 0.16 uses names of pandas 2 that are deprecated in pandas 3
+        warnings.simplefilter("ignore", DeprecationWarning)
+        outside = np.asarray(pvlib.irradiance.get_extra_radiation(times), dtype=float)
+        if turbidity is None:
+            linke = pvlib.clearsky.lookup_linke_turbidity(
+                times, math.degrees(float(place.latitude)), math.degrees(float(place.longitude))
+            ).to_numpy()
+        else:
+            linke = np.full(len(unix), float(turbidity))
+    up = np.asarray(sun.is_up)
+    mass = pvlib.atmosphere.get_relative_airmass(zenith[up])
+    absolute = pvlib.atmosphere.get_absolute_airmass(mass, float(air.pressure))
+    ineichen: Any = pvlib.clearsky.ineichen  # without types
+    sky = ineichen(
+        zenith[up], absolute, linke[up], altitude=float(place.altitude), dni_extra=outside[up]
+    )
+    beam, diffuse, level = np.zeros((3, len(unix)))
+    beam[up], diffuse[up], level[up] = (np.asarray(sky[k]) for k in ("dni", "dhi", "ghi"))
+    return ClearSky(beam, diffuse, level, outside, linke)
+
+
+def panel_irradiance(
+    normals_w: Normals, sun: Sun, sky: ClearSky, *, albedo: float = 0.2
+) -> Samples:
+    """Total irradiance of the front of a panel with unit normals (3, n), world (n,) [W/m^2].
+
+    Args:
+        albedo: reflectivity of the ground [1].
+    """
+    import pvlib
+
+    tilt = np.degrees(np.arctan2(np.hypot(normals_w[0], normals_w[1]), normals_w[2]))
+    around = np.degrees(np.arctan2(normals_w[0], normals_w[1])) % 360.0
+    up = np.asarray(sun.is_up)
+    total = pvlib.irradiance.get_total_irradiance(
+        tilt,
+        around,
+        90.0 - np.degrees(np.asarray(sun.elevation)),
+        np.degrees(np.asarray(sun.azimuth)),
+        sky.beam,
+        sky.level,
+        sky.diffuse,
+        dni_extra=sky.outside,
+        albedo=albedo,
+        model="haydavies",
+    )
+    return np.where(up, np.asarray(total["poa_global"]), 0.0)
+
+
+def single_axis_normals(sun: Sun, *, limit: float = math.radians(60.0)) -> Normals:
+    """Unit normals (3, n) of a tracker that rotates about one horizontal axis, north to south.
+
+    The panel faces the sun as nearly as it can, without backtracking, and is level at night.
+
+    Args:
+        limit: largest rotation from level [rad].
+
+    Source: pvlib.tracking.singleaxis.
+    """
+    import pvlib
+
+    singleaxis: Any = pvlib.tracking.singleaxis  # without types
+    with np.errstate(invalid="ignore"):
+        turned = singleaxis(
+            90.0 - np.degrees(np.asarray(sun.elevation)),
+            np.degrees(np.asarray(sun.azimuth)),
+            axis_tilt=0.0,
+            axis_azimuth=180.0,
+            max_angle=math.degrees(limit),
+            backtrack=False,
+        )
+    tilt = np.radians(np.nan_to_num(np.asarray(turned["surface_tilt"])))
+    around = np.radians(np.nan_to_num(np.asarray(turned["surface_azimuth"])))
+    return np.stack([np.sin(tilt) * np.sin(around), np.sin(tilt) * np.cos(around), np.cos(tilt)])
+
+
+def energy(unix: Samples, irradiance: Samples) -> float:
+    """Integral of irradiance over time [J/m^2], by the trapezoidal rule."""
+    return float(np.trapezoid(irradiance, unix))
+
+
+def level_normals(n: int) -> Normals:
+    """Unit normals (3, n) of a horizontal panel."""
+    return np.asarray(jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0])[:, None], (3, n)))

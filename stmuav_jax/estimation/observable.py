@@ -1,0 +1,146 @@
+"""Observability of the state by measurements along a path, with a report in words.
+
+The rows of the observability matrix are the derivatives of the measurements, in units of their
+noise, with respect to the error of the first state, in units of the scales L_0 if these are given:
+
+    O = [R^-1/2 H_0; R^-1/2 H_1 F_1; R^-1/2 H_2 F_2 F_1; ...] L_0
+
+A direction v with O v = 0 changes no measurement, so no filter can estimate it.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..algebra.space import AbstractSpace, Point
+from .factor import divide_lower
+from .model import Inputs, StateSpaceModel
+
+# A component below this fraction of a direction's largest is not named.
+_NAMED = 1e-3
+
+
+class Observability(NamedTuple):
+    """Singular values and null directions of the observability matrix.
+
+    Attributes:
+        singular_values: singular values (n,), in descending order.
+        rank: number of singular values above the tolerance.
+        null: orthonormal basis of the scaled unobservable directions (n, n - rank).
+        names: names of the state's error components.
+        scale: numbers by which these components were divided (n,).
+    """
+
+    singular_values: np.ndarray
+    rank: int
+    null: np.ndarray
+    names: tuple[str, ...]
+    scale: np.ndarray
+
+    def words(self) -> str:
+        """Sentences on the rank, the unobservable states and their unobservable combinations."""
+        n = len(self.names)
+        if self.rank == n:
+            return f"All {n} states are observable."
+        alone, combined = _separate(self.null)
+        lines = [f"{self.rank} of {n} directions are observable."]
+        if alone:
+            listed = ", ".join(self.names[i] for i in alone)
+            lines.append(f"Not observable at all: {listed}.")
+        for direction in combined.T:
+            lines.append(f"Not observable together: {self._sum(direction * self.scale)}.")
+        return " ".join(lines)
+
+    def _sum(self, v: np.ndarray) -> str:
+        """Text of a direction as a sum of states, scaled to a largest component of one."""
+        v = v / v[np.argmax(np.abs(v))]
+        parts = [
+            f"{'-' if c < 0 else '+'} {'' if abs(abs(c) - 1) < 1e-9 else f'{abs(c):.3g} '}{self.names[i]}"
+            for i, c in enumerate(v)
+            if abs(c) > _NAMED
+        ]
+        return " ".join(parts).removeprefix("+ ")
+
+
+def _separate(null: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """States that are unobservable by themselves, and a reduced basis of the other directions."""
+    inside = np.sum(null**2, axis=1)
+    alone = [i for i in range(len(null)) if inside[i] > 1 - 1e-6]
+    rest = null.copy()
+    rest[alone] = 0.0
+    left, values, _ = np.linalg.svd(rest, full_matrices=False)
+    basis = left[:, values > 1e-6]
+    # reduced echelon form: each direction has a component that the others do not have
+    for k in range(basis.shape[1]):
+        i, j = np.unravel_index(np.argmax(np.abs(basis[:, k:])), basis[:, k:].shape)
+        basis[:, [k, k + int(j)]] = basis[:, [k + int(j), k]]
+        basis[:, k] /= basis[i, k]
+        for other in range(basis.shape[1]):
+            if other != k:
+                basis[:, other] -= basis[i, other] * basis[:, k]
+    return alone, basis
+
+
+def observability_matrix(
+    model: StateSpaceModel, start: Point, u: Inputs, dt: Any, count: int
+) -> Float[Array, "_ n"]:
+    """Observability matrix of `count` + 1 measurements along a path, in units of their noise.
+
+    Args:
+        start: initial state.
+        u: inputs (count, k) or None.
+        dt: length of the steps [s].
+    """
+    n, sensor = model.space.size, model.sensor
+    zero = jnp.zeros(n, model.noise.dtype)
+
+    def seen(x: Point, now: Inputs) -> Array:
+        centre = sensor(x, now)
+        error = lambda v: sensor.space.difference(sensor(model.space.retract(x, v), now), centre)
+        return divide_lower(sensor.noise, jax.jacfwd(error)(zero))
+
+    def step(carry: tuple, now: Inputs) -> tuple:
+        x, F = carry
+        moved = model(x, now, dt)
+        error = lambda v: model.space.difference(model(model.space.retract(x, v), now, dt), moved)
+        F = jax.jacfwd(error)(zero) @ F
+        return (moved, F), seen(moved, now) @ F
+
+    first = jax.tree.map(lambda leaf: leaf[0], u)
+    path = jax.lax.scan(step, (start, jnp.eye(n, dtype=zero.dtype)), u, length=count)[1]
+    return jnp.concatenate([seen(start, first), path.reshape(-1, n)])
+
+
+def observability(
+    model: StateSpaceModel,
+    start: Point,
+    *,
+    u: Inputs = None,
+    dt: Any,
+    count: int,
+    scale: Any = None,
+    tolerance: float = 1e-9,
+    space: AbstractSpace | None = None,
+) -> Observability:
+    """Rank, singular values and null directions of the observability matrix along a path.
+
+    Args:
+        start, u, dt, count: as in `observability_matrix`.
+        scale: size of a notable error of each component (n,), so that the result does not depend
+            on units; ones by default.
+        tolerance: fraction of the largest singular value below which others count as zero.
+        space: space whose errors the directions are; the model's by default.
+    """
+    if space is not None:
+        model = eqx.tree_at(lambda m: m.space, model, space)
+    model.space.check(start, "The start")
+    rows = jax.jit(lambda s, u: observability_matrix(model, s, u, dt, count))(start, u)
+    n = rows.shape[1]
+    size = np.ones(n) if scale is None else np.asarray(scale, dtype=float)
+    _, values, right = np.linalg.svd(np.asarray(rows) * size, full_matrices=True)
+    rank = int(np.sum(values > tolerance * max(values[0], np.finfo(float).tiny)))
+    return Observability(values, rank, right[rank:].T, model.names, size)

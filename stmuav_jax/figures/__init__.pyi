@@ -1,0 +1,58 @@
+"""Public names of this folder; `__init__.py` imports each when it is first used."""
+
+from .day import (
+    DAY_FIGURES as DAY_FIGURES,
+    day_dataset as day_dataset,
+    day_rows as day_rows,
+    light as light,
+    load_attitude as load_attitude,
+    sky as sky,
+    tracking as tracking,
+)
+from .estimate import (
+    CASE_FIGURES as CASE_FIGURES,
+    case_dataset as case_dataset,
+    consistency as consistency,
+    errors as errors,
+    hover as hover,
+    hover_table as hover_table,
+    offset as offset,
+    rates as rates,
+    summary_table as summary_table,
+)
+from .loads import (
+    loads_figure as loads_figure,
+    loads_table as loads_table,
+    save_loads as save_loads,
+)
+from .plot import (
+    FIGURES as FIGURES,
+    STYLES as STYLES,
+    balances as balances,
+    euler_parameters as euler_parameters,
+    grid as grid,
+    positions as positions,
+    save_figures as save_figures,
+)
+from .report import (
+    certificate_rows as certificate_rows,
+    certificate_table as certificate_table,
+)
+from .study_analysis import (
+    Analysis as Analysis,
+    analyse as analyse,
+)
+from .study_data import (
+    StudyData as StudyData,
+)
+from .study_report import (
+    write_report as write_report,
+)
+from .tuning import (
+    flight_figure as flight_figure,
+    flown as flown,
+    load_search as load_search,
+    loss_history as loss_history,
+    save_linear as save_linear,
+    save_search as save_search,
+)

@@ -1,0 +1,338 @@
+"""Tables, figures, dataset and files of a day of pointing at the sun."""
+
+import csv
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.table import Table
+from rich.text import Text
+
+from ..environment.sun import attitude
+from ..files.netcdf import FileError, labelled
+from ..tracker.day import PANELS, Day
+from ..tracker.kinematics import Reason, panel_angles, panel_normal
+from ..tracker.workspace import direction_grid, survey
+from .plot import STYLES, grid
+from .terminal import row, table
+
+FORMAT = "stmuav_jax day"
+FORMAT_VERSION = 1
+
+PANEL_NAMES = {
+    "tracker": "tracker on the UAV",
+    "two_axis": "two axes, unlimited",
+    "single_axis": "single axis, on the ground",
+    "airframe": "fixed on the UAV",
+    "flat": "level",
+}
+
+
+def clock(hours: float) -> str:
+    """Clock time of hours since midnight, such as '07:30' of 7.5."""
+    minutes = round(60 * hours)
+    return f"{minutes // 60:02d}:{minutes % 60:02d}"
+
+
+def title(day: Day) -> str:
+    """Title with place and date in words."""
+    lat, lon = math.degrees(float(day.place.latitude)), math.degrees(float(day.place.longitude))
+    where = (
+        f"{abs(lat):.4g}° {'N' if lat >= 0 else 'S'}, {abs(lon):.5g}° {'E' if lon >= 0 else 'W'}"
+    )
+    return f"Pointing at the sun, {where}, {day.start:%Y-%m-%d} (UTC{day.start.isoformat()[19:]})"
+
+
+def _reason_words(day: Day) -> str:
+    codes, counts = np.unique(day.reason[day.is_up & ~day.facing], return_counts=True)
+    hour = (day.hours[1] - day.hours[0]) * counts
+    order = np.argsort(-hour)
+    words = [f"{Reason(int(codes[k])).words} {hour[k]:.1f} h" for k in order]
+    return ", ".join(words) or "-"
+
+
+def _span(values: np.ndarray, unit: str, digits: int = 1) -> str:
+    return f"{np.nanmin(values):.{digits}f} to {np.nanmax(values):.{digits}f} {unit}"
+
+
+def day_rows(day: Day) -> list[tuple[str, str]]:
+    """Main results of the day as rows (quantity, value) in words."""
+    height = np.degrees(np.asarray(day.sun.elevation))
+    error = np.degrees(day.pointing_error)
+    up = ", ".join(f"{clock(a)} to {clock(b)}" for a, b in day.daylight)
+    top = int(np.argmax(height))
+    angles = np.degrees(day.angles)
+    rows = [
+        ("Sun above the horizon", f"{up} ({sum(b - a for a, b in day.daylight):.1f} h)"),
+        ("Highest", f"{height[top]:.1f}° at {clock(day.hours[top])}"),
+        ("Within the tracker's reach", f"{day.hours_of(day.facing):.1f} h"),
+        ("Out of reach because of", _reason_words(day)),
+        ("Panel angles phi, theta", f"{_span(angles[0], '°')}, {_span(angles[1], '°')}"),
+        (
+            "Strokes q2, q3",
+            f"{_span(1e3 * day.strokes[0], 'mm')}, {_span(1e3 * day.strokes[1], 'mm')}",
+        ),
+    ]
+    if np.any(day.facing):
+        rows.append(("Pointing error within reach, largest", f"{np.max(error[day.facing]):.2g}°"))
+    cosine = day.incidence_cosine[day.is_up]
+    return [
+        *rows,
+        ("Pointing error in daylight, mean, largest",
+         f"{np.nanmean(error):.1f}°, {np.nanmax(error):.1f}°"),
+        ("Incidence cosine, mean, smallest", f"{np.mean(cosine):.3f}, {np.min(cosine):.3f}"),
+        ("Lost by the tracker's reach and errors", f"{-100 * day.gain('tracker', 'two_axis'):.2f} %"),
+    ]  # fmt: skip
+
+
+def day_tables(day: Day) -> tuple[Table, Table]:
+    """Tables for the terminal: main results, and the energies of the panels."""
+    figures = Table(title=Text(title(day)), show_header=False, title_justify="left")
+    figures.add_column(style="bold")
+    figures.add_column()
+    for cells in day_rows(day):
+        row(figures, *cells)
+    heads = ("panel", "kWh/m² a day", "more than level", "more than single axis")
+    energies = table(*heads, title="Under a clear sky", right=1)
+    for panel in PANELS:
+        row(
+            energies,
+            PANEL_NAMES[panel],
+            f"{day.energy[panel] / 3.6e6:.3f}",
+            f"{100 * day.gain(panel):+.1f} %",
+            f"{100 * day.gain(panel, 'single_axis'):+.1f} %",
+        )
+    return figures, energies
+
+
+# --- files
+
+
+def day_dataset(day: Day) -> xr.Dataset:
+    """Labelled dataset of the day, with times in seconds since local midnight.
+
+    Dimensions: time, axis (x, y, z; the world is east, north, up), axis_b (of the UAV), angle,
+    leg, panel. Every variable has `units` and `description`; attributes hold place, date and
+    settings.
+    """
+    s = "time"
+    table = {
+        "unix_time": ((s,), day.unix, "s", "UTC since 1970-01-01, without leap seconds"),
+        "sun_direction": (("axis", s), day.sun.s_w, "1", "seen through air; east, north, up"),
+        "sun_elevation": ((s,), day.sun.elevation, "rad", "seen through air"),
+        "sun_azimuth": ((s,), day.sun.azimuth, "rad", "clockwise from north"),
+        "sun_in_body": (("axis_b", s), day.s_b, "1", "direction to the sun in the UAV's axes"),
+        "R_wb": (("axis", "axis_b", s), day.R_wb, "1", "UAV to world"),
+        "panel_angles": (("angle", s), day.angles, "rad", "R_x(phi) R_y(theta); NaN at night"),
+        "strokes": (("leg", s), day.strokes, "m", "heights of the rods' lower joints"),
+        "shifts": (("leg", s), day.shifts, "m", "strokes from the initial posture's"),
+        "panel_normal": (("axis", s), day.normals_w, "1", "in the world"),
+        "reason": ((s,), day.reason, "1", "why the sun is not faced: attribute reasons"),
+        "pointing_error": ((s,), day.pointing_error, "rad", "panel's normal from the sun"),
+        "incidence_cosine": ((s,), day.incidence_cosine, "1", "of the panel on the UAV"),
+        "beam": ((s,), day.sky.beam, "W/m^2", "clear sky, on a plane that faces the sun"),
+        "diffuse": ((s,), day.sky.diffuse, "W/m^2", "clear sky, on a level plane"),
+        "irradiance": (("panel", s), np.stack([day.irradiance[k] for k in PANELS]), "W/m^2", ""),
+        "energy": (("panel",), np.array([day.energy[k] for k in PANELS]), "J/m^2", "of the day"),
+    }  # fmt: skip
+    words = {"units": "s", "description": "since local midnight"}
+    coordinates = {
+        "time": xr.Variable((s,), day.unix - day.unix[0], words),
+        "axis": ["x", "y", "z"],
+        "axis_b": ["x", "y", "z"],
+        "angle": ["phi", "theta"],
+        "leg": [2, 3],
+        "panel": list(PANELS),
+    }
+    place = {k: float(getattr(day.place, k)) for k in ("latitude", "longitude", "altitude")}
+    return labelled(
+        table, coordinates, format=FORMAT, format_version=FORMAT_VERSION, title=title(day),
+        place=place, start=day.start.isoformat(), settings=day.settings,
+        reasons={int(reason): reason.words for reason in Reason},
+        parameters=day.parameters.to_dict(),
+    )  # fmt: skip
+
+
+def load_attitude(path: str | os.PathLike[str]) -> Callable[[Array], Float[Array, "3 3"]]:
+    """Attitude history from a CSV file with columns t, roll, pitch, yaw.
+
+    Times t are increasing seconds since local midnight. Angles are in degrees
+    (`environment.sun.attitude`), linear between rows and constant outside of them.
+
+    Returns:
+        attitude R_wb (3, 3) as a function of time [s].
+
+    Raises:
+        FileError: the file is missing, or has other columns, values or order.
+    """
+    source, names = Path(path), ["t", "roll", "pitch", "yaw"]
+    try:
+        with source.open(newline="", encoding="utf-8") as file:
+            rows = [row for row in csv.reader(file) if row]
+    except FileNotFoundError:
+        raise FileError(f"There is no file {source}.") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FileError(f"{source} is not a readable CSV file: {error}.") from error
+    if not rows or [cell.strip() for cell in rows[0]] != names:
+        raise FileError(f"{source} must begin with the line t,roll,pitch,yaw.")
+    try:
+        t, *degrees = np.array(rows[1:], dtype=float).reshape(-1, 4).T
+    except ValueError:
+        raise FileError(f"{source} must have four numbers in each line after the first.") from None
+    if len(t) == 0 or not np.all(np.isfinite([t, *degrees])) or np.any(np.diff(t) <= 0):
+        raise FileError(f"{source} must have finite numbers and times that rise from line to line.")
+    angles = np.unwrap(np.radians(degrees), axis=1)
+
+    def history(time: Array) -> Float[Array, "3 3"]:
+        return attitude(*(jnp.interp(time, t, angle) for angle in angles))
+
+    return history
+
+
+# --- figures
+
+
+def _hours(ax: Axes, day: Day) -> None:
+    """Set the x axis to local hours, from a little before sunrise to a little after sunset."""
+    first, last = day.daylight[0][0], day.daylight[-1][1]
+    ax.set_xlim(max(first - 0.5, 0.0), min(last + 0.5, day.hours[-1]))
+    ax.set_xlabel("local time [h]", fontsize=9)
+
+
+def _shade(ax: Axes, day: Day) -> None:
+    """Shade the times in which the sun is up but out of reach."""
+    out = day.is_up & ~day.facing
+    ax.fill_between(
+        day.hours, 0, 1, where=out.tolist(), transform=ax.get_xaxis_transform(), color="0.9", lw=0,
+        label="out of reach",
+    )  # fmt: skip
+
+
+def tracking(day: Day) -> Figure:
+    """Figure of sun, panel angles, strokes and pointing error over the day."""
+    figure, axes = grid(2, 2, 5.2)
+    curves = {
+        (0, 0): ("sun", "elevation [°]", [("elevation", np.degrees(np.asarray(day.sun.elevation)))]),
+        (0, 1): ("panel angles", "angle [°]",
+                 [("$\\phi$", np.degrees(day.angles[0])), ("$\\theta$", np.degrees(day.angles[1]))]),
+        (1, 0): ("strokes", "stroke [mm]",
+                 [("$q_2$", 1e3 * day.strokes[0]), ("$q_3$", 1e3 * day.strokes[1])]),
+        (1, 1): ("pointing error", "angle to the sun [°]",
+                 [("panel", np.degrees(day.pointing_error))]),
+    }  # fmt: skip
+    for place, (name, label, lines) in curves.items():
+        ax = axes[place]
+        _shade(ax, day)
+        for (words, values), (color, dash) in zip(lines, STYLES, strict=False):
+            ax.plot(day.hours, values, label=words, color=color, linestyle=dash, linewidth=1.4)
+        ax.set_title(name, fontsize=10)
+        ax.set_ylabel(label, fontsize=9)
+        _hours(ax, day)
+        if len(lines) > 1:
+            handles, words = ax.get_legend_handles_labels()
+            ax.legend(handles[1:], words[1:], fontsize=8)
+    axes[0, 0].set_ylim(bottom=0)
+    axes[1, 1].set_ylim(bottom=0)
+    axes[1, 1].legend(fontsize=8)
+    figure.suptitle(title(day), fontsize=11)
+    return figure
+
+
+def sky(day: Day) -> Figure:
+    """Figure of the paths of sun and panel in the UAV's axes, and of the tracker's workspace."""
+    figure, axes = grid(1, 1, 5.2, subplot_kw={"projection": "polar"})
+    ax: Any = axes[0, 0]
+    turn, tilt = np.radians(np.arange(0, 361, 1.0)), np.radians(np.arange(0, 90.1, 0.5))
+    room = jax.jit(lambda direction_b: _room(day, direction_b))
+    inside = np.asarray(room(direction_grid(turn, tilt))).T
+    ax.contourf(turn, np.degrees(tilt), inside, levels=[0.0, np.inf], colors=["#DDEEDD"])
+    ax.contour(turn, np.degrees(tilt), inside, levels=[0.0], colors=["#009E73"], linewidths=1.0)
+    up = day.is_up
+    panel_b = np.asarray(panel_normal(jnp.asarray(day.angles)))
+    for way, words, (color, dash) in zip(
+        (day.s_b, panel_b), ("sun", "panel's normal"), STYLES, strict=False
+    ):
+        around = np.full(len(up), np.nan)
+        around[up] = np.unwrap(np.arctan2(way[1, up], way[0, up]))
+        down = np.degrees(np.arccos(np.clip(way[2], -1, 1)))
+        ax.plot(around, down, color=color, linestyle=dash, label=words)
+    _mark_hours(ax, day)
+    ax.fill([], [], color="#DDEEDD", ec="#009E73", label="reach of the tracker")
+    ax.set_ylim(0, 90)
+    ax.set_rlabel_position(_free_azimuth(day))
+    ax.set_xticks(np.radians([0, 90, 180, 270]), ["x", "y", "-x", "-y"])
+    ax.set_yticks([15, 30, 45, 60, 75], ["15°", "30°", "45°", "60°", "75°"], fontsize=8)
+    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.05, 1.0))
+    ax.set_title(f"{title(day)}\nin the UAV's axes, angle from its z axis", fontsize=10)
+    return figure
+
+
+def _room(day: Day, direction_b: Float[Array, "3 *s"]) -> Float[Array, "*s"]:
+    """Smallest scaled margin: positive in the workspace, zero on its boundary."""
+    m = survey(day.geometry, panel_angles(direction_b), day.limits).margins
+    parts = jnp.stack([m.tilt, m.parallel, *(m.lower / 0.05), *(m.upper / 0.05)])
+    # compiled minima may ignore NaN
+    return jnp.min(jnp.where(jnp.isfinite(parts), parts, -1.0), axis=0)
+
+
+def _free_azimuth(day: Day) -> float:
+    """Azimuth [degrees] at which labels are farthest from the sun's path, off the axes."""
+    path = np.arctan2(day.s_b[1], day.s_b[0])[day.is_up & (day.s_b[2] > 0)]
+    choices = np.radians([22.5, 67.5, 112.5, 157.5, 202.5, 247.5, 292.5, 337.5])
+    apart = np.abs((path[:, None] - choices + np.pi) % (2 * np.pi) - np.pi)
+    return float(np.degrees(choices[np.argmax(np.min(apart, axis=0, initial=np.pi))]))
+
+
+def _mark_hours(ax: Axes, day: Day) -> None:
+    for hour in range(math.ceil(day.hours[-1])):
+        k = int(np.argmin(np.abs(day.hours - hour)))
+        if day.is_up[k] and day.s_b[2, k] > 0:
+            at = math.atan2(day.s_b[1, k], day.s_b[0, k]), math.degrees(math.acos(day.s_b[2, k]))
+            ax.plot(*at, "o", color=STYLES[0][0], markersize=3)
+            if hour % 2 == 0:
+                ax.annotate(f"{hour} h", at, (4, 4), textcoords="offset points", fontsize=8)
+
+
+def light(day: Day) -> Figure:
+    """Figure of the panels' irradiances over the day, and of their energies."""
+    figure, axes = grid(1, 2, 3.4, width_ratios=(3, 2))
+    left, right = axes[0]
+    shown = [p for p in PANELS if p != "airframe" or abs(day.gain("airframe")) > 1e-6]
+    own: tuple[str, Any] = ("#CC79A7", (0, (5, 1, 1, 1)))
+    looks = (STYLES[0], STYLES[3], STYLES[1], own, STYLES[2])
+    styles: dict[str, tuple[str, Any]] = dict(zip(PANELS, looks, strict=True))
+    for panel in shown:
+        color, dash = styles[panel]
+        left.plot(
+            day.hours, day.irradiance[panel], color=color, linestyle=dash, linewidth=1.4,
+            label=PANEL_NAMES[panel],
+        )  # fmt: skip
+    left.set_ylabel("irradiance [W/m²]", fontsize=9)
+    left.set_ylim(bottom=0)
+    _hours(left, day)
+    left.legend(fontsize=8, loc="lower center")
+    energies = [day.energy[panel] / 3.6e6 for panel in shown]
+    bars = right.barh(
+        [PANEL_NAMES[p] for p in shown], energies, color=[styles[p][0] for p in shown], height=0.6
+    )
+    right.bar_label(bars, [f" {100 * day.gain(p):+.1f} %" for p in shown], fontsize=8)
+    right.set_xlim(0, 1.4 * max(energies))
+    right.invert_yaxis()
+    right.set_xlabel("energy [kWh/m² a day]", fontsize=9)
+    right.grid(False, axis="y")
+    for ax in (left, right):
+        ax.set_axisbelow(True)
+    figure.suptitle(title(day), fontsize=11)
+    return figure
+
+
+DAY_FIGURES = {"tracking": tracking, "sky": sky, "light": light}

@@ -1,0 +1,95 @@
+"""Table (CSV) of reaction loads for a mechanical designer, and their figure."""
+
+import csv
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from ..dynamics.loads import COMPONENTS, UNITS, Envelope, JointLoads, envelope
+from ..dynamics.scene import Scene
+from ..files.netcdf import write_atomically
+from ..mechanics.system import System
+from .plot import curves, grid
+from .terminal import row as add_row, table
+
+HEADER = (
+    "joint", "type", "body_i", "body_j", "component", "unit", "min", "t_min_s", "max", "t_max_s",
+)  # fmt: skip
+
+# Loads below this are round-off of joints without such a load; tables show them as 0 [N, N m].
+_NOTHING = 1e-9
+
+
+def rows(system: System, found: Envelope) -> list[tuple[str | float, ...]]:
+    """Rows of the table, one per joint and component, with columns as in `HEADER`."""
+    values = [np.asarray(x) for x in (found.least, found.t_least, found.most, found.t_most)]
+    table: list[tuple[str | float, ...]] = []
+    for k, joint in enumerate(system.joints):
+        for c, (name, unit) in enumerate(zip(COMPONENTS, UNITS, strict=True)):
+            numbers = (float(x[k, c]) for x in values)
+            table.append((joint.name, joint.kind, joint.body_i, joint.body_j, name, unit, *numbers))
+    return table
+
+
+def save_loads(scene: Scene, loads: JointLoads, path: str | os.PathLike[str]) -> Path:
+    """Save the envelope of reaction loads as CSV, atomically; return the path.
+
+    Loads act from body i on body j, about the joint's point on body j, in the axes of the
+    joint's frame on body i.
+    """
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(HEADER)
+    for row in rows(scene.system, envelope(loads)):
+        writer.writerow([f"{x:.6g}" if isinstance(x, float) else x for x in row])
+    return write_atomically(path, text.getvalue().encode())
+
+
+def loads_table(scene: Scene, loads: JointLoads) -> Table:
+    """Table for the terminal: peaks of force and moment at every joint."""
+    found = envelope(loads)
+    heads = ("joint", "type", "peak force [N]", "at [s]", "peak moment [N m]", "at [s]")
+    shown = table(*heads, title=f"{scene.title}: peaks of the joint reactions")
+    force, moment = COMPONENTS.index("|F|"), COMPONENTS.index("|M|")
+    for k, joint in enumerate(scene.system.joints):
+        cells: list[str] = []
+        for c in (force, moment):
+            value, time = float(found.most[k, c]), float(found.t_most[k, c])
+            cells += ["0", ""] if value < _NOTHING else [f"{value:.4g}", f"{time:.4f}"]
+        add_row(shown, joint.name, joint.kind, *cells)
+    return shown
+
+
+def loads_figure(scene: Scene, found: JointLoads) -> Figure:
+    """Figure of force and moment over time in joint axes, with a row of panels per joint."""
+    joints = scene.system.joints
+    figure, axes = grid(max(len(joints), 1), 2, 0.9 + 1.35 * max(len(joints), 1))
+    for k, joint in enumerate(joints):
+        _history(found, k, axes[k])
+        axes[k, 0].set_ylabel(f"{joint.name}", fontsize=9, fontweight="bold")
+        for ax in axes[k]:
+            if k < len(joints) - 1:
+                ax.set_xlabel("")
+                ax.tick_params(labelbottom=False)
+    figure.align_ylabels(axes[:, 0])
+    axes[0, 0].set_title("force [N]", fontsize=10)
+    axes[0, 1].set_title("moment [N m]", fontsize=10)
+    if joints:
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), ncols=4, loc="outside lower center")
+    else:
+        for ax in axes.flat:
+            ax.set_axis_off()
+    figure.suptitle(f"{scene.title}\nreactions in joint axes, body i on body j", fontsize=10)
+    return figure
+
+
+def _history(found: JointLoads, k: int, axes: np.ndarray) -> None:
+    values = np.asarray(found.components)[:, k]
+    for ax, part in zip(axes, (slice(0, 4), slice(4, 8)), strict=True):
+        curves(ax, np.asarray(found.ts), values[:, part], ("x", "y", "z", "magnitude"))
+        if not np.any(np.abs(values[:, part]) > _NOTHING):
+            ax.set_ylim(-1.0, 1.0)

@@ -1,0 +1,83 @@
+"""Table of a run's certificate for the terminal."""
+
+import math
+
+from rich.table import Table
+from rich.text import Text
+
+from ..dynamics.run import Run
+from .terminal import row
+
+# Error estimates below this are differences of round-off, for motions of some metres.
+_ROUND_OFF = 1e-14
+
+
+def _number(value: float | None, unit: str) -> str:
+    if value is None or math.isnan(value):
+        return "not applicable" if value is None else "not found"
+    return f"{value:.2e} {unit}".rstrip()
+
+
+def _estimate(largest: float, end: float, unit: str) -> str:
+    if math.isnan(largest):
+        return "none"
+    words = f"{largest:.1e} {unit}"
+    words += "" if math.isnan(end) else f", at the end {end:.1e} {unit}"
+    return f"{words} (round-off)" if largest < _ROUND_OFF else words
+
+
+def certificate_rows(run: Run) -> list[tuple[str, str]]:
+    """Entries of a run's certificate as rows (quantity, value) in words."""
+    c = run.certificate
+    rank = f"{c.rank} of {c.rows} rows" if c.rows else "no joints"
+    if c.redundant:
+        rank += f"; dependent rows in {', '.join(c.redundant)}"
+    rows = [
+        ("Result", f"{c.result} at t = {c.t_end:g} s"),
+        ("Estimated position error", _estimate(c.position_error, c.position_error_end, "m")),
+        ("Estimated orientation error", _estimate(c.angle_error, c.angle_error_end, "rad")),
+    ]
+    if c.error_words:
+        rows.append(("About these errors", c.error_words))
+    rows += [
+        ("Constraint violation, lengths", _number(c.position_violation, "m")),
+        ("Constraint violation, angles", _number(c.angle_violation, "rad")),
+        ("Violation of the lengths' rates", _number(c.velocity_violation, "m/s")),
+        ("Violation of the angles' rates", _number(c.angular_velocity_violation, "rad/s")),
+        ("Violation of the Euler parameters' norm", _number(c.norm_violation, "")),
+        ("Energy balance, of the largest energy", _number(c.relative_energy_error, "")),
+    ]
+    if c.momentum_error is not None:
+        rows += [
+            ("Momentum balance, relative", _number(c.momentum_error, "")),
+            ("Angular momentum balance, relative", _number(c.angular_momentum_error, "")),
+        ]
+    rows.append(("Rank of the constraint Jacobian", rank))
+    if c.smallest_singular_value is not None:
+        rows.append(("Smallest singular value on the way", _number(c.smallest_singular_value, "")))
+    rows.append(("Steps accepted, rejected", f"{c.accepted_steps}, {c.rejected_steps}"))
+    if 2 * c.unsteered_steps > c.accepted_steps:
+        rows.append(
+            (
+                "Steps that grew at their limit",
+                f"{c.unsteered_steps}: not the error but the saved times, or nothing, chose most lengths",
+            )
+        )
+    return [
+        *rows,
+        ("Time to compile the integration", f"{c.compile_seconds:.2f} s"),
+        ("Time to run it", f"{c.run_seconds:.2f} s"),
+        ("Time for the second run, for the errors", f"{c.estimate_seconds:.2f} s"),
+        ("Time for checks and balances", f"{c.analysis_seconds:.2f} s"),
+    ]
+
+
+def certificate_table(run: Run) -> Table:
+    """Table of a run's certificate for the terminal."""
+    # names of bodies and joints are printed literally: brackets in them are no markup
+    table = Table(title=Text(run.scene.title), show_header=False, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column()
+    for cells in certificate_rows(run):
+        row(table, *cells)
+    return table

@@ -1,0 +1,133 @@
+"""Files and figures of parameter searches, tuned inputs and linear models."""
+
+import io
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from ..algebra.least_squares import Search, SearchReason
+from ..algebra.rotation import to_rotation_vector
+from ..files.netcdf import FileError, write_atomically
+from ..flight.linear import Linear
+from ..flight.tuning import InputTuning
+from .plot import grid
+
+_FORMAT = "stmuav_jax search"
+
+
+def save_linear(linear: Linear, path: str | os.PathLike[str]) -> Path:
+    """Write A, B, C, D and the names with units of states, inputs and outputs to an npz file."""
+    names = {
+        kind: np.array([f"{name} [{unit}]" for name, unit in getattr(linear, kind)])
+        for kind in ("states", "inputs", "outputs")
+    }
+    content = io.BytesIO()
+    matrices = {name: getattr(linear, name) for name in "ABCD"}
+    np.savez(content, **matrices, **names)  # pyright: ignore[reportArgumentType]
+    return write_atomically(path, content.getvalue())
+
+
+def save_search(search: Search, problem: str, path: str | os.PathLike[str]) -> Path:
+    """Write the state of a search, from which `load_search` resumes it.
+
+    Args:
+        search: state of the search.
+        problem: name of the problem; searches of another problem are refused on loading.
+        path: path of the npz file.
+    """
+    leaves = jax.tree.leaves(search.values)
+    head = {
+        "format": _FORMAT,
+        "problem": problem,
+        "loss": search.loss,
+        "history": list(search.history),
+        "best": search.best,
+        "reason": int(search.reason),
+    }
+    content = io.BytesIO()
+    arrays = {f"leaf_{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
+    np.savez(content, head=np.array(json.dumps(head)), **arrays)  # pyright: ignore[reportArgumentType]
+    return write_atomically(path, content.getvalue())
+
+
+def load_search(path: str | os.PathLike[str], problem: str, like: Any) -> Search:
+    """Read a search of a problem whose values have the tree structure and shapes of `like`.
+
+    Raises:
+        FileError: no such file, not a search, or one of another problem.
+    """
+    try:
+        with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as content:
+            head = json.loads(str(content["head"]))
+            arrays = [content[f"leaf_{k}"] for k in range(len(content.files) - 1)]
+    except FileNotFoundError:
+        raise FileError(f"There is no file {path} to go on from.") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise FileError(f"{path} is not a search, or it is damaged: {error}") from None
+    if head.get("format") != _FORMAT:
+        raise FileError(f"{path} is not a search.")
+    if head["problem"] != problem:
+        raise FileError(
+            f"{path} holds a search of another problem: '{head['problem']}', not '{problem}'."
+        )
+    leaves, form = jax.tree.flatten(like)
+    if [np.shape(leaf) for leaf in leaves] != [a.shape for a in arrays]:
+        raise FileError(
+            f"{path} holds values of shapes {[a.shape for a in arrays]}, where "
+            f"{[np.shape(leaf) for leaf in leaves]} are wanted."
+        )
+    values = jax.tree.unflatten(form, [jnp.asarray(a) for a in arrays])
+    history = tuple(float(x) for x in head["history"])
+    return Search(values, head["loss"], history, head["best"], SearchReason(head["reason"]))
+
+
+def loss_history(history: tuple[float, ...]) -> Figure:
+    """Figure of the loss over the steps."""
+    figure, axes = grid(1, 1, 3.2)
+    axes[0, 0].semilogy(np.arange(len(history)), history, marker=".", lw=1)
+    axes[0, 0].set(xlabel="step", ylabel="loss")
+    return figure
+
+
+def flight_figure(
+    ts: np.ndarray, rows: dict[str, dict[str, np.ndarray]], marks: dict[str, list[float]]
+) -> Figure:
+    """Figure of curves over time, with a panel per "quantity [unit]" and limits as dashed lines."""
+    figure, panels = grid(len(rows), 1, 1.9 * len(rows) + 0.5, sharex=True)
+    for axes, (label, curves) in zip(panels[:, 0], rows.items(), strict=True):
+        for name, values in curves.items():
+            axes.plot(ts, values, lw=1.2, label=name)
+        for mark in marks.get(label, []):
+            axes.axhline(mark, color="0.4", lw=0.8, ls="--")
+        axes.set_ylabel(label, fontsize=9)
+        if len(curves) > 1:
+            axes.legend(fontsize=7, ncols=min(len(curves), 3))
+    panels[-1, 0].set_xlabel("t [s]", fontsize=9)
+    return figure
+
+
+def flown(
+    tuning: InputTuning, values: Any, samples: int = 200
+) -> tuple[Float[np.ndarray, " k"], dict[str, dict[str, np.ndarray]]]:
+    """Times and curves of a solution of `slew`, by "quantity [unit]" and name, for figures."""
+    motion = tuning.motion(values, samples)
+    path, squared, forces = motion.points, motion.inputs[:, :-2], motion.inputs[:, -2:]
+    tilt = np.asarray(jax.vmap(to_rotation_vector)(path.p))
+    deg = lambda x: np.degrees(np.asarray(x))
+    return np.asarray(motion.ts), {
+        "panel [degrees]": {"phi": deg(path.angles[:, 0]), "theta": deg(path.angles[:, 1])},
+        "UAV [degrees]": {k: deg(tilt[:, i]) for i, k in enumerate(("roll", "pitch", "yaw"))},
+        "UAV [mm]": {k: 1e3 * np.asarray(path.r[:, i]) for i, k in enumerate("xyz")},
+        "actuators [N]": {f"slider {i + 2}": np.asarray(forces[:, i]) for i in range(2)},
+        "rotors [rad/s]": {
+            f"{i + 1}": np.sqrt(np.asarray(squared[:, i])) for i in range(squared.shape[1])
+        },
+    }

@@ -1,0 +1,1 @@
+"""Relative motions that joints leave free: one class in one module each, behind one interface."""

@@ -1,0 +1,5 @@
+"""Rotors, motors, drag, and the allocation of rotor speeds. Floor 7."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,0 @@
-"""Floor 4: what one asks of the machine: pointing, trim, linearisation, tuning, loads."""

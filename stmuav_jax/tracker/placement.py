@@ -1,0 +1,108 @@
+"""Poses and velocities of the tracker's six bodies, and its eight joints, by panel orientation."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..algebra.rotation import angular_velocity, product, rotation_matrix
+from ..mechanics.state import State
+from .geometry import TrackerGeometry, close_loops, turn_by_angles
+from .kinematics import RISING, Rods, strokes_of
+
+TRACKER_BODIES = ("slider_2", "slider_3", "post_4", "rod_5", "rod_6", "panel_7")
+
+
+class Placement(NamedTuple):
+    """Bodies and joints of the tracker at one posture, in the base's frame.
+
+    Attributes:
+        r: centres of mass of the bodies, in the order of `TRACKER_BODIES` (6, 3) [m].
+        p: Euler parameters of the bodies, body to base (6, 4).
+        points: points of the joints by joint name (3,) [m].
+        axes: axes of the joints by joint name (3,), those of universal joints as "U35.i" and
+            "U35.j".
+    """
+
+    r: Float[Array, "6 3"]
+    p: Float[Array, "6 4"]
+    points: dict[str, Float[Array, "3"]]
+    axes: dict[str, Float[Array, "3"]]
+
+
+def turn_about(angle: Float[Array, ""], axis: int) -> Float[Array, "4"]:
+    """Euler parameters of a rotation [rad] about a coordinate axis (0, 1 or 2)."""
+    e = jnp.zeros(4).at[0].set(jnp.cos(angle / 2))
+    return e.at[axis + 1].set(jnp.sin(angle / 2))
+
+
+def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RISING) -> Placement:
+    """Place every body and joint at panel angles (phi, theta) (2,) [rad]; NaN out of reach.
+
+    Body axes: z along the post and the rods, upward from the lower joint; post R_x, rod 6
+    R_y, rod 5 R_y R_x (the y axis of universal joint 3-5 is in the slider, its x axis in the
+    rod), panel R_x R_y.
+
+    Source: report Part II, section 3.1 and Eq. 3.10; docs/geometry.md.
+    """
+    loops = close_loops(geometry, turn_by_angles(angles))
+    q2, q3 = strokes_of(geometry, loops, rods)
+    x, y, z = jnp.eye(3)
+    hinge = jnp.stack([geometry.axis[0], geometry.axis[1], geometry.hinge])
+    foot = jnp.stack([geometry.axis[0], geometry.axis[1], jnp.zeros(())])
+    top = hinge + loops.rise * z - loops.lean * y
+    ball_2, ball_3 = (hinge + jnp.stack(ball) for ball in loops.balls)
+    low_2 = foot - geometry.arms[0] * x + q2 * z
+    low_3 = foot + geometry.arms[1] * y + q3 * z
+    along_2, along_3 = ball_2 - low_2, ball_3 - low_3
+    aside = jnp.arctan2(along_3[0], along_3[2])
+    forth = jnp.arctan2(-along_3[1], jnp.sqrt(along_3[0] ** 2 + along_3[2] ** 2))
+    level = jnp.array([1.0, 0.0, 0.0, 0.0])
+    post = turn_about(jnp.arctan2(loops.lean, loops.rise), 0)
+    rod_5 = product(turn_about(aside, 1), turn_about(forth, 0))
+    rod_6 = turn_about(jnp.arctan2(along_2[0], along_2[2]), 1)
+    panel = product(turn_about(angles[0], 0), turn_about(angles[1], 1))
+    out, up = geometry.slider_out, geometry.slider_up
+    r = jnp.stack(
+        [
+            low_2 - out[0] * x + up[0] * z,
+            low_3 + out[1] * y + up[1] * z,
+            hinge + rotation_matrix(post) @ geometry.post_com,
+            low_3 + geometry.rod_com[1] * along_3,
+            low_2 + geometry.rod_com[0] * along_2,
+            top + rotation_matrix(panel) @ geometry.panel_com,
+        ]
+    )
+    points = {
+        "T12": r[0], "T13": r[1], "R14": hinge, "R26": low_2,
+        "U35": low_3, "U47": top, "S57": ball_3, "S67": ball_2,
+    }  # fmt: skip
+    axes = {
+        "T12": z, "T13": z, "R14": x, "R26": y,
+        "U35.i": y, "U35.j": rotation_matrix(rod_5)[:, 0],
+        "U47.i": x, "U47.j": rotation_matrix(panel)[:, 1],
+    }  # fmt: skip
+    return Placement(r, jnp.stack([level, level, post, rod_5, rod_6, panel]), points, axes)
+
+
+def posture(
+    geometry: TrackerGeometry,
+    angles: Float[Array, "2"],
+    rates: Float[Array, "2"] | None = None,
+    rods: Rods = RISING,
+) -> State:
+    """State of the six bodies on a base at rest.
+
+    Args:
+        angles: panel angles (phi, theta) (2,) [rad].
+        rates: rates of the panel angles (2,) [rad/s], by default zero.
+    """
+
+    def poses(x: Array) -> tuple[Array, Array]:
+        at = place(geometry, x, rods)
+        return at.r, at.p
+
+    rates = jnp.zeros_like(angles) if rates is None else rates
+    (r, p), (v, p_rate) = jax.jvp(poses, (angles,), (rates,))
+    return State(r, p, v, jax.vmap(angular_velocity)(p, p_rate))

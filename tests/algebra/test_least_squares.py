@@ -1,0 +1,82 @@
+"""Searching: known minima, bests kept, restarts, bad losses."""
+
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+
+import stmuav_jax as stm
+from stmuav_jax.algebra.least_squares import SearchReason, search
+
+LM = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
+
+
+def rosenbrock(v):
+    """Residuals, zero at (1, 1)."""
+    return {"a": 1 - v["x"], "b": 10 * (v["y"] - v["x"] ** 2)}
+
+
+START = {"x": -1.2, "y": 1.0}
+
+
+def test_least_squares():
+    seen = []
+    found = search(rosenbrock, START, LM, report=lambda s: seen.append(s.loss))
+    assert found.reason == SearchReason.CONVERGED
+    np.testing.assert_allclose([found.values["x"], found.values["y"]], 1, atol=1e-8)
+    assert found.history[0] == pytest.approx(0.5 * (2.2**2 + (10 * 0.44) ** 2))
+    assert tuple(seen) == found.history
+    assert found.steps == len(seen) - 1
+    assert seen == sorted(seen, reverse=True)
+    assert "Converged" in found.words()
+
+
+def test_a_minimiser_of_optax():
+    adam = optx.OptaxMinimiser(optax.adam(0.05), rtol=1e-6, atol=1e-6)
+    found = search(lambda v: (v - 2.0) ** 2, jnp.asarray(0.0), adam, steps=500, patience=500)
+    assert float(found.values) == pytest.approx(2.0, abs=1e-3)
+
+
+def test_goes_on_where_it_was():
+    first = search(rosenbrock, START, LM, steps=5)
+    assert first.reason == SearchReason.STEPS
+    assert first.steps == 5
+    again = search(rosenbrock, START, LM, steps=100, resume=first)
+    assert again.history[:6] == first.history
+    assert again.loss < 1e-16 < first.loss
+    with pytest.raises(stm.SettingError, match="values of another form"):
+        search(rosenbrock, {"x": 0.0, "y": jnp.zeros(2)}, LM, resume=first)
+
+
+def test_interrupted():
+    def stop(now):
+        if now.steps == 3:
+            raise KeyboardInterrupt
+
+    found = search(rosenbrock, START, LM, report=stop)
+    assert found.reason == SearchReason.INTERRUPTED
+    assert found.steps == 3
+
+
+def test_loss_that_is_not_finite():
+    """Downhill to a cliff: what was best before is kept."""
+    cliff = lambda v: jnp.where(v > 0.5, v, jnp.nan)
+    descent = optx.OptaxMinimiser(optax.sgd(0.2), rtol=1e-6, atol=1e-6)
+    found = search(cliff, jnp.asarray(1.0), descent)
+    assert found.reason == SearchReason.NOT_FINITE
+    assert 0.5 < found.loss < 0.7
+    assert np.isnan(found.history[-1])
+    assert "not finite at step" in found.words()
+    with pytest.raises(stm.SettingError, match="loss at the start of the search is nan"):
+        search(cliff, jnp.asarray(0.0), descent)
+
+
+def test_patience():
+    flat = lambda v: 1.0 + 0.0 * v
+    descent = optx.OptaxMinimiser(optax.sgd(0.2), rtol=1e-30, atol=1e-30)
+    found = search(flat, jnp.asarray(1.0), descent, patience=4)
+    assert found.reason in (SearchReason.PATIENCE, SearchReason.CONVERGED)
+    assert found.steps <= 4
+    with pytest.raises(stm.SettingError, match="at least one of steps, not 0"):
+        search(flat, jnp.asarray(1.0), descent, steps=0)

@@ -1,0 +1,107 @@
+"""Reverse mode by kept steps: against diffrax's own, forward mode, and differences."""
+
+from dataclasses import replace
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import pendulum, swung
+
+import stmuav_jax as stm
+
+KEEPING = stm.Method(rtol=1e-10, atol=1e-10)
+AGAIN = replace(KEEPING, adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=500))
+AHEAD = replace(KEEPING, adjoint=diffrax.ForwardMode())
+# mass, length, first angle, first rate, start and length of the flight
+Q = jnp.array([2.0, 0.5, 1.1, -0.3, 0.2, 1.5])
+
+
+def push(t):
+    """A moment that depends on time [N m]."""
+    return 0.8 * jnp.sin(3.0 * t)
+
+
+def swing(q, method, times=None):
+    """Of a driven pendulum: heights at three times, weighted, and the last rate."""
+    mass, length, angle, rate = q[:4]
+    t0, span = q[4:] if times is None else times
+    system = pendulum(length=length, mass=mass, forces=(stm.JointEffort("hinge", push),))
+    start = swung(system, angle, rate, length)
+    ts = t0 + span * jnp.array([0.0, 0.35, 0.5, 1.0])
+    states = stm.integrate(system, start, ts, method).states
+    return states.r[1:, 0, 2] @ jnp.array([1.0, -0.5, 2.0]) + 0.1 * states.omega[-1, 0, 1]
+
+
+of_kept = jax.jit(jax.value_and_grad(lambda q: swing(q, KEEPING)))
+
+
+def test_three_routes():
+    """By numbers of the model and of the start, and by times, which the flow's equations give."""
+    value, gradient = of_kept(Q)
+    same, again = jax.jit(jax.value_and_grad(lambda q: swing(q, AGAIN)))(Q)
+    ahead = jax.jit(jax.jacfwd(lambda q: swing(q, AHEAD)))(Q)
+    assert value == same
+    np.testing.assert_allclose(gradient[:4], again[:4], rtol=1e-11)
+    np.testing.assert_allclose(gradient[:4], ahead[:4], rtol=1e-9)
+    h = 1e-3
+    run = jax.jit(jax.vmap(lambda q: swing(q, AHEAD)))
+    step = lambda k: np.asarray(run(Q + k * h * jnp.eye(6)))
+    expected = (8 * (step(1) - step(-1)) - (step(2) - step(-2))) / (12 * h)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-7)
+
+
+def test_many_at_once():
+    """Flights of different lengths: vmap of grad is a loop of grads."""
+    several = Q + jnp.linspace(0.0, 0.4, 3)[:, None]
+    values, gradients = jax.jit(jax.vmap(jax.value_and_grad(lambda q: swing(q, KEEPING))))(several)
+    for q, value, gradient in zip(several, values, gradients, strict=True):
+        alone, expected = of_kept(q)
+        # round-off decides on steps, and those on the error
+        assert value == pytest.approx(float(alone), rel=1e-9)
+        np.testing.assert_allclose(gradient, expected, rtol=1e-9)
+
+
+def test_second_derivatives():
+    """Forward over reverse is symmetric and as differences have it."""
+    first = jax.grad(lambda x: swing(x, KEEPING, Q[4:]))
+    H = np.asarray(jax.jit(jax.jacfwd(first))(Q[:4]))
+    np.testing.assert_allclose(H, H.T, rtol=1e-7, atol=1e-7 * np.max(np.abs(H)))
+    run, h = jax.jit(first), 1e-4
+    rows = [(run(Q[:4] + h * e) - run(Q[:4] - h * e)) / (2 * h) for e in np.eye(4)]
+    np.testing.assert_allclose(H, rows, atol=1e-5 * np.max(np.abs(H)))
+
+
+def test_more_steps_than_are_kept():
+    """Windows done again on the way back: the same derivatives as those of all steps kept."""
+    fine = stm.Method(rtol=1e-12, atol=1e-12, solver=diffrax.Tsit5())
+    few = replace(fine, adjoint=stm.dynamics.DiscreteAdjoint(kept=64))
+    of = lambda method: jax.jit(jax.value_and_grad(lambda q: swing(q, method, Q[4:])))
+    expected, same = of(fine)(Q[:4])
+    value, gradient = of(few)(Q[:4])
+    system = pendulum(length=Q[1], mass=Q[0])
+    counts = jax.jit(lambda s: stm.integrate(system, s, Q[4] + Q[5] * jnp.array([0.0, 1.0]), fine))(
+        swung(system, Q[2], Q[3], Q[1])
+    ).counts
+    # at least three windows of 64 in the longest of the three spans
+    assert float(counts.accepted[-1]) * 0.5 > 2 * 64
+    assert value == expected
+    np.testing.assert_allclose(gradient, same, rtol=1e-11)
+
+
+def test_in_diffrax_itself():
+    """Elsewhere it is an adjoint like any other, with as many checkpoints."""
+    term = diffrax.ODETerm(lambda t, y, k: -k * y)
+
+    def end(k, adjoint):
+        solution = diffrax.diffeqsolve(
+            term, diffrax.Tsit5(), 0.0, 1.0, 0.1, jnp.ones(2), k, adjoint=adjoint, max_steps=64
+        )
+        return jnp.sum(jnp.asarray(solution.ys))
+
+    found = jax.grad(end)(0.7, stm.dynamics.DiscreteAdjoint(kept=8))
+    same = jax.grad(end)(0.7, diffrax.RecursiveCheckpointAdjoint(checkpoints=8))
+    assert found == same
+    with pytest.raises(stm.SettingError, match="at least one step attempt, not 0"):
+        stm.dynamics.DiscreteAdjoint(kept=0)

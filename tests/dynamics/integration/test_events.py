@@ -1,0 +1,69 @@
+"""Events: direction, restarts at the event, other thresholds, values that are not numbers; jumps."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import stmuav_jax as stm
+
+BODY = stm.Body("m", 1.0, (1e-3,) * 3, position=(0, 0, 0))
+PULL = float(np.linalg.norm(stm.Gravity().acceleration))
+AHEAD = stm.Method(adjoint=diffrax.ForwardMode())
+
+
+class Plane(eqx.Module):
+    """Height above a plane; not a number after a time."""
+
+    height: float | jax.Array
+    until: float | jax.Array
+
+    def __call__(self, t, state):
+        return jnp.where(t > self.until, jnp.nan, state.r[0, 2] - self.height)
+
+
+def test_bouncing_ball():
+    """Six arcs from one compiled function, each started at the event that ended the one before."""
+    up = stm.translational("h", "ground", "m", point=(0, 0, 0), axis=(0, 0, 1))
+    system = stm.System([BODY], [up], [stm.Gravity()])
+    at, compiled = system.reference, []
+
+    @eqx.filter_jit
+    def fall(t, z, v, plane):
+        compiled.append(1)
+        start = stm.State(at.r.at[0, 2].set(z), at.p, at.v.at[0, 2].set(v), at.omega)
+        method = stm.Method(adjoint=diffrax.ForwardMode(), event=plane, direction=False)
+        return stm.integrate(system, start, jnp.stack([t, t + 3.0]), method)
+
+    t, z, v = jnp.zeros(()), jnp.ones(()), jnp.zeros(())
+    # of one type, as weakly typed numbers would be compiled again
+    plane = lambda height, until: Plane(*(jnp.asarray(x, float) for x in (height, until)))
+    ground = plane(0.0, np.inf)
+    for bounce in range(6):
+        arc = fall(t, z, v, ground)
+        assert arc.result == diffrax.RESULTS.event_occurred
+        t, z, v = arc.ts[-1], arc.states.r[-1, 0, 2], -0.8 * arc.states.v[-1, 0, 2]
+        expected = np.sqrt(2 / PULL) * (1 + 2 * sum(0.8**k for k in range(1, bounce + 1)))
+        assert abs(float(t) - expected) < 1e-9, bounce
+    # another threshold, and an event that stops being a number
+    lost = fall(jnp.zeros(()), jnp.ones(()), jnp.zeros(()), plane(-1.0, 0.3))
+    assert lost.result == diffrax.RESULTS.nonfinite
+    assert 0.3 < float(lost.ts[-1]) < 3.0
+    assert np.isnan(lost.states.r[-1, 0, 2])
+    assert len(compiled) == 1
+
+
+def test_known_jumps():
+    """A square wave of 3 N: as accurate as the tolerance, and without a rejected step."""
+    along = stm.translational("h", "ground", "m", point=(0, 0, 0), axis=(1, 0, 0))
+    wave = lambda t, kin: 3 * jnp.sign(jnp.sin(2 * jnp.pi * t)) * jnp.eye(3)[0]
+    system = stm.System([BODY], [along], [stm.AppliedForce("m", wave)])
+    ts = jnp.array([0.0, 1.0, 2.5, 2.7, 5.0])
+    method = eqx.tree_at(
+        lambda m: m.jump_ts, AHEAD, jnp.arange(0.0, 5.5, 0.5), is_leaf=lambda x: x is None
+    )
+    path = jax.jit(lambda: stm.integrate(system, system.reference, ts, method))()
+    np.testing.assert_array_equal(path.ts, ts)
+    np.testing.assert_allclose(path.states.r[:, 0, 0], [0, 0.75, 1.875, 2.115, 3.75], atol=1e-8)
+    assert int(path.counts.rejected[-1]) == 0

@@ -1,0 +1,274 @@
+"""The wrapped solver: projected ends, nothing stale remembered, order and interpolation kept."""
+
+from functools import cache
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import pendulum, relative_error, swung
+
+import stmuav_jax as stm
+from stmuav_jax.dynamics.formulations.base import Residuals
+from stmuav_jax.dynamics.integration.problem import prepare
+from stmuav_jax.dynamics.integration.stepping import (
+    ProjectedSolver,
+    ProjectionLimit,
+    StepSizeMemory,
+    error_norm,
+)
+
+SYSTEM = pendulum()
+START = swung(SYSTEM, 1.2, 2.0)
+END = 1.0
+SOLVERS = {"Tsit5": diffrax.Tsit5(), "Kvaerno3": diffrax.Kvaerno3(), "Dopri8": diffrax.Dopri8()}
+
+
+def method(solver, tolerance=1e-8):
+    """Maximal coordinates, in which a pendulum has constraints to hold.
+
+    ForwardMode: nothing is differentiated backwards here.
+    """
+    return stm.Method(
+        formulation=stm.Augmented(),
+        solver=SOLVERS[solver],
+        rtol=tolerance,
+        atol=tolerance,
+        adjoint=diffrax.ForwardMode(),
+        # the wrapped solver alone, without the bound of steps that goes to step control
+        steps="state",
+    )
+
+
+TOLERANCES = {"Tsit5": 1e-11, "Kvaerno3": 1e-5, "Dopri8": 1e-13}
+
+
+@cache
+def reached(solver):
+    """The trajectory by one solver, at its own tolerance."""
+    ts, how = jnp.asarray([0.0, 0.4, END]), method(solver, TOLERANCES[solver])
+    return jax.jit(lambda s: stm.integrate(SYSTEM, s, ts, how))(START)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_every_step_ends_on_the_constraints(solver):
+    worst = reached(solver).worst
+    assert reached(solver).result == diffrax.RESULTS.successful
+    assert float(worst.position[-1]) < 1e-14
+    assert float(worst.velocity[-1]) < 1e-13
+    assert float(worst.norm[-1]) < 1e-15
+
+
+@pytest.mark.parametrize(("solver", "error"), [("Tsit5", 1e-9), ("Kvaerno3", 1e-3)])
+def test_projected_solvers_agree_with_dopri8(solver, error):
+    assert relative_error(reached(solver).states, reached("Dopri8").states) < error
+
+
+# --- single steps
+
+
+STIFF = diffrax.Kvaerno3(root_finder=diffrax.VeryChord(1e-12, 1e-12, norm=error_norm(13)))
+TIMES = jnp.asarray([0.0, 0.15, 0.3])
+
+
+def problem_of(solver, how=None):
+    """A prepared problem and its start; implicit stages are solved to 1e-12."""
+    how = stm.Projection() if how is None else how
+    inner = STIFF if solver == "Kvaerno3" else SOLVERS[solver]
+    m = stm.Method(
+        formulation=stm.Augmented(),
+        solver=inner,
+        stabilisation=how,
+        adjoint=diffrax.ForwardMode(),
+        balances=True,
+        steps="state",
+    )
+    problem = prepare(SYSTEM, m)
+    x = m.formulation.to_vector(problem.model, START)
+    return problem, jnp.concatenate([x, jnp.zeros(1)])
+
+
+@pytest.fixture(scope="module", params=["Tsit5", "Kvaerno3"])
+def two_steps(request):
+    """Two coarse steps, and the second again from a fresh start at the first one's end."""
+    problem, y0 = problem_of(request.param)
+    solver, terms = problem.solver(), diffrax.ODETerm(problem.field)
+
+    @jax.jit
+    def walk(y0, times):
+        a, b, c = times
+        model, middle = problem.model, 0.5 * (a + b)
+        state = solver.init(terms, a, b, y0, model)
+        y1, _, info, state, _ = solver.step(terms, a, b, y0, model, state, jnp.asarray(False))
+        y2, _, _, kept, _ = solver.step(terms, b, c, y1, model, state, jnp.asarray(False))
+        fresh = solver.init(terms, b, c, y1, model)
+        again, _, _, _, _ = solver.step(terms, b, c, y1, model, fresh, jnp.asarray(False))
+        between = solver.interpolation_cls(t0=a, t1=b, **info)
+        seen = [between.evaluate(t) for t in (a, middle, b)]
+        return y1, y2, again, seen, between.evaluate(middle, b), info["shift"], kept[1]
+
+    return y0, jax.tree.map(np.asarray, walk(y0, TIMES))
+
+
+def test_nothing_stale_is_remembered(two_steps):
+    """The projection moved the end, so the slope that the solver kept is not used."""
+    _, (_, y2, again, _, _, shift, _) = two_steps
+    assert np.max(np.abs(shift)) > 1e-8
+    np.testing.assert_allclose(y2, again, rtol=0, atol=1e-13)
+
+
+def test_interpolation_meets_the_projected_end(two_steps):
+    y0, (y1, _, _, (start, middle, end), part, shift, _) = two_steps
+    np.testing.assert_allclose(start, y0, rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(end, y1)
+    assert np.max(np.abs(end - y1 + shift)) > 1e-8
+    np.testing.assert_allclose(part, end - middle, rtol=0, atol=1e-15)
+
+
+def test_worst_residuals_are_those_of_the_ends(two_steps):
+    _, (*_, worst) = two_steps
+    assert float(worst.position) < 1e-12
+    assert float(worst.norm) < 1e-15
+
+
+def test_without_projection_the_step_is_the_inner_ones():
+    problem, y0 = problem_of("Tsit5", stm.Unstabilised())
+    solver, inner, terms = problem.solver(), diffrax.Tsit5(), diffrax.ODETerm(problem.field)
+
+    @jax.jit
+    def both(y0):
+        outer_state = solver.init(terms, 0.0, 0.1, y0, problem.model)
+        inner_state = inner.init(terms, 0.0, 0.1, y0, problem.model)
+        one = solver.step(terms, 0.0, 0.1, y0, problem.model, outer_state, False)[:2]
+        two = inner.step(terms, 0.0, 0.1, y0, problem.model, inner_state, False)[:2]
+        return one, two
+
+    # the stages are summed in another order
+    one, two = both(y0)
+    assert relative_error(one, two) < 1e-14
+
+
+def test_observed_order_of_tsit5_with_projection():
+    """Halving a constant step divides the error by about 2^5.
+
+    Tsit5's coefficients of order five are small: with coarser steps the next order shows.
+    """
+    span = 2.0
+    problem, y0 = problem_of("Tsit5")
+
+    @jax.jit
+    def end(step):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(problem.field),
+            problem.solver(),
+            0.0,
+            span,
+            step,
+            y0,
+            problem.model,
+            stepsize_controller=diffrax.ConstantStepSize(),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=400,
+        )
+        assert solution.ys is not None
+        return problem.method.formulation.to_state(problem.model, solution.ys[0][:-1])
+
+    tight = jax.jit(
+        lambda s: stm.integrate(SYSTEM, s, jnp.asarray([0.0, span]), method("Dopri8", 1e-13))
+    )
+    exact = jax.tree.map(lambda x: x[-1], tight(START).states)
+    coarse, fine = (relative_error(end(span / n), exact) for n in (160, 320))
+    assert fine > 5e-12  # far above the reference's own error
+    assert abs(np.log2(coarse / fine) - 5) < 0.3
+
+
+def test_orders_are_those_of_the_inner_solver():
+    problem, _ = problem_of("Tsit5")
+    terms = diffrax.ODETerm(problem.field)
+    solver, inner = problem.solver(), diffrax.Tsit5()
+    assert solver.order(terms) == inner.order(terms) == 5
+    assert solver.error_order(terms) == inner.error_order(terms)
+    assert solver.strong_order(terms) == inner.strong_order(terms)
+
+
+# --- step size control
+
+
+def test_an_error_that_is_not_finite_is_never_small():
+    """A step into a place without a field must be refused: NaN < 1 is false, 0 < 1 is true."""
+    norm = error_norm(2)
+    for bad in (np.nan, np.inf):
+        assert not float(norm(jnp.asarray([bad, 1.0, 0.0]))) < 1e300
+
+
+def test_quadratures_do_not_steer_the_steps():
+    norm = error_norm(2)
+    assert float(norm(jnp.asarray([3.0, 4.0, 1e9]))) == pytest.approx(np.sqrt(12.5))
+    assert float(norm(jnp.zeros(3))) == 0
+    assert np.all(np.isfinite(jax.grad(norm)(jnp.zeros(3))))
+
+
+def test_a_step_cut_short_by_an_output_time_is_remembered():
+    """After 0.1 cut to 0.001, the next step is 0.1 again and not ten times 0.001."""
+    inner = diffrax.PIDController(rtol=1e-3, atol=1e-3)
+    start = StepSizeMemory(inner, jnp.asarray(0.1))  # pyright: ignore[reportCallIssue]
+    controller = start.wrap(1)
+    y = jnp.ones(2)
+    terms, func = diffrax.ODETerm(lambda t, y, args: -y), diffrax.Tsit5().func
+    _, state = controller.init(terms, 0.0, 1.0, y, None, None, func, 5)
+    assert float(state[0]) == pytest.approx(0.1)
+    keep, t0, t1, _, state, _ = controller.adapt_step_size(
+        jnp.asarray(0.0), jnp.asarray(0.001), y, y, None, 1e-9 * y, 5, state
+    )
+    assert bool(keep)
+    assert float(t0) == 0.001
+    assert float(t1 - t0) == pytest.approx(0.1)
+    # a rejected step is never lengthened
+    keep, t0, t1, _, state, _ = controller.adapt_step_size(t0, t1, y, y, None, 1e3 * y, 5, state)
+    assert not bool(keep)
+    assert float(t1 - t0) < 0.1
+
+
+def test_a_step_that_the_projection_moves_far_is_not_kept():
+    """Beyond t = 0.5 "projection" throws the state to 1e8: no such state is ever the last."""
+    none = jnp.zeros(())
+    residuals = Residuals(*(none,) * 5)
+
+    def project(t, y, args):
+        return jnp.where(t > 0.5, 1e8 + y, y), residuals
+
+    far = ProjectionLimit(1e-8, 1e-8, 1)
+    solver = ProjectedSolver(
+        diffrax.Dopri8(), project, lambda t, y, args: residuals, lambda t, y, args: args, far
+    )
+    controller = StepSizeMemory(  # pyright: ignore[reportCallIssue]
+        controller=diffrax.PIDController(rtol=1e-8, atol=1e-8, norm=error_norm(1)),
+        step=jnp.asarray(0.01),
+    )
+    found = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: -y),
+        solver,
+        0.0,
+        1.0,
+        None,
+        jnp.ones(1),
+        stepsize_controller=controller,
+        max_steps=500,
+        throw=False,
+    )
+    assert found.result == diffrax.RESULTS.dt_min_reached
+    assert found.ts is not None
+    assert found.ys is not None
+    assert float(found.ts[-1]) == pytest.approx(0.5, abs=1e-9)
+    assert float(found.ys[-1, 0]) == pytest.approx(np.exp(-0.5), rel=1e-7)
+
+
+def test_an_ordinary_projection_leaves_the_error_as_it_is():
+    y0, y1, error = jnp.array([1.0, 2.0]), jnp.array([1.1, 2.1]), jnp.array([1e-9, -2e-9])
+    far = ProjectionLimit(1e-8, 1e-8, 2)
+    np.testing.assert_array_equal(far.error(y0, y1, y1 + 1e-8, error), error)
+    for end in (y1 + 1e-5, y1 + 1e9, y1 + jnp.nan):
+        off = far.error(y0, y1, end, error)
+        scale = 1e-8 + 1e-8 * jnp.maximum(jnp.abs(y0), jnp.abs(end))
+        assert not error_norm(2)(off / scale) < 1

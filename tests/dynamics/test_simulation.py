@@ -1,0 +1,369 @@
+"""`simulate`: bad settings and starts, failures on the way, and what a run holds."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import pendulum, relative_error, scene_of, state_of, swung, turn
+
+import stmuav_jax as stm
+from stmuav_jax.dynamics.checks import check_method
+
+SYSTEM = pendulum()
+START = swung(SYSTEM, 1.0, 0.5)
+SCENE = scene_of(SYSTEM, START, t1=0.4, save_every=0.02)
+NOTHING = (0.0, 0.0, 0.0)
+
+
+# --- settings: refused before anything is compiled
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"t1": -0.1}, r"t1 = -0.1 s must be finite and not before t0 = 0.0 s"),
+        ({"t1": np.nan}, "must be finite"),
+        ({"t1": np.inf}, "must be finite"),
+        ({"save_every": 0.0}, "save_every must be finite and positive"),
+        ({"save_every": -0.1}, "save_every must be finite and positive"),
+        ({"save_every": np.nan}, "save_every must be finite and positive"),
+        ({"ts": [0.0, 0.2, 0.1]}, r"must increase, but ts\[2\] = 0.1 s follows ts\[1\] = 0.2 s"),
+        ({"ts": [0.0, 0.1, 0.1]}, "must increase"),
+        ({"ts": [0.1, 0.2]}, "first output time must be the scene's t0 = 0.0 s, not 0.1 s"),
+        ({"ts": []}, "list of finite numbers"),
+        ({"ts": [0.0, np.nan]}, "list of finite numbers"),
+        ({"ts": np.array([[0.0, 1.0]])}, "list of finite numbers"),
+        ({"state": START}, "A scene has its own initial state"),
+    ],
+)
+def test_bad_settings_are_refused(settings, words):
+    with pytest.raises(stm.SettingError, match=words):
+        stm.simulate(SCENE, **settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"rtol": -1e-6}, "rtol must be finite and at least 1e-15.*-1e-06"),
+        ({"rtol": 1e-17}, "rtol must be finite and at least 1e-15"),
+        ({"rtol": np.nan}, "rtol must be finite"),
+        ({"atol": 0.0}, "atol must be finite and at least 1e-15"),
+        ({"atol": np.inf}, "atol must be finite"),
+        ({"solver": diffrax.Euler()}, "Euler has no error estimate.*Dopri8"),
+        ({"max_steps": 0}, "max_steps"),
+        ({"max_steps": -5}, "max_steps"),
+        ({"first_step": 0.0}, "first_step"),
+        ({"first_step": -1e-3}, "first_step"),
+        ({"first_step": np.nan}, "first_step"),
+        ({"solver": "Rodas5P"}, r"solver must be an object.*the text 'Rodas5P': write Rodas5P\(\)"),
+        ({"solver": stm.Rodas5P}, r"solver must.*the class Rodas5P: write Rodas5P\(\)"),
+        (
+            {"formulation": "tree"},
+            r"formulation must be an object such as Tree\(\).*text 'tree': write Tree",
+        ),
+        ({"formulation": stm.Tree}, r"the class Tree: write Tree\(\)"),
+        ({"stabilisation": "none"}, r"stabilisation must be an object such as Projection\(\)"),
+    ],
+)
+def test_bad_methods_are_refused(settings, words):
+    with pytest.raises(stm.SettingError, match=words):
+        stm.simulate(SCENE, method=stm.Method(**settings))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [(diffrax.Dopri8(), "Dopri8"), (stm.Method, "the class Method"), ("dopri8", "'dopri8'")],
+)
+def test_nothing_but_a_method_says_how_to_integrate(given, words):
+    with pytest.raises(stm.SettingError, match=rf"must be a Method\(\.\.\.\), but it is {words}"):
+        check_method(given)
+
+
+def test_a_solver_to_be_chosen_needs_simulate():
+    """The pure function cannot look at the values of the start."""
+    with pytest.raises(stm.SettingError, match=r"Method\(solver=choose_solver\(system, state\)\)"):
+        stm.integrate(SYSTEM, START, jnp.array([0.0, 0.1]), stm.Method(solver="auto"))
+
+
+def test_simulate_sets_what_only_it_may_decide():
+    """A run is not differentiated, and its balances belong to its analysis."""
+    asked = stm.Method(rtol=1e-6, steps="sensitivities", balances=True)
+    got = stm.simulate(SCENE, method=asked, t1=0.1, error_estimate=False, analysis=False).method
+    assert isinstance(got.adjoint, diffrax.ForwardMode)
+    assert (got.steps, got.balances, got.rtol, got.max_steps) == ("state", False, 1e-6, 100_000)
+
+
+def simulated(system=SYSTEM, state=START, **settings):
+    return stm.simulate(system, state, **settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({}, r"give the end t1 \[s\], or the saved times"),
+        ({"t1": np.nan}, "t1 = nan s must be finite"),
+        ({"t1": -1.0}, "not before t0"),
+        ({"t1": 1.0, "state": None}, r"give its initial State.*given: none"),
+        ({"ts": []}, "list of finite numbers"),
+    ],
+)
+def test_a_system_needs_a_state_and_an_end(settings, words):
+    with pytest.raises(stm.SettingError, match=words):
+        simulated(**settings)
+
+
+def test_a_system_from_a_state(run):
+    found = simulated(method=stm.Method(rtol=1e-10, atol=1e-10), t1=0.4, save_every=0.02)
+    np.testing.assert_array_equal(found.states.r, run[0].states.r)
+    assert found.scene.name == "system"
+    later = simulated(ts=[1.0, 1.1])
+    assert (later.scene.t0, later.certificate.t_end) == (1.0, 1.1)
+    assert len(simulated(t1=0.4).ts) == 101
+
+
+def test_a_traced_start_is_refused_by_the_name_of_what_serves():
+    """Not as an array that JAX cannot convert."""
+    height = lambda angle: simulated(state=swung(SYSTEM, angle, 0.5), t1=0.1).states.r[-1, 0, 2]
+    for through in (jax.grad, jax.jit, lambda f: lambda x: jax.vmap(f)(jnp.asarray([x]))):
+        with pytest.raises(stm.SettingError, match=r"Use stmuav_jax\.integrate"):
+            through(height)(1.0)
+
+
+# --- starts
+
+
+def with_start(**changes):
+    parts = {name: getattr(START, name) for name in ("r", "p", "v", "omega")} | changes
+    return scene_of(SYSTEM, stm.State(**parts), t1=0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"r": START.r * jnp.nan}, "initial position of body 'bob' must be finite"),
+        ({"v": START.v.at[0, 1].set(jnp.inf)}, "initial velocity of body 'bob' must be finite"),
+        ({"omega": START.omega * jnp.nan}, "angular velocity of body 'bob' must be finite"),
+        ({"p": START.p * 0.9}, "body 'bob' in the initial state must have norm 1.*has norm 0.9"),
+        ({"p": START.p * 0.0}, "body 'bob' in the initial state are all zero"),
+        ({"p": START.p * jnp.nan}, "body 'bob' in the initial state must be finite"),
+        (
+            {"r": START.r + 1e-5},
+            "initial positions do not fit the joints: joint 'hinge' is off by 1e-05.*assemble",
+        ),
+        ({"r": START.r.at[0, 1].add(2e-8)}, "positions do not fit the joints: joint 'hinge'"),
+        (
+            {"v": START.v + 1e-3},
+            r"initial velocities do not fit the joints: joint 'hinge' is off by 0.001 m/s.*assemble",
+        ),
+    ],
+)
+def test_bad_starts_are_refused(changes, words):
+    with pytest.raises(stm.StateError, match=words):
+        stm.simulate(with_start(**changes))
+
+
+def test_a_wrong_angle_and_a_wrong_distance_have_their_own_units():
+    bodies = [stm.Body("bar", 1.0, (0.1, 0.1, 0.1), position=(0, 0, -1.0))]
+    hinge = stm.revolute("hinge", "ground", "bar", point=(0, 0, 0), axis=(0, 1, 0))
+    tilted = stm.System(bodies, [hinge], [])
+    turned = state_of([[0, 0, -1.0]], [turn((0, 0, 1), 0.25)])
+    with pytest.raises(stm.StateError, match=r"'hinge' is off by 0.247 \(a cosine") as error:
+        simulated(tilted, turned, t1=0.1, analysis=False)
+    assert " m (" not in str(error.value)
+    rod = stm.distance("rod", "ground", "bar", point_i=(0, 0, 0), point_j=(0, 0, -1.0))
+    tied = stm.System(bodies, [rod], [])
+    with pytest.raises(stm.StateError, match=r"joint 'rod' is off by 1 m \("):
+        simulated(tied, state_of([[0, 0, 0.0]], [[1.0, 0, 0, 0]]), t1=0.1, analysis=False)
+
+
+def test_states_of_another_size_are_refused():
+    two = state_of(np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    with pytest.raises(stm.SettingError, match=r"State.r must have shape \(..., 1, 3\)"):
+        stm.simulate(scene_of(SYSTEM, two))
+
+
+@pytest.mark.parametrize("kind", [stm.AppliedForce, stm.AppliedMoment])
+def test_a_load_that_is_not_finite_at_the_start(kind):
+    bad = kind("bob", lambda t, kin: jnp.asarray([jnp.nan, 0.0, 0.0]) * (1 + t))
+    system = pendulum(forces=(stm.JointDamping("hinge", turning=0.1), bad))
+    with pytest.raises(
+        stm.ModelError, match=rf"load of {kind.__name__} on bob is not finite at t = 0"
+    ):
+        stm.simulate(scene_of(system, START))
+
+
+# --- runs
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A plain run, with its progress."""
+    seen = []
+    found = stm.simulate(SCENE, method=stm.Method(rtol=1e-10, atol=1e-10), progress=seen.append)
+    return found, seen
+
+
+def test_a_joint_of_a_run(run):
+    """Its angle from the body's own turn, its rate from the body's angular velocity."""
+    found, _ = run
+    joint = found.scene.system.joints[0]
+    motion = found.joint(joint.name)
+    p = found.body(joint.body_j).p
+    np.testing.assert_allclose(np.cos(motion.angle / 2), np.abs(p[:, 0]), atol=1e-12)
+    rates = np.linalg.norm(found.body(joint.body_j).omega, axis=1)
+    np.testing.assert_allclose(np.abs(motion.angle_rate), rates, atol=1e-9)
+
+
+def test_a_run_and_its_certificate(run):
+    found, seen = run
+    c = found.certificate
+    assert found.successful
+    assert c.result == "successful"
+    assert c.t_end == 0.4
+    np.testing.assert_allclose(found.ts, np.linspace(0, 0.4, 21), atol=1e-15)
+    assert found.ts[-1] == 0.4
+    assert c.position_violation < 1e-14
+    assert c.velocity_violation < 1e-13
+    assert c.norm_violation < 1e-15
+    assert c.relative_energy_error < 1e-9
+    assert (c.rows, c.rank, c.redundant) == (5, 5, ())
+    assert c.momentum_error is None
+    assert c.angular_momentum_error is None
+    assert 0.1 < c.smallest_singular_value < 10
+    assert c.accepted_steps > 20
+    assert seen[-1] == 1.0
+    assert seen == sorted(seen)
+    assert c.compile_seconds > 0
+    assert set(c.to_dict()) >= {"result", "energy_error", "rank"}
+
+
+def test_what_a_run_holds(run):
+    found, _ = run
+    assert found.states.r.shape == (21, 1, 3)
+    assert relative_error([x[0] for x in (found.states.r, found.states.p)], [START.r, START.p]) == 0
+    bob = found.body("bob")
+    np.testing.assert_array_equal(bob.r, found.states.r[:, 0])
+    with pytest.raises(stm.ModelError, match="Did you mean 'bob'"):
+        found.body("bobb")
+    snapshot = found.snapshot
+    total = snapshot.kinetic + snapshot.potential
+    assert np.max(np.abs(total - total[0])) < 1e-9 * np.max(np.abs(total))
+    # the hinge's force is m (a - g) at every saved time
+    a = snapshot.accelerations.v_rate[:, 0]
+    expected = 2.0 * (a + np.array([0, 0, 9.81]))
+    np.testing.assert_allclose(snapshot.reactions.force[:, 0], expected, atol=1e-9)
+
+
+def test_ctrl_c_keeps_what_was_reached(run):
+    def stop(fraction):
+        raise KeyboardInterrupt
+
+    found = stm.simulate(SCENE, method=stm.Method(rtol=1e-10, atol=1e-10), progress=stop)
+    assert found.certificate.result == "interrupted"
+    assert not found.successful
+    count = len(found.ts)
+    assert 1 < count < 21
+    assert found.certificate.t_end == found.ts[-1] < 0.4
+    full = run[0].states.r[:count]
+    np.testing.assert_allclose(found.states.r, full, rtol=0, atol=1e-12)
+
+
+def bursting():
+    """A pendulum whose load turns bad at 0.3 s."""
+    burst = lambda t, kin: jnp.where(t < 0.3, 1.0, jnp.nan) * jnp.asarray([0.0, 0.0, 1.0])
+    return scene_of(
+        pendulum(forces=(stm.AppliedForce("bob", burst),)), START, t1=0.5, save_every=0.1
+    )
+
+
+@pytest.fixture(scope="module")
+def failed():
+    """The error of such a run."""
+    with pytest.raises(stm.SimulationError) as error:
+        stm.simulate(bursting())
+    return error.value
+
+
+def test_a_load_that_turns_bad_is_named(failed):
+    assert "load of AppliedForce on bob is not finite" in str(failed)
+    assert "stopped at t = 0.3" in str(failed)
+
+
+def check_part(run):
+    """The part before 0.3 s, finite throughout."""
+    assert isinstance(run, stm.Run)
+    assert not run.successful
+    assert run.certificate.t_end == pytest.approx(0.3, abs=1e-6)
+    np.testing.assert_allclose(run.ts[:3], [0, 0.1, 0.2])
+    assert len(run.ts) == len(run.states.r) == 4
+    assert np.all(np.isfinite(run.states.r))
+    assert np.isfinite(run.certificate.energy_error)
+
+
+def test_the_failed_run_is_kept(failed):
+    check_part(failed.run)
+
+
+@pytest.mark.slow
+def test_without_throw_the_failed_run_is_returned():
+    check_part(stm.simulate(bursting(), throw=False))
+
+
+def test_a_failure_names_the_end_that_was_asked_for():
+    run = stm.simulate(
+        SCENE, method=stm.Method(max_steps=2, rtol=1e-12, atol=1e-12), throw=False, t1=0.3
+    )
+    assert "s of 0.3 s:" in run.failure
+
+
+def test_without_analysis_there_is_no_snapshot(run):
+    found = stm.simulate(SCENE, method=stm.Method(rtol=1e-10, atol=1e-10), analysis=False)
+    np.testing.assert_allclose(found.states.r, run[0].states.r, rtol=0, atol=1e-12)
+    assert np.isnan(found.certificate.energy_error)
+    assert found.certificate.rank == 5
+    with pytest.raises(stm.SettingError, match="analysis=False"):
+        _ = found.snapshot
+    with pytest.raises(stm.StateError, match="positions do not fit"):
+        stm.simulate(with_start(r=START.r + 1e-5), analysis=False)
+
+
+def test_too_few_steps():
+    run = stm.simulate(SCENE, method=stm.Method(max_steps=2, rtol=1e-12, atol=1e-12), throw=False)
+    assert run.certificate.result == "max_steps reached"
+    assert not run.successful
+    assert run.certificate.t_end < 0.4
+    assert np.all(np.isfinite(run.states.r))
+
+
+@pytest.mark.slow
+def test_an_event_ends_a_run():
+    run = stm.simulate(SCENE, method=stm.Method(event=lambda t, state: t > 0.11))
+    assert run.successful
+    assert run.certificate.result == "event occurred"
+    assert 0.11 <= run.certificate.t_end < 0.4
+    assert run.ts[-1] == run.certificate.t_end
+    assert np.all(np.diff(run.ts) > 0)
+
+
+@pytest.mark.slow
+def test_an_event_that_is_no_number_is_named():
+    """With a direction, and a jump before it; what was reached is kept."""
+    lost = lambda t, state: jnp.where(t > 0.11, jnp.nan, -1.0)
+    with pytest.raises(stm.SimulationError, match="value of its event is not a number") as error:
+        stm.simulate(
+            SCENE,
+            method=stm.Method(event=lost, direction=True, jump_ts=[0.05]),
+            error_estimate=False,
+        )
+    run = error.value.run
+    assert isinstance(run, stm.Run)
+    assert 0.1 <= run.certificate.t_end < 0.4
+    assert np.all(np.isfinite(run.states.r[:5]))
+
+
+def test_a_span_of_no_length_gives_the_start():
+    run = stm.simulate(SCENE, t1=0.0)
+    assert run.successful
+    np.testing.assert_array_equal(run.ts, [0.0])
+    np.testing.assert_array_equal(run.states.r[0], START.r)

@@ -1,0 +1,99 @@
+"""Derivatives of accelerations by the balance of forces, against other routes."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import forked
+
+import stmuav_jax as stm
+from stmuav_jax.algebra.rotation import cross
+from stmuav_jax.dynamics.formulations.stabilisation import Baumgarte, Unstabilised
+from stmuav_jax.dynamics.tree.frames import backward_pass, forward_pass, pick
+
+SYSTEMS = {
+    "uav": (lambda: stm.make_scene("uav_tracker", 2).system, Unstabilised()),
+    "tracker, Baumgarte": (lambda: stm.make_scene("tracker", 1).system, Baumgarte(5.0, 7.0)),
+    "forked, with a ball": (lambda: forked(True), Unstabilised()),
+}
+
+
+def central(of, h):
+    """Derivative at 0 of a function of one number, to fourth order."""
+    return (8 * (of(h) - of(-h)) - (of(2 * h) - of(-2 * h))) / (12 * h)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        "uav",
+        pytest.param("tracker, Baumgarte", marks=pytest.mark.slow),
+        "forked, with a ball",
+    ],
+)
+def case(request):
+    """x' as a function of x and of masses, inertias and points of joints; a direction of each."""
+    make, how = SYSTEMS[request.param]
+    system = make()
+    rng = np.random.default_rng(11)
+    numbers = lambda s: (s.bodies.mass, s.bodies.inertia, *(j.point_j for j in s.joints))
+    start = jax.tree.map(jnp.asarray, numbers(system))
+    x = stm.Tree().to_vector(stm.Tree().prepare(system), system.reference)
+    x = x + 0.05 * rng.normal(size=x.shape)
+
+    def rate(x, values):
+        changed = eqx.tree_at(numbers, system, values)
+        model = stm.Tree().prepare(changed)
+        return stm.Tree().derivative(model, jnp.asarray(0.3), x, how)[0]
+
+    tensor = lambda a: a + np.swapaxes(a, 1, 2) if a.ndim == 3 else a
+    step = lambda a: jnp.asarray(tensor(0.1 * np.mean(np.abs(a)) * rng.normal(size=a.shape)))
+    dx = jnp.asarray(rng.normal(size=x.shape))
+    return rate, x, start, dx, jax.tree.map(step, start), rng.normal(size=x.shape)
+
+
+def test_forward_reverse_differences(case):
+    rate, x, start, dx, dv, weight = case
+    moved = lambda h: rate(x + h * dx, jax.tree.map(lambda a, b: a + h * b, start, dv))
+    run = jax.jit(moved)
+    forward = jax.jit(lambda: jax.jvp(rate, (x, start), (dx, dv))[1])()
+    expected = central(run, 1e-3)
+    size = np.max(np.abs(expected))
+    np.testing.assert_allclose(forward, expected, rtol=1e-8, atol=1e-8 * size)
+
+    grads = jax.jit(lambda: jax.vjp(rate, x, start)[1](jnp.asarray(weight)))()
+    back = sum(
+        jnp.vdot(a, b) for a, b in zip(*map(jax.tree.leaves, (grads, (dx, dv))), strict=True)
+    )
+    assert float(back) == pytest.approx(float(weight @ forward), rel=1e-9, abs=1e-10 * size)
+
+
+def test_second_derivative(case):
+    rate, x, start, dx, _, weight = case
+    gradient = jax.grad(lambda x: weight @ rate(x, start))
+    second = jax.jit(lambda: jax.jvp(gradient, (x,), (dx,))[1])()
+    run = jax.jit(lambda h: gradient(x + h * dx))
+    expected = central(run, 1e-3)
+    size = np.max(np.abs(expected))
+    np.testing.assert_allclose(second, expected, rtol=1e-7, atol=1e-7 * size)
+
+
+def test_linear_parts():
+    """Rules of cross products, of picking, and of sums along chains, against their definition."""
+    tree = stm.Tree().prepare(stm.make_scene("uav_tracker", 2).system).parameters.tree
+    rng = np.random.default_rng(2)
+    frames = len(tree.steps) + 1
+    own = jnp.asarray(rng.normal(size=(6, frames, 2)))
+    for f in (
+        lambda a: forward_pass(tree, a[:, :1], a[:, 1:]),
+        lambda a: backward_pass(tree, a),
+        lambda a: pick(a, np.array([3, 0, 3]), 1),
+        lambda a: cross(a[:3], own[3:]),
+        lambda a: cross(own[:3, :1], a[3:]),
+    ):
+        there = rng.normal(size=f(own).shape)
+        ahead = jax.jvp(f, (own,), (own,))[1]
+        np.testing.assert_allclose(ahead, f(own), rtol=1e-13, atol=1e-13)
+        (back,) = jax.vjp(f, own)[1](jnp.asarray(there))
+        assert float(jnp.vdot(back, own)) == pytest.approx(float(np.vdot(there, f(own))), rel=1e-12)

@@ -1,0 +1,357 @@
+"""Reports of studies: what they say is what the statistics say, whatever a study holds."""
+
+import html.parser
+import io
+import json
+
+import numpy as np
+import pytest
+import scipy.stats as st
+import xarray as xr
+from matplotlib.image import imread
+from rich.console import Console
+from studies import FACTORS, REASONS, study
+
+from stmuav_jax.checks.errors import SettingError
+from stmuav_jax.figures import study_data as data_module, study_plot, study_region
+from stmuav_jax.figures.plot import grid
+from stmuav_jax.figures.study_analysis import analyse, plain
+from stmuav_jax.figures.study_data import study_data
+from stmuav_jax.figures.study_report import write_report
+from stmuav_jax.figures.study_table import summary_lines, summary_table
+from stmuav_jax.files.netcdf import FileError
+from stmuav_jax.montecarlo.sensitivity import sobol
+from stmuav_jax.montecarlo.statistics import mean, probability, quantiles
+
+VOID = {"meta", "img", "br"}
+
+
+class Page(html.parser.HTMLParser):
+    """Checks that tags close in order; gathers text and what the page refers to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.sources: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.sources += [str(value) for name, value in attrs if name in ("src", "href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def tiny(count: int, **more) -> xr.Dataset:
+    """A study of one input and two quantities, soon drawn."""
+    found = study(count, factors={"angle": FACTORS["angle"]}, times=0, **more)
+    return found[["angle", "peak", "touched", "status"]]
+
+
+def strictly(text: str) -> dict:
+    def refuse(word):
+        raise AssertionError(f"{word} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def report(dataset, folder, **more):
+    """Paths by name, the page and the summary; each checked for form."""
+    paths = write_report(dataset, folder, dpi=40, **more)
+    assert sorted(paths) == sorted(p for p in folder.rglob("*") if p.is_file())
+    page = Page((folder / "report.html").read_text())
+    return paths, page, strictly((folder / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    dataset = study(1500, pending=60, correlation=[("angle", "rate", 0.3)])
+    return dataset, *report(dataset, tmp_path_factory.mktemp("report"))
+
+
+def test_every_figure_is_there_and_drawn(whole):
+    _, paths, page, _ = whole
+    names = {path.stem for path in paths[2:]}
+    assert names == {
+        "quantities", "fans", "failures", "sensitivities", "scatter", "settling", "inputs",
+        "event_1",
+    }  # fmt: skip
+    for path in paths[2:]:
+        picture = imread(path)[..., :3]
+        assert np.mean(picture < 0.95) > 0.01
+    assert len(page.sources) == 8
+    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
+
+
+def test_summary_is_what_the_statistics_say(whole):
+    dataset, _, _, summary = whole
+    fine = dataset.status.values == 1
+    failed = dataset.status.values > 1
+    peak, fall = dataset.peak.values[fine], dataset.fall.values[fine]
+    said = summary["samples"]
+    assert said["total"] == 1500
+    assert (said["completed"], said["not_completed"], said["not_computed"]) == (
+        np.sum(fine), np.sum(failed), 60
+    )  # fmt: skip
+    assert tuple(said["share_not_completed"].values()) == probability(int(np.sum(failed)), 1440)
+    for code, words in REASONS.items():
+        assert said["reasons"][str(code)]["words"] == words
+        assert said["reasons"][str(code)]["count"] == np.sum(dataset.status == code)
+    found = summary["quantities"]["peak"]
+    assert tuple(found["mean"].values()) == mean(peak)
+    assert tuple(found["quantiles"]["0.95"].values()) == quantiles(peak, (0.95,))[0.95]
+    rank = found["influence"]["rank_correlation"]["damping"]["value"]
+    assert rank == pytest.approx(st.spearmanr(dataset.damping.values[fine], peak)[0])  # type: ignore
+    never = summary["quantities"]["fall"]
+    assert never["mean"] is None
+    assert never["quantiles"]["0.95"]["value"] == "inf"
+    assert never["infinite"]["share"]["value"] == np.mean(np.isinf(fall))
+    assert summary["quantities"]["touched"]["probability"]["value"] == np.mean(peak >= 0.5)
+    assert summary["quantities"]["force[joint=panel]"]["unit"] == "N"
+    assert summary["inputs"]["angle"]["values"] == 1440
+    assert summary["identity"] == json.loads(dataset.attrs["identity"])
+
+
+def test_page_says_what_is_known(whole):
+    _, _, page, _ = whole
+    text = " ".join(page.text)
+    for words in (
+        "Damped oscillators", "left the region of contact", "60 not computed", "largest angle [rad]",
+        "infinite, so without a mean", "largest reaction, panel [N]", "truncated normal, mean 6",
+        "independent random draws, seed 5", "Correlation of angle and rate", "settings.solver",
+        "dopri8", "touched its stop",
+    ):  # fmt: skip
+        assert words in text
+
+
+def test_saltelli_study(tmp_path):
+    """Indices are of all samples, statistics of A and B; a quantity that cannot have them says why."""
+    factors = {name: FACTORS[name] for name in ("payload", "rate", "angle")}
+    dataset = study(5 * 128, "saltelli", factors=factors, times=0, failing=False)
+    dataset = dataset.drop_vars(["force", "joint"])
+    dataset = dataset[sorted(map(str, dataset.data_vars))]  # as some stores give them
+    _, page, summary = report(dataset, tmp_path)
+    found = sobol(dataset.peak.values, dataset.status.values, 3)
+    said = summary["quantities"]["peak"]["influence"]
+    assert list(said["sobol_total"]) == ["payload", "rate", "angle"]
+    assert [x["value"] for x in said["sobol_total"].values()] == found.total.value.tolist()
+    assert summary["quantities"]["peak"]["values"] == 256
+    independent = dataset.peak.values.reshape(128, 5)[:, :2]
+    assert summary["quantities"]["peak"]["mean"]["value"] == pytest.approx(np.mean(independent))
+    assert "finite values" in summary["quantities"]["fall"]["influence"]["note"]
+    assert "of which 256 are independent" in " ".join(page.text)
+
+
+SMALL = {
+    "one": (study(1), "1 sample: 1 completed"),
+    "one, failed": (
+        tiny(1).assign(status=("sample", [2], {"role": "status"})),
+        "0 completed, 1 did not complete",
+    ),
+    "none fine": (study(40, pending=40), "0 completed, 0 did not complete, 40 not computed"),
+    "none": (study(0), "0 samples"),
+    "two": (tiny(2), "2 samples"),
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_small_studies(name, tmp_path):
+    dataset, words = SMALL[name]
+    _, page, summary = report(dataset, tmp_path)
+    assert words in " ".join(page.text)
+    assert summary["samples"]["total"] == dataset.sizes["sample"]
+
+
+def test_without_inputs_or_quantities(tmp_path):
+    dataset = tiny(30)[["status"]]
+    _, page, summary = report(dataset, tmp_path)
+    assert "No inputs." in " ".join(page.text)
+    assert summary["quantities"] == {}
+
+
+@pytest.mark.parametrize(
+    ("format", "sources"), [("svg", "data:image/svg+xml"), ("pdf", "figures/")]
+)
+def test_other_formats(format, sources, tmp_path):
+    paths, page, _ = report(tiny(60), tmp_path, format=format)
+    assert all(source.startswith(sources) for source in page.sources)
+    assert {path.suffix for path in paths[2:]} == {f".{format}"}
+    assert "failures.pdf" not in page.sources or (tmp_path / "figures" / "failures.pdf").exists()
+
+
+def test_again_over_an_old_report(tmp_path):
+    dataset = tiny(30)
+    first = write_report(dataset, tmp_path, dpi=40)
+    before = (tmp_path / "summary.json").read_bytes()
+    assert write_report(dataset, tmp_path, dpi=40) == first
+    assert (tmp_path / "summary.json").read_bytes() == before
+
+
+def test_words_of_a_study_are_no_html(tmp_path):
+    dataset = tiny(20)
+    dataset.attrs["title"] = "<script>alert(1)</script> & $x_1"
+    dataset.peak.attrs["long_name"] = "<b>peak</b> of $\\alpha"
+    dataset.attrs["identity"] = json.dumps(
+        {"a<b": "</td>", "limit": float("inf"), "ls": [1.5] * 99}
+    )
+    _, page, summary = report(dataset, tmp_path)
+    text = (tmp_path / "report.html").read_text()
+    assert "<script" not in text
+    assert "<b>" not in text
+    assert "<script>alert(1)</script> & $x_1" in page.text
+    assert "(99 in all)" in " ".join(page.text)
+    assert summary["identity"]["limit"] == "inf"
+
+
+def test_curves_are_read_by_blocks(monkeypatch):
+    """Blocks of any size give the same curves, of the fine samples in their order."""
+    data = study_data(study(300, pending=20))
+    one = next(curve for curve in data.curves if curve.key == "wear[joint=panel]")
+    _, expected = data.curve(one, 100)
+    fine = np.flatnonzero(data.dataset.status.values == 1)[:100]
+    np.testing.assert_array_equal(expected, data.dataset.wear.values[fine, :, 1])
+    monkeypatch.setattr(data_module, "BLOCK", 81 * 7)
+    _, found = data.curve(one, 100)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_components_beyond_the_limit_are_left_out_and_said_so():
+    dataset = study(5, times=0)
+    many = np.zeros((5, 6, 5))
+    dataset["many"] = (("sample", "body", "axis"), many, {"role": "quantity", "units": "N"})
+    data = study_data(dataset)
+    assert sum(one.column == "many" for one in data.quantities) == data_module.COMPONENTS
+    assert data.notes == ("Of the 30 components of 'many' the first 12 are shown.",)
+    assert data.quantities[-1].key == "many[body=2, axis=1]"
+
+
+def test_axes_of_curves():
+    """Time, or numbers with a unit; names and bare numbers are components."""
+    dataset = study(5, times=0)
+    flag = {"role": "quantity", "units": "N"}
+    dataset = dataset.assign_coords(height=("height", [1.0, 2.0, 4.0], {"units": "m"}))
+    dataset["drag"] = (("sample", "height"), np.ones((5, 3)), flag)
+    dataset["rotors"] = (("sample", "rotor"), np.ones((5, 2)), flag)
+    data = study_data(dataset)
+    assert [(one.key, one.axis) for one in data.curves] == [("drag", "height")]
+    assert [one.key for one in data.quantities[-2:]] == ["rotors[rotor=0]", "rotors[rotor=1]"]
+
+
+def test_many_inputs_keep_the_most_influential():
+    more = {f"mass_{k}": (st.norm(1.0, 0.1), "kg", f"mass of body {k}") for k in range(8)}
+    data = study_data(study(600, factors=FACTORS | more, times=0))
+    analysis = analyse(data)
+    figure = study_plot.scatter(data, analysis)
+    assert figure is not None
+    below = [
+        ax.get_xlabel().replace("\n", " ").split(" [")[0] for ax in figure.axes if ax.get_xlabel()
+    ]
+    assert set(below[:2]) == {"initial angle", "payload"}
+    assert len(below) == 5
+    assert "4 of 4 quantities and 5 of 14 inputs" in figure.get_supxlabel().replace("\n", " ")
+    bars = study_region.sensitivities(data, analysis)
+    assert bars is not None
+    assert "12 of 14 inputs" in bars.get_supxlabel()
+
+
+def test_failure_region_takes_the_inputs_that_matter():
+    """Samples fail by angle and rate, and by frequency and damping; points are thinned and said so."""
+    data = study_data(study(9000, times=0))
+    analysis = analyse(data)
+    assert analysis.failing is not None
+    order = [analysis.varying[k].key for k in np.argsort(-analysis.failing)]
+    assert order[0] == "angle"
+    assert set(order[-2:]) == {"offset", "payload"}
+    figure = study_region.failures(data, analysis)
+    assert figure is not None
+    total = int(np.sum(data.dataset.status.values == 1))
+    assert f"1,500 of {total:,} (others)" in figure.get_supxlabel().replace("\n", " ")
+    counts = sum(int(text.get_text()) for text in figure.axes[1].texts)
+    assert counts == 9000
+
+
+def test_undefined_values_are_counted_and_left_out():
+    dataset = study(200, times=0, failing=False)
+    dataset.peak.values[:30] = np.nan
+    found = plain(analyse(study_data(dataset)))["quantities"]["peak"]
+    assert (found["values"], found["undefined"]) == (170, 30)
+    assert found["influence"]["samples"] == 170
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d.rename(sample="row"), "not 'sample'"),
+        (lambda d: d.drop_vars("status"), "one column of the role 'status', but here are []"),
+        (lambda d: d.assign_attrs(identity="{"), "'identity' is not JSON"),
+        (lambda d: d.assign_attrs(reasons="[]"), "'reasons' must be a JSON object"),
+    ],
+)
+def test_what_is_no_study(change, words, tmp_path):
+    with pytest.raises(FileError) as caught:
+        write_report(change(tiny(3)), tmp_path)
+    assert words in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_refused(tmp_path):
+    with pytest.raises(SettingError, match=r"cannot be 'pgn'\. Did you mean 'png'"):
+        write_report(tiny(3), tmp_path, "pgn")
+    with pytest.raises(SettingError, match="level of confidence"):
+        write_report(tiny(3), tmp_path, level=95.0)
+    with pytest.raises(FileError):
+        write_report(xr.Dataset(), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("failure", "event", "words"),
+    [
+        ({"quantity": "fall"}, lambda d: np.isfinite(d.fall.values), "until the tracker touches"),
+        ({"quantity": "fall", "below": 2.0}, lambda d: d.fall.values < 2.0, "below 2 s"),
+        ({"quantity": "peak", "above": 1.0}, lambda d: d.peak.values > 1.0, "above 1 rad"),
+    ],
+)
+def test_a_declared_failure_is_what_is_reported(failure, event, words):
+    """Among the samples that were completed; the share that was not is another number."""
+    dataset = study(400, pending=40)
+    identity = json.loads(dataset.attrs["identity"]) | {"failure": failure}
+    dataset.attrs["identity"] = json.dumps(identity)
+    analysis = analyse(study_data(dataset))
+    fine = dataset.status.values == 1
+    wanted = probability(int(np.sum(event(dataset)[fine])), int(np.sum(fine)))
+    assert analysis.failure is not None
+    assert analysis.failure.probability == wanted
+    assert words in analysis.failure.words
+    said = " ".join(summary_lines(analysis))
+    assert f"Probability of failure ({analysis.failure.words}): {100 * wanted.value:.3g} %" in said
+    assert "did not complete" in said
+    assert "40 not computed" in said
+
+
+def test_without_a_declared_failure_none_is_reported():
+    analysis = analyse(study_data(study(100, failing=False)))
+    assert analysis.failure is None
+    assert "failure" not in " ".join(summary_lines(analysis))
+    table = summary_table(analysis)
+    console = Console(width=200, file=io.StringIO())
+    console.print(table)
+    assert "largest angle [rad]" in console.file.getvalue()  # pyright: ignore
+
+
+def test_shares_below_zero_stay_within_their_axes():
+    analysis = analyse(study_data(study(300)))
+    one = analysis.findings[0]
+    low = np.full(len(one.influence.names), -0.4)
+    found = one._replace(influence=one.influence._replace(first=low))
+    figure, axes = grid(1, 1, 3.0)
+    study_region._share_bars(axes[0, 0], found, list(one.influence.names))
+    assert axes[0, 0].get_xlim()[0] < -0.4
+    del figure

@@ -1,0 +1,70 @@
+"""Tables and lines as a terminal shows them: brackets are units and names, and nothing is cut."""
+
+import inspect
+import io
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from stmuav_jax.commands.flight import _slope_table, _trim_table
+from stmuav_jax.figures.estimate import summary_table
+from stmuav_jax.figures.report import certificate_table
+from stmuav_jax.figures.terminal import line, row, table
+from stmuav_jax.parameters.airframe import PART_II
+
+
+def printed(what, width=120):
+    console = Console(width=width, file=io.StringIO(), record=True)
+    console.print(what)
+    return console.export_text()
+
+
+def test_brackets_are_no_markup():
+    made = table("turn [rad/s]", "at [s]", title="hull[b] [mm]")
+    row(made, "[/b]", "[mrad]")
+    words = printed(made)
+    for part in ("turn [rad/s]", "at [s]", "hull[b] [mm]", "[/b]", "[mrad]"):
+        assert part in words
+    console = Console(width=80, file=io.StringIO(), record=True)
+    line(console, "[kg] :x: [/b]")
+    assert console.export_text() == "[kg] :x: [/b]\n"
+
+
+def test_names_in_a_certificate_are_no_markup(monkeypatch):
+    rows = [("Rank", "33 of 34 rows; dependent rows in hinge[0], [/b]")]
+    monkeypatch.setattr("stmuav_jax.figures.report.certificate_rows", lambda _: rows)
+    named: Any = SimpleNamespace(scene=SimpleNamespace(title="System of arm[b]"))
+    words = printed(inspect.unwrap(certificate_table)(named))
+    assert "hinge[0], [/b]" in words
+    assert "System of arm[b]" in words
+
+
+def test_units_of_a_trim():
+    labels = [("turn_x", "degrees"), ("speed_1", "rad/s"), ("force_2", "N")]
+    words = printed(_trim_table(np.ones(3), labels))
+    slopes = printed(_slope_table("mass.panel_7", PART_II, np.ones(3), labels))
+    for _, unit in labels:
+        assert unit in words
+        assert f"[{unit}]" in slopes
+    assert "mass.panel_7 [kg]" in slopes
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_estimates_fit_an_ordinary_terminal(width):
+    """Every head and every number is there, with units, at 80 columns too."""
+    one: Any = SimpleNamespace(
+        case=8, tuning="consistent", seeds=50, settled=1.2, to_2cm=0.366, to_5mm=float("nan"),
+        rmse=(0.00226, 0.0123), nees_offset=24.9, nees_offset_window=(1.0, 3.0), nees=0.321,
+        nees_window=(4.0, 6.0), nis=2.11, nis_window=(2.9, 3.1),
+        verdict=SimpleNamespace(flagged=50),
+    )  # fmt: skip
+    # past the type check that the tests switch on
+    words = printed(inspect.unwrap(summary_table)([one]), width)
+    assert "\u2026" not in words
+    assert max(map(len, words.splitlines())) <= width
+    for part in ("[s]", "[mm]", "consistent", "0.366", "never", "2.26", "12.30", "24.9", "0.321",
+                 "2.11", "high", "low", "50"):  # fmt: skip
+        assert part in words, part

@@ -1,0 +1,317 @@
+"""Tuned inputs, identification and flight conditions of mechanisms that are not the UAV."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array
+from mechanisms import cart_pole, four_bar
+
+import stmuav_jax as stm
+from stmuav_jax.algebra.sampled import Sampled
+from stmuav_jax.rotorcraft.rotor import hover_speed_squared
+from stmuav_jax.tracker.drive import SLIDER_JOINTS
+
+
+@pytest.fixture(scope="module")
+def cart():
+    space = stm.TreeSpace(cart_pole())
+    return space, space.from_state(space.system.reference)
+
+
+class Most(eqx.Module):
+    """How far an effort is beyond what a motor has."""
+
+    effort: Array
+
+    def __call__(self, motion):
+        return jnp.abs(motion.inputs) / self.effort - 1
+
+
+@pytest.mark.slow
+def test_a_cart_is_moved_with_its_pole_upright(cart):
+    """A force history after which the cart rests half a metre further on, to 1e-8."""
+    space, x = cart
+    target = space.retract(x, jnp.array([0.5, 0.0, 0.0, 0.0]))
+    tuning = stm.flight.tune_inputs(
+        space, [stm.flight.end_at(space, target)], start=x, duration=1.5, inputs=["effort"],
+        sizes=[10.0], knots=8,
+    )  # fmt: skip
+    found = tuning.search()
+    motion = tuning.motion(found.values)
+    end = jax.tree.map(lambda leaf: leaf[-1], motion.points)
+    assert float(jnp.max(jnp.abs(space.difference(end, target)))) < 1e-8
+    assert motion.inputs.shape == (200, 1)
+    assert tuning.inputs(found.values)(jnp.asarray(0.3)).shape == (1,)
+
+
+def test_a_limit_counts_only_beyond(cart):
+    """A hundredfold share of what is passed, as a root mean square over the motion."""
+    space, x = cart
+    inputs = jnp.array([[8.0], [-12.0], [10.0], [15.0]])
+    motion = stm.flight.TunedMotion(jnp.arange(4.0), x, inputs, inputs, space, space.system)
+    found = stm.flight.Limit(Most(jnp.asarray(10.0)))(motion)
+    np.testing.assert_allclose(found, [[0.0], [10.0], [0.0], [25.0]], rtol=1e-12)
+    np.testing.assert_allclose(stm.flight.roughness(motion), [[42.0], [-17.0]])
+
+
+@pytest.mark.slow
+def test_a_torque_that_holds_a_four_bar():
+    """A constant found by the motion alone is that of the trim."""
+    space = stm.TreeSpace(four_bar(), independent=["A.angle"])
+    x = space.from_state(space.system.reference)
+    near = [stm.flight.departures(space, x)]
+    tuning = stm.flight.tune_inputs(space, near, start=x, duration=0.3, sizes=[5.0], weight=10.0)
+    found = tuning.search()
+    held = stm.trim(space, at=x).values
+    np.testing.assert_allclose(tuning.inputs(found.values), held, rtol=1e-8)
+
+
+def test_what_tuning_refuses(cart):
+    space, x = cart
+    near = [stm.flight.departures(space, x)]
+    with pytest.raises(stm.SettingError, match="at least one residual"):
+        stm.flight.tune_inputs(space, [], start=x, duration=1.0)
+    with pytest.raises(stm.SettingError, match="name 'force', which is no input"):
+        stm.flight.tune_inputs(space, near, start=x, duration=1.0, inputs=["force"])
+    with pytest.raises(stm.ModelError, match=r"must have shape \(5, 1\), not \(4, 1\)"):
+        stm.flight.tune_inputs(space, near, start=x, duration=1.0, knots=5, values=np.zeros((4, 1)))
+    with pytest.raises(stm.SettingError, match="name 'hinge', which is no state"):
+        stm.flight.departures(space, x, {"hinge": 1.0})
+
+
+# --- identification
+
+
+def fitted(predict, truth, sizes, sigma, labels):
+    """From a start that is off by half of the sizes: without noise, and with it."""
+    clean = np.asarray(jax.jit(predict)(jnp.asarray(truth)))
+    start = truth + 0.5 * sizes * np.array([1.0, -1.0, 1.0])[: len(truth)]
+    rng = np.random.default_rng(7)
+    noisy = clean + sigma * rng.normal(size=clean.shape)
+    return [
+        stm.flight.identify(predict, record, sigma, start, sizes, labels=labels)
+        for record in (clean, noisy)
+    ]
+
+
+@pytest.mark.slow
+def test_a_cart_pole_is_identified(cart):
+    """Bob, length and damping from the cart's place, the pole's angle and its gyroscope."""
+    space = stm.TreeSpace(cart_pole(damping=0.05))
+    x = space.from_state(space.system.reference)
+    knots = np.linspace(0.0, 0.8, 7)
+    push = Sampled(knots, 6.0 * np.random.default_rng(1).normal(size=7), 3)
+    predict = stm.flight.motion_model(
+        lambda q: cart_pole(bob=q[0], length=q[1], damping=q[2]),
+        space.retract(x, jnp.array([0.0, 0.05, 0.0, 0.0])),
+        np.linspace(0.0, 0.8, 33),
+        ["rail.shift", "hinge.angle", stm.sensing.Gyroscope("pole")],
+        inputs={"effort": push},
+        space=space,
+    )
+    truth, sizes = np.array([0.5, 0.8, 0.05]), np.array([0.1, 0.1, 0.05])
+    sigma = np.array([1e-3, 2e-3, 5e-3, 5e-3, 5e-3])
+    exact, found = fitted(predict, truth, sizes, sigma, ["bob", "length", "damping"])
+    np.testing.assert_allclose(exact.values, truth, rtol=1e-8)
+    assert found.within(truth, 4.0)
+    assert 0.6 < found.misfit < 1.4
+
+
+@pytest.mark.slow
+def test_a_four_bar_is_identified():
+    """A mass and a damper in a closed loop, from one encoder and one rate."""
+    space = stm.TreeSpace(four_bar(damping=0.3), independent=["A.angle"])
+    x = space.from_state(space.system.reference)
+    predict = stm.flight.motion_model(
+        lambda q: four_bar(masses=(1.0, 2.0, q[0]), damping=q[1]),
+        x, np.linspace(0.0, 0.8, 33), ["A.angle", "A.angle_rate"],
+        inputs={"effort": 8.0}, space=space,
+    )  # fmt: skip
+    truth, sizes = np.array([1.5, 0.3]), np.array([0.3, 0.1])
+    sigma = np.array([1e-4, 1e-3])
+    exact, found = fitted(predict, truth, sizes, sigma, ["rocker", "damping"])
+    np.testing.assert_allclose(exact.values, truth, rtol=1e-8)
+    assert found.within(truth, 4.0)
+
+
+def test_what_a_motion_model_refuses(cart):
+    space, x = cart
+    model = lambda make, outputs, **more: stm.flight.motion_model(
+        make, x, [0.0, 0.1], outputs, **more
+    )(jnp.array([0.5]))
+    make = lambda q: cart_pole(bob=q[0])
+    with pytest.raises(stm.SettingError, match="needs the state space that has its coordinates"):
+        model(make, ["rail.shift"])
+    with pytest.raises(stm.SettingError, match="name 'rail', which is no state"):
+        model(make, ["rail"], space=space)
+    with pytest.raises(stm.SettingError, match="are no vector"):
+        model(make, [stm.sensing.AttitudeFix("pole")], space=space)
+    with pytest.raises(stm.SettingError, match="name 'force', which is no input"):
+        model(make, ["rail.shift"], space=space, inputs={"force": 1.0})
+
+
+# --- flight conditions
+
+
+@pytest.fixture(scope="module")
+def hexacopter():
+    scene = stm.make_scene("hexacopter")
+    space = stm.TreeSpace(scene.system)
+    return space, space.from_state(scene.state0)
+
+
+def test_a_hexacopter_hovers_climbs_and_turns(hexacopter):
+    """The thrust is the weight, over the cosine of the bank; heading and turn are those wanted."""
+    space, x = hexacopter
+    mass, speed, rate = float(space.system.bodies.mass[0]), 3.0, 0.8
+    k_f = space.system.forces[1].k_f
+    conditions = {
+        "hover": stm.flight.hover(yaw=0.3),
+        "climb": stm.flight.climb(2.0, yaw=0.3),
+        "turn": stm.flight.steady_turn(speed, rate, yaw=0.3),
+    }
+    for name, condition in conditions.items():
+        found = stm.flight.trim_condition(space, condition, at=x)
+        bank = np.arctan(speed * rate / 9.81) if name == "turn" else 0.0
+        R = np.asarray(stm.rotation.rotation_matrix(found.point.p))
+        assert np.arccos(min(R[2, 2], 1.0)) == pytest.approx(bank, rel=0.02, abs=1e-7)
+        lift = float(k_f * jnp.sum(found.values))
+        assert lift == pytest.approx(mass * 9.81 / np.cos(bank), rel=1e-3 if bank else 1e-12)
+        assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(0.3, abs=1e-12)
+        np.testing.assert_allclose(found.point.omega, condition.rate * R[2], atol=1e-12)
+    # by six rotors with two dimensions of choice: those that differ least
+    equal = hover_speed_squared(mass, [0.0, 0.0, 9.81], k_f, 6)
+    hover = stm.flight.trim_condition(space, conditions["hover"], at=x, values=equal)
+    again = stm.flight.trim_condition(space, conditions["hover"], at=x)
+    np.testing.assert_allclose(hover.values, again.values, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_derivative_of_the_nearest_trim(hexacopter):
+    """With more unknowns than equations too: the lift m (g + a) by the acceleration a is m."""
+    space, x = hexacopter
+    k_f, mass = space.system.forces[1].k_f, float(space.system.bodies.mass[0])
+
+    def lift(a):
+        up = stm.flight.hover()._replace(acceleration=a * jnp.array([0.0, 0.0, 1.0]))
+        return k_f * jnp.sum(stm.flight.trim_condition(space, up, at=x, throw=False).values)
+
+    assert float(jax.jacfwd(lift)(jnp.asarray(0.5))) == pytest.approx(mass, rel=1e-10)
+
+
+def test_what_a_flight_condition_refuses(hexacopter, cart):
+    space, x = hexacopter
+    trim = stm.flight.trim_condition
+    with pytest.raises(stm.SettingError, match="floating base flies"):
+        trim(cart[0], stm.flight.hover(), at=cart[1])
+    with pytest.raises(stm.SettingError, match="not as angles of a panel"):
+        trim(space, stm.flight.hover([0.1, 0.1]), at=x)
+    with pytest.raises(stm.SettingError, match="Pointing at the sun needs"):
+        trim(space, stm.flight.hover(sun=[0, 0, 1.0]), at=x)
+    with pytest.raises(stm.ModelError, match="no body 'panel'"):
+        trim(space, stm.flight.hover(sun=[0, 0, 1.0]), at=x, pointing="panel")
+
+
+@pytest.mark.slow
+def test_a_hexacopter_is_held_and_identified(hexacopter):
+    """Speeds that hold it, by the motion alone, carry its weight; a flight tells mass and inertia."""
+    space, x = hexacopter
+    near = [stm.flight.departures(space, x)]
+    tuning = stm.flight.tune_inputs(space, near, start=x, duration=0.2, weight=10.0)
+    values = tuning.inputs(tuning.search().values)
+    held = stm.flight.trim_condition(space, stm.flight.hover(), at=x).values
+    rotors = space.system.forces[1]
+    com = jnp.zeros(3)
+    wrench = rotors.wrench(held, com)
+    np.testing.assert_allclose(rotors.wrench(values, com), wrench, atol=1e-7)
+
+    bodies = lambda s: (s.system.bodies.mass, s.system.bodies.inertia)
+    inertia = space.system.bodies.inertia
+    made = lambda q: space.with_system(
+        eqx.tree_at(bodies, space, (q[:1], inertia.at[0, 0, 0].set(q[1]))).system
+    )
+    knots = np.linspace(0.0, 0.5, 6)
+    speeds = np.asarray(held) * (1 + 0.05 * np.random.default_rng(2).normal(size=(6, 6)))
+    predict = stm.flight.motion_model(
+        made, x, np.linspace(0.0, 0.5, 26),
+        [stm.sensing.PositionFix("hexacopter"), "omega_x", stm.sensing.Accelerometer("hexacopter")],
+        inputs={"speed_squared": Sampled(knots, speeds, 3)},
+    )  # fmt: skip
+    truth = np.array([float(space.system.bodies.mass[0]), float(inertia[0, 0, 0])])
+    sizes, sigma = 0.1 * truth, np.array([1e-3] * 3 + [5e-3] + [5e-2] * 3)
+    exact, found = fitted(predict, truth, sizes, sigma, ["mass", "J_xx"])
+    np.testing.assert_allclose(exact.values, truth, rtol=1e-8)
+    assert found.within(truth, 4.0)
+
+
+# --- the report's mechanisms
+
+PANEL = stm.tracker.initial_angles(stm.PART_II)
+
+
+@pytest.fixture(scope="module")
+def flyer():
+    return stm.scenes.uav_flyer()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("route", ["closed form", "tree"])
+def test_the_uav_by_the_general_route(flyer, route):
+    """Its own trim and that of any mechanism agree, in cruise and in a turn."""
+    space, at = flyer, stm.flight.at_rest(PANEL)
+    if route == "tree":
+        space = stm.TreeSpace(flyer.system)
+        at = space.from_state(flyer.to_state(at))
+    start = np.concatenate([np.full(6, 1.8e6), np.zeros(2)])
+    for condition in (
+        stm.flight.cruise(4.0, 0.7, yaw=0.3),
+        stm.flight.steady_turn(3.0, 0.8),
+    ):
+        found = stm.flight.trim_condition(space, condition, at=at, values=start)
+        own = stm.flight.trim_flight(flyer, condition._replace(angles=jnp.asarray(PANEL)))
+        np.testing.assert_allclose(found.values, jnp.concatenate(own.inputs), rtol=1e-9)
+        state, exact = space.to_state(found.point), flyer.to_state(own.coordinates)
+        np.testing.assert_allclose(state.p, exact.p, atol=1e-9)
+        np.testing.assert_allclose(state.omega, exact.omega, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_uav_at_the_sun_by_the_general_route(flyer):
+    condition = stm.flight.hover(sun=[0.3, -0.2, 1.0], yaw=0.4)
+    found = stm.flight.trim_condition(
+        flyer, condition, at=stm.flight.at_rest(PANEL), free=["phi", "theta"],
+        pointing="panel_7", values=np.concatenate([np.full(6, 1.8e6), np.zeros(2)]),
+    )  # fmt: skip
+    own = stm.flight.trim_flight(flyer, condition)
+    np.testing.assert_allclose(found.values, jnp.concatenate(own.inputs), rtol=1e-9)
+    np.testing.assert_allclose(found.point.angles, own.coordinates.angles, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_tracker_on_ground():
+    """Forces that hold it are those of virtual work; the motion finds them too."""
+    scene = stm.make_scene("tracker")
+    efforts = [stm.JointEffort(name, 0.0) for name in SLIDER_JOINTS]
+    forces = (stm.Gravity([0.0, 0.0, -9.81]), *efforts)
+    space = stm.TreeSpace(eqx.tree_at(lambda s: s.forces, scene.system, forces))
+    x = space.from_state(scene.state0)
+    assert space.dof == 2
+    held = stm.trim(space, at=x)
+
+    def heights(v):
+        state = space.to_state(space.retract(x, jnp.concatenate([v, jnp.zeros(2)])))
+        sliders = [state.r[space.system.index(name), 2] for name in ("slider_2", "slider_3")]
+        return jnp.stack(sliders), 9.81 * (space.system.bodies.mass @ state.r[:, 2])
+
+    moved, lifted = jax.jit(jax.jacfwd(heights))(jnp.zeros(2))
+    np.testing.assert_allclose(held.values, np.linalg.solve(moved.T, lifted), rtol=1e-8)
+    linear = stm.linearize(space, x, values=held.values)
+    assert linear.modes()[0].s.real > 1.0
+    near = [stm.flight.departures(space, x)]
+    tuning = stm.flight.tune_inputs(
+        space, near, start=x, duration=0.1, sizes=[5.0, 5.0], weight=10.0
+    )
+    values = tuning.inputs(tuning.search().values)
+    np.testing.assert_allclose(values, held.values, rtol=1e-6)

@@ -1,0 +1,208 @@
+"""Filters on mechanisms: the simulator as process model, consistent over a hundred seeds."""
+
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import stmuav_jax as stm
+from stmuav_jax.algebra.compiler import quick_jit
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "flight"))
+from test_any_mechanism import four_bar, twin_rate  # pyright: ignore[reportMissingImports]
+
+estimation, sensing = stm.estimation, stm.sensing
+
+SEEDS, DT = 100, 0.02
+# angle of the crank at which the four-bar is assembled; the encoder reads zero there [rad]
+ASSEMBLED = 1.0
+# angle [rad], rate [rad/s]: of the start, of a step's noise, and of the encoder
+START, WANDER, ENCODER = np.array([0.1, 0.5]), np.array([0.0, 0.05]), 5e-3
+
+
+@pytest.fixture(scope="module")
+def bars():
+    """A four-bar's model, seen by the encoder of its crank, and a posture at rest."""
+    space = stm.TreeSpace(four_bar(), independent=["A.angle"])
+    model = sensing.system_model(
+        space,
+        [sensing.Encoder("A")],
+        Q=WANDER**2,
+        R=[ENCODER**2],
+        inputs=stm.inputs_of(space.system),
+    )
+    return space, model, space.from_state(space.system.reference)
+
+
+def twin_step(z, torque, dt):
+    """A step of the twin's own equation in its one coordinate."""
+    rates = lambda z, u: jnp.stack([z[1], twin_rate(z[0], z[1], u[0])])
+    return estimation.rk4(rates)(z, torque, dt)
+
+
+def test_a_filter_of_a_four_bar_is_that_of_its_twin(bars):
+    """Mean and covariance after four readings, from the simulator and by hand: to 1e-9."""
+    space, model, x = bars
+    y = np.array([[0.03], [0.02], [0.05], [0.01]])
+    torque = np.array([[2.0], [1.0], [0.0], [-1.0]])
+    filtered = quick_jit(lambda m, p: estimation.kalman_filter(m, p, y, u=torque, dt=DT))
+    found = filtered(model, estimation.gaussian(x, np.diag(START**2)))
+    by_hand = estimation.StateSpaceModel(
+        twin_step,
+        np.diag(WANDER**2),
+        estimation.Sensor(lambda z, u: z[:1] - ASSEMBLED, [[ENCODER**2]]),
+    )
+    exact = filtered(by_hand, estimation.gaussian([ASSEMBLED, 0.0], np.diag(START**2)))
+    moved = jax.vmap(lambda mean: space.difference(mean, x))(found.mean)
+    np.testing.assert_allclose(moved + jnp.array([ASSEMBLED, 0.0]), exact.mean, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, exact.covariance, rtol=1e-8, atol=1e-12)
+    assert model.names == ("A.angle", "A.angle_rate")
+    assert model.sensor.names == ("encoder A",)
+
+
+def records(count):
+    """Motions of the twin with noise, and what encoders read: (T, 2, s), (T, 1, s)."""
+    rng = np.random.default_rng(14)
+    torque = 2.0 * np.sin(0.4 * np.arange(count))[:, None]
+    start = np.array([ASSEMBLED, 0.0])[:, None] + START[:, None] * rng.standard_normal((2, SEEDS))
+    pushed = WANDER[:, None] * rng.standard_normal((count, 2, SEEDS))
+
+    def onwards(z, now):
+        u, w = now
+        z = jax.vmap(twin_step, in_axes=(1, None, None), out_axes=1)(z, u, DT) + w
+        return z, z
+
+    truth = jax.jit(lambda z: jax.lax.scan(onwards, z, (torque, pushed))[1])(start)
+    read = truth[:, :1] - ASSEMBLED + ENCODER * rng.standard_normal((count, 1, SEEDS))
+    return jnp.asarray(torque), truth, read
+
+
+@pytest.mark.slow
+def test_a_four_bar_from_one_encoder_over_a_hundred_seeds(bars):
+    """NEES of angle and rate within its 95 % interval, where the twin is the truth."""
+    space, model, x = bars
+    count = 30
+    torque, truth, y = records(count)
+    prior = estimation.gaussian(x, np.diag(START**2))
+    spread = jax.vmap(jax.vmap(lambda v: space.retract(x, v), in_axes=1, out_axes=-1))
+    true = spread(truth - jnp.array([ASSEMBLED, 0.0])[:, None])
+
+    def judged(model):
+        out = estimation.filter_bank(model, prior, y, u=torque, dt=DT)
+        assert bool(out.ok.all())
+        return np.asarray(estimation.path_nees(out, true, space)), np.asarray(out.nis)
+
+    nees, nis = judged(model)
+    low, high = estimation.mean_interval(2, SEEDS, 0.95)
+    assert low < nees[-1].mean() < high
+    assert low < nees[count // 2].mean() < high
+    low, high = estimation.mean_interval(1, SEEDS * count, 0.95)
+    assert low < nis.mean() < high
+    # a filter that believes in a third of the encoder's noise is found out
+    sure = eqx.tree_at(lambda m: m.sensor.noise, model, model.sensor.noise / 3)
+    assert judged(sure)[0][-1].mean() > estimation.mean_interval(2, SEEDS, 0.999)[1]
+
+
+# --- the UAV with its tracker: gyroscope, accelerometer, encoders of both sliders
+
+# deviations of the start, of a step's noise: r, attitude, panel angles, v, omega, their rates, mass
+ORDER = (3, 3, 2, 3, 3, 2, 1)
+UAV_START = np.repeat([0.1, 0.005, 0.02, 0.1, 0.05, 0.05, 0.1], ORDER)
+UAV_WANDER = np.repeat([0.0, 0.0, 0.0, 0.01, 0.02, 0.02, 0.0], ORDER)
+# gyroscope [rad/s], accelerometer [m/s^2], encoders [m]
+UAV_NOISE = np.repeat([0.01, 0.05, 5e-4], (3, 3, 2))
+UAV_STEPS, UAV_DT = 10, 0.02
+
+
+def balance(flyer, x, inputs):
+    """Inputs of least norm at which a posture has no accelerations: they are linear in them."""
+    scale = jnp.repeat(jnp.array([1e5, 1.0]), np.array([6, 2]))
+    under = lambda w: flyer.rates(x, 0.0, inputs.applied(flyer.system, scale * w))[8:]
+    found = quick_jit(jax.vmap(under))(jnp.concatenate([jnp.zeros((1, 8)), jnp.eye(8)]))
+    return scale * np.linalg.lstsq((found[1:] - found[0]).T, -found[0], rcond=1e-9)[0]
+
+
+@pytest.fixture(scope="module")
+def uav():
+    """The model, with one step and with four in each, a prior, and inputs that shake it (T, 8)."""
+    flyer = stm.scenes.uav_flyer()
+    panel, base = flyer.system.index("panel_7"), "hexacopter_1"
+    inputs = stm.inputs_of(flyer.system)
+    mass = flyer.system.bodies.mass
+
+    def adapt(flyer, numbers):
+        own = mass.at[panel].set(mass[panel] * numbers[0])
+        return eqx.tree_at(lambda f: f.system.bodies.mass, flyer, own)
+
+    model, fine = (
+        sensing.system_model(
+            flyer,
+            [
+                sensing.Gyroscope(base),
+                sensing.Accelerometer(base),
+                sensing.Encoder("T12"),
+                sensing.Encoder("T13"),
+            ],
+            Q=UAV_WANDER**2,
+            R=UAV_NOISE**2,
+            inputs=inputs,
+            parameters=["mass of the panel over its own"],
+            adapt=adapt,
+            substeps=substeps,
+        )
+        for substeps in (1, 4)
+    )
+    x = flyer.from_state(flyer.system.reference)
+    prior = estimation.gaussian({"motion": x, "parameters": jnp.ones(1)}, np.diag(UAV_START**2))
+    wave = np.sin(np.arange(UAV_STEPS)[:, None] * np.linspace(0.5, 2.0, 8))
+    shake = np.repeat([2e4, 1.0], [6, 2])
+    return model, fine, prior, jnp.asarray(balance(flyer, x, inputs) + shake * wave)
+
+
+@pytest.mark.slow
+def test_the_uav_from_its_own_sensors_over_a_hundred_seeds(uav):
+    """NEES of attitude, panel angles and the panel's mass within its 95 % interval.
+
+    The truth is the simulator's, with noise and with steps four times finer than the filter's.
+    """
+    model, fine, prior, u = uav
+    rng = np.random.default_rng(7)
+    drawn = lambda sizes, *count: jnp.asarray(
+        sizes[:, None] * rng.standard_normal((*count, len(sizes), SEEDS))
+    )
+    start = fine.space.retract(jax.tree.map(lambda a: a[:, None], prior.mean), drawn(UAV_START))
+
+    def onwards(x, now):
+        u, w = now
+        x = fine.space.retract(fine(x, u, UAV_DT), w)
+        return x, (x, fine.sensor(x, u))
+
+    fly = quick_jit(lambda start, u, w: jax.lax.scan(onwards, start, (u, w))[1])
+    truth, seen = fly(start, u, drawn(UAV_WANDER, UAV_STEPS))
+    out = estimation.filter_bank(model, prior, seen + drawn(UAV_NOISE, UAV_STEPS), u=u, dt=UAV_DT)
+    assert bool(out.ok.all())
+    last = jax.tree.map(lambda a: a[-1], (out.mean, out.factor, truth))
+    parts = {
+        "all": slice(0, 17),
+        "attitude": slice(3, 6),
+        "angles": slice(6, 8),
+        "mass": slice(16, 17),
+    }
+    for part, only in parts.items():
+        found = float(jnp.mean(estimation.nees(*last, model.space, only=only)))
+        low, high = estimation.mean_interval(only.stop - only.start, SEEDS, 0.95)
+        assert low < found < high, part
+    nis = np.asarray(out.nis)
+    low, high = estimation.mean_interval(8, SEEDS * UAV_STEPS, 0.95)
+    assert low < nis.mean() < high
+    # What was not known at the start is known now, but for the attitude: in free flight no sensor on
+    # board feels where down is. The gyroscope keeps it from growing with the body rates' errors.
+    deviation = np.asarray(jnp.mean(out.deviation[-1], axis=-1))
+    assert np.all(deviation[6:8] < 0.5 * UAV_START[6:8])
+    assert deviation[16] < 0.25 * UAV_START[16]
+    assert np.all(deviation[3:6] < 1.2 * UAV_START[3:6])
+    assert np.all(UAV_STEPS * UAV_DT * UAV_START[11:14] > 1.5 * UAV_START[3:6])

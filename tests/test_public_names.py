@@ -1,0 +1,81 @@
+"""The front door: few names at the root, everything else in a room, nothing found only in depth."""
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import stmuav_jax as stm
+
+REPOSITORY = Path(__file__).parents[1]
+ROOT = Path(stm.__file__).parent
+ROOMS = sorted(stub.parent.name for stub in ROOT.glob("*/__init__.pyi"))
+PAGES = [
+    *(REPOSITORY / "notebooks").glob("*.ipynb"),
+    *(REPOSITORY / "docs").rglob("*.md"),
+    *(REPOSITORY / "docs").rglob("*.py"),
+    REPOSITORY / "README.md",
+]
+
+
+def text(page: Path) -> str:
+    """A page's text; of a notebook, the sources of its cells."""
+    if page.suffix != ".ipynb":
+        return page.read_text()
+    cells = json.loads(page.read_text())["cells"]
+    return "\n".join("".join(cell["source"]) for cell in cells)
+
+
+def test_the_root_has_at_most_sixty_names():
+    assert len([name for name in dir(stm) if name not in ROOMS]) <= 60
+
+
+@pytest.mark.parametrize("room", ["", *ROOMS])
+def test_every_public_name_is_there(room):
+    namespace = getattr(stm, room) if room else stm
+    for name in dir(namespace):
+        found = getattr(namespace, name)
+        assert isinstance(found, ModuleType) == (name in (*ROOMS, "rotation")), name
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_no_public_name_is_that_of_a_module(room):
+    """An import of the module would otherwise hide the name."""
+    modules = {path.stem for path in (ROOT / room).iterdir()} - {"rotation"}
+    assert not modules & set(dir(getattr(stm, room)))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pages_use_public_names(page):
+    found = text(page)
+    for source, names in re.findall(r"from stmuav_jax([\w.]*) import (\([^)]*\)|[^\n]+)", found):
+        assert source.count(".") <= 1, f"{page.name} imports from stmuav_jax{source}."
+        namespace = getattr(stm, source[1:]) if source else stm
+        for name in re.findall(r"\w+(?: as \w+)?", names):
+            assert name.split(" as ")[0] in dir(namespace)
+    for room, name in re.findall(r"(?<![\w.])stm\.([a-z]\w*)\.([A-Za-z]\w*)", found):
+        assert room not in ROOMS or name in dir(getattr(stm, room)), f"stm.{room}.{name}"
+    for name in re.findall(r"(?<![\w.])stm\.([A-Za-z]\w*)", found):
+        assert name in dir(stm), f"{page.name} uses stm.{name}."
+
+
+def test_one_alias_is_used_everywhere():
+    for folder in ("tests", "benchmarks", "docs", "notebooks"):
+        for path in (REPOSITORY / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Import):
+                    used = {a.asname for a in node.names if a.name == "stmuav_jax"}
+                    assert used <= {"stm", None}, f"{path.name}: {used}"
+
+
+def test_rooms_are_empty_until_they_are_used():
+    code = (
+        "import sys, stmuav_jax as stm; stm.flight, stm.estimation, stm.tracker; "
+        "sys.exit('jax' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

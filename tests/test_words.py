@@ -1,0 +1,39 @@
+"""Docstrings are sentences: the first one names its subject."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import stmuav_jax
+
+ROOT = Path(stmuav_jax.__file__).parent
+MODULES = sorted(ROOT.rglob("*.py"))
+
+# With these a sentence has no subject: its reader does not know what is spoken of.
+NO_SUBJECT = {
+    "Of", "What", "Where", "Whether", "Which", "How", "When", "Until", "As", "Like", "It", "They",
+    "That", "Those",
+}  # fmt: skip
+NO_SUBJECT_PAIRS = {"The same", "By how"}
+
+
+def documented(tree: ast.Module) -> list[tuple[str, str]]:
+    """Name and docstring of a module, its classes and its functions."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            words = ast.get_docstring(node)
+            if words:
+                found.append((getattr(node, "name", "the module"), words))
+    return found
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_docstrings_name_their_subject(path):
+    for name, words in documented(ast.parse(path.read_text())):
+        first = words.split()
+        opening = first[0].strip(",.:")
+        assert opening not in NO_SUBJECT, f"{name}: {words.splitlines()[0]}"
+        assert " ".join(first[:2]) not in NO_SUBJECT_PAIRS, f"{name}: {words.splitlines()[0]}"
+        assert len(words.split()) > 1, f"{name}: {words}"
