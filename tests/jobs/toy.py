@@ -36,7 +36,6 @@ class Toy(AbstractWork):
     seed: int = 0
     more: int = 0  # further columns
     pause: float = 0.0  # seconds asleep for each call
-    rounds: int = 0  # of products of 64 x 64 matrices, for each 16 samples
     most: int | None = None  # more at once do not fit in memory
     words: str = "Out of memory"
     fall: tuple[int, str] | None = None  # sample whose process dies if this file is there
@@ -87,9 +86,6 @@ class Toy(AbstractWork):
                 os.kill(os.getpid(), signal.SIGKILL)
         if self.pause:
             time.sleep(self.pause)
-        matrix = np.eye(64)
-        for _ in range(self.rounds * count // 16):
-            matrix = matrix @ matrix
         numbers = np.arange(first, first + count)
         x = uniform(self.seed, 0, numbers)
         fine = x >= 0.1
