@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..algebra.compiler import in_blocks, kept_jit
+from ..checks.numbers import as_jax
 from ..checks.shapes import Numbers
 from ..mechanics.load import Load
 from ..mechanics.state import State
@@ -114,7 +115,7 @@ def snapshots(
     """
 
     def block(*at: Any) -> Snapshot:
-        return _snapshots(formulation, model, rows, *jax.tree.map(jnp.asarray, at))
+        return _snapshots(formulation, model, rows, *jax.tree.map(as_jax, at))
 
     return in_blocks(block, _BLOCK, ts, states, internal)
 
