@@ -21,6 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import get_opaque_trace_state
 
+from . import kept
+
 Options = dict[str, str | bool | int | float]
 
 # XLA's CPU compiler hands sums of products above some size to a library meant for large
@@ -177,23 +179,41 @@ def program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
 
 
 def _compiled(function: Callable[..., Any], args: tuple[Any, ...]) -> Callable[..., Any]:
-    numbers, rest = eqx.partition(args, eqx.is_array)
-    static: list[Any] = []
-
-    def run(numbers: Any) -> Any:
-        found, others = eqx.partition(function(*eqx.combine(numbers, rest)), eqx.is_array)
-        static[:] = [others]
-        return found
-
-    run.__name__ = run.__qualname__ = getattr(function, "__name__", "run")
-    options = compiler_options(quick=True)
-    compiled = jax.jit(run, compiler_options=options).lower(numbers).compile()
+    key = kept.key_of(function, args, _NO_LIBRARY | _QUICK)
+    compiled, result = kept.load(key) or _compiled_now(function, args, key)
 
     def call(*args: Any) -> Any:
-        found = compiled(eqx.filter(args, eqx.is_array))
-        return eqx.combine(jax.block_until_ready(found), static[0])
+        arrays = [leaf for leaf in jax.tree.leaves(args) if eqx.is_array(leaf)]
+        found = jax.block_until_ready(compiled(arrays))
+        return jax.tree.map(lambda x: found[x] if isinstance(x, kept.Slot) else x, result)
 
     return call
+
+
+def _compiled_now(
+    function: Callable[..., Any], args: tuple[Any, ...], key: str | None
+) -> tuple[Callable[[list[Any]], list[Any]], Any]:
+    """Program of lists of arrays, and the result's pytree with a `Slot` for each of them."""
+    leaves, structure = jax.tree.flatten(args)
+    places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
+    arrays, result = [leaves[k] for k in places], []
+
+    def run(arrays: list[Any]) -> list[Any]:
+        given = list(leaves)
+        for k, array in zip(places, arrays, strict=True):
+            given[k] = array
+        found, tree = jax.tree.flatten(function(*jax.tree.unflatten(structure, given)))
+        numbers = [x for x in found if eqx.is_array(x)]
+        count = iter(range(len(numbers)))
+        marked = [kept.Slot(next(count)) if eqx.is_array(x) else x for x in found]
+        result[:] = [jax.tree.unflatten(tree, marked)]
+        return numbers
+
+    run.__name__ = run.__qualname__ = getattr(function, "__name__", "run")
+    lowered = jax.jit(run, compiler_options=compiler_options(quick=True)).lower(arrays)
+    compiled = lowered.compile()
+    kept.store(key, lowered, compiled, len(arrays), result[0])
+    return compiled, result[0]
 
 
 def _kind(leaf: Any) -> Hashable:

@@ -17,7 +17,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import cross, rotation_matrix_in
+from ..algebra.rotation import rotation_matrix_in
 from ..checks.errors import ModelError, check_finite, check_shape, concrete
 from ..checks.numbers import array_module, as_numpy, floats
 from ..checks.shapes import Numbers
@@ -214,19 +214,8 @@ def _frame_about(z: Float[Array, "3"]) -> Float[Array, "3 3"]:
     z, module = as_numpy(z), array_module(z)
     other = module.eye(3, dtype=z.dtype)[module.argmin(module.abs(z))]
     x = other - (other @ z) * z
-    return _frame(x / module.sqrt(x @ x), z=z)
-
-
-def _frame(
-    x: Float[Array | np.ndarray, "3"],
-    y: Float[Array | np.ndarray, "3"] | None = None,
-    z: Float[Array | np.ndarray, "3"] | None = None,
-) -> Float[Array, "3 3"]:
-    """Right-handed frame with two given columns, x and one of the others."""
-    module = array_module(x, y, z)
-    product = np.cross if module is np else cross
-    y = product(z, x) if y is None else y
-    return floats(module.stack([x, y, product(x, y) if z is None else z], axis=1))
+    x = x / module.sqrt(x @ x)
+    return floats(module.stack([x, module.cross(z, x), z], axis=1))
 
 
 def _joint(
@@ -293,7 +282,8 @@ def universal(
             f"The axes of universal joint '{name}' must be perpendicular, but they are "
             f"{degrees:.6g} degrees apart."
         )
-    frame = _frame(*as_numpy((x, y)))
+    module, (x, y) = array_module(x, y), as_numpy((x, y))
+    frame = floats(module.stack([x, y, module.cross(x, y)], axis=1))
     return _joint("universal", name, body_i, body_j, point, point, frame)
 
 
