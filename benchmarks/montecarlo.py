@@ -59,7 +59,7 @@ ONE = Size(flights=4, lanes=(2,), checked=2, t1=0.02, tolerances=(1e-6,), tight=
 
 def study(size: Size, tolerance: float) -> stm.montecarlo.Study:
     """The flights, with what a study of them would keep."""
-    normal = {"distribution": "normal", "mean": 0.0, "deviation": 0.1}
+    normal = {"distribution": "normal", "mean": 0.0, "standard_deviation": 0.1}
     names = ("vx", "vy", "vz", "p", "q", "r")
     return study_from_plain(
         {

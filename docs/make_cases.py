@@ -37,7 +37,7 @@ def main() -> None:
         for case in (1, 2, 3):
             run = stm.simulate(stm.make_scene(name, case))
             c = run.certificate
-            growth = "-" if c.error_e_folding is None else f"{c.error_e_folding:.2g} s"
+            growth = "-" if c.error_e_folding_time is None else f"{c.error_e_folding_time:.2g} s"
             rows += (
                 f"| `{name}` | {case} | {c.position_error:.1e} m | {growth} "
                 f"| {c.position_violation:.1e} m | {c.angle_violation:.1e} rad "

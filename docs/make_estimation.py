@@ -142,12 +142,12 @@ def machine() -> dict:
     flight = stm.flight.sensed_flight(scene.system, scene.state0)
     rotors = next(f for f in scene.system.forces if isinstance(f, stm.rotorcraft.Rotors))
     rng = np.random.default_rng(0)
-    y = np.asarray(flight.omega)[1:] + 1e-3 * rng.normal(size=(len(flight.squared), 3))
+    y = np.asarray(flight.omega)[1:] + 1e-3 * rng.normal(size=(len(flight.speed_squared), 3))
     model = stm.quadrotor.rotorcraft_model(
         rotors,
         stm.flight.inertia_about_centre(scene.system, scene.state0),
         jnp.sum(scene.system.bodies.mass),
-        height=flight.centre[0, 2],
+        height=flight.centre_of_mass[0, 2],
         Q=[1e-8] * 3 + [4e-9] * 2,
         R=[1e-6] * 3,
     )
@@ -155,12 +155,12 @@ def machine() -> dict:
         [0.0, 0.0, 0.0, 0.05, -0.05], np.diag([0.1] * 3 + [0.05] * 2) ** 2
     )
     inputs = {
-        "one rigid body": flight.squared,
-        "motion of the parts known": stm.quadrotor.moved(
-            flight.squared, flight.J, flight.h, flight.centre[:, 2], 5e-3
+        "one rigid body": flight.speed_squared,
+        "motion of the parts known": stm.quadrotor.moving_part_inputs(
+            flight.speed_squared, flight.J, flight.h, flight.centre_of_mass[:, 2], 5e-3
         ),
     }
-    truth = np.asarray(flight.centre)[1:, :2]
+    truth = np.asarray(flight.centre_of_mass)[1:, :2]
     found = {
         words: np.asarray(stm.estimation.kalman_filter(model, prior, y, u=u, dt=5e-3).mean)[:, 3:]
         for words, u in inputs.items()

@@ -200,7 +200,7 @@ class Fit:
 
     Attributes:
         reading: what was fitted. converged: whether the minimum was found.
-        values, deviations: of the fitted unknowns by name [m], [rad], [1].
+        values, standard_deviations: of the fitted unknowns by name [m], [rad], [1].
         chi_square: the weighted sum of squares. freedom: numbers that can differ less unknowns.
         correlations: of the fitted unknowns, in the order of `values` (k, k).
         position_errors: centres of mass less printed, bodies 2 to 7 (6, 3) [m].
@@ -212,7 +212,7 @@ class Fit:
     reading: Reading
     converged: bool
     values: dict[str, float]
-    deviations: dict[str, float]
+    standard_deviations: dict[str, float]
     chi_square: float
     freedom: int
     correlations: np.ndarray = field(repr=False)
@@ -278,7 +278,9 @@ def fit(reading: Reading | None = None, *, start: dict[str, float] | None = None
         reading=reading,
         converged=bool(good),
         values=dict(zip(names.tolist(), everything[free].tolist(), strict=True)),
-        deviations=dict(zip(names.tolist(), (deviations * _SIZE[free]).tolist(), strict=True)),
+        standard_deviations=dict(
+            zip(names.tolist(), (deviations * _SIZE[free]).tolist(), strict=True)
+        ),
         chi_square=float(left @ left),
         freedom=len(left) - _ALWAYS_ZERO - int(free.sum()),
         correlations=covariance / np.outer(deviations, deviations),
@@ -316,7 +318,7 @@ def table(found: Fit) -> str:
     for name, value in found.values.items():
         unit = "rad" if name in ("phi", "theta") else "1" if name.startswith("middle") else "mm"
         scale = 1e3 if unit == "mm" else 1.0
-        spread = found.deviations[name]
+        spread = found.standard_deviations[name]
         lines.append(f"{name:18s}{scale * value:10.4f}{scale * spread:12.4f} {unit}")
     lines += ["", f"{'centre of mass':18s}{'fitted less printed [mm]':>30s}"]
     for name, error in zip(TRACKER_BODIES, 1e3 * found.position_errors, strict=True):

@@ -79,7 +79,7 @@ class Spring:
 
 @dataclass(frozen=True)
 class Servo:
-    """The force -k (x - target) - c x_rate on the shift x of a translational joint.
+    """The force -k (x - target) - c x_rate on the displacement x of a translational joint.
 
     joint: its number. stiffness k [N/m], damping c [N s/m], target [m].
     """

@@ -173,7 +173,7 @@ def run_trim(command: Trim) -> int:
     line(
         out,
         f"Panel angles {angles} degrees. Accelerations left: {float(found.residual):.1e}; "
-        f"{found.choices} dimensions of choice among the rotors' speeds, taken nearest each other.",
+        f"{found.null_space_dimension} dimensions of choice among the rotors' speeds, taken nearest each other.",
     )
     content = {
         "values": {name: float(v) for (name, _), v in zip(labels, unknowns, strict=True)},
@@ -218,14 +218,14 @@ def modes_table(modes: Sequence[Any]) -> Table:
     """Table of the modes other than those of a free rigid body, which have eigenvalue zero."""
     shown = table("s [1/s]", "doubles or halves in [s]", "states that take part", title="Modes")
     for mode in modes:
-        if abs(mode.s) < 1e-3:
+        if abs(mode.eigenvalue) < 1e-3:
             continue
-        s = f"{mode.s.real:.4g}"
-        if abs(mode.s.imag) > 1e-9 * abs(mode.s):
-            s += f" {'+' if mode.s.imag > 0 else '-'} {abs(mode.s.imag):.4g} i"
+        s = f"{mode.eigenvalue.real:.4g}"
+        if abs(mode.eigenvalue.imag) > 1e-9 * abs(mode.eigenvalue):
+            s += f" {'+' if mode.eigenvalue.imag > 0 else '-'} {abs(mode.eigenvalue.imag):.4g} i"
         time = "neither"
-        if math.isfinite(mode.doubling):
-            time = f"{'doubles' if mode.doubling > 0 else 'halves'} in {abs(mode.doubling):.4g}"
+        if math.isfinite(mode.doubling_time):
+            time = f"{'doubles' if mode.doubling_time > 0 else 'halves'} in {abs(mode.doubling_time):.4g}"
         parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in mode.states[:3])
         row(shown, s, time, parts)
     return shown

@@ -182,7 +182,7 @@ def _hold(
     times = [holding_time(flyer, each, start) for each in (untuned, inputs)]
     shown = table("", "untuned", "tuned", title=titled("Constant inputs that hold", found, done))
     for k in range(count):
-        pair = (untuned.squared[k], inputs.squared[k])
+        pair = (untuned.speed_squared[k], inputs.speed_squared[k])
         row(shown, f"rotor {k + 1} [rad/s]", *(_speed(float(x)) for x in pair))
     for k in range(2):
         pair = (untuned.forces[k], inputs.forces[k])
@@ -226,8 +226,8 @@ def _slew(
         ("largest tilt [mrad]", lambda p: f"{1e3 * float(p.tilt):.2f}", ""),
         ("largest drift [mm]", lambda p: f"{1e3 * float(p.drift):.2f}", ""),
         ("force [N]", lambda p: f"{float(p.force):.3f}", f"{limits.force}"),
-        ("least shifts [mm]", lambda p: mm(p.lower), mm(limits.lower)),
-        ("largest shifts [mm]", lambda p: mm(p.upper), mm(limits.upper)),
+        ("smallest displacements [mm]", lambda p: mm(p.lower), mm(limits.lower)),
+        ("largest displacements [mm]", lambda p: mm(p.upper), mm(limits.upper)),
     ]
     if command.reaction is not None:
         rows.append(("reaction [N]", lambda p: f"{float(p.reaction):.2f}", f"{command.reaction}"))
@@ -255,20 +255,20 @@ def _identify(
     case = experiment(make, given, seed=command.seed)
     run = lambda **watched: identify(
         case.predict, case.record, case.sigma, case.start, case.sizes,
-        labels=case.labels, weakest=0.5, **watched,
+        labels=case.labels, min_singular_value=0.5, **watched,
     )  # fmt: skip
     found = _watched(command, folder, f"identify {case.name}", jnp.zeros(len(case.truth)), run)
     # at the level of the noise a search may stop improving without convergence
     freedom = case.record.size - len(case.truth)
     stopped = found.search.reason is SearchReason.PATIENCE
-    noise = stopped and found.misfit * freedom <= chi2.ppf(0.999, freedom)
+    noise = stopped and found.reduced_chi_square * freedom <= chi2.ppf(0.999, freedom)
     done = _converged(found.search) or bool(noise)
     shown = table(
         "parameter", "true", "start", "found", "deviation",
         title=titled("Identified parameters", found.search, done),
     )  # fmt: skip
     for k, label in enumerate(case.labels):
-        numbers = (case.truth[k], case.start[k], found.values[k], found.deviations[k])
+        numbers = (case.truth[k], case.start[k], found.values[k], found.standard_deviations[k])
         row(shown, label, *(f"{x:.5g}" for x in numbers))
     return found.search, shown, _figures(command, folder, found.search, {}), done
 

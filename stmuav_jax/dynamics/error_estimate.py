@@ -60,10 +60,10 @@ class ErrorEstimate:
         position: error of the centres of mass (k, n) [m].
         angle: angle between computed and exact orientation (k, n) [rad].
         velocity: error (k, n) [m/s]. angular_velocity: error (k, n) [rad/s].
-        e_folding: time in which errors grow by the factor e [s], if they grow exponentially over
+        e_folding_time: time in which errors grow by the factor e [s], if they grow exponentially over
             the later half of the determined motion; else None.
-        lost_at: first saved time at which a position is known to no better than 1 % of the largest
-            distance travelled, or an orientation to 0.01 rad [s]; None if there is none.
+        predictability_horizon: first saved time at which a position is known to no better than 1 %
+            of the largest distance travelled, or an orientation to 0.01 rad [s]; else None.
         note: reason why estimates are missing at some times; empty if none is missing.
     """
 
@@ -71,8 +71,8 @@ class ErrorEstimate:
     angle: Float[np.ndarray, "k n"]
     velocity: Float[np.ndarray, "k n"]
     angular_velocity: Float[np.ndarray, "k n"]
-    e_folding: float | None = None
-    lost_at: float | None = None
+    e_folding_time: float | None = None
+    predictability_horizon: float | None = None
     note: str = ""
 
     @property
@@ -83,13 +83,13 @@ class ErrorEstimate:
     def words(self, ts: Float[np.ndarray, " k"]) -> str:
         """Notable facts about the errors besides their size, as text; empty if there are none."""
         found = []
-        if self.e_folding is not None:
-            found.append(f"Errors grow e-fold every {self.e_folding:.2g} s.")
-        if self.lost_at is not None:
-            k = int(np.searchsorted(ts, self.lost_at))
+        if self.e_folding_time is not None:
+            found.append(f"Errors grow e-fold every {self.e_folding_time:.2g} s.")
+        if self.predictability_horizon is not None:
+            k = int(np.searchsorted(ts, self.predictability_horizon))
             position, angle = (np.max(x[k]) for x in (self.position, self.angle))
             found.append(
-                f"From t = {self.lost_at:.4g} s on the positions are known to no better than "
+                f"From t = {self.predictability_horizon:.4g} s on the positions are known to no better than "
                 f"{position:.1g} m and the orientations to no better than {angle:.1g} rad."
             )
         return " ".join([*found, *([self.note] if self.note else [])])

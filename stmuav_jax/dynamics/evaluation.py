@@ -33,7 +33,7 @@ class Snapshot(eqx.Module):
         residuals: scaled position residual of every row (m,) [m], or [rad] for cosines and angles.
         rates: scaled velocity residual of every row (m,) [m/s] or [rad/s].
         singular_values: those of the constraint Jacobian in (v, omega'), descending.
-        acceleration_misfit: largest |J qddot - gamma|; non-zero for contradictory rows.
+        acceleration_residual: largest |J qddot - gamma|; non-zero for contradictory rows.
         finite_loads: true for each force element whose load is finite.
     """
 
@@ -45,7 +45,7 @@ class Snapshot(eqx.Module):
     residuals: Float[Array, " m"]
     rates: Float[Array, " m"]
     singular_values: Float[Array, " s"]
-    acceleration_misfit: Float[Array, ""]
+    acceleration_residual: Float[Array, ""]
     finite_loads: Bool[Array, " forces"]
 
 
@@ -78,7 +78,7 @@ def snapshot(
         residuals=scale * eq.value,
         rates=scale * (eq.matrix @ u - eq.target),
         singular_values=values,
-        acceleration_misfit=jnp.max(jnp.abs(eq.matrix @ u_rate - eq.gamma), initial=0.0),
+        acceleration_residual=jnp.max(jnp.abs(eq.matrix @ u_rate - eq.gamma), initial=0.0),
         finite_loads=jnp.stack(finite) if finite else jnp.zeros((0,), bool),
     )
 

@@ -65,18 +65,18 @@ class Envelope(eqx.Module):
     """Minimum and maximum of each load component at every joint, and where they occur.
 
     Attributes:
-        least, most: minimum and maximum (joints, 8) [N], [N m], columns as in `COMPONENTS`.
-        t_least, t_most: times of the extremes (joints, 8) [s].
-        run_least, run_most: indices of their runs in a flattened batch (joints, 8).
+        minimum, maximum: minimum and maximum (joints, 8) [N], [N m], columns as in `COMPONENTS`.
+        t_minimum, t_maximum: times of the extremes (joints, 8) [s].
+        run_minimum, run_maximum: indices of their runs in a flattened batch (joints, 8).
         joints: names of the joints.
     """
 
-    least: Float[Array, "joints 8"]
-    most: Float[Array, "joints 8"]
-    t_least: Float[Array, "joints 8"]
-    t_most: Float[Array, "joints 8"]
-    run_least: Int[Array, "joints 8"]
-    run_most: Int[Array, "joints 8"]
+    minimum: Float[Array, "joints 8"]
+    maximum: Float[Array, "joints 8"]
+    t_minimum: Float[Array, "joints 8"]
+    t_maximum: Float[Array, "joints 8"]
+    run_minimum: Int[Array, "joints 8"]
+    run_maximum: Int[Array, "joints 8"]
     joints: tuple[str, ...] = eqx.field(static=True)
 
 

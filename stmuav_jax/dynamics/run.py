@@ -40,7 +40,8 @@ class Certificate:
             the exact motion, the largest over all bodies and saved times [m], [rad], [m/s],
             [rad/s]; see `ErrorEstimate`.
         position_error_end, angle_error_end: the largest over all bodies at the last saved time.
-        error_e_folding, error_lost_at: those of `ErrorEstimate` [s]. error_words: both in words.
+        error_e_folding_time, predictability_horizon: those of `ErrorEstimate` [s]. error_words: both
+        in words.
         position_violation, angle_violation: largest residual of constraints that are lengths [m],
             and of those that are cosines or angles [rad], over all accepted steps.
         velocity_violation, angular_velocity_violation: those of their rates [m/s], [rad/s].
@@ -52,7 +53,7 @@ class Certificate:
         smallest_singular_value: that of the constraint Jacobian along the saved path; None
             without joints.
         rank, rows: those at the start. redundant: joints that own a dependent row.
-        accepted_steps, rejected_steps: numbers over the whole run. unsteered_steps: steps accepted
+        accepted_steps, rejected_steps: numbers over the whole run. steps_at_growth_limit: steps accepted
             with an error so far below the tolerance that the next step could grow as much as any
             may.
         compile_seconds, run_seconds: times of the integration. estimate_seconds: that of the second
@@ -67,8 +68,8 @@ class Certificate:
     angle_error_end: float
     velocity_error: float
     angular_velocity_error: float
-    error_e_folding: float | None
-    error_lost_at: float | None
+    error_e_folding_time: float | None
+    predictability_horizon: float | None
     error_words: str
     position_violation: float
     angle_violation: float
@@ -85,7 +86,7 @@ class Certificate:
     redundant: tuple[str, ...]
     accepted_steps: int
     rejected_steps: int
-    unsteered_steps: int
+    steps_at_growth_limit: int
     compile_seconds: float
     run_seconds: float
     estimate_seconds: float
@@ -150,7 +151,7 @@ class Run:
 
     def joint(self, name: str) -> JointMotion:
         """Coordinates and rates of one joint at the saved times, with continuous angles: `.angle`,
-        `.shift`, or `.coordinates` (k, c)."""
+        `.displacement`, or `.coordinates` (k, c)."""
         found = joint_motion(self.scene.system, self.states, name, self.ts)
         return jax.tree.map(np.asarray, found)
 

@@ -165,10 +165,10 @@ def _inspect(
             problem = dataclasses.replace(problem, method=method)
             first = snapshots(allowing, model, rows, *start)
         size = 1 + np.max(np.abs(first.accelerations.v_rate), initial=0.0)
-        if not first.acceleration_misfit[0] <= 1e-6 * size:
+        if not first.acceleration_residual[0] <= 1e-6 * size:
             raise ModelError(
                 "The constraints contradict each other: no accelerations satisfy all of them "
-                f"(misfit {first.acceleration_misfit[0]:.3g}). Among the dependent rows are those of "
+                f"(misfit {first.acceleration_residual[0]:.3g}). Among the dependent rows are those of "
                 f"{', '.join(rank.redundant)}. Where only this posture makes them dependent, it is "
                 "the velocities that fit no motion through it."
             )

@@ -31,15 +31,15 @@ class ClearSky(NamedTuple):
     Attributes:
         beam: beam irradiance of a plane that faces the sun (DNI).
         diffuse: diffuse irradiance of a horizontal plane (DHI).
-        level: total irradiance of a horizontal plane (GHI).
-        outside: beam irradiance outside the atmosphere.
+        global_horizontal: total irradiance of a horizontal plane (GHI).
+        extraterrestrial: beam irradiance outside the atmosphere.
         turbidity: Linke's turbidity (n,) [1].
     """
 
     beam: Samples
     diffuse: Samples
-    level: Samples
-    outside: Samples
+    global_horizontal: Samples
+    extraterrestrial: Samples
     turbidity: Samples
 
 
@@ -104,9 +104,9 @@ def panel_irradiance(
         90.0 - np.degrees(np.asarray(sun.elevation)),
         np.degrees(np.asarray(sun.azimuth)),
         sky.beam,
-        sky.level,
+        sky.global_horizontal,
         sky.diffuse,
-        dni_extra=sky.outside,
+        dni_extra=sky.extraterrestrial,
         albedo=albedo,
         model="haydavies",
     )

@@ -125,7 +125,7 @@ def inconsistent(filtered: Filtered, *, window: int = 50, level: float = 0.999) 
             f"A window of at least 1 step and a level in (0, 1), not {window} and {level}."
         )
     nis = np.asarray(filtered.nis)
-    there = np.sum(np.asarray(filtered.innovations.there), axis=1)
+    there = np.sum(np.asarray(filtered.innovations.measured), axis=1)
     shape = np.broadcast_shapes(nis.shape, there.shape)
     total, degrees = (
         _running(np.broadcast_to(a, shape).astype(float), window) for a in (nis, there)

@@ -63,7 +63,7 @@ class Filtered(eqx.Module):
         return jax.vmap(outer_square)(self.factor)
 
     @property
-    def deviation(self) -> Float[Array, "T n *s"]:
+    def standard_deviation(self) -> Float[Array, "T n *s"]:
         """Standard deviations after each measurement."""
         return jnp.sqrt(jnp.sum(self.factor**2, axis=2))
 
@@ -81,7 +81,7 @@ class Filtered(eqx.Module):
     @property
     def missing(self) -> Int[Array, "*s"]:
         """Number of missing (NaN) components of measurements."""
-        return jnp.sum(~self.innovations.there, axis=(0, 1))
+        return jnp.sum(~self.innovations.measured, axis=(0, 1))
 
     def at(self, k: int) -> Gaussian:
         """Estimate after measurement k."""

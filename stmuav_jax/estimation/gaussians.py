@@ -31,7 +31,7 @@ class Gaussian(eqx.Module):
         return outer_square(self.factor)
 
     @property
-    def deviation(self) -> Float[Array, "n *s"]:
+    def standard_deviation(self) -> Float[Array, "n *s"]:
         """Standard deviations, the square roots of P's diagonal."""
         return jnp.sqrt(jnp.sum(jnp.swapaxes(self.factor, 0, 1) ** 2, axis=0))
 

@@ -30,14 +30,14 @@ class Observability(NamedTuple):
     Attributes:
         singular_values: singular values (n,), in descending order.
         rank: number of singular values above the tolerance.
-        null: orthonormal basis of the scaled unobservable directions (n, n - rank).
+        null_space: orthonormal basis of the scaled unobservable directions (n, n - rank).
         names: names of the state's error components.
         scale: numbers by which these components were divided (n,).
     """
 
     singular_values: np.ndarray
     rank: int
-    null: np.ndarray
+    null_space: np.ndarray
     names: tuple[str, ...]
     scale: np.ndarray
 
@@ -46,7 +46,7 @@ class Observability(NamedTuple):
         n = len(self.names)
         if self.rank == n:
             return f"All {n} states are observable."
-        alone, combined = _separate(self.null)
+        alone, combined = _separate(self.null_space)
         lines = [f"{self.rank} of {n} directions are observable."]
         if alone:
             listed = ", ".join(self.names[i] for i in alone)

@@ -93,7 +93,7 @@ class OnlineEstimate:
         return self._layout.mean(self._numbers)
 
     @property
-    def deviation(self) -> np.ndarray:
+    def standard_deviation(self) -> np.ndarray:
         """Standard deviations (n,) as a NumPy array."""
         return np.sqrt(np.sum(self._layout.factor(self._numbers) ** 2, axis=1))
 

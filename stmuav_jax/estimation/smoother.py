@@ -43,7 +43,7 @@ class Smoothed(eqx.Module):
         return jax.vmap(outer_square)(self.factor)
 
     @property
-    def deviation(self) -> Float[Array, "T n *s"]:
+    def standard_deviation(self) -> Float[Array, "T n *s"]:
         """Standard deviations at each time."""
         return jnp.sqrt(jnp.sum(self.factor**2, axis=2))
 

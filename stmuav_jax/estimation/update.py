@@ -38,26 +38,26 @@ class Innovation(NamedTuple):
 
     Attributes:
         error: measurement less its prediction (m, *s), zero where missing.
-        scaled: Ls^-1 error, of unit covariance if the filter is consistent (m, *s).
+        normalised: Ls^-1 error, of unit covariance if the filter is consistent (m, *s).
         factor: root Ls of the innovation's covariance (m, m, *s); a missing measurement has the
             row and column of the unit matrix.
-        there: True for components that are not missing (m, *s).
+        measured: True for components that are not missing (m, *s).
     """
 
     error: Float[Array, "m *s"]
-    scaled: Float[Array, "m *s"]
+    normalised: Float[Array, "m *s"]
     factor: Float[Array, "m m *s"]
-    there: Bool[Array, "m *s"]
+    measured: Bool[Array, "m *s"]
 
     @property
     def missing(self) -> Int[Array, "*s"]:
         """Number of missing components."""
-        return jnp.sum(~self.there, axis=0)
+        return jnp.sum(~self.measured, axis=0)
 
     @property
     def nis(self) -> Float[Array, "*s"]:
         """Normalised innovation squared nu^T S^-1 nu, chi-squared with (m - missing) degrees."""
-        return jnp.sum(self.scaled**2, axis=0)
+        return jnp.sum(self.normalised**2, axis=0)
 
     @property
     def log_likelihood(self) -> Float[Array, "*s"]:

@@ -134,7 +134,7 @@ def day_dataset(day: Day) -> xr.Dataset:
         "R_wb": (("axis", "axis_b", s), day.R_wb, "1", "UAV to world"),
         "panel_angles": (("angle", s), day.angles, "rad", "R_x(phi) R_y(theta); NaN at night"),
         "strokes": (("leg", s), day.strokes, "m", "heights of the rods' lower joints"),
-        "shifts": (("leg", s), day.shifts, "m", "strokes from the initial posture's"),
+        "displacements": (("leg", s), day.displacements, "m", "strokes from the initial posture's"),
         "panel_normal": (("axis", s), day.normals_w, "1", "in the world"),
         "reason": ((s,), day.reason, "1", "why the sun is not faced: attribute reasons"),
         "pointing_error": ((s,), day.pointing_error, "rad", "panel's normal from the sun"),

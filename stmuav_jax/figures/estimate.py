@@ -48,7 +48,7 @@ def summary_table(summaries: Iterable[CaseSummary]) -> Table:
         )  # fmt: skip
     table.caption = (
         "Medians of the times from which on the error is below 2 cm and 5 mm. After "
-        f"{rows[0].settled:g} s: RMSE, and the means of NEES of the offset (2 is right), of rates and "
+        f"{rows[0].settling_time:g} s: RMSE, and the means of NEES of the offset (2 is right), of rates and "
         "offset (5), and of NIS (3); high and low: outside the interval of 99.9 % of a consistent "
         "filter. Flagged: runs whose innovations contradict their filter."
     )
@@ -164,7 +164,7 @@ def errors(study: CaseStudy) -> Figure:
     t = np.asarray(study.record.t)[1:]
     for column, name in enumerate(names):
         found: Estimates = study.estimates[name]
-        error, deviation = np.asarray(found.error), np.asarray(found.deviation)
+        error, deviation = np.asarray(found.error), np.asarray(found.standard_deviation)
         for row, axis in enumerate("xy"):
             ax = axes[row, column]
             ax.plot(t, 1e3 * error[:, 3 + row, :20], color="0.65", linewidth=0.4)
@@ -244,7 +244,12 @@ def case_dataset(study: CaseStudy) -> xr.Dataset:
         "euler_parameters": (("time", "e", "seed"), record.p[1:], "1", "true, body to world"),
         "measured": (("time", "axis", "seed"), record.y[:, :3], "rad/s", "by the gyroscope"),
         "estimate": (each, together(lambda e: e.mean), "rad/s, m", "means"),
-        "deviation": (each, together(lambda e: e.deviation), "rad/s, m", "the filter's own"),
+        "standard_deviation": (
+            each,
+            together(lambda e: e.standard_deviation),
+            "rad/s, m",
+            "the filter's own",
+        ),
         "nees": (scalar, together(lambda e: e.nees), "1", "of rates and offset, 5 degrees"),
         "nees_offset": (scalar, together(lambda e: e.nees_offset), "1", "2 degrees of freedom"),
         "nis": (scalar, together(lambda e: e.nis), "1", "of the innovations, 3 degrees"),
@@ -271,7 +276,7 @@ def hover_dataset(flights: dict[str, Hover]) -> xr.Dataset:
         ),
         "truth": (each, together(lambda h: h.truth), "rad/s, m", "body rates and centre of mass"),
         "estimate": (each, together(lambda h: h.mean), "rad/s, m", "means"),
-        "deviation": (each, together(lambda h: h.deviation), "rad/s, m", "the filter's own"),
+        "standard_deviation": (each, together(lambda h: h.standard_deviation), "rad/s, m", "the filter's own"),
         "tilt": (scalar, together(lambda h: h.tilt), "rad", "true, of the rotors' axis"),
         "nees": (scalar, together(lambda h: h.nees), "1", "of all 14 error states"),
         "nees_offset": (scalar, together(lambda h: h.nees_offset), "1", "2 degrees of freedom"),

@@ -26,7 +26,9 @@ _NOTHING = 1e-9
 
 def rows(system: System, found: Envelope) -> list[tuple[str | float, ...]]:
     """Rows of the table, one per joint and component, with columns as in `HEADER`."""
-    values = [np.asarray(x) for x in (found.least, found.t_least, found.most, found.t_most)]
+    values = [
+        np.asarray(x) for x in (found.minimum, found.t_minimum, found.maximum, found.t_maximum)
+    ]
     table: list[tuple[str | float, ...]] = []
     for k, joint in enumerate(system.joints):
         for c, (name, unit) in enumerate(zip(COMPONENTS, UNITS, strict=True)):
@@ -58,7 +60,7 @@ def loads_table(scene: Scene, loads: JointLoads) -> Table:
     for k, joint in enumerate(scene.system.joints):
         cells: list[str] = []
         for c in (force, moment):
-            value, time = float(found.most[k, c]), float(found.t_most[k, c])
+            value, time = float(found.maximum[k, c]), float(found.t_maximum[k, c])
             cells += ["0", ""] if value < _NOTHING else [f"{value:.4g}", f"{time:.4f}"]
         add_row(shown, joint.name, joint.kind, *cells)
     return shown

@@ -56,11 +56,11 @@ def certificate_rows(run: Run) -> list[tuple[str, str]]:
     if c.smallest_singular_value is not None:
         rows.append(("Smallest singular value on the way", _number(c.smallest_singular_value, "")))
     rows.append(("Steps accepted, rejected", f"{c.accepted_steps}, {c.rejected_steps}"))
-    if 2 * c.unsteered_steps > c.accepted_steps:
+    if 2 * c.steps_at_growth_limit > c.accepted_steps:
         rows.append(
             (
                 "Steps that grew at their limit",
-                f"{c.unsteered_steps}: not the error but the saved times, or nothing, chose most lengths",
+                f"{c.steps_at_growth_limit}: not the error but the saved times, or nothing, chose most lengths",
             )
         )
     return [

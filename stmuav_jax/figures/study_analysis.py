@@ -42,7 +42,7 @@ class Influence(NamedTuple):
         names: keys of the d inputs.
         indices: Sobol indices of a Saltelli study; None in others.
         first: first-order indices (d,), from `indices` or from bins.
-        chance: bound of an index from bins without influence; None for Sobol indices.
+        noise_bound: bound of an index from bins without influence; None for Sobol indices.
         ranks: Spearman's rank correlations; None where they are not defined.
         samples: number of samples behind the results.
         note: remark on the results, or the reason why there are none.
@@ -51,7 +51,7 @@ class Influence(NamedTuple):
     names: tuple[str, ...]
     indices: SobolIndices | None
     first: np.ndarray | None
-    chance: float | None
+    noise_bound: float | None
     ranks: IndexIntervals | None
     samples: int
     note: str
@@ -196,7 +196,7 @@ def _from_samples(
         if np.any(np.isinf(values)):
             values, note = rankdata(values), "shares are of the ranks, since values are infinite"
         found = binned(table, values, level=level)
-        first, chance = found.value, found.chance
+        first, chance = found.value, found.noise_bound
     except SettingError as error:
         note = str(error)
     return Influence(names, None, first, chance, ranks, len(values), note)
@@ -211,7 +211,7 @@ def _failing(data: StudyData, picked: list[int]) -> np.ndarray | None:
 
 
 def _varies(summary: SampleSummary) -> bool:
-    least, most = summary.least, summary.most
+    least, most = summary.minimum, summary.maximum
     return least is not None and most is not None and least < most
 
 
@@ -241,7 +241,7 @@ def plain(analysis: Analysis) -> dict[str, Any]:
     return {
         "level": analysis.level,
         "samples": {
-            "total": analysis.total, "not_computed": o.missing, "completed": o.fine,
+            "total": analysis.total, "not_computed": o.missing, "completed": o.successful,
             "not_completed": o.failed, "share_not_completed": _estimate(o.failure),
             "reasons": {
                 str(code): {
@@ -284,9 +284,12 @@ def _estimate(one: IntervalEstimate | None) -> dict[str, Any] | None:
 def _summary(one: SampleSummary) -> dict[str, Any]:
     return {
         "values": one.values, "undefined": one.undefined,
-        "infinite": {"above": one.never, "below": one.below, "share": _estimate(one.infinite)},
-        "least": number(one.least), "most": number(one.most),
-        "mean": _estimate(one.mean), "deviation": _estimate(one.deviation),
+        "infinite": {
+            "above": one.positive_infinite, "below": one.negative_infinite,
+            "share": _estimate(one.infinite_probability),
+        },
+        "minimum": number(one.minimum), "maximum": number(one.maximum),
+        "mean": _estimate(one.mean), "standard_deviation": _estimate(one.standard_deviation),
         "quantiles": {f"{share:g}": _estimate(x) for share, x in one.quantiles.items()},
     }  # fmt: skip
 
@@ -312,7 +315,7 @@ def _influence(one: Influence) -> dict[str, Any]:
         "sobol_first": _shares(one.names, one.indices.first if one.indices else None),
         "sobol_total": _shares(one.names, one.indices.total if one.indices else None),
         "share": None if one.indices else _named(one.names, one.first),
-        "share_by_chance": number(one.chance),
+        "share_by_chance": number(one.noise_bound),
         "rank_correlation": _shares(one.names, one.ranks),
         "samples": one.samples,
         "note": one.note,

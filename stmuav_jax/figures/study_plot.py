@@ -166,8 +166,8 @@ def _histogram(
         mark = summary.quantiles[share].value
         if np.isfinite(mark):
             ax.axvline(mark, color=BLACK, linewidth=0.9, linestyle="--")
-    if summary.infinite:
-        remarks.append(f"infinite: {100 * summary.infinite.value:.3g} %")
+    if summary.infinite_probability:
+        remarks.append(f"infinite: {100 * summary.infinite_probability.value:.3g} %")
     if summary.undefined:
         remarks.append(f"undefined: {summary.undefined}")
     ax.set_title("; ".join(text for text in remarks if text), fontsize=8)
@@ -286,6 +286,6 @@ def _scatter_notes(
         if data.design == "saltelli"
         else ", $\\rho$: rank correlation."
     )
-    if any(f.summary.infinite for f in rows):
+    if any(f.summary.infinite_probability for f in rows):
         letters += " Triangles: infinite."
     return [*notes, letters]

@@ -162,7 +162,7 @@ def settling(data: StudyData, analysis: Analysis) -> Figure | None:
     for one, ax in zip(shown, axes[1:], strict=True):
         values = data.values(one.quantity)
         values = values[~np.isnan(values)]
-        never = one.summary.infinite is not None
+        never = one.summary.infinite_probability is not None
         what = "mean" if one.summary.mean and not one.event else "probability"
         _settle(ax, np.isinf(values) if never else values, what, analysis.level)
         name = "share that is infinite" if never else "probability" if one.event else "mean"
@@ -244,11 +244,15 @@ def _share_bars(ax: Axes, one: Finding, names: list[str]) -> None:
     ax.barh(
         np.arange(len(names)), value, 0.6, color=BLUE, label="share that the input alone decides"
     )
-    if found.chance is not None:
+    if found.noise_bound is not None:
         ax.axvline(
-            found.chance, color=BLACK, linewidth=0.9, linestyle=":", label="what chance stays below"
+            found.noise_bound,
+            color=BLACK,
+            linewidth=0.9,
+            linestyle=":",
+            label="what chance stays below",
         )
-    widest = max(float(np.max(value)), found.chance or 0.0, 0.05)
+    widest = max(float(np.max(value)), found.noise_bound or 0.0, 0.05)
     if found.ranks:
         for row, k in enumerate(picked):
             ax.text(

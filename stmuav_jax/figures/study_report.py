@@ -176,11 +176,12 @@ def _page(data: StudyData, analysis: Analysis, figures: list[str]) -> str:
 
 def _lead(analysis: Analysis) -> str:
     o = analysis.outcomes
-    used = o.fine + o.failed + o.missing
+    used = o.successful + o.failed + o.missing
     words = "1 sample" if analysis.total == 1 else f"{analysis.total:,} samples"
     if used < analysis.total:
         words += f", of which {used:,} are independent of each other"
-    words += f": {o.fine:,} completed, {o.failed:,} did not complete, {o.missing:,} not computed. "
+    words += f": {o.successful:,} completed, {o.failed:,} did not complete, "
+    words += f"{o.missing:,} not computed. "
     if o.failure and o.failed:
         words += f"Share of runs that did not complete: {_percent(o.failure)}. "
     if analysis.failure:
@@ -191,7 +192,7 @@ def _lead(analysis: Analysis) -> str:
 
 def _outcomes(analysis: Analysis) -> str:
     o = analysis.outcomes
-    rows = [["completed", f"{o.fine:,}", "", ""]]
+    rows = [["completed", f"{o.successful:,}", "", ""]]
     for code, (words, share) in o.reasons.items():
         rows.append(
             [f"did not complete: {words}", f"{o.codes.get(code, 0):,}", _percent(share), f"{code}"]
@@ -209,20 +210,20 @@ def _quantities(analysis: Analysis) -> str:
     for one in found:
         words = _text(label(one.quantity.words, one.quantity.unit))
         rows.append([words + _remarks(one.summary), *_statistics(one.summary)])
-    head = ["", "values", "mean", "deviation", "5 %", "median", "95 %", "least", "most"]
+    head = ["", "values", "mean", "std. dev.", "5 %", "median", "95 %", "minimum", "maximum"]
     return "<h2>Quantities, over the completed samples</h2>" + _table(head, rows)
 
 
 def _statistics(one: SampleSummary) -> list[str]:
     quantiles = [_estimate(one.quantiles.get(share)) for share in (0.05, 0.5, 0.95)]
-    spread = [_estimate(one.mean), _estimate(one.deviation)]
-    return [f"{one.values:,}", *spread, *quantiles, _number(one.least), _number(one.most)]
+    spread = [_estimate(one.mean), _estimate(one.standard_deviation)]
+    return [f"{one.values:,}", *spread, *quantiles, _number(one.minimum), _number(one.maximum)]
 
 
 def _remarks(one: SampleSummary) -> str:
     found = []
-    if one.infinite:
-        found.append(f"infinite, so without a mean: {_percent(one.infinite)}")
+    if one.infinite_probability:
+        found.append(f"infinite, so without a mean: {_percent(one.infinite_probability)}")
     if one.undefined:
         found.append(f"undefined in {one.undefined:,} samples")
     return "".join(f"<br><small>{text}</small>" for text in found)
@@ -271,8 +272,9 @@ def _influences(one: Finding, words: Mapping[str, str]) -> str:
         shares = found.first if found.first is not None else []
         columns.append([_small(x) for x in shares] or ["" for _ in found.names])
         columns.append(_interval(found.ranks) if found.ranks else ["" for _ in found.names])
-        if found.chance is not None:
-            remark += f"<p><small>by chance shares stay below {_small(found.chance)}</small></p>"
+        if found.noise_bound is not None:
+            bound = _small(found.noise_bound)
+            remark += f"<p><small>by chance shares stay below {bound}</small></p>"
     rows = [
         [_text(words.get(found.names[k], found.names[k])), *(c[k] for c in columns)] for k in order
     ]
@@ -288,12 +290,12 @@ def _sampling(data: StudyData, analysis: Analysis) -> str:
     laws = {column_name(str(one["name"])): _law(one) for one in plans}
     for one in data.inputs:
         summary = analysis.inputs[one.key]
-        known = [_estimate(summary.mean), _estimate(summary.deviation)]
-        ends = [_number(summary.least), _number(summary.most)]
+        known = [_estimate(summary.mean), _estimate(summary.standard_deviation)]
+        ends = [_number(summary.minimum), _number(summary.maximum)]
         rows.append(
             [_text(label(one.words, one.unit)), _text(laws.get(one.key, "")), *known, *ends]
         )
-    head = ["", "distribution", "mean drawn", "deviation drawn", "least", "most"]
+    head = ["", "distribution", "mean drawn", "standard deviation drawn", "minimum", "maximum"]
     words = ""
     if given:
         design = _DESIGNS.get(data.design, data.design).format(stratum=given.get("stratum"))

@@ -35,7 +35,7 @@ def summary_lines(analysis: Analysis) -> list[str]:
     """Lines with the samples' outcomes, and the probability of the declared failure."""
     o = analysis.outcomes
     lines = [
-        f"{o.fine:,} samples completed, {o.failed:,} did not complete, {o.missing:,} not computed."
+        f"{o.successful:,} samples completed, {o.failed:,} did not complete, {o.missing:,} not computed."
     ]
     lines += [
         f"  did not complete: {o.codes.get(code, 0):,}, {words}"

@@ -51,7 +51,7 @@ class Trim(eqx.Module):
         residual: largest difference from the wanted accelerations [m/s^2] or [rad/s^2].
         conditioning: smallest over largest singular value of the Jacobian with scaled unknowns;
             near zero, other trims lie near.
-        found: true if the residual is below `TOLERANCE`; point and values are NaN otherwise.
+        converged: true if the residual is below `TOLERANCE`; point and values are NaN otherwise.
         steps: number of steps of Newton's method.
         inputs: names and units of the values.
     """
@@ -60,7 +60,7 @@ class Trim(eqx.Module):
     values: Float[Array, " m"]
     residual: Float[Array, ""]
     conditioning: Float[Array, ""]
-    found: Bool[Array, ""]
+    converged: Bool[Array, ""]
     steps: Int[Array, ""]
     inputs: Inputs
 

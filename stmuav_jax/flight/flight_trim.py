@@ -34,7 +34,7 @@ from ..rotorcraft.allocation import (
     RotorLimits,
     allocate,
     check_lift,
-    least,
+    minimum_norm,
     wrench_map,
 )
 from ..rotorcraft.motor import MotorRotors
@@ -111,7 +111,7 @@ class FlightTrim(eqx.Module):
         residual: largest residual acceleration [m/s^2] or [rad/s^2].
         conditioning: smallest over largest singular value of the Jacobian, in units of a
             radian, the weight, and the weight times a metre; near zero, other trims lie near.
-        choices: null-space dimension of the allocation: rotors less thrust and moments.
+        null_space_dimension: that of the allocation: rotors less thrust and moments.
         reason: code of `TrimReason`.
         steps: number of steps of Newton's method.
     """
@@ -125,7 +125,7 @@ class FlightTrim(eqx.Module):
     steps: Int[Array, ""]
 
     @property
-    def choices(self) -> int:
+    def null_space_dimension(self) -> int:
         return self.speeds.shape[-1] - 4
 
     @property
@@ -177,7 +177,7 @@ def _left(at: FlyerPoint, inputs: RotorsAndForces, setting: _Setting) -> Float[A
 
 def _residual(z: Float[Array, "8"], setting: _Setting) -> Float[Array, "8"]:
     at = _point(z[:2], setting.wanted)
-    squared = least(_map(setting.flyer, at), z[2:6])
+    squared = minimum_norm(_map(setting.flyer, at), z[2:6])
     return _left(at, RotorsAndForces(squared, z[6:]), setting)
 
 
@@ -286,12 +286,12 @@ def _found(setting: _Setting, limits: TrimLimits) -> FlightTrim:
     values = jnp.linalg.svd(last.J * sizes, compute_uv=False)
     at = _point(z[:2], setting.wanted)
     B = _map(flyer, at)
-    squared = least(B, z[2:6])
+    squared = minimum_norm(B, z[2:6])
     missed = jnp.zeros((), bool)
     if limits.rotors is not None:
         # the wrench is the same, and so are the accelerations
         given = allocate(B, z[2:6], limits.rotors)
-        squared, missed = given.squared, given.reason != AllocationReason.VALID
+        squared, missed = given.speed_squared, given.reason != AllocationReason.VALID
     inputs, left = RotorsAndForces(squared, z[6:]), last.size
     spun = jnp.zeros((), bool)
     if limits.rotors is not None and isinstance(flyer.propulsion, MotorRotors):

@@ -83,11 +83,11 @@ class RotorsAndForces(NamedTuple):
     """Inputs of the UAV, numbers or histories: functions of (t, kinematics) such as `Sampled`.
 
     Attributes:
-        squared: squared rotor speeds (k,) [rad^2/s^2].
+        speed_squared: squared rotor speeds (k,) [rad^2/s^2].
         forces: actuator forces (2,) [N].
     """
 
-    squared: Any
+    speed_squared: Any
     forces: Any
 
 
@@ -121,7 +121,7 @@ class Flyer(AbstractStateSpace):
         system: the seven bodies, base first, with one `Rotors` or `MotorRotors` and one
             `LinearActuator` for each slider. Other forces stay as they are.
         geometry: lengths of the tracker.
-        shift: displacement of the tracker in the base's frame (3,) [m].
+        displacement: displacement of the tracker in the base's frame (3,) [m].
         limits: limits of the tracker's workspace (`tracker_limits`), which a trim observes;
             None for all that its rods reach.
 
@@ -131,7 +131,7 @@ class Flyer(AbstractStateSpace):
 
     system: System
     geometry: TrackerGeometry
-    shift: Float[Array, "3"]
+    displacement: Float[Array, "3"]
     limits: Limits | None
     rotors: int = eqx.field(static=True)
     actuators: tuple[int, int] = eqx.field(static=True)
@@ -141,7 +141,11 @@ class Flyer(AbstractStateSpace):
     dof: int = eqx.field(static=True)
 
     def __init__(
-        self, system: System, geometry: TrackerGeometry, shift: Any, limits: Limits | None = None
+        self,
+        system: System,
+        geometry: TrackerGeometry,
+        displacement: Any,
+        limits: Limits | None = None,
     ) -> None:
         rotors = [k for k, f in enumerate(system.forces) if isinstance(f, Rotors | MotorRotors)]
         pushers = {
@@ -153,7 +157,7 @@ class Flyer(AbstractStateSpace):
                 f"system has {len(rotors)} and those for {', '.join(sorted(pushers)) or 'none'}."
             )
         self.system, self.geometry = system, geometry
-        self.shift, self.limits = jnp.asarray(shift, dtype=float), limits
+        self.displacement, self.limits = jnp.asarray(displacement, dtype=float), limits
         self.rotors = rotors[0]
         self.actuators = (pushers["slider_2"], pushers["slider_3"])
         self.dof, self.is_flat = 8, False
@@ -186,7 +190,7 @@ class Flyer(AbstractStateSpace):
         forces = list(self.system.forces)
         forces[self.rotors] = own.steady()
         system = eqx.tree_at(lambda s: s.forces, self.system, tuple(forces))
-        return Flyer(system, self.geometry, self.shift, self.limits)
+        return Flyer(system, self.geometry, self.displacement, self.limits)
 
     def with_inputs(
         self, inputs: RotorsAndForces, speeds: Float[Array, " k"] | None = None
@@ -198,12 +202,12 @@ class Flyer(AbstractStateSpace):
                 are numbers or a `Sampled` history, and else the present ones.
         """
         rotors, actuators = self.inputs
-        system = rotors.applied(self.system, inputs.squared)
+        system = rotors.applied(self.system, inputs.speed_squared)
         system = actuators.applied(system, inputs.forces)
         if not self.lagging:
             return system
         if speeds is None:
-            first = inputs.squared
+            first = inputs.speed_squared
             first = first(first.breaks[0]) if isinstance(first, Sampled) else first
             if callable(first):
                 return system
@@ -220,7 +224,7 @@ class Flyer(AbstractStateSpace):
 
     def to_state(self, x: FlyerPoint, t: Time = 0.0) -> State:
         del t
-        return whole_state(self.geometry, self.shift, x)
+        return whole_state(self.geometry, self.displacement, x)
 
     def from_state(self, state: State) -> FlyerPoint:
         panel = self.system.index("panel_7")
@@ -272,7 +276,7 @@ class Flyer(AbstractStateSpace):
             parts.append(internal_rates(system, time, kin))
         return jnp.concatenate(parts)
 
-    def settled(self, x: FlyerPoint, t: Time = 0.0) -> FlyerPoint:
+    def with_closed_loops(self, x: FlyerPoint, t: Time = 0.0) -> FlyerPoint:
         del t
         return x
 
@@ -321,15 +325,17 @@ class Flyer(AbstractStateSpace):
         return FlyerAccelerations(found.v[:, 0], found.omega[:, 0], moving.acceleration)
 
 
-def whole_state(geometry: TrackerGeometry, shift: Float[Array, "3"], at: FlyerPoint) -> State:
+def whole_state(
+    geometry: TrackerGeometry, displacement: Float[Array, "3"], at: FlyerPoint
+) -> State:
     """State of the seven bodies, base first, from independent coordinates.
 
     Args:
-        shift: displacement of the tracker in the base's frame (3,) [m].
+        displacement: displacement of the tracker in the base's frame (3,) [m].
     """
     inside = posture(geometry, at.angles, at.rates)
     R = rotation_matrix(at.p)
-    arms = inside.r + shift
+    arms = inside.r + displacement
     turning = jax.vmap(rotation_matrix)(inside.p)
     r = at.r + arms @ R.T
     v = at.v + (inside.v + jnp.cross(at.omega, arms)) @ R.T

@@ -34,7 +34,7 @@ from ..dynamics.statespace.tree import TreeSpace
 from ..mechanics.inputs import with_inputs
 from ..mechanics.system import System
 from ..parameters.table import Parameters
-from ..sensing.sensors import AbstractSensor, seen_at
+from ..sensing.sensors import AbstractSensor, sensed_motion_at
 from .multiple_shooting import fly
 
 Predict = Callable[[Float[Array, " p"]], Float[Array, "k m"]]
@@ -72,10 +72,10 @@ class Identified:
         labels: names of the p parameters.
         values: estimates (p,).
         covariance: covariance of their errors (p, p).
-        deviations: standard deviations of their errors (p,).
-        strengths: singular values of J in units of the sizes, largest first (p,): reciprocals of
+        standard_deviations: standard deviations of their errors (p,).
+        singular_values: those of J in units of the sizes, largest first (p,): reciprocals of
             the standard deviations along each direction, relative to the parameters' sizes.
-        misfit: reduced chi-square, the sum of squares over (numbers in the record less p); near
+        reduced_chi_square: the sum of squares over (numbers in the record less p); near
             one if sigma is right.
         search: the least-squares search.
     """
@@ -83,14 +83,16 @@ class Identified:
     labels: tuple[str, ...]
     values: Float[np.ndarray, " p"]
     covariance: Float[np.ndarray, "p p"]
-    deviations: Float[np.ndarray, " p"]
-    strengths: Float[np.ndarray, " p"]
-    misfit: float
+    standard_deviations: Float[np.ndarray, " p"]
+    singular_values: Float[np.ndarray, " p"]
+    reduced_chi_square: float
     search: Search
 
     def within(self, truth: Numbers, deviations: float = 3.0) -> bool:
         """Test whether every value is within so many standard deviations of a known truth (p,)."""
-        return bool(np.all(np.abs(self.values - np.asarray(truth)) <= deviations * self.deviations))
+        return bool(
+            np.all(np.abs(self.values - np.asarray(truth)) <= deviations * self.standard_deviations)
+        )
 
 
 def table_with(table: Parameters, unknowns: Sequence[Unknown], q: Float[Array, " p"]) -> Parameters:
@@ -197,7 +199,7 @@ def _read(
         raise SettingError(
             f"The readings of the sensor '{output.name}' are no vector: record the states instead."
         )
-    see = lambda t, now: jnp.atleast_1d(output.read(seen_at(space, now, t, system)))
+    see = lambda t, now: jnp.atleast_1d(output.read(sensed_motion_at(space, now, t, system)))
     return jax.vmap(see)(ts, path)
 
 
@@ -226,17 +228,17 @@ def _at(residuals: Misfit, z: Float[Array, " p"]) -> tuple[Float[Array, " n"], F
 
 
 def check_identifiable(
-    J: Float[np.ndarray, "n p"], labels: Sequence[str], weakest: float = 1.0
+    J: Float[np.ndarray, "n p"], labels: Sequence[str], min_singular_value: float = 1.0
 ) -> Float[np.ndarray, " p"]:
     """Singular values of a whitened Jacobian in units of the sizes, largest first.
 
     Raises:
-        IdentifiabilityError: one is below `weakest`: the standard deviation along its direction
-            exceeds 1 / weakest of the parameters' sizes.
+        IdentifiabilityError: one is below `min_singular_value`: the standard deviation along its direction
+            exceeds 1 / min_singular_value of the parameters' sizes.
     """
     _, values, directions = np.linalg.svd(J, full_matrices=len(J) < J.shape[1])
     values = np.pad(values, (0, J.shape[1] - len(values)))
-    weak = np.flatnonzero(values < max(weakest, 1e-12 * values[0]))
+    weak = np.flatnonzero(values < max(min_singular_value, 1e-12 * values[0]))
     if not len(weak):
         return values
     words = []
@@ -247,7 +249,7 @@ def check_identifiable(
         words.append(", ".join(parts) + f" (singular value {values[k]:.2g})")
     raise IdentifiabilityError(
         "The record does not determine these combinations of parameters, in units of their "
-        f"sizes: {'; '.join(words)}. Singular values of at least {weakest:g} are wanted: leave "
+        f"sizes: {'; '.join(words)}. Singular values of at least {min_singular_value:g} are wanted: leave "
         "one of the parameters out, or record a flight that moves them apart."
     )
 
@@ -260,7 +262,7 @@ def identify(
     sizes: Numbers,
     *,
     labels: Sequence[str] | None = None,
-    weakest: float = 1.0,
+    min_singular_value: float = 1.0,
     steps: int = 50,
     report: Callable[[Search], None] | None = None,
     resume: Search | None = None,
@@ -271,7 +273,7 @@ def identify(
         predict: parameters (p,) -> predictions (k, m), such as `motion_model`.
         record: (k, m). sigma: standard deviations of its errors (m,).
         start: where the search starts, by label or in order. sizes: typical sizes (p,).
-        weakest: see `check_identifiable`.
+        min_singular_value: see `check_identifiable`.
         report, resume: see `search`.
 
     Raises:
@@ -289,8 +291,8 @@ def identify(
     residuals = Misfit(predict, *numbers)
     r, J = (np.asarray(x) for x in _at(residuals, jnp.zeros_like(q0)))
     _check_start(r, J, q0, names)
-    check_identifiable(J, names, weakest)
-    return _fitted(residuals, names, weakest, steps, report, resume)
+    check_identifiable(J, names, min_singular_value)
+    return _fitted(residuals, names, min_singular_value, steps, report, resume)
 
 
 def identify_many(
@@ -301,7 +303,7 @@ def identify_many(
     sizes: Numbers,
     *,
     labels: Sequence[str] | None = None,
-    weakest: float = 1.0,
+    min_singular_value: float = 1.0,
     steps: int = 50,
 ) -> Iterator[Identified]:
     """Identify parameters from many records of one flight, one after another, compiled once.
@@ -321,13 +323,13 @@ def identify_many(
     for k, record in enumerate(records):
         check_finite(record, f"Record {k}", "")
         numbers = (jnp.asarray(x, dtype=float) for x in (record, sigma, starts[k], sizes))
-        yield _fitted(Misfit(predict, *numbers), names, weakest, steps, None, None)
+        yield _fitted(Misfit(predict, *numbers), names, min_singular_value, steps, None, None)
 
 
 def _fitted(
     residuals: Misfit,
     names: tuple[str, ...],
-    weakest: float,
+    min_singular_value: float,
     steps: int,
     report: Callable[[Search], None] | None,
     resume: Search | None,
@@ -336,13 +338,13 @@ def _fitted(
     method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
     found = search(residuals, zero, method, steps=steps, report=report, resume=resume)
     r, J = (np.asarray(x) for x in _at(residuals, found.values))
-    strengths = check_identifiable(J, names, weakest)
+    singular_values = check_identifiable(J, names, min_singular_value)
     scale = np.asarray(residuals.sizes)
     covariance = scale[:, None] * np.linalg.inv(J.T @ J) * scale
-    misfit = float(r @ r) / max(r.size - len(scale), 1)
+    reduced = float(r @ r) / max(r.size - len(scale), 1)
     values = np.asarray(residuals.start + scale * found.values)
     deviations = np.sqrt(np.diag(covariance))
-    return Identified(names, values, covariance, deviations, strengths, misfit, found)
+    return Identified(names, values, covariance, deviations, singular_values, reduced, found)
 
 
 def _check_start(r: np.ndarray, J: np.ndarray, q0: Array, names: Sequence[str]) -> None:

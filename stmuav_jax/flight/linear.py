@@ -32,18 +32,18 @@ class Mode:
     """Mode of the linear system; rigid-body modes have eigenvalues of zero but for round-off.
 
     Attributes:
-        s: eigenvalue of A [1/s].
+        eigenvalue: eigenvalue of A [1/s].
         frequency: undamped frequency |s| / 2 pi [Hz].
         damping: damping ratio -Re s / |s| [1].
-        doubling: time to double the amplitude [s], negative for the time to halve it, infinite
+        doubling_time: time to double the amplitude [s], negative for the time to halve it, infinite
             where the real part is zero.
         states: states of largest participation (name, share).
     """
 
-    s: complex
+    eigenvalue: complex
     frequency: float
     damping: float
-    doubling: float
+    doubling_time: float
     states: tuple[tuple[str, float], ...]
 
 

@@ -77,13 +77,13 @@ class Growth(NamedTuple):
         factor: largest singular value of the transition matrix, in m, rad, m/s and rad/s (k,).
         rate: slope of the logarithm of `factor` over the second half (finite-time Lyapunov
             exponent) [1/s].
-        useful: last time before `factor` times the relative tolerance of a step reaches 1 % [s].
+        useful_until: last time before `factor` times the relative tolerance of a step reaches 1 % [s].
     """
 
     ts: Float[np.ndarray, " k"]
     factor: Float[np.ndarray, " k"]
     rate: float
-    useful: float
+    useful_until: float
 
 
 def growth(
@@ -163,7 +163,7 @@ class Shooting(eqx.Module):
         guess: initial points at the nodes between segments (n - 1, .).
         edges: times of the start, the nodes and the end (n + 1,) [s].
         method: integration method of the segments.
-        inside: number of output times per segment.
+        outputs_per_segment: number of output times per segment.
         weight: weight of the defects at the nodes.
     """
 
@@ -174,7 +174,7 @@ class Shooting(eqx.Module):
     guess: Point
     edges: Float[Array, " e"]
     method: Method
-    inside: int = eqx.field(static=True, default=10)
+    outputs_per_segment: int = eqx.field(static=True, default=10)
     weight: float | Float[Array, ""] = 1e3
 
     def unknowns(self, values: PyTree[Any]) -> dict[str, Any]:
@@ -187,7 +187,7 @@ class Shooting(eqx.Module):
         joined = lambda a, b: jnp.concatenate([a[None], b])
         origins = jax.tree.map(joined, self.start, self.guess)
         steps = joined(jnp.zeros(self.space.size), unknowns["nodes"])
-        share = jnp.linspace(0.0, 1.0, self.inside + 1)
+        share = jnp.linspace(0.0, 1.0, self.outputs_per_segment + 1)
         first, last = self.edges[:-1, None], self.edges[1:, None]
         ts = first + share * (last - first)
 
@@ -217,7 +217,7 @@ def shooting(
     edges: Float[np.ndarray, " e"],
     method: Method | None = None,
     *,
-    inside: int = 10,
+    outputs_per_segment: int = 10,
     weight: float = 1e3,
 ) -> Shooting:
     """Set up a `Shooting` problem with the guess as a function of time [s].
@@ -228,8 +228,8 @@ def shooting(
     edges = np.asarray(edges, dtype=float)
     if len(edges) < 2 or np.any(np.diff(edges) <= 0):
         raise SettingError(f"The edges of segments must be two or more increasing times: {edges}.")
-    if inside < 1:
-        raise SettingError(f"A segment needs at least one output time, not {inside}.")
+    if outputs_per_segment < 1:
+        raise SettingError(f"A segment needs at least one output time, not {outputs_per_segment}.")
     method = Method(rtol=1e-9, atol=1e-9) if method is None else method
     method = replace(method, adjoint=diffrax.ForwardMode())
     points = [guess(float(t)) for t in edges[:-1]]
@@ -238,4 +238,6 @@ def shooting(
         nodes = jax.tree.map(lambda *x: jnp.stack(x), *points[1:])
     else:
         nodes = jax.tree.map(lambda x: jnp.zeros((0, *x.shape)), start)
-    return Shooting(space, system, cost, start, nodes, jnp.asarray(edges), method, inside, weight)
+    return Shooting(
+        space, system, cost, start, nodes, jnp.asarray(edges), method, outputs_per_segment, weight
+    )

@@ -26,7 +26,7 @@ from ..dynamics.tree.formulation import Tree
 from ..mechanics.forces.applied import Gravity
 from ..mechanics.state import State
 from ..mechanics.system import System
-from ..rotorcraft.allocation import least, wrench_map
+from ..rotorcraft.allocation import minimum_norm, wrench_map
 from ..rotorcraft.rotor import Rotors
 
 
@@ -35,11 +35,11 @@ class SensedFlight(eqx.Module):
 
     Attributes:
         t: times (T + 1,) [s].
-        squared: squared rotor speeds, held over the steps (T, k) [rad^2/s^2].
+        speed_squared: squared rotor speeds, held over the steps (T, k) [rad^2/s^2].
         p: attitude of the base, Euler parameters (T + 1, 4).
         omega: body rates of the base (T + 1, 3) [rad/s].
         force: specific force at the base's origin at the end of each step (T, 3) [m/s^2].
-        centre: centre of mass of the system in the base's frame (T + 1, 3) [m].
+        centre_of_mass: centre of mass of the system in the base's frame (T + 1, 3) [m].
         J: inertia of the system about its centre of mass, base axes (T + 1, 3, 3) [kg m^2].
         h: angular momentum of the parts relative to the base, about the centre of mass, base axes
             (T + 1, 3) [N m s].
@@ -47,11 +47,11 @@ class SensedFlight(eqx.Module):
     """
 
     t: Float[Array, " t"]
-    squared: Float[Array, "T k"]
+    speed_squared: Float[Array, "T k"]
     p: Float[Array, "t 4"]
     omega: Float[Array, "t 3"]
     force: Float[Array, "T 3"]
-    centre: Float[Array, "t 3"]
+    centre_of_mass: Float[Array, "t 3"]
     J: Float[Array, "t 3 3"]
     h: Float[Array, "t 3"]
     residual: Float[Array, ""]
@@ -146,7 +146,7 @@ def _fly(
         # sines of the rotations that bring z to the vertical, and x to the world's x
         turn = jnp.stack([up_b[1], -up_b[0], -ahead_b[1]])
         moment = J @ (-gains.tilt * turn - gains.rate * state.omega[0])
-        return least(B, jnp.concatenate([(weight / R[2, 2])[None], moment]))
+        return minimum_norm(B, jnp.concatenate([(weight / R[2, 2])[None], moment]))
 
     def step(state: State, span: tuple) -> tuple[State, tuple]:
         before, after = span

@@ -94,7 +94,7 @@ def experiment(
     held = trim_flight(make(table), hover(angles)).inputs
     fixed = np.random.default_rng(2026)
     knots = np.linspace(0.0, duration, 9)
-    speeds = np.asarray(held.squared) * (0.92 + 0.075 * fixed.normal(size=(9, 6)))
+    speeds = np.asarray(held.speed_squared) * (0.92 + 0.075 * fixed.normal(size=(9, 6)))
     forces = np.asarray(held.forces) + 2.0 * fixed.normal(size=(9, 2))
     inputs = {
         "speed_squared": Sampled(knots, speeds, 3),

@@ -214,7 +214,7 @@ def tune_inputs(
     sizes: Numbers | None = None,
     knots: int | None = None,
     segments: int = 1,
-    inside: int = 10,
+    outputs_per_segment: int = 10,
     guess: Callable[[float], Point] | None = None,
     weight: float = 1e3,
     method: Method | None = None,
@@ -232,7 +232,8 @@ def tune_inputs(
         sizes: of the inputs (k,): what counts as a change of one; default the largest of their
             values, or one where these are zero.
         knots: of the splines, evenly spaced in time; default none: the inputs are constant.
-        segments: of multiple shooting. inside: output times in each. weight: of their gaps.
+        segments: number of segments of multiple shooting. outputs_per_segment: output times in each.
+            weight: weight of the gaps between them.
         guess: time [s] -> point, where segments start in the search; default the start.
         name: of the problem, for files.
 
@@ -263,7 +264,7 @@ def tune_inputs(
     driven = _Driven(space, inputs, _Signals(sizes, times))
     problem = shooting(
         space, driven, _Cost(driven, tuple(residuals)), guess or (lambda _: start),
-        np.linspace(0.0, duration, segments + 1), method, inside=inside, weight=weight,
+        np.linspace(0.0, duration, segments + 1), method, outputs_per_segment=outputs_per_segment, weight=weight,
     )  # fmt: skip
     return InputTuning(name, problem, problem.unknowns(jnp.broadcast_to(given, shape) / sizes))
 

@@ -68,8 +68,8 @@ def hold(
     start = at_rest(angles)
     if flyer.lagging:
         own: Any = flyer.propulsion
-        start = start._replace(internal=own.speeds_of(jnp.asarray(untuned.squared)))
-    scale = jnp.full_like(untuned.squared, jnp.mean(untuned.squared))
+        start = start._replace(internal=own.speeds_of(jnp.asarray(untuned.speed_squared)))
+    scale = jnp.full_like(untuned.speed_squared, jnp.mean(untuned.speed_squared))
     return tune_inputs(
         flyer, [departures(flyer, start)], start=start, duration=horizon,
         inputs=_every(flyer), values=jnp.concatenate(untuned),
@@ -105,18 +105,18 @@ def holding_time(
     start: FlyerPoint,
     *,
     limit: float = np.radians(5.0),
-    longest: float = 5.0,
+    max_time: float = 5.0,
     method: Method | None = None,
 ) -> float:
     """Time for which base and panel stay within `limit` [rad] of their start [s].
 
-    To 5 ms; at most `longest`.
+    To 5 ms; at most `max_time`.
     """
     method = Method(rtol=1e-10, atol=1e-12) if method is None else method
-    ts = jnp.arange(0.0, longest + 2.5e-3, 5e-3)
+    ts = jnp.arange(0.0, max_time + 2.5e-3, 5e-3)
     reached, turned = map(np.asarray, _departures(flyer, inputs, start, ts, method))
     out = ~(turned < limit) | (np.diff(reached, prepend=-1.0) <= 0)
-    return float(ts[np.argmax(out)]) if np.any(out) else longest
+    return float(ts[np.argmax(out)]) if np.any(out) else max_time
 
 
 class SlewLimits(NamedTuple):
@@ -124,8 +124,8 @@ class SlewLimits(NamedTuple):
 
     Attributes:
         force: of the actuators either way [N].
-        home: strokes from which the sliders' shifts are measured (2,) [m], see `strokes`.
-        lower, upper: of the shifts (2,) [m].
+        home: strokes from which the sliders' displacements are measured (2,) [m], see `strokes`.
+        lower, upper: of the displacements (2,) [m].
         reaction: of the force in any joint [N], or None: not looked at.
     """
 
@@ -140,7 +140,7 @@ class Peaks(NamedTuple):
     """Peaks of a history of inputs and of the motion that it causes.
 
     Attributes:
-        force: largest of an actuator [N]. lower, upper: least and largest shifts (2,) [m].
+        force: largest of an actuator [N]. lower, upper: least and largest displacements (2,) [m].
         reaction: largest force in a joint [N], or None where it has no limit.
         tilt: largest [rad]. drift: largest [m]. error: of the panel at the end [rad].
     """
@@ -163,15 +163,15 @@ class _Within(eqx.Module):
     def __call__(self, motion: TunedMotion) -> Float[Array, "m n"]:
         limits = self.limits
         forces = jnp.abs(motion.inputs[:, -2:]) / jnp.asarray(limits.force) - 1
-        shift = _shifts(self.flyer, limits, motion.points)
+        displacement = _displacements(self.flyer, limits, motion.points)
         upper, lower = jnp.asarray(limits.upper), jnp.asarray(limits.lower)
-        over = [forces, (shift - upper) / 0.01, (lower - shift) / 0.01]
+        over = [forces, (displacement - upper) / 0.01, (lower - displacement) / 0.01]
         if limits.reaction is not None:
             over.append(joint_forces(motion) / jnp.asarray(limits.reaction) - 1)
         return jnp.concatenate(over, axis=1)
 
 
-def _shifts(flyer: Flyer, limits: SlewLimits, path: FlyerPoint) -> Float[Array, "m 2"]:
+def _displacements(flyer: Flyer, limits: SlewLimits, path: FlyerPoint) -> Float[Array, "m 2"]:
     """Displacements of the sliders from home along a path [m]."""
     return strokes(flyer.geometry, path.angles.T).T - jnp.asarray(limits.home)
 
@@ -185,7 +185,7 @@ def slew(
     *,
     knots: int = 8,
     segments: int = 6,
-    inside: int = 8,
+    outputs_per_segment: int = 8,
     method: Method | None = None,
 ) -> InputTuning:
     """Histories of inputs that turn the panel between angles (2,) [rad] in a duration [s].
@@ -228,8 +228,8 @@ def slew(
         ],
         start=start, duration=duration, inputs=_every(flyer),
         values=(1 - share) * straight[0] + share * straight[1],
-        sizes=jnp.append(ends[0].inputs.squared, jnp.stack([force, force])), knots=knots,
-        segments=segments, inside=inside, guess=guess, method=method,
+        sizes=jnp.append(ends[0].inputs.speed_squared, jnp.stack([force, force])), knots=knots,
+        segments=segments, outputs_per_segment=outputs_per_segment, guess=guess, method=method,
         name=f"slew {_words(before)} to {_words(after)} in {duration:g} s, {knots} knots, {segments}",
     )  # fmt: skip
 
@@ -245,13 +245,13 @@ def peaks(tuning: InputTuning, values: Any, samples: int = 200) -> Peaks:
 def _peaks(motion: TunedMotion, start: FlyerPoint, end: FlyerPoint, kept: _Within) -> Peaks:
     path, flyer = motion.points, kept.flyer
     x = jax.vmap(lambda now: flyer.difference(now, start))(path)
-    shift = _shifts(flyer, kept.limits, path)
+    displacement = _displacements(flyer, kept.limits, path)
     size = lambda v: jnp.max(jnp.sqrt(jnp.sum(v**2, axis=1)))
     limited = kept.limits.reaction is not None
     return Peaks(
         force=jnp.max(jnp.abs(motion.inputs[:, -2:])),
-        lower=jnp.min(shift, axis=0),
-        upper=jnp.max(shift, axis=0),
+        lower=jnp.min(displacement, axis=0),
+        upper=jnp.max(displacement, axis=0),
         reaction=jnp.max(joint_forces(motion)) if limited else None,
         tilt=size(x[:, 3:6]),
         drift=size(x[:, :3]),
@@ -276,6 +276,6 @@ def _check_inside(flyer: Flyer, end: FlightTrim, limits: SlewLimits, when: str) 
     for k, name in enumerate(("slider_2", "slider_3")):
         if not lower[k] <= stroke[k] <= upper[k]:
             raise ModelError(
-                f"The shift of {name} {when} the turn is {1e3 * stroke[k]:.4g} mm, outside its "
+                f"The displacement of {name} {when} the turn is {1e3 * stroke[k]:.4g} mm, outside its "
                 f"limits of {1e3 * lower[k]:.4g} to {1e3 * upper[k]:.4g} mm."
             )

@@ -44,11 +44,11 @@ from ..algebra.rotation import (
 from ..algebra.stacked import apply, dot, multiply
 
 Form = Literal["omega", "p", "world"]
-Kind = Literal["point", "n1", "n2", "p1", "p2", "distance", "angle", "shift", "screw"]
+Kind = Literal["point", "n1", "n2", "p1", "p2", "distance", "angle", "displacement", "screw"]
 
 # Number of rows of each primitive: s,3  n1,1  n2,1  p1,2  p2,2  s-s,1, two drivers, the screw.
 ROWS: dict[str, int] = {
-    "point": 3, "n1": 1, "n2": 1, "p1": 2, "p2": 2, "distance": 1, "angle": 1, "shift": 1,
+    "point": 3, "n1": 1, "n2": 1, "p1": 2, "p2": 2, "distance": 1, "angle": 1, "displacement": 1,
     "screw": 1,
 }  # fmt: skip
 
@@ -289,7 +289,7 @@ def distance(i: BodyKinematics, j: BodyKinematics, data: Data, form: Form) -> Ro
     )
 
 
-def shift(i: BodyKinematics, j: BodyKinematics, data: Data, form: Form) -> Row:
+def displacement(i: BodyKinematics, j: BodyKinematics, data: Data, form: Form) -> Row:
     """Displacement s_i . d along the axis, the row of a driver, which subtracts its motion."""
     return n2(i, j, data, form)
 
@@ -337,6 +337,6 @@ def screw(i: BodyKinematics, j: BodyKinematics, data: Data, form: Form) -> Row:
 
 PRIMITIVES: dict[str, Callable[[BodyKinematics, BodyKinematics, Data, Form], Row]] = {
     "point": point, "n1": n1, "n2": n2, "p1": p1, "p2": p2,
-    "distance": distance, "angle": angle, "shift": shift,
+    "distance": distance, "angle": angle, "displacement": displacement,
     "screw": screw,
 }  # fmt: skip

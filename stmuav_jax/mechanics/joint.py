@@ -111,16 +111,16 @@ CATALOGUE: dict[str, JointKind] = {
     "distance": JointKind((Term("distance"),)),
     "revolute_spherical": JointKind((Term("n2", Z), Term("distance"))),
     "drive_angle": JointKind((Term("angle", X, X, Y),)),
-    "drive_shift": JointKind((Term("shift", Z),)),
+    "drive_displacement": JointKind((Term("displacement", Z),)),
 }
 
 # Name of a coordinate that a joint may leave free.
-Which = Literal["angle", "shift"]
+Which = Literal["angle", "displacement"]
 
 # Kinds of joints that leave free the angle about their z axis, or the displacement along it.
 LEAVES_FREE: dict[str, tuple[str, ...]] = {
     "angle": tuple(k for k, entry in CATALOGUE.items() if any(c.angular for c in entry.columns)),
-    "shift": tuple(
+    "displacement": tuple(
         k for k, entry in CATALOGUE.items() if any(c.linear != 0 for c in entry.columns)
     ),
 }
@@ -385,7 +385,7 @@ def revolute_spherical(
 
 
 def drive(
-    name: str, joint: Joint, motion: Motion, *, coordinate: Literal["angle", "shift"]
+    name: str, joint: Joint, motion: Motion, *, coordinate: Literal["angle", "displacement"]
 ) -> Joint:
     """Prescribe a relative coordinate of a joint as a function of time; 1 row, rheonomic.
 

@@ -17,7 +17,7 @@ class JointCoordinate(eqx.Module):
     """Angle or displacement of a joint at one state.
 
     Attributes:
-        which: "angle" or "shift". body_i, body_j: the joint's bodies.
+        which: "angle" or "displacement". body_i, body_j: the joint's bodies.
         value: angle about z from body i to body j [rad], in (-pi, pi] except that of a screw, whose
             displacement determines the whole turns; or displacement of j's point along z from i's
             [m]. rate: its time derivative [rad/s] or [m/s].
@@ -66,8 +66,8 @@ def coordinate(kin: Kinematics, joint: Joint, which: Which) -> JointCoordinate:
 
 
 def free_coordinates(joint: Joint) -> list[Which]:
-    """Coordinates that a joint leaves free: "angle" about its z axis, "shift" along it."""
-    return [which for which in ("angle", "shift") if joint.kind in LEAVES_FREE[which]]
+    """Coordinates that a joint leaves free: "angle" about its z axis, "displacement" along it."""
+    return [which for which in ("angle", "displacement") if joint.kind in LEAVES_FREE[which]]
 
 
 def choose(joint: Joint, which: Which | None, what: str) -> Which:
@@ -86,12 +86,12 @@ def choose(joint: Joint, which: Which | None, what: str) -> Which:
         return free[0]
     if which is None and free:
         raise ModelError(
-            f"{what}: a {joint.kind} joint leaves both an angle and a shift free; say which by "
-            "coordinate='angle' or coordinate='shift'."
+            f"{what}: a {joint.kind} joint leaves both an angle and a displacement free; say which by "
+            "coordinate='angle' or coordinate='displacement'."
         )
     names = LEAVES_FREE if which is None else (which,)
     needed = "; ".join(f"{name} needs one of: {', '.join(LEAVES_FREE[name])}" for name in names)
-    wanted = "an angle or a shift" if which is None else f"the {which}"
+    wanted = "an angle or a displacement" if which is None else f"the {which}"
     raise ModelError(
         f"{what} acts on {wanted}, but a {joint.kind} joint does not leave that free about or "
         f"along one axis ({needed})."

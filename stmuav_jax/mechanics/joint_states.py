@@ -39,7 +39,7 @@ COORDINATES: dict[str, tuple[tuple[str, str], ...]] = {
     )
     for kind, entry in CATALOGUE.items()
     if entry.motion
-} | {"drive_angle": REVOLUTE.coordinates, "drive_shift": PRISMATIC.coordinates}
+} | {"drive_angle": REVOLUTE.coordinates, "drive_displacement": PRISMATIC.coordinates}
 
 
 class JointMotion(eqx.Module):
@@ -68,14 +68,14 @@ class JointMotion(eqx.Module):
         return self.rates[..., self._place("angle")]
 
     @property
-    def shift(self) -> Float[Array | np.ndarray, "*s"]:
+    def displacement(self) -> Float[Array | np.ndarray, "*s"]:
         """Displacement of j's point along z from i's (...,) [m]; translational and cylindrical."""
-        return self.coordinates[..., self._place("shift")]
+        return self.coordinates[..., self._place("displacement")]
 
     @property
-    def shift_rate(self) -> Float[Array | np.ndarray, "*s"]:
-        """Rate of `shift` (...,) [m/s]."""
-        return self.rates[..., self._place("shift")]
+    def displacement_rate(self) -> Float[Array | np.ndarray, "*s"]:
+        """Rate of `displacement` (...,) [m/s]."""
+        return self.rates[..., self._place("displacement")]
 
     def _place(self, name: str) -> int:
         names = [found for found, _ in COORDINATES[self.kind]]

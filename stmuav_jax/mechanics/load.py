@@ -194,7 +194,7 @@ class ActsOn(NamedTuple):
     Attributes:
         bodies: names of bodies, which may include "ground".
         joints: names of joints.
-        coordinates: joints with the coordinate that they must leave free, "angle" or "shift";
+        coordinates: joints with the coordinate that they must leave free, "angle" or "displacement";
             None for the only free one.
     """
 

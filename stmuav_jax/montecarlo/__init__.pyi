@@ -34,11 +34,11 @@ from .sensitivity import (
 from .statistics import (
     bands as bands,
     convergence as convergence,
-    deviation as deviation,
     mean as mean,
     outcomes as outcomes,
     probability as probability,
     quantiles as quantiles,
+    standard_deviation as standard_deviation,
     summarise as summarise,
 )
 from .study import (

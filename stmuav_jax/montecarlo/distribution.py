@@ -2,7 +2,7 @@
 
 A study's identity contains its distributions, so each has a plain form for TOML and JSON:
 
-    mass = {distribution = "normal", mean = 0.95, deviation = 0.02}
+    mass = {distribution = "normal", mean = 0.95, standard_deviation = 0.02}
     rate = {distribution = "scipy.gamma", a = 2.0, scale = 0.1}
 
 In Python the first is `scipy.stats.norm(0.95, 0.02)`. SciPy does the mathematics.
@@ -50,8 +50,8 @@ def _between(p: Any, **more: float) -> dict[str, float]:
 
 
 def _truncated(p: Any) -> dict[str, float]:
-    a, b = ((p[end] - p["mean"]) / p["deviation"] for end in ("low", "high"))
-    return {"a": a, "b": b, "loc": p["mean"], "scale": p["deviation"]}
+    a, b = ((p[end] - p["mean"]) / p["standard_deviation"] for end in ("low", "high"))
+    return {"a": a, "b": b, "loc": p["mean"], "scale": p["standard_deviation"]}
 
 
 def _holds_draws(p: Any) -> bool:
@@ -64,20 +64,20 @@ def _holds_draws(p: Any) -> bool:
 
 KINDS: Mapping[str, _Kind] = {
     "normal": _Kind(
-        {"mean": Finite, "deviation": Positive},
-        scipy="norm", arguments=lambda p: {"loc": p["mean"], "scale": p["deviation"]},
+        {"mean": Finite, "standard_deviation": Positive},
+        scipy="norm", arguments=lambda p: {"loc": p["mean"], "scale": p["standard_deviation"]},
     ),
     # mean and standard deviation are those before the truncation
     "truncated_normal": _Kind(
-        {"mean": Finite, "deviation": Positive, "low": (_Limit, -math.inf),
+        {"mean": Finite, "standard_deviation": Positive, "low": (_Limit, -math.inf),
          "high": (_Limit, math.inf)},
         (_ORDERED, (_holds_draws, "the limits must not be too far from the mean")),
         "truncnorm", _truncated,
     ),
     "uniform": _Kind({"low": Finite, "high": Finite}, (_ORDERED,), "uniform", _between),
     "lognormal": _Kind(
-        {"median": Positive, "log_deviation": Positive},
-        scipy="lognorm", arguments=lambda p: {"s": p["log_deviation"], "scale": p["median"]},
+        {"median": Positive, "log_standard_deviation": Positive},
+        scipy="lognorm", arguments=lambda p: {"s": p["log_standard_deviation"], "scale": p["median"]},
     ),
     "loguniform": _Kind(
         {"low": Positive, "high": Positive}, (_ORDERED,), "loguniform",

@@ -231,7 +231,7 @@ class Flights:
         held = self.held
         for k, force in enumerate(forces):
             if isinstance(force, Rotors):
-                squared: Any = force.speed_squared if held is None else held.squared
+                squared: Any = force.speed_squared if held is None else held.speed_squared
                 shares = [values.get(name) for name in _rotor_inputs(force)]
                 if held is not None or any(share is not None for share in shares):
                     ones = [jnp.asarray(1.0 if x is None else x, dtype=float) for x in shares]
@@ -290,7 +290,7 @@ def _hover_inputs(table: Parameters) -> RotorsAndForces:
             "There is no hover at the initial posture of these parameters: "
             f"{TrimReason(int(found.reason)).name.lower().replace('_', ' ')}."
         )
-    return RotorsAndForces(np.asarray(found.inputs.squared), np.asarray(found.inputs.forces))
+    return RotorsAndForces(np.asarray(found.inputs.speed_squared), np.asarray(found.inputs.forces))
 
 
 def flights(

@@ -18,12 +18,12 @@ from .work import AbstractWork
 
 
 def _normal(deviation: float, **more: Any) -> dict[str, Any]:
-    return {"distribution": "normal", "mean": 0.0, "deviation": deviation} | more
+    return {"distribution": "normal", "mean": 0.0, "standard_deviation": deviation} | more
 
 
 def _share(deviation: float) -> dict[str, Any]:
     return {
-        "distribution": "truncated_normal", "mean": 1.0, "deviation": deviation,
+        "distribution": "truncated_normal", "mean": 1.0, "standard_deviation": deviation,
         "low": 1.0 - 4 * deviation, "high": 1.0 + 4 * deviation, "relative": True,
     }  # fmt: skip
 
@@ -79,7 +79,7 @@ _TOLERANCES = {
     "geometry.arms": _share(0.001),
     "geometry.panel_com[2]": _normal(2e-4, mean=PART_II.value("geometry.panel_com")[2]),
 } | {
-    f"input.rotor_{k}": {"distribution": "normal", "mean": 1.0, "deviation": 0.005}
+    f"input.rotor_{k}": {"distribution": "normal", "mean": 1.0, "standard_deviation": 0.005}
     for k in range(1, 7)
 }  # fmt: skip
 

@@ -51,12 +51,12 @@ class Binned(NamedTuple):
 
     Attributes:
         value: first-order indices (d,).
-        chance: bound that the index of a factor without influence exceeds with small probability.
+        noise_bound: bound that the index of a factor without influence exceeds with small probability.
         bins: number of bins.
     """
 
     value: Float[np.ndarray, " d"]
-    chance: float
+    noise_bound: float
     bins: int
 
 

@@ -42,14 +42,14 @@ class Outcomes(NamedTuple):
 
     Attributes:
         missing: number of samples not computed yet.
-        fine, failed: numbers of successful and failed samples.
+        successful, failed: numbers of successful and failed samples.
         codes: number of failed samples by their code.
         failure: probability that a sample fails; None if none is computed.
         reasons: words and probability by code, for every code that has words or samples.
     """
 
     missing: int
-    fine: int
+    successful: int
     failed: int
     codes: dict[int, int]
     failure: IntervalEstimate | None
@@ -62,23 +62,23 @@ class SampleSummary(NamedTuple):
     Attributes:
         values: number of values that are not NaN, infinite ones included.
         undefined: number of NaN values, left out of all else.
-        never, below: numbers of values +infinity and -infinity.
-        infinite: probability of either; None if there are none.
-        least, most: smallest and largest value; None without values.
+        positive_infinite, negative_infinite: numbers of values +infinity and -infinity.
+        infinite_probability: probability of either; None if there are none.
+        minimum, maximum: smallest and largest value; None without values.
         mean: mean; None with infinite values or without values.
-        deviation: standard deviation; None with infinite values or fewer than two values.
+        standard_deviation: standard deviation; None with infinite values or fewer than two values.
         quantiles: quantiles by their probability.
     """
 
     values: int
     undefined: int
-    never: int
-    below: int
-    infinite: IntervalEstimate | None
-    least: float | None
-    most: float | None
+    positive_infinite: int
+    negative_infinite: int
+    infinite_probability: IntervalEstimate | None
+    minimum: float | None
+    maximum: float | None
     mean: IntervalEstimate | None
-    deviation: IntervalEstimate | None
+    standard_deviation: IntervalEstimate | None
     quantiles: dict[float, IntervalEstimate]
 
 
@@ -152,7 +152,7 @@ def mean(values: Values, level: float = LEVEL) -> IntervalEstimate:
     return IntervalEstimate(middle, middle - float(half), middle + float(half))
 
 
-def deviation(values: Values, level: float = LEVEL) -> IntervalEstimate:
+def standard_deviation(values: Values, level: float = LEVEL) -> IntervalEstimate:
     """Standard deviation (divisor n - 1) with Bonett's interval, which needs 5 values.
 
         s sqrt(c) exp(+-(z c / 2) sqrt((g - (n - 3) / n) / (n - 1))),  c = n / (n - z)
@@ -259,11 +259,11 @@ def summarise(
     finite = count > 0 and never + below == 0
     return SampleSummary(
         count, undefined, never, below,
-        infinite=probability(never + below, count, level) if never + below else None,
-        least=float(np.min(known)) if count else None,
-        most=float(np.max(known)) if count else None,
+        infinite_probability=probability(never + below, count, level) if never + below else None,
+        minimum=float(np.min(known)) if count else None,
+        maximum=float(np.max(known)) if count else None,
         mean=mean(known, level) if finite else None,
-        deviation=deviation(known, level) if finite and count > 1 else None,
+        standard_deviation=standard_deviation(known, level) if finite and count > 1 else None,
         quantiles=quantiles(known, shares, level) if count else {},
     )  # fmt: skip
 

@@ -40,8 +40,8 @@ from .model import (
     thrusts as thrusts,
 )
 from .rotorcraft import (
-    Moved as Moved,
-    moved as moved,
+    MovingPartInputs as MovingPartInputs,
+    moving_part_inputs as moving_part_inputs,
     rotorcraft_model as rotorcraft_model,
 )
 from .tuning import (

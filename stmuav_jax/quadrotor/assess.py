@@ -38,24 +38,24 @@ class Estimates(eqx.Module):
     """Estimates of (Omega, offset) by a bank of filters, at T times for s seeds.
 
     Attributes:
-        mean, deviation: means and standard deviations (T, 5, s) [rad/s, m].
+        mean, standard_deviation: means and standard deviations (T, 5, s) [rad/s, m].
         truth: true values (T, 5, s) [rad/s, m].
         nees_offset: NEES of the offset (T, s).
         nees: NEES of all five components (T, s).
         nis: NIS of the innovations (T, s), infinite from a failure on.
         ok: False from the step at which a filter failed (T, s).
-        scaled, there: scaled innovations, and True for those not missing (T, m, s).
+        normalised, measured: normalised innovations, and True for those not missing (T, m, s).
     """
 
     mean: Float[Array, "T 5 s"]
-    deviation: Float[Array, "T 5 s"]
+    standard_deviation: Float[Array, "T 5 s"]
     truth: Float[Array, "T 5 s"]
     nees_offset: Float[Array, "T s"]
     nees: Float[Array, "T s"]
     nis: Float[Array, "T s"]
     ok: Bool[Array, "T s"]
-    scaled: Float[Array, "T m s"]
-    there: Bool[Array, "T m s"]
+    normalised: Float[Array, "T m s"]
+    measured: Bool[Array, "T m s"]
 
     @property
     def error(self) -> Float[Array, "T 5 s"]:
@@ -71,13 +71,13 @@ class CaseSummary(NamedTuple):
         seeds, failed: numbers of all runs and of those that lost their covariance.
         to_2cm, to_2cm_worst: median and largest time of convergence to 2 cm over the seeds.
         to_5mm: median time of convergence to 5 mm. All three are NaN if a run does not converge.
-        rmse: root-mean-square error of the offset (x, y) after `settled`.
-        nees_offset, nees, nis: means over seeds and times after `settled`.
+        rmse: root-mean-square error of the offset (x, y) after `settling_time`.
+        nees_offset, nees, nis: means over seeds and times after `settling_time`.
         nees_offset_window, nees_window, nis_window: intervals of these means with a probability
             of 99.9 %; those of NEES are for the mean over seeds at one time.
-        outside: number of 50 times after `settled` at which the mean of `nees` is out of its
+        outside: number of 50 times after `settling_time` at which the mean of `nees` is out of its
             interval.
-        settled: time at which the settled part begins.
+        settling_time: time at which the settled part begins.
         verdict: verdict over all runs, from their innovations.
     """
 
@@ -96,7 +96,7 @@ class CaseSummary(NamedTuple):
     nees_window: tuple[float, float]
     nis_window: tuple[float, float]
     outside: int
-    settled: float
+    settling_time: float
     verdict: RunsVerdict
 
     def plain(self) -> dict[str, Any]:
@@ -123,7 +123,7 @@ def _estimated(
     path: Filtered | Smoothed = found
     if smoothed:
         path = smooth(tuning.model, found)
-    seen = jnp.asarray(tuning.seen)
+    seen = jnp.asarray(tuning.output_matrix)
 
     def each(mean: Any, factor: Array, true: Array) -> tuple[Array, Array, Array, Array]:
         x = tuning.point(mean)
@@ -136,7 +136,7 @@ def _estimated(
     mean, deviation, of_offset, of_all = jax.vmap(each)(path.mean, path.factor, truth)
     return Estimates(
         mean, deviation, truth, of_offset, of_all, found.nis, found.ok,
-        found.innovations.scaled, found.innovations.there,
+        found.innovations.normalised, found.innovations.measured,
     )  # fmt: skip
 
 
@@ -171,7 +171,7 @@ def summarise(estimates: Estimates, record: CaseRecord, tuning: str) -> CaseSumm
     settled = t[1:] > from_time
     names = tuple(f"gyroscope {axis}" for axis in "xyz")
     found = over_runs(
-        judge(estimates.scaled, estimates.there, estimates.ok, np.diff(t), names=names)
+        judge(estimates.normalised, estimates.measured, estimates.ok, np.diff(t), names=names)
     )
     judged = (from_time, found)
     if not count:

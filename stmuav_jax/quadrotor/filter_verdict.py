@@ -61,11 +61,11 @@ class Verdict(NamedTuple):
         p_value: smallest p-value of the tests, times their number.
         p_values: p-value of every test by its name.
         settled: time from which the record counts as settled [s].
-        since: end of the first window outside of its interval [s], NaN without one.
-        high, low: fractions of windows whose NIS is too large or too small.
-        start: mean NIS per measured component at the start, with an expected value of one.
-        size: mean NIS per measured component in the settled part, with the same expected value.
-        memory: mean correlation with the next innovation, with an expected value of zero.
+        inconsistent_since: end of the first window outside of its interval [s], NaN without one.
+        fraction_high, fraction_low: fractions of windows whose NIS is too large or too small.
+        initial_nis: mean NIS per measured component at the start, with an expected value of one.
+        settled_nis: mean NIS per measured component in the settled part, with the same expected value.
+        autocorrelation: mean correlation with the next innovation, with an expected value of zero.
         missing: fraction of measurements that are missing.
         words: sentences on the findings and their usual causes.
     """
@@ -74,18 +74,18 @@ class Verdict(NamedTuple):
     level: float
     p_value: float
     p_values: dict[str, float]
-    settled: float
-    since: float
-    high: float
-    low: float
-    start: float
-    size: float
-    memory: float
+    settling_time: float
+    inconsistent_since: float
+    fraction_high: float
+    fraction_low: float
+    initial_nis: float
+    settled_nis: float
+    autocorrelation: float
     missing: float
     words: str
 
     @property
-    def spoke(self) -> tuple[str, ...]:
+    def significant_tests(self) -> tuple[str, ...]:
         """Names of the tests that were significant."""
         limit = self.level / len(TESTS)
         return tuple(name for name, p in self.p_values.items() if p < limit)
@@ -98,7 +98,7 @@ class RunsVerdict(NamedTuple):
         status: "inconsistent" if more runs are so than chance allows at the level of one run,
             "failed" if a run lost its covariance, "undecided" if all runs are undecided.
         runs, flagged, failed: numbers of all runs, of inconsistent and of failed ones.
-        spoke: names of the tests that were significant in at least half of the flagged runs.
+        significant_tests: names of the tests that were significant in at least half of the flagged runs.
         words: sentences on all runs and on a typical one.
     """
 
@@ -106,7 +106,7 @@ class RunsVerdict(NamedTuple):
     runs: int
     flagged: int
     failed: int
-    spoke: tuple[str, ...]
+    significant_tests: tuple[str, ...]
     words: str
 
     @property
@@ -114,7 +114,7 @@ class RunsVerdict(NamedTuple):
         """Summary of the verdict in one line."""
         if self.failed:
             return f"{self.status}: {self.failed} of {self.runs} runs lost their covariance"
-        tests = f" ({', '.join(self.spoke)})" if self.flagged else ""
+        tests = f" ({', '.join(self.significant_tests)})" if self.flagged else ""
         return f"{self.status}: {self.flagged} of {self.runs} runs flagged{tests}"
 
 
@@ -134,7 +134,9 @@ def over_runs(found: tuple[Verdict, ...]) -> RunsVerdict:
     elif chance <= level * (1 + 1e-9):
         status = "inconsistent"
     spoke = tuple(
-        n for n in TESTS if 2 * sum(n in v.spoke for v in flagged) >= max(len(flagged), 1)
+        n
+        for n in TESTS
+        if 2 * sum(n in v.significant_tests for v in flagged) >= max(len(flagged), 1)
     )
     # the run with the median p-value is the typical one of its status
     alike = sorted((v for v in found if v.status == status), key=lambda v: v.p_value)
@@ -173,7 +175,7 @@ def verdict(
     one = jax.tree.map(lambda a: np.asarray(a)[..., None], (filtered.innovations, filtered.ok))
     innovations, ok = one
     return judge(
-        innovations.scaled, innovations.there, ok, filtered.dt,
+        innovations.normalised, innovations.measured, ok, filtered.dt,
         settle=settle, level=level, window=window, names=names,
     )[0]  # fmt: skip
 
@@ -181,7 +183,7 @@ def verdict(
 def verdicts(filtered: Filtered, **options: Any) -> tuple[Verdict, ...]:
     """Verdicts on the filters of a bank, with the options of `verdict`."""
     innovations = filtered.innovations
-    return judge(innovations.scaled, innovations.there, filtered.ok, filtered.dt, **options)
+    return judge(innovations.normalised, innovations.measured, filtered.ok, filtered.dt, **options)
 
 
 def judge(
@@ -198,7 +200,7 @@ def judge(
     """Verdicts from innovations alone.
 
     Args:
-        scaled, there: scaled innovations, and True for those not missing (T, m, s).
+        normalised, measured: normalised innovations, and True for those not missing (T, m, s).
         ok: False from the step at which a filter failed (T, s).
         dt: lengths of the steps (T,) [s].
         settle, level, window, names: as in `verdict`.
@@ -358,8 +360,10 @@ def _verdict(found: dict[str, Any], i: int, level: float, names: tuple[str, ...]
     number = lambda key: float(of[key])
     return Verdict(
         status, level, least, p_values,
-        settled=number("settled"), since=number("since"), high=number("high"), low=number("low"),
-        start=number("start"), size=number("size"), memory=number("memory"),
+        settling_time=number("settled"), inconsistent_since=number("since"),
+        fraction_high=number("high"), fraction_low=number("low"),
+        initial_nis=number("start"), settled_nis=number("size"),
+        autocorrelation=number("memory"),
         missing=number("missing"), words=" ".join(_sentences(status, of, spoke, level, names)),
     )  # fmt: skip
 

@@ -58,9 +58,9 @@ class Loop(eqx.Module):
         position, velocity: gains of the position controller [1/s^2, 1/s].
         tilt, rate: gains of the tilt controller [1/s^2, 1/s].
         thrust: largest thrust of a rotor [N].
-        capture: standard deviation of a measured position [m].
-        gust: standard deviation of the velocity's change in one step [m/s].
-        level, still: standard deviations of attitude [rad] and velocity [m/s] at the start.
+        position_noise: standard deviation of a measured position [m].
+        velocity_noise: standard deviation of the velocity's change in one step [m/s].
+        initial_tilt, initial_velocity: standard deviations of attitude [rad] and velocity [m/s] at the start.
         substeps: number of substeps of the true motion in each step.
     """
 
@@ -69,10 +69,10 @@ class Loop(eqx.Module):
     tilt: float = 100.0
     rate: float = 20.0
     thrust: float = 20.0
-    capture: float = 2e-3
-    gust: float = 1e-3
-    level: float = 0.02
-    still: float = 0.1
+    position_noise: float = 2e-3
+    velocity_noise: float = 1e-3
+    initial_tilt: float = 0.02
+    initial_velocity: float = 0.1
     substeps: int = eqx.field(static=True, default=4)
 
 
@@ -81,33 +81,33 @@ class Hover(eqx.Module):
 
     Attributes:
         t, thrust: times (T + 1,) [s] and thrusts of the rotors (T, 4, s) [N].
-        truth, mean, deviation: true values, estimates and standard deviations of (omega, offset)
+        truth, mean, standard_deviation: true values, estimates and standard deviations of (omega, offset)
             after each step (T, 5, s).
         r, tilt: true position of the epicentre (T, 3, s) [m], and angle of the rotors' axis from
             the vertical (T, s) [rad].
         nees, nees_offset: NEES of all 14 error states and of the offset (T, s).
         nis: NIS (T, s), infinite from a failure on.
         ok: False from the step at which a filter failed (T, s).
-        scaled, there: scaled innovations, and True for those not missing (T, 6, s).
+        normalised, measured: normalised innovations, and True for those not missing (T, 6, s).
     """
 
     t: Float[Array, " t"]
     thrust: Float[Array, "T 4 s"]
     truth: Float[Array, "T 5 s"]
     mean: Float[Array, "T 5 s"]
-    deviation: Float[Array, "T 5 s"]
+    standard_deviation: Float[Array, "T 5 s"]
     r: Float[Array, "T 3 s"]
     tilt: Float[Array, "T s"]
     nees: Float[Array, "T s"]
     nees_offset: Float[Array, "T s"]
     nis: Float[Array, "T s"]
     ok: Bool[Array, "T s"]
-    scaled: Float[Array, "T 6 s"]
-    there: Bool[Array, "T 6 s"]
+    normalised: Float[Array, "T 6 s"]
+    measured: Bool[Array, "T 6 s"]
 
     def verdict(self) -> RunsVerdict:
         """Verdict on the filter over all seeds, from its innovations."""
-        return over_runs(judge(self.scaled, self.there, self.ok, np.diff(self.t)))
+        return over_runs(judge(self.normalised, self.measured, self.ok, np.diff(self.t)))
 
 
 def hover_space() -> Composite:
@@ -187,7 +187,9 @@ def hover_filter(
         Q[6:] = FOLLOWING
     R = value("true.R" if own else "filter.R")
     model = hover_model(
-        [*Q, *[0.0] * 3, *[loop.gust**2] * 3], [*R, *[loop.capture**2] * 3], parameters=parameters
+        [*Q, *[0.0] * 3, *[loop.velocity_noise**2] * 3],
+        [*R, *[loop.position_noise**2] * 3],
+        parameters=parameters,
     )
     start = np.array(value("filter.start"))
     mean = {
@@ -200,8 +202,8 @@ def hover_filter(
     known = np.array(value("filter.P0"))[3:]
     if own:
         known = np.array([WIDE["rate"]] * 3 + [WIDE["offset"]] * 2) ** 2
-    rest = [loop.capture**2] * 3 + [loop.still**2] * 3
-    return model, gaussian(mean, np.diag([*[loop.level**2] * 3, *known, *rest]))
+    rest = [loop.position_noise**2] * 3 + [loop.initial_velocity**2] * 3
+    return model, gaussian(mean, np.diag([*[loop.initial_tilt**2] * 3, *known, *rest]))
 
 
 def simulate_hover(
@@ -256,18 +258,20 @@ def _flown(
         jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, salt), shape))(keys), 0, -1
     )
     value = lambda name: jnp.asarray(parameters.value(name))
-    spread = jnp.concatenate([jnp.sqrt(value("true.Q")), jnp.zeros(3), jnp.full(3, loop.gust)])
-    noise = jnp.concatenate([jnp.sqrt(value("true.R")), jnp.full(3, loop.capture)])
+    spread = jnp.concatenate(
+        [jnp.sqrt(value("true.Q")), jnp.zeros(3), jnp.full(3, loop.velocity_noise)]
+    )
+    noise = jnp.concatenate([jnp.sqrt(value("true.R")), jnp.full(3, loop.position_noise)])
     kicks, noises = draw(0, count, 14) * spread[:, None], draw(1, count, 6) * noise[:, None]
     dt, case = t[1] - t[0], 5 if moves else 1
     place = lambda now: offsets(case, now)[:, None]
     first = draw(2, 9)
     start = {
-        "p": from_rotation_vector(loop.level * first[:3]),
+        "p": from_rotation_vector(loop.initial_tilt * first[:3]),
         "omega": jnp.broadcast_to(value("true.start")[3:6, None], (3, s)),
         "offset": jnp.broadcast_to(place(t[0]), (2, s)),
-        "r": loop.capture * first[3:6],
-        "v": loop.still * first[6:],
+        "r": loop.position_noise * first[3:6],
+        "v": loop.initial_velocity * first[6:],
     }
     wide = jax.tree.map(lambda a: jnp.broadcast_to(a[..., None], (*a.shape, s)), prior)
 
@@ -307,7 +311,7 @@ def _seen(
     compare = lambda only: nees(estimate.mean, estimate.factor, truth, model.space, only=only)
     axis = rotation_matrix(truth["p"])[2, 2]
     return (
-        u, pick(truth), pick(estimate.mean), estimate.deviation[3:8], truth["r"],
+        u, pick(truth), pick(estimate.mean), estimate.standard_deviation[3:8], truth["r"],
         jnp.arccos(jnp.clip(axis, -1.0, 1.0)), compare(None), compare(slice(6, 8)),
-        jnp.where(ok, seen.nis, jnp.inf), ok, seen.scaled, seen.there,
+        jnp.where(ok, seen.nis, jnp.inf), ok, seen.normalised, seen.measured,
     )  # fmt: skip

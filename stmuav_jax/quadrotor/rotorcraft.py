@@ -7,7 +7,7 @@ accelerometer that reads
 
     k_f sum u_k e_z / m + Omega' x (-c) + Omega x (Omega x (-c)).
 
-J and c_z are those of one posture. If parts of the machine move in a known way (`Moved`), the model
+J and c_z are those of one posture. If parts of the machine move in a known way (`MovingPartInputs`), the model
 includes the terms that the report neglects, with J(t) and the parts' angular momentum h(t) relative
 to the frame:
 
@@ -33,18 +33,18 @@ from ..rotorcraft.rotor import Rotors
 from .model import NAMES, OBSERVABLE, body_rates, matrix, specific_force
 
 
-class Moved(NamedTuple):
+class MovingPartInputs(NamedTuple):
     """Inputs of a machine with moving parts, as mean values over a step, components first.
 
     Attributes:
-        squared: squared rotor speeds (k,) [rad^2/s^2].
+        speed_squared: squared rotor speeds (k,) [rad^2/s^2].
         J, J_rate: inertia about the centre of mass [kg m^2], its rate [kg m^2/s], row by row (9,).
         h, h_rate: angular momentum of the parts relative to the frame, about the centre of mass
             (3,) [N m s], and its rate [N m].
         height: z coordinate c_z of the centre of mass (1,) [m].
     """
 
-    squared: Array
+    speed_squared: Array
     J: Array
     J_rate: Array
     h: Array
@@ -52,24 +52,26 @@ class Moved(NamedTuple):
     height: Array
 
 
-def moved(squared: Array, J: Array, h: Array, height: Array, dt: Any) -> Moved:
+def moving_part_inputs(
+    speed_squared: Array, J: Array, h: Array, height: Array, dt: Any
+) -> MovingPartInputs:
     """Inputs over T steps from values at their T + 1 ends.
 
     Args:
-        squared: squared rotor speeds over the steps (T, k).
-        J, h, height: as in `Moved`, (T + 1, 3, 3), (T + 1, 3) and (T + 1,).
+        speed_squared: squared rotor speeds over the steps (T, k).
+        J, h, height: as in `MovingPartInputs`, (T + 1, 3, 3), (T + 1, 3) and (T + 1,).
         dt: length of the steps [s].
     """
     J, height = J.reshape(len(J), 9), height[:, None]
     middle = lambda a: (a[1:] + a[:-1]) / 2
     rate = lambda a: jnp.diff(a, axis=0) / dt
-    return Moved(squared, middle(J), rate(J), middle(h), rate(h), middle(height))
+    return MovingPartInputs(speed_squared, middle(J), rate(J), middle(h), rate(h), middle(height))
 
 
 def rotorcraft_model(
     rotors: Rotors, J: Any, mass: Any, *, height: Any = 0.0, Q: Any, R: Any
 ) -> StateSpaceModel:
-    """Model of body rates and centre of mass (x, y), with squared rotor speeds or `Moved` as input.
+    """Model of body rates and centre of mass (x, y), with squared rotor speeds or `MovingPartInputs` as input.
 
     Args:
         J, mass: inertia of the whole about its centre of mass (3, 3) [kg m^2], and mass [kg].
@@ -87,10 +89,10 @@ def rotorcraft_model(
         """Angular acceleration Omega' and centre of mass c (3, *s)."""
         lanes = (1,) * (x.ndim - 1)
         wide = lambda a: a.reshape(-1, *lanes)
-        is_moved = isinstance(u, Moved)
+        is_moved = isinstance(u, MovingPartInputs)
         z = u.height if is_moved else jnp.asarray(height)
         c = jnp.concatenate([x[3:5], jnp.broadcast_to(z, x[:1].shape)])
-        squared = u.squared if is_moved else u
+        squared = u.speed_squared if is_moved else u
         thrust = rotors.k_f * squared
         total = jnp.sum(thrust, axis=0)
         about_x = jnp.sum(wide(rotors.arms[:, 1]) * thrust, axis=0) - c[1] * total
@@ -112,7 +114,7 @@ def rotorcraft_model(
         if not accelerometer:
             return x[:3]
         slope, c = turning(x, u)
-        squared = u.squared if isinstance(u, Moved) else u
+        squared = u.speed_squared if isinstance(u, MovingPartInputs) else u
         lift = jnp.sum(rotors.k_f * squared, axis=0) / mass
         return jnp.concatenate([x[:3], specific_force(x[:3], slope, c, lift)])
 

@@ -57,20 +57,20 @@ class FilterTuning(eqx.Module):
     Attributes:
         name: name for tables.
         model, prior, method: arguments of `kalman_filter`.
-        seen: matrix (5, n) that maps the state's error to that of (Omega, offset).
+        output_matrix: matrix (5, n) that maps the state's error to that of (Omega, offset).
     """
 
     name: str = eqx.field(static=True)
     model: StateSpaceModel
     prior: Gaussian
     method: AbstractFilter
-    seen: Float[np.ndarray, "5 n"]
+    output_matrix: Float[np.ndarray, "5 n"]
 
     def point(self, mean: Any) -> Float[Array, "5 *s"]:
         """Values of Omega and of the offset in a state."""
         if isinstance(mean, dict):
             return jnp.concatenate([mean["omega"], mean["offset"]])
-        return jnp.tensordot(jnp.asarray(self.seen), mean, axes=1)
+        return jnp.tensordot(jnp.asarray(self.output_matrix), mean, axes=1)
 
 
 def report_tuning(

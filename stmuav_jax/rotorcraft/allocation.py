@@ -1,7 +1,7 @@
 """Control allocation: rotor speeds that give a wanted wrench.
 
 The squared speeds u = omega^2 of k rotors give thrust and moments linearly: w = B u,
-w = (f_z, tau_x, tau_y, tau_z) about a point. `least` is the minimum-norm u with B u = w, whose
+w = (f_z, tau_x, tau_y, tau_z) about a point. `minimum_norm` is the minimum-norm u with B u = w, whose
 speeds therefore differ least. `allocate` keeps to limits of the speeds:
 
     attainable      min |u - u_0|      with B u = w,  u within its limits
@@ -51,7 +51,7 @@ def wrench_map(rotors: Rotors, about: Float[Array, "3"]) -> Float[Array, "4 k"]:
     return jax.jacfwd(lambda u: rotors.wrench(u, about))(zero)[jnp.array(_ROWS)]
 
 
-def least(B: Float[Array, "4 k"], wrench: Float[Array, "4"]) -> Float[Array, " k"]:
+def minimum_norm(B: Float[Array, "4 k"], wrench: Float[Array, "4"]) -> Float[Array, " k"]:
     """Minimum-norm u with B u = wrench; NaN where the rotors cannot give every wrench."""
     gram = B @ B.T
     scale = 1 / jnp.sqrt(jnp.diagonal(gram))
@@ -106,18 +106,18 @@ class Allocation(eqx.Module):
     """Rotor speeds for a wanted wrench.
 
     Attributes:
-        squared: squared speeds u (k,) [rad^2/s^2].
+        speed_squared: squared speeds u (k,) [rad^2/s^2].
         speeds: rotor speeds (k,) [rad/s].
         wrench: wrench that they give (4,) [N], [N m].
-        missed: wanted wrench less the given one (4,) [N], [N m].
+        wrench_error: wanted wrench less the given one (4,) [N], [N m].
         at_limit: true for each rotor at one of its limits (k,).
         reason: code of `AllocationReason`.
     """
 
-    squared: Float[Array, " k"]
+    speed_squared: Float[Array, " k"]
     speeds: Float[Array, " k"]
     wrench: Float[Array, "4"]
-    missed: Float[Array, "4"]
+    wrench_error: Float[Array, "4"]
     at_limit: Bool[Array, " k"]
     reason: Int[Array, ""]
 
@@ -205,8 +205,8 @@ def _allocate(
     x = best + (x - jax.lax.stop_gradient(x))
     missed = wrench - B @ (lower + span * x)
     off = box.b - box.A @ x
-    least = _least_norm(known, jax.lax.stop_gradient(x), held, forced)
-    optimal = (_beyond(known, x) < ATTAINED) & _is_nearest(known, x) & least
+    is_least = _least_norm(known, jax.lax.stop_gradient(x), held, forced)
+    optimal = (_beyond(known, x) < ATTAINED) & _is_nearest(known, x) & is_least
     reason = first_reason(
         (~optimal, AllocationReason.NOT_CONVERGED),
         (_size(off) >= ATTAINED, AllocationReason.UNATTAINABLE),
@@ -309,8 +309,8 @@ def _inverse(box: _Box, held: Int[Array, " k"]) -> tuple[Float[Array, "k 4"], Fl
     U, values, V = jnp.linalg.svd(box.A * (held == 0), full_matrices=False)
     counts = values > _RANK * values[0]
     kept = jnp.where(counts, values, jnp.inf)
-    least = jnp.min(kept) / jnp.where(values[0] > 0, values[0], 1.0)
-    return (V.T / kept) @ U.T, _ROUND_OFF + 1e-15 / least
+    smallest = jnp.min(kept) / jnp.where(values[0] > 0, values[0], 1.0)
+    return (V.T / kept) @ U.T, _ROUND_OFF + 1e-15 / smallest
 
 
 def _walked(
@@ -382,19 +382,19 @@ def check_lift(
         ModelError: the weight lies outside; the message has the required and available thrust.
     """
     lower, upper = limits.squared(rotors.spin.shape[0])
-    least, most = rotors.k_f * jnp.sum(lower), rotors.k_f * jnp.sum(upper)
+    lowest, most = rotors.k_f * jnp.sum(lower), rotors.k_f * jnp.sum(upper)
     needed = jnp.asarray(weight, dtype=float)
-    if not concrete(least, most, needed):
-        return least, most
-    range_of = f"rotors of body '{rotors.body}' give {float(least):.4g} to {float(most):.4g} N"
+    if not concrete(lowest, most, needed):
+        return lowest, most
+    range_of = f"rotors of body '{rotors.body}' give {float(lowest):.4g} to {float(most):.4g} N"
     if float(needed) > float(most):
         raise ModelError(
             f"The rotors cannot carry the weight: {float(needed):.4g} N are required, but within "
             f"their speed limits the {range_of}."
         )
-    if float(needed) < float(least):
+    if float(needed) < float(lowest):
         raise ModelError(
             f"The rotors cannot turn slowly enough to hover: the weight is {float(needed):.4g} N, "
             f"but within their speed limits the {range_of}."
         )
-    return least, most
+    return lowest, most

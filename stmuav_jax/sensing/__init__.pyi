@@ -12,6 +12,6 @@ from .sensors import (
     PositionFix as PositionFix,
     SensedMotion as SensedMotion,
     readings as readings,
-    seen_along as seen_along,
-    seen_at as seen_at,
+    sensed_motion_along as sensed_motion_along,
+    sensed_motion_at as sensed_motion_at,
 )

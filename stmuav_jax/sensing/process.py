@@ -21,7 +21,7 @@ from ..dynamics.statespace.base import AbstractStateSpace, motion_rates
 from ..estimation.model import Sensor, StateSpaceModel
 from ..estimation.propagate import rk4_step_in_loop
 from ..mechanics.inputs import Inputs
-from .sensors import AbstractSensor, check_sensors, seen_at
+from .sensors import AbstractSensor, check_sensors, sensed_motion_at
 
 Adapt = Callable[[AbstractStateSpace, Float[Array, " p"]], AbstractStateSpace]
 
@@ -39,7 +39,7 @@ def moved_over(
     def onwards(x: Point, _: None) -> tuple[Point, None]:
         rate = lambda v, s: motion_rates(space, x, v, 0.0, system)
         v = rk4_step_in_loop(rate, space.difference(x, x), h)
-        return space.settled(space.retract(x, v)), None
+        return space.with_closed_loops(space.retract(x, v)), None
 
     # stages and substeps are loops: a mechanism's rates are compiled once, not in each of them
     return onwards(x, None)[0] if substeps == 1 else jax.lax.scan(onwards, x, length=substeps)[0]
@@ -113,7 +113,7 @@ def system_model(
 
     def read(x: Point, u: Any) -> Point:
         own, point, system = at(x, u)
-        seen = seen_at(own, point, 0.0, system, accelerations=felt)
+        seen = sensed_motion_at(own, point, 0.0, system, accelerations=felt)
         found = {sensor.name: sensor.read(seen) for sensor in sensors}
         return found if composite else jnp.concatenate(list(found.values()))
 

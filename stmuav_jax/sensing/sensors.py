@@ -150,7 +150,7 @@ class Encoder(AbstractSensor):
 
     Args:
         joint: name of the joint.
-        coordinate: "angle" or "shift" (displacement), needed if the joint leaves both free.
+        coordinate: "angle" or "displacement", needed if the joint leaves both free.
     """
 
     needs_accelerations: ClassVar[bool] = False
@@ -235,7 +235,7 @@ def gravity_of(system: System) -> Float[Array, "3"]:
     return sum(found, start=jnp.zeros(3))  # pyright: ignore[reportReturnType]
 
 
-def seen_at(
+def sensed_motion_at(
     space: AbstractStateSpace,
     x: Point,
     t: Time = 0.0,
@@ -261,7 +261,7 @@ def seen_at(
     return SensedMotion(given.kinematics(state), state.p, slope.v, slope.omega, gravity_of(given))
 
 
-def seen_along(run: Run) -> SensedMotion:
+def sensed_motion_along(run: Run) -> SensedMotion:
     """Motion of all bodies at the saved times of a run, stacked along the first axis.
 
     Raises:
@@ -281,7 +281,7 @@ def readings(sensors: tuple[AbstractSensor, ...], run: Run) -> dict[str, Array]:
         SettingError: the run was made with analysis=False; no sensors, or two of one name.
     """
     check_sensors(sensors)
-    seen = seen_along(run)
+    seen = sensed_motion_along(run)
     return {sensor.name: jax.vmap(sensor.read)(seen) for sensor in sensors}
 
 

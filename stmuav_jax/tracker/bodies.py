@@ -39,17 +39,22 @@ _AXES = ("T12", "T13", "R14", "R26", "U35.i", "U35.j", "U47.i", "U47.j")
 
 @kept_jit
 def _place_all(
-    geometry: TrackerGeometry, angles: Float[Array, "2"], shift: Float[Array, "3"]
+    geometry: TrackerGeometry, angles: Float[Array, "2"], displacement: Float[Array, "3"]
 ) -> tuple[Array, ...]:
     """Arrays of `_Placed`, compiled as one: each small operation alone would cost a compilation."""
     at = place(geometry, angles)
     points = jnp.stack([at.points[name] for name in _POINTS])
-    return at.r + shift, at.p, points + shift, jnp.stack([at.axes[name] for name in _AXES])
+    return (
+        at.r + displacement,
+        at.p,
+        points + displacement,
+        jnp.stack([at.axes[name] for name in _AXES]),
+    )
 
 
-def _placed(parameters: Parameters, shift: Numbers) -> _Placed:
+def _placed(parameters: Parameters, displacement: Numbers) -> _Placed:
     geometry, angles = tracker_geometry(parameters), initial_angles(parameters)
-    arrays = _place_all(geometry, angles, floats(shift))
+    arrays = _place_all(geometry, angles, floats(displacement))
     if concrete(arrays):
         arrays = tuple(np.asarray(array) for array in arrays)
         if not np.all(np.isfinite(arrays[0])):
@@ -62,14 +67,16 @@ def _placed(parameters: Parameters, shift: Numbers) -> _Placed:
     )
 
 
-def tracker_bodies(parameters: Parameters, shift: Numbers = (0.0, 0.0, 0.0)) -> tuple[Body, ...]:
-    """Bodies 2 to 7 of the tracker at the initial posture, displaced by `shift` (3,) [m].
+def tracker_bodies(
+    parameters: Parameters, displacement: Numbers = (0.0, 0.0, 0.0)
+) -> tuple[Body, ...]:
+    """Bodies 2 to 7 of the tracker at the initial posture, displaced by `displacement` (3,) [m].
 
     Raises:
         ModelError: numbers that no body can have, or lengths with which the tracker cannot take
             that posture; the message says which leg, or the post, does not reach.
     """
-    placed = _placed(parameters, shift)
+    placed = _placed(parameters, displacement)
     return tuple(
         Body(
             name,
@@ -84,14 +91,14 @@ def tracker_bodies(parameters: Parameters, shift: Numbers = (0.0, 0.0, 0.0)) -> 
 
 
 def tracker_joints(
-    parameters: Parameters, base: str, shift: Numbers = (0.0, 0.0, 0.0)
+    parameters: Parameters, base: str, displacement: Numbers = (0.0, 0.0, 0.0)
 ) -> tuple[Joint, ...]:
-    """Eight joints of the tracker on body `base` ("ground" if fixed), displaced by `shift` [m].
+    """Eight joints of the tracker on body `base` ("ground" if fixed), displaced by `displacement` [m].
 
     Raises:
         ModelError: lengths that cannot be assembled.
     """
-    placed = _placed(parameters, shift)
+    placed = _placed(parameters, displacement)
     points, axes = placed.points, placed.axes
 
     def slide(name: str, slider: str) -> Joint:

@@ -125,7 +125,7 @@ class Day:
         return np.asarray(self.sun.is_up)
 
     @property
-    def shifts(self) -> Float[np.ndarray, "2 n"]:
+    def displacements(self) -> Float[np.ndarray, "2 n"]:
         """Displacements of the slider joints from the initial posture (2, n) [m]."""
         return self.strokes - np.asarray(self.limits.home)[:, None]
 

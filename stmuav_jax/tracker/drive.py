@@ -76,7 +76,7 @@ def stroke_drivers(
         )
     by_name = {joint.name: joint for joint in joints}
     return tuple(
-        drive(f"drive {name}", by_name[name], motion, coordinate="shift")
+        drive(f"drive {name}", by_name[name], motion, coordinate="displacement")
         for name, motion in zip(SLIDER_JOINTS, strokes, strict=True)
     )
 
@@ -120,7 +120,7 @@ def slider_drive(
         forces += _stops(parameters)
     if friction is not None:
         numbers = {k: parameters.value(f"friction.{k}") for k in ("coulomb", "viscous", "speed")}
-        forces += [JointFriction(j, coordinate="shift", **numbers) for j in SLIDER_JOINTS]
+        forces += [JointFriction(j, coordinate="displacement", **numbers) for j in SLIDER_JOINTS]
     unused = tuple(f"{group}." for group, option in options.items() if option is None)
     return Drive(tuple(forces), parameters, unused, _note(servo, stops, friction))
 
@@ -143,7 +143,7 @@ def _servos(parameters: Parameters, servo: Servo) -> list[AbstractForce]:
         )
     numbers = {k: parameters.value(f"servo.{k}") for k in ("stiffness", "damping")}
     return [
-        JointServo(joint, target=target, coordinate="shift", **numbers)
+        JointServo(joint, target=target, coordinate="displacement", **numbers)
         for joint, target in zip(SLIDER_JOINTS, servo.targets, strict=True)
     ]
 
@@ -152,7 +152,7 @@ def _stops(parameters: Parameters) -> list[AbstractForce]:
     numbers = {k: parameters.value(f"stop.{k}") for k in ("stiffness", "damping", "width")}
     limits = zip(parameters.value("stop.lower"), parameters.value("stop.upper"), strict=True)
     return [
-        EndStop(joint, lower=lower, upper=upper, coordinate="shift", **numbers)
+        EndStop(joint, lower=lower, upper=upper, coordinate="displacement", **numbers)
         for joint, (lower, upper) in zip(SLIDER_JOINTS, limits, strict=True)
     ]
 

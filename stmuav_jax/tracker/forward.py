@@ -150,24 +150,24 @@ def follow(
     start: Float[Array | np.ndarray, "2"],
     rods: Rods = RISING,
     *,
-    longest: float = 0.2,
+    max_distance: float = 0.2,
 ) -> Found:
     """Panel angles along a path of strokes, continued from `start` on the same branch.
 
     The search at each point starts from the one before. Where it fails, or finds angles farther
-    than `longest` away, the path ends: that point and all later ones are NaN, with
+    than `max_distance` away, the path ends: that point and all later ones are NaN, with
     `Reason.NOT_CONVERGED` or `Reason.BRANCH` at the first of them and `BRANCH` after it.
 
     Args:
         q: strokes at n points of the path (2, n) [m].
         start: angles near the first point (2,) [rad].
-        longest: largest distance between neighbouring points [rad].
+        max_distance: largest distance between neighbouring points [rad].
     """
 
     def next_point(at: tuple[Array, Array], target: Array) -> tuple[tuple[Array, Array], Found]:
         angles, lost = at
         found = angles_from_strokes(geometry, target, angles, rods)
-        far = _size(found.angles - angles) > longest
+        far = _size(found.angles - angles) > max_distance
         wrong = (lost, Reason.BRANCH), (far, Reason.BRANCH)
         reason = jnp.where(found.reason == 0, first_reason(*wrong), found.reason)
         reason = jnp.where(lost, jnp.int8(Reason.BRANCH), reason)

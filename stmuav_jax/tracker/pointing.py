@@ -22,13 +22,13 @@ class Aim(NamedTuple):
     Attributes:
         angles: panel angles (phi, theta) (2, ...) [rad].
         strokes: heights of the rods' lower joints in the base's frame (2, ...) [m].
-        shifts: displacements of the slider joints from the initial posture (2, ...) [m].
+        displacements: displacements of the slider joints from the initial posture (2, ...) [m].
         reason: codes of `Reason` (...).
     """
 
     angles: Float[Array, "2 *s"]
     strokes: Float[Array, "2 *s"]
-    shifts: Float[Array, "2 *s"]
+    displacements: Float[Array, "2 *s"]
     reason: Int[Array, "*s"]
 
 
@@ -130,8 +130,8 @@ def why_outside(geometry: TrackerGeometry, limits: Limits, margins: Margins, rea
     below, above = float(np.asarray(margins.lower)[k]), float(np.asarray(margins.upper)[k])
     end, over = ("lower", below) if below < 0 else ("upper", above)
     limit = float(np.asarray(getattr(limits, end))[k])
-    shift = limit + over if end == "lower" else limit - over
+    displacement = limit + over if end == "lower" else limit - over
     return (
-        f"slider {k + 2} would have to stand at {1e3 * shift:.4g} mm from its initial place, "
+        f"slider {k + 2} would have to stand at {1e3 * displacement:.4g} mm from its initial place, "
         f"{-1e3 * over:.3g} mm beyond its {end} stop at {1e3 * limit:.4g} mm."
     )

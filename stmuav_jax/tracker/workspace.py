@@ -4,9 +4,9 @@ A posture is in the workspace if post and rods reach it (real roots), the panel 
 most a limit, the sliders hold it (`parallel_margin` above a limit), and both strokes are within
 their stops. Reason codes name the first of these that fails.
 
-Strokes are measured from two zeros. `strokes` are heights in the base's frame; `shifts` are the
+Strokes are measured from two zeros. `strokes` are heights in the base's frame; `displacements` are the
 displacements that slider joints, servos and end stops measure, zero at the table's initial
-posture: shifts = strokes - limits.home. Limits of the strokes ("stop." in a table) are
+posture: displacements = strokes - limits.home. Limits of the strokes ("stop." in a table) are
 displacements.
 
 Three margins measure the distance from singularities:
@@ -143,7 +143,7 @@ class Survey(NamedTuple):
         angles: panel angles (phi, theta) (2, ...) [rad].
         normal: normal of the panel, base axes (3, ...).
         strokes: heights of the rods' lower joints (2, ...) [m].
-        shifts: displacements of the slider joints (2, ...) [m].
+        displacements: displacements of the slider joints (2, ...) [m].
         reason: codes of `Reason` (...); 0 is in the workspace.
         margins: signed distances from each limit; NaN where roots are imaginary.
         condition: condition number of d strokes / d angles (...), infinite at a singularity.
@@ -154,7 +154,7 @@ class Survey(NamedTuple):
     angles: Float[Array, "2 *s"]
     normal: Float[Array, "3 *s"]
     strokes: Float[Array, "2 *s"]
-    shifts: Float[Array, "2 *s"]
+    displacements: Float[Array, "2 *s"]
     reason: Int[Array, "*s"]
     margins: Margins
     condition: Float[Array, "*s"]
@@ -174,7 +174,7 @@ def measure(
     rows = loop_jacobian(geometry, turn, loops, rods)
     (a, b), _ = rows
     determinant = (a[1] * b[0] - a[0] * b[1]) / (geometry.panel_arms[0] * geometry.panel_arms[1])
-    shifts = q - pairwise(limits.home, q)
+    displacements = q - pairwise(limits.home, q)
     across = jnp.sqrt(turn.sin_theta**2 + (turn.sin_phi * turn.cos_theta) ** 2)
     return (
         q,
@@ -183,8 +183,8 @@ def measure(
             loops.post_square / geometry.post**2,
             jnp.stack([loops.squares[k] / geometry.rods[k] ** 2 for k in (0, 1)]),
             determinant - limits.margin,
-            shifts - pairwise(limits.lower, q),
-            pairwise(limits.upper, q) - shifts,
+            displacements - pairwise(limits.lower, q),
+            pairwise(limits.upper, q) - displacements,
         ),
         rows,
     )

@@ -53,7 +53,11 @@ def test_the_estimate_is_within_a_factor_of_three_of_the_error(reference, tolera
     each = [within(x, y) for x, y in zip(found.errors.position[1:], position[1:], strict=True)]
     assert np.mean(each) >= 0.75
     assert found.errors.position[0] == 0.0
-    assert (found.errors.e_folding, found.errors.lost_at, found.errors.note) == (None, None, "")
+    assert (
+        found.errors.e_folding_time,
+        found.errors.predictability_horizon,
+        found.errors.note,
+    ) == (None, None, "")
     assert c.error_words == ""
 
 
@@ -87,10 +91,10 @@ def test_steps_that_nothing_steers_are_in_the_certificate(reference):
     """At rest all steps grow at their limit, up to the saved times; in motion few do."""
     at_rest = run(scene_of(SYSTEM, SYSTEM.reference, t1=4.0, save_every=0.25), error_estimate=False)
     c = at_rest.certificate
-    assert c.unsteered_steps == c.accepted_steps
+    assert c.steps_at_growth_limit == c.accepted_steps
     words = dict(certificate_rows(at_rest))["Steps that grew at their limit"]
     assert words.startswith(f"{c.accepted_steps}: ")
-    assert reference.certificate.unsteered_steps < 0.5 * reference.certificate.accepted_steps
+    assert reference.certificate.steps_at_growth_limit < 0.5 * reference.certificate.accepted_steps
     assert "Steps that grew at their limit" not in dict(certificate_rows(reference))
 
 
@@ -172,7 +176,9 @@ def test_exponential_growth_is_told_from_powers_of_time():
 def test_words_of_a_chaotic_run():
     none = np.zeros((3, 1))
     error = np.array([[0.0], [0.002], [0.013]])
-    found = ErrorEstimate(error, none, none, none, e_folding=0.0912, lost_at=1.7)
+    found = ErrorEstimate(
+        error, none, none, none, e_folding_time=0.0912, predictability_horizon=1.7
+    )
     assert found.words(np.array([0.0, 1.0, 1.7])) == (
         "Errors grow e-fold every 0.091 s. From t = 1.7 s on the positions are known to no better than "
         "0.01 m and the orientations to no better than 0 rad."
@@ -202,7 +208,7 @@ def test_the_estimate_in_the_scenes():
         if (name, case, tolerance) == ("uav_tracker", 2, 1e-6):
             # an error of a centimetre at the end, and the certificate says so
             assert 0.005 < found.certificate.position_error_end < 0.03
-            assert found.errors.e_folding == pytest.approx(0.13, rel=0.4)
-            assert found.errors.lost_at == pytest.approx(1.75, abs=0.25)
+            assert found.errors.e_folding_time == pytest.approx(0.13, rel=0.4)
+            assert found.errors.predictability_horizon == pytest.approx(1.75, abs=0.25)
             assert "Errors grow e-fold" in found.certificate.error_words
     assert np.mean(fine) >= 0.9

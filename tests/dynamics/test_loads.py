@@ -107,7 +107,7 @@ def standing():
     table = stm.PART_II
     joints = stm.tracker.tracker_joints(table, stm.GROUND)
     hold = [
-        stm.drive(f"hold {j.name}", j, lambda t: 0.0 * t, coordinate="shift")
+        stm.drive(f"hold {j.name}", j, lambda t: 0.0 * t, coordinate="displacement")
         for j in joints
         if j.name in ("T12", "T13")
     ]
@@ -149,13 +149,13 @@ def test_envelope_of_a_batch_says_where_and_when():
     assert loads.components.shape == (2, 101, 1, 8)
     found = stm.dynamics.envelope(loads)
     column = COMPONENTS.index
-    assert float(found.most[0, column("F_x")]) == pytest.approx(2.0)
-    assert float(found.t_most[0, column("F_x")]) == pytest.approx(0.5)
-    assert int(found.run_most[0, column("F_x")]) == 1
-    assert float(found.least[0, column("F_x")]) == pytest.approx(-2.0)
-    assert float(found.t_least[0, column("F_x")]) == 0.0
-    assert float(found.most[0, column("|F|")]) == pytest.approx(np.sqrt(5.0))
-    assert float(found.most[0, column("|M|")]) == 0.0
+    assert float(found.maximum[0, column("F_x")]) == pytest.approx(2.0)
+    assert float(found.t_maximum[0, column("F_x")]) == pytest.approx(0.5)
+    assert int(found.run_maximum[0, column("F_x")]) == 1
+    assert float(found.minimum[0, column("F_x")]) == pytest.approx(-2.0)
+    assert float(found.t_minimum[0, column("F_x")]) == 0.0
+    assert float(found.maximum[0, column("|F|")]) == pytest.approx(np.sqrt(5.0))
+    assert float(found.maximum[0, column("|M|")]) == 0.0
 
 
 def test_smooth_peaks_are_between_the_peak_and_its_bound():
@@ -189,7 +189,9 @@ def test_gradient_of_a_peak_and_a_batch_of_runs():
         system = pendulum(mass=mass)
         path = stm.integrate(system, swung(system, 1.2), ts, how)
         loads = stm.dynamics.joint_loads(system, path.ts, path.states)
-        return stm.dynamics.smooth_peaks(loads, 40.0)[0, 0], stm.dynamics.envelope(loads).most[0, 3]
+        return stm.dynamics.smooth_peaks(loads, 40.0)[0, 0], stm.dynamics.envelope(loads).maximum[
+            0, 3
+        ]
 
     values = jax.jit(jax.vmap(peaks))
     step = 1e-3
@@ -217,8 +219,10 @@ def test_peaks_between_saved_times_are_found():
     true = 2.0 * (GRAVITY + 0.5 * rate)
     saved, resolved = stm.dynamics.run_loads(run), stm.dynamics.resolved_loads(run, 1e-3)
     column = COMPONENTS.index("|F|")
-    assert float(stm.dynamics.envelope(saved).most[0, column]) < 0.97 * true
-    assert float(stm.dynamics.envelope(resolved).most[0, column]) == pytest.approx(true, rel=1e-3)
+    assert float(stm.dynamics.envelope(saved).maximum[0, column]) < 0.97 * true
+    assert float(stm.dynamics.envelope(resolved).maximum[0, column]) == pytest.approx(
+        true, rel=1e-3
+    )
     assert np.all(np.diff(np.asarray(resolved.ts)) > 0)
     assert set(np.asarray(run.ts)) <= set(np.asarray(resolved.ts))
     with pytest.raises(stm.SettingError, match="positive"):
@@ -239,8 +243,8 @@ def test_the_snap_through_of_case_2_is_not_missed():
         stm.dynamics.envelope(f(run)) for f in (stm.dynamics.run_loads, stm.dynamics.resolved_loads)
     )
     k, column = saved.joints.index("T13"), COMPONENTS.index("|F|")
-    assert float(saved.most[k, column]) == pytest.approx(267, abs=3)
-    assert float(resolved.most[k, column]) == pytest.approx(880, abs=10)
-    assert float(resolved.t_most[k, column]) == pytest.approx(0.86, abs=2e-3)
+    assert float(saved.maximum[k, column]) == pytest.approx(267, abs=3)
+    assert float(resolved.maximum[k, column]) == pytest.approx(880, abs=10)
+    assert float(resolved.t_maximum[k, column]) == pytest.approx(0.86, abs=2e-3)
     finer = stm.dynamics.envelope(stm.dynamics.resolved_loads(run, 1e-3))
-    np.testing.assert_allclose(finer.most[:, column], resolved.most[:, column], rtol=0.01)
+    np.testing.assert_allclose(finer.maximum[:, column], resolved.maximum[:, column], rtol=0.01)

@@ -9,7 +9,7 @@ import xarray as xr
 
 from stmuav_jax.montecarlo.sampling import Sampling
 
-FREQUENCY = {"distribution": "truncated_normal", "mean": 6.0, "deviation": 1.0, "low": 3.0}
+FREQUENCY = {"distribution": "truncated_normal", "mean": 6.0, "standard_deviation": 1.0, "low": 3.0}
 PAYLOAD = {"distribution": "choice", "values": [0.0, 0.5, 1.0]}
 FACTORS: dict[str, tuple[Any, str, str]] = {
     "angle": (st.norm(0.0, 0.4), "rad", "initial angle"),

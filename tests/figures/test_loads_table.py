@@ -29,9 +29,9 @@ def test_csv_holds_every_component_of_every_joint(short_run, loads, tmp_path):
     row = next(r for r in rows if r[0] == "R14" and r[4] == "M_y")
     assert row[1:4] == ["revolute", "hexacopter_1", "post_4"]
     assert row[5] == "N m"
-    assert float(row[6]) == pytest.approx(float(found.least[k, c]), rel=1e-5)
-    assert float(row[8]) == pytest.approx(float(found.most[k, c]), rel=1e-5)
-    assert float(row[9]) == pytest.approx(float(found.t_most[k, c]), rel=1e-5)
+    assert float(row[6]) == pytest.approx(float(found.minimum[k, c]), rel=1e-5)
+    assert float(row[8]) == pytest.approx(float(found.maximum[k, c]), rel=1e-5)
+    assert float(row[9]) == pytest.approx(float(found.t_maximum[k, c]), rel=1e-5)
 
 
 def test_terminal_table_has_a_row_for_each_joint(short_run, loads):

@@ -56,7 +56,7 @@ def test_units_of_a_trim():
 def test_estimates_fit_an_ordinary_terminal(width):
     """Every head and every number is there, with units, at 80 columns too."""
     one: Any = SimpleNamespace(
-        case=8, tuning="consistent", seeds=50, settled=1.2, to_2cm=0.366, to_5mm=float("nan"),
+        case=8, tuning="consistent", seeds=50, settling_time=1.2, to_2cm=0.366, to_5mm=float("nan"),
         rmse=(0.00226, 0.0123), nees_offset=24.9, nees_offset_window=(1.0, 3.0), nees=0.321,
         nees_window=(4.0, 6.0), nis=2.11, nis_window=(2.9, 3.1),
         verdict=SimpleNamespace(flagged=50),

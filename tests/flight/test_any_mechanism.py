@@ -18,8 +18,8 @@ def cart():
 def test_names_of_a_cart_pole(cart):
     space, x = cart
     assert space.names == (
-        ("rail.shift", "m"), ("hinge.angle", "rad"),
-        ("rail.shift_rate", "m/s"), ("hinge.angle_rate", "rad/s"),
+        ("rail.displacement", "m"), ("hinge.angle", "rad"),
+        ("rail.displacement_rate", "m/s"), ("hinge.angle_rate", "rad/s"),
     )  # fmt: skip
     assert (space.dof, space.size) == (2, 4)
     assert stm.inputs_of(space.system).names == (("effort", "N or N m"),)
@@ -67,9 +67,9 @@ def test_what_a_trim_refuses(cart):
     with pytest.raises(stm.SettingError, match=r"name 'hinge', .*Did you mean 'hinge.angle'"):
         stm.trim(space, at=x, free=["hinge"])
     with pytest.raises(stm.StateError, match=r"no such trim near the start"):
-        stm.trim(space, at=x, free=["rail.shift"], accelerations=[0.0, 1.0])
-    none = stm.trim(space, at=x, free=["rail.shift"], accelerations=[0.0, 1.0], throw=False)
-    assert not bool(none.found)
+        stm.trim(space, at=x, free=["rail.displacement"], accelerations=[0.0, 1.0])
+    none = stm.trim(space, at=x, free=["rail.displacement"], accelerations=[0.0, 1.0], throw=False)
+    assert not bool(none.converged)
     assert np.isnan(none.values).all()
     with pytest.raises(stm.ModelError, match="wanted accelerations must be numbers of shape"):
         stm.trim(space, at=x, free=["hinge.angle"], accelerations=[0.0])
@@ -207,7 +207,7 @@ def stewart():
 @pytest.fixture(scope="module")
 def platform():
     system, feet, heads = stewart()
-    space = stm.TreeSpace(system, independent=[f"T{k}.shift" for k in range(6)])
+    space = stm.TreeSpace(system, independent=[f"T{k}.displacement" for k in range(6)])
     return space, space.from_state(system.reference), feet, heads
 
 
@@ -216,7 +216,7 @@ def test_stewart_platform(platform):
     """Six degrees of freedom; its legs' forces are those of static equilibrium, to 1e-9."""
     space, x, feet, heads = platform
     assert space.dof == 6
-    assert [name for name, _ in space.names[:6]] == [f"T{k}.shift" for k in range(6)]
+    assert [name for name, _ in space.names[:6]] == [f"T{k}.displacement" for k in range(6)]
     found = stm.trim(space, at=x)
     exact = static_forces(feet, heads)
     np.testing.assert_allclose(found.values, exact, rtol=1e-9)

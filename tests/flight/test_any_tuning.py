@@ -107,7 +107,7 @@ def test_a_cart_pole_is_identified(cart):
         lambda q: cart_pole(bob=q[0], length=q[1], damping=q[2]),
         space.retract(x, jnp.array([0.0, 0.05, 0.0, 0.0])),
         np.linspace(0.0, 0.8, 33),
-        ["rail.shift", "hinge.angle", stm.sensing.Gyroscope("pole")],
+        ["rail.displacement", "hinge.angle", stm.sensing.Gyroscope("pole")],
         inputs={"effort": push},
         space=space,
     )
@@ -116,7 +116,7 @@ def test_a_cart_pole_is_identified(cart):
     exact, found = fitted(predict, truth, sizes, sigma, ["bob", "length", "damping"])
     np.testing.assert_allclose(exact.values, truth, rtol=1e-8)
     assert found.within(truth, 4.0)
-    assert 0.6 < found.misfit < 1.4
+    assert 0.6 < found.reduced_chi_square < 1.4
 
 
 @pytest.mark.slow
@@ -143,13 +143,13 @@ def test_what_a_motion_model_refuses(cart):
     )(jnp.array([0.5]))
     make = lambda q: cart_pole(bob=q[0])
     with pytest.raises(stm.SettingError, match="needs the state space that has its coordinates"):
-        model(make, ["rail.shift"])
+        model(make, ["rail.displacement"])
     with pytest.raises(stm.SettingError, match="name 'rail', which is no state"):
         model(make, ["rail"], space=space)
     with pytest.raises(stm.SettingError, match="are no vector"):
         model(make, [stm.sensing.AttitudeFix("pole")], space=space)
     with pytest.raises(stm.SettingError, match="name 'force', which is no input"):
-        model(make, ["rail.shift"], space=space, inputs={"force": 1.0})
+        model(make, ["rail.displacement"], space=space, inputs={"force": 1.0})
 
 
 # --- flight conditions
@@ -308,7 +308,7 @@ def test_the_tracker_on_ground():
     moved, lifted = jax.jit(jax.jacfwd(heights))(jnp.zeros(2))
     np.testing.assert_allclose(held.values, np.linalg.solve(moved.T, lifted), rtol=1e-8)
     linear = stm.linearize(space, x, values=held.values)
-    assert linear.modes()[0].s.real > 1.0
+    assert linear.modes()[0].eigenvalue.real > 1.0
     near = [stm.flight.departures(space, x)]
     tuning = stm.flight.tune_inputs(
         space, near, start=x, duration=0.1, sizes=[5.0, 5.0], weight=10.0

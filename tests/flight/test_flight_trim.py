@@ -25,7 +25,7 @@ from stmuav_jax.flight.flight_trim import (
 from stmuav_jax.flight.flyer import STATES, Flyer
 from stmuav_jax.flight.linear import linearize
 from stmuav_jax.mechanics.inputs import inputs_of
-from stmuav_jax.rotorcraft.allocation import RotorLimits, least, wrench_map
+from stmuav_jax.rotorcraft.allocation import RotorLimits, minimum_norm, wrench_map
 from stmuav_jax.scenes.uav_tracker import uav_flyer
 from stmuav_jax.tracker.kinematics import Reason
 
@@ -163,7 +163,7 @@ def test_refused(flyer):
         hover(sun=[0, 1.0])
     bare = eqx.tree_at(lambda s: s.forces, flyer.system, flyer.system.forces[:2])
     with pytest.raises(stm.ModelError, match="one LinearActuator for each slider"):
-        Flyer(bare, flyer.geometry, flyer.shift)
+        Flyer(bare, flyer.geometry, flyer.displacement)
 
 
 def test_outside_the_workspace(flyer, many):
@@ -216,10 +216,10 @@ def test_within_rotor_limits(flyer, start):
     found = trim_flight(flyer, hover(START), TrimLimits(RotorLimits(0.0, highest)))
     assert np.max(found.speeds) <= highest * (1 + 1e-12)
     assert float(found.residual) < 1e-10
-    assert found.choices == 2
+    assert found.null_space_dimension == 2
     B = wrench_map(flyer.system.forces[flyer.rotors], jnp.array([0.01, -0.02, 0.05]))
     np.testing.assert_allclose(
-        B @ found.inputs.squared, B @ start.inputs.squared, rtol=1e-10, atol=1e-12
+        B @ found.inputs.speed_squared, B @ start.inputs.speed_squared, rtol=1e-10, atol=1e-12
     )
 
 
@@ -227,7 +227,7 @@ def test_least_norm_allocation(flyer):
     rotors = flyer.system.forces[flyer.rotors]
     B = np.asarray(wrench_map(rotors, jnp.array([0.01, -0.02, 0.05])))
     wrench = np.array([70.0, 0.3, -0.2, 0.05])
-    u = np.asarray(least(jnp.asarray(B), jnp.asarray(wrench)))
+    u = np.asarray(minimum_norm(jnp.asarray(B), jnp.asarray(wrench)))
     np.testing.assert_allclose(u, np.linalg.pinv(B) @ wrench, rtol=1e-10)
     full = np.asarray(rotors.wrench(jnp.asarray(u), jnp.array([0.01, -0.02, 0.05])))
     np.testing.assert_allclose(full, [0, 0, *wrench], atol=1e-12)
@@ -295,13 +295,13 @@ def test_linear_against_the_simulated_flight(flyer, start, linear):
 def test_modes_and_measures(linear):
     """Two falling panel modes in pairs, twelve of a rigid body; all inputs together move them."""
     modes = linear.modes()
-    real = np.array([m.s.real for m in modes])
+    real = np.array([m.eigenvalue.real for m in modes])
     assert real[0] == pytest.approx(-real[-1], rel=1e-6)
     assert real[1] == pytest.approx(-real[-2], rel=1e-6)
     assert 5 < real[1] < real[0] < 15
     assert np.max(np.abs(real[2:-2])) < 1e-4
     assert {name for name, _ in modes[0].states[:2]} == {"theta", "theta_rate"}
-    assert modes[0].doubling == pytest.approx(np.log(2) / real[0])
+    assert modes[0].doubling_time == pytest.approx(np.log(2) / real[0])
     assert np.min(linear.controllability()) > 1e-3
     deaf = replace(linear, B=np.zeros_like(linear.B))
     assert np.max(deaf.controllability()) < 1e-6

@@ -10,7 +10,7 @@ from stmuav_jax.estimation.consistency import mean_interval
 from stmuav_jax.estimation.gaussians import gaussian
 from stmuav_jax.estimation.online import OnlineFilter
 from stmuav_jax.flight.sensed import centre_of_mass, inertia_about_centre, sensed_flight
-from stmuav_jax.quadrotor.rotorcraft import moved, rotorcraft_model
+from stmuav_jax.quadrotor.rotorcraft import moving_part_inputs, rotorcraft_model
 
 GYROSCOPE, ACCELEROMETER = 1e-3, 0.05  # standard deviations [rad/s], [m/s^2]
 
@@ -26,7 +26,7 @@ def machine(made, flight, **more):
         rotors,
         inertia_about_centre(made.system, made.state0),
         jnp.sum(made.system.bodies.mass),
-        height=flight.centre[0, 2],
+        height=flight.centre_of_mass[0, 2],
         **more,
     )
 
@@ -54,14 +54,14 @@ def test_held_tracker_is_one_rigid_body(held):
     mass and inertia."""
     made, flight = held
     model = machine(made, flight, **NOISE)
-    c = flight.centre[0, :2]
-    assert np.ptp(np.asarray(flight.centre), axis=0).max() < 1e-12
+    c = flight.centre_of_mass[0, :2]
+    assert np.ptp(np.asarray(flight.centre_of_mass), axis=0).max() < 1e-12
     before = jnp.concatenate([flight.omega[:-1].T, jnp.broadcast_to(c[:, None], (2, 40))])
-    after = jax.jit(lambda x, u: model(x, u, 5e-3))(before, flight.squared.T)
+    after = jax.jit(lambda x, u: model(x, u, 5e-3))(before, flight.speed_squared.T)
     # RK4's error of a step of 5 ms at 0.4 rad/s
     np.testing.assert_allclose(after[:3].T, flight.omega[1:], rtol=0, atol=1e-8)
     now = jnp.concatenate([flight.omega[1:].T, jnp.broadcast_to(c[:, None], (2, 40))])
-    seen = model.sensor(now, flight.squared.T)
+    seen = model.sensor(now, flight.speed_squared.T)
     np.testing.assert_allclose(seen[3:].T, flight.force, rtol=0, atol=1e-8)
     assert np.max(np.abs(flight.omega[0])) > 0.2
     assert flight.residual < 1e-12
@@ -85,16 +85,16 @@ def test_it_flies(moving):
     tilt = 2 * np.arcsin(np.linalg.norm(np.asarray(flight.p)[:, 1:3], axis=1))
     assert np.degrees(tilt.max()) < 5
     # what there is to find: the centre of mass moves by millimetres
-    assert np.ptp(np.asarray(flight.centre)[:, 1]) > 2e-3
+    assert np.ptp(np.asarray(flight.centre_of_mass)[:, 1]) > 2e-3
     np.testing.assert_allclose(
-        flight.centre[0], centre_of_mass(made.system, made.state0), rtol=0, atol=1e-15
+        flight.centre_of_mass[0], centre_of_mass(made.system, made.state0), rtol=0, atol=1e-15
     )
 
 
 def online(made, flight, inputs, sensors=6):
     """Errors of the centre of mass (T, 2) [m] and NIS, one sample at a time, from 5 cm wrong."""
     rng = np.random.default_rng(0)
-    count = len(flight.squared)
+    count = len(flight.speed_squared)
     noise = rng.normal(size=(count, 6)) * np.sqrt(NOISE["R"])
     y = np.concatenate([flight.omega[1:], flight.force], axis=1) + noise
     prior = gaussian([0.0, 0.0, 0.0, 0.05, -0.05], np.diag([0.1, 0.1, 0.1, 0.05, 0.05]) ** 2)
@@ -108,14 +108,14 @@ def online(made, flight, inputs, sensors=6):
         found.append(
             np.asarray(now.step(y[k, :sensors], float(flight.t[k + 1]), at(k)).state.mean[3:])
         )
-    return np.array(found) - np.asarray(flight.centre)[1:, :2], np.array(now.nis)
+    return np.array(found) - np.asarray(flight.centre_of_mass)[1:, :2], np.array(now.nis)
 
 
 @pytest.mark.slow
 def test_what_the_moving_parts_do_is_felt(moving):
     """One rigid body in the filter: the panel's reaction, up to 0.2 N m, passes for offset."""
     made, flight = moving
-    error, nis = online(made, flight, flight.squared)
+    error, nis = online(made, flight, flight.speed_squared)
     assert 1e-3 < np.max(np.abs(error[20:])) < 4e-3
     assert np.mean(nis[20:]) > 12  # 6 expected: the filter's own measurements show it
 
@@ -124,7 +124,9 @@ def test_what_the_moving_parts_do_is_felt(moving):
 def test_centre_of_mass_online(moving):
     """With the known motion of the parts: within 0.4 mm from 0.1 s on, and NIS as it must be."""
     made, flight = moving
-    inputs = moved(flight.squared, flight.J, flight.h, flight.centre[:, 2], 5e-3)
+    inputs = moving_part_inputs(
+        flight.speed_squared, flight.J, flight.h, flight.centre_of_mass[:, 2], 5e-3
+    )
     error, nis = online(made, flight, inputs, sensors=3)
     assert np.max(np.abs(error[20:])) < 0.4e-3
     low, high = mean_interval(3, 220)

@@ -46,7 +46,7 @@ def test_momentum_in_a_turn(flyer, both):
     h = INERTIA * float(jnp.sum(rotors.spin * with_motors.speeds))
     assert abs(h) > 1e-2
     com = jnp.zeros(3)
-    moment = lambda found: np.asarray(rotors.wrench(found.inputs.squared, com))[3:]
+    moment = lambda found: np.asarray(rotors.wrench(found.inputs.speed_squared, com))[3:]
     extra = np.cross(W, [0.0, 0.0, h])
     np.testing.assert_allclose(
         moment(with_motors) - moment(without), extra, atol=2e-2 * np.max(np.abs(extra))

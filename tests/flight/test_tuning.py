@@ -74,10 +74,10 @@ def test_growth_is_that_of_the_linear_system(flyer, held):
         exact = expm(linear.A * t)
         np.testing.assert_allclose(Phi, exact, atol=2e-5 * np.max(np.abs(exact)))
     seen = growth(flyer, system, start, ts, method)
-    assert seen.rate == pytest.approx(linear.modes()[0].s.real, rel=0.25)
-    assert seen.useful == 0.4
+    assert seen.rate == pytest.approx(linear.modes()[0].eigenvalue.real, rel=0.25)
+    assert seen.useful_until == 0.4
     loose = growth(flyer, system, start, ts, stm.Method(rtol=1e-3, atol=1e-3))
-    assert loose.useful < 0.4
+    assert loose.useful_until < 0.4
     with pytest.raises(stm.SettingError, match="three times or more"):
         growth(flyer, system, start, ts[:2])
 
@@ -90,7 +90,9 @@ def test_hold(flyer, untuned, held):
     tuning = hold(flyer, START, untuned, horizon=0.4)
     found = search(tuning.residuals, tuning.start, LM, steps=60)
     inputs = rotors_and_forces(tuning.inputs(found.values))
-    np.testing.assert_allclose(np.sqrt(inputs.squared), np.sqrt(held.squared), rtol=1e-7)
+    np.testing.assert_allclose(
+        np.sqrt(inputs.speed_squared), np.sqrt(held.speed_squared), rtol=1e-7
+    )
     np.testing.assert_allclose(inputs.forces, held.forces, rtol=1e-6)
     after = holding_time(flyer, inputs, start)
     assert before < 0.3
@@ -116,7 +118,7 @@ def test_slew(flyer):
     after = np.asarray(START) + np.array([0.4, 0.3])
     stops = tracker_limits(stm.PART_II)
     limits = SlewLimits(6.2, stops.home, stops.lower, stops.upper, 30.0)
-    tuning = slew(flyer, START, after, 1.0, limits, segments=5, inside=6)
+    tuning = slew(flyer, START, after, 1.0, limits, segments=5, outputs_per_segment=6)
     found = search(tuning.residuals, tuning.start, LM, steps=25)
     before, now = peaks(tuning, tuning.start), peaks(tuning, found.values)
     assert float(now.error) < 1e-4 < 0.1 < float(before.error)
@@ -134,7 +136,9 @@ def test_slew_refused(flyer):
         stm.ModelError, match=r"before the turn needs an actuator force of 5\.958 N"
     ):
         slew(flyer, START, after, 1.0, SlewLimits(force=5.0))
-    with pytest.raises(stm.ModelError, match=r"shift of slider_2 before the turn is 22\.06 mm"):
+    with pytest.raises(
+        stm.ModelError, match=r"displacement of slider_2 before the turn is 22\.06 mm"
+    ):
         slew(flyer, START, after, 1.0, SlewLimits(upper=(0.001, 0.1)))
     with pytest.raises(stm.StateError, match="cannot take the panel angles"):
         slew(flyer, START, [0.2, -1.5], 1.0)
@@ -156,11 +160,11 @@ def test_identification(case):
     """Ten parameters from one record, with deviations that say how far off they are."""
     found = identify(
         case.predict, case.record, case.sigma, case.start, case.sizes, labels=case.labels,
-        weakest=0.5,
+        min_singular_value=0.5,
     )  # fmt: skip
-    assert np.all(np.abs(found.values - case.truth) < 4 * found.deviations)
-    assert np.max(found.deviations / case.sizes) < 0.15
-    assert 0.8 < found.misfit < 1.2
+    assert np.all(np.abs(found.values - case.truth) < 4 * found.standard_deviations)
+    assert np.max(found.standard_deviations / case.sizes) < 0.15
+    assert 0.8 < found.reduced_chi_square < 1.2
     # what is left is the record's noise
     assert 30 * found.search.loss < found.search.history[0]
 
@@ -176,14 +180,14 @@ def test_a_hundred_records(case):
     found = list(
         stm.flight.identify_many(
             case.predict, jnp.asarray(records), case.sigma, jnp.asarray(starts), case.sizes,
-            labels=case.labels, weakest=0.5,
+            labels=case.labels, min_singular_value=0.5,
         )
     )  # fmt: skip
     assert sum(one.within(case.truth) for one in found) >= 95
     # deviations are honest both ways: normal errors are within one of them in 68 of 100
-    inside = np.mean([np.abs(one.values - case.truth) < one.deviations for one in found])
+    inside = np.mean([np.abs(one.values - case.truth) < one.standard_deviations for one in found])
     assert 0.62 < inside < 0.74
-    assert 0.97 < np.mean([one.misfit for one in found]) < 1.03
+    assert 0.97 < np.mean([one.reduced_chi_square for one in found]) < 1.03
 
 
 def test_what_cannot_be_told_is_named():
@@ -209,7 +213,7 @@ def test_a_straight_line():
     np.testing.assert_allclose(found.covariance, 0.01 * np.linalg.inv(X.T @ X), rtol=1e-8)
     assert found.labels == ("offset", "slope")
     left = record[:, 0] - X @ exact
-    assert found.misfit == pytest.approx(left @ left / 0.01 / 28)
+    assert found.reduced_chi_square == pytest.approx(left @ left / 0.01 / 28)
 
 
 def test_records_refused():

@@ -16,8 +16,8 @@ samples = 40
 seed = 2
 design = "sobol"
 [factors]
-"start.p" = {distribution = "normal", mean = 0.0, deviation = 2.0}
-"bare.mass" = {distribution = "normal", mean = 1.0, deviation = 0.1, relative = true}
+"start.p" = {distribution = "normal", mean = 0.0, standard_deviation = 2.0}
+"bare.mass" = {distribution = "normal", mean = 1.0, standard_deviation = 0.1, relative = true}
 "start.q" = {file = "rates.csv", column = "q"}
 [quantities]
 tilt = {signal = "tilt", take = "largest"}

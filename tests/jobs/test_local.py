@@ -410,7 +410,7 @@ def test_changes_of_devices_give_the_same_files(tmp_path):
     study = study_from_plain(
         {
             "scene": "hexacopter", "t1": 0.02, "seed": 4,
-            "factors": {"start.p": {"distribution": "normal", "mean": 0.0, "deviation": 3.0}},
+            "factors": {"start.p": {"distribution": "normal", "mean": 0.0, "standard_deviation": 3.0}},
             "quantities": {"tilt": {"signal": "tilt", "take": "largest"}},
         }
     )  # fmt: skip

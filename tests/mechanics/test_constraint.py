@@ -13,11 +13,11 @@ from stmuav_jax.algebra.rotation import angular_velocity, normalise
 from stmuav_jax.mechanics import constraint
 
 FORMS = ("omega", "p")
-IN_TABLES = ("point", "n1", "n2", "p1", "p2", "distance", "shift")
+IN_TABLES = ("point", "n1", "n2", "p1", "p2", "distance", "displacement")
 ALL_ROWS = {
     **{
         k: constraint.PRIMITIVES[k]
-        for k in ("point", "n1", "n2", "distance", "angle", "shift", "screw")
+        for k in ("point", "n1", "n2", "distance", "angle", "displacement", "screw")
     },
     "p1": constraint.p1_all,
     "p2": constraint.p2_all,

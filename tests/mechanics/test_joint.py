@@ -166,7 +166,7 @@ def test_driven_angle(angle):
 
 def test_driven_shift():
     joint = rail()
-    system = one_joint(joint, stm.drive("jack", joint, jnp.sin, coordinate="shift"))
+    system = one_joint(joint, stm.drive("jack", joint, jnp.sin, coordinate="displacement"))
     state = state_of([[0, 0, np.sin(0.3)]], [[1, 0, 0, 0]], [[0, 0, np.cos(0.3)]])
     eq = equations_of(system, "body", state, 0.3)
     np.testing.assert_allclose(eq.value, 0, atol=1e-15)
@@ -184,7 +184,11 @@ def test_a_driver_takes_one_degree_of_freedom():
 @pytest.mark.parametrize(
     ("joint", "coordinate", "words"),
     [
-        (hinge(), "shift", "'motor' prescribes the shift of joint 'hinge', but a revolute"),
+        (
+            hinge(),
+            "displacement",
+            "'motor' prescribes the displacement of joint 'hinge', but a revolute",
+        ),
         (rail(), "angle", "but a translational joint does not leave it free"),
         (stm.spherical("ball", "ground", "b", point=NONE), "angle", "revolute, cylindrical"),
     ],

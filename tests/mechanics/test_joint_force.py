@@ -26,18 +26,18 @@ def swing(t):
     return 0.2 * jnp.sin(3 * t)
 
 
-# on a shift; the numbers make each of them act at the states below
+# on a displacement; the numbers make each of them act at the states below
 FORCES = {
     "servo": stm.mechanics.JointServo(
-        "J", stiffness=40.0, damping=3.0, target=0.1, coordinate="shift"
+        "J", stiffness=40.0, damping=3.0, target=0.1, coordinate="displacement"
     ),
     "led servo": stm.mechanics.JointServo(
-        "J", stiffness=40.0, damping=3.0, target=swing, coordinate="shift"
+        "J", stiffness=40.0, damping=3.0, target=swing, coordinate="displacement"
     ),
-    "upper stop": stm.mechanics.EndStop("J", upper=-4.0, coordinate="shift", **STOP),
-    "lower stop": stm.mechanics.EndStop("J", lower=4.0, coordinate="shift", **STOP),
+    "upper stop": stm.mechanics.EndStop("J", upper=-4.0, coordinate="displacement", **STOP),
+    "lower stop": stm.mechanics.EndStop("J", lower=4.0, coordinate="displacement", **STOP),
     "friction": stm.mechanics.JointFriction(
-        "J", coulomb=2.0, viscous=0.5, speed=0.7, coordinate="shift"
+        "J", coulomb=2.0, viscous=0.5, speed=0.7, coordinate="displacement"
     ),
 }
 ANGULAR = {
@@ -69,7 +69,7 @@ def load_of(force, state, t=T):
 
 @pytest.fixture(scope="module")
 def state():
-    """Random places and velocities; the joint is not closed, which a shift must not mind."""
+    """Random places and velocities; the joint is not closed, which a displacement must not mind."""
     rng = np.random.default_rng(5)
     p = [random_quaternion(rng) for _ in range(2)]
     return state_of(rng.normal(size=(2, 3)), p, rng.normal(size=(2, 3)), rng.normal(size=(2, 3)))
@@ -209,7 +209,7 @@ def test_the_ramp_is_a_line_that_starts_smoothly():
 
 
 STIFF = stm.mechanics.EndStop(
-    "J", upper=0.0, stiffness=1e5, damping=100.0, width=2e-4, coordinate="shift"
+    "J", upper=0.0, stiffness=1e5, damping=100.0, width=2e-4, coordinate="displacement"
 )
 _hessians = jax.jit(jax.vmap(jax.hessian(lambda y: STIFF.law(y[0], y[1], jnp.zeros(())))))
 
@@ -273,7 +273,7 @@ def test_gradients_are_finite_everywhere():
     """At rest, at the limit, at depths whose powers underflow: all of them, up to the second."""
     x = [0.0, 5e-324, 1e-200, 1e-60, 1e-20, -1.0, 2e-4, 1.0]
     y = jnp.asarray([[d, v, 0.3] for d in x for v in (0.0, 1.0, -1.0)])
-    friction = stm.mechanics.JointFriction("J", coulomb=2.0, speed=1e-3, coordinate="shift")
+    friction = stm.mechanics.JointFriction("J", coulomb=2.0, speed=1e-3, coordinate="displacement")
     for force in (STIFF, friction, FORCES["led servo"]):
         for leaf in jax.tree.leaves(_derivatives(y, force)):
             assert np.all(np.isfinite(leaf))
@@ -396,7 +396,7 @@ RUB: dict[str, Any] = {"coulomb": 1.0, "speed": 0.1}
     ("make", "words"),
     [
         (lambda: build(UNIVERSAL, stm.mechanics.JointFriction("U", **RUB)),
-         r"JointFriction in joint 'U' acts on an angle or a shift, but a universal joint"),
+         r"JointFriction in joint 'U' acts on an angle or a displacement, but a universal joint"),
         (lambda: build(SLIDE, stm.mechanics.JointFriction("S", coordinate="angle", **RUB)),
          r"in joint 'S' acts on the angle, but a translational joint.*angle needs one of: revol"),
         (lambda: build(SCREW, stm.mechanics.EndStop("C", lower=0.0, **STOP)),

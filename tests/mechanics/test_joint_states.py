@@ -139,8 +139,10 @@ def test_words_of_refusals():
     system, ts, states = wheel(1.0, 1.0, 5)
     with pytest.raises(stm.ModelError, match=r"no joint 'axel'\. Did you mean 'axle'"):
         stm.mechanics.joint_motion(system, states, "axel")
-    with pytest.raises(stm.ModelError, match=r"is revolute and has no shift of its own; .*: angle"):
-        _ = stm.mechanics.joint_motion(system, states, "axle").shift
+    with pytest.raises(
+        stm.ModelError, match=r"is revolute and has no displacement of its own; .*: angle"
+    ):
+        _ = stm.mechanics.joint_motion(system, states, "axle").displacement
     with pytest.raises(stm.SettingError, match="5 states, but the times have shape"):
         stm.mechanics.joint_motion(system, states, "axle", ts[1:])
     with pytest.raises(stm.SettingError, match=r"use jax\.vmap"):

@@ -15,7 +15,7 @@ from stmuav_jax.montecarlo.disturbed_flights import Drawn
 from stmuav_jax.montecarlo.study import study_from_plain
 from stmuav_jax.montecarlo.work import FINE
 
-NORMAL = {"distribution": "normal", "mean": 0.0, "deviation": 0.3}
+NORMAL = {"distribution": "normal", "mean": 0.0, "standard_deviation": 0.3}
 TURNING = {
     "name": "turning",
     "scene": "hexacopter",
@@ -26,8 +26,13 @@ TURNING = {
     "seed": 4,
     "factors": {
         "start.p": NORMAL,
-        "start.q": NORMAL | {"deviation": 3.0},
-        "bare.mass": {"distribution": "normal", "mean": 1.0, "deviation": 0.1, "relative": True},
+        "start.q": NORMAL | {"standard_deviation": 3.0},
+        "bare.mass": {
+            "distribution": "normal",
+            "mean": 1.0,
+            "standard_deviation": 0.1,
+            "relative": True,
+        },
     },
     "quantities": {
         "tilt": {"signal": "tilt", "take": "largest"},

@@ -17,16 +17,16 @@ def make(name, **parameters):
 
 # Each with SciPy's distribution by another parametrisation or by its definition.
 CASES = {
-    "normal": (make("normal", mean=1.0, deviation=0.2), st.norm(1.0, 0.2)),
+    "normal": (make("normal", mean=1.0, standard_deviation=0.2), st.norm(1.0, 0.2)),
     "truncated_normal": (
-        make("truncated_normal", mean=1.0, deviation=0.2, low=0.9, high=1.5),
+        make("truncated_normal", mean=1.0, standard_deviation=0.2, low=0.9, high=1.5),
         st.truncnorm(-0.5, 2.5, 1.0, 0.2),
     ),
     "one_sided": (
-        make("truncated_normal", mean=0.0, deviation=2.0, low=0.0), st.halfnorm(scale=2.0)
+        make("truncated_normal", mean=0.0, standard_deviation=2.0, low=0.0), st.halfnorm(scale=2.0)
     ),
     "uniform": (make("uniform", low=-2.0, high=3.0), st.beta(1, 1, -2.0, 5.0)),
-    "lognormal": (make("lognormal", median=2.0, log_deviation=0.3), st.lognorm(0.3, scale=2.0)),
+    "lognormal": (make("lognormal", median=2.0, log_standard_deviation=0.3), st.lognorm(0.3, scale=2.0)),
     "loguniform": (make("loguniform", low=0.1, high=10.0), st.reciprocal(0.1, 10.0)),
     "triangular": (make("triangular", low=0.0, mode=1.0, high=4.0), st.triang(0.25, 0.0, 4.0)),
     "beta": (make("beta", a=2.0, b=3.0, low=-1.0, high=1.0), st.beta(2.0, 3.0, -1.0, 2.0)),
@@ -87,11 +87,13 @@ def test_plain_form_goes_through_json(one):
 
 def test_plain_form_from_toml():
     text = """
-    mass = {distribution = "normal", mean = 1, deviation = 0.02}
+    mass = {distribution = "normal", mean = 1, standard_deviation = 0.02}
     gain = 3
     """
     table = tomllib.loads(text)
-    assert as_distribution(table["mass"], "mass") == make("normal", mean=1.0, deviation=0.02)
+    assert as_distribution(table["mass"], "mass") == make(
+        "normal", mean=1.0, standard_deviation=0.02
+    )
     assert as_distribution(table["gain"], "gain") == make("constant", value=3.0)
 
 
@@ -99,16 +101,16 @@ REFUSED = {
     "unknown": ({"distribution": "norml"}, "no distribution 'norml'. Did you mean 'normal'"),
     "no name": ({"mean": 0.0}, "'distribution' with its name is missing"),
     "parameter": (
-        {"distribution": "normal", "mean": 0.0, "deviatoin": 1.0},
-        "no entry 'deviatoin'. Did you mean 'deviation'",
+        {"distribution": "normal", "mean": 0.0, "standard_deviatoin": 1.0},
+        "no entry 'standard_deviatoin'. Did you mean 'standard_deviation'",
     ),
-    "missing": ({"distribution": "normal", "mean": 0.0}, "needs 'deviation'"),
+    "missing": ({"distribution": "normal", "mean": 0.0}, "needs 'standard_deviation'"),
     "negative": (
-        {"distribution": "normal", "mean": 0.0, "deviation": -0.1},
-        "'deviation' must be finite and positive, but it is -0.1",
+        {"distribution": "normal", "mean": 0.0, "standard_deviation": -0.1},
+        "'standard_deviation' must be finite and positive, but it is -0.1",
     ),
     "zero": ({"distribution": "weibull", "scale": 0.0, "shape": 1.0}, "finite and positive"),
-    "not a number": ({"distribution": "normal", "mean": "0", "deviation": 1.0}, "must be a number"),
+    "not a number": ({"distribution": "normal", "mean": "0", "standard_deviation": 1.0}, "must be a number"),
     "true": ({"distribution": "constant", "value": True}, "must be a number"),
     "nan": ({"distribution": "constant", "value": float("nan")}, "must be finite"),
     "infinite": ({"distribution": "uniform", "low": 0.0, "high": float("inf")}, "must be finite"),
@@ -121,7 +123,7 @@ REFUSED = {
         "mode must lie between low and high",
     ),
     "far limits": (
-        {"distribution": "truncated_normal", "mean": 0.0, "deviation": 1.0, "low": 1e200},
+        {"distribution": "truncated_normal", "mean": 0.0, "standard_deviation": 1.0, "low": 1e200},
         "too far from the mean",
     ),
     "weights": ({"distribution": "choice", "values": [1, 2], "weights": [1]}, "one weight"),
@@ -142,7 +144,7 @@ def test_what_is_refused_and_whose_it_is(case):
 
 def test_a_distribution_checks_itself():
     with pytest.raises(SettingError, match="finite and positive"):
-        Distribution("normal", {"mean": 0.0, "deviation": 0.0})
+        Distribution("normal", {"mean": 0.0, "standard_deviation": 0.0})
 
 
 def test_scipys_frozen_distributions():

@@ -17,11 +17,11 @@ FACTORS = {
     "b": {
         "distribution": "truncated_normal",
         "mean": 0.0,
-        "deviation": 1.0,
+        "standard_deviation": 1.0,
         "low": -0.5,
         "high": 2.0,
     },
-    "c": {"distribution": "lognormal", "median": 2.0, "log_deviation": 0.3},
+    "c": {"distribution": "lognormal", "median": 2.0, "log_standard_deviation": 0.3},
     "d": st.loguniform(0.1, 1.0),
     "e": {"distribution": "triangular", "low": 0.0, "mode": 1.0, "high": 2.0},
     "f": st.beta(2.0, 3.0),
@@ -208,7 +208,7 @@ def test_sobol_ends():
 
 PLAIN = {
     "factors": {
-        "x": {"distribution": "normal", "mean": 0.0, "deviation": 1.0},
+        "x": {"distribution": "normal", "mean": 0.0, "standard_deviation": 1.0},
         "y": {"distribution": "uniform", "low": 0.0, "high": 1.0},
         "z": {"distribution": "uniform", "low": 0.0, "high": 1.0},
         "k": 3.0,
@@ -220,8 +220,8 @@ REFUSED = {
     "entry": ({"sed": 1}, "no entry 'sed'. Did you mean 'seed'"),
     "no factors": ({"factors": {}}, "at least one factor"),
     "factor": (
-        {"factors": {"mass": {"distribution": "normal", "mean": 0.0, "deviation": -1}}},
-        "Factor 'mass': 'deviation' must be finite and positive, but it is -1",
+        {"factors": {"mass": {"distribution": "normal", "mean": 0.0, "standard_deviation": -1}}},
+        "Factor 'mass': 'standard_deviation' must be finite and positive, but it is -1",
     ),
     "design": ({"design": "sobel"}, "not 'sobel'. Did you mean 'sobol'"),
     "seed": ({"seed": -1}, "'seed' must be at least 0, but it is -1"),

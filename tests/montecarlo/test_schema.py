@@ -15,7 +15,7 @@ from stmuav_jax.montecarlo.examples import READY, make_work, ready
 from stmuav_jax.montecarlo.schema import estimation_file, flights_file, name_fault
 from stmuav_jax.montecarlo.study import study_from_plain
 
-NORMAL = {"distribution": "normal", "mean": 0.0, "deviation": 0.3}
+NORMAL = {"distribution": "normal", "mean": 0.0, "standard_deviation": 0.3}
 BASE = {
     "name": "odd", "scene": "hexacopter", "t1": 0.1, "every": 0.05, "rtol": 1e-8, "atol": 1e-8,
     "samples": 8, "chunk": 4, "lanes": 8, "seed": 4, "design": "random", "solver": "dopri8",
@@ -152,7 +152,7 @@ def test_many_changes_at_once():
         ({"quantities": {"a": {"signal": "tilt", "take": "final", "levl": 1}}},
          "'quantities.a' has no entry 'levl'. Did you mean 'level'"),
         ({"factors": {"start.p": NORMAL | {"relative": "yes"}}}, "'relative', which must be true"),
-        ({"factors": {"start.p": NORMAL | {"deviation": 10**400}}}, "of about 401 digits"),
+        ({"factors": {"start.p": NORMAL | {"standard_deviation": 10**400}}}, "of about 401 digits"),
         ({"factors": {"start.p": {"distribution": "uniform", "low": -1e308, "high": 1e308}}},
          "draws that are not finite"),
         ({"factors": {"bare.inertia[0,]": 1.0}, "correlation": []}, "names no entry"),

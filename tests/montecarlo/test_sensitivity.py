@@ -95,7 +95,7 @@ def test_chance_of_factors_without_influence():
     """Five per cent lie above it, to 4 deviations; on average the index is 0."""
     rng = np.random.default_rng(4)
     found = binned(rng.uniform(size=(400, 1500)), rng.normal(size=400))
-    share = np.mean(found.value > found.chance)
+    share = np.mean(found.value > found.noise_bound)
     assert share == pytest.approx(0.05, abs=4 * np.sqrt(0.05 * 0.95 / 1500))
     assert abs(np.mean(found.value)) < 4 * np.std(found.value) / np.sqrt(1500)
 

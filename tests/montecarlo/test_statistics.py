@@ -10,12 +10,12 @@ from stmuav_jax.checks.errors import SettingError
 from stmuav_jax.montecarlo.statistics import (
     bands,
     convergence,
-    deviation,
     independent,
     mean,
     outcomes,
     probability,
     quantiles,
+    standard_deviation,
     summarise,
 )
 
@@ -47,13 +47,13 @@ def test_intervals_of_mean_and_deviation_cover_the_truth(name):
     tries = [draw(rng, 300) for _ in range(800)]
     covered(np.array([inside(mean(y), middle) for y in tries]), 0.94, 0.96)
     least = 0.93 if name == "exponential" else 0.94
-    covered(np.array([inside(deviation(y), spread) for y in tries]), least, 0.965)
+    covered(np.array([inside(standard_deviation(y), spread) for y in tries]), least, 0.965)
 
 
 def test_deviation_of_normal_numbers_is_as_by_chi_square():
     """Bonett's interval comes close to the exact one, which holds for normal numbers only."""
     y = np.random.default_rng(4).normal(0.0, 1.0, 2000)
-    found = deviation(y, 0.9)
+    found = standard_deviation(y, 0.9)
     ends = np.sqrt(1999 * np.var(y, ddof=1) / st.chi2.ppf([0.95, 0.05], 1999))
     assert found.value == pytest.approx(np.std(y, ddof=1), rel=1e-12)
     assert [found.low, found.high] == pytest.approx(ends, rel=2e-3)
@@ -109,8 +109,8 @@ def test_too_few_samples_for_an_end():
     assert found[0.95].high is None
     assert found[0.95].low is not None
     assert mean(np.array([2.0])) == (2.0, None, None)
-    assert deviation(np.array([1.0, 2.0]))[1:] == (None, None)
-    assert deviation(np.full(50, 0.1)) == (0.0, None, None)
+    assert standard_deviation(np.array([1.0, 2.0]))[1:] == (None, None)
+    assert standard_deviation(np.full(50, 0.1)) == (0.0, None, None)
 
 
 def test_wilson_interval():
@@ -131,16 +131,21 @@ def test_wilson_interval():
 def test_never_is_a_value_for_quantiles_and_not_for_means():
     y = np.concatenate([np.arange(60.0), np.full(40, INF), [np.nan]])
     found = summarise(y, (0.5, 0.9))
-    assert (found.values, found.undefined, found.never, found.below) == (100, 1, 40, 0)
+    assert (found.values, found.undefined, found.positive_infinite, found.negative_infinite) == (
+        100,
+        1,
+        40,
+        0,
+    )
     assert found.mean is None
-    assert found.deviation is None
-    assert found.infinite == probability(40, 100)
+    assert found.standard_deviation is None
+    assert found.infinite_probability == probability(40, 100)
     assert found.quantiles[0.5].value == 49.0
     assert found.quantiles[0.9].value == INF
     # ranks of the 95 % intervals: 40 to 61 and 31 to 51; from 61 on it is never
     assert found.quantiles[0.5][1:] == (39.0, INF)
     assert quantiles(y[:-1], (0.4,))[0.4][1:] == (30.0, 50.0)
-    assert (found.least, found.most) == (0.0, INF)
+    assert (found.minimum, found.maximum) == (0.0, INF)
     with pytest.raises(SettingError, match="finite values, but 40 of 100"):
         mean(y[:-1])
 
@@ -152,15 +157,17 @@ def test_summary_of_nothing_and_of_one():
     assert nothing.quantiles == {}
     one = summarise(np.array([3]))
     assert one.mean == (3.0, None, None)
-    assert one.deviation is None
+    assert one.standard_deviation is None
     assert one.quantiles[0.5] == (3.0, None, None)
     assert summarise(np.array([np.nan])).undefined == 1
 
 
 def test_huge_values_do_not_overflow():
     y = np.array([1e200, -1e200, 3e200, 0.0, 1e200, 2e200])
-    expected = np.array(deviation(y / 1e200), dtype=float)
-    np.testing.assert_allclose(np.array(deviation(y), dtype=float), 1e200 * expected, rtol=1e-12)
+    expected = np.array(standard_deviation(y / 1e200), dtype=float)
+    np.testing.assert_allclose(
+        np.array(standard_deviation(y), dtype=float), 1e200 * expected, rtol=1e-12
+    )
 
 
 def test_bands_are_quantiles_at_every_place():
@@ -189,7 +196,7 @@ def test_convergence_takes_the_first_samples():
 def test_outcomes():
     status = np.array([0, 0, 1, 1, 1, 2, 3, 3, 9], dtype=np.int8)
     found = outcomes(status, {2: "too stiff", 3: "left the ground", 4: "never seen"})
-    assert (found.missing, found.fine, found.failed) == (2, 3, 4)
+    assert (found.missing, found.successful, found.failed) == (2, 3, 4)
     assert found.codes == {2: 1, 3: 2, 9: 1}
     assert found.failure == probability(4, 7)
     assert found.reasons[3] == ("left the ground", probability(2, 7))
@@ -209,7 +216,7 @@ def test_independent_samples_of_designs():
     ("call", "words"),
     [
         (lambda: mean(np.array([])), "at least 1 values, but there are 0"),
-        (lambda: deviation(np.array([1.0])), "at least 2 values, but there are 1"),
+        (lambda: standard_deviation(np.array([1.0])), "at least 2 values, but there are 1"),
         (lambda: probability(0, 0), "at least one sample"),
         (lambda: mean(np.array([1.0]), 1.0), "must lie in (0, 1), but it is 1"),
         (lambda: quantiles(np.array([1.0]), (1.5,)), "share of a quantile"),

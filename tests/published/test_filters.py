@@ -150,7 +150,7 @@ def attitude():
         wrong = attitude_model(scale_q * Q, scale_r * R, mass=4.08)
         out = filter_bank(wrong, prior, y, u=jnp.asarray(u), dt=DT)
         each = jax.vmap(lambda m, f, x: nees(m, f, x, wrong.space))(out.mean, out.factor, truth)
-        return each, out.nis, out.innovations.scaled, out.mean
+        return each, out.nis, out.innovations.normalised, out.mean
 
     return outer_jit(run)
 

@@ -81,7 +81,7 @@ def test_rank_and_redundant_joints(run: stm.Run) -> None:
     system, loops = run.scene.system, loops_of(run)
     found = stm.dynamics.rank(system, run.scene.state0)
     assert (found.rows, found.rank, found.dof) == {1: (20, 17, 1), 2: (35, 29, 1)}[loops]
-    assert found.smallest > 0.1
+    assert found.smallest_singular_value > 0.1
     assert found.redundant
     assert set(found.redundant) <= {joint.name for joint in system.joints}
     certificate = run.certificate

@@ -66,7 +66,9 @@ def test_moving_load_against_the_multibody_simulation():
         "frame", (0.5 * (F[1] - F[3]), 0.5 * (F[2] - F[0]), 0.0), frame="body"
     )
     system = stm.System(
-        [frame, load], [rail, stm.drive("go", rail, travel, coordinate="shift")], [push, twist]
+        [frame, load],
+        [rail, stm.drive("go", rail, travel, coordinate="displacement")],
+        [push, twist],
     )
     end = stm.integrate(
         system, system.reference, jnp.array([0.0, 0.3]), stm.Method(rtol=1e-11, atol=1e-11)

@@ -58,9 +58,9 @@ def test_false_alarms():
     found = judged(records(RUNS))
     assert 0.005 <= share(found) <= 0.02
     # no test has the alarms to itself: each is held to an eighth of them
-    spoke = [name for v in found for name in v.spoke]
+    spoke = [name for v in found for name in v.significant_tests]
     assert max(spoke.count(name) for name in TESTS) <= 7
-    assert np.mean([v.settled == 0 for v in found]) > 0.99
+    assert np.mean([v.settling_time == 0 for v in found]) > 0.99
     # each p-value is uniform (Kolmogorov's distance, 99.9 % at 1000: 0.062)
     for name in ("start", "size", "memory", "slow drift", "bias"):
         p = np.sort([v.p_values[name] for v in found])
@@ -94,7 +94,7 @@ def test_power(given, tests, words):
     found = judged(records(250, seed=3, **given))
     assert share(found) >= 0.95
     for name in tests:
-        assert np.mean([name in v.spoke for v in found]) >= 0.95
+        assert np.mean([name in v.significant_tests for v in found]) >= 0.95
     assert np.mean([words in v.words for v in found]) >= 0.5
 
 
@@ -116,8 +116,8 @@ def test_start_and_settling():
     """A wrong start is told apart from the rest: nothing speaks after it; or a time is given."""
     y = records(8, seed=6, start=(30.0, 0.0))
     found = judged(y, settle=20.0)
-    np.testing.assert_allclose([v.settled for v in found], 20.0)
-    assert all("size" not in v.spoke and "start" in v.spoke for v in found)
+    np.testing.assert_allclose([v.settling_time for v in found], 20.0)
+    assert all("size" not in v.significant_tests and "start" in v.significant_tests for v in found)
     assert all("From 20 s on nothing speaks against" in v.words for v in found)
 
 
@@ -149,14 +149,14 @@ def test_a_transient_that_ends_on_the_other_side():
     for found, sign in zip(
         judge(z, np.ones_like(z, bool), np.ones((400, 2), bool), 0.1), (1, -1), strict=True
     ):
-        assert found.settled == pytest.approx(10.0)
-        assert (found.start > 1) == (found.size < 1) == (sign > 0)
+        assert found.settling_time == pytest.approx(10.0)
+        assert (found.initial_nis > 1) == (found.settled_nis < 1) == (sign > 0)
         assert "From 10 s" not in found.words
         assert "In the settled part, from 10 s on" in found.words
         assert ("smaller than" if sign > 0 else "larger than") in found.words
     # all windows on one side: no settled part
     found = judge(z[:100], np.ones((100, 2, 2), bool), np.ones((100, 2), bool), 0.1)
-    assert all(v.settled == 0 and "No window of the first half" in v.words for v in found)
+    assert all(v.settling_time == 0 and "No window of the first half" in v.words for v in found)
 
 
 def test_failed():
@@ -227,9 +227,9 @@ def test_report_tuning_is_seen_through(quadrotor):
     tuning = report_tuning("observable")
     found = of(tuning, record.y, record.u)
     assert share(found) == 1.0
-    assert all({"start", "size", "memory"} <= set(v.spoke) for v in found)
+    assert all({"start", "size", "memory"} <= set(v.significant_tests) for v in found)
     assert all("its lag hides below" in v.words for v in found)
-    assert all(0.3 < v.settled < 1.1 and v.size < 1 for v in found)
+    assert all(0.3 < v.settling_time < 1.1 and v.settled_nis < 1 for v in found)
 
 
 @pytest.mark.slow

@@ -167,7 +167,7 @@ def test_consistency():
             case._replace(R=wrong * case.R).model(), case.prior(), y, dt=1.0, group=runs
         )
         nees = path_nees(out, truth, Vector(2))
-        return np.asarray(nees), np.asarray(out.nis), np.asarray(out.innovations.scaled)
+        return np.asarray(nees), np.asarray(out.nis), np.asarray(out.innovations.normalised)
 
     nees, nis, scaled = run(1.0)
     for values, degrees in ((nees, 2), (nis, 1)):
@@ -209,9 +209,11 @@ def test_smoother_of_the_quadrotor():
     wrong = np.abs(start - np.array(PART_III.value("true.start"))[3:])
     out = kalman_filter(five, gaussian(start, np.diag(wrong**2)), y, u=u, dt=DT)
     smoothed = smooth(five, out)
-    assert np.all(np.asarray(smoothed.deviation) <= np.asarray(out.deviation) * (1 + 1e-9))
+    assert np.all(
+        np.asarray(smoothed.standard_deviation) <= np.asarray(out.standard_deviation) * (1 + 1e-9)
+    )
     inside = slice(20, 380)
-    spread = lambda path: np.mean(np.asarray(path.deviation)[inside, 3:])
+    spread = lambda path: np.mean(np.asarray(path.standard_deviation)[inside, 3:])
     assert spread(smoothed) < 0.75 * spread(out)
 
 

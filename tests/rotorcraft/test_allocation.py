@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 
 from stmuav_jax import PART_II, ModelError
 from stmuav_jax.rotorcraft import AllocationReason, RotorLimits, Rotors, allocate, allocation
-from stmuav_jax.rotorcraft.allocation import check_lift, least, wrench_map
+from stmuav_jax.rotorcraft.allocation import check_lift, minimum_norm, wrench_map
 
 K_F, K_TAU = PART_II.value("rotor.k_f"), PART_II.value("rotor.k_tau")
 LOW, HIGH = 300.0, 1700.0
@@ -73,7 +73,7 @@ def test_inverse_mixing_of_the_report_numbers_the_rotors_otherwise():
     printed = inverse_as_printed(length, K_F * length / K_TAU)
     mine = wrench_map(hexagon(-30, -60, ALTERNATE, length), jnp.zeros(3))
     theirs = wrench_map(hexagon(90, -60, ALTERNATE, length), jnp.zeros(3))
-    as_matrix = lambda B: np.asarray(jax.vmap(lambda w: least(B, w))(jnp.eye(4))).T
+    as_matrix = lambda B: np.asarray(jax.vmap(lambda w: minimum_norm(B, w))(jnp.eye(4))).T
     np.testing.assert_allclose(as_matrix(theirs), printed, rtol=1e-12, atol=1e-9)
     corrected = np.roll(printed, 4, axis=0)
     np.testing.assert_allclose(as_matrix(mine), corrected, rtol=1e-12, atol=1e-9)
@@ -139,18 +139,18 @@ def allocated(request, batched):
 
 def test_speeds_are_within_limits_and_give_the_wrench_they_say(allocated):
     B, _, _, w, found = allocated
-    assert np.all(found.squared >= LOW**2 * (1 - EXACT))
-    assert np.all(found.squared <= HIGH**2 * (1 + EXACT))
-    np.testing.assert_allclose(found.speeds, np.sqrt(found.squared), rtol=1e-14)
-    np.testing.assert_allclose(found.wrench, found.squared @ B.T, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found.wrench + found.missed, w, rtol=0, atol=1e-12)
+    assert np.all(found.speed_squared >= LOW**2 * (1 - EXACT))
+    assert np.all(found.speed_squared <= HIGH**2 * (1 + EXACT))
+    np.testing.assert_allclose(found.speeds, np.sqrt(found.speed_squared), rtol=1e-14)
+    np.testing.assert_allclose(found.wrench, found.speed_squared @ B.T, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.wrench + found.wrench_error, w, rtol=0, atol=1e-12)
 
 
 def test_attainable_wrenches_are_given_exactly(allocated):
     """Those made from speeds within the limits, edge of the set included."""
     *_, found = allocated
     assert np.all(found.reason[: 2 * COUNT] == AllocationReason.VALID)
-    assert np.max(np.abs(found.missed[: 2 * COUNT])) < EXACT
+    assert np.max(np.abs(found.wrench_error[: 2 * COUNT])) < EXACT
 
 
 def test_none_is_left_unfinished_and_unattainable_ones_are_told(allocated):
@@ -158,14 +158,14 @@ def test_none_is_left_unfinished_and_unattainable_ones_are_told(allocated):
     assert np.all(found.reason != AllocationReason.NOT_CONVERGED)
     far = found.reason == AllocationReason.UNATTAINABLE
     assert 0.5 * COUNT < far.sum() <= COUNT
-    assert np.all(np.max(np.abs(found.missed[far]), axis=1) > 1e-6)
+    assert np.all(np.max(np.abs(found.wrench_error[far]), axis=1) > 1e-6)
 
 
 def test_misfit_is_scipys(allocated):
     """Bounded-variable least squares (BVLS), row by row."""
     B, priority, _, w, found = allocated
     W = priority / (np.abs(B).sum(axis=1) * SPAN)
-    mine = np.linalg.norm(found.missed * W, axis=1)
+    mine = np.linalg.norm(found.wrench_error * W, axis=1)
     A, limits = W[:, None] * B * SPAN, (LOW**2 / SPAN, HIGH**2 / SPAN)
     theirs = [
         np.sqrt(2 * lsq_linear(A, W * each, limits, method="bvls", tol=1e-14).cost) for each in w
@@ -180,8 +180,8 @@ def test_unattainable_ones_satisfy_the_conditions_of_optimality(allocated):
     B, priority, _, _, found = allocated
     W = priority / (np.abs(B).sum(axis=1) * SPAN)
     far = found.reason == AllocationReason.UNATTAINABLE
-    slope = -(found.missed[far] * W) @ (W[:, None] * B * SPAN)
-    u = found.squared[far]
+    slope = -(found.wrench_error[far] * W) @ (W[:, None] * B * SPAN)
+    u = found.speed_squared[far]
     low, high = u < LOW**2 * (1 + 1e-9), u > HIGH**2 * (1 - 1e-9)
     assert np.all(slope[low] > -1e-9)
     assert np.all(slope[high] < 1e-9)
@@ -192,7 +192,7 @@ def test_attained_ones_deviate_least(allocated):
     """u - u_0 = B^T y + z, z >= 0 at the lowest speed, <= 0 at the highest, else 0 (KKT)."""
     B, _, start, _, found = allocated
     A = B / np.linalg.norm(B, axis=1)[:, None]
-    for u in found.squared[:COUNT]:
+    for u in found.speed_squared[:COUNT]:
         low, high = u < LOW**2 * (1 + 1e-9), u > HIGH**2 * (1 - 1e-9)
         rows = np.concatenate([A.T, np.eye(6)[:, low], -np.eye(6)[:, high]], axis=1)
         bounds = np.zeros(rows.shape[1])
@@ -219,13 +219,13 @@ def test_edges_against_every_active_set(batched):
             assert np.all(found.reason == AllocationReason.VALID)
             exact = least_squares(B, part, LOW, HIGH, start)
             # the twin may use its tolerance in limits and wrench where few sets are regular
-            assert np.max(np.abs(found.squared - exact)) < 1e-6 * SPAN
+            assert np.max(np.abs(found.speed_squared - exact)) < 1e-6 * SPAN
 
 
 def test_without_active_limits_it_is_the_least_norm_inverse(batched):
     w = jnp.array([72.25, 0.05, -0.08, 0.01])
     found = batched(TABLE, w[None], limits=(0.0, 2000.0))
-    np.testing.assert_allclose(found.squared[0], least(TABLE, w), rtol=1e-12)
+    np.testing.assert_allclose(found.speed_squared[0], minimum_norm(TABLE, w), rtol=1e-12)
     assert not np.any(found.at_limit)
 
 
@@ -233,9 +233,9 @@ def test_yaw_is_given_up_first(batched):
     """A yaw moment that is not to be had with the thrust: the priorities decide who yields."""
     w = np.array([[100.0, 0.0, 0.0, 2.5]])
     even, last = (batched(TABLE, w, each) for each in (EVEN, YAW_LAST))
-    assert abs(even.missed[0, 0]) > 0.5
-    assert np.max(np.abs(last.missed[0, :3])) < 0.05
-    assert abs(last.missed[0, 3]) > abs(even.missed[0, 3])
+    assert abs(even.wrench_error[0, 0]) > 0.5
+    assert np.max(np.abs(last.wrench_error[0, :3])) < 0.05
+    assert abs(last.wrench_error[0, 3]) > abs(even.wrench_error[0, 3])
 
 
 UNITS = (np.array([10.0, 1.0, 1.0, 0.1]), np.array(0.1), (np.array(10.0), np.array(100.0)))
@@ -252,7 +252,7 @@ def derivatives():
 
     def allocated(w, scale, limits):
         found = allocate(TABLE * scale, w, RotorLimits(*limits))
-        return found.squared, found.reason
+        return found.speed_squared, found.reason
 
     @jax.jit
     @jax.vmap

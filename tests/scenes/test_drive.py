@@ -19,7 +19,9 @@ def strokes(scene, states):
 
     def one(state):
         kin = scene.system.kinematics(state)
-        return jnp.stack([coordinate(kin, kin.joint(j), "shift").value for j in ("T12", "T13")])
+        return jnp.stack(
+            [coordinate(kin, kin.joint(j), "displacement").value for j in ("T12", "T13")]
+        )
 
     return np.asarray(jax.vmap(one)(states))
 

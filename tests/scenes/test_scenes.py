@@ -96,7 +96,7 @@ def test_rank_and_degrees_of_freedom(name, case, expected):
     found = rank(scene.system, scene.state0)
     assert (found.rows, found.rank, found.dof) == expected
     if found.rows:
-        assert 0.03 < found.smallest < 0.045
+        assert 0.03 < found.smallest_singular_value < 0.045
 
 
 def test_hexacopter_has_no_constraint_code():
@@ -158,7 +158,7 @@ def test_the_cure_works():
     scene = make_scene("tracker", 1)
     found = assemble(scene.system, printed_state(scene))
     assert bool(found.converged)
-    assert float(found.moved) < 5e-3
+    assert float(found.largest_displacement) < 5e-3
 
 
 def test_a_scene_starts_from_another_posture():
@@ -168,7 +168,7 @@ def test_a_scene_starts_from_another_posture():
     assert np.asarray(scene.state0.p[5]) == pytest.approx([1, 0, 0, 0], abs=1e-15)
     found = assemble(scene.system, scene.state0)
     assert float(jnp.max(found.residuals)) < 1e-15
-    assert float(found.moved) < 1e-15
+    assert float(found.largest_displacement) < 1e-15
 
 
 @pytest.mark.parametrize("name", ["tracker", "uav_tracker"])

@@ -201,7 +201,7 @@ def test_the_uav_from_its_own_sensors_over_a_hundred_seeds(uav):
     assert low < nis.mean() < high
     # What was not known at the start is known now, but for the attitude: in free flight no sensor on
     # board feels where down is. The gyroscope keeps it from growing with the body rates' errors.
-    deviation = np.asarray(jnp.mean(out.deviation[-1], axis=-1))
+    deviation = np.asarray(jnp.mean(out.standard_deviation[-1], axis=-1))
     assert np.all(deviation[6:8] < 0.5 * UAV_START[6:8])
     assert deviation[16] < 0.25 * UAV_START[16]
     assert np.all(deviation[3:6] < 1.2 * UAV_START[3:6])

@@ -19,7 +19,7 @@ from stmuav_jax.sensing.sensors import (
     Gyroscope,
     PositionFix,
     readings,
-    seen_at,
+    sensed_motion_at,
 )
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "flight"))
@@ -77,7 +77,7 @@ def test_sensors_of_a_turning_body(copter):
     system = space.system
     body, com = system.names[0], np.asarray(system.bodies.com[0])
     arm = np.array([0.1, -0.05, 0.2])
-    seen = jax.jit(lambda x: seen_at(space, x))(x)
+    seen = jax.jit(lambda x: sensed_motion_at(space, x))(x)
     state = space.to_state(x)
     R = np_rotation(np.asarray(state.p[0]))
     w, w_rate = np.asarray(state.omega[0]), np.asarray(seen.omega_rate[0])

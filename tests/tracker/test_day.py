@@ -187,17 +187,21 @@ def test_clear_sky_is_that_of_pvlib(day):
     high = np.asarray(position["apparent_elevation"]) > 3
     expected = spot.get_clearsky(
         index[day.is_up], solar_position=position, linke_turbidity=linke,
-        dni_extra=day.sky.outside[day.is_up],
+        dni_extra=day.sky.extraterrestrial[day.is_up],
     )  # fmt: skip
-    for name, mine in (("dni", day.sky.beam), ("dhi", day.sky.diffuse), ("ghi", day.sky.level)):
+    for name, mine in (
+        ("dni", day.sky.beam),
+        ("dhi", day.sky.diffuse),
+        ("ghi", day.sky.global_horizontal),
+    ):
         np.testing.assert_allclose(mine[day.is_up][high], expected[name][high], rtol=1e-3)
     assert np.all((linke > 3.5) & (linke < 5.5))
 
 
 def test_level_panel_gets_the_level_irradiance(day):
     """Transposition to a level panel changes nothing; sums are integrals."""
-    np.testing.assert_allclose(day.irradiance["flat"], day.sky.level, atol=1e-6)
-    hours = np.sum(day.sky.level) * 900.0  # rectangles: the night's ends are zero
+    np.testing.assert_allclose(day.irradiance["flat"], day.sky.global_horizontal, atol=1e-6)
+    hours = np.sum(day.sky.global_horizontal) * 900.0  # rectangles: the night's ends are zero
     assert day.energy["flat"] == pytest.approx(hours, rel=1e-9)
 
 
@@ -301,7 +305,7 @@ def test_day_as_a_file(day, tmp_path):
     reasons = json.loads(data.attrs["reasons"])
     assert reasons["20"] == "below horizon"
     assert reasons["3"] == "tilt"
-    shift = data["shifts"] - data["strokes"]
+    shift = data["displacements"] - data["strokes"]
     assert np.ptp(shift.sel(leg=2).to_numpy()[day.is_up]) < 1e-15
     assert day_dataset(day).attrs["start"] == "2024-03-21T00:00:00+07:00"
 

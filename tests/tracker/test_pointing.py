@@ -31,7 +31,7 @@ def test_a_stack_of_directions(normals):
     assert np.max(np.abs(panel_normal(found.angles) - normals)[:, valid]) < 1e-15
     assert np.max(np.abs(strokes(G, found.angles) - found.strokes)[:, valid]) < 1e-15
     home = np.asarray(LIMITS.home)[:, None]
-    assert np.max(np.abs(found.strokes - found.shifts - home)[:, valid]) < 1e-16
+    assert np.max(np.abs(found.strokes - found.displacements - home)[:, valid]) < 1e-16
     assert np.array_equal(np.isnan(found.strokes).any(axis=0), ~valid)
     turned = np.asarray([np.arctan2(-normals[1], normals[2]), np.arcsin(normals[0])])
     assert np.array_equal(survey(G, turned, LIMITS).reason, found.reason)
@@ -41,16 +41,16 @@ def test_one_direction():
     found = aim(G, np.array([0.0, 0.0, 3.0]), LIMITS)
     assert np.asarray(found.angles).tolist() == [0, 0]
     # the panel was tilted at the start: level is 18.0 and 18.6 mm away
-    assert 1e3 * np.asarray(found.shifts) == pytest.approx([18.01, 18.64], abs=0.005)
+    assert 1e3 * np.asarray(found.displacements) == pytest.approx([18.01, 18.64], abs=0.005)
 
 
 def test_shifts_are_what_the_scenes_joints_measure():
-    """A servo whose target is the shift would turn the panel to the direction."""
+    """A servo whose target is the displacement would turn the panel to the direction."""
     n = np.array([0.2, 0.3, 1.0])
     found = aim(G, n, LIMITS)
     table = PART_I.replaced({"posture.phi": found.angles[0], "posture.theta": found.angles[1]})
     moved = make_scene("tracker", 1, table).state0.r - make_scene("tracker", 1).state0.r
-    assert np.asarray(found.shifts) == pytest.approx(np.asarray(moved[:2, 2]), abs=1e-16)
+    assert np.asarray(found.displacements) == pytest.approx(np.asarray(moved[:2, 2]), abs=1e-16)
 
 
 @pytest.mark.parametrize(

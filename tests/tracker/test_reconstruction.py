@@ -68,7 +68,7 @@ def test_the_fit_reaches_its_figure(best):
 
 def test_the_adopted_lengths_are_within_the_fits_deviations(best):
     for name, value in ADOPTED.items():
-        assert abs(best.values[name] - value) < 1.0 * best.deviations[name], name
+        assert abs(best.values[name] - value) < 1.0 * best.standard_deviations[name], name
     assert set(best.values) - set(ADOPTED) == {"middle_5", "middle_6", "rod_more"}
 
 
@@ -107,7 +107,7 @@ def test_it_is_a_minimum(best):
     other = least_squares(misfits, x0, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-12)
     assert 2 * other.cost == pytest.approx(best.chi_square, rel=1e-8)
     spreads = np.sqrt(np.diag(np.linalg.inv(other.jac.T @ other.jac))) * sizes
-    assert list(best.deviations.values()) == pytest.approx(spreads, rel=1e-3)
+    assert list(best.standard_deviations.values()) == pytest.approx(spreads, rel=1e-3)
 
 
 def test_other_starts_find_the_same(best):
@@ -145,8 +145,8 @@ def test_what_the_tables_do_not_decide(fits, best):
     """Joint 3-5's order weakly, equal rods not at all; legs apart fit a little better."""
     assert 1 < fits["joint 3-5 with x in the slider"].chi_square - best.chi_square < 4
     assert abs(fits["both rods of one length"].chi_square - best.chi_square) < 1
-    assert best.deviations["rod"] > 5e-3
-    assert best.deviations["rod_more"] < 1.5e-3
+    assert best.standard_deviations["rod"] > 5e-3
+    assert best.standard_deviations["rod_more"] < 1.5e-3
     gain = best.chi_square - fits["panel arms apart"].chi_square
     assert 6 < gain < 10
     assert fits["all of these apart"].freedom == best.freedom - 3

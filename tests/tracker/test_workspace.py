@@ -42,7 +42,7 @@ def zero(f, low, high):
 
 def test_zero_of_the_shifts_is_the_initial_posture():
     at = look(G, HOME, LIMITS)
-    assert np.max(np.abs(at.shifts)) < 1e-16
+    assert np.max(np.abs(at.displacements)) < 1e-16
     assert np.asarray(at.strokes) == pytest.approx([0.02206362, 0.02143280], abs=1e-8)
     assert int(at.reason) == Reason.VALID
     assert np.asarray(at.margins.lower) == pytest.approx([0.012, 0.035], abs=1e-15)

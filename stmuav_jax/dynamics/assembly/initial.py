@@ -35,13 +35,13 @@ class Assembly(eqx.Module):
         state: positions on the constraints, and velocities compatible with them.
         converged: true if the residuals are below the tolerance.
         residuals: largest absolute position residual of each joint (joints,) [m] or [rad].
-        moved: largest displacement of a centre of mass [m].
+        largest_displacement: largest displacement of a centre of mass [m].
     """
 
     state: State
     converged: Bool[Array, ""]
     residuals: Float[Array, " joints"]
-    moved: Float[Array, ""]
+    largest_displacement: Float[Array, ""]
 
 
 def assemble(
@@ -235,14 +235,14 @@ class Rank(NamedTuple):
     Attributes:
         rows: number of constraint rows. rank: number of independent rows.
         dof: degrees of freedom, 6 n - rank.
-        smallest: smallest non-zero singular value of the velocity Jacobian.
+        smallest_singular_value: smallest non-zero singular value of the velocity Jacobian.
         redundant: names of joints that own a dependent row, by pivoting.
     """
 
     rows: int
     rank: int
     dof: int
-    smallest: float
+    smallest_singular_value: float
     redundant: tuple[str, ...]
 
 
@@ -357,7 +357,7 @@ def singular_posture(system: System, states: State, t: float, rank: int) -> str:
 def _standing(system: System, state: State, names: tuple[str, ...]) -> str:
     """Names of joints with their present angles and displacements, where one is free."""
     kin = system.kinematics(state)
-    units: dict[Which, str] = {"angle": "rad", "shift": "m"}
+    units: dict[Which, str] = {"angle": "rad", "displacement": "m"}
     found = []
     for name in names:
         joint = system.joints[system.joint_index(name)]

@@ -53,7 +53,7 @@ class KinematicPath(eqx.Module):
         v_rate: accelerations, world (k, n, 3) [m/s^2]. omega_rate: body axes [rad/s^2].
         reason: codes of `PathReason` (k,).
         residual: largest constraint residual (k,).
-        smallest: ratio of the smallest to the largest singular value of the Jacobian in
+        singular_value_ratio: ratio of the smallest to the largest singular value of the Jacobian in
             (v, omega') (k,), zero at a singularity.
     """
 
@@ -63,7 +63,7 @@ class KinematicPath(eqx.Module):
     omega_rate: Float[Array, "k n 3"]
     reason: Int[Array, " k"]
     residual: Float[Array, " k"]
-    smallest: Float[Array, " k"]
+    singular_value_ratio: Float[Array, " k"]
 
 
 def driven(system: System, motions: Mapping[str, Motion]) -> System:
@@ -91,13 +91,13 @@ def kinematic_path(
     *,
     hold: tuple[str, ...] = (),
     tolerance: float = 1e-12,
-    longest: float = 0.2,
+    max_change: float = 0.2,
     throw: bool = True,
 ) -> KinematicPath:
     """Motion that a system's drivers determine, continued along the times ts.
 
     Newton's method computes every posture from the one before, extrapolated by its velocities and
-    accelerations. The result is accepted only if it is no further than `longest` from the
+    accelerations. The result is accepted only if it is no further than `max_change` from the
     extrapolation and, for equal numbers of rows and unknowns, the determinant of the Jacobian
     keeps its sign: a path ends where that fails and never continues on another branch. The path
     is differentiable (implicit function theorem), and the function may be jitted.
@@ -105,7 +105,7 @@ def kinematic_path(
     Args:
         guess: state near the posture at ts[0]; it determines the branch.
         hold: bodies that keep their pose of the guess.
-        tolerance: bound of the residuals [m]. longest: bound [m] or [rad].
+        tolerance: bound of the residuals [m]. max_change: bound [m] or [rad].
         throw: raise an error if the path stops, for concrete values.
 
     Raises:
@@ -116,7 +116,7 @@ def kinematic_path(
     held = {system.index(name) for name in hold}
     free = tuple(6 * b + k for b in range(system.n_bodies) if b not in held for k in range(6))
     times = jnp.asarray(ts, dtype=guess.r.dtype)
-    path = _path(system, guess, times, free, jnp.asarray(tolerance), jnp.asarray(longest))
+    path = _path(system, guess, times, free, jnp.asarray(tolerance), jnp.asarray(max_change))
     if throw and concrete(path):
         _check(system, path, guess, free)
     return path
@@ -145,7 +145,7 @@ def _check(system: System, path: KinematicPath, guess: State, free: tuple[int, .
     }[code]
     raise StateError(
         f"The path stops at t = {float(path.ts[k]):.6g} s: {why} (largest residual "
-        f"{float(path.residual[k]):.3g}, smallest singular value {float(path.smallest[k]):.3g} of the "
+        f"{float(path.residual[k]):.3g}, smallest singular value {float(path.singular_value_ratio[k]):.3g} of the "
         "largest). Take closer times, another path, or throw=False to keep what was reached."
     )
 
@@ -163,7 +163,7 @@ class _At(NamedTuple):
 
 @kept_jit
 def _path(
-    system: System, guess: State, ts: Any, free: tuple[int, ...], tolerance: Any, longest: Any
+    system: System, guess: State, ts: Any, free: tuple[int, ...], tolerance: Any, max_change: Any
 ) -> KinematicPath:
     model = Augmented().prepare(system)
     n = system.n_bodies
@@ -184,7 +184,7 @@ def _path(
             (at.lost, PathReason.AFTER_FAILURE),
             (~(residual <= tolerance), PathReason.NOT_CONVERGED),
             (~(smallest > _SINGULAR), PathReason.SINGULAR),
-            ((moved > longest) | (sign * at.sign < 0), PathReason.BRANCH),
+            ((moved > max_change) | (sign * at.sign < 0), PathReason.BRANCH),
         )
         fine = reason == 0
         keep = lambda x, y: jax.tree.map(lambda a, b: jnp.where(fine, a, b), x, y)

@@ -53,27 +53,31 @@ class DiscreteAdjoint(diffrax.AbstractAdjoint):
 
     In `integrate` an explicit method without an event is differentiated as the module describes.
     With implicit methods, events, and in `diffrax.diffeqsolve` itself, the adjoint is diffrax's
-    `RecursiveCheckpointAdjoint` with `kept` checkpoints, which takes adaptive steps again.
+    `RecursiveCheckpointAdjoint` with `recorded_steps` checkpoints, which takes adaptive steps again.
 
     Attributes:
-        kept: number of step attempts recorded at a time; None for 4,096 divided among the output
+        recorded_steps: number of step attempts recorded at a time; None for 4,096 divided among the output
             times, at least 64 for each.
 
     Raises:
-        SettingError: `kept` is less than one.
+        SettingError: `recorded_steps` is less than one.
     """
 
-    kept: int | None = None
+    recorded_steps: int | None = None
 
     def __check_init__(self) -> None:
-        if self.kept is not None and self.kept < 1:
+        if self.recorded_steps is not None and self.recorded_steps < 1:
             raise SettingError(
-                f"A DiscreteAdjoint keeps at least one step attempt, not {self.kept}."
+                f"A DiscreteAdjoint keeps at least one step attempt, not {self.recorded_steps}."
             )
 
     def of(self, problem: Problem, segments: int) -> diffrax.AbstractAdjoint:
         """Adjoint for a problem, with its number of recorded attempts in each of the segments."""
-        kept = max(KEPT // max(segments, 1), 64) if self.kept is None else self.kept
+        kept = (
+            max(KEPT // max(segments, 1), 64)
+            if self.recorded_steps is None
+            else self.recorded_steps
+        )
         kept = min(problem.method.max_steps, kept)
         if isinstance(problem.solver().solver, NonDenseRungeKutta):
             return DiscreteAdjoint(kept)
@@ -81,7 +85,7 @@ class DiscreteAdjoint(diffrax.AbstractAdjoint):
 
     def loop(self, **how: Any) -> Any:
         """Loop of `diffrax.diffeqsolve`, see there."""
-        return diffrax.RecursiveCheckpointAdjoint(checkpoints=self.kept).loop(**how)
+        return diffrax.RecursiveCheckpointAdjoint(checkpoints=self.recorded_steps).loop(**how)
 
 
 def recorded(

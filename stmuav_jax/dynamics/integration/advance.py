@@ -56,8 +56,8 @@ def _to(
 ) -> SegmentEnd:
     """Integrate from the carry to t1 [s], or to an event before it."""
     if isinstance(adjoint, DiscreteAdjoint):
-        assert adjoint.kept is not None
-        return recorded(problem, carry, t1, adjoint.kept)
+        assert adjoint.recorded_steps is not None
+        return recorded(problem, carry, t1, adjoint.recorded_steps)
     if problem.method.event is not None:
         return to_event(problem, carry, t1, adjoint)
     return landing(problem.solve(carry, t1, adjoint))

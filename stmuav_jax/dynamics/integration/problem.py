@@ -66,13 +66,13 @@ class Counts(eqx.Module):
 
     Attributes:
         accepted, rejected: steps accepted and rejected by their error estimates.
-        unsteered: accepted steps whose error was so far below the tolerance that the next step
+        at_growth_limit: accepted steps whose error was so far below the tolerance that the next step
             could grow by the largest factor: their length was not chosen by the error.
     """
 
     accepted: Int[Array, ""]
     rejected: Int[Array, ""]
-    unsteered: Int[Array, ""]
+    at_growth_limit: Int[Array, ""]
 
 
 class IntegrationState(eqx.Module):

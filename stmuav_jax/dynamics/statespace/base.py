@@ -59,7 +59,7 @@ class AbstractStateSpace(AbstractSpace):
         """
 
     @abstractmethod
-    def settled(self, x: Point, t: Time = 0.0) -> Point:
+    def with_closed_loops(self, x: Point, t: Time = 0.0) -> Point:
         """Equal point with closed loops, from which other points can be reached."""
 
     @abstractmethod

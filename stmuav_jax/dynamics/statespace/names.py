@@ -14,7 +14,7 @@ BASE = (
 def velocity_names(tree: SpanningTree) -> tuple[tuple[str, str], ...]:
     """Name and unit of every velocity of the spanning tree, as those of its coordinate.
 
-    The names are `joint.angle`, `joint.shift`, `joint.angle_1` and `joint.angle_2` of a universal
+    The names are `joint.angle`, `joint.displacement`, `joint.angle_1` and `joint.angle_2` of a universal
     joint, `joint.rotation_x` of a spherical one, `body.displacement_x` of a free body.
     """
     found: list[tuple[str, str]] = []

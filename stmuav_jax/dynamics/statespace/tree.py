@@ -225,7 +225,7 @@ class TreeSpace(AbstractStateSpace):
     def to_state(self, x: TreePoint, t: Time = 0.0) -> State:
         return Tree().to_state(self.model, join(self.closed(x, t)))
 
-    def settled(self, x: TreePoint, t: Time = 0.0) -> TreePoint:
+    def with_closed_loops(self, x: TreePoint, t: Time = 0.0) -> TreePoint:
         if not self.selection.rows:
             return x._replace(ahead=jnp.zeros_like(x.ahead))
         at = self._closed(x, t)

@@ -255,7 +255,7 @@ class JointDamping(AbstractForce):
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
         joint = kin.joint(self.joint)
         i, j = kin.index(joint.body_i), kin.index(joint.body_j)
-        slide = coordinate(kin, joint, "shift")
+        slide = coordinate(kin, joint, "displacement")
         drag = slide.load(kin, -self.sliding * slide.rate)
         spin = self.turning * (kin.omega_w[j] - kin.omega_w[i])
         return drag + couple(kin, joint.body_i, joint.body_j, spin)

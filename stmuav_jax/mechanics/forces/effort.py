@@ -20,7 +20,7 @@ class JointEffort(AbstractJointForce):
     Args:
         joint: name of a revolute, translational, cylindrical or screw joint.
         effort: [N] along a displacement, [N m] about an angle; a number or a function of t [s].
-        coordinate: "angle" or "shift"; needed for a cylindrical joint or a screw only.
+        coordinate: "angle" or "displacement"; needed for a cylindrical joint or a screw only.
 
     Raises:
         ModelError: the effort is not finite, or no function of t.

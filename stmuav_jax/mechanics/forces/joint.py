@@ -32,7 +32,7 @@ class AbstractJointForce(AbstractForce):
 
     Attributes:
         joint: name of the joint.
-        coordinate: "angle", "shift", or None for the only one that the joint leaves free.
+        coordinate: "angle", "displacement", or None for the only one that the joint leaves free.
     """
 
     joint: str = eqx.field(static=True)
@@ -60,7 +60,7 @@ class AbstractJointForce(AbstractForce):
         joint = kin.joint(self.joint)
         what = f"{type(self).__name__} in joint '{joint.name}'"
         found = coordinate(kin, joint, choose(joint, self.coordinate, what))
-        if found.which == "shift":
+        if found.which == "displacement":
             return found
         turns = jnp.round((found.value - self.centre(t)) / (2 * jnp.pi))
         return eqx.tree_at(lambda c: c.value, found, found.value - 2 * jnp.pi * turns)
@@ -83,7 +83,7 @@ class JointServo(AbstractJointForce):
         stiffness: k >= 0 [N/m] or [N m/rad]. damping: c >= 0 [N s/m] or [N m s/rad].
         target: x_ref, a number [m] or [rad], or a function of t [s] alone that JAX can
             differentiate twice; JAX computes its rate.
-        coordinate: "angle" or "shift"; needed for a cylindrical joint or a screw only.
+        coordinate: "angle" or "displacement"; needed for a cylindrical joint or a screw only.
 
     The potential is k (x - x_ref)^2 / 2; a moving target does work at the rate Q x_ref_rate, the
     damper dissipates c (x_rate - x_ref_rate)^2. An angle may follow its target over any number of
@@ -152,7 +152,7 @@ class EndStop(AbstractJointForce):
             be less than a turn apart.
         stiffness: k > 0 [N/m] or [N m/rad]. damping: c >= 0 [N s/m] or [N m s/rad].
         width: depth w > 0 over which the spring reaches its stiffness [m] or [rad].
-        coordinate: "angle" or "shift"; needed for a cylindrical joint or a screw only.
+        coordinate: "angle" or "displacement"; needed for a cylindrical joint or a screw only.
 
     Raises:
         ModelError: a number is not finite or out of its range, there is no limit, or the limits
@@ -235,7 +235,7 @@ class JointFriction(AbstractJointForce):
         joint: name of a revolute, translational, cylindrical or screw joint.
         coulomb: F >= 0 [N] or [N m]. viscous: c >= 0 [N s/m] or [N m s/rad].
         speed: smoothing speed v0 > 0 [m/s] or [rad/s]; friction is 76 % of F at v0, 96 % at 2 v0.
-        coordinate: "angle" or "shift"; needed for a cylindrical joint or a screw only.
+        coordinate: "angle" or "displacement"; needed for a cylindrical joint or a screw only.
 
     Raises:
         ModelError: a number is not finite or out of its range.
@@ -297,16 +297,16 @@ def ramp_area(d: Float[Array, ""], w: Float[Array, ""]) -> Float[Array, ""]:
 
 # --- checks of user input
 
-_LENGTH = {"shift": "m", "angle": "rad", None: "m or rad"}
-_EFFORT = {"shift": "N", "angle": "N m", None: "N or N m"}
-_STIFFNESS = {"shift": "N/m", "angle": "N m/rad", None: "N/m or N m/rad"}
-_DAMPING = {"shift": "N s/m", "angle": "N m s/rad", None: "N s/m or N m s/rad"}
+_LENGTH = {"displacement": "m", "angle": "rad", None: "m or rad"}
+_EFFORT = {"displacement": "N", "angle": "N m", None: "N or N m"}
+_STIFFNESS = {"displacement": "N/m", "angle": "N m/rad", None: "N/m or N m/rad"}
+_DAMPING = {"displacement": "N s/m", "angle": "N m s/rad", None: "N s/m or N m s/rad"}
 
 
 def which_coordinate(value: Which | None) -> Which | None:
     """Check the name of a coordinate and return it; raises `ModelError` for any other word."""
-    if value not in (None, "angle", "shift"):
-        raise ModelError(f"A joint's coordinate is 'angle' or 'shift', not '{value}'.")
+    if value not in (None, "angle", "displacement"):
+        raise ModelError(f"A joint's coordinate is 'angle' or 'displacement', not '{value}'.")
     return value
 
 

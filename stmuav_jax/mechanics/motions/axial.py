@@ -109,12 +109,12 @@ class Axial(AbstractRelativeMotion):
 
 
 def whole_turns(
-    angle: Float[Array, "*k"], shift: Float[Array, "*k"], pitch: Float[Array, "*k"]
+    angle: Float[Array, "*k"], displacement: Float[Array, "*k"], pitch: Float[Array, "*k"]
 ) -> Float[Array, "*k"]:
     """Whole turns by which displacement / pitch exceeds an angle in (-pi, pi], times 2 pi [rad]."""
-    return 2 * jnp.pi * jnp.round((shift / pitch - angle) / (2 * jnp.pi))
+    return 2 * jnp.pi * jnp.round((displacement / pitch - angle) / (2 * jnp.pi))
 
 
 REVOLUTE = Axial("revolute", ("angle", "rad"), 1.0, 0.0)
-PRISMATIC = Axial("prismatic", ("shift", "m"), 0.0, 1.0)
+PRISMATIC = Axial("prismatic", ("displacement", "m"), 0.0, 1.0)
 SCREW = Axial("screw", ("angle", "rad"), 1.0, None)

@@ -55,7 +55,7 @@ def test_a_consistent_state_is_left_alone(bars):
     found = stm.assemble(system, state)
     assert relative_error(found.state, state) < 1e-12
     assert bool(found.converged)
-    assert float(found.moved) < 1e-12
+    assert float(found.largest_displacement) < 1e-12
     assert found.residuals.shape == (4,)
 
 
@@ -73,8 +73,8 @@ def test_a_guess_is_assembled(near):
     assert np.max(np.abs(rate)) < 1e-12
     np.testing.assert_allclose(jnp.sum(found.state.p**2, axis=1), 1, atol=1e-15)
     distance = np.linalg.norm(found.state.r - guess.r, axis=1)
-    assert float(found.moved) == pytest.approx(np.max(distance), rel=1e-12)
-    assert float(found.moved) > 1e-3
+    assert float(found.largest_displacement) == pytest.approx(np.max(distance), rel=1e-12)
+    assert float(found.largest_displacement) > 1e-3
 
 
 def test_it_is_the_nearest_in_the_mass_metric(bars, near):

@@ -39,10 +39,10 @@ def test_rank_and_names(bars):
     assert (found.rows, found.rank, found.dof) == (20, 17, 1)
     assert 1 <= len(found.redundant) <= 3
     assert set(found.redundant) <= set(JOINTS)
-    assert found.smallest > 1e-3
+    assert found.smallest_singular_value > 1e-3
     many, smallest = stm.dynamics.ranks(system, jax.tree.map(lambda x: jnp.stack([x, x]), state))
     assert list(many) == [17, 17]
-    np.testing.assert_allclose(smallest, found.smallest, rtol=1e-9)
+    np.testing.assert_allclose(smallest, found.smallest_singular_value, rtol=1e-9)
     assert stm.dynamics.rank(other, state)[:3] == (17, 17, 1)
     assert stm.dynamics.rank(other, state).redundant == ()
 

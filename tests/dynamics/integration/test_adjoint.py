@@ -76,7 +76,7 @@ def test_second_derivatives():
 def test_more_steps_than_are_kept():
     """Windows done again on the way back: the same derivatives as those of all steps kept."""
     fine = stm.Method(rtol=1e-12, atol=1e-12, solver=diffrax.Tsit5())
-    few = replace(fine, adjoint=stm.dynamics.DiscreteAdjoint(kept=64))
+    few = replace(fine, adjoint=stm.dynamics.DiscreteAdjoint(recorded_steps=64))
     of = lambda method: jax.jit(jax.value_and_grad(lambda q: swing(q, method, Q[4:])))
     expected, same = of(fine)(Q[:4])
     value, gradient = of(few)(Q[:4])
@@ -100,8 +100,8 @@ def test_in_diffrax_itself():
         )
         return jnp.sum(jnp.asarray(solution.ys))
 
-    found = jax.grad(end)(0.7, stm.dynamics.DiscreteAdjoint(kept=8))
+    found = jax.grad(end)(0.7, stm.dynamics.DiscreteAdjoint(recorded_steps=8))
     same = jax.grad(end)(0.7, diffrax.RecursiveCheckpointAdjoint(checkpoints=8))
     assert found == same
     with pytest.raises(stm.SettingError, match="at least one step attempt, not 0"):
-        stm.dynamics.DiscreteAdjoint(kept=0)
+        stm.dynamics.DiscreteAdjoint(recorded_steps=0)

@@ -138,7 +138,7 @@ def test_steps_for_the_state_alone():
     free, bounded = run(jnp.inf), run(0.05)
     assert int(free.counts.accepted[-1]) < 10
     assert int(bounded.counts.accepted[-1]) >= 100
-    assert int(free.counts.unsteered[-1]) == int(free.counts.accepted[-1])
+    assert int(free.counts.at_growth_limit[-1]) == int(free.counts.accepted[-1])
 
 
 @pytest.mark.parametrize(

@@ -142,5 +142,5 @@ def test_a_motion_of_ones_own(monkeypatch):
 
 def test_names_and_units():
     assert REVOLUTE.coordinates == SCREW.coordinates == (("angle", "rad"),)
-    assert PRISMATIC.coordinates == (("shift", "m"),)
+    assert PRISMATIC.coordinates == (("displacement", "m"),)
     assert [c.linear for m in (REVOLUTE, PRISMATIC, SCREW) for c in m.columns] == [0.0, 1.0, None]
