@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import rotation_matrix_in
-from ..checks.errors import ModelError, check_finite, check_shape, concrete
-from ..checks.numbers import array_module, as_numpy, floats
+from ..checks.errors import ModelError, concrete
+from ..checks.numbers import array_module, as_numpy, floats, scalar, vector
 from ..checks.shapes import Numbers
 from .body import Body
 from .constraint import ROWS, Data
@@ -200,13 +200,11 @@ def resolve(joint: Joint, i: Body | None, j: Body | None) -> Joint:
 
 
 def _unit(axis: Numbers, what: str) -> Float[Array, "3"]:
-    vector = as_numpy(floats(axis))
-    check_shape(vector, (3,), what)
-    check_finite(vector, what, "")
-    length = array_module(vector).sqrt(vector @ vector)
-    if concrete(vector) and float(length) == 0:
+    along = as_numpy(vector(axis, what, ""))
+    length = array_module(along).sqrt(along @ along)
+    if concrete(along) and float(length) == 0:
         raise ModelError(f"{what} has zero length; give any non-zero vector along it.")
-    return floats(vector / length)
+    return floats(along / length)
 
 
 def _frame_about(z: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -228,10 +226,8 @@ def _joint(
     frame: Float[Array, "3 3"],
     length: Numbers = 0.0,
 ) -> Joint:
-    points = floats(point_i), floats(point_j)
-    for value in points:
-        check_shape(value, (3,), f"A point of joint '{name}'")
-        check_finite(value, f"A point of joint '{name}'", "m")
+    what = f"A point of joint '{name}'"
+    points = vector(point_i, what, "m"), vector(point_j, what, "m")
     if body_i == body_j:
         raise ModelError(f"Joint '{name}' joins body '{body_i}' to itself.")
     return Joint(
@@ -323,9 +319,7 @@ def screw(
         ModelError: the axis has zero length, or the pitch is zero or not finite.
     """
     frame = _frame_about(_unit(axis, f"The axis of joint '{name}'"))
-    value = floats(pitch)
-    check_shape(value, (), f"The pitch of joint '{name}'")
-    check_finite(value, f"The pitch of joint '{name}'", "m/rad")
+    value = scalar(pitch, f"The pitch of joint '{name}'", "m/rad")
     if concrete(value) and float(value) == 0:
         raise ModelError(
             f"The pitch of joint '{name}' must not be zero; a joint without one is revolute."
