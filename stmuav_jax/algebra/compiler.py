@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import get_opaque_trace_state
 
+from ..checks.numbers import as_jax
 from . import kept
 
 Options = dict[str, str | bool | int | float]
@@ -91,6 +92,8 @@ def outer_jit(function: Callable[..., Any]) -> Any:
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """`eqx.filter_jit` with `compiler_options(quick=True)`, determined at the first call.
 
+    Where programs are kept for later processes (`keep_programs`), this one is too.
+
     Within a transformation (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a
     larger program.
 
@@ -106,7 +109,12 @@ def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(function)
     def call(*args: Any) -> Any:
-        return within(*args) if transformed(args) else made()(*args)
+        if transformed(args):
+            return within(*args)
+        # NumPy's arrays are arguments here, while kept programs take those of JAX only
+        given = jax.tree.map(lambda x: as_jax(x) if isinstance(x, np.ndarray) else x, args)
+        key = kept.key_of(function, given, _NO_LIBRARY | _QUICK)
+        return made()(*args) if key is None else _by_key(key, function, given)(*given)
 
     return call
 
@@ -163,7 +171,11 @@ def program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
     """
     leaves, structure = jax.tree.flatten(args)
     setting = (jax.config.jax_enable_x64, jax.config.jax_default_device)  # pyright: ignore[reportAttributeAccessIssue]
-    key = (function, structure, setting, tuple(map(_kind, leaves)))
+    return _by_key((function, structure, setting, tuple(map(_kind, leaves))), function, args)
+
+
+def _by_key(key: Hashable, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    """Program of a key, compiled if there is none."""
     with _lock:
         found = _programs.get(key)
         if found is not None:
@@ -210,8 +222,12 @@ def _compiled_now(
         return numbers
 
     run.__name__ = run.__qualname__ = getattr(function, "__name__", "run")
-    lowered = jax.jit(run, compiler_options=compiler_options(quick=True)).lower(arrays)
-    compiled = lowered.compile()
+    options = compiler_options(quick=True)
+    if key is None:
+        return jax.jit(run, compiler_options=options).lower(arrays).compile(), result[0]
+    with kept.beside_jax_cache(run):
+        lowered = jax.jit(run, compiler_options=options).lower(arrays)
+        compiled = lowered.compile()
     kept.store(key, lowered, compiled, len(arrays), result[0])
     return compiled, result[0]
 

@@ -11,6 +11,7 @@ belongs to another user, or that others may write to, is therefore not used.
 """
 
 import contextlib
+import dataclasses
 import enum
 import functools
 import hashlib
@@ -18,11 +19,12 @@ import os
 import pickle
 import platform
 import re
+import secrets
 import stat
 import sys
 import tempfile
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -95,13 +97,12 @@ def key_of(function: Callable[..., Any], args: tuple[Any, ...], options: Any) ->
         return None
     try:
         text = _text((function, args, options))
-    except (_NoTextError, RecursionError):
+    except (_NoTextError, RecursionError, ValueError):
         return None
-    settings = sorted(
-        (name, repr(value))
-        for name, value in jax.config.values.items()
-        if not any(word in name for word in ("cache", "log", "traceback"))
-    )
+    # those of JAX's cache and of its messages make no difference to a program
+    others = ("cache", "log", "traceback")
+    values = {k: v for k, v in jax.config.values.items() if not any(x in k for x in others)}
+    settings = sorted((name, repr(value)) for name, value in values.items())
     whole = repr((text, _platform(), settings))
     return hashlib.sha256(whole.encode()).hexdigest()
 
@@ -140,6 +141,23 @@ def load(key: str | None) -> tuple[Call, Any] | None:
     with contextlib.suppress(OSError):
         os.utime(path)
     return call, result
+
+
+@contextlib.contextmanager
+def beside_jax_cache(function: Any) -> Iterator[None]:
+    """Compile a function without JAX's own cache, neither read nor written, within the context.
+
+    XLA serialises a program that came out of that cache without its code: it can be loaded, but
+    not run. A name that never occurred is in no cache.
+    """
+    shortest = "jax_persistent_cache_min_compile_time_secs"
+    before = getattr(jax.config, shortest)
+    function.__name__ = f"{function.__name__}_{secrets.token_hex(8)}"
+    jax.config.update(shortest, 1e9)
+    try:
+        yield
+    finally:
+        jax.config.update(shortest, before)
 
 
 def store(key: str | None, lowered: Any, compiled: Any, count: int, result: Any) -> None:
@@ -231,8 +249,12 @@ def _processor() -> tuple[str, ...]:
     return (platform.machine(), *(line for line in lines if line.startswith(wanted)))
 
 
-def _text(x: Any) -> Any:
+def _text(x: Any, constant: bool = False) -> Any:
     """Nested tuples of texts that describe an object without its arrays' numbers.
+
+    Args:
+        constant: the numbers too, because they are part of the program: those of objects that JAX
+            does not look into, such as static fields and what a function closes over.
 
     Raises:
         _NoTextError: the object, or a part of it, has no such text.
@@ -240,11 +262,10 @@ def _text(x: Any) -> Any:
     if x is None or isinstance(x, bool | int | float | complex | str | bytes) or x is Ellipsis:
         return type(x).__name__, repr(x)
     if isinstance(x, jax.Array):
-        return "array", x.shape, str(x.dtype), getattr(x, "weak_type", False)
+        kind = (x.shape, str(x.dtype), getattr(x, "weak_type", False))
+        return "array", kind, _digest(np.asarray(x)) if constant else ""
     if isinstance(x, np.ndarray | np.generic):
-        if x.dtype.hasobject:
-            raise _NoTextError
-        return "numpy", x.shape, str(x.dtype), hashlib.sha256(x.tobytes()).hexdigest()
+        return "numpy", x.shape, str(x.dtype), _digest(x)
     if isinstance(x, np.dtype):
         return "dtype", str(x)
     if isinstance(x, type):
@@ -252,37 +273,54 @@ def _text(x: Any) -> Any:
     if isinstance(x, enum.Enum):
         return _name(type(x)), x.name
     if isinstance(x, Mapping):
-        return _name(type(x)), tuple((_text(k), _text(v)) for k, v in x.items())
+        own = constant or type(x) is not dict
+        return _name(type(x)), tuple((_text(k, True), _text(v, own)) for k, v in x.items())
     if isinstance(x, tuple | list):
-        return _name(type(x)), tuple(map(_text, x))
+        own = constant or not (type(x) in (tuple, list) or hasattr(x, "_fields"))
+        return _name(type(x)), tuple(_text(part, own) for part in x)
     if isinstance(x, frozenset | set):
-        return _name(type(x)), tuple(sorted(map(repr, map(_text, x))))
-    return _text_of_call(x)
+        return _name(type(x)), tuple(sorted(repr(_text(part, True)) for part in x))
+    return _text_of_call(x) or _text_of_fields(x, constant)
 
 
 def _text_of_call(x: Any) -> Any:
-    """Text of a function, or of an object that its fields describe."""
+    """Text of a function; None for other objects."""
     if isinstance(x, functools.partial):
-        return "partial", _text((x.func, x.args, x.keywords))
+        return "partial", _name(type(x)), _text((x.func, x.args, x.keywords), True)
     if isinstance(x, types.MethodType):
-        return "method", _text((x.__func__, x.__self__))
+        return "method", _text((x.__func__, x.__self__), True)
     if isinstance(x, types.FunctionType):
         cells = tuple(cell.cell_contents for cell in x.__closure__ or ())
         own = (x.__code__, cells, x.__defaults__, x.__kwdefaults__)
-        return "function", _name(x), _text(own)
+        return "function", _name(x), _text(own, True)
     if isinstance(x, types.CodeType):
         # a function within a function has no name of its own; its code tells it from others
         parts = (x.co_code, x.co_consts, x.co_names, x.co_varnames, x.co_freevars)
-        return "code", _text(parts)
+        return "code", _text(parts, True)
     if isinstance(x, types.BuiltinFunctionType | np.ufunc):
         return "function", _name(x)
     if hasattr(x, "__wrapped__") and not isinstance(x, eqx.Module):
-        return "wrapper", _name(type(x)), _text(x.__wrapped__)
-    fields = getattr(x, "__dataclass_fields__", None)
-    if fields is None:
+        return "wrapper", _name(type(x)), _text(x.__wrapped__, True)
+    return None
+
+
+def _text_of_fields(x: Any, constant: bool) -> Any:
+    """Text of an instance of a dataclass."""
+    if not dataclasses.is_dataclass(x):
         raise _NoTextError
-    values = [(name, _text(getattr(x, name))) for name in fields if hasattr(x, name)]
-    return _name(type(x)), tuple(values)
+    own = constant or not isinstance(x, eqx.Module)
+    values = tuple(
+        (field.name, _text(getattr(x, field.name), own or bool(field.metadata.get("static"))))
+        for field in dataclasses.fields(x)
+        if hasattr(x, field.name)
+    )
+    return _name(type(x)), values
+
+
+def _digest(array: Any) -> str:
+    if array.dtype.hasobject:
+        raise _NoTextError
+    return hashlib.sha256(array.tobytes()).hexdigest()
 
 
 def _name(x: Any) -> str:

@@ -187,8 +187,7 @@ def resolve(joint: Joint, i: Body | None, j: Body | None) -> Joint:
     def fix(body: Body | None, point: Array, frame: Array) -> tuple[Array, Array]:
         if body is None:
             return point, frame
-        own = (point, frame, body.orientation, body.position)
-        point, frame, p, position = as_numpy(own)
+        point, frame, p, position = as_numpy((point, frame, body.orientation, body.position))
         R_bw = rotation_matrix_in(array_module(p), p).T
         return floats(R_bw @ (point - position)), floats(R_bw @ frame)
 
