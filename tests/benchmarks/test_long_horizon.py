@@ -1,6 +1,7 @@
 """The long-horizon benchmark: its symmetric comparator, its measures, its smoke test."""
 
 import json
+import runpy
 import sys
 from types import SimpleNamespace
 
@@ -10,8 +11,8 @@ import jax.numpy as jnp
 import long_horizon
 import numpy as np
 import pytest
-from horizons.gauss import Gauss
 from problems import conservative
+from shared.gauss import Gauss
 
 import stmuav_jax as stm
 
@@ -108,7 +109,7 @@ def test_smoke(tmp_path, monkeypatch):
     """The script at its smallest size: a complete record and its figures."""
     arguments = ["--quick", "--results", str(tmp_path), "--figures", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["long_horizon.py", *arguments])
-    long_horizon.main()
+    runpy.run_path(long_horizon.__file__, run_name="__main__")
     record = json.loads((tmp_path / "long_horizon.json").read_text())
     assert {"commit", "dirty", "versions", "cores", "date"} <= set(record["environment"])
     (problem,) = record["problems"]

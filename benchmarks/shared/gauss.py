@@ -9,7 +9,7 @@ Source: E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006),
 II.1.3 (coefficients), IV.2 (quadratic invariants) and VIII.6 (iterations to round-off).
 """
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -25,17 +25,13 @@ Vector = Float[Array, " k"]
 _DONE, _STALLED = 1e-15, 1e-10
 _MOST = 100
 
-_ROOT = float(np.sqrt(3.0))
-_TABLES = {
-    1: (np.array([[0.5]]), np.array([1.0]), np.array([0.5])),
-    2: (
-        np.array([[1 / 4, 1 / 4 - _ROOT / 6], [1 / 4 + _ROOT / 6, 1 / 4]]),
-        np.array([0.5, 0.5]),
-        np.array([0.5 - _ROOT / 6, 0.5 + _ROOT / 6]),
-    ),
-}
-# The slopes' polynomial through c_1 and c_2, continued to 1 + c_1 and 1 + c_2: the first guess.
-_GUESS = {1: np.array([[1.0]]), 2: np.array([[1 - _ROOT, _ROOT], [-_ROOT, 1 + _ROOT]])}
+
+def coefficients(stages: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A, b and c; and the slopes' polynomial continued to the next step, as a first guess there."""
+    x, weights = np.polynomial.legendre.leggauss(stages)
+    c, k = (1 + x[:, None]) / 2, np.arange(stages)
+    values = np.linalg.inv(c**k)
+    return c ** (k + 1) / (k + 1) @ values, weights / 2, c[:, 0], (1 + c) ** k @ values
 
 
 class GaussState(NamedTuple):
@@ -46,24 +42,15 @@ class GaussState(NamedTuple):
 
 
 class Gauss(diffrax.AbstractSolver):
-    """One or two Gauss-Legendre stages by fixed-point iterations to round-off.
+    """Gauss-Legendre stages by fixed-point iterations to round-off.
 
     It has no error estimate: steps are fixed. A step whose iterations do not converge fails
     with `nonlinear_divergence`. Between steps it interpolates linearly.
-
-    Args:
-        stages: 1 or 2.
     """
 
+    term_structure: ClassVar = diffrax.ODETerm
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
     stages: int = eqx.field(static=True, default=2)
-
-    @property
-    def term_structure(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return diffrax.ODETerm
-
-    @property
-    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return diffrax.LocalLinearInterpolation
 
     def order(self, terms: Any) -> int:
         return 2 * self.stages
@@ -76,49 +63,30 @@ class Gauss(diffrax.AbstractSolver):
         return terms.vf(t0, y0, args)
 
     def step(
-        self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Vector,
-        args: Any,
-        solver_state: GaussState,
-        made_jump: Any,
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> tuple[Vector, None, Any, GaussState, diffrax.RESULTS]:
         # the remembered slopes are a first guess only, so a jump does no harm
         del made_jump
         h = t1 - t0
-        A, b, c = (jnp.asarray(part, y0.dtype) for part in _TABLES[self.stages])
+        A, b, c, guess = (jnp.asarray(part, y0.dtype) for part in coefficients(self.stages))
         field = jax.vmap(lambda t, y: terms.vf(t, y, args))
 
-        def again(slopes: Float[Array, "s k"]) -> Float[Array, "s k"]:
-            return field(t0 + c * h, y0 + h * A @ slopes)
+        def going(now: Any) -> Array:
+            _, moved, before, count = now
+            stalled = (moved >= before) & (moved <= _STALLED)
+            return (moved > _DONE) & ~stalled & jnp.isfinite(moved) & (count < _MOST)
 
-        guess = jnp.asarray(_GUESS[self.stages], y0.dtype) @ solver_state.slopes
-        slopes, count, converged = _fixed_point(again, guess, h / (1 + jnp.abs(y0)))
+        def iterate(now: Any) -> Any:
+            slopes, moved, _, count = now
+            after = field(t0 + c * h, y0 + h * A @ slopes)
+            change = jnp.max(jnp.abs((after - slopes) * h / (1 + jnp.abs(y0))))
+            return after, change, moved, count + 1
+
+        first = (guess @ solver_state.slopes, jnp.asarray(jnp.inf), None, jnp.zeros((), int))
+        slopes, moved, _, count = jax.lax.while_loop(going, iterate, iterate(first))
         y1 = y0 + h * b @ slopes
         state = GaussState(slopes, solver_state.evaluations + self.stages * count)
         results: Any = diffrax.RESULTS
         good, bad = results.successful, results.nonlinear_divergence
-        result = results.where(converged, good, bad)
+        result = results.where(moved <= _STALLED, good, bad)
         return y1, None, {"y0": y0, "y1": y1}, state, result
-
-
-def _fixed_point(
-    again: Any, guess: Float[Array, "s k"], weight: Vector
-) -> tuple[Float[Array, "s k"], Int[Array, ""], Array]:
-    """Iterate to round-off: the slopes, the number of iterations, whether they converged."""
-
-    def going(now: Any) -> Array:
-        _, moved, before, count = now
-        stalled = (moved >= before) & (moved <= _STALLED)
-        return (moved > _DONE) & ~stalled & jnp.isfinite(moved) & (count < _MOST)
-
-    def iterate(now: Any) -> Any:
-        slopes, moved, _, count = now
-        after = again(slopes)
-        return after, jnp.max(jnp.abs((after - slopes) * weight)), moved, count + 1
-
-    first = iterate((guess, jnp.asarray(jnp.inf, guess.dtype), None, jnp.zeros((), int)))
-    slopes, moved, _, count = jax.lax.while_loop(going, iterate, first)
-    return slopes, count, moved <= _STALLED
