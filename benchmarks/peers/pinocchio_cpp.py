@@ -180,12 +180,6 @@ class PinocchioCpp(Peer):
         words = Texts(scene).call(program, "cost", 20_000)
         return float(np.median(words["seconds"]))
 
-    def start_accelerations(self, scene: Scene) -> np.ndarray:
-        """Accelerations of the centres of mass at the start, world (n, 3) [m/s^2]."""
-        program, _ = compile_program()
-        words = Texts(scene).call(program, "cost", 1)
-        return np.reshape(words["accelerations"][0], (-1, 3))
-
     def throughput(
         self, scene: Scene, states: State, t1: float, setting: Setting
     ) -> tuple[float, np.ndarray]:

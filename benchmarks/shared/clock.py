@@ -106,6 +106,15 @@ def compiled(
     return done, clock() - start
 
 
+def compile_and_measure(
+    function: Callable[..., Any], *arguments: Any, **how: Any
+) -> tuple[Timing, Any, float]:
+    """Timing and output of a function compiled for these arguments, and the seconds for that."""
+    program, seconds = compiled(function, *arguments)
+    timing, output = measure(lambda: program(*arguments), **how)
+    return timing, output, seconds
+
+
 def rounded(value: Any, digits: int = 4) -> Any:
     """Significant digits of an array as a list, for JSON; what is not finite as None."""
     flat = [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in np.ravel(value)]
