@@ -7,8 +7,8 @@ to 0.5 s and blames "high stiff" equations. This script runs the report's dense 
     b  with Table 4.1 of Part II as printed    e  in millimetres and by an inverse matrix
     c  from the Euler parameters as printed    f  without stabilisation for 10 s
 
-and measures (stiffness) the eigenvalues along the path. What was varied over geometries, and how
-the printed table stops, was measured once; docs/failure.md says by which commit's scripts.
+The eigenvalues along the path, what was varied over geometries and how the printed table stops were
+measured once; docs/failure.md says by which commit's scripts.
 """
 
 import json
@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 from dense.tables import Variant
 from failing import measures
-from failing.figures import draw
 from failing.measures import Reference, Report, attempt, describe
 from failing.steps import Scheme
+from matplotlib.figure import Figure
 from shared.command import begin, parser
+from shared.pages import Row, panels, save
 from shared.record import ROOT, environment, write
 
 from stmuav_jax import Baumgarte, Method, Projection, Unstabilised, make_scene, simulate
@@ -153,49 +154,34 @@ def long_run(size: Size) -> dict[str, Any]:
     return {"long": rows}
 
 
-def stiffness(size: Size) -> dict[str, Any]:
-    """Eigenvalues along the converged paths, beside the steps that ode45 took at its defaults.
-
-    "dense": all 98 of the system as it is integrated; "reduced": 16, see `reduced_eigenvalues`.
-    """
-    rows = []
-    for ref in references(size).values():
-        model, pick = (
-            Report(ref.scene),
-            np.arange(0, len(ref.times), min(2, size.eigenvalues_every)),
-        )
-        times = ref.times[pick]
-        at = lambda k, model=model, ref=ref: (model, ref.times[k], ref.start_at(model, int(k)))
-        dense = np.array([measures.eigenvalues(*at(k)) for k in pick])
-        reduced = measures.reduced_eigenvalues(ref.scene, ref.times, ref.states)[pick]
-        _, history = attempt(ref.scene, ref.times, DEFAULT)
-        h, early = np.interp(times, history.ends, history.sizes), times <= 0.5
-        steps = {"t": history.ends.tolist(), "h": history.sizes.tolist()}
-        row = {"case": ref.scene.name, "t": np.round(times, 6).tolist(), "steps": steps}
-        for name, values in (("dense", dense), ("reduced", reduced)):
-            series = {
-                "fastest": np.max(np.abs(values), axis=1),
-                "most_negative_real": np.min(np.real(values), axis=1),
-                "largest_real": np.max(np.real(values), axis=1),
-                "largest_imaginary": np.max(np.imag(values), axis=1),
-                "step_times_fastest": h * np.max(np.abs(values), axis=1),
-            }
-            row[name] = {key: found.tolist() for key, found in series.items()}
-            row[name]["before_half_second"] = {
-                "fastest": float(np.max(series["fastest"][early])),
-                "most_negative_real": float(np.min(series["most_negative_real"][early])),
-                "largest_step_times_fastest": float(np.max(series["step_times_fastest"][early])),
-            }
-        rows.append(row)
-    return {"stiffness": rows}
+def violation(result: Row) -> Figure:
+    """Constraint violation against time of one run of each kind, case 2."""
+    figure, (axes,) = panels(1, 1, 8, 4.2)
+    kinds = ("corrected", "printed p", "gamma: lost dots", "d~^T in the Jacobian", "all four")
+    tight = "ode45 1e-06/1e-09"
+    axes.axvspan(0.45, 0.5, color="0.85", zorder=0, label="report's simulation stops")
+    axes.grid(alpha=0.3)
+    for name, scheme in (("corrected", "ode45 1e-03/1e-06"), *((kind, tight) for kind in kinds)):
+        for row in result["trials"]:
+            if (row["name"], row["scheme"], row["case"]) != (name, scheme, 2):
+                continue
+            series = row["series"]
+            values = np.array(series["violation"], dtype=float)
+            (line,) = axes.semilogy(series["t"][1:], values[1:], label=f"{name}, {scheme}")
+            if row["failure"]:
+                axes.plot(row["reached"], values[-1], "x", color=line.get_color(), ms=9, mew=2)
+    axes.set(xlabel="t [s]", ylabel="largest constraint violation [m or 1]")
+    axes.set_title("Case 2: constraint violation; a cross marks where a run stopped", fontsize=10)
+    axes.legend(fontsize=8, loc="lower right")
+    return figure
 
 
-PARTS = {"trials": trials, "stiffness": stiffness, "long": long_run}
+PARTS = {"trials": trials, "long": long_run}
 
 
 def main() -> None:
-    """Run parts and write `failure.json`, then the figures of a complete one."""
-    again = "figures from a complete result"
+    """Run parts and write `failure.json`, then the figure of a complete one."""
+    again = "the figure from a complete result"
     made = parser(__doc__, quick="the smallest size, for a smoke test", redraw=again)
     made.add_argument("--figures", type=Path, default=FIGURES)
     made.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
@@ -211,8 +197,9 @@ def main() -> None:
         old["measured"] = {**old.get("measured", {}), name: environment()}
         what = {"what": "the report's dense system and its variants, Part II"}
         write("failure", {**what, **old, **found}, options.results)
-    if set(PARTS) <= set(json.loads(path.read_text())["measured"]):
-        print(path, *draw(json.loads(path.read_text()), options.figures), sep="\n")
+    found = json.loads(path.read_text())
+    if set(PARTS) <= set(found["measured"]):
+        print(path, *save({"violation": violation(found)}, options.figures), sep="\n")
 
 
 if __name__ == "__main__":

@@ -3,15 +3,13 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from dense.system import Dense
 from dense.tables import Array, Variant, g_and_l, times as product
 from failing.steps import History, Limits, Scheme, integrate
 
-from stmuav_jax import Augmented, Method, Scene, State, Unstabilised, simulate
+from stmuav_jax import Method, Scene, State, simulate
 
 EVERY = 0.01  # spacing of looked-at times [s]
 
@@ -168,44 +166,3 @@ def eigenvalues(model: Report, t: float, y: Array) -> Array:
     if not np.all(np.isfinite(jacobian)):
         return np.full(size, np.nan + 0j)
     return np.linalg.eigvals(jacobian)
-
-
-def _null(normals: jax.Array) -> jax.Array:
-    """An orthonormal basis of what the rows leave free, as columns."""
-    return jnp.linalg.svd(normals, full_matrices=True)[2][normals.shape[0] :].T
-
-
-@eqx.filter_jit
-def _reduced(system: Any, ts: Any, states: State) -> Any:
-    formulation = Augmented()
-    model = formulation.prepare(system)
-    places = 7 * system.n_bodies
-
-    def manifold(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        state = formulation.to_state(model, x)
-        eq = model.constraints.equations(jnp.zeros(()), system.kinematics(state))
-        u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
-        return jnp.concatenate([eq.value, jnp.sum(state.p**2, axis=1) - 1]), eq.matrix @ u
-
-    def one(at: Any) -> jax.Array:
-        t, state = at
-        x = formulation.to_vector(model, state)
-        rate = lambda x: formulation.derivative(model, t, x, Unstabilised())[0]
-        of_place, of_rate = jax.jacfwd(manifold)(x)
-        tangent = _null(jnp.concatenate([of_place, of_rate]))
-        bases = _null(of_place[:, :places]), _null(of_rate[:, places:])
-        chart = jax.scipy.linalg.block_diag(bases[0].T, bases[1].T)
-        return chart @ jax.jacfwd(rate)(x) @ tangent @ jnp.linalg.inv(chart @ tangent)
-
-    return jax.lax.map(one, (ts, states))
-
-
-def reduced_eigenvalues(scene: Scene, ts: Array, states: State) -> Array:
-    """Eigenvalues (k, 16) of the equations reduced to the 8 degrees of freedom, along a path.
-
-    Local coordinates at x0: z = T^T (q - q0) and w = B^T u, with T and B orthonormal bases of
-    what the constraints leave free to q = (r, p) and to u = (v, omega'), SI units. Away from an
-    equilibrium eigenvalues depend on such a choice; `eigenvalues` is another one.
-    """
-    at = jnp.asarray(ts), jax.tree.map(jnp.asarray, states)
-    return np.linalg.eigvals(np.asarray(_reduced(scene.system, *at)))

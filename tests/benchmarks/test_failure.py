@@ -124,6 +124,4 @@ def test_smallest_run(tmp_path):
     corrected = next(row for row in record["trials"] if row["name"] == "corrected")
     assert not corrected["failure"]
     assert corrected["series"]["violation"][-1] < 1e-4
-    (stiffness,) = record["stiffness"]
-    assert 0 < stiffness["reduced"]["before_half_second"]["fastest"] < 100
-    assert len(list(tmp_path.glob("*.png"))) == 2
+    assert (tmp_path / "violation.png").stat().st_size > 5000
