@@ -37,7 +37,7 @@ BENCHMARKS: dict[str, tuple[str, ...]] = {
 }
 # Parts of a result that no script measures any more: their question is settled, and they stay as
 # they were measured (docs/failure.md names the commit with their scripts).
-FINISHED = {"failure": {"stiffness", "alignment", "nature", "collapses"}}
+FINISHED = {"failure": {"trials", "stiffness", "long", "alignment", "nature", "collapses"}}
 # These measure more than one core, or the command line as a user starts it.
 ALL_CORES = ("montecarlo", "first_result")
 THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}

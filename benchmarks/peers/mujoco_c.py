@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from problems.plain import Sinus, Start, UnsupportedError, loop_seconds, plain, start, starts
-from problems.tree import coordinates, span
+from problems.tree import coordinates
 from scipy.spatial.transform import Rotation
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at
-from peers.pinocchio_model import LinkModel, link_model, why_no_joint_forces
+from peers.pinocchio_model import LinkModel, linked, why_no_joint_forces
 from stmuav_jax import Scene, State
 
 # A link's joints in MuJoCo: kind, and the letters of their axes.
@@ -117,9 +117,7 @@ class World:
         # or failures would be written into a file in the working directory
         mujoco.set_mju_user_warning(lambda _: None)
         self.mujoco = mujoco
-        numbers = plain(scene)
-        self.tree = span(numbers)
-        self.links = link_model(numbers, self.tree)
+        self.tree, self.links = linked(scene)
         self.model = build(self.links, step, integrator)
         self.data = mujoco.MjData(self.model)
         self.step, self.t0 = step, scene.t0

@@ -5,11 +5,10 @@ from importlib import metadata
 from typing import Any
 
 import numpy as np
-from problems.plain import loop_seconds, plain, start
-from problems.tree import span
+from problems.plain import loop_seconds, start
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at
-from peers.pinocchio_model import generalised, link_model, start_vectors, why_no_joint_forces
+from peers.pinocchio_model import generalised, linked, start_vectors, why_no_joint_forces
 from peers.scipy_dense import follow
 from stmuav_jax import Scene
 
@@ -21,9 +20,7 @@ class Dynamics:
         import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
         self.pin: Any = pin
-        numbers = plain(scene)
-        tree = span(numbers)
-        self.links = link_model(numbers, tree)
+        tree, self.links = linked(scene)
         self.q0, self.v0 = start_vectors(tree, start(scene))
         self.model = self._tree()
         self.data = self.model.createData()
