@@ -36,8 +36,11 @@ BENCHMARKS: dict[str, tuple[str, ...]] = {
     **{name: (f"{name}.py",) for name in ALONE},
 }
 # Parts of a result that no script measures any more: their question is settled, and they stay as
-# they were measured (docs/failure.md names the commit with their scripts).
-FINISHED = {"failure": {"trials", "stiffness", "long", "alignment", "nature", "collapses"}}
+# they were measured (docs/failure.md and docs/long_times.md name the commits of their scripts).
+FINISHED = {
+    "failure": {"trials", "stiffness", "long", "alignment", "nature", "collapses"},
+    "long_horizon": {"symmetric"},
+}
 # These measure more than one core, or the command line as a user starts it.
 ALL_CORES = ("montecarlo", "first_result")
 THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}

@@ -1,15 +1,16 @@
 """Structure over long times: energy error of conservative systems against run time.
 
 Six problems, 60 s each. Projected, unstabilised and Baumgarte-stabilised Dopri8 and Tsit5 at
-tolerances 1e-4 to 1e-12, against Gauss-Legendre methods of order 2 and 4 with fixed steps, which
-are symmetric (benchmarks/shared/gauss.py), with the same projection and without.
+tolerances 1e-4 to 1e-12. Gauss-Legendre methods of order 2 and 4, which are symmetric, were compared
+with them once; their runs and the comparison stay in the record, and docs/long_times.md says by
+which commit's scripts they were made.
 
 Trajectories of the tracker diverge whatever the method, so energies are compared, not states. The
 energy error is (E - E0) / scale with the largest kinetic energy of the finest run as scale; its
-drift is the slope of a straight line fitted over time. The fixed steps run in a bare loop without
-step size control, which favours them.
+drift is the slope of a straight line fitted over time.
 """
 
+import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,47 +25,43 @@ from problems.conservative import PROBLEMS, Problem, simple_pendulum
 from sections import long_page
 from shared.clock import compiled, ready, rounded, timed
 from shared.command import benchmark
-from shared.gauss import Gauss
 from shared.methods import evaluations, trajectory
+from shared.record import RESULTS, environment
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration.problem import prepare
 
 GAIN = 10.0  # 1/s, of Baumgarte's feedback: the package's default
+LEVELS = (1e-3, 1e-6, 1e-9)
+SOLVERS = {"dopri8": diffrax.Dopri8(), "tsit5": diffrax.Tsit5()}
+SYMMETRIC = ("gauss", "midpoint")
+# The tolerance whose error over time is kept for the figure, with Dopri8.
+SERIES = 1e-6
 
 
 @dataclass(frozen=True)
-class Family:
-    """A method but for its tolerance or step.
+class Size:
+    """How much is run.
 
     Attributes:
-        solver: "dopri8", "tsit5", "gauss" (two stages) or "midpoint".
-        hold: "projection", "baumgarte" or "none".
+        families: solvers, and what holds the joints: "projection", "baumgarte" or "none".
+        horizon, every: [s], every is the time between outputs.
+        slow: the most seconds of a run; finer settings of a family that took more are left out.
     """
 
-    solver: str
-    hold: str
-
-    @property
-    def name(self) -> str:
-        return f"{self.solver}, {self.hold}"
-
-    @property
-    def fixed(self) -> bool:
-        return self.solver in ("gauss", "midpoint")
-
-    @property
-    def projected(self) -> bool:
-        return self.hold == "projection"
+    problems: tuple[Callable[[], Problem], ...] = PROBLEMS
+    families: tuple[tuple[str, str], ...] = tuple(
+        (s, h) for s in SOLVERS for h in ("projection", "none", "baumgarte")
+    )
+    horizon: float = 60.0
+    every: float = 0.5
+    tolerances: tuple[float, ...] = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+    repeats: int = 3
+    slow: float = 1.5
 
 
-FAMILIES = (
-    *(Family(s, h) for s in ("dopri8", "tsit5") for h in ("projection", "none", "baumgarte")),
-    Family("gauss", "projection"), Family("gauss", "none"), Family("midpoint", "projection"),
-)  # fmt: skip
-SOLVERS: dict[str, diffrax.AbstractSolver] = {
-    "dopri8": diffrax.Dopri8(), "tsit5": diffrax.Tsit5(), "gauss": Gauss(2), "midpoint": Gauss(1),
-}  # fmt: skip
+QUICK = Size(
+    (simple_pendulum,), (("dopri8", "projection"),), horizon=2.0, tolerances=(1e-4, 1e-8), repeats=1
+)
 
 
 class Path(NamedTuple):
@@ -79,65 +76,22 @@ class Path(NamedTuple):
     worst: Array
 
 
-def _energies(system: stm.System, states: stm.State) -> tuple[Array, Array]:
-    """Total and kinetic [J]."""
-    found = jax.vmap(lambda state: stm.dynamics.energy(system, state, jnp.zeros(())))(states)
-    return found.kinetic + found.potential, found.kinetic
-
-
-def adaptive(family: Family, redundant: bool) -> Callable[..., Path]:
+def integration(solver: diffrax.AbstractSolver, hold: str, redundant: bool) -> Callable[..., Path]:
     """(tolerance, gain, system, state, ts) -> Path.
 
     Baumgarte's equations with no gain are the unstabilised ones, so these share a compilation.
     """
-    solver = SOLVERS[family.solver]
 
     def run(tol: Any, gain: Any, system: stm.System, state: stm.State, ts: Any) -> Path:
-        hold = stm.Projection() if family.projected else stm.Baumgarte(gain, gain, gain)
-        integrate = trajectory(stm.Tree(redundant=redundant), solver, stabilisation=hold)
-        found = integrate(system, state, ts, tol)
+        held = stm.Projection() if hold == "projection" else stm.Baumgarte(gain, gain, gain)
+        tree = stm.Tree(redundant=redundant)
+        found = trajectory(tree, solver, stabilisation=held)(system, state, ts, tol)
         # a run that stopped keeps its last time
         good = found.ts >= ts * (1 - 1e-12)
+        of = jax.vmap(lambda state: stm.dynamics.energy(system, state, jnp.zeros(())))(found.states)
         took, not_taken = found.counts.accepted[-1], found.counts.rejected[-1]
         worst, calls = found.worst.position[-1], evaluations(solver, took + not_taken)
-        energies = _energies(system, found.states)
-        return Path(good, *energies, took, not_taken, calls, worst)
-
-    return run
-
-
-def fixed(family: Family, redundant: bool) -> Callable[..., Path]:
-    """(steps between outputs, system, state, ts) -> Path, all steps of one length."""
-    hold = stm.Projection() if family.projected else stm.Unstabilised()
-    tree, solver = stm.Tree(redundant=redundant), SOLVERS[family.solver]
-    method = stm.Method(formulation=tree, solver=solver, stabilisation=hold, steps="state")
-
-    def run(count: Any, system: stm.System, state: stm.State, ts: Array) -> Path:
-        problem = prepare(system, method)
-        solver, terms = problem.solver(), diffrax.ODETerm(problem.field)
-        h = (ts[1] - ts[0]) / count
-        y0 = method.formulation.to_vector(problem.model, state)
-
-        def step(now: Any) -> Any:
-            i, t, y, inner, _ = now
-            at = t + i * h
-            y, _, _, inner, result = solver.step(terms, at, at + h, y, problem.model, inner, False)
-            good = (result == diffrax.RESULTS.successful) & jnp.all(jnp.isfinite(y))
-            return i + 1, t, y, inner, good
-
-        def to_next(now: Any, t: Any) -> Any:
-            y, inner, good = now
-            start = (jnp.zeros((), int), t, y, inner, good)
-            _, _, y, inner, good = jax.lax.while_loop(lambda c: (c[0] < count) & c[4], step, start)
-            return (y, inner, good), (y, good)
-
-        begin = (y0, solver.init(terms, ts[0], ts[0] + h, y0, problem.model), jnp.asarray(True))
-        (_, (inner, worst), _), (ys, good) = jax.lax.scan(to_next, begin, ts[:-1])
-        ys = jnp.concatenate([y0[None], ys])
-        good = jnp.concatenate([jnp.ones(1, bool), good])
-        states = jax.vmap(lambda y: method.formulation.to_state(problem.model, y))(ys)
-        took, none = count * jnp.sum(good[1:]), jnp.zeros((), int)
-        return Path(good, *_energies(system, states), took, none, inner.evaluations, worst.position)
+        return Path(good, of.kinetic + of.potential, of.kinetic, took, not_taken, calls, worst)
 
     return run
 
@@ -149,98 +103,64 @@ class Runner:
         self.ts, self.repeats = jnp.asarray(ts), repeats
         self.compiled: dict[Any, tuple[Any, float]] = {}
 
-    def __call__(self, family: Family, problem: Any, setting: float) -> tuple[dict[str, Any], Path]:
-        """One run at a tolerance, or with so many steps between outputs: its record, its path."""
-        gain = jnp.asarray(GAIN if family.hold == "baumgarte" else 0.0)
-        size = (jnp.asarray(int(setting)),) if family.fixed else (jnp.asarray(setting), gain)
-        arguments = (*size, problem.system, problem.state, self.ts)
-        kind = "held" if family.projected else "free"
+    def __call__(
+        self, family: tuple[str, str], problem: Problem, tolerance: float
+    ) -> tuple[dict[str, Any], Path]:
+        """One run: its record, its path."""
+        solver, hold = family
+        gain = jnp.asarray(GAIN if hold == "baumgarte" else 0.0)
+        given = (jnp.asarray(tolerance), gain, problem.system, problem.state, self.ts)
         joints = tuple((joint.name, problem.redundant) for joint in problem.system.joints)
-        key = (family.solver, kind, joints)
+        key = (solver, hold == "projection", joints)
         if key not in self.compiled:
-            make = fixed if family.fixed else adaptive
-            run = make(family, problem.redundant)
-            self.compiled[key] = compiled(run, *arguments, clock=time.process_time)
+            run = integration(SOLVERS[solver], hold, problem.redundant)
+            self.compiled[key] = compiled(run, *given, clock=time.process_time)
         call, seconds = self.compiled[key]
-        cost, path = timed(call, *arguments, repeats=self.repeats)
+        cost, path = timed(call, *given, repeats=self.repeats)
         path = ready(path)
-        every, last = float(self.ts[1] - self.ts[0]), int(np.flatnonzero(path.good)[-1])
         counts = ("accepted", "rejected", "evaluations")
         row = {
-            "family": family.name, "solver": family.solver, "hold": family.hold,
-            "tolerance": None if family.fixed else setting,
-            "step": every / setting if family.fixed else None,
-            "seconds": rounded(cost.processor.median), "cost": cost.to_dict(),
+            "family": f"{solver}, {hold}", "solver": solver, "hold": hold, "tolerance": tolerance,
+            "step": None, "seconds": rounded(cost.processor.median), "cost": cost.to_dict(),
             "compile_seconds": rounded(seconds),
             **{name: int(getattr(path, name)) for name in counts},
-            "residual": rounded(path.worst), "reached": float(self.ts[last]),
+            "residual": rounded(path.worst),
+            "reached": float(self.ts[int(np.flatnonzero(path.good)[-1])]),
             "completed": bool(np.all(path.good)),
         }  # fmt: skip
         return row, path
 
 
-LEVELS = (1e-3, 1e-6, 1e-9)
-
-
-@dataclass(frozen=True)
-class Size:
-    """How much is run.
-
-    Attributes:
-        horizon, every: [s], every is the time between outputs.
-        counts: fixed steps from one output to the next.
-        slow: the most seconds of a run; finer settings of a family that took more are left out.
-    """
-
-    problems: tuple[Callable[[], Problem], ...] = PROBLEMS
-    families: tuple[Family, ...] = FAMILIES
-    horizon: float = 60.0
-    every: float = 0.5
-    tolerances: tuple[float, ...] = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
-    counts: tuple[int, ...] = (10, 20, 40, 80, 160, 320)
-    repeats: int = 3
-    slow: float = 1.5
-
-
-QUICK = Size(
-    (simple_pendulum,),
-    tuple(f for f in FAMILIES if f.name in ("dopri8, projection", "gauss, projection")),
-    horizon=2.0, tolerances=(1e-4, 1e-8), counts=(10, 40), repeats=1,
-)  # fmt: skip
-# The runs whose error over time is kept for the figure.
-SERIES = {
-    *((f"dopri8, {hold}", 1e-6) for hold in ("projection", "none", "baumgarte")),
-    *((family, 40) for family in ("gauss, projection", "gauss, none", "midpoint, projection")),
-}
-
-
-def run_problem(problem: Problem, size: Size, runner: Runner) -> dict[str, Any]:
-    """All families on one problem."""
-    found: list[tuple[dict[str, Any], Any, float]] = []
+def run_problem(
+    problem: Problem, size: Size, runner: Runner, former: dict[str, Any]
+) -> dict[str, Any]:
+    """All families on one problem, beside the symmetric methods of the former record."""
+    found: list[tuple[dict[str, Any], Any]] = []
     for family in size.families:
-        for setting in size.counts if family.fixed else size.tolerances:
-            row, path = runner(family, problem, setting)
-            found.append((row, path, setting))
-            print(f"{problem.name}: {family.name} {setting:g}: {row['seconds']:.3g} s", flush=True)
+        for tolerance in size.tolerances:
+            row, path = runner(family, problem, tolerance)
+            found.append((row, path))
+            said = f"{row['family']} {tolerance:g}: {row['seconds']:.3g} s"
+            print(f"{problem.name}: {said}", flush=True)
             if row["seconds"] > size.slow:
                 break
     # the largest kinetic energy [J] of the finest completed run of the first family
-    first = size.families[0].name
-    whole = [path for row, path, _ in found if row["family"] == first and row["completed"]]
+    first = found[0][0]["family"]
+    whole = [path for row, path in found if row["family"] == first and row["completed"]]
     scale = float(np.max(whole[-1].kinetic))
-    runs = []
-    for row, path, setting in found:
+    for row, path in found:
         row.update(energy_error(runner.ts, path, scale))
-        if (row["family"], setting) in SERIES:
+        if (row["solver"], row["tolerance"]) == ("dopri8", SERIES):
             row["series"] = rounded(errors(path, scale))
-        runs.append(row)
+    kept = [row for row in former.get("runs", []) if row["solver"] in SYMMETRIC]
+    runs = [*(row for row, _ in found), *kept]
     return {
         "name": problem.name,
         "title": problem.title,
         "scale": scale,
         "runs": runs,
         "cheapest": {str(level): cheapest(runs, level) for level in LEVELS},
-        "answers": {cost: answer(runs, cost) for cost in ("seconds", "evaluations")},
+        "answers": former.get("answers", {}),
     }
 
 
@@ -273,48 +193,27 @@ def cheapest(runs: list[dict[str, Any]], level: float) -> dict[str, Any]:
     return best
 
 
-def answer(runs: list[dict[str, Any]], cost: str) -> dict[str, Any]:
-    """Every completed fixed-step run against the best projected explicit run that costs no more.
-
-    The ratio is the fixed-step run's error over the explicit run's: above 1 the explicit run is
-    better at equal cost. Where no explicit run is as cheap there is none to compare with.
-    """
-    whole = [row for row in runs if row["largest"] is not None]
-    explicit = [row for row in whole if row["step"] is None and row["hold"] == "projection"]
-    pairs = []
-    for row in whole:
-        if row["step"] is None:
-            continue
-        rivals = [other for other in explicit if other[cost] <= row[cost]]
-        best = min(rivals, key=lambda other: other["largest"], default=None)
-        over = lambda key, a=row, b=best: rounded(abs(a[key] / b[key])) if b and b[key] else None
-        against = best and [best["family"], best["tolerance"]]
-        which = {"family": row["family"], "step": row["step"], "cost": row[cost]}
-        pairs.append({
-            **which, "against": against, "ratio": over("largest"), "drift_ratio": over("drift"),
-        })  # fmt: skip
-    compared = [pair for pair in pairs if pair["ratio"] is not None]
-    return {
-        "pairs": pairs,
-        "compared": len(compared),
-        "explicit_better": sum(pair["ratio"] > 1 for pair in compared),
-        "explicit_drifts_less": sum((pair["drift_ratio"] or 0) > 1 for pair in compared),
-    }
-
-
 def record(size: Size) -> Iterator[dict[str, Any]]:
     """What there is after each problem, so that a long run leaves what it has."""
+    former = json.loads((RESULTS / "long_horizon.json").read_text())
+    once = former.get("measured", {}).get("symmetric", former["environment"])
+    same = size.horizon == former["horizon"]
+    kept = {row["name"]: row for row in former["problems"]} if same else {}
     ts = np.linspace(0.0, size.horizon, round(size.horizon / size.every) + 1)
     runner = Runner(ts, size.repeats)
     problems: list[dict[str, Any]] = []
     for make in size.problems:
-        problems.append(run_problem(make(), size, runner))
+        problem = make()
+        problems.append(run_problem(problem, size, runner, kept.get(problem.name, {})))
+        # written at once, over the former record
+        left = [row for name, row in kept.items() if name not in {p["name"] for p in problems}]
         yield {
             "what": "energy error of conservative systems over long times",
             "seconds": "processor time of the process on one core",
             "horizon": size.horizon,
             "every": size.every,
-            "problems": problems,
+            "measured": {"explicit": environment(), **({"symmetric": once} if same else {})},
+            "problems": [*problems, *left],
         }
 
 

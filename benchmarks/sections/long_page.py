@@ -93,7 +93,7 @@ def answers(problems: list[Row]) -> str:
 
     def of(family: str, cost: str) -> Any:
         def cell(found: Row) -> str:
-            pairs = [p for p in found[cost]["pairs"] if p["family"] == family]
+            pairs = [p for p in found[cost]["pairs"] if p["family"] == family] if found else []
             ratios = [p["ratio"] for p in pairs if p["ratio"] is not None]
             span = f", {min(ratios):.0e} to {max(ratios):.0e}" if ratios else ""
             return f"{sum(ratio > 1 for ratio in ratios)} of {len(ratios)}{span}"
