@@ -8,7 +8,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -34,20 +34,16 @@ class Timing:
     spread: float
     repeats: int
 
-    def to_dict(self) -> dict[str, float]:
-        """As plain numbers, for JSON."""
-        return asdict(self)
+    to_dict = asdict
 
 
-class Cost(NamedTuple):
+@dataclass(frozen=True)
+class Cost:
     """Seconds of the processor and of the clock."""
 
     processor: Timing
     clock: Timing
-
-    def to_dict(self) -> dict[str, Any]:
-        """As plain numbers, for JSON."""
-        return {"processor": self.processor.to_dict(), "clock": self.clock.to_dict()}
+    to_dict = asdict
 
 
 def summary(seconds: list[float]) -> Timing:
