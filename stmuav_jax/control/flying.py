@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError
+from ..flight.sensed import centre_of_mass, inertia_about_centre, inner_momentum
 from ..mechanics.state import State
 from ..mechanics.system import System
 from ..rotorcraft.allocation import RotorLimits, allocate, check_lift, wrench_map
@@ -16,10 +17,8 @@ from ..rotorcraft.motor import MotorRotors
 from ..rotorcraft.rotor import Rotors
 from ..sensing.sensors import gravity_of
 from .geometric import (
-    BaseMotion,
     FlightGains,
     MassProperties,
-    WantedWrench,
     Waypoint,
     base_motion,
     wrench_for,
@@ -65,7 +64,6 @@ class FlightController(eqx.Module):
     inverse: Float[Array, "k 4"]
     limits: RotorLimits | None
     period: Float[Array, ""]
-    body: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -84,37 +82,41 @@ class FlightController(eqx.Module):
                 f"{len(found)} sets and gravity of {jnp.asarray(self.gravity).tolist()} m/s^2."
             )
         motors = found[0]
-        rotors = motors.rotors if isinstance(motors, MotorRotors) else motors
+        if system.index(_rotors(motors).body) != 0:
+            raise ModelError(
+                f"A flight controller needs its rotors on the first body, '{system.names[0]}', but they "
+                f"are on '{_rotors(motors).body}'."
+            )
+        rotors = _rotors(motors)
         own = getattr(motors, "squared_limits", None)
         if limits is None and own is not None:
             limits = RotorLimits(jnp.sqrt(own[0]), jnp.sqrt(own[1]))
         weight = jnp.sum(system.bodies.mass) * jnp.linalg.norm(self.gravity)
         if limits is not None:
             check_lift(rotors, limits, weight)
-        self.body = system.index(rotors.body)
         # moments are about the base's centre of mass: the map does not change with the posture
-        self.wrenches = wrench_map(rotors, system.bodies.com[self.body])
+        self.wrenches = wrench_map(rotors, system.bodies.com[0])
         self.inverse = jnp.linalg.pinv(self.wrenches)
         self.gains = FlightGains() if gains is None else gains
         self.limits, self.period = limits, jnp.asarray(1.0 / rate)
-        self.mass = rigid(system, system.reference, self.body) if mass is None else mass
+        self.mass = mass_properties(system, system.reference) if mass is None else mass
 
     def start(self) -> FlightMemory:
         """First memory."""
         return FlightMemory(jnp.zeros(3))
 
-    def wanted(self, estimate: Any, reference: Waypoint, memory: FlightMemory) -> WantedWrench:
-        """Wrench about the centre of mass of the whole machine."""
-        base = self._base(estimate)
-        mass = self.mass(estimate) if callable(self.mass) else self.mass
-        return wrench_for(base, reference, mass, self.gains, self.gravity, memory.integral)
-
     def __call__(
         self, estimate: Any, reference: Waypoint, memory: FlightMemory
     ) -> tuple[Float[Array, " k"], FlightMemory]:
         """Squared rotor speeds (k,) [rad^2/s^2], and the memory."""
-        base = self._base(estimate)
         mass = self.mass(estimate) if callable(self.mass) else self.mass
+        return self.command(estimate, reference, memory, mass)
+
+    def command(
+        self, estimate: Any, reference: Waypoint, memory: FlightMemory, mass: MassProperties
+    ) -> tuple[Float[Array, " k"], FlightMemory]:
+        """Squared rotor speeds (k,) and the memory, with given mass properties."""
+        base = base_motion(estimate) if isinstance(estimate, State) else estimate
         found = wrench_for(base, reference, mass, self.gains, self.gravity, memory.integral)
         lever = jnp.cross(mass.centre, jnp.array([0.0, 0.0, 1.0]) * found.wrench[0])
         wrench = found.wrench.at[1:].add(lever)
@@ -122,9 +124,6 @@ class FlightController(eqx.Module):
         error = base.r - reference.r
         integral = memory.integral + jnp.where(given, self.period, 0.0) * error
         return squared, FlightMemory(integral)
-
-    def _base(self, estimate: Any) -> BaseMotion:
-        return base_motion(estimate, self.body) if isinstance(estimate, State) else estimate
 
     def _allocated(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
         """Squared speeds, and whether they give the wrench."""
@@ -147,14 +146,22 @@ class FlightController(eqx.Module):
         return jax.lax.cond(inside, lambda: (least, jnp.ones((), bool)), at_limits)
 
 
-def rigid(system: System, state: State, body: int = 0) -> MassProperties:
-    """Mass properties of all bodies at a state, parts at rest against the base, body `body`."""
-    mass = system.bodies.mass
-    R_0w = base_motion(state, body).R.T
-    arms = (state.r - system.com(state)) @ R_0w.T
-    R = jnp.einsum("ij,njk->nik", R_0w, jax.vmap(lambda k: base_motion(state, k).R)(jnp.arange(len(mass))))
-    own = jnp.einsum("nij,njk,nlk->il", R, system.bodies.inertia, R)
-    square = jnp.sum(mass * jnp.sum(arms**2, axis=1))
-    J = own + square * jnp.eye(3) - jnp.einsum("n,ni,nj->ij", mass, arms, arms)
-    zero = jnp.zeros(3)
-    return MassProperties(jnp.sum(mass), R_0w @ (system.com(state) - state.r[body]), J, zero, zero)
+def _rotors(force: Rotors | MotorRotors) -> Rotors:
+    return force.rotors if isinstance(force, MotorRotors) else force
+
+
+def mass_properties(
+    system: System, state: State, moment: Float[Array, "3"] | None = None
+) -> MassProperties:
+    """Mass properties of all bodies at a state; the first body is the base.
+
+    Args:
+        moment: moment that accelerates the other parts against the base (3,) [N m], by default zero.
+    """
+    return MassProperties(
+        jnp.sum(system.bodies.mass),
+        centre_of_mass(system, state),
+        inertia_about_centre(system, state),
+        inner_momentum(system, state),
+        jnp.zeros(3) if moment is None else moment,
+    )

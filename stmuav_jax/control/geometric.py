@@ -136,9 +136,9 @@ class BaseMotion(NamedTuple):
     omega: Float[Array, "3"]
 
 
-def base_motion(state: State, k: int = 0) -> BaseMotion:
-    """Motion of body k of a state."""
-    return BaseMotion(state.r[k], rotation_matrix(state.p[k]), state.v[k], state.omega[k])
+def base_motion(state: State) -> BaseMotion:
+    """Motion of the first body of a state."""
+    return BaseMotion(state.r[0], rotation_matrix(state.p[0]), state.v[0], state.omega[0])
 
 
 class WantedWrench(NamedTuple):

@@ -36,7 +36,7 @@ class PlantState(eqx.Module):
     """State of a plant at a sample; see `Plant.reset`.
 
     Attributes:
-        k: number of the sample. t: its time [s].
+        k: number of the sample. t: its time [s]. t0: time of the first sample [s].
         state: true state of all bodies. internal: true states of force elements (z,).
         estimate: what a controller sees.
         applied: inputs that were held until this sample (m,).
@@ -50,6 +50,7 @@ class PlantState(eqx.Module):
 
     k: Int[Array, ""]
     t: Float[Array, ""]
+    t0: Float[Array, ""]
     state: State
     internal: Float[Array, " z"]
     estimate: Any
@@ -176,7 +177,7 @@ class Plant(eqx.Module):
         readings = self.bench.arrived(queues)
         estimate, memory = self._estimated(t, state, internal, readings, self.before, self.memory)
         return PlantState(
-            k, t, state, internal, estimate, self.before, readings, motion, pending, queues,
+            k, t, t, state, internal, estimate, self.before, readings, motion, pending, queues,
             memory, key,
         )  # fmt: skip
 
@@ -185,9 +186,8 @@ class Plant(eqx.Module):
         queue = jnp.concatenate([now.pending, jnp.asarray(inputs, self.before.dtype)[None]])
         held, pending = queue[0], queue[1:]
         k = now.k + 1
-        # times are counted from the start in whole periods, so that round-off does not add up
-        start = now.t - now.k / self.rate
-        t = start + k / self.rate
+        # times are counted in whole periods, so that round-off does not add up
+        t = now.t0 + k / self.rate
         motion = self.motion.moved(now.motion, held, t)
         state, internal = self.motion.state(motion.y)
         seen = self._seen(t, state, internal, held)
@@ -197,7 +197,7 @@ class Plant(eqx.Module):
         readings = self.bench.arrived(queues)
         estimate, memory = self._estimated(t, state, internal, readings, held, now.memory)
         return PlantState(
-            k, t, state, internal, estimate, held, readings, motion, pending, queues, memory,
+            k, t, now.t0, state, internal, estimate, held, readings, motion, pending, queues, memory,
             now.key,
         )  # fmt: skip
 
