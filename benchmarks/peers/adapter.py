@@ -26,6 +26,16 @@ class Setting:
     options: dict[str, Any] = field(default_factory=dict)
 
 
+def tolerances(solver: str, powers: Iterable[int] = range(4, 13)) -> list[Setting]:
+    """Tolerances of 10^-k."""
+    return [Setting(solver, tolerance=10.0**-k) for k in powers]
+
+
+def steps(solver: str, *lengths: float) -> list[Setting]:
+    """Fixed steps [s]."""
+    return [Setting(solver, step=length) for length in lengths]
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What one run gives.
@@ -113,17 +123,11 @@ class Peer(ABC):
 
     def unsupported(self, scene: Scene) -> str:
         """What our adapter lacks for this scene; empty if it can be run."""
-        del scene
         return ""
 
     @abstractmethod
-    def settings(self) -> list[Setting]:
-        """From coarse to fine."""
-
-    def settings_for(self, scene: Scene) -> list[Setting]:
-        """Those for a scene, where that makes a difference."""
-        del scene
-        return self.settings()
+    def settings(self, scene: Scene | None = None) -> list[Setting]:
+        """From coarse to fine; those for a scene, where that makes a difference."""
 
     @abstractmethod
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
@@ -131,5 +135,4 @@ class Peer(ABC):
 
     def acceleration_seconds(self, scene: Scene) -> float | None:
         """Cost of one evaluation of all accelerations at the start [s], in a tight loop."""
-        del scene
         return None

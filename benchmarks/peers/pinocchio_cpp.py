@@ -19,7 +19,7 @@ import numpy as np
 from problems.plain import Start, plain, start, starts, why_not
 from problems.tree import why_no_tree
 
-from peers.adapter import Outcome, Peer, Prepared, Setting
+from peers.adapter import Outcome, Peer, Prepared, Setting, tolerances
 from peers.pinocchio_model import linked, model_text, start_vectors, starts_text
 from stmuav_jax import Scene, State
 
@@ -146,8 +146,8 @@ class PinocchioCpp(Peer):
     def unsupported(self, scene: Scene) -> str:
         return why_not(scene) or why_no_tree(plain(scene))
 
-    def settings(self) -> list[Setting]:
-        return [Setting("rkf78", tolerance=10.0**-k) for k in (4, 5, 6, 7, 8, 9, 10, 11, 12)]
+    def settings(self, scene: Scene | None = None) -> list[Setting]:
+        return tolerances("rkf78")
 
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         program, seconds = compile_program()
