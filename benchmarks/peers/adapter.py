@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from stmuav_jax import Scene
+from stmuav_jax import Scene, State
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,19 @@ class Peer(ABC):
     @abstractmethod
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         """Build the model and, where there is something to compile, compile it."""
+
+    def throughput(
+        self, scene: Scene, states: State, t1: float, setting: Setting
+    ) -> tuple[float, np.ndarray] | None:
+        """Trajectories per second on one thread, and where they end; None without such a mode.
+
+        Args:
+            states: consistent starts, arrays (k, n, .). t1: end [s].
+
+        Returns:
+            The median rate [1/s]; centres of mass at t1 (k, n, 3) [m].
+        """
+        return None
 
     def acceleration_seconds(self, scene: Scene) -> float | None:
         """Cost of one evaluation of all accelerations at the start [s], in a tight loop."""

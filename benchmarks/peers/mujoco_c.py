@@ -228,24 +228,15 @@ class MujocoC(Peer):
         return loop_seconds(lambda: world.mujoco.mj_forward(world.model, world.data))
 
     def throughput(
-        self, scene: Scene, states: State, t1: float, setting: Setting, threads: int = 1
+        self, scene: Scene, states: State, t1: float, setting: Setting
     ) -> tuple[float, np.ndarray]:
-        """Trajectories per second of a rollout on some threads, and where they end.
-
-        Args:
-            states: consistent starts, arrays (k, n, .). t1: end [s].
-
-        Returns:
-            The median rate of three [1/s]; centres of mass at t1 (k, n, 3) [m].
-        """
         rollout: Any = importlib.import_module("mujoco.rollout")
 
         world = World(scene, setting.step or 1e-3)
         count = int(whole_steps(scene.t0, np.array([t1]), world.step)[0])
         first = np.stack([world.begin(state) for state in starts(states)])
         controls = np.broadcast_to(world.control(count), (len(first), count, world.model.nu))
-        datas = [world.mujoco.MjData(world.model) for _ in range(max(threads, 1))]
-        with rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
-            call = lambda: pool.rollout(world.model, datas, first, controls, nstep=count)[0]
+        with rollout.Rollout(nthread=0) as pool:
+            call = lambda: pool.rollout(world.model, world.data, first, controls, nstep=count)[0]
             seconds, ends = loop_seconds(call, loops=1, repeats=3), call()[:, -1]
         return len(first) / seconds, np.stack([world.positions(end)[0] for end in ends])

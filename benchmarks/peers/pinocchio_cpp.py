@@ -176,14 +176,6 @@ class PinocchioCpp(Peer):
     def throughput(
         self, scene: Scene, states: State, t1: float, setting: Setting
     ) -> tuple[float, np.ndarray]:
-        """Trajectories per second on one thread, one after the other, and where they end.
-
-        Args:
-            states: consistent starts, arrays (k, n, .). t1: end [s].
-
-        Returns:
-            The median rate [1/s]; centres of mass at t1 (k, n, 3) [m].
-        """
         program, _ = compile_program()
         texts, tolerance = Texts(scene, starts(states)), setting.tolerance or 1e-6
         words = texts.call(program, "many", tolerance, self.repeats, t1)

@@ -173,13 +173,15 @@ def throughput(
         Rows; none for a peer without a mode for batches.
     """
     rows: list[dict[str, Any]] = []
-    offered = getattr(peer, "throughput", None)
     empty = {"method": peer.name, "per_second": None}
-    for setting in peer.settings() if offered else ():
+    for setting in peer.settings():
         try:
-            rate, ends = offered(*given, setting)  # pyright: ignore[reportOptionalCall]
+            done = peer.throughput(*given, setting)
         except Exception as error:
             return [*rows, empty | {"failure": reason(error)}]
+        if done is None:
+            return []
+        rate, ends = done
         found, count = errors(ends, exact), len(ends)
         lost = int(np.sum(~np.isfinite(ends).all((1, 2))))
         said = f"{lost} of {count} trajectories ended with a state that is not finite."
