@@ -18,21 +18,18 @@ import sys
 import time
 from pathlib import Path
 
+from report import PARTS
 from shared.command import begin, parser
 from shared.record import ALLOW, MEASURED, RESULTS, ROOT, commit, moved
 
 FOLDER = Path(__file__).parent
-SUITE = (
-    "work_precision", "acceleration", "batch", "scaling", "gradient", "hexacopter", "scenes",
-    "published", "stiff",
-)  # fmt: skip
 ALONE = (
     "stiff", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "failure",
     "montecarlo",
 )  # fmt: skip
 # Result -> the script that measures it, with its arguments, in the order of running.
 BENCHMARKS: dict[str, tuple[str, ...]] = {
-    **{f"suite_{name}": ("suite.py", "--only", name, "--no-report") for name in SUITE},
+    **{f"suite_{name}": ("suite.py", "--only", name, "--no-report") for name in PARTS},
     **{name: (f"{name}.py",) for name in ALONE},
 }
 # Parts of a result that no script measures any more: their question is settled, and they stay as
