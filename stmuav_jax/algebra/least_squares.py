@@ -32,6 +32,7 @@ class SearchReason(AbstractReason):
     PATIENCE = 2
     NOT_FINITE = 3
     INTERRUPTED = 4
+    LIMIT_PASSED = 5
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,10 @@ class Search:
                 f"The loss is not finite at step {self.steps}; what came before is kept: {at}."
             ),
             SearchReason.INTERRUPTED: f"Interrupted after {self.steps} steps; {at}.",
+            SearchReason.LIMIT_PASSED: (
+                f"Ended after {self.steps} steps with a solution that passes a limit: it conflicts "
+                f"with what else is wanted; {at}."
+            ),
         }[self.reason]
 
 

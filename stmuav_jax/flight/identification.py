@@ -46,7 +46,7 @@ class Unknown(NamedTuple):
     Attributes:
         name: name of the parameter.
         size: typical size of the number, in the parameter's unit.
-        places: all entries that have this value, such as ((0, 1), (1, 0)) of an inertia tensor;
+        places: places of all entries with this value, such as ((0, 1), (1, 0)) of an inertia tensor;
             ((),) for a plain number.
     """
 
@@ -73,7 +73,7 @@ class Identified:
         values: estimates (p,).
         covariance: covariance of their errors (p, p).
         standard_deviations: standard deviations of their errors (p,).
-        singular_values: those of J in units of the sizes, largest first (p,): reciprocals of
+        singular_values: singular values of J in units of the sizes, largest first (p,): reciprocals of
             the standard deviations along each direction, relative to the parameters' sizes.
         reduced_chi_square: the sum of squares over (numbers in the record less p); near
             one if sigma is right.
@@ -146,13 +146,13 @@ def motion_model(
     """Predictions (k, m) of the record of a motion, as a function of parameters (p,).
 
     Args:
-        make: parameters -> the mechanism: a state space, or a system, whose coordinates are then
-            those of `space`; see `from_table`.
-        start: the point at the first time, known, or a function of the state space.
+        make: function parameters -> mechanism: a state space, or a system, whose coordinates are
+            then those of `space`; see `from_table`.
+        start: point at the first time, known, or a function of the state space.
         ts: times of the record (k,), increasing [s].
-        outputs: what it has in each row: names of states, as departures from the start, and
+        outputs: columns of the record: names of states, as departures from the start, and
             sensors, in this order; or a function (state space, point) -> (m,).
-        inputs: known ones by name, numbers or histories; see `stmuav_jax.mechanics.with_inputs`.
+        inputs: known inputs by name, numbers or histories; see `stmuav_jax.mechanics.with_inputs`.
 
     Raises:
         SettingError: an unknown name, a sensor whose readings are no vector, or a system without
@@ -270,11 +270,12 @@ def identify(
     """Identify parameters by least squares from a record.
 
     Args:
-        predict: parameters (p,) -> predictions (k, m), such as `motion_model`.
-        record: (k, m). sigma: standard deviations of its errors (m,).
-        start: where the search starts, by label or in order. sizes: typical sizes (p,).
-        min_singular_value: see `check_identifiable`.
-        report, resume: see `search`.
+        predict: function parameters (p,) -> predictions (k, m), such as `motion_model`.
+        record: measurements (k, m). sigma: standard deviations of their errors (m,).
+        start: parameters at which the search starts, by label or in order.
+        sizes: typical sizes of the parameters (p,).
+        min_singular_value: bound of `check_identifiable`.
+        report, resume: arguments of `search`.
 
     Raises:
         IdentifiabilityError: the record does not determine a direction; the message names it.

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import stmuav_jax as stm
 from stmuav_jax import PART_II, SettingError, make_scene
 from stmuav_jax.dynamics import energy
 from stmuav_jax.dynamics.formulations.augmented import Augmented
@@ -101,6 +102,17 @@ def test_a_trims_inputs_hold():
     assert level < 0.01
 
 
+def test_a_trim_of_another_scene():
+    """The rotors of the hexacopter at its trim carry its weight, also as shares of drawn factors."""
+    study = flights("hexacopter", inputs="trim")
+    drawn, _ = build(study, input__rotor_1=1.1)
+    for system, more in ((study.nominal()[0], 0.0), (drawn, 0.1 / 6)):
+        rotors = next(f for f in system.forces if isinstance(f, stm.rotorcraft.Rotors))
+        lift = float(rotors.k_f * jnp.sum(rotors.speed_squared))
+        weight = 9.81 * float(jnp.sum(system.bodies.mass))
+        assert lift == pytest.approx(weight * (1 + more), rel=1e-10)
+
+
 @pytest.mark.parametrize(
     ("factor", "words"),
     [
@@ -123,8 +135,8 @@ def test_refusals():
         flights("hexacopter", gusts=True)
     with pytest.raises(SettingError, match="no airframe"):
         flights("tracker", drag=True)
-    with pytest.raises(SettingError, match="trim are for uav_tracker"):
-        flights("hexacopter", inputs="trim")
+    with pytest.raises(SettingError, match="spin has no inputs that a trim could find"):
+        flights("spin", inputs="trim")
     with pytest.raises(SettingError, match="that it could multiply"):
         flights("hexacopter", relative=frozenset({"start.p"})).entry("start.p")
 
