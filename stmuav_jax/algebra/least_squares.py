@@ -20,6 +20,7 @@ from jaxtyping import Array, PyTree
 from ..checks.errors import SettingError
 from ..checks.reason import AbstractReason
 from .compiler import quick_jit
+from .derivative import value_and_jacobian
 
 Method = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 
@@ -89,9 +90,8 @@ def all_at_once(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
         flat, unravel = ravel_pytree(primals[0])
         along = ravel_pytree(tangents[0])[0]
-        push = lambda e: jax.jvp(function, primals, (unravel(e),))
-        out, columns = jax.vmap(push, out_axes=(0, -1))(jnp.eye(flat.shape[0], dtype=flat.dtype))
-        return jax.tree.map(lambda x: x[0], out), jax.tree.map(lambda J: J @ along, columns)
+        value, columns = value_and_jacobian(lambda x: function(unravel(x)), flat)
+        return value, jax.tree.map(lambda J: J @ along, columns)
 
     return of
 

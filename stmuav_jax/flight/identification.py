@@ -24,6 +24,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..algebra.compiler import quick_jit
+from ..algebra.derivative import value_and_jacobian
 from ..algebra.least_squares import Search, search
 from ..algebra.space import CyclicVector, Point, Vector
 from ..checks.errors import ModelError, SettingError, check_finite
@@ -222,8 +223,7 @@ class Misfit(eqx.Module):
 @quick_jit
 def _at(residuals: Misfit, z: Float[Array, " p"]) -> tuple[Float[Array, " n"], Float[Array, "n p"]]:
     """Residuals and their Jacobian at scaled parameters z."""
-    push = lambda e: jax.jvp(residuals, (z,), (e,))
-    r, J = jax.vmap(push, out_axes=(None, -1))(jnp.eye(z.shape[0], dtype=z.dtype))
+    r, J = value_and_jacobian(residuals, z)
     return r.reshape(-1), J.reshape(-1, z.shape[0])
 
 

@@ -130,7 +130,7 @@ class Limit(eqx.Module):
     """
 
     excess: Callable[[TunedMotion], Any]
-    weight: float = 100.0
+    weight: float | Float[Array, ""] = 100.0
     tolerance: float = 0.01
 
     def __call__(self, motion: TunedMotion) -> Any:

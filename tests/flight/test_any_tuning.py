@@ -81,7 +81,7 @@ def test_a_limit_is_kept_or_said_to_be_passed(cart):
     target = space.retract(x, jnp.array([0.5, 0.0, 0.0, 0.0]))
 
     def made(effort, weight=100.0):
-        limit = stm.flight.Limit(Most(jnp.asarray(effort)), weight)
+        limit = stm.flight.Limit(Most(jnp.asarray(effort)), jnp.asarray(weight))
         return stm.flight.tune_inputs(
             space, [stm.flight.end_at(space, target), limit], start=x, duration=1.5,
             inputs=["effort"], sizes=[10.0], knots=8,
