@@ -35,6 +35,12 @@ BENCHMARKS: dict[str, tuple[str, ...]] = {
     **{f"suite_{name}": ("suite.py", "--only", name, "--no-report") for name in SUITE},
     **{name: (f"{name}.py",) for name in ALONE},
 }
+# Parts of a result that no script measures any more: their question is settled, and they stay as
+# they were measured (docs/failure.md and docs/long_times.md name the commits of their scripts).
+FINISHED = {
+    "failure": {"trials", "stiffness", "long", "alignment", "nature", "collapses"},
+    "long_horizon": {"symmetric"},
+}
 # These measure more than one core, or the command line as a user starts it.
 ALL_CORES = ("montecarlo", "first_result")
 THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -48,7 +54,9 @@ def why_again(name: str, results: Path) -> str:
     content = json.loads(path.read_text())
     about = content["environment"]
     # a result made of parts says for each where it was measured
-    for part in [about, *content.get("measured", {}).values()]:
+    parts = content.get("measured", {})
+    now = [part for key, part in parts.items() if key not in FINISHED.get(name, ())]
+    for part in (about, *now):
         if part["dirty"] or part.get("package_from_elsewhere"):
             return f"Measured on {part['commit'][:10]} with changes."
         since = moved(part["commit"], *MEASURED)

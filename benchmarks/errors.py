@@ -1,8 +1,8 @@
 """The estimate of the global error: how near it is to the true error, and what it costs.
 
-2 s of the tracker and of the UAV at
-tolerances from 1e-2 to 1e-10. The reference is a run at 3e-13. Beside the second run of `simulate`, at
-a tenth of the tolerances, others: tighter, and looser, which would cost less. One core:
+2 s of the tracker and of the UAV at tolerances from 1e-2 to 1e-10. The reference is a run at 3e-13.
+Beside the second run of `simulate`, at a tenth of the tolerances, others: tighter, and looser, which
+would cost less. One core:
 
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 taskset -c 1 python benchmarks/errors.py
 """
@@ -66,12 +66,6 @@ def least(repeats: int, make: Callable[[], Any], go: Callable[[Any], Any]) -> tu
     return made, best
 
 
-def first_run(scene: stm.Scene, run: stm.Run, repeats: int) -> tuple[March, float]:
-    """The first run again, and the least processor seconds that it took."""
-    make = lambda: March(prepare(scene.system, run.method), scene.t0, scene.state0)
-    return least(repeats, make, lambda march: march.to(run.ts))
-
-
 def second_run(scene: stm.Scene, march: March, factor: float, repeats: int) -> dict[str, Any]:
     """Largest estimated position error, step attempts and least processor seconds."""
     first = march.trajectory()
@@ -92,15 +86,16 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
             references[name, case] = simulated(scene, REFERENCE, size.t1)
         run = simulated(scene, tolerance, size.t1)
         apart = np.linalg.norm(run.states.r - references[name, case].states.r, axis=-1)
-        march, seconds = first_run(scene, run, size.repeats)
+        make = lambda of=scene, run=run: March(prepare(of.system, run.method), of.t0, of.state0)
+        march, seconds = least(size.repeats, make, lambda march, ts=run.ts: march.to(ts))
         row: dict[str, Any] = {"scene": name, "case": case, "tolerance": tolerance}
         row |= {"true": float(np.max(apart)), "attempts": attempts(march), "seconds": seconds}
         row["second"] = [second_run(scene, march, f, size.repeats) for f in size.factors]
         rows.append(row)
-        print(line(row), flush=True)
+        each = (f"x {s['factor']:.2g}: {s['estimate']:.2e} m" for s in row["second"])
+        print(f"{name} {case} {tolerance:g}: true {row['true']:.2e} m;", *each, flush=True)
     factors = {str(f): summary(rows, k) for k, f in enumerate(size.factors)}
-    for factor, found in factors.items():
-        print(factor, found, flush=True)
+    print(*factors.items(), sep="\n")
     yield {
         "what": "estimates of the largest position error [m] against the true one, and their cost",
         "seconds": "processor time of the process, the least of the repeats",
@@ -110,24 +105,14 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
     }
 
 
-def line(row: dict[str, Any]) -> str:
-    """Of one case, the second runs behind each other."""
-    each = ", ".join(
-        f"x {s['factor']:.2g}: {s['estimate']:.2e} m, {s['seconds'] / row['seconds']:.2f} of the time"
-        for s in row["second"]
-    )
-    return f"{row['scene']} {row['case']} {row['tolerance']:g}: true {row['true']:.2e} m; {each}"
-
-
 def summary(rows: list[dict[str, Any]], k: int) -> dict[str, Any]:
     """How many of the k-th second runs are within a factor of three; cost in first runs."""
-    of = [(row, row["second"][k]) for row in rows]
-    ratios = np.array([s["estimate"] / row["true"] for row, s in of])
-    cost = np.array([s["seconds"] / row["seconds"] for row, s in of])
-    steps = np.array([s["attempts"] / row["attempts"] for row, s in of])
+    over = lambda key, of: np.array([row["second"][k][key] / row[of] for row in rows])
     spread = lambda x: [float(np.min(x)), float(np.median(x)), float(np.max(x))]
+    ratios, cost = over("estimate", "true"), spread(over("seconds", "seconds"))
     within = int(np.sum((ratios <= 3) & (ratios >= 1 / 3)))
-    return {"within": within, "of": len(of), "cost": spread(cost), "attempts": spread(steps)}
+    steps = spread(over("attempts", "attempts"))
+    return {"within": within, "of": len(rows), "cost": cost, "attempts": steps}
 
 
 if __name__ == "__main__":

@@ -28,13 +28,12 @@ from stmuav_jax.estimation.sigma import Unscented
 from stmuav_jax.estimation.update import DEFAULT, AbstractFilter, GaussianFilter
 from stmuav_jax.quadrotor.model import (
     PART_III,
-    euler_angle_rates,
     observable_model,
     rates,
     report_model,
     report_prior,
     thrusts,
-)  # fmt: skip
+)
 
 DT = 1e-3
 REPORT = Unscented(0.1, 2.0, 0.1)
@@ -171,23 +170,14 @@ def with_dynamax(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
 
     plain = ukf.psd_solve
     ukf.psd_solve = lambda A, b: plain(A, b, diagonal_boost=0.0)
-    J = jnp.asarray(PART_III.value("inertia"))
-    J_inverse = jnp.linalg.inv(J)
-
-    def step(q: Any, u: Any) -> Any:
-        w, total = q[3:6], jnp.sum(u)
-        tau = jnp.stack(
-            [-q[7] * total + 0.5 * (u[1] - u[3]), q[6] * total + 0.5 * (u[2] - u[0]), 0.0 * total]
-        )
-        turning = J_inverse @ (tau - jnp.cross(w, J @ w))
-        angles = euler_angle_rates(q[:3], w)
-        return q + DT * jnp.concatenate([angles, turning, jnp.zeros(2)])
-
+    rate = rates()
     # it updates first: with our first prediction as its prior, and inputs one later
     model, start = report_model(propagation="euler"), report_prior()
     first = GaussianFilter(REPORT).predict(model, start, jnp.asarray(u[0]), DT)
     Q, R = (jnp.diag(jnp.asarray(PART_III.value(f"filter.{name}"))) for name in "QR")
-    parameters = ParamsNLGSSM(first.mean, first.covariance, step, Q, lambda q, u: q[3:6], R)
+    parameters = ParamsNLGSSM(
+        first.mean, first.covariance, lambda q, u: q + DT * rate(q, u), Q, lambda q, u: q[3:6], R
+    )
     # its annotation says int for kappa
     settings = ukf.UKFHyperParams(0.1, 2, 0.1)  # pyright: ignore[reportArgumentType]
 
@@ -205,12 +195,10 @@ def with_dynamax(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
         "single": per_step(timing, size.steps),
         "apart": _apart(size, u, y, np.asarray(out[0])[: size.peer_steps]),
     }
-    if size.filters:
-        yb = jnp.asarray(np.broadcast_to(y[: size.bank_steps], (size.filters, size.bank_steps, 3)))
-        banked, _ = measure(lambda: many(yb, us[: size.bank_steps]), repeats=min(size.repeats, 3))
-        found["bank"] = per_step(banked, size.bank_steps * size.filters)
+    yb = jnp.asarray(np.broadcast_to(y[: size.bank_steps], (size.filters, size.bank_steps, 3)))
+    banked, _ = measure(lambda: many(yb, us[: size.bank_steps]), repeats=min(size.repeats, 3))
     ukf.psd_solve = plain
-    return found
+    return found | {"bank": per_step(banked, size.bank_steps * size.filters)}
 
 
 def record(size: Size) -> Iterator[dict[str, Any]]:

@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from shared.command import begin, parser
 from shared.record import write
@@ -21,27 +22,15 @@ from shared.record import write
 def one(cache: Path, out: Path, t1: float) -> dict[str, float]:
     """Wall times of one run of the command line [s]."""
     command = [sys.executable, "-m", "stmuav_jax.cli", "simulate", "uav_tracker", "--case", "2"]
+    command += ["--t1", str(t1), "--out", str(out)]
     clock = time.perf_counter()
-    subprocess.run(
-        [*command, "--t1", str(t1), "--out", str(out)],
-        env={**os.environ, "XDG_CACHE_HOME": str(cache)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    caches = {**os.environ, "XDG_CACHE_HOME": str(cache)}
+    subprocess.run(command, env=caches, capture_output=True, check=True)
     total = time.perf_counter() - clock
     c = json.loads((out / "certificate.json").read_text())["certificate"]
-    split = {
-        "compile": c["compile_seconds"],
-        "run": c["run_seconds"],
-        "checks": c["analysis_seconds"],
-    }
-    return {**split, "rest": total - sum(split.values()), "total": total}
-
-
-def median(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Median of every figure."""
-    return {key: statistics.median(row[key] for row in rows) for key in rows[0]}
+    split = {"compile": "compile", "run": "run", "checks": "analysis"}
+    parts = {name: c[f"{key}_seconds"] for name, key in split.items()}
+    return {**parts, "rest": total - sum(parts.values()), "total": total}
 
 
 def main() -> None:
@@ -51,22 +40,19 @@ def main() -> None:
     made.add_argument("--t1", type=float, default=2.0)
     options = made.parse_args()
     begin(options)
-    cold, warm = [], []
+    runs: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
     for _ in range(options.repeats):
         with tempfile.TemporaryDirectory() as folder:
-            cache, out = Path(folder) / "cache", Path(folder) / "out"
-            cold.append(one(cache, out, options.t1))
-            warm.append(one(cache, out, options.t1))
-    result = {
-        "what": f"stmuav simulate uav_tracker --case 2 --t1 {options.t1:g}, seconds",
-        "cold": {"median": median(cold), "runs": cold},
-        "warm": {"median": median(warm), "runs": warm},
+            for rows in runs.values():
+                rows.append(one(Path(folder) / "cache", Path(folder) / "out", options.t1))
+    result: dict[str, Any] = {
+        "what": f"stmuav simulate uav_tracker --case 2 --t1 {options.t1:g}, seconds"
     }
-    path = write("first_result", result, options.results)
-    for kind in ("cold", "warm"):
-        line = ", ".join(f"{k} {v:.2f}" for k, v in result[kind]["median"].items())
-        print(f"{kind}: {line}")
-    print(path)
+    for kind, rows in runs.items():
+        median = {key: statistics.median(row[key] for row in rows) for key in rows[0]}
+        result[kind] = {"median": median, "runs": rows}
+        print(f"{kind}: {', '.join(f'{k} {v:.2f}' for k, v in median.items())}")
+    print(write("first_result", result, options.results))
 
 
 if __name__ == "__main__":

@@ -1,27 +1,41 @@
 """Structure over long times: energy error of conservative systems against run time.
 
 Six problems, 60 s each. Projected, unstabilised and Baumgarte-stabilised Dopri8 and Tsit5 at
-tolerances 1e-4 to 1e-12, against Gauss-Legendre methods of order 2 and 4 with fixed steps, which
-are symmetric (benchmarks/horizons/gauss.py), with the same projection and without.
+tolerances 1e-4 to 1e-12. Gauss-Legendre methods of order 2 and 4, which are symmetric, were compared
+with them once; their runs and the comparison stay in the record, and docs/long_times.md says by
+which commit's scripts they were made.
 
 Trajectories of the tracker diverge whatever the method, so energies are compared, not states. The
 energy error is (E - E0) / scale with the largest kinetic energy of the finest run as scale; its
-drift is the slope of a straight line fitted over time. The fixed steps run in a bare loop without
-step size control, which favours them.
+drift is the slope of a straight line fitted over time.
 """
 
+import json
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import diffrax
+import jax
+import jax.numpy as jnp
 import numpy as np
-from horizons.families import FAMILIES, Family, Runner
-from horizons.pages import show
+from jaxtyping import Array
 from problems.conservative import PROBLEMS, Problem, simple_pendulum
-from shared.clock import rounded
+from sections import long_page
+from shared.clock import compiled, ready, rounded, timed
 from shared.command import benchmark
+from shared.methods import evaluations, trajectory
+from shared.record import RESULTS, environment
 
+import stmuav_jax as stm
+
+GAIN = 10.0  # 1/s, of Baumgarte's feedback: the package's default
 LEVELS = (1e-3, 1e-6, 1e-9)
+SOLVERS = {"dopri8": diffrax.Dopri8(), "tsit5": diffrax.Tsit5()}
+SYMMETRIC = ("gauss", "midpoint")
+# The tolerance whose error over time is kept for the figure, with Dopri8.
+SERIES = 1e-6
 
 
 @dataclass(frozen=True)
@@ -29,65 +43,125 @@ class Size:
     """How much is run.
 
     Attributes:
+        families: solvers, and what holds the joints: "projection", "baumgarte" or "none".
         horizon, every: [s], every is the time between outputs.
-        counts: fixed steps from one output to the next.
         slow: the most seconds of a run; finer settings of a family that took more are left out.
     """
 
     problems: tuple[Callable[[], Problem], ...] = PROBLEMS
-    families: tuple[Family, ...] = FAMILIES
+    families: tuple[tuple[str, str], ...] = tuple(
+        (s, h) for s in SOLVERS for h in ("projection", "none", "baumgarte")
+    )
     horizon: float = 60.0
     every: float = 0.5
     tolerances: tuple[float, ...] = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
-    counts: tuple[int, ...] = (10, 20, 40, 80, 160, 320)
     repeats: int = 3
     slow: float = 1.5
 
 
 QUICK = Size(
-    (simple_pendulum,),
-    tuple(f for f in FAMILIES if f.name in ("dopri8, projection", "gauss, projection")),
-    horizon=2.0, tolerances=(1e-4, 1e-8), counts=(10, 40), repeats=1,
-)  # fmt: skip
-# The runs whose error over time is kept for the figure.
-SERIES = {
-    *((f"dopri8, {hold}", 1e-6) for hold in ("projection", "none", "baumgarte")),
-    *((family, 40) for family in ("gauss, projection", "gauss, none", "midpoint, projection")),
-}
+    (simple_pendulum,), (("dopri8", "projection"),), horizon=2.0, tolerances=(1e-4, 1e-8), repeats=1
+)
 
 
-def run_problem(problem: Problem, size: Size, runner: Runner) -> dict[str, Any]:
-    """All families on one problem."""
-    found: list[tuple[dict[str, Any], Any, float]] = []
+class Path(NamedTuple):
+    """Energies [J] at the output times, which of them the run reached, and what they cost."""
+
+    good: Array
+    total: Array
+    kinetic: Array
+    accepted: Array
+    rejected: Array
+    evaluations: Array
+    worst: Array
+
+
+def integration(solver: diffrax.AbstractSolver, hold: str, redundant: bool) -> Callable[..., Path]:
+    """(tolerance, gain, system, state, ts) -> Path.
+
+    Baumgarte's equations with no gain are the unstabilised ones, so these share a compilation.
+    """
+
+    def run(tol: Any, gain: Any, system: stm.System, state: stm.State, ts: Any) -> Path:
+        held = stm.Projection() if hold == "projection" else stm.Baumgarte(gain, gain, gain)
+        tree = stm.Tree(redundant=redundant)
+        found = trajectory(tree, solver, stabilisation=held)(system, state, ts, tol)
+        # a run that stopped keeps its last time
+        good = found.ts >= ts * (1 - 1e-12)
+        of = jax.vmap(lambda state: stm.dynamics.energy(system, state, jnp.zeros(())))(found.states)
+        took, not_taken = found.counts.accepted[-1], found.counts.rejected[-1]
+        worst, calls = found.worst.position[-1], evaluations(solver, took + not_taken)
+        return Path(good, of.kinetic + of.potential, of.kinetic, took, not_taken, calls, worst)
+
+    return run
+
+
+class Runner:
+    """Runs families on problems, with one compilation for problems of one structure."""
+
+    def __init__(self, ts: np.ndarray, repeats: int) -> None:
+        self.ts, self.repeats = jnp.asarray(ts), repeats
+        self.compiled: dict[Any, tuple[Any, float]] = {}
+
+    def __call__(
+        self, family: tuple[str, str], problem: Problem, tolerance: float
+    ) -> tuple[dict[str, Any], Path]:
+        """One run: its record, its path."""
+        solver, hold = family
+        gain = jnp.asarray(GAIN if hold == "baumgarte" else 0.0)
+        given = (jnp.asarray(tolerance), gain, problem.system, problem.state, self.ts)
+        joints = tuple((joint.name, problem.redundant) for joint in problem.system.joints)
+        key = (solver, hold == "projection", joints)
+        if key not in self.compiled:
+            run = integration(SOLVERS[solver], hold, problem.redundant)
+            self.compiled[key] = compiled(run, *given, clock=time.process_time)
+        call, seconds = self.compiled[key]
+        cost, path = timed(call, *given, repeats=self.repeats)
+        path = ready(path)
+        counts = ("accepted", "rejected", "evaluations")
+        row = {
+            "family": f"{solver}, {hold}", "solver": solver, "hold": hold, "tolerance": tolerance,
+            "step": None, "seconds": rounded(cost.processor.median), "cost": cost.to_dict(),
+            "compile_seconds": rounded(seconds),
+            **{name: int(getattr(path, name)) for name in counts},
+            "residual": rounded(path.worst),
+            "reached": float(self.ts[int(np.flatnonzero(path.good)[-1])]),
+            "completed": bool(np.all(path.good)),
+        }  # fmt: skip
+        return row, path
+
+
+def run_problem(
+    problem: Problem, size: Size, runner: Runner, former: dict[str, Any]
+) -> dict[str, Any]:
+    """All families on one problem, beside the symmetric methods of the former record."""
+    found: list[tuple[dict[str, Any], Any]] = []
     for family in size.families:
-        for setting in size.counts if family.fixed else size.tolerances:
-            row, path = runner(family, problem, setting)
-            found.append((row, path, setting))
-            print(f"{problem.name}: {family.name} {setting:g}: {row['seconds']:.3g} s", flush=True)
+        for tolerance in size.tolerances:
+            row, path = runner(family, problem, tolerance)
+            found.append((row, path))
+            said = f"{row['family']} {tolerance:g}: {row['seconds']:.3g} s"
+            print(f"{problem.name}: {said}", flush=True)
             if row["seconds"] > size.slow:
                 break
-    scale = finest_scale(found)
-    runs = []
-    for row, path, setting in found:
+    # the largest kinetic energy [J] of the finest completed run of the first family
+    first = found[0][0]["family"]
+    whole = [path for row, path in found if row["family"] == first and row["completed"]]
+    scale = float(np.max(whole[-1].kinetic))
+    for row, path in found:
         row.update(energy_error(runner.ts, path, scale))
-        if (row["family"], setting) in SERIES:
+        if (row["solver"], row["tolerance"]) == ("dopri8", SERIES):
             row["series"] = rounded(errors(path, scale))
-        runs.append(row)
+    kept = [row for row in former.get("runs", []) if row["solver"] in SYMMETRIC]
+    runs = [*(row for row, _ in found), *kept]
     return {
         "name": problem.name,
         "title": problem.title,
         "scale": scale,
         "runs": runs,
         "cheapest": {str(level): cheapest(runs, level) for level in LEVELS},
-        "answers": {cost: answer(runs, cost) for cost in ("seconds", "evaluations")},
+        "answers": former.get("answers", {}),
     }
-
-
-def finest_scale(found: list[tuple[dict[str, Any], Any, float]]) -> float:
-    """The largest kinetic energy [J] of the finest completed run of the first family."""
-    first = found[0][0]["family"]
-    whole = [path for row, path, _ in found if row["family"] == first and row["completed"]]
-    return float(np.max(whole[-1].kinetic))
 
 
 def errors(path: Any, scale: float) -> np.ndarray:
@@ -112,68 +186,36 @@ def energy_error(ts: Any, path: Any, scale: float) -> dict[str, float | None]:
 def cheapest(runs: list[dict[str, Any]], level: float) -> dict[str, Any]:
     """By family: the cheapest run with an error up to the level, in seconds; None if none has."""
     best: dict[str, Any] = {row["family"]: None for row in runs}
-    for row in runs:
-        if row["largest"] is None or row["largest"] > level:
-            continue
-        now = best[row["family"]]
-        if now is None or row["seconds"] < now["seconds"]:
-            keys = ("seconds", "evaluations", "largest", "drift", "tolerance", "step")
-            best[row["family"]] = {key: row[key] for key in keys}
+    keys = ("seconds", "evaluations", "largest", "drift", "tolerance", "step")
+    fine = [row for row in runs if row["largest"] is not None and row["largest"] <= level]
+    for row in sorted(fine, key=lambda row: -row["seconds"]):
+        best[row["family"]] = {key: row[key] for key in keys}
     return best
-
-
-def answer(runs: list[dict[str, Any]], cost: str) -> dict[str, Any]:
-    """Every completed fixed-step run against the best projected explicit run that costs no more.
-
-    The ratio is the fixed-step run's error over the explicit run's: above 1 the explicit run is
-    better at equal cost. Where no explicit run is as cheap there is none to compare with.
-    """
-    whole = [row for row in runs if row["largest"] is not None]
-    explicit = [row for row in whole if row["step"] is None and row["hold"] == "projection"]
-    pairs = []
-    for row in whole:
-        if row["step"] is None:
-            continue
-        rivals = [other for other in explicit if other[cost] <= row[cost]]
-        best = min(rivals, key=lambda other: other["largest"], default=None)
-        ratios = {}
-        if best is not None:
-            for key in ("largest", "drift"):
-                below = abs(best[key])
-                ratios[key] = rounded(abs(row[key]) / below) if below else None
-        against = None if best is None else [best["family"], best["tolerance"]]
-        ratio = {"ratio": ratios.get("largest"), "drift_ratio": ratios.get("drift")}
-        which = {"family": row["family"], "step": row["step"], "cost": row[cost]}
-        pairs.append({**which, "against": against, **ratio})
-    compared = [pair for pair in pairs if pair["ratio"] is not None]
-    return {
-        "pairs": pairs,
-        "compared": len(compared),
-        "explicit_better": sum(pair["ratio"] > 1 for pair in compared),
-        "explicit_drifts_less": sum((pair["drift_ratio"] or 0) > 1 for pair in compared),
-    }
 
 
 def record(size: Size) -> Iterator[dict[str, Any]]:
     """What there is after each problem, so that a long run leaves what it has."""
+    former = json.loads((RESULTS / "long_horizon.json").read_text())
+    once = former.get("measured", {}).get("symmetric", former["environment"])
+    same = size.horizon == former["horizon"]
+    kept = {row["name"]: row for row in former["problems"]} if same else {}
     ts = np.linspace(0.0, size.horizon, round(size.horizon / size.every) + 1)
     runner = Runner(ts, size.repeats)
     problems: list[dict[str, Any]] = []
     for make in size.problems:
-        problems.append(run_problem(make(), size, runner))
+        problem = make()
+        problems.append(run_problem(problem, size, runner, kept.get(problem.name, {})))
+        # written at once, over the former record
+        left = [row for name, row in kept.items() if name not in {p["name"] for p in problems}]
         yield {
             "what": "energy error of conservative systems over long times",
             "seconds": "processor time of the process on one core",
             "horizon": size.horizon,
             "every": size.every,
-            "problems": problems,
+            "measured": {"explicit": environment(), **({"symmetric": once} if same else {})},
+            "problems": [*problems, *left],
         }
 
 
-def main() -> None:
-    """Run and write `long_horizon.json`."""
-    benchmark("long_horizon", __doc__, record, (Size(), QUICK), show)
-
-
 if __name__ == "__main__":
-    main()
+    benchmark("long_horizon", __doc__, record, (Size(), QUICK), long_page.show)

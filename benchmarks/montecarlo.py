@@ -76,12 +76,11 @@ class Bare:
 
     def __init__(self, size: Size, tolerance: float, lanes: int) -> None:
         work = FlightWork(study(size, tolerance))
-        plan, of = work.plan, work.study
-        drawn = of.sampling.draw(0, size.flights)
-        queue = Drawn(jnp.asarray(drawn), jnp.zeros(len(drawn), jnp.uint32))
+        plan = self.plan = work.plan
+        drawn = work.study.sampling.draw(0, size.flights)
+        self.queue = Drawn(jnp.asarray(drawn), jnp.zeros(len(drawn), jnp.uint32))
         run = lambda queue, count: fly(plan, queue, count, lanes)
-        self.program, self.compile_seconds = compiled(run, queue, jnp.asarray(1))
-        self.queue, self.plan = queue, plan
+        self.program, self.compile_seconds = compiled(run, self.queue, jnp.asarray(1))
 
     def fly(self, count: int) -> Any:
         """The first flights."""
@@ -135,12 +134,6 @@ def by_lanes(size: Size, tolerance: float) -> list[dict[str, Any]]:
     return rows
 
 
-def of_peers(size: Size, bare: Bare, exact: np.ndarray) -> list[dict[str, Any]]:
-    """Throughput of peers that offer it, by their settings."""
-    given = (stm.make_scene("uav_tracker", 2), bare.starts(size.checked), size.t1)
-    return [row for peer in peers()[0] for row in throughput(peer, given, exact, WANTED, 30.0)]
-
-
 def on_devices(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
     """A study's flights per second on so many cores, bare and with the store, in a new process."""
     given = [sys.executable, __file__, "--devices", str(devices), "--tolerance", str(tolerance)]
@@ -156,23 +149,20 @@ def child(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
     count = size.flights * devices
     work = FlightWork(study(size, tolerance), block=size.flights, devices=devices)
     work.run(0, 2)
-    bare, stored = [], []
-    for repeat in range(size.repeats):
-        started = time.perf_counter()
-        work.run(0, count)
-        bare.append(time.perf_counter() - started)
+    seconds = []
+    for _ in range(size.repeats):
         with tempfile.TemporaryDirectory() as folder:
             started = time.perf_counter()
+            work.run(0, count)
+            between = time.perf_counter()
             run_study(work, Path(folder) / "study.zarr", count, chunk=count)
-            stored.append(time.perf_counter() - started)
-        del repeat
+            seconds.append((between - started, time.perf_counter() - between))
+    bare, stored = np.array(seconds).T
     return {
-        "devices": devices,
-        "flights": count,
-        "per_second": count / float(np.median(bare)),
+        "devices": devices, "flights": count, "per_second": count / float(np.median(bare)),
         "per_second_stored": count / float(np.median(stored)),
-        "overhead": float(np.median(np.array(stored) / np.array(bare))) - 1,
-    }
+        "overhead": float(np.median(stored / bare)) - 1,
+    }  # fmt: skip
 
 
 def run(size: Size) -> dict[str, Any]:
@@ -182,23 +172,17 @@ def run(size: Size) -> dict[str, Any]:
     tolerance, tried = tolerance_for(size, exact)
     rows = by_lanes(size, tolerance)
     best = max(rows, key=lambda row: row["per_second"])
-    alone = Bare(size, tolerance, 1)
-    few = min(64, size.flights)
+    alone, few = Bare(size, tolerance, 1), min(64, size.flights)
     single, _ = measure(lambda: alone.fly(few), repeats=size.repeats)
     cores = sorted({1, os.cpu_count() or 1})
+    given = (stm.make_scene("uav_tracker", 2), tight.starts(size.checked), size.t1)
+    found = [row for peer in peers()[0] for row in throughput(peer, given, exact, WANTED, 30.0)]
     return {
-        "what": "flights per second, uav_tracker case 2",
-        "t1": size.t1,
-        "flights": size.flights,
-        "wanted_error": WANTED,
-        "tolerance": tolerance,
-        "tried": tried,
-        "rows": rows,
-        "best_lanes": best["lanes"],
-        "one_lane_per_second": few / single.median,
-        "peers": of_peers(size, tight, exact),
+        "what": "flights per second, uav_tracker case 2", "t1": size.t1, "flights": size.flights,
+        "wanted_error": WANTED, "tolerance": tolerance, "tried": tried, "rows": rows,
+        "best_lanes": best["lanes"], "one_lane_per_second": few / single.median, "peers": found,
         "cores": [on_devices(size, tolerance, count) for count in cores],
-    }
+    }  # fmt: skip
 
 
 def main() -> None:

@@ -10,18 +10,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from peers import PEERS
+from sections import tables
 from sections.figures import draw
 from sections.state import state
-from sections.tables import (
-    acceleration,
-    batch,
-    curves,
-    gradient,
-    hexacopter,
-    scaling,
-    scenes,
-)  # fmt: skip
 from shared.pages import Lines, table
 from shared.record import RESULTS, ROOT
 
@@ -30,15 +21,15 @@ from stmuav_jax.files.netcdf import write_atomically
 PAGE = ROOT / "docs" / "benchmarks.md"
 # Section -> its title and what writes it, in the page's order.
 PARTS: dict[str, tuple[str, Callable[[dict[str, Any]], Lines]]] = {
-    "work_precision": ("Time against error, seven-body UAV", curves),
-    "acceleration": ("One acceleration", acceleration),
-    "batch": ("Many trajectories", batch),
-    "scaling": ("Chains of closed loops", scaling),
-    "gradient": ("Gradients", gradient),
-    "hexacopter": ("One free body against the same by hand", hexacopter),
-    "scenes": ("All scenes", scenes),
-    "published": ("Time against error, published problems", curves),
-    "stiff": ("Time against error, stiff variants", curves),
+    "work_precision": ("Time against error, seven-body UAV", tables.curves),
+    "acceleration": ("One acceleration", tables.acceleration),
+    "batch": ("Many trajectories", tables.batch),
+    "scaling": ("Chains of closed loops", tables.scaling),
+    "gradient": ("Gradients", tables.gradient),
+    "hexacopter": ("One free body against the same by hand", tables.hexacopter),
+    "scenes": ("All scenes", tables.scenes),
+    "published": ("Time against error, published problems", tables.curves),
+    "stiff": ("Time against error, stiff variants", tables.curves),
 }
 
 HEAD = """# Benchmarks
@@ -72,18 +63,6 @@ def circumstances(results: dict[str, dict[str, Any]]) -> Lines:
     return [*table(head, rows), "", f"Versions (first section): {listed}."]
 
 
-def version(peer: dict[str, Any]) -> str:
-    """A program's version; old records put SciPy's in front of NumPy's without a name."""
-    number = peer["version"]
-    return f"SciPy {number}" if ", NumPy" in number and number[0].isdigit() else number
-
-
-def as_now(method: str) -> str:
-    """How a program is run now, for records that do not say it."""
-    how = next((peer.how for peer in PEERS if peer.name == method), "")
-    return f"(not recorded; as the adapter is now) {how}" if how else "not recorded"
-
-
 def compared(results: dict[str, dict[str, Any]]) -> Lines:
     """The peers, with versions and caveats, and those that were skipped."""
 
@@ -91,10 +70,13 @@ def compared(results: dict[str, dict[str, Any]]) -> Lines:
         found = (row for result in results.values() for row in result[key])
         return {row["method"]: row for row in found}.values()
 
-    there = [
-        [p["method"], version(p), p.get("how") or as_now(p["method"]), " ".join(p["caveats"])]
-        for p in unique("peers")
+    told = lambda p: [
+        p["method"],
+        p["version"],
+        p.get("how", "not recorded"),
+        " ".join(p["caveats"]),
     ]
+    there = [told(p) for p in unique("peers")]
     absent = [[p["method"], p["reason"]] for p in unique("skipped")]
     head = ["program", "version", "how it is run", "what is left out or done differently"]
     lines = table(head, there) if there else ["No other program was run."]

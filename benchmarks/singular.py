@@ -16,16 +16,8 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from problems.four_bar import (
-    LONG,
-    TOLERANCES,
-    closed_form,
-    course,
-    four_bar,
-    kinetic_and_potential,
-    missing,
-    start,
-)  # fmt: skip
+from problems import four_bar
+from problems.four_bar import LONG, TOLERANCES
 from shared.command import benchmark
 
 import stmuav_jax as stm
@@ -47,7 +39,7 @@ QUICK = Size((1,), (1e-4,), (1e-3,), TOLERANCES[:1])
 def course_of(system: stm.System, state: stm.State, rtol: float) -> tuple[dict[str, Any], Any]:
     """How one run went, and its trajectory."""
     began = time.process_time()
-    path = jax.block_until_ready(course(system, state, jnp.asarray(rtol)))
+    path = jax.block_until_ready(four_bar.course(system, state, jnp.asarray(rtol)))
     reached = int(np.sum(np.isfinite(np.asarray(path.states.r[:, 0, 0]))))
     counts = path.counts
     how = {
@@ -64,17 +56,19 @@ def course_of(system: stm.System, state: stm.State, rtol: float) -> tuple[dict[s
 
 def chain(loops: int, rtol: float, coupler: float = 1.0) -> dict[str, Any]:
     """One tolerance, against the closed form."""
-    system = four_bar(loops, coupler=coupler)
-    how, path = course_of(system, start(system), rtol)
-    off = 2 * np.asarray(path.states.r[:, 0, :2]) - closed_form(loops, LONG, coupler)[:, :2]
+    system = four_bar.four_bar(loops, coupler=coupler)
+    how, path = course_of(system, four_bar.start(system), rtol)
+    off = (
+        2 * np.asarray(path.states.r[:, 0, :2]) - four_bar.closed_form(loops, LONG, coupler)[:, :2]
+    )
     return {"loops": loops, "coupler": coupler, **how, "error": float(np.nanmax(np.abs(off)))}
 
 
 def miss(by: float, rtol: float) -> dict[str, Any]:
     """One tolerance, by the energy."""
-    system, state = missing(by)
+    system, state = four_bar.missing(by)
     how, path = course_of(system, state, rtol)
-    energy = kinetic_and_potential(system, path.states)
+    energy = four_bar.kinetic_and_potential(system, path.states)
     return {"missed_by": by, **how, "energy": float(np.nanmax(np.abs(energy - energy[0])))}
 
 

@@ -5,21 +5,73 @@ end stops, by friction, or not at all: steps, run time and position error over 1
 Tsit5 (explicit) and Rodas5P and Kvaerno5 (implicit) at tolerances 1e-4 to 1e-8, with the largest
 eigenvalue of the equations of motion. The reference is Rodas5P at 1e-11, checked by Dopri8.
 
-All scenes share one compilation per solver (stiffness/scenes.py says at what cost).
+All scenes hold the same force elements and differ in numbers only, so that one compilation per
+solver serves them all: a servo that is not there has no stiffness and no damping, friction that
+is not there no force, and end stops that are not there are 100 m away. Every scene therefore pays
+for all elements, in every solver alike.
 """
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from shared.clock import rounded
+from sections import stiff_page
+from shared.clock import compiled, ready, rounded, timed
 from shared.command import benchmark
-from stiffness.pages import show
-from stiffness.runs import EXPLICIT, IMPLICIT, TIGHT, Runner
-from stiffness.scenes import SCENES, SERVOS, Build, StiffScene
+from shared.methods import trajectory
+
+import stmuav_jax as stm
 
 LEVELS = (1e-4, 1e-6)  # m
+FAR = 100.0  # m
+TIGHT = 1e-11
+SOLVERS: dict[str, Any] = {
+    "dopri8": diffrax.Dopri8, "tsit5": diffrax.Tsit5, "rodas5p": stm.Rodas5P,
+    "kvaerno5": stm.dynamics.kvaerno5,
+}  # fmt: skip
+EXPLICIT, IMPLICIT = ("dopri8", "tsit5"), ("rodas5p", "kvaerno5")
+
+
+@dataclass(frozen=True)
+class StiffScene:
+    """What holds the sliders: servo stiffness [N/m] and damping [N s/m], stops, friction."""
+
+    name: str
+    stiffness: float = 0.0
+    damping: float = 0.0
+    stops: bool = False
+    friction: bool = False
+
+    def uav(self) -> stm.Scene:
+        """uav_tracker, case 2."""
+        away = stm.tracker.Stops() if self.stops else stm.tracker.Stops(lower=-FAR, upper=FAR)
+        rubbing = stm.tracker.Friction() if self.friction else stm.tracker.Friction(coulomb=0.0)
+        servo = stm.tracker.Servo(self.stiffness, self.damping)
+        return stm.make_scene("uav_tracker", 2, servo=servo, stops=away, friction=rubbing)
+
+    def slider(self) -> stm.Scene:
+        """One body on a guide with a servo: a stand-in for the smoke test."""
+        body = stm.Body("slider", 1.0, (1e-2, 1e-2, 1e-2))
+        guide = stm.translational("guide", "ground", "slider", axis=(0.0, 0.0, 1.0))
+        servo = stm.mechanics.JointServo(
+            "guide", stiffness=self.stiffness, damping=self.damping, target=1e-3
+        )
+        system = stm.System([body], [guide], [stm.Gravity(), servo])
+        return stm.Scene(self.name, "A slider with a servo", system, system.reference)
+
+
+FREE = StiffScene("free")
+SERVOS = tuple(StiffScene(f"servo {k:.0e}", k, 9e-4 * k) for k in (1e4, 1e5, 1e6, 1e7))
+STIFFEST = StiffScene("stiffest servo", 1e7, 6e4)
+STOPS = replace(FREE, name="end stops", stops=True)
+FRICTION = replace(FREE, name="friction", friction=True)
+SCENES = (FREE, *SERVOS, STIFFEST, STOPS, FRICTION)
 
 
 @dataclass(frozen=True)
@@ -30,7 +82,7 @@ class Size:
         pieces: of the path along which eigenvalues are taken.
     """
 
-    build: Build = StiffScene.uav
+    build: Callable[[StiffScene], stm.Scene] = StiffScene.uav
     scenes: tuple[StiffScene, ...] = SCENES
     solvers: tuple[str, ...] = (*EXPLICIT, *IMPLICIT)
     tolerances: tuple[float, ...] = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
@@ -42,6 +94,86 @@ class Size:
 QUICK = Size(
     StiffScene.slider, SERVOS[::3], ("dopri8", "rodas5p"), (1e-6, 1e-8), t1=0.1, pieces=2, repeats=1
 )
+
+
+def as_given(scene: stm.Scene) -> tuple[stm.System, stm.State]:
+    """System and start as arrays that are not weakly typed, so that all scenes share a trace."""
+    strong = lambda x: jnp.asarray(x, x.dtype) if eqx.is_array(x) else x
+    return jax.tree.map(strong, (scene.system, scene.state0))
+
+
+class Runner:
+    """Runs with output at the start, the middle and the end, compiled on first use."""
+
+    def __init__(self, t1: float, repeats: int) -> None:
+        self.ends, self.repeats = jnp.array([0.0, 0.5 * t1, t1]), repeats
+        self.calls: dict[str, Any] = {}
+        self.compile_seconds: dict[str, float] = {}
+
+    def prepared(self, solver: str, *given: Any) -> Any:
+        """The integration by a solver, compiled for (system, state, ts, tolerance)."""
+        if solver not in self.calls:
+            run = trajectory(stm.Tree(), SOLVERS[solver]())
+            done, seconds = compiled(run, *given, clock=time.process_time)
+            self.calls[solver], self.compile_seconds[solver] = done, seconds
+        return self.calls[solver]
+
+    def positions(self, found: Any) -> np.ndarray:
+        """Positions (2, n, 3) [m] behind the start; not numbers if the run did not reach the end."""
+        there = bool(np.all(np.asarray(found.ts) >= np.asarray(self.ends) * (1 - 1e-12)))
+        positions = np.asarray(found.states.r[1:])
+        return positions if there else np.full_like(positions, np.nan)
+
+    def tight(self, solver: str, scene: stm.Scene) -> np.ndarray:
+        """Positions (2, n, 3) [m] at the middle and the end, at the tightest tolerance."""
+        given = (*as_given(scene), self.ends, jnp.asarray(TIGHT))
+        return self.positions(self.prepared(solver, *given)(*given))
+
+    def run(self, solver: str, tol: float, scene: stm.Scene, exact: np.ndarray) -> dict[str, Any]:
+        """One timed run: counts, seconds, largest position error over all bodies [m]."""
+        given = (*as_given(scene), self.ends, jnp.asarray(tol))
+        cost, found = timed(self.prepared(solver, *given), *given, repeats=self.repeats)
+        found = ready(found)
+        off = np.max(np.linalg.norm(self.positions(found) - exact, axis=-1), axis=-1)
+        return {
+            "solver": solver, "tolerance": tol,
+            "accepted": int(found.counts.accepted[-1]),
+            "rejected": int(found.counts.rejected[-1]),
+            "seconds": rounded(cost.processor.median), "cost": cost.to_dict(),
+            "error_middle": rounded(off[0]), "error_end": rounded(off[1]),
+            "error": rounded(np.max(off)), "completed": bool(np.all(np.isfinite(off))),
+        }  # fmt: skip
+
+    def along(self, scene: stm.Scene, pieces: int, tol: float) -> Iterator[tuple[float, stm.State]]:
+        """Times and states along a run by Rodas5P: pieces of two, in the same compilation."""
+        system, state = as_given(scene)
+        times = np.linspace(0.0, float(self.ends[-1]), 2 * pieces + 1)
+        yield 0.0, state
+        for k in range(pieces):
+            given = (system, state, jnp.asarray(times[2 * k : 2 * k + 3]), jnp.asarray(tol))
+            found = self.prepared("rodas5p", *given)(*given)
+            for i in (1, 2):
+                state = jax.tree.map(lambda x, i=i: x[i], found.states)
+                yield float(times[2 * k + i]), state
+
+    def eigenvalues(self, scene: stm.Scene, pieces: int) -> dict[str, Any]:
+        """The eigenvalue of df/dx that is largest in size, at the start and along the run."""
+        system, _ = as_given(scene)
+        values, times = [], []
+        for t, state in self.along(scene, pieces, 1e-8):
+            if not np.all(np.isfinite(state.r)):
+                break
+            values.append(stm.dynamics.spectrum(system, state, t)[0])
+            times.append(t)
+        sizes = np.abs(values)
+        peak = int(np.argmax(sizes))
+        parts = lambda value: [rounded(value.real), rounded(value.imag)]
+        return {
+            "start": rounded(sizes[0]), "start_value": parts(values[0]),
+            "median": rounded(np.median(sizes)),
+            "largest": rounded(sizes[peak]), "largest_value": parts(values[peak]),
+            "largest_at": times[peak], "states": len(times),
+        }  # fmt: skip
 
 
 def run_scene(held: StiffScene, size: Size, runner: Runner) -> dict[str, Any]:
@@ -74,9 +206,7 @@ def cheapest(runs: list[dict[str, Any]], level: float) -> dict[str, Any]:
         return min(fine, key=lambda row: row["seconds"], default=None)
 
     explicit, implicit = best(EXPLICIT), best(IMPLICIT)
-    ratio = None
-    if explicit is not None and implicit is not None:
-        ratio = rounded(explicit["seconds"] / implicit["seconds"])
+    ratio = rounded(explicit["seconds"] / implicit["seconds"]) if explicit and implicit else None
     return {"explicit": explicit, "implicit": implicit, "explicit_over_implicit": ratio}
 
 
@@ -96,12 +226,10 @@ def crossover(scenes: list[dict[str, Any]], level: float) -> dict[str, Any]:
     def of(index: int | None) -> dict[str, Any] | None:
         if index is None or index < 0:
             return None
-        keys = ("name", "stiffness", "damping")
-        return {
-            **{key: rows[index][key] for key in keys},
-            "eigenvalue_at_start": rows[index]["eigenvalue"]["start"],
-            "explicit_over_implicit": ratios[index],
-        }
+        row = rows[index]
+        about = {key: row[key] for key in ("name", "stiffness", "damping")}
+        about["eigenvalue_at_start"] = row["eigenvalue"]["start"]
+        return {**about, "explicit_over_implicit": ratios[index]}
 
     return {"explicit_up_to": of(last), "implicit_from": of(first)}
 
@@ -120,10 +248,5 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
     }
 
 
-def main() -> None:
-    """Run and write `stiff.json`."""
-    benchmark("stiff", __doc__, record, (Size(), QUICK), show)
-
-
 if __name__ == "__main__":
-    main()
+    benchmark("stiff", __doc__, record, (Size(), QUICK), stiff_page.show)

@@ -5,6 +5,7 @@ All else is in the sub-namespaces, which have lists like this one.
 
 from . import (
     algebra as algebra,
+    control as control,
     dynamics as dynamics,
     environment as environment,
     estimation as estimation,

@@ -70,11 +70,14 @@ def cache_folder() -> Path:
 def _configure(use_cache: bool) -> None:
     import jax
 
+    from .algebra.kept import keep_programs
+
     jax.config.update("jax_enable_x64", True)
     if use_cache:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+        keep_programs(cache_folder() / "programs")
 
 
 def _read(words: Sequence[str]) -> tuple[str, Any]:

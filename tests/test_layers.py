@@ -31,12 +31,13 @@ FLOORS = {
     "flight": 9,
     "quadrotor": 9,
     "scenes": 10,
-    "montecarlo": 11,
-    "files": 12,
-    "figures": 13,
-    "jobs": 13,
-    "commands": 14,
-    "cli": 15,
+    "control": 11,
+    "montecarlo": 12,
+    "files": 13,
+    "figures": 14,
+    "jobs": 14,
+    "commands": 15,
+    "cli": 16,
 }
 LINES, STEPS, IN_A_ROOM = 400, 60, 15
 

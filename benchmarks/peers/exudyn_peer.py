@@ -215,12 +215,3 @@ class ExudynPeer(Peer):
             return Outcome(positions, None, int(counts[-1]) if done else None, 0, failure=failure)
 
         return Prepared(run)
-
-    def start_accelerations(self, scene: Scene) -> np.ndarray:
-        """Accelerations of the centres of mass at the start, world (n, 3) [m/s^2]."""
-        mechanism = Mechanism(scene)
-        sensors = mechanism.sense(mechanism.exu.OutputVariableType.Acceleration)
-        mechanism.mbs.Assemble()
-        step = 1e-6
-        mechanism.solve(mechanism.settings(scene.t0, scene.t0 + step, 1, step))
-        return mechanism.stored(sensors)[:, 0, 1:]

@@ -9,95 +9,68 @@ from typing import Any
 
 import numpy as np
 from problems.plain import Sinus, Start, UnsupportedError, loop_seconds, plain, start, starts
-from problems.tree import Tree, coordinates, span
+from problems.tree import coordinates
+from scipy.spatial.transform import Rotation
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at
-from peers.pinocchio_model import LinkModel, link_model, why_no_joint_forces
+from peers.pinocchio_model import LinkModel, linked, why_no_joint_forces
 from stmuav_jax import Scene, State
 
-_AXES = {"turn": ("hinge", "z"), "slide": ("slide", "z"), "universal": ("hinge", "xy")}
-_UNIT = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+# A link's joints in MuJoCo: kind, and the letters of their axes.
+_AXES = {
+    "free": ("mjJNT_FREE", "z"), "ball": ("mjJNT_BALL", "z"), "turn": ("mjJNT_HINGE", "z"),
+    "slide": ("mjJNT_SLIDE", "z"), "universal": ("mjJNT_HINGE", "xy"),
+}  # fmt: skip
+_UNIT = dict(zip("xyz", np.eye(3), strict=True))
 
 
-def mjcf(links: LinkModel, step: float, iterations: int = 100, integrator: str = "RK4") -> str:
-    """The model in MuJoCo's own format, every body's frame being its link's."""
-    out = [
-        '<mujoco><compiler angle="radian" balanceinertia="false" boundmass="0" '
-        'inertiafromgeom="false" fusestatic="false"/>',
-        f'<option timestep="{step!r}" integrator="{integrator}" gravity="{_text(links.gravity)}" '
-        f'solver="Newton" iterations="{iterations}" tolerance="1e-14" jacobian="dense">',
-        '<flag contact="disable" autoreset="disable" warmstart="disable"/></option><worldbody>',
-        *_bodies(links, -1),
-        *_sites(links, -1),
-        "</worldbody><equality>",
-    ]
-    soft = f'solref="{2 * step!r} 1" solimp="0.9999 0.9999 0.001 0.5 2"'
-    out += [f'<connect site1="cut{k}a" site2="cut{k}b" {soft}/>' for k in range(len(links.cuts))]
-    out.append("</equality><tendon>")
-    for k, (*_, stiffness, damping, length) in enumerate(links.springs):
-        out.append(
-            f'<spatial stiffness="{stiffness!r}" damping="{damping!r}" springlength="{length!r}">'
-            f'<site site="spring{k}a"/><site site="spring{k}b"/></spatial>'
-        )
-    out.append("</tendon><actuator>")
-    for k, (_, force, moment) in enumerate(links.wrenches):
-        out.append(f'<motor site="wrench{k}" gear="{_text([*force, *moment])}"/>')
-    for link, torque in _torques(links):
-        out.append(f'<motor joint="joint{link}z" gear="{torque!r}"/>')
-    for slider, gain in _pushes(links):
-        out.append(f'<motor joint="joint{slider}z" gear="{gain!r}"/>')
-    return "\n".join([*out, "</actuator></mujoco>"])
-
-
-def _text(numbers: object) -> str:
-    return " ".join(repr(float(x)) for x in np.ravel(np.asarray(numbers)))
-
-
-def _bodies(links: LinkModel, parent: int) -> list[str]:
-    """The links behind `parent`, each with those behind it."""
-    out = []
+def build(links: LinkModel, step: float, integrator: str) -> Any:
+    """The model in MuJoCo, every body's frame being its link's."""
+    mujoco: Any = importlib.import_module("mujoco")
+    spec = mujoco.MjSpec()
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    how, off = spec.option, mujoco.mjtDisableBit
+    how.timestep, how.gravity = step, links.gravity
+    how.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    how.tolerance, how.jacobian = 1e-14, mujoco.mjtJacobian.mjJAC_DENSE
+    how.disableflags = off.mjDSBL_CONTACT | off.mjDSBL_AUTORESET | off.mjDSBL_WARMSTART
+    bodies = {-1: spec.worldbody}
+    held = {link: numbers for link, *numbers in links.servos}
     for k, link in enumerate(links.links):
-        if link.parent != parent:
-            continue
-        F, J = link.placement, link.inertia
-        frame = " ".join([_text(F.R[:, 0]), _text(F.R[:, 1])])
-        out.append(f'<body name="link{k}" pos="{_text(F.x)}" xyaxes="{frame}">')
-        upper = (J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2])
-        out.append(
-            f'<inertial pos="{_text(link.com)}" mass="{link.mass!r}" fullinertia="{_text(upper)}"/>'
-        )
-        if link.kind == "free":
-            out.append("<freejoint/>")
-        elif link.kind == "ball":
-            out.append(f'<joint name="joint{k}" type="ball"/>')
-        else:
-            kind, axes = _AXES[link.kind]
-            held = _held(links, k)
-            out += [
-                f'<joint name="joint{k}{a}" type="{kind}" axis="{_UNIT[a]}"{held}/>' for a in axes
-            ]
-        out += [*_sites(links, k), *_bodies(links, k), "</body>"]
-    return out
-
-
-def _sites(links: LinkModel, link: int) -> list[str]:
-    """Where cut joints and constant wrenches hold on a link."""
-    out = []
-    for name, pairs in (("cut", links.cuts), ("spring", links.springs)):
+        turned = Rotation.from_matrix(link.placement.R).as_quat(scalar_first=True)
+        J, place = link.inertia, {"pos": link.placement.x, "quat": turned}
+        body = bodies[k] = bodies[link.parent].add_body(name=f"link{k}", **place)
+        body.mass, body.ipos, body.explicitinertial = link.mass, link.com, True
+        body.fullinertia = [J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]]
+        kind, axes = _AXES[link.kind]
+        for axis in axes:
+            joint = body.add_joint(name=f"joint{k}{axis}", type=getattr(mujoco.mjtJoint, kind))
+            joint.axis = _UNIT[axis]
+            # a servo with a fixed target is a joint's own spring and damper
+            if k in held:
+                joint.stiffness[0], joint.damping[0], joint.springref = held[k]
+    between = {"cut": links.cuts, "spring": links.springs}
+    for name, pairs in between.items():
         for k, (a, x, b, y, *_) in enumerate(pairs):
-            out += [f'<site name="{name}{k}a" pos="{_text(x)}"/>'] if a == link else []
-            out += [f'<site name="{name}{k}b" pos="{_text(y)}"/>'] if b == link else []
-    for k, (at, _, _) in enumerate(links.wrenches):
-        out += [f'<site name="wrench{k}"/>'] if at == link else []
-    return out
-
-
-def _held(links: LinkModel, link: int) -> str:
-    """A joint's own spring and damper, which is what a servo with a fixed target is."""
-    for at, stiffness, damping, target in links.servos:
-        if at == link:
-            return f' stiffness="{stiffness!r}" damping="{damping!r}" springref="{target!r}"'
-    return ""
+            bodies[a].add_site(name=f"{name}{k}a", pos=x)
+            bodies[b].add_site(name=f"{name}{k}b", pos=y)
+    for k in range(len(links.cuts)):
+        spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_SITE, name1=f"cut{k}a",
+            name2=f"cut{k}b", solref=[2 * step, 1], solimp=[0.9999, 0.9999, 0.001, 0.5, 2],
+        )  # fmt: skip
+    for k, (*_, stiffness, damping, length) in enumerate(links.springs):
+        tendon = spec.add_tendon(springlength=[length, length])
+        tendon.stiffness[0], tendon.damping[0] = stiffness, damping
+        tendon.wrap_site(f"spring{k}a")
+        tendon.wrap_site(f"spring{k}b")
+    site, joint = mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_JOINT
+    for k, (at, force, moment) in enumerate(links.wrenches):
+        bodies[at].add_site(name=f"wrench{k}")
+        spec.add_actuator(trntype=site, target=f"wrench{k}", gear=[*force, *moment])
+    for link, gain in (*_torques(links), *_pushes(links)):
+        spec.add_actuator(trntype=joint, target=f"joint{link}z", gear=[gain, 0, 0, 0, 0, 0])
+    return spec.compile()
 
 
 def _torques(links: LinkModel) -> list[tuple[int, float]]:
@@ -119,13 +92,9 @@ def _torques(links: LinkModel) -> list[tuple[int, float]]:
 
 def _pushes(links: LinkModel) -> list[tuple[int, float]]:
     """Slides that are pushed, with the amplitude [N]; actuators first, then forces."""
-    pushes = []
-    for _, slider, _, axis, force in links.actuators:
-        along = links.links[slider].placement.R[:, 2] @ axis
-        pushes.append((slider, float(along * force.amplitude)))
-    for k, _, force in links.forces:
-        pushes.append((k, float(links.links[k].placement.R[:, 2] @ force.amplitude)))
-    return pushes
+    axis = lambda link: links.links[link].placement.R[:, 2]
+    actuators = [(k, float(axis(k) @ a * f.amplitude)) for _, k, _, a, f in links.actuators]
+    return actuators + [(k, float(axis(k) @ f.amplitude)) for k, _, f in links.forces]
 
 
 def why_no_mujoco(scene: Scene) -> str:
@@ -145,13 +114,11 @@ class World:
 
     def __init__(self, scene: Scene, step: float, integrator: str = "RK4") -> None:
         mujoco: Any = importlib.import_module("mujoco")
-        self.mujoco = mujoco
         # or failures would be written into a file in the working directory
         mujoco.set_mju_user_warning(lambda _: None)
-        numbers = plain(scene)
-        self.tree: Tree = span(numbers)
-        self.links = link_model(numbers, self.tree)
-        self.model = mujoco.MjModel.from_xml_string(mjcf(self.links, step, integrator=integrator))
+        self.mujoco = mujoco
+        self.tree, self.links = linked(scene)
+        self.model = build(self.links, step, integrator)
         self.data = mujoco.MjData(self.model)
         self.step, self.t0 = step, scene.t0
         # controls that are always one, in front of those that swing
@@ -263,23 +230,6 @@ class MujocoC(Peer):
         world.begin(start(scene))
         return loop_seconds(lambda: world.mujoco.mj_forward(world.model, world.data))
 
-    def start_accelerations(self, scene: Scene) -> np.ndarray:
-        """Accelerations of the centres of mass at the start, world (n, 3) [m/s^2]."""
-        world = World(scene, 1e-5)
-        world.begin(start(scene))
-        mujoco, model, data = world.mujoco, world.model, world.data
-        # forces at the very start, not their mean over the first step
-        waves = [np.sin(s.rate * scene.t0 + s.phase) for s in world.waves()]
-        data.ctrl[:] = [1.0] * world.constant + waves
-        mujoco.mj_forward(model, data)
-        mujoco.mj_rnePostConstraint(model, data)
-        result, six = [], np.empty(6)
-        kind = mujoco.mjtObj.mjOBJ_BODY
-        for body in world.order:
-            mujoco.mj_objectAcceleration(model, data, kind, body, six, 0)
-            result.append(six[3:] + world.links.gravity)
-        return np.stack(result)
-
     def throughput(
         self, scene: Scene, states: State, t1: float, setting: Setting, threads: int = 1
     ) -> tuple[float, np.ndarray]:
@@ -299,10 +249,6 @@ class MujocoC(Peer):
         controls = np.broadcast_to(world.control(count), (len(first), count, world.model.nu))
         datas = [world.mujoco.MjData(world.model) for _ in range(max(threads, 1))]
         with rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
-
-            def call() -> np.ndarray:
-                return pool.rollout(world.model, datas, first, controls, nstep=count)[0]
-
-            seconds = loop_seconds(call, loops=1, repeats=3)
-            ends = call()[:, -1]
+            call = lambda: pool.rollout(world.model, datas, first, controls, nstep=count)[0]
+            seconds, ends = loop_seconds(call, loops=1, repeats=3), call()[:, -1]
         return len(first) / seconds, np.stack([world.positions(end)[0] for end in ends])

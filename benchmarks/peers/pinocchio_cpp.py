@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 from problems.plain import Start, plain, start, starts, why_not
-from problems.tree import span, why_no_tree
+from problems.tree import why_no_tree
 
 from peers.adapter import Outcome, Peer, Prepared, Setting
-from peers.pinocchio_model import link_model, model_text, start_vectors, starts_text
+from peers.pinocchio_model import linked, model_text, start_vectors, starts_text
 from stmuav_jax import Scene, State
 
 SOURCE = Path(__file__).with_suffix(".cpp")
@@ -39,16 +39,12 @@ def include_folders() -> dict[str, Path | None]:
     roots = [Path("/usr/include"), Path("/usr/local/include")]
     if found and found.origin:
         roots.insert(0, Path(found.origin).parents[1] / "cmeel.prefix" / "include")
-    wanted = {
-        "Pinocchio": "pinocchio/algorithm/crba.hpp",
-        "Boost odeint": "boost/numeric/odeint.hpp",
-        "Eigen": "Eigen/Core",
-    }
     folders = [*roots, *(root / "eigen3" for root in roots)]
+    first = lambda file: next((folder for folder in folders if (folder / file).exists()), None)
     return {
-        name: next((folder for folder in folders if (folder / file).exists()), None)
-        for name, file in wanted.items()
-    }
+        "Pinocchio": first("pinocchio/algorithm/crba.hpp"), "Eigen": first("Eigen/Core"),
+        "Boost odeint": first("boost/numeric/odeint.hpp"),
+    }  # fmt: skip
 
 
 def compiler() -> str | None:
@@ -62,9 +58,8 @@ def program_path() -> Path:
     version = subprocess.run([str(compiler()), "--version"], capture_output=True, check=True).stdout
     # -march=native: the program of one processor may not run on another
     cpu = Path("/proc/cpuinfo")
-    flags = (
-        [x for x in cpu.read_text().splitlines() if x.startswith("flags")] if cpu.exists() else []
-    )
+    lines = cpu.read_text().splitlines() if cpu.exists() else []
+    flags = [line for line in lines if line.startswith("flags")]
     sources = b"".join(SOURCE.with_suffix(x).read_bytes() for x in (".hpp", ".cpp"))
     key = hashlib.sha256(sources + version)
     for text in (*FLAGS, *flags[:1], metadata.version("pin")):
@@ -100,12 +95,10 @@ class Texts:
     """A scene's model and starts, as the program reads them from two files."""
 
     def __init__(self, scene: Scene, states: list[Start] | None = None) -> None:
-        numbers = plain(scene)
-        tree = span(numbers)
-        states = states if states is not None else [start(scene)]
-        self.model = model_text(link_model(numbers, tree))
-        self.starts = starts_text([(scene.t0, *start_vectors(tree, state)) for state in states])
-        self.bodies = numbers.n
+        tree, links = linked(scene)
+        first = [start(scene)] if states is None else states
+        self.model, self.bodies = model_text(links), len(links.bodies)
+        self.starts = starts_text([(scene.t0, *start_vectors(tree, state)) for state in first])
 
     def call(self, program: Path, mode: str, *arguments: float) -> Words:
         """Run the program in a mode; its lines by their first word.
@@ -179,12 +172,6 @@ class PinocchioCpp(Peer):
         program, _ = compile_program()
         words = Texts(scene).call(program, "cost", 20_000)
         return float(np.median(words["seconds"]))
-
-    def start_accelerations(self, scene: Scene) -> np.ndarray:
-        """Accelerations of the centres of mass at the start, world (n, 3) [m/s^2]."""
-        program, _ = compile_program()
-        words = Texts(scene).call(program, "cost", 1)
-        return np.reshape(words["accelerations"][0], (-1, 3))
 
     def throughput(
         self, scene: Scene, states: State, t1: float, setting: Setting

@@ -58,8 +58,10 @@ class LinkModel:
     servos: tuple[tuple[int, float, float, float], ...]
 
 
-def link_model(model: Plain, tree: Tree) -> LinkModel:
-    """The tree with every number in link axes."""
+def linked(scene: Scene) -> tuple[Tree, LinkModel]:
+    """A scene's tree, and the tree with every number in link axes."""
+    model = plain(scene)
+    tree = span(model)
     # a body's frame at its centre of mass, in the axes of the link that carries it
     body = [tree.links[link].on_child.inverse() for link in tree.carrier] + [IDENTITY]
     link = (*tree.carrier, -1)
@@ -83,7 +85,7 @@ def link_model(model: Plain, tree: Tree) -> LinkModel:
     ]
     zero = np.zeros(3)
     ends = lambda c: (*at(c.i, c.point_i), *at(c.j, c.point_j))
-    return LinkModel(
+    return tree, LinkModel(
         links=tuple(links), gravity=model.gravity,
         bodies=tuple(at(k, zero) for k in range(model.n)),
         wrenches=tuple(wrenches), actuators=tuple(actuators),
@@ -140,9 +142,10 @@ def generalised(links: LinkModel) -> tuple[np.ndarray, list[tuple[np.ndarray, Si
             raise UnsupportedError("An actuator across its slide is not written.")
         wave(slider, axis * force.amplitude, force)
     for k, _, force in links.forces:
-        if links.links[k].kind != "slide" or links.links[k].parent != -1:
-            said = "A force on a body that does not slide on ground is not written."
-            raise UnsupportedError(said)
+        if (links.links[k].kind, links.links[k].parent) != ("slide", -1):
+            raise UnsupportedError(
+                "A force on a body that does not slide on ground is not written."
+            )
         wave(k, force.amplitude, force)
     return constant, waves
 
@@ -150,8 +153,7 @@ def generalised(links: LinkModel) -> tuple[np.ndarray, list[tuple[np.ndarray, Si
 def why_no_joint_forces(scene: Scene) -> str:
     """What lacks for a scene as a tree whose driving forces are joint forces; empty if nothing."""
     try:
-        numbers = plain(scene)
-        generalised(link_model(numbers, span(numbers)))
+        generalised(linked(scene)[1])
     except UnsupportedError as error:
         return str(error)
     return ""
@@ -179,15 +181,12 @@ def model_text(model: LinkModel) -> str:
         + _text((link.placement.R, link.placement.x, link.mass, link.com, link.inertia))
         for link in model.links
     ]
+    rows = lambda name: [f"{name} {len(getattr(model, name))}", *map(_text, getattr(model, name))]
     lines = [f"links {len(links)}", *links, f"gravity {_text(model.gravity)}"]
     for name in ("bodies", "wrenches", "actuators", "forces", "cuts"):
-        rows = getattr(model, name)
-        lines += [f"{name} {len(rows)}", *map(_text, rows)]
+        lines += rows(name)
     lines += [f"closed {len(model.closed)}", _text(model.closed)]
-    for name in ("moments", "springs", "servos"):
-        rows = getattr(model, name)
-        lines += [f"{name} {len(rows)}", *map(_text, rows)]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *rows("moments"), *rows("springs"), *rows("servos")]) + "\n"
 
 
 def starts_text(starts: list[tuple[float, np.ndarray, np.ndarray]]) -> str:

@@ -1,16 +1,14 @@
 """Pinocchio from Python: a tree with cut joints, `constraintDynamics`, SciPy's DOP853."""
 
 import math
-from collections.abc import Callable
 from importlib import metadata
 from typing import Any
 
 import numpy as np
-from problems.plain import loop_seconds, plain, start
-from problems.tree import span
+from problems.plain import loop_seconds, start
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at
-from peers.pinocchio_model import generalised, link_model, start_vectors, why_no_joint_forces
+from peers.pinocchio_model import generalised, linked, start_vectors, why_no_joint_forces
 from peers.scipy_dense import follow
 from stmuav_jax import Scene
 
@@ -22,14 +20,16 @@ class Dynamics:
         import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
         self.pin: Any = pin
-        numbers = plain(scene)
-        tree = span(numbers)
-        self.links = link_model(numbers, tree)
+        tree, self.links = linked(scene)
         self.q0, self.v0 = start_vectors(tree, start(scene))
         self.model = self._tree()
         self.data = self.model.createData()
         self._close()
-        self._quaternions()
+        joints = self.model.joints
+        self.servos = [
+            (joints[k + 1].idx_q, joints[k + 1].idx_v, *numbers)
+            for k, *numbers in self.links.servos
+        ]
         self.constant, self.waves = generalised(self.links)
 
     def _tree(self) -> Any:
@@ -69,34 +69,6 @@ class Dynamics:
             # of three rows a cut, that across the plane is dependent
             self.solve = pin.ProximalSettings(1e-14, 1e-9, 20)
 
-    def _quaternions(self) -> None:
-        """Where quaternions and their angular velocities are, and all that is copied as it is."""
-        kinds = [link.kind for link in self.links.links]
-        joints = [self.model.joints[k + 1] for k in range(len(kinds))]
-        turning = [(k, kind) for k, kind in enumerate(kinds) if kind in ("free", "ball")]
-        # a free link is the first, with its place in front of its quaternion
-        self.turning = [
-            (joints[k].idx_q + 3 * (kind == "free"), joints[k].idx_v + 3 * (kind == "free"))
-            for k, kind in turning
-        ]
-        self.free = kinds[0] == "free"
-        plain = [
-            joint for joint, kind in zip(joints, kinds, strict=True) if kind not in ("free", "ball")
-        ]
-        q = [joint.idx_q + n for joint in plain for n in range(joint.nq)]
-        v = [joint.idx_v + n for joint in plain for n in range(joint.nv)]
-        self.plain = np.array(q, dtype=int), np.array(v, dtype=int)
-        self.servos = [
-            (joints[k].idx_q, joints[k].idx_v, *numbers) for k, *numbers in self.links.servos
-        ]
-
-    def _normalised(self, q: np.ndarray) -> np.ndarray:
-        """A copy of q with unit quaternions."""
-        q = q.copy()
-        for k, _ in self.turning:
-            q[k : k + 4] /= math.sqrt(q[k : k + 4] @ q[k : k + 4])
-        return q
-
     def _by_posture(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
         """Add joint forces that depend on the state: servos, world moments, springs."""
         for at_q, at_v, stiffness, damping, target in self.servos:
@@ -131,37 +103,15 @@ class Dynamics:
             return self.pin.aba(self.model, self.data, q, v, tau)
         return self.pin.constraintDynamics(self.model, self.data, q, v, tau, *self.cuts, self.solve)
 
-    def rate(self) -> Callable[[float, np.ndarray], np.ndarray]:
+    def rate(self, t: float, x: np.ndarray) -> np.ndarray:
         """dx/dt of x = (q, v); quaternions are normalised where they are used, not in x."""
-        nq, data, free, turning = self.model.nq, self.data, self.free, self.turning
-        to_q, from_v = self.plain
-        half = np.zeros((4, 4))
-
-        def rate(t: float, x: np.ndarray) -> np.ndarray:
-            q, v, out = x[:nq], x[nq:], np.empty_like(x)
-            if not turning:
-                out[:nq] = v
-                out[nq:] = self.acceleration(t, q, v)
-                return out
-            out[nq:] = self.acceleration(t, self._normalised(q), v)
-            if free:
-                # of the first joint, which aba leaves out of oMi
-                out[:3] = data.liMi[1].rotation @ v[:3]
-            for k, w in turning:
-                a, b, c = 0.5 * v[w : w + 3]
-                half[0, 1:] = c, -b, a
-                half[1, 0], half[1, 2:] = -c, (a, b)
-                half[2, :2], half[2, 3] = (b, -a), c
-                half[3, :3] = -a, -b, -c
-                out[k : k + 4] = half @ q[k : k + 4]
-            out[to_q] = v[from_v]
-            return out
-
-        return rate
+        q, v = self.pin.normalize(self.model, x[: self.model.nq]), x[self.model.nq :]
+        q_rate = self.pin.tangentMapProduct(self.model, q, v).ravel()
+        return np.concatenate([q_rate, self.acceleration(t, q, v)])
 
     def positions(self, x: np.ndarray) -> tuple[np.ndarray, float]:
         """Centres of mass (n, 3) and the largest gap of a cut joint [m]."""
-        q = self._normalised(x[: self.model.nq])
+        q = self.pin.normalize(self.model, x[: self.model.nq])
         self.pin.forwardKinematics(self.model, self.data, q)
         place = self.data.oMi
         gap = max(
@@ -196,11 +146,10 @@ class PinocchioPython(Peer):
 
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         dynamics = Dynamics(scene)
-        rate, x0 = dynamics.rate(), np.concatenate([dynamics.q0, dynamics.v0])
-        tolerance = setting.tolerance or 1e-6
+        x0, tolerance = np.concatenate([dynamics.q0, dynamics.v0]), setting.tolerance or 1e-6
 
         def run() -> Outcome:
-            path = follow(rate, x0, scene.t0, times, setting.solver, tolerance)
+            path = follow(dynamics.rate, x0, scene.t0, times, setting.solver, tolerance)
             n = len(dynamics.links.bodies)
             return looked_at(path.states, dynamics.positions, n, path.counts(), path.failure)
 
@@ -210,17 +159,3 @@ class PinocchioPython(Peer):
         dynamics = Dynamics(scene)
         q, v, t = dynamics.q0, dynamics.v0, scene.t0
         return loop_seconds(lambda: dynamics.acceleration(t, q, v))
-
-    def start_accelerations(self, scene: Scene) -> np.ndarray:
-        """Accelerations of the centres of mass at the start, world (n, 3) [m/s^2]."""
-        dynamics = Dynamics(scene)
-        pin, model, data = dynamics.pin, dynamics.model, dynamics.data
-        a = dynamics.acceleration(scene.t0, dynamics.q0, dynamics.v0)
-        pin.forwardKinematics(model, data, dynamics.q0, dynamics.v0, a)
-        result = []
-        for k, x in dynamics.links.bodies:
-            w = data.v[k + 1].angular
-            origin = pin.getClassicalAcceleration(model, data, k + 1, pin.LOCAL).linear
-            local = origin + np.cross(data.a[k + 1].angular, x) + np.cross(w, np.cross(w, x))
-            result.append(data.oMi[k + 1].rotation @ local)
-        return np.stack(result)

@@ -125,8 +125,3 @@ class ScipyDense(Peer):
         dense = Dense(scene)
         x0 = dense.start(scene)
         return loop_seconds(lambda: dense.accelerations(scene.t0, x0), loops=200)
-
-    def start_accelerations(self, scene: Scene) -> np.ndarray:
-        """Accelerations of the centres of mass at the start, world (n, 3) [m/s^2]."""
-        dense = Dense(scene)
-        return dense.accelerations(scene.t0, dense.start(scene))[:, :3]

@@ -36,10 +36,6 @@ class Problem:
     stiff: bool = False
     exact: Callable[[float], np.ndarray] | None = None
 
-    def system_and_start(self) -> tuple[stm.System, stm.State]:
-        """What is integrated."""
-        return self.scene.system, self.scene.state0
-
 
 def tracker(horizons: tuple[float, ...]) -> Problem:
     """The seven-body UAV with actuator forces, the report's case 2."""
@@ -49,22 +45,16 @@ def tracker(horizons: tuple[float, ...]) -> Problem:
 
 def stiff(horizon: float) -> list[Problem]:
     """The same with both sliders held by servos: the table's, and a much stiffer one."""
-    variants = {
-        "servo": (stm.tracker.Servo(), "sliders held by the table's servos (1e6 N/m)"),
-        "stiff_servo": (
-            stm.tracker.Servo(stiffness=1e7, damping=6e4),
-            "sliders held at 1e7 N/m and 6e4 N s/m",
-        ),
-    }
+
+    def held(key: str, servo: stm.tracker.Servo, title: str) -> Problem:
+        scene = stm.make_scene("uav_tracker", TRACKER_CASE, servo=servo)
+        key, title = f"uav_tracker_2_{key}", f"uav_tracker case 2, {title}"
+        return Problem(key, title, scene, (horizon,), stiff=True)
+
+    much = stm.tracker.Servo(stiffness=1e7, damping=6e4)
     return [
-        Problem(
-            f"uav_tracker_2_{key}",
-            f"uav_tracker case 2, {title}",
-            stm.make_scene("uav_tracker", TRACKER_CASE, servo=servo),
-            (horizon,),
-            stiff=True,
-        )
-        for key, (servo, title) in variants.items()
+        held("servo", stm.tracker.Servo(), "sliders held by the table's servos (1e6 N/m)"),
+        held("stiff_servo", much, "sliders held at 1e7 N/m and 6e4 N s/m"),
     ]
 
 

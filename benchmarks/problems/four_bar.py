@@ -12,6 +12,7 @@ While the cranks stay parallel, with theta from upright,
 As spatial revolute joints the loops have dependent rows: three per loop.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax
@@ -33,33 +34,28 @@ TOLERANCES = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 
 def four_bar(loops: int, gravity: Any = GRAVITY, coupler: float = 1.0) -> stm.System:
     """The mechanism with N loops of spatial revolute joints and couplers of so many kg."""
-    places = [float(i) for i in range(loops + 1)]
+    upright, lying = (ROD, THIN, ROD), (coupler * THIN, coupler * ROD, coupler * ROD)
     cranks = [
-        stm.Body(f"crank{i}", 1.0, (ROD, THIN, ROD), position=(x, 0.5, 0.0))
-        for i, x in enumerate(places)
+        stm.Body(f"crank{i}", 1.0, upright, position=(float(i), 0.5, 0.0)) for i in range(loops + 1)
     ]
     couplers = [
-        stm.Body(
-            f"coupler{i}",
-            coupler,
-            (coupler * THIN, coupler * ROD, coupler * ROD),
-            position=(x + 0.5, 1.0, 0.0),
-        )
-        for i, x in enumerate(places[:-1])
+        stm.Body(f"coupler{i}", coupler, lying, position=(i + 0.5, 1.0, 0.0)) for i in range(loops)
     ]
+    pull = stm.Gravity(jnp.asarray([0.0, -1.0, 0.0]) * jnp.asarray(gravity))
+    return stm.System([*cranks, *couplers], hinges(range(loops + 1)), [pull])
+
+
+def hinges(feet: Sequence[float]) -> list[stm.Joint]:
+    """All hinges of cranks that stand at some places [m] and end above 0, 1, 2, ..."""
     joints = [
-        stm.revolute(f"A{i}", "ground", f"crank{i}", point=(x, 0.0, 0.0), axis=Z)
-        for i, x in enumerate(places)
+        stm.revolute(f"A{i}", "ground", f"crank{i}", point=(float(x), 0.0, 0.0), axis=Z)
+        for i, x in enumerate(feet)
     ]
-    for i, x in enumerate(places[:-1]):
-        left, right = (x, 1.0, 0.0), (x + 1.0, 1.0, 0.0)
-        joints += [
-            stm.revolute(f"B{i} left", f"crank{i}", f"coupler{i}", point=left, axis=Z),
-            stm.revolute(f"B{i} right", f"crank{i + 1}", f"coupler{i}", point=right, axis=Z),
-        ]
-    zero = jnp.zeros(())
-    pull = stm.Gravity(jnp.stack([zero, -jnp.asarray(gravity), zero]))
-    return stm.System([*cranks, *couplers], joints, [pull])
+    for i in range(len(feet) - 1):
+        for side, k in (("left", i), ("right", i + 1)):
+            ends, point = (f"crank{k}", f"coupler{i}"), (float(k), 1.0, 0.0)
+            joints.append(stm.revolute(f"B{i} {side}", *ends, point=point, axis=Z))
+    return joints
 
 
 def start(system: stm.System, speed: Any = SPEED) -> stm.State:
@@ -85,13 +81,7 @@ def missing(by: float) -> tuple[stm.System, stm.State]:
         stm.Body("crank1", 1.0, inertia, position=(1 + by / 2, 0.5, 0.0), orientation=turned),
         stm.Body("coupler0", 1.0, (THIN, ROD, ROD), position=(0.5, 1.0, 0.0)),
     ]
-    joints = [
-        stm.revolute("A0", "ground", "crank0", point=(0.0, 0.0, 0.0), axis=Z),
-        stm.revolute("A1", "ground", "crank1", point=(1 + by, 0.0, 0.0), axis=Z),
-        stm.revolute("B0 left", "crank0", "coupler0", point=(0.0, 1.0, 0.0), axis=Z),
-        stm.revolute("B0 right", "crank1", "coupler0", point=(1.0, 1.0, 0.0), axis=Z),
-    ]
-    system = stm.System(bodies, joints, [stm.Gravity((0.0, -GRAVITY, 0.0))])
+    system = stm.System(bodies, hinges((0.0, 1 + by)), [stm.Gravity((0.0, -GRAVITY, 0.0))])
     rest = system.reference
     # the end of the longer crank moves across it, (1, by), and the coupler makes up for that
     v = SPEED * jnp.array([[0.5, 0.0, 0.0], [0.5, by / 2, 0.0], [1.0, by / 2, 0.0]])

@@ -4,7 +4,7 @@ All is measured from the bodies' centres of mass, in body axes, so that a peer n
 reference frames. Ground is body n, at the origin.
 """
 
-import time
+import timeit
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -157,18 +157,17 @@ def plain(scene: Scene, *, any_couple: bool = False) -> Plain:
         points = np.asarray(joint.point_i) - com[i], np.asarray(joint.point_j) - com[j]
         frames = np.asarray(joint.frame_i), np.asarray(joint.frame_j)
         joints.append(PlainJoint(joint.kind, i, j, *points, *frames))
-    loads: dict[str, list[Any]] = {kind: [] for kind in LOADS}
+    loads: dict[str, tuple[Any, ...]] = {kind: () for kind in ("wrenches", "actuators", "forces")}
+    gravity = np.zeros(3)
     for force in system.forces:
         kind, load = _load(force, scene, index, com, any_couple)
-        loads[kind].append(load)
+        if kind == "gravity":
+            gravity = gravity + load
+        else:
+            loads[kind] = (*loads.get(kind, ()), load)
     mass = np.asarray(system.bodies.mass, dtype=float)
     inertia = np.asarray(system.bodies.inertia, dtype=float)
-    gravity = sum(loads.pop("gravity"), np.zeros(3))
-    found = {kind: tuple(rows) for kind, rows in loads.items()}
-    return Plain(system.names, mass, inertia, tuple(joints), gravity, **found)
-
-
-LOADS = ("gravity", "wrenches", "actuators", "forces", "moments", "springs", "servos")
+    return Plain(system.names, mass, inertia, tuple(joints), gravity, **loads)
 
 
 def _load(
@@ -230,18 +229,10 @@ def why_not(scene: Scene) -> str:
 
 def starts(states: State) -> list[Start]:
     """Stacked states, arrays (k, n, .), as a list of starts."""
-    r, p, v, omega = (
-        np.asarray(x, dtype=float) for x in (states.r, states.p, states.v, states.omega)
-    )
-    return [Start(*one) for one in zip(r, p, v, omega, strict=True)]
+    parts = (np.asarray(x, dtype=float) for x in (states.r, states.p, states.v, states.omega))
+    return [Start(*one) for one in zip(*parts, strict=True)]
 
 
 def loop_seconds(call: Callable[[], object], loops: int = 2000, repeats: int = 5) -> float:
     """Median over repeats of the mean time of a call [s]."""
-    seconds = []
-    for _ in range(repeats):
-        clock = time.perf_counter()
-        for _ in range(loops):
-            call()
-        seconds.append((time.perf_counter() - clock) / loops)
-    return float(np.median(seconds))
+    return float(np.median(timeit.repeat(call, number=loops, repeat=repeats))) / loops

@@ -51,18 +51,13 @@ def absolute(q: np.ndarray) -> np.ndarray:
 
 def flat(point: tuple[float, float] | np.ndarray) -> np.ndarray:
     """A point of the plane in space."""
-    return np.array([point[0], point[1], 0.0])
+    return np.array([*point, 0.0])
 
 
 def at(place: np.ndarray, angle: float, point: tuple[float, float]) -> np.ndarray:
     """World position of a body's point, the body at `place` and `angle` [rad]."""
     c, s = np.cos(angle), np.sin(angle)
     return place + np.array([c * point[0] - s * point[1], s * point[0] + c * point[1], 0.0])
-
-
-def about_z(angle: float) -> tuple[float, float, float, float]:
-    """Euler parameters of a rotation by `angle` [rad] about z."""
-    return (float(np.cos(angle / 2)), 0.0, 0.0, float(np.sin(angle / 2)))
 
 
 def squeezer() -> stm.System:
@@ -79,7 +74,7 @@ def squeezer() -> stm.System:
     bodies = [
         stm.Body(
             name, mass, 3 * (inertia,), com=flat(com[name]), position=place[name],
-            orientation=about_z(angle[name]),
+            orientation=(np.cos(angle[name] / 2), 0.0, 0.0, np.sin(angle[name] / 2)),
         )
         for name, mass, inertia in zip(NAMES, MASS, INERTIA, strict=True)
     ]  # fmt: skip

@@ -90,12 +90,11 @@ def span(model: Plain) -> Tree:
     if len(carrier) != model.n + 1:
         raise UnsupportedError("More than one floating part is not written.")
     cuts = tuple(joint for joint in model.joints if joint not in kept)
-    plane = None
-    if any(joint.kind != "spherical" for joint in cuts):
-        plane = in_plane(model)
-        if plane is None:
-            said = "Cutting a spatial loop at a joint that is not spherical is not written."
-            raise UnsupportedError(said)
+    spatial = all(joint.kind == "spherical" for joint in cuts)
+    plane = None if spatial else in_plane(model)
+    if plane is None and not spatial:
+        said = "Cutting a spatial loop at a joint that is not spherical is not written."
+        raise UnsupportedError(said)
     return Tree(tuple(links), cuts, tuple(carrier[k] for k in range(model.n)), plane)
 
 

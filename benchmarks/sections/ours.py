@@ -21,24 +21,13 @@ def label(formulation: Any) -> str:
     return "augmented" if formulation.solve == "structured" else "augmented, dense"
 
 
-def watched(run: Any) -> Any:
-    """A `trajectory` that also returns whether it reached the end, found out inside the program."""
-
-    def both(*arguments: Any) -> tuple[stm.dynamics.Trajectory, Any]:
-        path = run(*arguments)
-        return path, path.result == diffrax.RESULTS.successful
-
-    return both
-
-
 def outcome(path: stm.dynamics.Trajectory, fine: Any, solver: Any) -> Outcome:
     """A trajectory in the suite's words, the start left out.
 
     In NumPy: what is asked of JAX's arrays here would be compiled, and timed, with the first run.
     """
-    accepted, rejected = (
-        int(np.asarray(count)[-1]) for count in (path.counts.accepted, path.counts.rejected)
-    )
+    counts = path.counts.accepted, path.counts.rejected
+    accepted, rejected = (int(np.asarray(count)[-1]) for count in counts)
     positions = np.asarray(path.states.r)[1:]
     failure = "" if bool(np.asarray(fine)) else words(path.result)
     if not failure and not np.all(np.isfinite(positions)):
@@ -72,8 +61,14 @@ class Ours(Peer):
         arguments = (scene.system, scene.state0, ts, tolerance)
         key = scene.name
         if key not in self._kept:
-            run = watched(trajectory(self.formulation, self.solver))
-            self._kept[key] = compiled(run, *arguments)
+            of = trajectory(self.formulation, self.solver)
+
+            def watched(*arguments: Any) -> Any:
+                """The trajectory, and whether it reached the end, found out in the program."""
+                path = of(*arguments)
+                return path, path.result == diffrax.RESULTS.successful
+
+            self._kept[key] = compiled(watched, *arguments)
         program, seconds = self._kept[key]
 
         def run() -> Outcome:

@@ -10,6 +10,8 @@ from sections.ours import Ours, explicit, for_stiff
 from sections.size import Size
 from shared.clock import Timing, measure, summary
 
+from stmuav_jax import Scene
+
 TARGETS = (1e-3, 1e-6, 1e-9)
 # A method whose run took longer than this is not tried with finer settings [s].
 PATIENCE = 3.0
@@ -40,29 +42,17 @@ def timed(run: Callable[[], Outcome], size: Size) -> tuple[Timing, Outcome]:
     return measure(run, repeats=size.repeats, warm_up=0, budget=size.budget)
 
 
-def empty(peer: Peer, setting: Setting, end: float, failure: str = "") -> dict[str, Any]:
-    """The row of a run of which nothing is known yet."""
-    how = {"solver": setting.solver, "tolerance": setting.tolerance, "step": setting.step}
-    measured = {"horizon": end, "error": None, "seconds": None, "failure": failure}
-    return {"method": peer.name, **how, **measured}
-
-
-def point(
-    peer: Peer, problem: Problem, end: float, setting: Setting, exact: np.ndarray, size: Size
-) -> dict[str, Any]:
-    """One run: its cost, its error, or why it failed."""
-    row = empty(peer, setting, end)
+def run(
+    peer: Peer, scene: Scene, end: float, setting: Setting, size: Size
+) -> tuple[dict[str, Any], np.ndarray | None]:
+    """One run: its cost, or why it failed; and where it ended."""
     try:
-        prepared = peer.prepare(problem.scene, np.array([end]), setting)
+        prepared = peer.prepare(scene, np.array([end]), setting)
         timing, outcome = timed(prepared.run, size)
     except Exception as error:
-        return row | {"failure": reason(error)}
-    return row | {
-        "error": distance(np.asarray(outcome.positions)[-1], exact),
-        "seconds": timing.to_dict(),
-        "compile_seconds": prepared.compile_seconds,
-        **outcome.figures(),
-    }
+        return {"failure": reason(error)}, None
+    cost = {"seconds": timing.to_dict(), "compile_seconds": prepared.compile_seconds}
+    return cost | outcome.figures(), np.asarray(outcome.positions)[-1]
 
 
 def line(
@@ -72,28 +62,23 @@ def line(
     rows: list[dict[str, Any]] = []
     slow: dict[str, str] = {}
     for setting in peer.settings_for(problem.scene):
-        if setting.solver in slow:
-            rows.append(empty(peer, setting, end, slow[setting.solver]))
+        row: dict[str, Any] = {
+            "method": peer.name, "solver": setting.solver, "tolerance": setting.tolerance,
+            "step": setting.step, "horizon": end, "error": None, "seconds": None,
+            "failure": slow.get(setting.solver, ""),
+        }  # fmt: skip
+        rows.append(row)
+        if row["failure"]:
             continue
-        rows.append(point(peer, problem, end, setting, exact, size))
-        say(rows[-1])
-        seconds = rows[-1]["seconds"]
-        if seconds and seconds["median"] > PATIENCE:
-            said = f"Left out: the coarser setting took {seconds['median']:.1f} s."
-            slow[setting.solver] = said
+        found, last = run(peer, problem.scene, end, setting, size)
+        row |= found | {"error": None if last is None else distance(last, exact)}
+        seconds = row["seconds"]["median"] if row["seconds"] else float("nan")
+        if seconds > PATIENCE:
+            slow[setting.solver] = f"Left out: the coarser setting took {seconds:.1f} s."
+        print(
+            f"  {peer.name} {setting}: {seconds} s, {row['error']} m {row['failure']}", flush=True
+        )
     return rows
-
-
-def say(row: dict[str, Any]) -> None:
-    """One line of progress."""
-    seconds = row["seconds"]["median"] if row["seconds"] else float("nan")
-    error = float("nan") if row["error"] is None else row["error"]
-    size = row["tolerance"] if row["tolerance"] is not None else row["step"]
-    print(
-        f"  {row['method']:34s} {row['solver']:18s} {size:7.0e} {row['horizon']:5g} s: "
-        f"{1e3 * seconds:9.2f} ms, error {error:8.1e} m {row['failure']}",
-        flush=True,
-    )
 
 
 def reference(problem: Problem, ours: Ours, size: Size) -> dict[float, np.ndarray]:
@@ -156,15 +141,15 @@ def cheapest(rows: list[dict[str, Any]], end: float) -> list[dict[str, Any]]:
 def curve(problem: Problem, ours: list[Ours], others: list[Peer], size: Size) -> dict[str, Any]:
     """All methods on one problem, against `reference`."""
     print(f"{problem.key}: {problem.title}", flush=True)
+    rows: list[dict[str, Any]] = []
     result: dict[str, Any] = {
         "problem": problem.key, "title": problem.title, "horizons": problem.horizons,
-        "closed_form": problem.exact is not None, "rows": [], "unsupported": [],
+        "closed_form": problem.exact is not None, "rows": rows, "unsupported": [],
     }  # fmt: skip
     try:
         exact = reference(problem, ours[0], size)
     except Exception as error:
         return result | {"failure": reason(error), "references": [], "cheapest": []}
-    rows = result["rows"]
     for method in (*ours[: size.methods], *others):
         if why := method.unsupported(problem.scene):
             result["unsupported"].append({"method": method.name, "reason": why})

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from peers.adapter import Peer
 from sections.ours import Ours
-from sections.precision import distance, reason, timed
+from sections.precision import distance, run
 from sections.size import Size
 from shared.clock import compiled, measure
 from shared.methods import trajectory
@@ -30,16 +30,7 @@ def scenes(size: Size, others: list[Peer]) -> dict[str, Any]:
         scene = stm.make_scene(name, case)
         ours = Ours(stm.Tree(), diffrax.Dopri8(), (TOLERANCE,))
         row: dict[str, Any] = {"scene": scene.name, "seconds": None, "failure": ""}
-        try:
-            prepared = ours.prepare(scene, np.array([size.span]), ours.settings()[0])
-            timing, outcome = timed(prepared.run, size)
-            row |= {
-                "seconds": timing.to_dict(),
-                "compile_seconds": prepared.compile_seconds,
-                **outcome.figures(),
-            }
-        except Exception as error:
-            row["failure"] = reason(error)
+        row |= run(ours, scene, size.span, ours.settings()[0], size)[0]
         rows.append(row)
         print(f"  {scene.name}: {row['seconds']} {row['failure']}", flush=True)
     return {"what": f"all scenes, tree, Dopri8 at {TOLERANCE:g}", "span": size.span, "rows": rows}
@@ -50,11 +41,11 @@ def by_hand(scene: stm.Scene) -> Any:
 
     (state (13,), end, tolerance) -> (state, steps). The quaternion is not normalised.
     """
-    bodies = scene.system.bodies
+    bodies, forces = scene.system.bodies, scene.system.forces
     mass, inertia = bodies.mass[0], bodies.inertia[0]
     inverse = jnp.linalg.inv(inertia)
-    rotors = next(f for f in scene.system.forces if isinstance(f, Rotors))
-    gravity = next(f for f in scene.system.forces if isinstance(f, stm.Gravity)).acceleration
+    rotors = next(f for f in forces if isinstance(f, Rotors))
+    gravity = next(f for f in forces if isinstance(f, stm.Gravity)).acceleration
     assert not callable(rotors.speed_squared)
     wrench = rotors.wrench(rotors.speed_squared, bodies.com[0])
 
@@ -70,7 +61,7 @@ def by_hand(scene: stm.Scene) -> Any:
         omega_rate = inverse @ (wrench[3:] - jnp.cross(omega, inertia @ omega))
         return jnp.concatenate([x[7:10], p_rate, v_rate, omega_rate])
 
-    def run(x: Any, end: Any, tolerance: Any) -> Any:
+    def solve(x: Any, end: Any, tolerance: Any) -> Any:
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(field), diffrax.Dopri8(), jnp.zeros(()), end, 1e-4, x,
             saveat=diffrax.SaveAt(t1=True),
@@ -80,7 +71,7 @@ def by_hand(scene: stm.Scene) -> Any:
         assert solution.ys is not None
         return solution.ys[0], solution.stats["num_steps"]
 
-    return run
+    return solve
 
 
 def run_times(
@@ -122,14 +113,12 @@ def hexacopter(size: Size, others: list[Peer]) -> dict[str, Any]:
 
     mine, x = run_times("stmuav-jax, tree", ours, flat, end, size)
     theirs, y = run_times("by hand", by_hand(scene), flat, end, size)
+    ratio = lambda a, b: a["seconds"]["median"] / b["seconds"]["median"]
+    pairs = zip(mine, theirs, strict=True)
     return {
         "what": "hexacopter against 13 equations by hand in diffrax, Dopri8; the latter does "
         "not normalise its quaternion and watches no residual",
-        "span": size.span,
-        "rows": mine + theirs,
-        "ratios": {
-            f"{a['tolerance']:.0e}": a["seconds"]["median"] / b["seconds"]["median"]
-            for a, b in zip(mine, theirs, strict=True)
-        },
+        "span": size.span, "rows": mine + theirs,
+        "ratios": {f"{a['tolerance']:.0e}": ratio(a, b) for a, b in pairs},
         "ends_differ": distance(x[None, :3], y[None, :3]),
-    }
+    }  # fmt: skip

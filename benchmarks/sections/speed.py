@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from peers.adapter import Peer
-from problems.compared import Problem, chain, disturbed, tracker
+from problems.compared import chain, disturbed, tracker
 from sections.ours import label
 from sections.precision import distance, reason
 from sections.size import Size
-from shared.clock import compiled, measure
+from shared.clock import compile_and_measure, compiled, measure
 from shared.methods import trajectory, words
 
 import stmuav_jax as stm
@@ -52,29 +52,23 @@ def formulation_cost(formulation: Any, scene: stm.Scene, size: Size) -> list[dic
     dense = isinstance(formulation, stm.Augmented) and formulation.solve == "dense"
     for batch in (1,) if dense else (1, *size.batches):
         count = max(1, size.evaluations // batch)
-        if batch == 1:
-            x, derivative = single, field
-        else:
-            x = jax.vmap(to_vector)(disturbed(scene, batch))
-            derivative = jax.vmap(field)
-        program, seconds = compiled(one_after_the_other(derivative, count), x)
-        timing, _ = measure(lambda p=program, x=x: p(x), repeats=size.repeats, budget=5.0)
+        x = single if batch == 1 else jax.vmap(to_vector)(disturbed(scene, batch))
+        run = one_after_the_other(field if batch == 1 else jax.vmap(field), count)
+        timing, _, seconds = compile_and_measure(run, x, repeats=size.repeats, budget=5.0)
         each, spread = (x / (count * batch) for x in (timing.median, timing.spread))
         rows.append({
             "method": f"stmuav-jax, {label(formulation)}", "batch": batch, "seconds": each,
             "spread": spread, "compile_seconds": seconds, "operations": ops, "failure": "",
         })  # fmt: skip
-        print(f"  {rows[-1]['method']} x {batch}: {1e6 * rows[-1]['seconds']:.2f} us", flush=True)
+        print(f"  {rows[-1]['method']} x {batch}: {1e6 * each:.2f} us", flush=True)
     return rows
 
 
 def acceleration(size: Size, others: list[Peer]) -> dict[str, Any]:
     """One evaluation of all accelerations, a lower bound of any explicit step."""
     scene = tracker(size.horizons).scene
-    kinds = (stm.Tree(), stm.Augmented(), stm.Augmented(solve="dense"))
-    rows = []
-    for formulation in kinds[: size.methods]:
-        rows += formulation_cost(formulation, scene, size)
+    kinds = (stm.Tree(), stm.Augmented(), stm.Augmented(solve="dense"))[: size.methods]
+    rows = [row for formulation in kinds for row in formulation_cost(formulation, scene, size)]
     for peer in others:
         row: dict[str, Any] = {"method": peer.name, "batch": 1, "seconds": None, "failure": ""}
         try:
@@ -86,23 +80,6 @@ def acceleration(size: Size, others: list[Peer]) -> dict[str, Any]:
         rows.append(row)
         print(f"  {peer.name}: {row['seconds']} {row['failure']}", flush=True)
     return {"what": "seconds for one acceleration, uav_tracker case 2", "rows": rows}
-
-
-def in_blocks(formulation: Any, solver: Any, scene: stm.Scene, block: int) -> Any:
-    """(states, ts, tolerance) -> end positions and success, vmap in blocks, one after the other."""
-    run = trajectory(formulation, solver)
-
-    def one(state: Any, ts: Any, tolerance: Any) -> tuple[Any, Any]:
-        path = run(scene.system, state, ts, tolerance)
-        return path.states.r[-1], path.result == diffrax.RESULTS.successful
-
-    def many(states: Any, ts: Any, tolerance: Any) -> tuple[Any, Any]:
-        split = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), states)
-        each = jax.vmap(one, in_axes=(0, None, None))
-        ends, fine = jax.lax.map(lambda s: each(s, ts, tolerance), split)
-        return ends.reshape(-1, *ends.shape[2:]), fine.reshape(-1)
-
-    return many
 
 
 def errors(ends: Any, exact: Any) -> dict[str, float | None]:
@@ -117,73 +94,75 @@ def errors(ends: Any, exact: Any) -> dict[str, float | None]:
 
 
 class Batches:
-    """Batches of one scene's trajectories from disturbed starts."""
+    """Batches of one scene's trajectories from disturbed starts, tree and Dopri8.
+
+    Attributes:
+        exact: ends of the first trajectories, at a tight tolerance.
+        tried: errors by tolerance. tolerance: the loosest whose largest error is small enough, else
+            whose median is, else the last.
+    """
 
     def __init__(self, size: Size) -> None:
         self.size, self.scene = size, tracker(size.horizons).scene
         self.ts = jnp.array([self.scene.t0, size.horizons[-1]])
         self.states = disturbed(self.scene, max(size.trajectories))
-        self.formulation, self.solver = stm.Tree(), diffrax.Dopri8()
-        self.exact = self._exact()
-
-    def first(self, count: int) -> stm.State:
-        """The first `count` starts."""
-        return jax.tree.map(lambda x: x[:count], self.states)
-
-    def program(self, count: int, block: int) -> tuple[Any, float]:
-        """Compiled for so many trajectories in blocks, and the seconds for that."""
-        many = in_blocks(self.formulation, self.solver, self.scene, block)
-        return compiled(many, self.first(count), self.ts, jnp.asarray(1e-6))
-
-    def _exact(self) -> np.ndarray:
-        count = min(self.size.trajectories)
-        program, _ = self.program(count, 1)
-        ends, fine = program(self.first(count), self.ts, jnp.asarray(self.size.tight))
-        if not bool(np.all(fine)):
-            lost = int(np.sum(~np.asarray(fine)))
+        count, self.tried = min(size.trajectories), []
+        program, _ = compiled(self.many(1), *self.given(count, size.tight))
+        ends, fine = program(*self.given(count, size.tight))
+        if lost := int(np.sum(~np.asarray(fine))):
             raise RuntimeError(
-                f"{lost} of {count} reference runs at {self.size.tight:g} stopped before the end."
+                f"{lost} of {count} reference runs at {size.tight:g} stopped before the end."
             )
-        self.tight_program = program
-        return np.asarray(ends)
-
-    def tolerance(self) -> tuple[float, list[dict[str, Any]]]:
-        """The loosest whose largest error is small enough, else whose median is; and what was tried."""
-        count, tried = len(self.exact), []
-        for tolerance in self.size.batch_tolerances:
-            ends, _ = self.tight_program(self.first(count), self.ts, jnp.asarray(tolerance))
-            tried.append({"tolerance": tolerance, **errors(ends, self.exact)})
-        for key in ("largest_error", "median_error"):
-            for row in tried:
-                if row[key] is not None and row[key] <= self.size.batch_error:
-                    return row["tolerance"], tried
-        return tried[-1]["tolerance"], tried
-
-    def row(self, count: int, block: int, tolerance: float) -> dict[str, Any]:
-        """Trajectories per second of one batch."""
-        program, seconds = self.program(count, block)
-        arguments = (self.first(count), self.ts, jnp.asarray(tolerance))
-        timing, (ends, fine) = measure(
-            lambda: program(*arguments), repeats=3, warm_up=0, budget=self.size.budget
+        self.exact = np.asarray(ends)
+        for tolerance in size.batch_tolerances:
+            ends, _ = program(*self.given(count, tolerance))
+            self.tried.append({"tolerance": tolerance, **errors(ends, self.exact)})
+        self.tolerance = next(
+            (
+                row["tolerance"]
+                for key in ("largest_error", "median_error")
+                for row in self.tried
+                if row[key] is not None and row[key] <= size.batch_error
+            ),
+            size.batch_tolerances[-1],
         )
+
+    def given(self, count: int, tolerance: float) -> tuple[stm.State, Any, Any]:
+        """Arguments of `many`: the first starts, the times and the tolerance."""
+        return jax.tree.map(lambda x: x[:count], self.states), self.ts, jnp.asarray(tolerance)
+
+    def many(self, block: int) -> Any:
+        """(states, ts, tolerance) -> ends and success, vmap in blocks one after the other."""
+        run = trajectory(stm.Tree(), diffrax.Dopri8())
+
+        def one(state: Any, ts: Any, tolerance: Any) -> tuple[Any, Any]:
+            path = run(self.scene.system, state, ts, tolerance)
+            return path.states.r[-1], path.result == diffrax.RESULTS.successful
+
+        def many(states: Any, ts: Any, tolerance: Any) -> tuple[Any, Any]:
+            split = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), states)
+            each = jax.vmap(one, in_axes=(0, None, None))
+            ends, fine = jax.lax.map(lambda s: each(s, ts, tolerance), split)
+            return ends.reshape(-1, *ends.shape[2:]), fine.reshape(-1)
+
+        return many
+
+    def row(self, count: int, block: int) -> dict[str, Any]:
+        """Trajectories per second of one batch."""
+        timing, (ends, fine), seconds = compile_and_measure(
+            self.many(block), *self.given(count, self.tolerance), repeats=3, warm_up=0,
+            budget=self.size.budget,
+        )  # fmt: skip
         lost = int(np.sum(~np.asarray(fine)))
         row = {
             "method": "stmuav-jax, tree", "trajectories": count, "block": block,
-            "tolerance": tolerance, "per_second": count / timing.median,
+            "tolerance": self.tolerance, "per_second": count / timing.median,
             "seconds": timing.to_dict(), "compile_seconds": seconds, "failed": lost,
             "failure": f"{lost} of {count} runs stopped before the end." if lost else "",
             **errors(ends, self.exact),
         }  # fmt: skip
         print(f"  {count} in blocks of {block}: {row['per_second']:.1f} per second", flush=True)
         return row
-
-    def of_peer(self, peer: Peer) -> list[dict[str, Any]]:
-        """A peer's throughput, finer settings until the error is small enough."""
-        count = min(self.size.peer_trajectories, len(self.states.r))
-        given = (self.scene, self.first(count), float(self.ts[-1]))
-        rows = throughput(peer, given, self.exact, self.size.batch_error, PATIENCE)
-        said = "A batch of trajectories is not written in our adapter."
-        return rows or [{"method": peer.name, "per_second": None, "failure": said}]
 
 
 def throughput(
@@ -225,22 +204,26 @@ def throughput(
 def batch(size: Size, others: list[Peer]) -> dict[str, Any]:
     """Trajectories per second: one, batches, and peers that offer a throughput mode."""
     runs = Batches(size)
-    tolerance, tried = runs.tolerance()
-    arguments = (runs.scene.system, runs.scene.state0, runs.ts, jnp.asarray(tolerance))
-    alone, _ = compiled(trajectory(runs.formulation, runs.solver), *arguments)
-    single, _ = measure(lambda: alone(*arguments), repeats=5 * size.repeats, budget=size.budget)
+    start = (runs.scene.system, runs.scene.state0, runs.ts, jnp.asarray(runs.tolerance))
+    run = trajectory(stm.Tree(), diffrax.Dopri8())
+    how = {"repeats": 5 * size.repeats, "budget": size.budget}
+    single, _, _ = compile_and_measure(run, *start, **how)
     counts = sorted(size.trajectories)
     middle = counts[len(counts) // 2]
-    rows = [runs.row(middle, block, tolerance) for block in size.blocks if middle % block == 0]
+    rows = [runs.row(middle, block) for block in size.blocks if middle % block == 0]
     best = max(rows, key=lambda row: row["per_second"])["block"]
-    rows += [runs.row(count, min(best, count), tolerance) for count in counts if count != middle]
+    rows += [runs.row(count, min(best, count)) for count in counts if count != middle]
+    first, *_ = runs.given(min(size.peer_trajectories, max(counts)), runs.tolerance)
+    said = "A batch of trajectories is not written in our adapter."
     for peer in others:
-        rows += runs.of_peer(peer)
+        given = (runs.scene, first, size.horizons[-1])
+        found = throughput(peer, given, runs.exact, size.batch_error, PATIENCE)
+        rows += found or [{"method": peer.name, "per_second": None, "failure": said}]
     return {
         "what": "trajectories per second, uav_tracker case 2, disturbed starts",
         "horizon": float(runs.ts[-1]),
-        "tolerance": tolerance,
-        "tried": tried,
+        "tolerance": runs.tolerance,
+        "tried": runs.tried,
         "error_wanted": size.batch_error,
         "references": len(runs.exact),
         "single": {"seconds": single.to_dict(), "per_second": 1 / single.best},
@@ -249,38 +232,27 @@ def batch(size: Size, others: list[Peer]) -> dict[str, Any]:
 
 
 def chain_cost(loops: int, size: Size) -> dict[str, Any]:
-    """One acceleration of a chain of N loops."""
-    problem = chain(loops)
-    system, state = problem.system_and_start()
-    tree = stm.Tree(redundant=True)
+    """One acceleration of a chain of N loops, and of some chains one simulated second."""
+    problem, tree, zero = chain(loops), stm.Tree(redundant=True), jnp.zeros(())
+    system, state = problem.scene.system, problem.scene.state0
     model = tree.prepare(system)
-    x, t = tree.to_vector(model, state), jnp.zeros(())
-    field = lambda x: tree.derivative(model, t, x, stm.Unstabilised())[0]
+    field = lambda x: tree.derivative(model, zero, x, stm.Unstabilised())[0]
     count = max(1, min(size.evaluations, 5000 // loops**2))
-    program, seconds = compiled(one_after_the_other(field, count), x)
-    one, _ = measure(lambda: program(x), repeats=size.repeats, budget=size.budget)
+    how = {"repeats": size.repeats, "budget": size.budget}
+    repeated, x = one_after_the_other(field, count), tree.to_vector(model, state)
+    one, _, seconds = compile_and_measure(repeated, x, **how)
     row = {
-        "loops": loops,
-        "bodies": system.n_bodies,
-        "acceleration_seconds": one.median / count,
-        "acceleration_compile_seconds": seconds,
-        "run_seconds": None,
-        "failure": "",
-    }
-    return row | (chain_run(problem, loops, size) if loops in size.run_loops else {})
-
-
-def chain_run(problem: Problem, loops: int, size: Size) -> dict[str, Any]:
-    """One simulated second of a chain of N loops."""
-    ts, tolerance = jnp.array([0.0, problem.horizons[-1]]), jnp.asarray(1e-6)
-    arguments = (*problem.system_and_start(), ts, tolerance)
-    run = trajectory(stm.Tree(redundant=True), diffrax.Dopri8())
-    program, seconds = compiled(run, *arguments)
-    timing, path = measure(lambda: program(*arguments), repeats=size.repeats, budget=size.budget)
+        "loops": loops, "bodies": system.n_bodies, "acceleration_seconds": one.median / count,
+        "acceleration_compile_seconds": seconds, "run_seconds": None, "failure": "",
+    }  # fmt: skip
+    if loops not in size.run_loops:
+        return row
+    given = (system, state, jnp.array([0.0, problem.horizons[-1]]), jnp.asarray(1e-6))
+    timing, path, seconds = compile_and_measure(trajectory(tree, diffrax.Dopri8()), *given, **how)
     fine = bool(path.result == diffrax.RESULTS.successful)
     # parallel cranks: by symmetry all of them turn alike
     heights = np.asarray(path.states.r[-1])[: loops + 1, 1:2]
-    return {
+    return row | {
         "run_seconds": timing.to_dict(),
         "run_compile_seconds": seconds,
         "steps": int(path.counts.accepted[-1] + path.counts.rejected[-1]),
@@ -293,29 +265,26 @@ def chain_run(problem: Problem, loops: int, size: Size) -> dict[str, Any]:
 def exponent(rows: list[dict[str, Any]], key: str, least: int) -> float | None:
     """k of seconds ~ N^k by least squares over rows with N >= least."""
     read = lambda row: row[key]["median"] if isinstance(row[key], dict) else row[key]
-    good = [(row["loops"], read(row)) for row in rows if not row["failure"] and row[key]]
-    good = [pair for pair in good if pair[0] >= least]
-    if len(good) < 2:
-        return None
-    n, seconds = np.log(np.array(good)).T
-    return float(np.polyfit(n, seconds, 1)[0])
+    fits = (row for row in rows if row["loops"] >= least and not row["failure"] and row[key])
+    good = [(row["loops"], read(row)) for row in fits]
+    return float(np.polyfit(*np.log(good).T, 1)[0]) if len(good) > 1 else None
 
 
 def scaling(size: Size, others: list[Peer]) -> dict[str, Any]:
     """Chains of N four-bar loops."""
     del others
     rows: list[dict[str, Any]] = []
+    left = ""
     for loops in size.loops:
-        clock: list[dict[str, Any]] = []
+        if left:
+            rows.append({"loops": loops, "failure": left})
+            continue
         try:
-            timing, _ = measure(
-                lambda n=loops, out=clock: out.append(chain_cost(n, size)), repeats=1, warm_up=0
-            )
+            timing, row = measure(lambda n=loops: chain_cost(n, size), repeats=1, warm_up=0)
         except Exception as error:
             rows.append({"loops": loops, "failure": reason(error)})
             continue
-        rows += clock
-        row = rows[-1]
+        rows.append(row)
         run = f"{1e3 * row['run_seconds']['median']:.1f} ms" if row["run_seconds"] else "no run"
         print(
             f"  N = {loops}: {1e6 * row['acceleration_seconds']:.1f} us, {run}, "
@@ -323,10 +292,7 @@ def scaling(size: Size, others: list[Peer]) -> dict[str, Any]:
             flush=True,
         )
         if timing.median > LONGEST:
-            left = [n for n in size.loops if n > loops]
-            text = f"left out: N = {loops} took {timing.median:.0f} s"
-            rows += [{"loops": n, "failure": text} for n in left]
-            break
+            left = f"left out: N = {loops} took {timing.median:.0f} s"
     keys = {"acceleration": "acceleration_seconds", "run": "run_seconds"}
     return {
         "what": "N-four-bar chain, tree with dependent rows; run: 1 s, Dopri8 at 1e-6",

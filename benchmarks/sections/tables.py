@@ -13,7 +13,7 @@ from shared.pages import (
     setting,
     table,
     whole,
-)  # fmt: skip
+)
 
 # What our adapters lack says nothing about what the programs can do.
 NOT_WRITTEN = ("not written in our adapter", "what the adapter lacks")

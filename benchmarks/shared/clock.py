@@ -8,7 +8,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -34,20 +34,16 @@ class Timing:
     spread: float
     repeats: int
 
-    def to_dict(self) -> dict[str, float]:
-        """As plain numbers, for JSON."""
-        return asdict(self)
+    to_dict = asdict
 
 
-class Cost(NamedTuple):
+@dataclass(frozen=True)
+class Cost:
     """Seconds of the processor and of the clock."""
 
     processor: Timing
     clock: Timing
-
-    def to_dict(self) -> dict[str, Any]:
-        """As plain numbers, for JSON."""
-        return {"processor": self.processor.to_dict(), "clock": self.clock.to_dict()}
+    to_dict = asdict
 
 
 def summary(seconds: list[float]) -> Timing:
@@ -104,6 +100,15 @@ def compiled(
     call: Any = stm.algebra.outer_jit(function)
     done = call.lower(*arguments).compile()
     return done, clock() - start
+
+
+def compile_and_measure(
+    function: Callable[..., Any], *arguments: Any, **how: Any
+) -> tuple[Timing, Any, float]:
+    """Timing and output of a function compiled for these arguments, and the seconds for that."""
+    program, seconds = compiled(function, *arguments)
+    timing, output = measure(lambda: program(*arguments), **how)
+    return timing, output, seconds
 
 
 def rounded(value: Any, digits: int = 4) -> Any:

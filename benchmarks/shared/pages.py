@@ -24,11 +24,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> Lines:
     return [line(head), line(["---"] * len(head)), *(line(row) for row in rows)]
 
 
-def titled(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table under its title, as text."""
-    return "\n".join([title, "", *table(head, rows)])
-
-
 def listed(rows: Sequence[Row], *columns: Column) -> Lines:
     """A Markdown table of records, column by column."""
 
@@ -44,9 +39,19 @@ def listed(rows: Sequence[Row], *columns: Column) -> Lines:
     return table(head, [[cell(row, column) for column in columns] for row in rows])
 
 
-def number(value: float | None, unit: float = 1.0) -> str:
-    """Three digits, or a dash."""
-    return "-" if value is None else f"{unit * value:.3g}"
+def titled(title: str, rows: Sequence[Row], *columns: Column) -> str:
+    """A table of records under its title, as text."""
+    return "\n".join([title, "", *listed(rows, *columns)])
+
+
+def shown(parts: Sequence[str], figures: Sequence[Path]) -> str:
+    """Texts with a blank line between them, and the figures' places."""
+    return "\n".join(["\n\n".join(parts), *map(str, figures)])
+
+
+def number(value: float | None, unit: float = 1.0, digits: int = 3) -> str:
+    """Some digits, or a dash."""
+    return "-" if value is None else f"{unit * value:.{digits}g}"
 
 
 def micro(value: float | None) -> str:
@@ -54,9 +59,9 @@ def micro(value: float | None) -> str:
     return number(value, 1e6)
 
 
-def power(value: float | None) -> str:
-    """Two digits and a power of ten, or a dash."""
-    return "-" if value is None else f"{value:.1e}"
+def power(value: float | None, behind: int = 1) -> str:
+    """One digit, some behind the point and a power of ten, or a dash."""
+    return "-" if value is None else f"{value:.{behind}e}"
 
 
 def whole(value: int | None) -> str:

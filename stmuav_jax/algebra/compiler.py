@@ -21,6 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import get_opaque_trace_state
 
+from ..checks.numbers import as_jax
+from . import kept
+
 Options = dict[str, str | bool | int | float]
 
 # XLA's CPU compiler hands sums of products above some size to a library meant for large
@@ -89,6 +92,8 @@ def outer_jit(function: Callable[..., Any]) -> Any:
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """`eqx.filter_jit` with `compiler_options(quick=True)`, determined at the first call.
 
+    Where programs are kept for later processes (`keep_programs`), this one is too.
+
     Within a transformation (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a
     larger program.
 
@@ -104,7 +109,12 @@ def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(function)
     def call(*args: Any) -> Any:
-        return within(*args) if transformed(args) else made()(*args)
+        if transformed(args):
+            return within(*args)
+        # NumPy's arrays are arguments here, while kept programs take those of JAX only
+        given = jax.tree.map(lambda x: as_jax(x) if isinstance(x, np.ndarray) else x, args)
+        key = kept.key_of(function, given, _NO_LIBRARY | _QUICK)
+        return made()(*args) if key is None else _by_key(key, function, given)(*given)
 
     return call
 
@@ -161,7 +171,11 @@ def program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
     """
     leaves, structure = jax.tree.flatten(args)
     setting = (jax.config.jax_enable_x64, jax.config.jax_default_device)  # pyright: ignore[reportAttributeAccessIssue]
-    key = (function, structure, setting, tuple(map(_kind, leaves)))
+    return _by_key((function, structure, setting, tuple(map(_kind, leaves))), function, args)
+
+
+def _by_key(key: Hashable, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    """Program of a key, compiled if there is none."""
     with _lock:
         found = _programs.get(key)
         if found is not None:
@@ -177,23 +191,45 @@ def program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
 
 
 def _compiled(function: Callable[..., Any], args: tuple[Any, ...]) -> Callable[..., Any]:
-    numbers, rest = eqx.partition(args, eqx.is_array)
-    static: list[Any] = []
+    key = kept.key_of(function, args, _NO_LIBRARY | _QUICK)
+    compiled, result = kept.load(key) or _compiled_now(function, args, key)
 
-    def run(numbers: Any) -> Any:
-        found, others = eqx.partition(function(*eqx.combine(numbers, rest)), eqx.is_array)
-        static[:] = [others]
-        return found
+    def call(*args: Any) -> Any:
+        arrays = [leaf for leaf in jax.tree.leaves(args) if eqx.is_array(leaf)]
+        found = jax.block_until_ready(compiled(arrays))
+        return jax.tree.map(lambda x: found[x] if isinstance(x, kept.Slot) else x, result)
+
+    return call
+
+
+def _compiled_now(
+    function: Callable[..., Any], args: tuple[Any, ...], key: str | None
+) -> tuple[Callable[[list[Any]], list[Any]], Any]:
+    """Program of lists of arrays, and the result's pytree with a `Slot` for each of them."""
+    leaves, structure = jax.tree.flatten(args)
+    places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
+    arrays, result = [leaves[k] for k in places], []
+
+    def run(arrays: list[Any]) -> list[Any]:
+        given = list(leaves)
+        for k, array in zip(places, arrays, strict=True):
+            given[k] = array
+        found, tree = jax.tree.flatten(function(*jax.tree.unflatten(structure, given)))
+        numbers = [x for x in found if eqx.is_array(x)]
+        count = iter(range(len(numbers)))
+        marked = [kept.Slot(next(count)) if eqx.is_array(x) else x for x in found]
+        result[:] = [jax.tree.unflatten(tree, marked)]
+        return numbers
 
     run.__name__ = run.__qualname__ = getattr(function, "__name__", "run")
     options = compiler_options(quick=True)
-    compiled = jax.jit(run, compiler_options=options).lower(numbers).compile()
-
-    def call(*args: Any) -> Any:
-        found = compiled(eqx.filter(args, eqx.is_array))
-        return eqx.combine(jax.block_until_ready(found), static[0])
-
-    return call
+    if key is None:
+        return jax.jit(run, compiler_options=options).lower(arrays).compile(), result[0]
+    with kept.beside_jax_cache(run):
+        lowered = jax.jit(run, compiler_options=options).lower(arrays)
+        compiled = lowered.compile()
+    kept.store(key, lowered, compiled, len(arrays), result[0])
+    return compiled, result[0]
 
 
 def _kind(leaf: Any) -> Hashable:

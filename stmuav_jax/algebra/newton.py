@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from .derivative import value_and_jacobian
+from .derivative import directional, value_and_jacobian
 
 # Residuals below this that no longer halve are taken for round-off.
 _ROUND_OFF = 1e-6
@@ -168,8 +168,33 @@ def _rooted_jvp(primals: Any, tangents: Any) -> Any:
     root, rest = _rooted(primal_fn, rewrite_fn, inputs)
     of = lambda y, given: rewrite_fn(y, rest, eqx.combine(given, still))
     rate = jax.jvp(lambda given: of(root, given), (varied,), (moved,))[1]
-    J = jax.jacfwd(lambda y: of(y, varied))(root)
+    J = _jacobian(root, _still(rest), inputs, rewrite_fn)
     zeros = jax.tree.map(
         lambda x: jax.custom_derivatives.zero_from_primal(x, symbolic_zeros=True), rest
     )
     return (root, rest), (-jnp.linalg.solve(J, rate), zeros)
+
+
+def _still(tree: Any) -> Any:
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
+@eqx.filter_custom_jvp
+def _jacobian(root: Any, rest: Any, inputs: Any, rewrite_fn: Any) -> Float[Array, "n n"]:
+    """Jacobian at a root: that of Newton's last step if it has it, else computed.
+
+    The equations are then compiled once less. Derivatives of the Jacobian are those of the
+    equations in both cases.
+    """
+    is_newton = lambda x: isinstance(x, NewtonState)
+    for state in filter(is_newton, jax.tree.leaves(rest, is_leaf=is_newton)):
+        if state.J.shape == (root.size, root.size):
+            return state.J
+    return jax.jacfwd(lambda y: rewrite_fn(y, rest, inputs))(root)
+
+
+@_jacobian.def_jvp
+def _jacobian_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    root, rest, inputs, rewrite_fn = primals
+    moved = lambda x, inputs: jax.jacfwd(lambda y: rewrite_fn(y, rest, inputs))(x)
+    return directional(moved, (root, inputs), (tangents[0], tangents[2]))

@@ -18,6 +18,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
@@ -87,12 +88,17 @@ def rotation_matrix(p: Quats) -> Float[Array, "3 3 ..."]:
 
     Source: report Part II, Eq. 6.10, corrected (its (1,1) entry is misprinted).
     """
+    return rotation_matrix_in(jnp, p)
+
+
+def rotation_matrix_in(module: Any, p: Quats) -> Float[Array | np.ndarray, "3 3 ..."]:
+    """`rotation_matrix` by the functions of a module, `numpy` or `jax.numpy`."""
     e0, e1, e2, e3 = p[0], p[1], p[2], p[3]
     s0, s1, s2, s3 = e0 * e0, e1 * e1, e2 * e2, e3 * e3
-    r0 = jnp.stack([s0 + s1 - s2 - s3, 2 * (e1 * e2 - e0 * e3), 2 * (e1 * e3 + e0 * e2)])
-    r1 = jnp.stack([2 * (e1 * e2 + e0 * e3), s0 - s1 + s2 - s3, 2 * (e2 * e3 - e0 * e1)])
-    r2 = jnp.stack([2 * (e1 * e3 - e0 * e2), 2 * (e2 * e3 + e0 * e1), s0 - s1 - s2 + s3])
-    return jnp.stack([r0, r1, r2])
+    r0 = module.stack([s0 + s1 - s2 - s3, 2 * (e1 * e2 - e0 * e3), 2 * (e1 * e3 + e0 * e2)])
+    r1 = module.stack([2 * (e1 * e2 + e0 * e3), s0 - s1 + s2 - s3, 2 * (e2 * e3 - e0 * e1)])
+    r2 = module.stack([2 * (e1 * e3 - e0 * e2), 2 * (e2 * e3 + e0 * e1), s0 - s1 - s2 + s3])
+    return module.stack([r0, r1, r2])
 
 
 def euler_parameter_rate(p: Quats, omega: Vec3s) -> Float[Array, "4 ..."]:

@@ -1,13 +1,56 @@
 """Conversion of a user's numbers to arrays, with errors that name a bad kind, shape or size."""
 
 import reprlib
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .errors import ModelError, check_finite, check_shape, concrete
 from .shapes import Numbers
+
+Tree = TypeVar("Tree")
+
+
+def floats(value: object) -> Array:
+    """Convert numbers to an array of floating-point numbers, of JAX's default data type.
+
+    Numbers that are not traced pass through NumPy. JAX would compile a program for each shape.
+    """
+    if concrete(value):
+        value = np.asarray(value, dtype=jax.dtypes.canonicalize_dtype(float))
+    return jnp.asarray(value, dtype=float)  # pyright: ignore[reportArgumentType]
+
+
+def stacked(rows: Sequence[Any], axis: int = 0) -> Array:
+    """Stack arrays along a new axis, by NumPy if none is traced, which compiles nothing."""
+    if not concrete(rows):
+        return jnp.stack(rows, axis=axis)
+    return as_jax(np.stack([np.asarray(row) for row in rows], axis=axis))
+
+
+def as_jax(array: Array | np.ndarray) -> Array:
+    """Convert a NumPy array to one of JAX of the same data type, without compiling."""
+    # without a data type `jnp.asarray` compiles a program for each shape
+    return jnp.asarray(array, dtype=jax.dtypes.canonicalize_dtype(array.dtype))
+
+
+def as_numpy(tree: Tree) -> Tree:
+    """Pytree with its arrays as NumPy arrays, or the same pytree if one of them is traced.
+
+    Operations on NumPy arrays compile nothing; `array_module` has the functions for them.
+    """
+    if not concrete(tree):
+        return tree
+    return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
+
+
+def array_module(*values: object) -> Any:
+    """The module `numpy` if none of the values is traced by JAX, else `jax.numpy`."""
+    return np if concrete(values) else jnp
 
 
 def numbers(
@@ -36,7 +79,7 @@ def numbers(
             found = np.asarray(None)
         if found.dtype.kind not in "biuf":
             raise error(f"{what} must be {_with(wanted, unit)}, but it is {reprlib.repr(value)}.")
-    array = jnp.asarray(value, dtype=float)  # pyright: ignore[reportArgumentType]
+    array = floats(value)
     if array.shape != shape:
         raise error(f"{what} must be {_with(wanted, unit)}, but its shape is {array.shape}.")
     check_finite(array, what, unit, error)
@@ -51,14 +94,14 @@ def vector(value: Numbers, what: str, unit: str) -> Float[Array, "3"]:
     """Convert a user's vector (3,) to an array; `ModelError` for a bad shape or number."""
     check_shape(value, (3,), what)
     check_finite(value, what, unit)
-    return jnp.asarray(value, dtype=float)
+    return floats(value)
 
 
 def scalar(value: Numbers, what: str, unit: str) -> Float[Array, ""]:
     """Convert a user's number to an array (); `ModelError` for a bad shape or number."""
     check_shape(value, (), what)
     check_finite(value, what, unit)
-    return jnp.asarray(value, dtype=float)
+    return floats(value)
 
 
 def nonnegative(value: Numbers, what: str, unit: str) -> Float[Array, ""]:

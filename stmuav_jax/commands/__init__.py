@@ -1,1 +1,1 @@
-"""Commands of the command line. Floor 14."""
+"""Commands of the command line. Floor 15."""

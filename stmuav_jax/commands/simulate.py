@@ -62,6 +62,8 @@ class Settings:
     """Steps allowed between two saved times."""
     error_estimate: bool = True
     """Estimate the run's error by a second run beside it."""
+    certificate: Literal["standard", "full"] = "standard"
+    """Full: also compare the accelerations with those by another formulation; compiles longer."""
     params: Annotated[Path | None, default("the report's values")] = None
     """TOML file with values that replace the table's."""
     out: Annotated[Path | None, default("runs/SCENE")] = None
@@ -165,6 +167,7 @@ def run_scene(scene: "Scene", settings: Settings, console: Console) -> "Run":
             t1=settings.t1,
             save_every=settings.save_every,
             error_estimate=settings.error_estimate,
+            certificate=settings.certificate,
             throw=False,
             progress=report,
         )

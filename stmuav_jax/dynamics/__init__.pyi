@@ -49,6 +49,7 @@ from .integration.adjoint import DiscreteAdjoint as DiscreteAdjoint
 from .integration.advance import (
     Trajectory as Trajectory,
 )
+from .integration.explicit import RungeKutta4 as RungeKutta4
 from .integration.rosenbrock import (
     Rodas5P as Rodas5P,
 )

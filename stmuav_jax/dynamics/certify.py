@@ -1,40 +1,107 @@
 """Certificate of a finished run, from its trajectory and analysis."""
 
+from typing import NamedTuple
+
+import jax
 import numpy as np
 
 from ..mechanics.system import System
 from .assembly.initial import Rank
 from .error_estimate import ErrorEstimate
-from .evaluation import Snapshot, StartCheck
+from .evaluation import Balances, RowsAt, Saved, accelerations, balances, rows_at, singular_values
+from .formulations.augmented import Augmented, Model
 from .formulations.constraints import Constraints
 from .integration.advance import Trajectory
-from .run import Certificate, Seconds, relative
+from .integration.problem import Problem
+from .run import Certificate, Seconds, relative, saved
+from .tree.formulation import Tree
+
+
+class Start(NamedTuple):
+    """Checks of the initial state: its constraint rows, their rank, and the largest | |p|^2 - 1 |."""
+
+    rows: RowsAt
+    rank: Rank
+    norm: float
+
+
+# Largest number of saved states at which the standard certificate looks at the rank.
+SEEN = 256
+
+
+class Checked(NamedTuple):
+    """Checks of the saved states.
+
+    Attributes:
+        balances: energies and momenta; None if they were left out.
+        smallest: smallest singular value number `rank` of the constraint Jacobian, or None.
+        difference: that of two formulations, see `Certificate.formulation_difference`, or None.
+        worst: largest constraint residuals by name in a certificate.
+    """
+
+    balances: Balances | None
+    smallest: float | None
+    difference: float | None
+    worst: dict[str, float]
+
+
+def check_saved(
+    problem: Problem, rows: Model, start: Start, first: Trajectory, full: bool
+) -> Checked:
+    """Checks of the saved states of a run, by the rows of all joints and by another formulation.
+
+    Args:
+        rows: system prepared for maximal coordinates, with the rows of all joints.
+        full: look at the rows of every saved state, and compare accelerations with those by
+            another formulation.
+    """
+    at, system = saved(first), rows.system
+    pick = np.arange(len(at.ts))
+    if not full and len(pick) > SEEN:
+        pick = np.linspace(0, len(pick) - 1, SEEN).round().astype(int)
+    there = rows_at(rows, jax.tree.map(lambda x: np.asarray(x)[pick], at))
+    smallest = difference = None
+    if start.rank.rank:
+        smallest = float(np.min(singular_values(there)[:, start.rank.rank - 1]))
+    looked = there if full else start.rows
+    if full:
+        difference = _formulation_difference(problem, rows, at, bool(start.rank.redundant))
+    worst = violations(rows.constraints, first, looked, start.norm)
+    return Checked(balances(system, at), smallest, difference, worst)
+
+
+def _formulation_difference(problem: Problem, rows: Model, at: Saved, dependent: bool) -> float:
+    """Largest relative difference of the accelerations by two formulations."""
+    own = problem.method.formulation
+    other, model = Augmented(), rows
+    if isinstance(own, Augmented):
+        other = Tree()
+        model = other.prepare(rows.system)
+    other = other.allowing_dependent_rows() if dependent else other
+    found = [accelerations(how, m, at) for how, m in ((own, problem.model), (other, model))]
+    pairs = [[x.v_rate, x.omega_rate] for x in found]
+    return max(relative(a - b, a, b) for a, b in zip(*pairs, strict=True))
 
 
 def certify(
     system: System,
     trajectory: Trajectory,
-    view: Snapshot | None,
+    checked: Checked,
     errors: ErrorEstimate,
     rank: Rank,
-    worst: dict[str, float],
     result: str,
     seconds: Seconds,
 ) -> Certificate:
     """Assemble the certificate of a finished run.
 
     Args:
-        view: `Snapshot`s of the saved states, if they were analysed. rank: rank at the start.
-        worst: result of `violations`. result: outcome of the run in words.
+        rank: rank at the start. result: outcome of the run in words.
     """
-    drift, relative_drift, momentum = _balances(system, trajectory, view)
+    drift, relative_drift, momentum = _balances(system, trajectory, checked.balances)
     position, angle, velocity, angular_velocity = (
         _over_all(x)
         for x in (errors.position, errors.angle, errors.velocity, errors.angular_velocity)
     )
-    smallest = None
-    if view is not None and rank.rank:
-        smallest = float(np.min(view.singular_values[:, rank.rank - 1]))
     return Certificate(
         result=result,
         t_end=float(trajectory.ts[-1]),
@@ -47,15 +114,16 @@ def certify(
         error_e_folding_time=errors.e_folding_time,
         predictability_horizon=errors.predictability_horizon,
         error_words=errors.words(np.asarray(trajectory.ts)),
-        **worst,
+        **checked.worst,
         energy_error=drift,
         relative_energy_error=relative_drift,
         momentum_error=momentum[0],
         angular_momentum_error=momentum[1],
-        smallest_singular_value=smallest,
+        smallest_singular_value=checked.smallest,
         rows=rank.rows,
         rank=rank.rank,
         redundant=rank.redundant,
+        formulation_difference=checked.difference,
         accepted_steps=int(trajectory.counts.accepted[-1]),
         rejected_steps=int(trajectory.counts.rejected[-1]),
         steps_at_growth_limit=int(trajectory.counts.at_growth_limit[-1]),
@@ -67,7 +135,7 @@ def certify(
 
 
 def _balances(
-    system: System, trajectory: Trajectory, view: Snapshot | None
+    system: System, trajectory: Trajectory, view: Balances | None
 ) -> tuple[float, float, tuple[float | None, float | None]]:
     """Largest energy error [J], its ratio to the largest energy, relative momentum errors."""
     if view is None:
@@ -86,17 +154,21 @@ def _balances(
 
 
 def violations(
-    constraints: Constraints, trajectory: Trajectory, start: StartCheck
+    constraints: Constraints, trajectory: Trajectory, rows: RowsAt, norm: float
 ) -> dict[str, float]:
-    """Largest residuals at the start and over the accepted steps, by name in a certificate."""
+    """Largest residuals over the accepted steps and in `rows`, by name in a certificate.
+
+    Args:
+        norm: largest | |p|^2 - 1 | at the start.
+    """
     angular, worst = constraints.angular, trajectory.worst
     over = lambda way, x: max(float(way[-1]), float(np.max(np.abs(x), initial=0.0)))
     return {
-        "position_violation": over(worst.position, start.residuals[~angular]),
-        "angle_violation": over(worst.angle, start.residuals[angular]),
-        "velocity_violation": over(worst.velocity, start.rates[~angular]),
-        "angular_velocity_violation": over(worst.angular_velocity, start.rates[angular]),
-        "norm_violation": max(float(worst.norm[-1]), start.norm),
+        "position_violation": over(worst.position, rows.residuals[:, ~angular]),
+        "angle_violation": over(worst.angle, rows.residuals[:, angular]),
+        "velocity_violation": over(worst.velocity, rows.rates[:, ~angular]),
+        "angular_velocity_violation": over(worst.angular_velocity, rows.rates[:, angular]),
+        "norm_violation": max(float(worst.norm[-1]), norm),
     }
 
 

@@ -7,6 +7,7 @@ import diffrax
 import numpy as np
 
 from ..checks.errors import ModelError, SettingError, StateError, concrete
+from ..checks.numbers import as_numpy
 from ..checks.physical import check_unit
 from ..mechanics.constraint import ROWS
 from ..mechanics.state import State
@@ -114,6 +115,7 @@ def check_start(system: System, state: State) -> None:
         ("v", "velocity", "m/s"),
         ("omega", "angular velocity", "rad/s"),
     )
+    state = as_numpy(state)
     for k, name in enumerate(system.names):
         check_unit(state.p[k], f"body '{name}' in the initial state", StateError)
         for field, words, unit in units:

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..algebra.rotation import from_rotation_vector, product
+from ..checks.numbers import floats
 from ..mechanics.state import State
 from .integration.advance import Trajectory
 from .integration.march import March
@@ -110,13 +111,13 @@ class SecondRun:
         self.first = problem
         factor = usual(problem) if factor is None else factor
         self.difference = 1.5 if factor == ROUND_OFF else abs(1 - factor)
-        smaller = lambda x: jnp.maximum(x * factor, jnp.minimum(x, _SMALLEST))
+        smaller = lambda x: floats(max(float(x) * factor, min(float(x), _SMALLEST)))
         method = problem.method
         changes: dict[str, Any] = {"rtol": smaller(method.rtol), "atol": smaller(method.atol)}
         # a run with a bounded step length becomes more accurate by halving the bound
         longest: Any = getattr(method, "max_step", None)
         if eqx.is_array(longest):
-            changes["max_step"] = longest / 2
+            changes["max_step"] = floats(float(longest) / 2)
         method = dataclasses.replace(method, **changes)
         self.march = March(dataclasses.replace(problem, method=method), t0, state0)
         self.last = (t0, 0)

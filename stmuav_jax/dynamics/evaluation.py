@@ -1,5 +1,6 @@
 """Evaluation of single states: accelerations, reactions, energy, momentum and residuals."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,7 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..algebra.compiler import in_blocks, kept_jit
+from ..checks.numbers import as_jax
 from ..checks.shapes import Numbers
+from ..mechanics.internal import with_internal
 from ..mechanics.load import Load
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
@@ -22,142 +25,139 @@ from .integration.problem import at_internal
 
 
 class Snapshot(eqx.Module):
-    """Quantities of a system at one state and time.
+    """Quantities of a system at one state and time, or stacked along leading axes.
 
     Attributes:
         accelerations: accelerations and Lagrange multipliers.
         reactions: reactions at every joint, world axes.
         kinetic, potential: energies [J].
         momentum: linear and angular momentum about the world's origin (6,).
-        residuals: scaled position residual of every row (m,) [m], or [rad] for cosines and angles.
-        rates: scaled velocity residual of every row (m,) [m/s] or [rad/s].
-        singular_values: those of the constraint Jacobian in (v, omega'), descending.
-        acceleration_residual: largest |J qddot - gamma|; non-zero for contradictory rows.
-        finite_loads: true for each force element whose load is finite.
     """
 
     accelerations: Accelerations
     reactions: Reactions
+    kinetic: Float[Array | np.ndarray, "*k"]
+    potential: Float[Array | np.ndarray, "*k"]
+    momentum: Float[Array | np.ndarray, "*k 6"]
+
+
+class Balances(NamedTuple):
+    """Energies [J] and momentum (6,) at one state; see `Snapshot`."""
+
     kinetic: Float[Array, ""]
     potential: Float[Array, ""]
     momentum: Float[Array, "6"]
+
+
+class RowsAt(NamedTuple):
+    """Constraint rows of all joints and loads of all force elements at one state.
+
+    Attributes:
+        residuals: scaled position residual of every row (m,) [m], or [rad] for cosines and angles.
+        rates: scaled velocity residual of every row (m,) [m/s] or [rad/s].
+        matrix: constraint Jacobian in (v, omega') (m, 6 n). gamma: right-hand side of its
+            rows for accelerations (m,).
+        finite_loads: true for each force element whose load is finite.
+    """
+
     residuals: Float[Array, " m"]
     rates: Float[Array, " m"]
-    singular_values: Float[Array, " s"]
-    acceleration_residual: Float[Array, ""]
+    matrix: Float[Array, "m k"]
+    gamma: Float[Array, " m"]
     finite_loads: Bool[Array, " forces"]
 
 
-def snapshot(
-    formulation: AbstractFormulation, model: Any, rows: Model, t: Float[Array, ""], state: State
-) -> Snapshot:
-    """Evaluate one state through a formulation, without stabilisation.
+class Saved(NamedTuple):
+    """Times (k,) [s], states (k, n, .) and actuator states of the forces (k, m) of a run."""
 
-    Args:
-        model: system prepared for the formulation. rows: system prepared for maximal
-            coordinates, with the rows of all joints.
-    """
-    system = rows.system
-    result = formulation.accelerations(model, t, state, Unstabilised())
-    kin = system.kinematics(state)
-    eq = rows.constraints.equations(t, kin)
-    scale = rows.constraints.scales()
-    u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
-    u_rate = jnp.concatenate([result.v_rate, result.omega_rate], axis=1).reshape(-1)
-    loads = [force.load(t, kin) for force in system.forces]
-    finite = [jnp.all(jnp.isfinite(x.force)) & jnp.all(jnp.isfinite(x.moment)) for x in loads]
-    values = jnp.linalg.svd(eq.matrix, compute_uv=False) if eq.gamma.size else eq.gamma
-    now = energy(system, state, t)
-    return Snapshot(
-        accelerations=result,
-        reactions=formulation.reactions(model, t, state, result),
-        kinetic=now.kinetic,
-        potential=now.potential,
-        momentum=momentum(system, state),
-        residuals=scale * eq.value,
-        rates=scale * (eq.matrix @ u - eq.target),
-        singular_values=values,
-        acceleration_residual=jnp.max(jnp.abs(eq.matrix @ u_rate - eq.gamma), initial=0.0),
-        finite_loads=jnp.stack(finite) if finite else jnp.zeros((0,), bool),
-    )
+    ts: Float[Array, " k"] | np.ndarray
+    states: State
+    internal: Float[Array, "k m"] | np.ndarray
 
 
 @kept_jit
-def _snapshots(
-    formulation: AbstractFormulation, model: Any, rows: Model, ts: Any, states: State, own: Any
-) -> Snapshot:
-    def one(at: tuple[Array, State, Array]) -> Snapshot:
-        t, state, z = at
-        if not z.shape[0]:
-            return snapshot(formulation, model, rows, t, state)
-        return snapshot(formulation, at_internal(model, z), at_internal(rows, z), t, state)
+def _dynamics(
+    formulation: AbstractFormulation, model: Any, saved: Saved, reacting: bool
+) -> tuple[Accelerations, Reactions | None]:
+    def one(at: Saved) -> tuple[Accelerations, Reactions | None]:
+        here = at_internal(model, at.internal) if at.internal.shape[0] else model
+        found = formulation.accelerations(here, at.ts, at.states, Unstabilised())
+        return found, formulation.reactions(here, at.ts, at.states, found) if reacting else None
 
-    return jax.lax.map(one, (ts, states, own))
+    return jax.lax.map(one, saved)
+
+
+@kept_jit
+def _balances(system: System, saved: Saved) -> Balances:
+    def one(at: Saved) -> Balances:
+        here = with_internal(system, at.internal)
+        now = energy(here, at.states, at.ts)
+        return Balances(now.kinetic, now.potential, momentum(here, at.states))
+
+    return jax.lax.map(one, saved)
+
+
+@kept_jit
+def _rows(model: Model, saved: Saved) -> RowsAt:
+    def one(at: Saved) -> RowsAt:
+        system, state = with_internal(model.system, at.internal), at.states
+        kin = system.kinematics(state)
+        eq = model.constraints.equations(at.ts, kin)
+        scale = model.constraints.scales()
+        u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
+        loads = [force.load(at.ts, kin) for force in system.forces]
+        finite = [jnp.all(jnp.isfinite(x.force)) & jnp.all(jnp.isfinite(x.moment)) for x in loads]
+        fine = jnp.stack(finite) if finite else jnp.zeros((0,), bool)
+        off = scale * (eq.matrix @ u - eq.target)
+        return RowsAt(scale * eq.value, off, eq.matrix, eq.gamma, fine)
+
+    return jax.lax.map(one, saved)
 
 
 # One block size for the initial state and for all saved states: one compilation serves both.
 _BLOCK = 32
 
 
-def snapshots(
-    formulation: AbstractFormulation,
-    model: Any,
-    rows: Model,
-    ts: np.ndarray,
-    states: State,
-    internal: np.ndarray,
-) -> Snapshot:
-    """`snapshot` of k states, as NumPy arrays stacked along the first axis.
+def _in_blocks(function: Callable[[Saved], Any], saved: Saved) -> Any:
+    return in_blocks(lambda *at: function(Saved(*jax.tree.map(as_jax, at))), _BLOCK, *saved)
+
+
+def snapshots(formulation: AbstractFormulation, model: Any, saved: Saved) -> Snapshot:
+    """`Snapshot`s of saved states, as NumPy arrays stacked along the first axis.
+
+    The accelerations are those of the formulation, without stabilisation.
 
     Args:
-        internal: actuator states of the forces (k, m).
+        model: system prepared for the formulation.
     """
-
-    def block(*at: Any) -> Snapshot:
-        return _snapshots(formulation, model, rows, *jax.tree.map(jnp.asarray, at))
-
-    return in_blocks(block, _BLOCK, ts, states, internal)
+    found = _in_blocks(lambda at: _dynamics(formulation, model, at, True), saved)
+    return Snapshot(*found, *balances(model.system, saved))
 
 
-class StartCheck(NamedTuple):
-    """Quantities of the initial state that `simulate` checks; `Snapshot` describes each."""
-
-    residuals: np.ndarray
-    rates: np.ndarray
-    singular_values: np.ndarray
-    finite_loads: np.ndarray
-    norm: float
+def accelerations(formulation: AbstractFormulation, model: Any, saved: Saved) -> Accelerations:
+    """Accelerations of saved states by a formulation, as those of `snapshots`."""
+    return _in_blocks(lambda at: _dynamics(formulation, model, at, False), saved)[0]
 
 
-def first_look(view: Snapshot, state: State) -> StartCheck:
-    """Checked quantities from the first of stacked snapshots."""
-    parts = (view.residuals, view.rates, view.singular_values, view.finite_loads)
-    residuals, rates, values, finite = (np.asarray(part)[0] for part in parts)
-    return StartCheck(residuals, rates, values, finite, _off_unit(state))
+def balances(system: System, saved: Saved) -> Balances:
+    """`Balances` of saved states, as NumPy arrays stacked along the first axis."""
+    return _in_blocks(lambda at: _balances(system, at), saved)
 
 
-def look(rows: Model, state: State, t: float) -> StartCheck:
-    """Checked quantities at one state, without accelerations: less to compile than a snapshot."""
-    *parts, matrix = _rows_and_loads(rows, state, jnp.asarray(t, dtype=state.r.dtype))
-    residuals, rates, finite = map(np.asarray, parts)
-    values = np.linalg.svd(matrix, compute_uv=False) if residuals.size else residuals
-    return StartCheck(residuals, rates, values, finite, _off_unit(state))
+def rows_at(model: Model, saved: Saved) -> RowsAt:
+    """`RowsAt` of saved states, as NumPy arrays stacked along the first axis.
+
+    Args:
+        model: system prepared for maximal coordinates, with the rows of all joints.
+    """
+    return _in_blocks(lambda at: _rows(model, at), saved)
 
 
-def _off_unit(state: State) -> float:
-    return float(np.max(np.abs(np.sum(np.asarray(state.p) ** 2, axis=-1) - 1)))
-
-
-@kept_jit
-def _rows_and_loads(rows: Model, state: State, t: Any) -> tuple[Array, Array, Array, Array]:
-    kin = rows.system.kinematics(state)
-    eq = rows.constraints.equations(t, kin)
-    scale = rows.constraints.scales()
-    u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
-    loads = [force.load(t, kin) for force in rows.system.forces]
-    finite = [jnp.all(jnp.isfinite(x.force)) & jnp.all(jnp.isfinite(x.moment)) for x in loads]
-    fine = jnp.stack(finite) if finite else jnp.zeros((0,), bool)
-    return scale * eq.value, scale * (eq.matrix @ u - eq.target), fine, eq.matrix
+def singular_values(rows: RowsAt) -> Float[np.ndarray, "k s"]:
+    """Singular values of the constraint Jacobians of stacked rows, descending."""
+    if not rows.gamma.shape[-1]:
+        return np.asarray(rows.gamma)
+    return np.linalg.svd(rows.matrix, compute_uv=False)
 
 
 class Evaluation(eqx.Module):

@@ -1,5 +1,6 @@
 """Outcome of a simulation, with its certificate."""
 
+import functools
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,7 +12,8 @@ from ..checks.errors import SettingError
 from ..mechanics.joint_states import JointMotion, joint_motion
 from ..mechanics.state import State
 from .error_estimate import ErrorEstimate
-from .evaluation import Snapshot
+from .evaluation import Saved, Snapshot, snapshots
+from .formulations.base import AbstractModel
 from .integration.advance import Trajectory
 from .method import Method
 from .scene import Scene
@@ -50,14 +52,17 @@ class Certificate:
             the largest energy.
         momentum_error, angular_momentum_error: largest change not explained by forces,
             relative to the largest momentum or impulse; None where a joint names ground.
-        smallest_singular_value: that of the constraint Jacobian along the saved path; None
-            without joints.
+        smallest_singular_value: that of the constraint Jacobian along the saved path, at most
+            `SEEN` of its states unless the certificate is "full"; None without joints.
         rank, rows: those at the start. redundant: joints that own a dependent row.
-        accepted_steps, rejected_steps: numbers over the whole run. steps_at_growth_limit: steps accepted
-            with an error so far below the tolerance that the next step could grow as much as any
-            may.
+        formulation_difference: largest difference between the accelerations by the formulation in
+            use and by another, `Augmented` or `Tree`, at any saved time, relative to the largest
+            acceleration; None unless the certificate is "full".
+        accepted_steps, rejected_steps: numbers over the whole run. steps_at_growth_limit: steps
+            accepted with an error so far below the tolerance that the next step could grow as
+            much as any may.
         compile_seconds, run_seconds: times of the integration. estimate_seconds: that of the second
-            run. analysis_seconds: that of balances and reactions, compilation included.
+            run. analysis_seconds: that of checks and balances, compilation included.
     """
 
     result: str
@@ -84,6 +89,7 @@ class Certificate:
     rows: int
     rank: int
     redundant: tuple[str, ...]
+    formulation_difference: float | None
     accepted_steps: int
     rejected_steps: int
     steps_at_growth_limit: int
@@ -104,7 +110,8 @@ class Run:
     Attributes:
         scene: simulated scene. method: method of the integration.
         trajectory: saved times, states, work, impulse (NumPy arrays).
-        analysis: accelerations, reactions, energies at the saved times, unless left out.
+        model: system prepared for the method's formulation, for the analysis of the saved states;
+            None if it was left out.
         errors: estimated errors at the saved times.
         certificate: summary of the run's quality.
         settings: description of the method in words, kept with the results.
@@ -114,20 +121,24 @@ class Run:
     scene: Scene
     method: Method
     trajectory: Trajectory
-    analysis: Snapshot | None
+    model: AbstractModel | None
     errors: ErrorEstimate
     certificate: Certificate
     settings: dict[str, Any]
     failure: str = ""
 
-    @property
+    @functools.cached_property
     def snapshot(self) -> Snapshot:
-        """Analysis of the saved states; raises `SettingError` if it was left out."""
-        if self.analysis is None:
+        """Accelerations, reactions, energies at the saved times, computed when first asked for.
+
+        Raises:
+            SettingError: the run was made with analysis=False.
+        """
+        if self.model is None:
             raise SettingError(
                 "This run was made with analysis=False and has no accelerations, reactions or energies."
             )
-        return self.analysis
+        return snapshots(self.method.formulation, self.model, saved(self.trajectory))
 
     @property
     def ts(self) -> np.ndarray:
@@ -154,6 +165,11 @@ class Run:
         `.displacement`, or `.coordinates` (k, c)."""
         found = joint_motion(self.scene.system, self.states, name, self.ts)
         return jax.tree.map(np.asarray, found)
+
+
+def saved(trajectory: Trajectory) -> Saved:
+    """Saved times, states and actuator states of a trajectory."""
+    return Saved(np.asarray(trajectory.ts), trajectory.states, np.asarray(trajectory.internal))
 
 
 def relative(error: ArrayLike, *scales: ArrayLike) -> float:

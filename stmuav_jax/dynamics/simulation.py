@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -12,21 +12,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..checks.errors import ModelError, SimulationError
+from ..checks.errors import ModelError, SettingError, SimulationError
 from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .assembly.initial import Rank, rank_of, singular_posture
-from .certify import certify, violations
+from .assembly.initial import rank_of, singular_posture
+from .certify import Checked, Start, certify, check_saved, violations
 from .checks import check_consistent, check_loads, check_method, check_start, output_times, scene_of
 from .error_estimate import LOOSER, ErrorEstimate, SecondRun, estimated, without
-from .evaluation import Snapshot, StartCheck, first_look, look, snapshots
+from .evaluation import Saved, accelerations, rows_at
 from .formulations.augmented import Augmented, Model
 from .integration.advance import Trajectory
 from .integration.march import CHUNK, March
 from .integration.problem import Problem, prepare
 from .method import Method
-from .run import Run, Seconds
+from .run import Run, Seconds, saved
 from .scene import Scene
 from .stiffness import choose_solver
 
@@ -43,6 +43,7 @@ def simulate(
     ts: Sequence[float] | np.ndarray | None = None,
     error_estimate: bool = True,
     analysis: bool = True,
+    certificate: Literal["standard", "full"] = "standard",
     throw: bool = True,
     progress: Progress | None = None,
 ) -> Run:
@@ -63,8 +64,10 @@ def simulate(
         error_estimate: estimate the global error at every saved time by a second run at smaller
             tolerances, see `ErrorEstimate`. The second run takes 1.1 to 2 times as long as the
             first; it needs no further compilation.
-        analysis: compute accelerations, reactions, energies and balances at the saved times.
-            Without it the run has no `snapshot`, and there is less to compile.
+        analysis: check energies, momenta and ranks at the saved times, and let the run compute its
+            `snapshot`. Without it there is less to compile.
+        certificate: "full" also looks at the rows of all joints at every saved time, and compares
+            the accelerations with those by another formulation, which has to be compiled.
         throw: raise an error if the end was not reached; otherwise the run's certificate says so.
         progress: function that is called with the completed fraction.
 
@@ -72,11 +75,17 @@ def simulate(
         A `Run`. Ctrl-C ends it early with what was reached.
 
     Raises:
-        SettingError: tolerances, span, saved times or kinds of arguments are invalid.
+        SettingError: tolerances, span, saved times or kinds of arguments are invalid, or a full
+            certificate is wanted without the analysis.
         StateError: the initial state is not finite, not unit or not consistent.
         ModelError: constraints are contradictory, or a load is not finite at the start.
         SimulationError: the end was not reached (with `throw`); its `run` holds the result so far.
     """
+    if certificate not in ("standard", "full") or (certificate == "full" and not analysis):
+        raise SettingError(
+            'The certificate is "standard", or "full" with analysis=True, '
+            f"but certificate={certificate!r} and analysis={analysis!r} were given."
+        )
     scene = scene_of(scene, state, t1, save_every, ts)
     times = output_times(scene, t1, save_every, ts)
     method = Method() if method is None else method
@@ -89,7 +98,8 @@ def simulate(
         steps="state",
         balances=analysis,
     )
-    run = _carried_out(scene, method, times, progress, error_estimate, analysis)
+    wanted = _Wanted(error_estimate, analysis, certificate == "full")
+    run = _carried_out(scene, method, times, progress, wanted)
     if run.successful or run.certificate.result == "interrupted":
         return run
     run = dataclasses.replace(run, failure=_failure(run, float(times[-1])))
@@ -98,36 +108,46 @@ def simulate(
     return run
 
 
+class _Wanted(NamedTuple):
+    """Parts of a run that may be left out: error estimate, analysis, full certificate."""
+
+    estimate: bool
+    analysis: bool
+    full: bool
+
+
 def _carried_out(
     scene: Scene,
     method: Method,
     times: np.ndarray,
     progress: Progress | None,
-    estimate: bool,
-    analysis: bool,
+    wanted: _Wanted,
 ) -> Run:
     """Run with its certificate, complete or not."""
     clock = time.perf_counter()
     problem = prepare(scene.system, method)
     prepared = time.perf_counter() - clock
-    problem, rows, rank, seen = _inspect(scene, problem, analysis)
+    problem, rows, start = _inspect(scene, problem)
     looked = time.perf_counter() - clock - prepared
-    done = _run(scene, problem, times, progress, estimate)
+    done = _run(scene, problem, times, progress, wanted.estimate)
     clock = time.perf_counter()
     method = dataclasses.replace(method, formulation=problem.method.formulation)
     first = done.trajectory
-    saved = (np.asarray(first.ts), first.states, np.asarray(first.internal))
-    view = snapshots(method.formulation, problem.model, rows, *saved) if analysis else None
-    errors = _errors(scene, done, view)
+    if wanted.analysis:
+        checked = check_saved(problem, rows, start, first, wanted.full)
+    else:
+        worst = violations(rows.constraints, first, start.rows, start.norm)
+        checked = Checked(None, None, None, worst)
+    errors = _errors(scene, problem, done, wanted.analysis)
     seconds = dataclasses.replace(
         done.seconds,
         compile=done.seconds.compile + prepared,
         analysis=looked + time.perf_counter() - clock,
     )
     result = done.stopped or _words(first)
-    worst = violations(rows.constraints, first, seen)
-    certificate = certify(scene.system, first, view, errors, rank, worst, result, seconds)
-    return Run(scene, method, first, view, errors, certificate, _settings(method))
+    certificate = certify(scene.system, first, checked, errors, start.rank, result, seconds)
+    model = problem.model if wanted.analysis else None
+    return Run(scene, method, first, model, errors, certificate, _settings(method))
 
 
 def _solver(scene: Scene, method: Method) -> diffrax.AbstractSolver:
@@ -138,21 +158,20 @@ def _solver(scene: Scene, method: Method) -> diffrax.AbstractSolver:
     return choose_solver(scene.system, scene.state0, scene.t0, formulation=how)
 
 
-def _inspect(
-    scene: Scene, problem: Problem, analysis: bool
-) -> tuple[Problem, Model, Rank, StartCheck]:
+def _inspect(scene: Scene, problem: Problem) -> tuple[Problem, Model, Start]:
     """Check the initial state and its loads, determine the rank, and allow for dependent rows.
 
     The rows of all joints are those of maximal coordinates, whatever the problem's formulation.
     """
-    system, formulation, model = scene.system, problem.method.formulation, problem.model
+    system, formulation, state = scene.system, problem.method.formulation, scene.state0
     rows = Augmented().prepare(system)
-    start = _one(scene)
-    first = snapshots(formulation, model, rows, *start) if analysis else None
-    seen = look(rows, scene.state0, scene.t0) if first is None else first_look(first, scene.state0)
-    check_loads(system, seen.finite_loads, scene.t0)
-    check_consistent(system, rows, seen.residuals, seen.rates)
-    rank = rank_of(system, rows, scene.state0, scene.t0, seen.singular_values)
+    row = lambda x: np.asarray(x)[None]
+    here = Saved(np.array([scene.t0]), *jax.tree.map(row, (state, internal_states(system))))
+    seen = rows_at(rows, here)
+    residuals, rates, matrix, gamma, finite_loads = (x[0] for x in seen)
+    check_loads(system, finite_loads, scene.t0)
+    check_consistent(system, rows, residuals, rates)
+    rank = rank_of(system, rows, state, scene.t0, matrix)
     if rank.rank < rank.rows:
         allowing = formulation.allowing_dependent_rows()
         if allowing is None:
@@ -160,25 +179,19 @@ def _inspect(
                 f"Dependent constraint rows in {', '.join(rank.redundant)}, for which "
                 f"{type(formulation).__name__} does not allow."
             )
-        if allowing is not formulation or first is None:
-            method = dataclasses.replace(problem.method, formulation=allowing)
-            problem = dataclasses.replace(problem, method=method)
-            first = snapshots(allowing, model, rows, *start)
-        size = 1 + np.max(np.abs(first.accelerations.v_rate), initial=0.0)
-        if not first.acceleration_residual[0] <= 1e-6 * size:
+        method = dataclasses.replace(problem.method, formulation=allowing)
+        problem = dataclasses.replace(problem, method=method)
+        nearest = np.linalg.lstsq(matrix, gamma, rcond=1e-9)[0]
+        misfit = np.max(np.abs(matrix @ nearest - gamma))
+        if not misfit <= 1e-6 * (1 + np.max(np.abs(nearest))):
             raise ModelError(
                 "The constraints contradict each other: no accelerations satisfy all of them "
-                f"(misfit {first.acceleration_residual[0]:.3g}). Among the dependent rows are those of "
+                f"(misfit {misfit:.3g}). Among the dependent rows are those of "
                 f"{', '.join(rank.redundant)}. Where only this posture makes them dependent, it is "
                 "the velocities that fit no motion through it."
             )
-    return problem, rows, rank, seen
-
-
-def _one(scene: Scene) -> tuple[np.ndarray, State, np.ndarray]:
-    row = lambda x: np.asarray(x)[None]
-    own = row(internal_states(scene.system))
-    return np.array([scene.t0]), jax.tree.map(row, scene.state0), own
+    off_unit = np.max(np.abs(np.sum(np.asarray(state.p) ** 2, axis=-1) - 1))
+    return problem, rows, Start(seen, rank, float(off_unit))
 
 
 class _Done(NamedTuple):
@@ -227,15 +240,17 @@ def _run(
     return _Done(joined, second, Seconds(compiling, *running), stopped)
 
 
-def _errors(scene: Scene, done: _Done, view: Snapshot | None) -> ErrorEstimate:
+def _errors(scene: Scene, problem: Problem, done: _Done, analysis: bool) -> ErrorEstimate:
     """Error estimate, by a run at larger tolerances if the second run has stopped early."""
     first, second = done.trajectory, done.second
     if second is None:
         return without(first, "none was asked for")
     rates = None
-    if view is not None:
-        found = (view.accelerations.v_rate[-1], view.accelerations.omega_rate[-1])
-        rates = np.asarray(found[0]), np.asarray(found[1])
+    if analysis and first.result == diffrax.RESULTS.event_occurred:
+        # the second run's event is at another time, by which its end is moved
+        last = jax.tree.map(lambda x: np.asarray(x)[-1:], saved(first))
+        found = accelerations(problem.method.formulation, problem.model, last)
+        rates = np.asarray(found.v_rate[0]), np.asarray(found.omega_rate[0])
     if done.stopped:
         return estimated(first, second, rates, "the run was interrupted")
     found = estimated(first, second, rates)

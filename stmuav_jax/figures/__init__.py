@@ -1,4 +1,4 @@
-"""Figures, reports and tables of results. Floor 13."""
+"""Figures, reports and tables of results. Floor 14."""
 
 import lazy_loader
 

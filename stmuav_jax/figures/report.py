@@ -55,6 +55,9 @@ def certificate_rows(run: Run) -> list[tuple[str, str]]:
     rows.append(("Rank of the constraint Jacobian", rank))
     if c.smallest_singular_value is not None:
         rows.append(("Smallest singular value on the way", _number(c.smallest_singular_value, "")))
+    difference = c.formulation_difference
+    words = "not computed" if difference is None else _number(difference, "")
+    rows.append(("Accelerations by another formulation, difference", words))
     rows.append(("Steps accepted, rejected", f"{c.accepted_steps}, {c.rejected_steps}"))
     if 2 * c.steps_at_growth_limit > c.accepted_steps:
         rows.append(

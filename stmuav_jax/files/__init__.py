@@ -1,4 +1,4 @@
-"""Runs, studies and tables as files: NetCDF, Zarr, TOML. Floor 12."""
+"""Runs, studies and tables as files: NetCDF, Zarr, TOML. Floor 13."""
 
 import lazy_loader
 

@@ -93,7 +93,7 @@ def to_dataset(run: Run) -> xr.Dataset:
             of_body, errors.angular_velocity, "rad/s", f"{exact} angular velocity",
         ),
     }  # fmt: skip
-    if run.analysis is not None:
+    if run.model is not None:
         table |= _analysed(run)
     names = internal_names(system)
     if names:

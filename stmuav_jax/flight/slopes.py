@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 import jax
 from jaxtyping import Array, Float
 
-from ..algebra.compiler import outer_jit
+from ..algebra.compiler import quick_jit
 from .flight_trim import FlightTrim, TrimLimits, trim_flight
 from .flyer import Flyer
 from .steady import FlightCondition
@@ -34,5 +34,5 @@ def trim_slopes(
         found = trim_flight(build(values), wanted, limits, throw=False)
         return found.vector, found
 
-    slopes, found = outer_jit(jax.jacfwd(of, has_aux=True))(dict(values))
+    slopes, found = quick_jit(jax.jacfwd(of, has_aux=True))(dict(values))
     return found, slopes

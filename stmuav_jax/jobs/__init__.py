@@ -1,4 +1,4 @@
-"""Studies on many processes, interrupted and resumed. Floor 13."""
+"""Studies on many processes, interrupted and resumed. Floor 14."""
 
 import lazy_loader
 

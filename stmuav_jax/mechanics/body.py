@@ -1,11 +1,12 @@
 """Rigid bodies: mass, centre of mass, inertia tensor, and pose at the reference posture."""
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import rotation_matrix
+from ..algebra.rotation import rotation_matrix_in
 from ..checks.errors import ModelError, check_finite, check_shape, concrete
+from ..checks.numbers import array_module, as_numpy, floats, stacked
 from ..checks.physical import check_inertia, check_mass, check_unit
 from ..checks.shapes import Numbers
 
@@ -61,14 +62,16 @@ class Body(eqx.Module):
         self.name = name
         self.free = free
         self.triangle_tolerance = triangle_tolerance
-        self.mass = jnp.asarray(mass, dtype=float)
-        tensor = jnp.asarray(inertia, dtype=float)
-        self.inertia = jnp.diag(tensor) if tensor.ndim == 1 else tensor
+        self.mass = floats(mass)
+        tensor = floats(inertia)
+        if tensor.ndim == 1:
+            tensor = floats(array_module(tensor).diag(tensor))
+        self.inertia = tensor
         if tensor.shape == (3, 3) and not concrete(tensor):
             self.inertia = 0.5 * (tensor + tensor.T)
-        self.com = jnp.asarray(com, dtype=float)
-        self.position = jnp.asarray(position, dtype=float)
-        self.orientation = jnp.asarray(orientation, dtype=float)
+        self.com = floats(com)
+        self.position = floats(position)
+        self.orientation = floats(orientation)
         if not name or name == GROUND:
             raise ModelError(f"A body cannot be named '{name}': '{GROUND}' is the fixed world.")
         check_shape(self.mass, (), f"The mass of body '{name}'")
@@ -83,9 +86,10 @@ class Body(eqx.Module):
         check_unit(self.orientation, f"body '{name}'", ModelError)
 
     @property
-    def com_position(self) -> Float[Array, "3"]:
+    def com_position(self) -> Float[Array | np.ndarray, "3"]:
         """World position of the centre of mass at the reference posture (3,) [m]."""
-        return self.position + rotation_matrix(self.orientation) @ self.com
+        position, p, com = as_numpy((self.position, self.orientation, self.com))
+        return position + rotation_matrix_in(array_module(p), p) @ com
 
 
 class Bodies(eqx.Module):
@@ -101,7 +105,7 @@ def stack_bodies(bodies: tuple[Body, ...]) -> Bodies:
     """Stack a user's bodies into arrays, in their order."""
     return Bodies(
         names=tuple(b.name for b in bodies),
-        mass=jnp.stack([b.mass for b in bodies]),
-        com=jnp.stack([b.com for b in bodies]),
-        inertia=jnp.stack([b.inertia for b in bodies]),
+        mass=stacked([b.mass for b in bodies]),
+        com=stacked([b.com for b in bodies]),
+        inertia=stacked([b.inertia for b in bodies]),
     )

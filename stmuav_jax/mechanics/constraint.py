@@ -29,6 +29,7 @@ from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import (
@@ -65,12 +66,12 @@ class Data(eqx.Module):
         length: length of a rod [m], for "distance"; pitch [m/rad], for "screw".
     """
 
-    point_i: Float[Array, "3 *batch"]
-    point_j: Float[Array, "3 *batch"]
-    axis_i: Float[Array, "3 *batch"]
-    axis_j: Float[Array, "3 *batch"]
-    side_i: Float[Array, "3 *batch"]
-    length: Float[Array, "*batch"]
+    point_i: Float[Array | np.ndarray, "3 *batch"]
+    point_j: Float[Array | np.ndarray, "3 *batch"]
+    axis_i: Float[Array | np.ndarray, "3 *batch"]
+    axis_j: Float[Array | np.ndarray, "3 *batch"]
+    side_i: Float[Array | np.ndarray, "3 *batch"]
+    length: Float[Array | np.ndarray, "*batch"]
 
 
 class BodyKinematics(eqx.Module):

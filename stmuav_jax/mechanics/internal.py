@@ -12,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..checks.numbers import floats
 from .load import AbstractForce
 from .state import Kinematics
 from .system import System
@@ -75,4 +76,4 @@ def internal_rates(system: System, t: Float[Array, ""], kin: Kinematics) -> Floa
 
 
 def _joined(parts: list[Array]) -> Float[Array, " m"]:
-    return jnp.concatenate(parts) if parts else jnp.zeros((0,))
+    return jnp.concatenate(parts) if parts else floats(())

@@ -14,12 +14,12 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import cross, rotation_matrix
-from ..checks.errors import ModelError, check_finite, check_shape, concrete
+from ..algebra.rotation import rotation_matrix_in
+from ..checks.errors import ModelError, concrete
+from ..checks.numbers import array_module, as_numpy, floats, scalar, vector
 from ..checks.shapes import Numbers
 from .body import Body
 from .constraint import ROWS, Data
@@ -162,7 +162,12 @@ class Joint(eqx.Module):
         """True if the joint's `length` is the pitch of a screw [m/rad]."""
         return CATALOGUE[self.kind].pitched
 
-    def data(self, term: Term, com_i: Float[Array, "3"], com_j: Float[Array, "3"]) -> Data:
+    def data(
+        self,
+        term: Term,
+        com_i: Float[Array | np.ndarray, "3"],
+        com_j: Float[Array | np.ndarray, "3"],
+    ) -> Data:
         """Body-fixed parameters of one primitive, with points relative to the centres of mass."""
         return Data(
             point_i=self.point_i - com_i,
@@ -182,8 +187,9 @@ def resolve(joint: Joint, i: Body | None, j: Body | None) -> Joint:
     def fix(body: Body | None, point: Array, frame: Array) -> tuple[Array, Array]:
         if body is None:
             return point, frame
-        R_bw = rotation_matrix(body.orientation).T
-        return R_bw @ (point - body.position), R_bw @ frame
+        point, frame, p, position = as_numpy((point, frame, body.orientation, body.position))
+        R_bw = rotation_matrix_in(array_module(p), p).T
+        return floats(R_bw @ (point - position)), floats(R_bw @ frame)
 
     point_i, frame_i = fix(i, joint.point_i, joint.frame_i)
     point_j, frame_j = fix(j, joint.point_j, joint.frame_j)
@@ -193,21 +199,20 @@ def resolve(joint: Joint, i: Body | None, j: Body | None) -> Joint:
 
 
 def _unit(axis: Numbers, what: str) -> Float[Array, "3"]:
-    vector = jnp.asarray(axis, dtype=float)
-    check_shape(vector, (3,), what)
-    check_finite(vector, what, "")
-    length = jnp.sqrt(vector @ vector)
-    if concrete(vector) and float(length) == 0:
+    along = as_numpy(vector(axis, what, ""))
+    length = array_module(along).sqrt(along @ along)
+    if concrete(along) and float(length) == 0:
         raise ModelError(f"{what} has zero length; give any non-zero vector along it.")
-    return vector / length
+    return floats(along / length)
 
 
 def _frame_about(z: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Right-handed frame with the given third column, its x axis near the least aligned axis."""
-    other = jnp.eye(3, dtype=z.dtype)[jnp.argmin(jnp.abs(z))]
+    z, module = as_numpy(z), array_module(z)
+    other = module.eye(3, dtype=z.dtype)[module.argmin(module.abs(z))]
     x = other - (other @ z) * z
-    x = x / jnp.sqrt(x @ x)
-    return jnp.stack([x, cross(z, x), z], axis=1)
+    x = x / module.sqrt(x @ x)
+    return floats(module.stack([x, module.cross(z, x), z], axis=1))
 
 
 def _joint(
@@ -220,10 +225,8 @@ def _joint(
     frame: Float[Array, "3 3"],
     length: Numbers = 0.0,
 ) -> Joint:
-    points = jnp.asarray(point_i, dtype=float), jnp.asarray(point_j, dtype=float)
-    for value in points:
-        check_shape(value, (3,), f"A point of joint '{name}'")
-        check_finite(value, f"A point of joint '{name}'", "m")
+    what = f"A point of joint '{name}'"
+    points = vector(point_i, what, "m"), vector(point_j, what, "m")
     if body_i == body_j:
         raise ModelError(f"Joint '{name}' joins body '{body_i}' to itself.")
     return Joint(
@@ -236,7 +239,7 @@ def _joint(
         point_j=points[1],
         frame_i=frame,
         frame_j=frame,
-        length=jnp.asarray(length, dtype=float),
+        length=floats(length),
     )
 
 
@@ -245,12 +248,12 @@ _ORIGIN = (0.0, 0.0, 0.0)
 
 def weld(name: str, body_i: str, body_j: str, *, point: Numbers = _ORIGIN) -> Joint:
     """Rigid connection of two bodies; 6 rows. `point` (3,) [m]: point of the reaction."""
-    return _joint("weld", name, body_i, body_j, point, point, jnp.eye(3))
+    return _joint("weld", name, body_i, body_j, point, point, floats(np.eye(3)))
 
 
 def spherical(name: str, body_i: str, body_j: str, *, point: Numbers) -> Joint:
     """Spherical joint at a point in world coordinates at the reference posture (3,) [m]; 3 rows."""
-    return _joint("spherical", name, body_i, body_j, point, point, jnp.eye(3))
+    return _joint("spherical", name, body_i, body_j, point, point, floats(np.eye(3)))
 
 
 def universal(
@@ -267,15 +270,16 @@ def universal(
     """
     x = _unit(axis_i, f"axis_i of joint '{name}'")
     y = _unit(axis_j, f"axis_j of joint '{name}'")
-    if concrete(x, y) and abs(float(x @ y)) > 1e-9:
-        degrees = float(np.degrees(np.arccos(np.clip(float(x @ y), -1, 1))))
+    cosine = float(np.dot(x, y)) if concrete(x, y) else 0.0
+    if abs(cosine) > 1e-9:
+        degrees = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
         raise ModelError(
             f"The axes of universal joint '{name}' must be perpendicular, but they are "
             f"{degrees:.6g} degrees apart."
         )
-    return _joint(
-        "universal", name, body_i, body_j, point, point, jnp.stack([x, y, cross(x, y)], 1)
-    )
+    module, (x, y) = array_module(x, y), as_numpy((x, y))
+    frame = floats(module.stack([x, y, module.cross(x, y)], axis=1))
+    return _joint("universal", name, body_i, body_j, point, point, frame)
 
 
 def revolute(name: str, body_i: str, body_j: str, *, point: Numbers, axis: Numbers) -> Joint:
@@ -314,9 +318,7 @@ def screw(
         ModelError: the axis has zero length, or the pitch is zero or not finite.
     """
     frame = _frame_about(_unit(axis, f"The axis of joint '{name}'"))
-    value = jnp.asarray(pitch, dtype=float)
-    check_shape(value, (), f"The pitch of joint '{name}'")
-    check_finite(value, f"The pitch of joint '{name}'", "m/rad")
+    value = scalar(pitch, f"The pitch of joint '{name}'", "m/rad")
     if concrete(value) and float(value) == 0:
         raise ModelError(
             f"The pitch of joint '{name}' must not be zero; a joint without one is revolute."
@@ -325,8 +327,9 @@ def screw(
 
 
 def _length(name: str, point_i: Numbers, point_j: Numbers, length: Numbers | None) -> Numbers:
-    apart = jnp.asarray(point_j, dtype=float) - jnp.asarray(point_i, dtype=float)
-    value = jnp.sqrt(apart @ apart) if length is None else jnp.asarray(length, dtype=float)
+    ends = as_numpy((floats(point_i), floats(point_j)))
+    apart = ends[1] - ends[0]
+    value = floats(array_module(apart).sqrt(apart @ apart) if length is None else length)
     if concrete(value) and not (np.isfinite(float(value)) and float(value) > 0):
         raise ModelError(f"The length of joint '{name}' must be positive, but it is {value} m.")
     return value
@@ -348,7 +351,7 @@ def distance(
         length: length of the rod [m]; by default the distance of the points.
     """
     value = _length(name, point_i, point_j, length)
-    return _joint("distance", name, body_i, body_j, point_i, point_j, jnp.eye(3), value)
+    return _joint("distance", name, body_i, body_j, point_i, point_j, floats(np.eye(3)), value)
 
 
 def revolute_spherical(

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from ..algebra.rotation import cross
 from ..algebra.stacked import apply_transposed, dot
 from ..checks.errors import ModelError, check_finite, check_shape
+from ..checks.numbers import floats
 from ..checks.shapes import Numbers
 from .joint import Which
 from .state import Kinematics
@@ -40,7 +41,7 @@ def signal(
         return value  # pyright: ignore[reportReturnType]
     check_shape(value, shape, what)
     check_finite(value, what, unit)
-    return jnp.asarray(value, dtype=float)
+    return floats(value)
 
 
 def check_arguments(function: Callable[..., object], what: str) -> None:
@@ -96,8 +97,8 @@ class Sine(eqx.Module):
 
     def __init__(self, amplitude: Numbers, angular_frequency: Numbers) -> None:
         check_finite((amplitude, angular_frequency), "A sine signal", "")
-        self.amplitude = jnp.asarray(amplitude, dtype=float)
-        self.angular_frequency = jnp.asarray(angular_frequency, dtype=float)
+        self.amplitude = floats(amplitude)
+        self.angular_frequency = floats(angular_frequency)
 
     def __call__(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "*shape"]:
         del kin

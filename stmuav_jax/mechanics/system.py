@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, SettingError, nearest_names
+from ..checks.numbers import stacked
 from .body import GROUND, Bodies, Body, stack_bodies
 from .joint import Joint, resolve
 from .joint_coordinate import choose
@@ -63,10 +64,10 @@ class System(eqx.Module):
             resolve(j, by_name.get(j.body_i), by_name.get(j.body_j)) for j in joints
         )
         self.forces = tuple(forces)
-        zero = jnp.zeros_like(self.bodies.com)
+        zero = stacked([np.zeros(3, self.bodies.com.dtype)] * len(bodies))
         self.reference = State(
-            r=jnp.stack([b.com_position for b in bodies]),
-            p=jnp.stack([b.orientation for b in bodies]),
+            r=stacked([b.com_position for b in bodies]),
+            p=stacked([b.orientation for b in bodies]),
             v=zero,
             omega=zero,
         )
@@ -142,7 +143,7 @@ def check_state(system: System, state: State) -> None:
                 f"State.{name} must have shape (..., {n}, {width}) for bodies "
                 f"{', '.join(system.names)}, but it has {jnp.shape(array)}."
             )
-        check_precision(jnp.asarray(array), system.allow_float32)
+        check_precision(array, system.allow_float32)
 
 
 def _check_names(bodies: Sequence[Body], joints: Sequence[Joint]) -> None:

@@ -1,4 +1,4 @@
-"""Monte Carlo studies: sampling, batches, statistics, sensitivity. Floor 11."""
+"""Monte Carlo studies: sampling, batches, statistics, sensitivity. Floor 12."""
 
 import lazy_loader
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.stacked import apply
 from ..checks.errors import ModelError, check_finite
-from ..checks.numbers import nonnegative
+from ..checks.numbers import array_module, as_numpy, floats, nonnegative
 from ..checks.shapes import Numbers
 from ..mechanics.load import AbstractForce, ActsOn, Load, Signal, evaluate, push, signal
 from ..mechanics.state import Kinematics
@@ -54,8 +54,8 @@ class Rotors(AbstractForce):
         speed_squared: Numbers | Callable[..., object],
     ) -> None:
         self.body = body
-        self.arms = jnp.asarray(arms, dtype=float)
-        self.spin = jnp.asarray(spin, dtype=float)
+        self.arms = floats(arms)
+        self.spin = floats(spin)
         of = f"of the rotors of body '{body}'"
         self.k_f = nonnegative(k_f, f"The thrust coefficient k_f {of}", "N s^2/rad^2")
         self.k_tau = nonnegative(k_tau, f"The torque coefficient k_tau {of}", "N m s^2/rad^2")
@@ -104,6 +104,6 @@ def hover_speed_squared(
         k_f: thrust coefficient [N s^2/rad^2].
         count: number k of rotors.
     """
-    g = jnp.asarray(gravity, dtype=float)
-    weight = jnp.asarray(mass, dtype=float) * jnp.sqrt(g @ g)
-    return jnp.full(count, 1.0) * weight / (count * jnp.asarray(k_f, dtype=float))
+    module = array_module(mass, gravity, k_f)
+    m, g, k = as_numpy((floats(mass), floats(gravity), floats(k_f)))
+    return floats(module.full(count, 1.0) * (m * module.sqrt(g @ g)) / (count * k))

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 from typing import Any, Literal
 
-import jax.numpy as jnp
-
 from ..checks.errors import SettingError
+from ..checks.numbers import array_module, as_numpy, floats
 from ..checks.shapes import Numbers
 from ..dynamics.scene import Scene
 from ..flight.flyer import Flyer
@@ -119,12 +118,14 @@ def uav_flyer(parameters: Parameters = PART_II, **options: Any) -> Flyer:
 
 def _flight(case: int, parameters: Parameters, **options: Any) -> RotorsAndAir:
     names = (BASE, *TRACKER_BODIES)
-    gravity = jnp.asarray(parameters.value("gravity"), dtype=float)
-    total = sum(jnp.asarray(parameters.value(f"mass.{name}"), dtype=float) for name in names)
+    gravity, *masses = as_numpy(
+        [floats(parameters.value(key)) for key in ("gravity", *(f"mass.{n}" for n in names))]
+    )
+    total = sum(masses)
     hover = hover_speed_squared(total, gravity, parameters.value("rotor.k_f"), 6)
     lift = parameters.value("lift_factor") if case == 3 else 1.0
-    weight = total * jnp.linalg.norm(gravity)
-    return flight(rotors(BASE, parameters, lift * hover), weight, parameters, **options)
+    weight = total * array_module(gravity).linalg.norm(gravity)
+    return flight(rotors(BASE, parameters, lift * as_numpy(hover)), weight, parameters, **options)
 
 
 def _forces(case: int, air: RotorsAndAir, couple: Any) -> tuple[AbstractForce, ...]:

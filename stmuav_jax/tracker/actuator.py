@@ -4,10 +4,10 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..checks.errors import SettingError
+from ..checks.numbers import floats
 from ..checks.shapes import Numbers
 from ..mechanics.load import AbstractForce, ActsOn, Load, Signal, evaluate, push, signal
 from ..mechanics.state import Kinematics
@@ -50,7 +50,7 @@ class LinearActuator(AbstractForce):
                 f"The actuators' couple must be 'consistent' or 'printed', not '{couple}'."
             )
         self.base, self.slider, self.couple = base, slider, couple
-        self.axis_point = jnp.asarray(axis_point, dtype=float)
+        self.axis_point = floats(axis_point)
         self.force = signal(force, f"The actuator force on body '{slider}'", (), "N")
 
     def acts_on(self) -> ActsOn:

@@ -10,12 +10,13 @@ Source: report Part II, section 3.1 (joints); docs/geometry.md (lengths).
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import kept_jit
 from ..checks.errors import concrete
+from ..checks.numbers import floats
 from ..checks.shapes import Numbers
 from ..mechanics.body import Body
 from ..mechanics.joint import Joint, revolute, spherical, translational, universal
@@ -36,7 +37,7 @@ _POINTS = ("T12", "T13", "R14", "R26", "U35", "U47", "S57", "S67")
 _AXES = ("T12", "T13", "R14", "R26", "U35.i", "U35.j", "U47.i", "U47.j")
 
 
-@jax.jit
+@kept_jit
 def _place_all(
     geometry: TrackerGeometry, angles: Float[Array, "2"], displacement: Float[Array, "3"]
 ) -> tuple[Array, ...]:
@@ -53,7 +54,7 @@ def _place_all(
 
 def _placed(parameters: Parameters, displacement: Numbers) -> _Posture:
     geometry, angles = tracker_geometry(parameters), initial_angles(parameters)
-    arrays = _place_all(geometry, angles, jnp.asarray(displacement, dtype=float))
+    arrays = _place_all(geometry, angles, floats(displacement))
     if concrete(arrays):
         arrays = tuple(np.asarray(array) for array in arrays)
         if not np.all(np.isfinite(arrays[0])):

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.derivative import safe_sqrt
 from ..checks.errors import ModelError, check_finite, check_shape, concrete
+from ..checks.numbers import floats
 from ..checks.shapes import Numbers
 from ..parameters.table import Parameters
 
@@ -88,18 +89,18 @@ class TrackerGeometry(eqx.Module):
         rod_com: Numbers,
         panel_com: Numbers,
     ) -> None:
-        self.axis = jnp.asarray(axis, dtype=float)
-        self.hinge = jnp.asarray(hinge, dtype=float)
-        self.post = jnp.asarray(post, dtype=float)
-        self.arms = jnp.asarray(arms, dtype=float)
-        self.panel_arms = jnp.asarray(panel_arms, dtype=float)
-        self.panel_depths = jnp.asarray(panel_depths, dtype=float)
-        self.rods = jnp.asarray(rods, dtype=float)
-        self.slider_out = jnp.asarray(slider_out, dtype=float)
-        self.slider_up = jnp.asarray(slider_up, dtype=float)
-        self.post_com = jnp.asarray(post_com, dtype=float)
-        self.rod_com = jnp.asarray(rod_com, dtype=float)
-        self.panel_com = jnp.asarray(panel_com, dtype=float)
+        self.axis = floats(axis)
+        self.hinge = floats(hinge)
+        self.post = floats(post)
+        self.arms = floats(arms)
+        self.panel_arms = floats(panel_arms)
+        self.panel_depths = floats(panel_depths)
+        self.rods = floats(rods)
+        self.slider_out = floats(slider_out)
+        self.slider_up = floats(slider_up)
+        self.post_com = floats(post_com)
+        self.rod_com = floats(rod_com)
+        self.panel_com = floats(panel_com)
         for name, shape in _SHAPES.items():
             _check_length(name, getattr(self, name), shape)
 
@@ -128,7 +129,7 @@ def initial_angles(parameters: Parameters) -> Float[Array, "2"]:
     Raises:
         ModelError: an angle that is not finite.
     """
-    angles = jnp.asarray([parameters.value(f"posture.{k}") for k in ("phi", "theta")], dtype=float)
+    angles = floats([parameters.value(f"posture.{k}") for k in ("phi", "theta")])
     check_finite(angles, "posture.phi and posture.theta of the tracker", "rad")
     return angles
 

@@ -9,10 +9,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dense.report import Report
+from dense.steps import Limits, Scheme, integrate
 from dense.tables import Variant, g_and_l
-from failing.geometry import adopted, geometry, sample, varied_scene
-from failing.model import Report
-from failing.steps import Limits, Scheme, integrate
 
 import stmuav_jax as stm
 
@@ -82,10 +81,7 @@ def test_energy_and_residuals_of_the_start(moving):
     ("scheme", "error"),
     [
         (Scheme("ode45", 1e-8, 1e-10), 1e-6),
-        (Scheme("rk45", 1e-8, 1e-10), 1e-6),
-        (Scheme("radau", 1e-8, 1e-10), 1e-6),
         (Scheme("rk4", step=1e-2), 1e-6),
-        (Scheme("euler", step=1e-3), 2e-2),
     ],
     ids=lambda x: getattr(x, "method", ""),
 )
@@ -103,7 +99,7 @@ def test_integrators_follow_an_oscillator(scheme, error):
 def test_every_run_ends():
     blow_up = lambda t, y: np.array([y[0] ** 2, 0.0])
     times = np.linspace(0, 2, 21)
-    for scheme in (Scheme("ode45"), Scheme("rk45"), Scheme("rk4", step=0.01)):
+    for scheme in (Scheme("ode45"), Scheme("rk4", step=0.01)):
         history = integrate(blow_up, np.array([1.0, 0.0]), times, scheme)
         assert history.failure
         assert 0.8 < history.stopped_at < 1.2
@@ -111,33 +107,19 @@ def test_every_run_ends():
     assert few.failure == "8 evaluations"
 
 
-def test_adopted_lengths_give_the_tables():
-    for key, value in geometry(jnp.asarray(adopted())).items():
-        np.testing.assert_allclose(value, stm.PART_II.value(key), atol=1e-12)
-
-
-@pytest.mark.parametrize("swapped", [False, True])
-def test_varied_geometries_close(swapped):
-    for design in sample(3, seed=1):
-        scene = varied_scene("uav_tracker", 2, jnp.asarray(design), swapped=swapped)
-        assembly = stm.assemble(scene.system, scene.state0)
-        assert float(jnp.max(assembly.residuals)) < 1e-12
-        assert float(assembly.largest_displacement) < 1e-12
-
-
 @pytest.mark.slow
 def test_smallest_run(tmp_path):
     subprocess.run(
-        [sys.executable, FOLDER / "failure.py", "--quick", "--results", tmp_path,
-         "--figures", tmp_path],
+        [sys.executable, FOLDER / "failure.py", "--quick", "--results", tmp_path],
         check=True, capture_output=True, timeout=900,
     )  # fmt: skip
     record = json.loads((tmp_path / "failure.json").read_text())
     assert {"commit", "dirty", "versions", "cores", "date"} <= set(record["environment"])
-    assert {row["part"] for row in record["trials"]} == set("abcde")
-    assert all(row["steps"] > 0 for row in record["trials"])
-    corrected = next(row for row in record["trials"] if row["name"] == "corrected")
-    assert not corrected["failure"]
-    assert corrected["series"]["violation"][-1] < 1e-4
-    assert record["alignment"]["rows"][0]["finished"] == 2
-    assert len(list(tmp_path.glob("*.png"))) == 4
+    assert record["measured"]["deciding"]["commit"] == record["environment"]["commit"]
+    assert all(row["steps"] > 0 for row in record["deciding"])
+    corrected = record["deciding"][0]
+    assert (corrected["name"], corrected["failure"]) == ("corrected", "")
+    assert corrected["violation"] < 1e-4
+    # what was measured once is kept
+    former = json.loads((FOLDER / "results" / "failure.json").read_text())
+    assert record["trials"] == former["trials"]

@@ -1,61 +1,17 @@
-"""The long-horizon benchmark: its symmetric comparator, its measures, its smoke test."""
+"""The long-horizon benchmark: its measures, what it keeps of symmetric methods, its smoke test."""
 
 import json
+import runpy
 import sys
 from types import SimpleNamespace
 
-import diffrax
-import jax
-import jax.numpy as jnp
 import long_horizon
 import numpy as np
 import pytest
-from horizons.gauss import Gauss
 from problems import conservative
+from shared import record
 
 import stmuav_jax as stm
-
-
-def march(stages, y0, h, count):
-    """y after so many steps of the plane pendulum y = (angle, rate), and whether all converged."""
-    terms = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0])]))
-    solver, zero = Gauss(stages), jnp.zeros(())
-
-    def step(now, _):
-        y, state, good = now
-        y, _, _, state, result = solver.step(terms, zero, zero + h, y, None, state, False)
-        return (y, state, good & (result == diffrax.RESULTS.successful)), None
-
-    start = (y0, solver.init(terms, zero, zero + h, y0, None), jnp.asarray(True))
-    (y, _, good), _ = jax.lax.scan(step, start, length=count)
-    return np.asarray(y), bool(good)
-
-
-START = jnp.array([2.0, 0.3])
-
-
-@pytest.mark.parametrize("stages", [1, 2])
-def test_order(stages):
-    """Statistical class: 2 and 4 within 0.1, against ten times as many steps of order 4."""
-    exact, _ = march(2, START, 3.0 / 640, 640)
-    counts = (16, 32, 64)
-    errors = [np.linalg.norm(march(stages, START, 3.0 / n, n)[0] - exact) for n in counts]
-    assert -np.polyfit(np.log(counts), np.log(errors), 1)[0] == pytest.approx(2 * stages, abs=0.1)
-
-
-@pytest.mark.parametrize("stages", [1, 2])
-def test_symmetric(stages):
-    """Exact class: as many steps back lead to the start."""
-    there, good = march(stages, START, 0.1, 50)
-    back, too = march(stages, jnp.asarray(there), -0.1, 50)
-    assert good
-    assert too
-    np.testing.assert_allclose(back, START, rtol=0, atol=1e-12)
-
-
-def test_steps_too_long_fail():
-    """Fixed-point iterations diverge: a result code, not a number that looks fine."""
-    assert not march(2, START, 20.0, 3)[1]
 
 
 def path_of(total):
@@ -73,25 +29,25 @@ def test_energy_error_of_a_straight_line():
     assert set(failed.values()) == {None}
 
 
-def test_equal_cost():
-    """The best explicit run that costs no more, and none where all cost more."""
+def test_cheapest():
+    row = {"family": "a", "tolerance": 1e-6, "step": None, "evaluations": 1, "drift": 0.0}
+    runs = [{**row, "seconds": s, "largest": e} for s, e in ((2.0, 1e-9), (1.0, 1e-6), (0.5, None))]
+    assert long_horizon.cheapest(runs, 1e-6)["a"]["seconds"] == 1.0
+    assert long_horizon.cheapest(runs, 1e-8)["a"]["seconds"] == 2.0
+    assert long_horizon.cheapest(runs, 1e-10) == {"a": None}
 
-    def row(family, largest, seconds, step=None):
-        hold = family.split(", ")[1]
-        return {"family": family, "hold": hold, "largest": largest, "drift": largest,
-                "seconds": seconds, "step": step, "tolerance": 1e-6}  # fmt: skip
 
-    runs = [
-        row("dopri8, projection", 1e-4, 1.0),
-        row("tsit5, projection", 1e-6, 2.0),
-        row("dopri8, none", 1e-9, 0.1),
-        row("gauss, none", 1e-5, 0.5, 0.1),
-        row("gauss, none", 1e-5, 1.5, 0.1),
-        row("gauss, none", 1e-5, 2.5, 0.1),
-    ]
-    found = long_horizon.answer(runs, "seconds")
-    assert [pair["ratio"] for pair in found["pairs"]] == [None, pytest.approx(0.1), 10.0]
-    assert (found["compared"], found["explicit_better"]) == (2, 1)
+def test_symmetric_methods_are_kept():
+    """The former record's runs and comparison stand beside new runs, which they do not touch."""
+    former = json.loads((record.RESULTS / "long_horizon.json").read_text())["problems"][0]
+    quick = long_horizon.QUICK
+    runner = long_horizon.Runner(np.linspace(0.0, 0.1, 3), 1)
+    found = long_horizon.run_problem(conservative.simple_pendulum(), quick, runner, former)
+    kept = [row for row in former["runs"] if row["solver"] in long_horizon.SYMMETRIC]
+    assert len(kept) == 18
+    assert found["runs"][-18:] == kept
+    assert found["answers"] == former["answers"]
+    assert len(found["runs"]) == 20
 
 
 @pytest.mark.parametrize("make", [conservative.heavy_top, conservative.four_bar])
@@ -108,16 +64,16 @@ def test_smoke(tmp_path, monkeypatch):
     """The script at its smallest size: a complete record and its figures."""
     arguments = ["--quick", "--results", str(tmp_path), "--figures", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["long_horizon.py", *arguments])
-    long_horizon.main()
-    record = json.loads((tmp_path / "long_horizon.json").read_text())
-    assert {"commit", "dirty", "versions", "cores", "date"} <= set(record["environment"])
-    (problem,) = record["problems"]
-    assert len(problem["runs"]) == 4
+    runpy.run_path(long_horizon.__file__, run_name="__main__")
+    found = json.loads((tmp_path / "long_horizon.json").read_text())
+    assert {"commit", "dirty", "versions", "cores", "date"} <= set(found["environment"])
+    (problem,) = found["problems"]
+    assert len(problem["runs"]) == 2
     for row in problem["runs"]:
         assert row["completed"]
         assert row["residual"] <= 1e-8
         assert row["seconds"] > 0
-    coarse, fine = (row for row in problem["runs"] if row["solver"] == "dopri8")
+    coarse, fine = problem["runs"]
     assert fine["largest"] < coarse["largest"]
     assert fine["evaluations"] > coarse["evaluations"]
     assert len(list(tmp_path.glob("*.png"))) == 3

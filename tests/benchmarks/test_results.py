@@ -147,3 +147,12 @@ def test_what_is_run_again(about, since, reason, monkeypatch, tmp_path):
     result(tmp_path, "stiff", **about)
     assert reason in everything.why_again("stiff", tmp_path)
     assert bool(everything.why_again("stiff", tmp_path)) == bool(reason)
+
+
+def test_finished_parts_are_not_run_again(monkeypatch, tmp_path):
+    told = {"commit": "a" * 40, "dirty": False}
+    for name, again in (("alignment", False), ("deciding", True)):
+        parts = {"environment": told, "measured": {name: {**told, "dirty": True}}}
+        (tmp_path / "failure.json").write_text(json.dumps(parts))
+        monkeypatch.setattr(everything, "moved", lambda *_: 0)
+        assert bool(everything.why_again("failure", tmp_path)) == again

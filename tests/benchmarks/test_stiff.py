@@ -1,6 +1,7 @@
 """The stiff benchmark: its scenes, its reading of the crossover, its smoke test."""
 
 import json
+import runpy
 import sys
 
 import jax
@@ -8,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stiff
-from stiffness.runs import as_given
-from stiffness.scenes import FREE, SCENES
+from stiff import FREE, SCENES, as_given
 
 import stmuav_jax as stm
 
@@ -68,7 +68,7 @@ def test_smoke(tmp_path, monkeypatch):
     """The script at its smallest size: a complete record and its figures."""
     arguments = ["--quick", "--results", str(tmp_path), "--figures", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["stiff.py", *arguments])
-    stiff.main()
+    runpy.run_path(stiff.__file__, run_name="__main__")
     record = json.loads((tmp_path / "stiff.json").read_text())
     assert {"commit", "dirty", "versions", "cores", "date"} <= set(record["environment"])
     soft, hard = record["scenes"]

@@ -14,9 +14,6 @@ FLOORS = {
     "dense": 1,
     "peers": 2,
     "sections": 3,
-    "stiffness": 3,
-    "horizons": 3,
-    "failing": 3,
     "": 4,
 }
 TESTS = {path.stem for path in FOLDER.parent.joinpath("tests").rglob("*.py")} | {"tests"}

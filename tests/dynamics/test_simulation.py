@@ -8,6 +8,7 @@ import pytest
 from helpers import pendulum, relative_error, scene_of, state_of, swung, turn
 
 import stmuav_jax as stm
+from stmuav_jax.dynamics import certify
 from stmuav_jax.dynamics.checks import check_method
 
 SYSTEM = pendulum()
@@ -326,6 +327,35 @@ def test_without_analysis_there_is_no_snapshot(run):
         _ = found.snapshot
     with pytest.raises(stm.StateError, match="positions do not fit"):
         stm.simulate(with_start(r=START.r + 1e-5), analysis=False)
+
+
+@pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=str)
+def test_a_full_certificate_compares_two_formulations(run, formulation):
+    assert run[0].certificate.formulation_difference is None
+    method = stm.Method(rtol=1e-10, atol=1e-10, formulation=formulation)
+    found = stm.simulate(SCENE, method=method, error_estimate=False, certificate="full").certificate
+    assert found.formulation_difference is not None
+    assert found.formulation_difference < 1e-12
+    assert found.smallest_singular_value == pytest.approx(
+        run[0].certificate.smallest_singular_value
+    )
+
+
+def test_a_full_certificate_sees_a_wrong_formulation(run, monkeypatch):
+    """Accelerations that are a millionth too large are found by the other formulation."""
+    right = certify.accelerations
+    wrong = lambda how, *at: jax.tree.map(
+        lambda x: x * (1 + 1e-6 * isinstance(how, stm.Tree)), right(how, *at)
+    )
+    monkeypatch.setattr(certify, "accelerations", wrong)
+    method = stm.Method(rtol=1e-10, atol=1e-10)
+    found = stm.simulate(SCENE, method=method, error_estimate=False, certificate="full").certificate
+    assert found.formulation_difference == pytest.approx(1e-6, rel=1e-3)
+
+
+def test_a_full_certificate_needs_the_analysis():
+    with pytest.raises(stm.SettingError, match="certificate='full' and analysis=False"):
+        stm.simulate(SCENE, analysis=False, certificate="full")
 
 
 def test_too_few_steps():

@@ -256,23 +256,23 @@ def rank_of(
     model: Model,
     state: State,
     t: float = 0.0,
-    values: np.ndarray | None = None,
+    matrix: np.ndarray | None = None,
     *,
     tolerance: float = 1e-9,
 ) -> Rank:
-    """Rank as by `rank`, for a prepared model and with the singular values if they are known.
+    """Rank as by `rank`, for a prepared model and with the constraint Jacobian if it is known.
 
     Singular values below `tolerance` times the largest count as zero.
     """
     owner, columns = model.constraints.owner, 6 * system.n_bodies
     if not owner:
         return Rank(0, 0, columns, float("inf"), ())
-    if values is None:
-        values = np.linalg.svd(jacobian(model, state, t), compute_uv=False)
+    matrix = jacobian(model, state, t) if matrix is None else matrix
+    values = np.linalg.svd(matrix, compute_uv=False)
     count = int(np.sum(values > tolerance * values[0]))
     names: tuple[str, ...] = ()
     if count < len(owner):
-        dependent = _dependent_rows(jacobian(model, state, t), count)
+        dependent = _dependent_rows(matrix, count)
         names = tuple(dict.fromkeys(system.joints[owner[k]].name for k in dependent))
     return Rank(len(owner), count, columns - count, float(values[count - 1]), names)
 

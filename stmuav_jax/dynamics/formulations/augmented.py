@@ -29,6 +29,7 @@ from ...algebra.rotation import (
     normalise,
     product,
 )
+from ...checks.numbers import array_module, as_jax, as_numpy
 from ...mechanics.load import Load, total_load
 from ...mechanics.state import Kinematics, State
 from ...mechanics.system import System
@@ -87,8 +88,10 @@ class Augmented(AbstractFormulation):
         return self if self.redundant else dataclasses.replace(self, redundant=True)
 
     def prepare(self, system: System) -> Model:
-        inverse = jax.vmap(jnp.linalg.inv)(system.bodies.inertia)
-        return Model(system, constraints(system, self.rows), inverse)
+        inertia = as_numpy(system.bodies.inertia)
+        # one batched inversion either way; NumPy's compiles nothing
+        inverse = array_module(inertia).linalg.inv(inertia)
+        return Model(system, constraints(system, self.rows), as_jax(inverse))
 
     def to_vector(self, model: Model, state: State) -> Float[Array, " k"]:
         return jnp.concatenate([x.reshape(-1) for x in (state.r, state.p, state.v, state.omega)])

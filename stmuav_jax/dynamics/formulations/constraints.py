@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...checks.errors import concrete
+from ...checks.numbers import as_numpy, stacked
 from ...mechanics.constraint import ANGULAR, PRIMITIVES, ROWS, BodyKinematics, Data, Form, Row, side
 from ...mechanics.joint import Motion
 from ...mechanics.state import Kinematics
@@ -187,9 +187,10 @@ def constraints(
     """
     ground = system.n_bodies
     place = {name: k for k, name in enumerate(system.names)}
-    com = jnp.concatenate([system.bodies.com, jnp.zeros((1, 3), system.bodies.com.dtype)])
+    centres = as_numpy(system.bodies.com)
+    com = [*centres, np.zeros(3, centres.dtype)]
     found: dict[str, list[tuple[int, int, int, Data, Motion | None]]] = {}
-    for number, joint in enumerate(system.joints):
+    for number, joint in enumerate(map(as_numpy, system.joints)):
         if joints is not None and number not in joints:
             continue
         i, j = place.get(joint.body_i, ground), place.get(joint.body_j, ground)
@@ -200,18 +201,9 @@ def constraints(
     owner: list[int] = []
     for kind in (k for k in PRIMITIVES if k in found):
         i, j, numbers, data, motions = zip(*found[kind], strict=True)
-        stacked = jax.tree.map(lambda *x: _stack(x), *data)
+        joined = jax.tree.map(lambda *x: stacked(x, axis=-1), *data)
         groups.append(
-            ConstraintGroup(
-                kind, i, j, numbers, stacked, tuple(m for m in motions if m is not None)
-            )
+            ConstraintGroup(kind, i, j, numbers, joined, tuple(m for m in motions if m is not None))
         )
         owner += [number for number in numbers for _ in range(ROWS[kind])]
     return Constraints(tuple(groups), tuple(owner), system.n_bodies)
-
-
-def _stack(rows: Sequence[Array]) -> Array:
-    """Arrays stacked along a last axis, by NumPy if all are concrete, which compiles nothing."""
-    if all(concrete(row) for row in rows):
-        return jnp.asarray(np.stack([np.asarray(row) for row in rows], axis=-1))
-    return jnp.stack(rows, axis=-1)

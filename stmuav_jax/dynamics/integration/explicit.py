@@ -1,6 +1,6 @@
 """Explicit Runge-Kutta steps without the stages that only serve an interpolant."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import jax
@@ -15,6 +15,27 @@ class RecordedStep(diffrax.LocalLinearInterpolation):
     """Linear interpolant of a step, with the slopes of its stages (s, k) as a record."""
 
     slopes: Array
+
+
+class RungeKutta4(diffrax.AbstractERK):
+    """Classical Runge-Kutta method of order 4, for steps of fixed length: it estimates no error.
+
+    Source: E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I (1993),
+    section II.1.
+    """
+
+    scan_kind: None = None
+    tableau: ClassVar[diffrax.ButcherTableau] = diffrax.ButcherTableau(
+        a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
+        b_sol=np.array([1.0, 2.0, 2.0, 1.0]) / 6.0,
+        b_error=np.zeros(4),
+        c=np.array([0.5, 0.5, 1.0]),
+    )
+    interpolation_cls: ClassVar[Any] = diffrax.LocalLinearInterpolation
+
+    def order(self, terms: Any) -> int:
+        del terms
+        return 4
 
 
 class NonDenseRungeKutta(diffrax.AbstractAdaptiveSolver):

@@ -5,10 +5,10 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ...algebra.compiler import program
+from ...checks.numbers import floats
 from ...mechanics.state import State
 from .advance import Trajectory, advance
 from .problem import Problem, compiled_begin
@@ -32,8 +32,8 @@ class March:
 
     def __init__(self, problem: Problem, t0: float, state0: State) -> None:
         self.problem = problem
-        self.carry: Any = compiled_begin(problem, jnp.asarray(float(t0)), state0)
-        chunk = jnp.full(CHUNK, float(t0))
+        self.carry: Any = compiled_begin(problem, floats(t0), state0)
+        chunk = floats(np.full(CHUNK, float(t0)))
         self.program = program(advance, problem, self.carry, chunk)
         self.parts: list[Trajectory] = []
 
@@ -46,7 +46,7 @@ class March:
         for start in range(0, len(times), CHUNK):
             part = times[start : start + CHUNK]
             chunk = np.append(part, np.full(CHUNK - len(part), part[-1]))
-            self.carry, trajectory = self.program(self.problem, self.carry, jnp.asarray(chunk))
+            self.carry, trajectory = self.program(self.problem, self.carry, floats(chunk))
             found.append(_shortened(trajectory, len(part)))
             if not self.going:
                 break
@@ -56,7 +56,9 @@ class March:
     @property
     def going(self) -> bool:
         """True if neither an event nor a failure has ended the integration."""
-        return bool(self.carry.result == diffrax.RESULTS.successful)
+        # the numbers of both results, because comparing results compiles a program
+        result, successful = jax.tree.leaves((self.carry.result, diffrax.RESULTS.successful))
+        return int(result) == int(successful)
 
     def trajectory(self) -> Trajectory:
         """Trajectory of all parts, without repeats of the last state after an event or failure."""

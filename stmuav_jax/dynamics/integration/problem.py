@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from ...algebra.compiler import kept_jit
 from ...checks.errors import SettingError
+from ...checks.numbers import floats
 from ...checks.shapes import Numbers
 from ...mechanics.internal import internal_count, internal_rates, internal_states, with_internal
 from ...mechanics.state import State
@@ -257,7 +258,7 @@ def landing(solution: diffrax.Solution) -> SegmentEnd:
 def _as_arrays(event: Any) -> Any:
     """Event with its numbers as arrays, so that other numbers need no other compilation."""
     number = lambda x: isinstance(x, float | np.floating | np.ndarray)
-    return jax.tree.map(lambda x: jnp.asarray(x, float) if number(x) else x, event)
+    return jax.tree.map(lambda x: floats(x) if number(x) else x, event)
 
 
 def prepare(system: System, method: AbstractMethod) -> Problem:
@@ -271,9 +272,9 @@ def prepare(system: System, method: AbstractMethod) -> Problem:
             'The solver "auto" is for simulate, which sees the values of the start. Elsewhere give '
             "Method(solver=choose_solver(system, state))."
         )
-    numbers = {k: jnp.asarray(getattr(method, k), float) for k in NUMBERS}
+    numbers = {k: floats(getattr(method, k)) for k in NUMBERS}
     if method.jump_ts is not None:
-        numbers["jump_ts"] = jnp.asarray(method.jump_ts, float)
+        numbers["jump_ts"] = floats(method.jump_ts)
     method = dataclasses.replace(method, **numbers)
     # numbers that functions close over become leaves, so that they can be differentiated
     system, method = opened((system, method))

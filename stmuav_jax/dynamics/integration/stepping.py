@@ -149,7 +149,10 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         jump = made_jump if self.project is None else True
         args = self.at_step(t0, y0, args)
         if self.guard is not None:
-            field = lambda t, y: terms.vf(t, y, args)
+            # of constants, so that the modes, which have no derivative, compile without any
+            still = jax.lax.stop_gradient(eqx.filter(args, eqx.is_inexact_array))
+            still = eqx.combine(still, args)
+            field = lambda t, y: terms.vf(t, y, still)
             modes = [self.guard.looked(field, t0, y0, t1 - t0, *modes)]
         y1, y_error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, jump

@@ -262,7 +262,24 @@ def _velocities(parameters: TreeParameters, pose: Pose, ends: _Ends) -> Array:
     v_b = pick(ends.v, b, 1) + cross(omega_b, at - pick(ends.r, b, 1))
     v_f = pick(ends.v, f, 1) + cross(omega_f, at - pick(ends.r, f, 1))
     turning, sliding = dot(axis, omega_b - omega_f), dot(axis, v_b - v_f)
-    return jnp.where(table.angular > 0, turning, sliding)
+    found = jnp.where(table.angular > 0, turning, sliding)
+    for own in _long_joints(tree):
+        # a slide is not at rest at its own origin where a later step turns about another one
+        turn, pivot = table.angular[own] * axis[:, own], at[:, own[-1:]]
+        pitch = 0.0 if parameters.pitch is None else parameters.pitch[frame[own] - 1]
+        along = table.linear[own] + table.pitched[own] * pitch
+        S = jnp.concatenate([turn, along * axis[:, own] + cross(turn, pivot - at[:, own])])
+        twist = jnp.concatenate([omega_b - omega_f, v_b - v_f])[:, own[-1]]
+        found = found.at[own].set(jnp.linalg.solve(S.T @ S, S.T @ twist))
+    return found
+
+
+def _long_joints(tree: SpanningTree) -> list[np.ndarray]:
+    """Columns of each joint of three steps or more."""
+    frame = columns(tree).frame
+    steps = [step.joint for step in tree.steps]
+    joints = sorted({j for j in steps if j is not None and steps.count(j) > 2})
+    return [np.array([k for k, f in enumerate(frame) if steps[f - 1] == j]) for j in joints]
 
 
 def _neighbours(tree: SpanningTree) -> tuple[np.ndarray, np.ndarray]:

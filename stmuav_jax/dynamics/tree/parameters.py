@@ -22,8 +22,8 @@ from jaxtyping import Array, Float
 
 from ...algebra.compiler import kept_jit
 from ...algebra.rotation import conjugate, from_matrix, product
-from ...algebra.stacked import dot, summed
-from ...checks.errors import concrete
+from ...algebra.stacked import dot
+from ...checks.numbers import as_jax, as_numpy, floats, stacked
 from ...mechanics.motions.base import CYCLIC, ColumnParts
 from ...mechanics.system import System
 from .frames import MotionGroup, aligned, columns, levels, motion_groups, pick, support
@@ -67,7 +67,7 @@ def tree_parameters(system: System, tree: SpanningTree) -> TreeParameters:
     """Parameters of a tree, from the joints and bodies of its system."""
     # concrete numbers are handled by NumPy: a hundred small operations, none to compile
     system = eqx.tree_at(lambda s: s.forces, system, ())
-    system = jax.tree.map(np.asarray, system) if concrete(system) else system
+    system = as_numpy(system)
     com_ref = [*system.bodies.com, np.zeros(3)]
     K: list[Any] = []
     k: list[Any] = []
@@ -100,9 +100,8 @@ def tree_parameters(system: System, tree: SpanningTree) -> TreeParameters:
     axes = [B[b] for b in range(ground + 1)]
     mass, centre, inertia = _by_frame(system, tree, axes, com)
     stacked_K, stacked_B = _stack(K, (3, 3)), _stack(axes, (3, 3))
-    K_p, B_p = _constant_euler_parameters(
-        tree, stacked_K, stacked_B, jnp.asarray(system.reference.p)
-    )
+    p = as_jax(system.reference.p)
+    K_p, B_p = _constant_euler_parameters(tree, stacked_K, stacked_B, p)
     return TreeParameters(
         tree,
         stacked_K,
@@ -112,7 +111,7 @@ def tree_parameters(system: System, tree: SpanningTree) -> TreeParameters:
         mass,
         centre,
         inertia,
-        summed(mass[None], support(tree).T)[0],
+        as_jax(as_numpy(mass) @ support(tree).T.astype(float)),
         K_p,
         B_p,
         _pitches(system, tree),
@@ -233,9 +232,8 @@ def shares(parameters: TreeParameters, group: MotionGroup, batch: int) -> Column
 
 def _stack(rows: list[Any], shape: tuple[int, ...]) -> Array:
     if not rows:
-        return jnp.zeros((*shape, 0))
-    known = all(isinstance(row, np.ndarray | np.floating) for row in rows)
-    return jnp.asarray(np.stack(rows, axis=-1)) if known else jnp.stack(rows, axis=-1)
+        return floats(np.zeros((*shape, 0)))
+    return stacked(rows, axis=-1)
 
 
 def _columns(axis: int) -> np.ndarray:

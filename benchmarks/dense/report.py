@@ -1,8 +1,12 @@
-"""The report's dense system as the failure benchmark runs it: guarded, with energy and measures."""
+"""The report's dense system as it was run: guarded, with the work done and measures of its errors."""
+
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from dense.steps import History, Limits, Scheme, integrate
 from dense.system import Dense
-from dense.tables import Array, g_and_l, times
+from dense.tables import Array, Variant, g_and_l, times as product
 
 from stmuav_jax import Scene
 
@@ -25,7 +29,7 @@ class Report(Dense):
     def turning(self, y: Array) -> Array:
         """Angular rates in body axes (n, 3) [rad/s]."""
         q, u = self.split(y)
-        return 2 * times(g_and_l(q[:-1, 3:])[1], u[:-1, 3:])
+        return 2 * product(g_and_l(q[:-1, 3:])[1], u[:-1, 3:])
 
     def _power(self, t: float, y: Array) -> float:
         """Power of rotors and actuators [W]."""
@@ -39,7 +43,7 @@ class Report(Dense):
         """Kinetic and potential energy less the work done so far [J]."""
         (q, u), omega, model = self.split(y), self.turning(y), self.model
         kinetic = np.sum(model.mass * np.sum(u[:-1, :3] ** 2, 1))
-        kinetic += np.sum(omega * times(model.inertia, omega))
+        kinetic += np.sum(omega * product(model.inertia, omega))
         potential = -np.sum(model.mass[:, None] * model.gravity * q[:-1, :3])
         return float(0.5 * kinetic + potential) * self.variant.metres**2 - float(y[-1])
 
@@ -52,6 +56,15 @@ class Report(Dense):
         """Largest | |p| - 1 |."""
         return float(np.max(np.abs(np.linalg.norm(self.split(y)[0][:-1, 3:], axis=1) - 1)))
 
-    def condition(self, t: float, y: Array) -> float:
-        """2-norm condition number of the large matrix."""
-        return float(np.linalg.cond(self.matrix(t, y)[0]))
+
+def attempt(
+    scene: Scene,
+    times: Array,
+    scheme: Scheme,
+    variant: Variant | None = None,
+    p: dict[str, Any] | None = None,
+) -> tuple[Report, History]:
+    """One run of the dense system, its states kept at `times`."""
+    model, limits = Report(scene, variant), Limits()
+    limits = replace(limits, size=limits.size / model.variant.metres)
+    return model, integrate(model.derivative, model.begin(scene, p), times, scheme, limits)

@@ -1,7 +1,7 @@
 """Integrators with a guard: every run ends, and says when and why.
 
-SciPy's adaptive methods, MATLAB's rule for the step size of ode45 (Shampine and Reichelt, The
-MATLAB ODE Suite, SIAM J. Sci. Comput. 18, 1997: error in the maximum norm), and fixed steps.
+MATLAB's rule for the step size of ode45 (Shampine and Reichelt, The MATLAB ODE Suite, SIAM J. Sci.
+Comput. 18, 1997: error in the maximum norm), and the classical Runge-Kutta method with fixed steps.
 """
 
 import time
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.integrate import DOP853, RK45, Radau
+from scipy.integrate import RK45
 
 Array = np.ndarray
 Field = Callable[[float, Array], Array]
@@ -34,7 +34,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Scheme:
-    """A method: "rk45", "ode45", "dop853", "radau" with tolerances, "rk4", "euler" with a step."""
+    """A method: "ode45" with tolerances, or "rk4" with a step [s]."""
 
     method: str
     rtol: float = 1e-3
@@ -53,31 +53,22 @@ class Scheme:
 class History:
     """States (k, 99) at the wanted times that were reached, steps taken, and how it ended.
 
-    `ends` and `sizes` are of accepted steps [s]; `failure` is empty if the end was reached.
+    `ends` and `sizes` are of accepted steps [s]; `failure` is empty if the end was reached. They
+    are lists while the run goes on, and arrays when it has ended.
     """
 
-    times: Array
-    states: Array
-    ends: Array
-    sizes: Array
-    evaluations: int
-    seconds: float
+    times: Any
+    states: Any
+    ends: Any
+    sizes: Any
+    evaluations: int = 0
+    seconds: float = 0.0
     failure: str = ""
     stopped_at: float = 0.0
 
     def summary(self) -> dict[str, Any]:
         """How far it came, why no farther, and in how many steps."""
         return {"reached": self.stopped_at, "failure": self.failure, "steps": len(self.sizes)}
-
-
-class _Log:
-    """What is kept while a run goes on, as in `History`."""
-
-    def __init__(self, y: Array) -> None:
-        self.times: list[float] = [0.0]
-        self.states: list[Array] = [y]
-        self.ends: list[float] = []
-        self.sizes: list[float] = []
 
 
 class Ode45:
@@ -130,14 +121,22 @@ class Ode45:
 
     def dense_output(self) -> Callable[[float], Array]:
         """Between the last two states, cubic in their values and rates."""
-        return hermite(*self.old, self.t, self.y, self.first)
+        (t0, y0, f0), y1, f1 = self.old, self.y, self.first
+        h = self.t - t0
+
+        def at(t: float) -> Array:
+            x = (t - t0) / h
+            bend = (1 - 2 * x) * (y1 - y0) + h * ((x - 1) * f0 + x * f1)
+            return (1 - x) * y0 + x * y1 + x * (x - 1) * bend
+
+        return at
 
 
 class Fixed:
-    """Classical Runge-Kutta of order 4, or Euler's method, with a fixed step."""
+    """The classical Runge-Kutta method of order 4 with a fixed step."""
 
-    def __init__(self, f: Field, y: Array, t1: float, h: float, order: int) -> None:
-        self.f, self.y, self.t, self.h, self.order = f, y, 0.0, h, order
+    def __init__(self, f: Field, y: Array, t1: float, h: float) -> None:
+        self.f, self.y, self.t, self.h = f, y, 0.0, h
         self.count, self.total, self.status = 0, round(t1 / h), "running"
         self.old: tuple[float, Array] = (0.0, y)
 
@@ -145,11 +144,9 @@ class Fixed:
         """One step."""
         t, y, h = self.t, self.y, self.h
         a = self.f(t, y)
-        slope = a
-        if self.order == 4:
-            b = self.f(t + h / 2, y + h / 2 * a)
-            c = self.f(t + h / 2, y + h / 2 * b)
-            slope = (a + 2 * b + 2 * c + self.f(t + h, y + h * c)) / 6
+        b = self.f(t + h / 2, y + h / 2 * a)
+        c = self.f(t + h / 2, y + h / 2 * b)
+        slope = (a + 2 * b + 2 * c + self.f(t + h, y + h * c)) / 6
         self.old = (t, y)
         self.y, self.count = y + h * slope, self.count + 1
         self.t = self.count * h
@@ -161,80 +158,49 @@ class Fixed:
         return lambda t: y0 + (t - t0) / (t1 - t0) * (y1 - y0)
 
 
-def hermite(
-    t0: float, y0: Array, f0: Array, t1: float, y1: Array, f1: Array
-) -> Callable[[float], Array]:
-    """The cubic with given values and rates at t0 and t1."""
-    h = t1 - t0
-
-    def at(t: float) -> Array:
-        x = (t - t0) / h
-        bend = (1 - 2 * x) * (y1 - y0) + h * ((x - 1) * f0 + x * f1)
-        return (1 - x) * y0 + x * y1 + x * (x - 1) * bend
-
-    return at
-
-
-def _stepper(scheme: Scheme, f: Field, y: Array, t1: float) -> Any:
-    if scheme.method in ("rk4", "euler"):
-        return Fixed(f, y, t1, scheme.step, 4 if scheme.method == "rk4" else 1)
-    if scheme.method == "ode45":
-        return Ode45(f, y, t1, scheme.rtol, scheme.atol)
-    atol = np.full(y.size, scheme.atol)
-    atol[-1] = 1e9  # the work done does not steer the steps
-    solver = {"rk45": RK45, "dop853": DOP853, "radau": Radau}[scheme.method]
-    return solver(f, 0.0, y, t1, rtol=scheme.rtol, atol=atol)
-
-
 def integrate(
     f: Field, y0: Array, times: Array, scheme: Scheme, limits: Limits | None = None
 ) -> History:
     """Integrate y' = f(t, y) from times[0] = 0 and keep the states at `times`."""
-    log, calls = _Log(y0), [0]
+    log = History([0.0], [y0], [], [])
 
     def counted(t: float, y: Array) -> Array:
-        calls[0] += 1
+        log.evaluations += 1
         return f(t, y)
 
     started = time.perf_counter()
     with np.errstate(all="ignore"):
-        stepper = _stepper(scheme, counted, y0, float(times[-1]))
-        failure = _advance(stepper, times, log, limits or Limits(), (started, calls))
-    kept = {name: np.array(values) for name, values in vars(log).items()}
-    seconds = time.perf_counter() - started
-    ended = {"failure": failure, "stopped_at": float(stepper.t)}
-    return History(**kept, evaluations=calls[0], seconds=seconds, **ended)
+        end = float(times[-1])
+        adaptive = lambda: Ode45(counted, y0, end, scheme.rtol, scheme.atol)
+        stepper = Fixed(counted, y0, end, scheme.step) if scheme.step else adaptive()
+        while not log.failure and len(log.times) < len(times):
+            log.failure = _advance(stepper, times, log, limits or Limits(), started)
+    log.seconds, log.stopped_at = time.perf_counter() - started, float(stepper.t)
+    for name in ("times", "states", "ends", "sizes"):
+        setattr(log, name, np.array(getattr(log, name)))
+    return log
 
 
-def _advance(
-    stepper: Any, times: Array, log: _Log, limits: Limits, clock: tuple[float, list[int]]
-) -> str:
-    """Step to the end; why it stopped before, in words."""
-    started, calls = clock
-    k = 1
-    while k < len(times):
-        before = stepper.t
-        try:
-            stepper.step()
-        except (ValueError, np.linalg.LinAlgError) as error:  # Radau on a state not finite
-            return f"the method stopped: {error}"
-        if stepper.status == "failed":
-            return "step size below the spacing of numbers"
-        if not np.all(np.isfinite(stepper.y)):
-            return "state not finite"
-        if np.max(np.abs(stepper.y[:-1])) > limits.size:
-            return f"state above {limits.size:.0e}"
-        log.ends.append(stepper.t)
-        log.sizes.append(stepper.t - before)
-        between = stepper.dense_output()
-        while k < len(times) and times[k] <= stepper.t + 1e-12:
-            log.times.append(float(times[k]))
-            log.states.append(np.array(between(times[k])))
-            k += 1
-        if log.sizes[-1] < limits.step and stepper.status != "finished":
-            return f"step size below {limits.step:.0e} s"
-        if calls[0] >= limits.evaluations:
-            return f"{limits.evaluations} evaluations"
-        if time.perf_counter() - started > limits.seconds:
-            return f"{limits.seconds:g} s of wall time"
+def _advance(stepper: Any, times: Array, log: History, limits: Limits, started: float) -> str:
+    """Make one step and keep it; why the run stops there, in words."""
+    before = stepper.t
+    stepper.step()
+    if stepper.status == "failed":
+        return "step size below the spacing of numbers"
+    if not np.all(np.isfinite(stepper.y)):
+        return "state not finite"
+    if np.max(np.abs(stepper.y[:-1])) > limits.size:
+        return f"state above {limits.size:.0e}"
+    log.ends.append(stepper.t)
+    log.sizes.append(stepper.t - before)
+    between = stepper.dense_output()
+    for t in times[len(log.times) :][times[len(log.times) :] <= stepper.t + 1e-12]:
+        log.times.append(float(t))
+        log.states.append(np.array(between(t)))
+    if log.sizes[-1] < limits.step and stepper.status != "finished":
+        return f"step size below {limits.step:.0e} s"
+    if log.evaluations >= limits.evaluations:
+        return f"{limits.evaluations} evaluations"
+    if time.perf_counter() - started > limits.seconds:
+        return f"{limits.seconds:g} s of wall time"
     return ""

@@ -1,0 +1,130 @@
+"""Markdown tables and figures of the stiff benchmark, from its JSON record alone."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from shared.pages import Row, number, panels, power, save, shown, titled
+
+NAMES = {"dopri8": "Dopri8", "tsit5": "Tsit5", "rodas5p": "Rodas5P", "kvaerno5": "Kvaerno5"}
+STYLES = {"dopri8": "C0o-", "tsit5": "C1s-", "rodas5p": "C2^--", "kvaerno5": "C3v--"}
+
+
+def show(path: Path, folder: Path) -> str:
+    """The tables for docs/stiff.md, and where the figures are that are drawn into a folder."""
+    record = json.loads(path.read_text())
+    scenes = record["scenes"]
+    parts = [fastest(scenes, level) for level in scenes[0]["cheapest"]]
+    parts += [eigenvalues(scenes), at_tolerance(scenes, 1e-6)]
+    parts += [json.dumps(record["crossover"], indent=1), f"compile: {record['compile_seconds']}"]
+    drawn = save({"stiff_work": work(record), "stiff_crossover": crossover(record)}, folder)
+    return shown(parts, drawn)
+
+
+def fastest(scenes: list[Row], level: str) -> str:
+    """The fastest runs with an error up to a level."""
+
+    def best(kind: str) -> Any:
+        def cell(scene: Row) -> str:
+            row = scene["cheapest"][level][kind]
+            said = row and f"{row['seconds']:.2g} s, {NAMES[row['solver']]} {row['tolerance']:.0e}"
+            return said or "-"
+
+        return (kind, None, cell)
+
+    return titled(
+        f"Fastest run with an error up to {float(level):.0e} m", scenes, ("scene", "name"),
+        ("eigenvalue at the start [1/s]", "eigenvalue", lambda e: number(e["start"], digits=2)),
+        best("explicit"), best("implicit"),
+        ("ratio", "cheapest", lambda c: number(c[level]["explicit_over_implicit"], digits=2)),
+    )  # fmt: skip
+
+
+def eigenvalues(scenes: list[Row]) -> str:
+    """The largest eigenvalue at the start and on the way, and what the references differ by."""
+    at_start = lambda e: "{:.2g} {:+.2g} i".format(*e["start_value"])
+    on_the_way = lambda e: f"{e['largest']:.2g} at {e['largest_at']:g} s"
+    apart = lambda r: ", ".join(power(a, 0) for a in r["dopri8_apart"])
+    return titled(
+        "Largest eigenvalue in size [1/s]", scenes, ("scene", "name"),
+        ("at the start", "eigenvalue", at_start),
+        ("median", "eigenvalue", lambda e: f"{e['median']:.2g}"),
+        ("largest on the way", "eigenvalue", on_the_way),
+        ("references apart [m]", "reference", apart),
+    )  # fmt: skip
+
+
+def at_tolerance(scenes: list[Row], tol: float) -> str:
+    """Every solver's steps, run time and error at one tolerance."""
+
+    def of(solver: str) -> Any:
+        def cell(runs: list[Row]) -> str:
+            row = next(r for r in runs if (r["solver"], r["tolerance"]) == (solver, tol))
+            error = "failed" if row["error"] is None else f"{row['error']:.0e} m"
+            return f"{row['accepted']}+{row['rejected']}, {row['seconds']:.2g} s, {error}"
+
+        return (NAMES[solver], "runs", cell)
+
+    title = f"At tolerance {tol:.0e}: steps+rejected, run, error"
+    return titled(title, scenes, ("scene", "name"), *map(of, solvers(scenes)))
+
+
+def solvers(scenes: list[Row]) -> list[str]:
+    """All solvers, in order."""
+    return list(dict.fromkeys(row["solver"] for row in scenes[0]["runs"]))
+
+
+def completed(scene: Row, solver: str) -> list[Row]:
+    """A solver's runs that reached the end."""
+    return [r for r in scene["runs"] if r["solver"] == solver and r["completed"]]
+
+
+def work(record: Row) -> Figure:
+    """Error against run time of every solver, one panel per scene."""
+    scenes = record["scenes"]
+    columns = min(4, len(scenes))
+    rows = -(-len(scenes) // columns)
+    width, height = 3.6 * columns + 1, 3.2 * rows + 0.8
+    figure, axes = panels(rows, columns, width, height, sharex=True, sharey=True)
+    lines = {}
+    for ax, scene in zip(axes, scenes, strict=False):
+        for solver in solvers(scenes):
+            fine = completed(scene, solver)
+            seconds, errors = [r["seconds"] for r in fine], [r["error"] for r in fine]
+            (lines[NAMES[solver]],) = ax.loglog(seconds, errors, STYLES[solver], markersize=4)
+        ax.set_title(scene["name"])
+        ax.grid(alpha=0.3)
+    for ax in axes[len(scenes) :]:
+        ax.set_axis_off()
+    figure.supxlabel(f"run time for {record['t1']:g} s [s]")
+    figure.supylabel("largest position error [m]")
+    figure.legend(lines.values(), lines.keys(), loc="outside upper center", ncols=4)
+    return figure
+
+
+def crossover(record: Row) -> Figure:
+    """Fastest run time to 1e-6 m against the largest eigenvalue at the start, by solver."""
+    figure, (ax,) = panels(1, 1, 8, 4.6)
+    start = lambda scene: scene["eigenvalue"]["start"]
+    servos = sorted((s for s in record["scenes"] if s["stiffness"] > 0), key=start)
+    for solver in solvers(record["scenes"]):
+        points = []
+        for scene in servos:
+            runs = completed(scene, solver)
+            if fine := [row["seconds"] for row in runs if row["error"] <= 1e-6]:
+                points.append((start(scene), min(fine)))
+        if points:
+            ax.loglog(*zip(*points, strict=True), STYLES[solver], label=NAMES[solver])
+    for scene in servos:
+        at, place = start(scene), ax.get_xaxis_transform()
+        beside = {"rotation": 90, "ha": "right", "fontsize": 8, "color": "0.4"}
+        ax.text(at, 0.03, scene["name"] + " ", transform=place, **beside)
+        ax.axvline(at, color="0.9", zorder=0)
+    seconds = f"fastest run for {record['t1']:g} s to 1e-6 m [s]"
+    ax.set(xlabel="largest |eigenvalue| at the start [1/s]", ylabel=seconds)
+    # room for the scenes' names below the curves
+    ax.set_ylim(bottom=0.2 * ax.dataLim.ymin)
+    ax.grid(alpha=0.3)
+    ax.legend()
+    return figure

@@ -1,0 +1,165 @@
+"""Controller of a flying machine's rotors: the geometric controller with control allocation."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..checks.errors import ModelError
+from ..flight.sensed import centre_of_mass, inertia_about_centre, inner_momentum
+from ..mechanics.state import State
+from ..mechanics.system import System
+from ..rotorcraft.allocation import RotorLimits, allocate, check_lift, wrench_map
+from ..rotorcraft.motor import MotorRotors
+from ..rotorcraft.rotor import Rotors
+from ..sensing.sensors import gravity_of
+from .geometric import (
+    FlightGains,
+    MassProperties,
+    Waypoint,
+    base_motion,
+    wrench_for,
+)
+
+# Weights of thrust and three moments where the limits do not allow all: yaw is given up first.
+_PRIORITY = (1.0, 1.0, 1.0, 0.01)
+
+
+class FlightMemory(NamedTuple):
+    """Memory of a `FlightController`.
+
+    Attributes:
+        integral: integral of the position error (3,) [m s].
+    """
+
+    integral: Float[Array, "3"]
+
+
+class FlightController(eqx.Module):
+    """Controller of the rotors: position and heading of the machine's base follow a `Waypoint`.
+
+    The estimate is a `State` of all bodies, or the `BaseMotion` of the base; the reference is a
+    `Waypoint`, the memory a `FlightMemory`. While the rotors cannot give the wanted wrench, the
+    integral of the position error stands still.
+
+    Args:
+        system: machine with one set of rotors and with gravity.
+        rate: control rate [Hz], for the integral.
+        gains: gains of the controller.
+        limits: limits of the rotor speeds; by default those of the machine's motors, if any.
+        mass: mass properties of all bodies, or a function of the estimate that returns them; by
+            default those of the system's reference posture.
+
+    Raises:
+        ModelError: not one set of rotors, no gravity, or limits that cannot carry the weight.
+    """
+
+    gains: FlightGains
+    mass: MassProperties | Callable[[Any], MassProperties]
+    gravity: Float[Array, "3"]
+    wrenches: Float[Array, "4 k"]
+    inverse: Float[Array, "k 4"]
+    limits: RotorLimits | None
+    period: Float[Array, ""]
+
+    def __init__(
+        self,
+        system: System,
+        rate: float,
+        *,
+        gains: FlightGains | None = None,
+        limits: RotorLimits | None = None,
+        mass: MassProperties | Callable[[Any], MassProperties] | None = None,
+    ) -> None:
+        found = [f for f in system.forces if isinstance(f, Rotors | MotorRotors)]
+        self.gravity = gravity_of(system)
+        if len(found) != 1 or not bool(jnp.any(self.gravity != 0)):
+            raise ModelError(
+                "A flight controller needs one set of rotors and gravity, but the system has "
+                f"{len(found)} sets and gravity of {jnp.asarray(self.gravity).tolist()} m/s^2."
+            )
+        motors = found[0]
+        if system.index(_rotors(motors).body) != 0:
+            raise ModelError(
+                f"A flight controller needs its rotors on the first body, '{system.names[0]}', but they "
+                f"are on '{_rotors(motors).body}'."
+            )
+        rotors = _rotors(motors)
+        own = getattr(motors, "squared_limits", None)
+        if limits is None and own is not None:
+            limits = RotorLimits(jnp.sqrt(own[0]), jnp.sqrt(own[1]))
+        weight = jnp.sum(system.bodies.mass) * jnp.linalg.norm(self.gravity)
+        if limits is not None:
+            check_lift(rotors, limits, weight)
+        # moments are about the base's centre of mass: the map does not change with the posture
+        self.wrenches = wrench_map(rotors, system.bodies.com[0])
+        self.inverse = jnp.linalg.pinv(self.wrenches)
+        self.gains = FlightGains() if gains is None else gains
+        self.limits, self.period = limits, jnp.asarray(1.0 / rate)
+        self.mass = mass_properties(system, system.reference) if mass is None else mass
+
+    def start(self) -> FlightMemory:
+        """First memory."""
+        return FlightMemory(jnp.zeros(3))
+
+    def __call__(
+        self, estimate: Any, reference: Waypoint, memory: FlightMemory
+    ) -> tuple[Float[Array, " k"], FlightMemory]:
+        """Squared rotor speeds (k,) [rad^2/s^2], and the memory."""
+        mass = self.mass(estimate) if callable(self.mass) else self.mass
+        return self.command(estimate, reference, memory, mass)
+
+    def command(
+        self, estimate: Any, reference: Waypoint, memory: FlightMemory, mass: MassProperties
+    ) -> tuple[Float[Array, " k"], FlightMemory]:
+        """Squared rotor speeds (k,) and the memory, with given mass properties."""
+        base = base_motion(estimate) if isinstance(estimate, State) else estimate
+        found = wrench_for(base, reference, mass, self.gains, self.gravity, memory.integral)
+        lever = jnp.cross(mass.centre, jnp.array([0.0, 0.0, 1.0]) * found.wrench[0])
+        wrench = found.wrench.at[1:].add(lever)
+        squared, given = self._allocated(wrench)
+        error = base.r - reference.r
+        integral = memory.integral + jnp.where(given, self.period, 0.0) * error
+        return squared, FlightMemory(integral)
+
+    def _allocated(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
+        """Squared speeds, and whether they give the wrench."""
+        least = self.inverse @ wrench
+        limits = self.limits
+        if limits is None:
+            return least, jnp.ones((), bool)
+        lower, upper = limits.squared(least.shape[0])
+        inside = jnp.all((least >= lower) & (least <= upper))
+
+        def at_limits() -> tuple[Array, Array]:
+            # a wrench that is not finite has no allocation, and stays what it is
+            finite = jnp.where(jnp.all(jnp.isfinite(wrench)), 1.0, jnp.nan)
+            found = allocate(self.wrenches, jnp.nan_to_num(wrench), limits, priority=_PRIORITY)
+            return finite * found.speed_squared, found.reason == 0
+
+        # the search by active sets takes much longer than the rest, and is rarely needed
+        return jax.lax.cond(inside, lambda: (least, jnp.ones((), bool)), at_limits)
+
+
+def _rotors(force: Rotors | MotorRotors) -> Rotors:
+    return force.rotors if isinstance(force, MotorRotors) else force
+
+
+def mass_properties(
+    system: System, state: State, moment: Float[Array, "3"] | None = None
+) -> MassProperties:
+    """Mass properties of all bodies at a state; the first body is the base.
+
+    Args:
+        moment: moment that accelerates the other parts against the base (3,) [N m], by default zero.
+    """
+    return MassProperties(
+        jnp.sum(system.bodies.mass),
+        centre_of_mass(system, state),
+        inertia_about_centre(system, state),
+        inner_momentum(system, state),
+        jnp.zeros(3) if moment is None else moment,
+    )
