@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from .commands.estimate import Estimate, run_estimate
-from .commands.flight import Linearize, Trim, run_linearize, run_trim
+from .commands.flight import Linearize, TrimCommand, run_linearize, run_trim
 from .commands.listing import List, run_list
 from .commands.montecarlo import Montecarlo, Report, run_montecarlo, run_report
 from .commands.options import arguments_of, check_options, check_words
@@ -50,7 +50,7 @@ COMMANDS = {
     "list": Command(List, run_list),
     "simulate": Command(simulate_class, run_simulate),
     "sun": Command(SunDay, run_sun, "Following the sun through the day"),
-    "trim": Command(Trim, run_trim, "Compiling and solving the trim"),
+    "trim": Command(TrimCommand, run_trim, "Compiling and solving the trim"),
     "linearize": Command(
         Linearize, run_linearize, "Compiling and solving trim and linear equations"
     ),

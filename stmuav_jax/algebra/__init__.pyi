@@ -15,7 +15,6 @@ from .sampled import (
     Sampled as Sampled,
 )
 from .space import (
-    Angle as Angle,
     Composite as Composite,
     CyclicVector as CyclicVector,
     Rotation as Rotation,

@@ -24,6 +24,16 @@ def directional(
     return jax.jvp(lambda x: function(*eqx.combine(x, fixed)), (moves,), (tangents,))
 
 
+def value_and_jacobian(
+    function: Callable[[Float[Array, " n"]], Any], x: Float[Array, " n"]
+) -> tuple[Any, Any]:
+    """Value of a function of a vector, and its Jacobian with the columns last, in one pass."""
+    push = lambda e: jax.jvp(function, (x,), (e,))
+    value, columns = jax.vmap(push, out_axes=(0, -1))(jnp.eye(x.shape[0], dtype=x.dtype))
+    # the value is the same along every direction
+    return jax.tree.map(lambda v: v[0], value), columns
+
+
 @jax.custom_jvp
 def without_derivative(x: Float[Array, "*s"], there: Bool[Array, "..."]) -> Float[Array, "*s"]:
     """Identity x -> x whose derivative is NaN where `there` is true, as x has none there."""

@@ -20,6 +20,7 @@ from jaxtyping import Array, PyTree
 from ..checks.errors import SettingError
 from ..checks.reason import AbstractReason
 from .compiler import quick_jit
+from .derivative import value_and_jacobian
 
 Method = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 
@@ -32,6 +33,7 @@ class SearchReason(AbstractReason):
     PATIENCE = 2
     NOT_FINITE = 3
     INTERRUPTED = 4
+    LIMIT_PASSED = 5
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,10 @@ class Search:
                 f"The loss is not finite at step {self.steps}; what came before is kept: {at}."
             ),
             SearchReason.INTERRUPTED: f"Interrupted after {self.steps} steps; {at}.",
+            SearchReason.LIMIT_PASSED: (
+                f"Ended after {self.steps} steps with a solution that passes a limit: it conflicts "
+                f"with what else is wanted; {at}."
+            ),
         }[self.reason]
 
 
@@ -84,9 +90,8 @@ def all_at_once(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
         flat, unravel = ravel_pytree(primals[0])
         along = ravel_pytree(tangents[0])[0]
-        push = lambda e: jax.jvp(function, primals, (unravel(e),))
-        out, columns = jax.vmap(push, out_axes=(0, -1))(jnp.eye(flat.shape[0], dtype=flat.dtype))
-        return jax.tree.map(lambda x: x[0], out), jax.tree.map(lambda J: J @ along, columns)
+        value, columns = value_and_jacobian(lambda x: function(unravel(x)), flat)
+        return value, jax.tree.map(lambda J: J @ along, columns)
 
     return of
 

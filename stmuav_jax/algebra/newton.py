@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from .derivative import directional
+from .derivative import directional, value_and_jacobian
 
 # Residuals below this that no longer halve are taken for round-off.
 _ROUND_OFF = 1e-6
@@ -80,9 +80,7 @@ class Newton(AbstractNewton):
         self, fn: Any, y: Any, args: Any, options: Any, state: NewtonState, tags: Any
     ) -> tuple[Any, NewtonState, Any]:
         del options, tags
-        of = lambda y: fn(y, args)
-        push = lambda e: jax.jvp(of, (y,), (e,), has_aux=True)
-        r, J, aux = jax.vmap(push, out_axes=(None, -1, None))(jnp.eye(y.shape[0], dtype=y.dtype))
+        (r, aux), (J, _) = value_and_jacobian(lambda y: fn(y, args), y)
         size = self.norm(r)
         stalled = (state.size < _ROUND_OFF) & ~(size < 0.5 * state.size)
         done = (size <= self.atol) | stalled | ~jnp.isfinite(size)
@@ -127,8 +125,7 @@ class NearestNewton(AbstractNewton):
     ) -> tuple[Any, NewtonState, Any]:
         del fn, options, tags
         z = y[: self.count]
-        push = lambda e: jax.jvp(lambda z: self.equations(z, args), (z,), (e,))
-        r, J = jax.vmap(push, out_axes=(None, -1))(jnp.eye(self.count, dtype=y.dtype))
+        r, J = value_and_jacobian(lambda z: self.equations(z, args), z)
         Q, R = jnp.linalg.qr(J.T)
         size = jnp.maximum(self.norm(r), self.norm(z - Q @ (Q.T @ z)))
         stalled = (state.size < _ROUND_OFF) & ~(size < 0.9 * state.size)

@@ -62,23 +62,6 @@ class Vector(AbstractSpace):
         _check_components(x, self.size, what)
 
 
-class Angle(AbstractSpace):
-    """Space of angles (size, *s) [rad] modulo a turn; errors lie in [-pi, pi]."""
-
-    size: int = eqx.field(static=True)
-    is_flat: bool = eqx.field(static=True, default=False)
-
-    def retract(self, x: Point, v: Error) -> Point:
-        return x + v
-
-    def difference(self, y: Point, x: Point) -> Error:
-        apart = y - x
-        return jnp.arctan2(jnp.sin(apart), jnp.cos(apart))
-
-    def check(self, x: Point, what: str) -> None:
-        _check_components(x, self.size, what)
-
-
 class CyclicVector(AbstractSpace):
     """Vectors (size, *s), some components of which are angles that are the same after a turn.
 

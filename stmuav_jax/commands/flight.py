@@ -49,7 +49,7 @@ _Flight = Annotated[SteadyFlight, tyro.conf.arg(name="")]
 
 
 @dataclasses.dataclass
-class Trim:
+class TrimCommand:
     """Find attitude, rotor speeds and actuator forces of a steady flight; write trim.json.
 
     Example: stmuav trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods
@@ -129,7 +129,7 @@ def wanted_of(given: SteadyFlight, values: "Parameters") -> Any:
     return wanted._replace(v=wanted.v + up.v)
 
 
-def _limits(command: Trim) -> Any:
+def _limits(command: TrimCommand) -> Any:
     from ..flight.flight_trim import TrimLimits
     from ..rotorcraft.allocation import RotorLimits
 
@@ -139,7 +139,9 @@ def _limits(command: Trim) -> Any:
     return TrimLimits(rotors, math.inf if command.force is None else command.force)
 
 
-def _solved(command: Trim, given: "Parameters", limits: Any) -> tuple[Any, dict[str, np.ndarray]]:
+def _solved(
+    command: TrimCommand, given: "Parameters", limits: Any
+) -> tuple[Any, dict[str, np.ndarray]]:
     """The trim, and the derivatives of its values by parameters of the table, by name."""
     import jax.numpy as jnp
 
@@ -157,7 +159,7 @@ def _solved(command: Trim, given: "Parameters", limits: Any) -> tuple[Any, dict[
     return trim_flight(uav_flyer(given), wanted, limits), {}
 
 
-def run_trim(command: Trim) -> int:
+def run_trim(command: TrimCommand) -> int:
     """Find the trim, print it and write trim.json; return the exit code."""
     import json
 

@@ -137,10 +137,8 @@ class FlightController(eqx.Module):
         def at_limits() -> tuple[Array, Array]:
             # a wrench that is not finite has no allocation, and stays what it is
             finite = jnp.where(jnp.all(jnp.isfinite(wrench)), 1.0, jnp.nan)
-            found = allocate(
-                self.wrenches, jnp.nan_to_num(wrench), limits, priority=_PRIORITY
-            )
-            return finite * found.squared, found.reason == 0
+            found = allocate(self.wrenches, jnp.nan_to_num(wrench), limits, priority=_PRIORITY)
+            return finite * found.speed_squared, found.reason == 0
 
         # the search by active sets takes much longer than the rest, and is rarely needed
         return jax.lax.cond(inside, lambda: (least, jnp.ones((), bool)), at_limits)

@@ -68,7 +68,7 @@ class HeldMotion(eqx.Module):
         else:
             carry, _ = jax.lax.scan(one, carry, jnp.arange(steps))
         accepted = now.counts.accepted + steps
-        counts = Counts(accepted, now.counts.rejected, now.counts.unsteered)
+        counts = Counts(accepted, now.counts.rejected, now.counts.at_growth_limit)
         return dataclasses.replace(
             now, t=t1, y=carry[0], solver_state=carry[1], counts=counts, result=carry[2]
         )

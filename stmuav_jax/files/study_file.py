@@ -6,6 +6,7 @@ store no longer depends on the file.
 """
 
 import csv
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -53,7 +54,7 @@ def column(path: str | os.PathLike[str], name: str) -> list[float]:
 
     Raises:
         FileError: the file is missing or not a text file.
-        SettingError: the column is missing, or an entry in it is not a number.
+        SettingError: the column is missing, or an entry in it is not a finite number.
     """
     source = Path(path)
     if source.exists() and not source.is_file():
@@ -76,7 +77,9 @@ def column(path: str | os.PathLike[str], name: str) -> list[float]:
         try:
             values.append(float(row[name] or ""))
         except (TypeError, ValueError):
+            values.append(math.nan)
+        if not math.isfinite(values[-1]):
             raise SettingError(
-                f"{source}, line {line}: {shown(row[name])} in column '{name}' is not a number."
-            ) from None
+                f"{source}, line {line}: {shown(row[name])} in column '{name}' is not a finite number."
+            )
     return values

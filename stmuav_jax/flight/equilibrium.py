@@ -160,14 +160,14 @@ def trim(
         space: state space of the mechanism.
         at: point at which the search starts; its states are kept except the free ones.
         free: names of states that may be changed.
-        inputs: those that may be chosen; default all of the system. Others stay as they are.
-        values: of the inputs to start from (m,); default as the system has them.
-        accelerations: wanted, of the independent velocities (dof,); default zero.
-        conditions: positions and velocities of all bodies -> what is to vanish too (c,), to be
-            met by free states; a module or function that is made once, since it is compiled in.
-        sizes: of the unknowns, the free states first and then the inputs (k,): what counts as
-            equally far from the start; default one for states, and for inputs their starts or one.
-        t: [s], where forces or joints depend on it.
+        inputs: inputs that may be chosen; default all of the system. Others stay as they are.
+        values: inputs at the start of the search (m,); default those that the system has.
+        accelerations: wanted rates of the independent velocities (dof,); default zero.
+        conditions: function of positions and velocities of all bodies -> further residuals (c,), to
+            be met by free states; a module or function made once, since it is compiled in.
+        sizes: changes of the unknowns that count as equally far from the start, free states first,
+            then inputs (k,); default one for states, and for inputs their starts or one.
+        t: time [s], where forces or joints depend on it.
         throw: raise where there is no trim, if values are known.
 
     Raises:

@@ -23,6 +23,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from ..algebra.compiler import kept_jit
+from ..algebra.derivative import safe_sqrt
 from ..algebra.newton import Implicit, Newton
 from ..algebra.rotation import product, rotation_matrix, to_rotation_vector
 from ..checks.errors import ModelError, StateError, concrete
@@ -313,10 +314,8 @@ def _found(setting: _Setting, limits: TrimLimits) -> FlightTrim:
         (jnp.max(jnp.abs(inputs.forces)) > limits.actuator, TrimReason.ACTUATOR_LIMIT),
         *((outside == why, own) for own, why in _OUTSIDE.items()),
     )
-    turning = squared > 0
-    speeds = jnp.where(turning, jnp.sqrt(jnp.where(turning, squared, 1.0)), 0.0)
     steps = solution.stats["num_steps"]
-    return FlightTrim(at, inputs, speeds, left, values[-1] / values[0], reason, steps)
+    return FlightTrim(at, inputs, safe_sqrt(squared), left, values[-1] / values[0], reason, steps)
 
 
 def _raise(reason: TrimReason, found: FlightTrim, flyer: Flyer, limits: TrimLimits) -> None:

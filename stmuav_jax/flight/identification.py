@@ -24,6 +24,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..algebra.compiler import quick_jit
+from ..algebra.derivative import value_and_jacobian
 from ..algebra.least_squares import Search, search
 from ..algebra.space import CyclicVector, Point, Vector
 from ..checks.errors import ModelError, SettingError, check_finite
@@ -46,7 +47,7 @@ class Unknown(NamedTuple):
     Attributes:
         name: name of the parameter.
         size: typical size of the number, in the parameter's unit.
-        places: all entries that have this value, such as ((0, 1), (1, 0)) of an inertia tensor;
+        places: places of all entries with this value, such as ((0, 1), (1, 0)) of an inertia tensor;
             ((),) for a plain number.
     """
 
@@ -73,7 +74,7 @@ class Identified:
         values: estimates (p,).
         covariance: covariance of their errors (p, p).
         standard_deviations: standard deviations of their errors (p,).
-        singular_values: those of J in units of the sizes, largest first (p,): reciprocals of
+        singular_values: singular values of J in units of the sizes, largest first (p,): reciprocals of
             the standard deviations along each direction, relative to the parameters' sizes.
         reduced_chi_square: the sum of squares over (numbers in the record less p); near
             one if sigma is right.
@@ -146,13 +147,13 @@ def motion_model(
     """Predictions (k, m) of the record of a motion, as a function of parameters (p,).
 
     Args:
-        make: parameters -> the mechanism: a state space, or a system, whose coordinates are then
-            those of `space`; see `from_table`.
-        start: the point at the first time, known, or a function of the state space.
+        make: function parameters -> mechanism: a state space, or a system, whose coordinates are
+            then those of `space`; see `from_table`.
+        start: point at the first time, known, or a function of the state space.
         ts: times of the record (k,), increasing [s].
-        outputs: what it has in each row: names of states, as departures from the start, and
+        outputs: columns of the record: names of states, as departures from the start, and
             sensors, in this order; or a function (state space, point) -> (m,).
-        inputs: known ones by name, numbers or histories; see `stmuav_jax.mechanics.with_inputs`.
+        inputs: known inputs by name, numbers or histories; see `stmuav_jax.mechanics.with_inputs`.
 
     Raises:
         SettingError: an unknown name, a sensor whose readings are no vector, or a system without
@@ -222,8 +223,7 @@ class Misfit(eqx.Module):
 @quick_jit
 def _at(residuals: Misfit, z: Float[Array, " p"]) -> tuple[Float[Array, " n"], Float[Array, "n p"]]:
     """Residuals and their Jacobian at scaled parameters z."""
-    push = lambda e: jax.jvp(residuals, (z,), (e,))
-    r, J = jax.vmap(push, out_axes=(None, -1))(jnp.eye(z.shape[0], dtype=z.dtype))
+    r, J = value_and_jacobian(residuals, z)
     return r.reshape(-1), J.reshape(-1, z.shape[0])
 
 
@@ -270,11 +270,12 @@ def identify(
     """Identify parameters by least squares from a record.
 
     Args:
-        predict: parameters (p,) -> predictions (k, m), such as `motion_model`.
-        record: (k, m). sigma: standard deviations of its errors (m,).
-        start: where the search starts, by label or in order. sizes: typical sizes (p,).
-        min_singular_value: see `check_identifiable`.
-        report, resume: see `search`.
+        predict: function parameters (p,) -> predictions (k, m), such as `motion_model`.
+        record: measurements (k, m). sigma: standard deviations of their errors (m,).
+        start: parameters at which the search starts, by label or in order.
+        sizes: typical sizes of the parameters (p,).
+        min_singular_value: bound of `check_identifiable`.
+        report, resume: arguments of `search`.
 
     Raises:
         IdentifiabilityError: the record does not determine a direction; the message names it.

@@ -25,6 +25,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from ..algebra.derivative import value_and_jacobian
 from ..algebra.space import Point
 from ..checks.errors import SettingError
 from ..dynamics.method import Method
@@ -143,12 +144,10 @@ def _flown_jvp(primals: Any, tangents: Any) -> tuple[Point, Point]:
     # starts of all n segments cost as much as those by one.
     (unknowns, how), (moves, _) = primals, tangents
     flat, unravel = ravel_pytree(unknowns)
-    push = lambda e: jax.jvp(lambda u: _segment(u, how), (unknowns,), (unravel(e),))
-    out, columns = jax.vmap(push, out_axes=(0, -1))(jnp.eye(flat.shape[0], dtype=flat.dtype))
+    points, columns = value_and_jacobian(lambda u: _segment(unravel(u), how), flat)
     given = lambda x, move: jnp.zeros_like(x) if move is None else move
     along = ravel_pytree(jax.tree.map(given, unknowns, moves, is_leaf=lambda x: x is None))[0]
-    first = jax.tree.map(lambda x: x[0], out)
-    return first, jax.tree.map(lambda J: J @ along, columns)
+    return points, jax.tree.map(lambda J: J @ along, columns)
 
 
 class Shooting(eqx.Module):

@@ -113,13 +113,19 @@ def sensed_flight(
         step: time between samples [s].
 
     Raises:
-        ModelError: not one set of rotors, or no gravity.
+        ModelError: not one set of rotors, rotors on another body than the first, or no gravity.
         SettingError: a final time before the first sample.
     """
     rotors = [k for k, f in enumerate(system.forces) if isinstance(f, Rotors)]
     pull = [f.acceleration for f in system.forces if isinstance(f, Gravity)]
     if len(rotors) != 1 or not pull:
         raise ModelError("A sensed flight needs one set of rotors and gravity.")
+    carrier: Any = system.forces[rotors[0]]
+    if carrier.body != system.names[0]:
+        raise ModelError(
+            f"The rotors are on body '{carrier.body}', but a sensed flight is controlled by the motion "
+            f"of the first body, '{system.names[0]}': put the body with the rotors first."
+        )
     if not 0 < step <= t1 < 1e4:
         raise SettingError(
             f"The end must lie between one step of {step:g} s and 1e4 s, not {t1:g} s."

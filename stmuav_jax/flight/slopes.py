@@ -22,7 +22,8 @@ def trim_slopes(
     """Trim of a flyer, and the derivatives of `FlightTrim.vector` by values it is built from.
 
     Args:
-        build: of values by name, traced by JAX. values: where the derivatives are taken.
+        build: function from values by name, traced by JAX, to the flyer.
+        values: values at which the derivatives are taken.
 
     Returns:
         the trim, whose `reason` says whether there is one, and the derivatives by name: the

@@ -37,11 +37,11 @@ class FlightCondition(NamedTuple):
     """A steady flight; see `hover`, `climb`, `cruise` and `steady_turn`.
 
     Attributes:
-        angles: of the UAV's panel (2,) [rad], or None where it points at the sun.
-        sun: direction to it, world (3,), or None.
+        angles: panel angles of the UAV (2,) [rad], or None where it points at the sun.
+        sun: direction to the sun, world (3,), or None.
         yaw: heading [rad]. v: velocity of the base, world (3,) [m/s].
-        rate: of turn about the vertical [rad/s].
-        acceleration: of the base beside that of the turn, world (3,) [m/s^2].
+        rate: rate of turn about the vertical [rad/s].
+        acceleration: acceleration of the base beside that of the turn, world (3,) [m/s^2].
     """
 
     angles: Float[Array, "2"] | None
@@ -136,13 +136,13 @@ def trim_condition(
     """Attitude and inputs of a steady flight of any mechanism with a floating base; see `trim`.
 
     Args:
-        condition: without angles of a panel: joints stay as they are in `at`.
-        at: a posture; the search starts from it with the base level and at the heading.
+        condition: flight without panel angles: joints stay as they are in `at`.
+        at: posture from which the search starts, with the base level and at the heading.
         free: names of further states that may be changed; with the sun at least two, such as the
             coordinates of the panel's joints.
-        inputs, values: those that may be chosen, and where the search starts.
-        sizes: of the unknowns: three turns, three rates of turn, the free states, then the inputs.
-        pointing: name of the body that points at the sun. axis: what of it does, body axes (3,).
+        inputs, values: inputs that may be chosen, and their values at the start of the search.
+        sizes: sizes of the unknowns: three turns, three rates of turn, free states, then inputs.
+        pointing: name of the body that points at the sun. axis: direction that does, body axes (3,).
 
     Raises:
         SettingError: nothing floats, angles of a panel, or a sun without a body that points at it.

@@ -63,9 +63,11 @@ class Experiment:
     """Simulated record, and the parameters and predictions behind it.
 
     Attributes:
-        name: short. labels, truth, sizes: of the parameters (p,). start: where to search from.
-        predict: see `motion_model`. clean: its predictions at the truth (k, 11).
-        record: with noise. sigma: the noise's deviations (11,).
+        name: short name for files.
+        labels, truth, sizes: names, true values and typical sizes of the parameters (p,).
+        start: parameters at the start of the search (p,).
+        predict: predictions of `motion_model`. clean: predictions at the truth (k, 11).
+        record: predictions with noise (k, 11). sigma: standard deviations of the noise (11,).
     """
 
     name: str

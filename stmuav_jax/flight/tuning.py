@@ -9,7 +9,7 @@ Source: J. T. Betts, Practical Methods for Optimal Control (2010), ch. 3 (direct
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,7 +20,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..algebra.compiler import quick_jit
-from ..algebra.least_squares import Method as SearchMethod, Search, search
+from ..algebra.least_squares import Method as SearchMethod, Search, SearchReason, search
 from ..algebra.sampled import Sampled
 from ..algebra.space import Point
 from ..checks.errors import ModelError, SettingError, check_finite
@@ -40,14 +40,19 @@ class TunedMotion(NamedTuple):
     """A motion under inputs that are tuned, as residuals see it.
 
     Attributes:
-        ts: (m,) [s]. points: of the state space (m, .). inputs: at these times (m, k).
-        values: what is searched for, inputs in units of their sizes: (k,), or (knots, k).
-        space: the mechanism's state space. system: with these inputs.
+        ts: times after the start (m,) [s].
+        points: points of the state space at these times (m, .).
+        inputs: inputs at these times (m, k).
+        extremes: inputs where their splines' pieces meet and where their slopes vanish (e, k): at
+            no time are they smaller or larger than the extremes.
+        values: unknowns of the search, inputs in units of their sizes: (k,), or (knots, k).
+        space: state space of the mechanism. system: system with these inputs.
     """
 
     ts: Float[Array, " m"]
     points: Point
     inputs: Float[Array, "m k"]
+    extremes: Float[Array, "e k"]
     values: Float[Array, "*n k"]
     space: AbstractStateSpace
     system: System
@@ -57,10 +62,12 @@ Residual = Callable[[TunedMotion], Any]
 
 
 class Departure(eqx.Module):
-    """Errors seen from a point in their sizes: as root mean squares over the motion, or at its end.
+    """Errors relative to a point in units of their sizes, over the motion or at its end.
 
     Attributes:
-        point: of the state space. sizes: what counts as one (n,). places: of the errors.
+        point: point of the state space. sizes: errors that count as one (n,).
+        places: places of these errors in an error of the state space.
+        at_end: true for the end alone, else root mean squares over the motion.
     """
 
     point: Point
@@ -82,8 +89,8 @@ def departures(
     """Residuals that keep a motion near a point.
 
     Args:
-        sizes: what counts as one, by the name of a state; others do not count. Default: all, with
-            one in their units.
+        sizes: errors that count as one, by the name of a state; others do not count. Default: all,
+            with one in their units.
     """
     return _departure(space, point, sizes, at_end=False)
 
@@ -111,20 +118,24 @@ def roughness(motion: TunedMotion) -> Float[Array, "m k"]:
 class Limit(eqx.Module):
     """Penalty residuals: zero where a limit is kept, else proportional to the excess over it.
 
-    A penalty is no guarantee: where a limit conflicts with the other residuals, or a search ends
-    early, the solution may still pass it. `excess` of the solution's motion says by how much.
+    The motion is looked at where it is known: its states at the output times, its inputs at all times
+    through `TunedMotion.extremes`. A penalty is no guarantee: where a limit conflicts with the other
+    residuals, the best motion passes it. `InputTuning.search` checks that and says so.
 
     Attributes:
-        excess: motion -> excess over the limit, negative inside, as a share of some size.
+        excess: function motion -> excess over the limit, negative inside, as a share of some size:
+            any pytree of arrays.
         weight: weight of these shares.
+        tolerance: share by which a solution may pass the limit.
     """
 
-    excess: Callable[[TunedMotion], Array]
-    weight: float = 100.0
+    excess: Callable[[TunedMotion], Any]
+    weight: float | Float[Array, ""] = 100.0
+    tolerance: float = 0.01
 
-    def __call__(self, motion: TunedMotion) -> Array:
-        over = jnp.maximum(self.excess(motion), 0.0)
-        return self.weight / jnp.sqrt(len(motion.ts)) * over
+    def __call__(self, motion: TunedMotion) -> Any:
+        over = lambda x: self.weight / jnp.sqrt(len(x)) * jnp.maximum(x, 0.0)
+        return jax.tree.map(over, self.excess(motion))
 
 
 class _Signals(eqx.Module):
@@ -136,6 +147,24 @@ class _Signals(eqx.Module):
     def __call__(self, values: Float[Array, "*n k"]) -> Any:
         scaled = values * self.sizes
         return scaled if self.ts is None else Sampled(np.array(self.ts), scaled, 3)
+
+    def extremes(self, values: Float[Array, "*n k"]) -> Float[Array, "e k"]:
+        """Inputs at the ends of all pieces and at their stationary points (e, k)."""
+        history = self(values)
+        return history[None] if self.ts is None else _extremes(history)
+
+
+def _extremes(spline: Sampled) -> Float[Array, "e k"]:
+    """Values of a cubic spline at the ends of its pieces and where its slope vanishes (e, k)."""
+    a, b, c, d = spline.coefficients
+    lengths = jnp.diff(spline.breaks)[:, None]
+    root = jnp.sqrt(jnp.maximum(b**2 - 3 * a * c, 0.0))
+    # of the two forms of each root the one without cancellation; one that is none becomes an end
+    q = -(b + jnp.where(b < 0, -root, root))
+    ratio = lambda x, y: jnp.clip(jnp.where(y == 0, 0.0, x / jnp.where(y == 0, 1.0, y)), 0, lengths)
+    # the slope is zero there, or the place is fixed: values do not depend on how it moves
+    places = [0 * a, *jax.lax.stop_gradient((ratio(q, 3 * a), ratio(c, q))), lengths + 0 * a]
+    return jnp.concatenate([((a * s + b) * s + c) * s + d for s in places])
 
 
 class _Driven(eqx.Module):
@@ -156,15 +185,16 @@ class _Cost(eqx.Module):
     residuals: tuple[Residual, ...]
 
     def __call__(self, values: Any, ts: Array, path: Point, system: System) -> Any:
-        motion = self.seen(values, ts, path, system)
+        motion = self.motion(values, ts, path, system)
         return [residual(motion) for residual in self.residuals]
 
-    def seen(self, values: Any, ts: Array, path: Point, system: System) -> TunedMotion:
+    def motion(self, values: Any, ts: Array, path: Point, system: System) -> TunedMotion:
         signals = self.driven.signals
         given: Any = signals(values)
         constant = lambda t: given
         inputs = jax.vmap(constant if signals.ts is None else given)(ts)
-        return TunedMotion(ts, path, inputs, values, self.driven.space, system)
+        extremes = signals.extremes(values)
+        return TunedMotion(ts, path, inputs, extremes, values, self.driven.space, system)
 
 
 @dataclass(frozen=True)
@@ -186,9 +216,30 @@ class InputTuning:
         return self.residuals.cost.driven.signals(values["values"])  # pyright: ignore
 
     def search(self, method: SearchMethod | None = None, **options: Any) -> Search:
-        """Solve it; see `search` for the options. Default: Levenberg-Marquardt."""
+        """Solve the problem; see `search` for the options. Default: Levenberg-Marquardt.
+
+        A search that has ended with a motion that passes a limit by more than its tolerance has not
+        succeeded: its reason is `SearchReason.LIMIT_PASSED`, and `excess` says by how much.
+        """
         method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8) if method is None else method
-        return search(self.residuals, self.start, method, **options)
+        found = search(self.residuals, self.start, method, **options)
+        if found.reason in (SearchReason.CONVERGED, SearchReason.PATIENCE):
+            over = zip(self.excess(found.values), self._limits(), strict=True)
+            if not all(share <= limit.tolerance for share, limit in over):
+                return replace(found, reason=SearchReason.LIMIT_PASSED)
+        return found
+
+    def excess(self, values: Any, samples: int = 200) -> tuple[float, ...]:
+        """Largest excess of the motion over each `Limit`, in its shares; negative inside it."""
+        limits = self._limits()
+        if not limits:
+            return ()
+        found = _excess(limits, self.motion(values, samples))
+        return tuple(float(x) for x in found)
+
+    def _limits(self) -> tuple[Limit, ...]:
+        every = self.residuals.cost.residuals  # pyright: ignore
+        return tuple(one for one in every if isinstance(one, Limit))
 
     def motion(self, values: Any, samples: int = 200) -> TunedMotion:
         """The motion under the inputs of a search, from its start in one piece."""
@@ -200,7 +251,13 @@ class InputTuning:
 def _in_one_piece(problem: Shooting, values: Any, ts: Float[Array, " m"]) -> TunedMotion:
     system = problem.system(values)
     path = fly(problem.space, system, problem.start, ts, problem.method)
-    return problem.cost.seen(values, ts, path, system)  # pyright: ignore
+    return problem.cost.motion(values, ts, path, system)  # pyright: ignore
+
+
+@quick_jit
+def _excess(limits: tuple[Limit, ...], motion: TunedMotion) -> list[Array]:
+    largest = lambda x: jnp.max(jnp.stack([jnp.max(leaf) for leaf in jax.tree.leaves(x)]))
+    return [largest(limit.excess(motion)) for limit in limits]
 
 
 def tune_inputs(
@@ -220,22 +277,22 @@ def tune_inputs(
     method: Method | None = None,
     name: str = "tuned inputs",
 ) -> InputTuning:
-    """The search for inputs under which residuals of a motion are small.
+    """Set up the search for inputs under which residuals of a motion are small.
 
     Args:
-        space: the mechanism's state space. start: where the motion starts.
-        residuals: motion (`TunedMotion`) -> any pytree of numbers that are to be small.
-        duration: of the motion [s].
-        inputs: those that are tuned, or their names; default all of the system.
-        values: of the inputs at the start of the search (k,), or with knots also (knots, k); default
-            those that the system has.
-        sizes: of the inputs (k,): what counts as a change of one; default the largest of their
-            values, or one where these are zero.
-        knots: of the splines, evenly spaced in time; default none: the inputs are constant.
+        space: state space of the mechanism. start: point at which the motion starts.
+        residuals: functions of the motion (`TunedMotion`) -> numbers to be made small, any pytree.
+        duration: length of the motion [s].
+        inputs: inputs that are tuned, or their names; default all of the system.
+        values: inputs at the start of the search (k,), or with knots also (knots, k); default those
+            that the system has.
+        sizes: changes of the inputs that count as one (k,); default the largest of their values, or
+            one where these are zero.
+        knots: number of knots of the splines, evenly spaced in time; None for constant inputs.
         segments: number of segments of multiple shooting. outputs_per_segment: output times in each.
-            weight: weight of the gaps between them.
-        guess: time [s] -> point, where segments start in the search; default the start.
-        name: of the problem, for files.
+        weight: weight of the gaps between segments.
+        guess: function time [s] -> point at which a segment starts; default the start.
+        name: name of the problem, for files.
 
     Raises:
         SettingError: a time that is not positive, too few knots or segments, no residuals, or an

@@ -60,7 +60,8 @@ def hold(
 
     Args:
         untuned: inputs to start with, such as equal speeds and no forces.
-        horizon: over which departures are counted [s]. segments: of multiple shooting.
+        horizon: time over which departures count [s].
+        segments: number of segments of multiple shooting.
 
     Raises:
         SettingError: a horizon that is not positive, or less than one segment.
@@ -123,10 +124,10 @@ class SlewLimits(NamedTuple):
     """Limits of a slew.
 
     Attributes:
-        force: of the actuators either way [N].
+        force: largest force of the actuators either way [N].
         home: strokes from which the sliders' displacements are measured (2,) [m], see `strokes`.
-        lower, upper: of the displacements (2,) [m].
-        reaction: of the force in any joint [N], or None: not looked at.
+        lower, upper: limits of the displacements (2,) [m].
+        reaction: largest force in any joint [N]; None for no limit.
     """
 
     force: Numbers = np.inf
@@ -140,9 +141,11 @@ class Peaks(NamedTuple):
     """Peaks of a history of inputs and of the motion that it causes.
 
     Attributes:
-        force: largest of an actuator [N]. lower, upper: least and largest displacements (2,) [m].
+        force: largest force of an actuator [N].
+        lower, upper: smallest and largest displacements of the sliders (2,) [m].
         reaction: largest force in a joint [N], or None where it has no limit.
-        tilt: largest [rad]. drift: largest [m]. error: of the panel at the end [rad].
+        tilt: largest tilt of the base [rad]. drift: largest distance of the base from its start [m].
+        error: error of the panel angles at the end [rad].
     """
 
     force: Float[Array, ""]
@@ -160,15 +163,15 @@ class _Within(eqx.Module):
     flyer: Flyer
     limits: SlewLimits
 
-    def __call__(self, motion: TunedMotion) -> Float[Array, "m n"]:
+    def __call__(self, motion: TunedMotion) -> list[Float[Array, "m n"]]:
         limits = self.limits
-        forces = jnp.abs(motion.inputs[:, -2:]) / jnp.asarray(limits.force) - 1
+        forces = jnp.abs(motion.extremes[:, -2:]) / jnp.asarray(limits.force) - 1
         displacement = _displacements(self.flyer, limits, motion.points)
         upper, lower = jnp.asarray(limits.upper), jnp.asarray(limits.lower)
         over = [forces, (displacement - upper) / 0.01, (lower - displacement) / 0.01]
         if limits.reaction is not None:
             over.append(joint_forces(motion) / jnp.asarray(limits.reaction) - 1)
-        return jnp.concatenate(over, axis=1)
+        return over
 
 
 def _displacements(flyer: Flyer, limits: SlewLimits, path: FlyerPoint) -> Float[Array, "m 2"]:
@@ -249,7 +252,7 @@ def _peaks(motion: TunedMotion, start: FlyerPoint, end: FlyerPoint, kept: _Withi
     size = lambda v: jnp.max(jnp.sqrt(jnp.sum(v**2, axis=1)))
     limited = kept.limits.reaction is not None
     return Peaks(
-        force=jnp.max(jnp.abs(motion.inputs[:, -2:])),
+        force=jnp.max(jnp.abs(motion.extremes[:, -2:])),
         lower=jnp.min(displacement, axis=0),
         upper=jnp.max(displacement, axis=0),
         reaction=jnp.max(joint_forces(motion)) if limited else None,

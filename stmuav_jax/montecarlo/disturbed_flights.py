@@ -25,12 +25,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..algebra.rotation import rotation_matrix
-from ..checks.errors import SettingError
+from ..checks.errors import SettingError, StateError
 from ..checks.quantity import quantities
 from ..checks.schema import SHOWN, named, shown
+from ..dynamics.scene import Scene
+from ..dynamics.statespace.tree import TreeSpace
+from ..dynamics.tree.topology import spanning_tree
 from ..environment.wind import dryden, low_altitude
+from ..flight.equilibrium import trim
 from ..flight.flight_trim import TrimReason, hover, trim_flight
-from ..flight.flyer import RotorsAndForces
+from ..flight.steady import trim_condition
+from ..mechanics.inputs import inputs_of
 from ..mechanics.state import State
 from ..mechanics.system import System
 from ..parameters.table import Parameters
@@ -88,7 +93,7 @@ class Flights:
         drag: add drag of the airframe.
         gusts: add Dryden gusts to the table's mean wind, different in each run; needs drag.
         duration: time for which gusts are sampled [s].
-        held: squared rotor speeds and actuator forces of the trim, where these are the inputs.
+        held: all inputs of the scene at its trim (m,), where these are the inputs.
     """
 
     scene: str
@@ -102,7 +107,12 @@ class Flights:
     drag: bool = False
     gusts: bool = False
     duration: float = 1.0
-    held: RotorsAndForces | None = None
+    held: Float[np.ndarray, " m"] | None = None
+
+    @property
+    def trimmed_case(self) -> int | None:
+        """Case of the scene: with a trim's inputs that of the UAV whose inputs are constant."""
+        return 2 if self.inputs == "trim" and self.scene == "uav_tracker" else self.case
 
     def entry(self, factor: str) -> FactorTarget:
         """Target of a factor.
@@ -162,8 +172,7 @@ class Flights:
             drawn_start = {k[6:]: v for k, v in values.items() if k.startswith("start.")}
             first = options.get("start", known["start"].kind())
             options["start"] = replace(first, **drawn_start)
-        case = 2 if self.inputs == "trim" else self.case
-        scene = make_scene(self.scene, case, table, **options)
+        scene = make_scene(self.scene, self.trimmed_case, table, **options)
         return self._driven(scene.system, values), scene.state0
 
     def _table(self, values: Mapping[str, Array]) -> Parameters:
@@ -227,23 +236,20 @@ class Flights:
 
     def _driven(self, system: System, values: Mapping[str, Array]) -> System:
         """System with the inputs of the trim, and their changes by the factors."""
+        if self.held is not None:
+            system = inputs_of(system).applied(system, jnp.asarray(self.held))
         forces = list(system.forces)
-        held = self.held
         for k, force in enumerate(forces):
             if isinstance(force, Rotors):
-                squared: Any = force.speed_squared if held is None else held.speed_squared
                 shares = [values.get(name) for name in _rotor_inputs(force)]
-                if held is not None or any(share is not None for share in shares):
+                if any(share is not None for share in shares):
                     ones = [jnp.asarray(1.0 if x is None else x, dtype=float) for x in shares]
-                    squared = squared * jnp.stack(ones)
+                    squared = force.speed_squared * jnp.stack(ones)
                     forces[k] = eqx.tree_at(lambda f: f.speed_squared, force, squared)
             elif isinstance(force, LinearActuator):
-                side = 0 if force.slider == "slider_2" else 1
-                push = force.force if held is None else jnp.asarray(held.forces[side], dtype=float)
-                more = values.get(_actuator_input(force))
+                push, more = force.force, values.get(_actuator_input(force))
                 if more is not None:
                     push = _Shift(push, more) if callable(push) else push + more
-                if held is not None or more is not None:
                     forces[k] = eqx.tree_at(lambda f: f.force, force, push)
         return eqx.tree_at(lambda s: s.forces, system, tuple(forces))
 
@@ -283,14 +289,30 @@ def _tensors(inertia: Float[np.ndarray, "n 3 3"], tolerance: float) -> Bool[np.n
     return finite & (moments[:, 0] > 0) & (moments[:, 2] <= most)
 
 
-def _hover_inputs(table: Parameters) -> RotorsAndForces:
+def _uav_hover(table: Parameters) -> Float[np.ndarray, " m"]:
     found = trim_flight(uav_flyer(table), hover(initial_angles(table)))
     if int(found.reason) != TrimReason.VALID:
         raise SettingError(
             "There is no hover at the initial posture of these parameters: "
-            f"{TrimReason(int(found.reason)).name.lower().replace('_', ' ')}."
+            f"{TrimReason(int(found.reason)).words}."
         )
-    return RotorsAndForces(np.asarray(found.inputs.speed_squared), np.asarray(found.inputs.forces))
+    return np.concatenate([np.asarray(x) for x in found.inputs])
+
+
+def _trim_inputs(scene: str, built: Scene) -> Float[np.ndarray, " m"]:
+    """Inputs of a scene at which it hovers, or stands still at its start if its base is fixed (m,)."""
+    if not len(inputs_of(built.system)):
+        raise SettingError(
+            f'The scene {scene} has no inputs that a trim could find: leave inputs = "trim" out.'
+        )
+    space = TreeSpace(built.system, built.state0)
+    start = space.from_state(built.state0)
+    try:
+        floats = spanning_tree(built.system).floating
+        found = trim_condition(space, hover(), at=start) if floats else trim(space, at=start)
+    except (StateError, SettingError) as error:
+        raise SettingError(f"The scene {scene} has no trim from its start: {error}") from None
+    return np.asarray(found.values)
 
 
 def flights(
@@ -299,7 +321,7 @@ def flights(
     """Checked settings of a study's runs, of a scene by name.
 
     Raises:
-        SettingError: an unknown scene, case or option, gusts without drag, trim of another scene.
+        SettingError: an unknown scene, case or option, gusts without drag, a scene without a trim.
     """
     if not isinstance(scene, str) or not (case is None or isinstance(case, int)):
         raise SettingError(f"A scene has a name and a case a number, not {shown((scene, case))}.")
@@ -307,8 +329,6 @@ def flights(
     table = entry.parameters if table is None else table
     case = entry.default_case if case is None else case
     made = Flights(scene, case, table, {}, **options)
-    if made.inputs == "trim" and scene != "uav_tracker":
-        raise SettingError(f"Inputs of a trim are for uav_tracker, not for {scene}.")
     if made.inputs == "trim" and "motor" in made.options:
         raise SettingError("Inputs of a trim are steady speeds of the rotors: leave motor out.")
     if made.drag and "drag" not in entry.options:
@@ -320,17 +340,15 @@ def flights(
             "A study with drag = true has the wind of the table, of its factors and of gusts: leave "
             "the option wind out."
         )
-    built = make_scene(
-        scene,
-        2 if made.inputs == "trim" else case,
-        table,
-        **options_from_plain(scene, made.options),
-    )
+    built = make_scene(scene, made.trimmed_case, table, **options_from_plain(scene, made.options))
     given = frozenset(
         name for name, line in built.parameters.items() if line != table[name].plain()
     )
     made = replace(made, own=_own(made, built.system), given=given)
-    return replace(made, held=_hover_inputs(table)) if made.inputs == "trim" else made
+    if made.inputs == "case":
+        return made
+    of_uav = scene == "uav_tracker"
+    return replace(made, held=_uav_hover(table) if of_uav else _trim_inputs(scene, built))
 
 
 def _own(of: Flights, system: System) -> dict[str, str]:

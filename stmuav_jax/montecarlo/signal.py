@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..algebra.derivative import safe_norm
 from ..algebra.rotation import rotation_matrix
 from ..checks.errors import SettingError, nearest_names
 from ..checks.schema import SHOWN, named
@@ -101,15 +102,9 @@ class Signal:
     smooth: bool = True
 
 
-def length(x: Float[Array, " k"]) -> Float[Array, ""]:
-    """Length of a vector, whose derivative at zero is set to zero."""
-    square = jnp.sum(x * x)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-
-
 def angle_between(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
     """Angle between two vectors [rad], exact near 0 and pi, with derivatives set to zero there."""
-    return jnp.arctan2(length(jnp.cross(a, b)), a @ b)
+    return jnp.arctan2(safe_norm(jnp.cross(a, b)), a @ b)
 
 
 _UP = (0.0, 0.0, 1.0)
@@ -118,9 +113,9 @@ _BASE = {
     "x": Signal(lambda v: v.state.r[0, 0], "m", "base, x"),
     "y": Signal(lambda v: v.state.r[0, 1], "m", "base, y"),
     "z": Signal(lambda v: v.state.r[0, 2], "m", "base, height"),
-    "distance": Signal(lambda v: length(v.state.r[0]), "m", "base, distance from the origin"),
-    "speed": Signal(lambda v: length(v.state.v[0]), "m/s", "base, speed"),
-    "spin": Signal(lambda v: length(v.state.omega[0]), "rad/s", "base, angular velocity"),
+    "distance": Signal(lambda v: safe_norm(v.state.r[0]), "m", "base, distance from the origin"),
+    "speed": Signal(lambda v: safe_norm(v.state.v[0]), "m/s", "base, speed"),
+    "spin": Signal(lambda v: safe_norm(v.state.omega[0]), "rad/s", "base, angular velocity"),
     "tilt": Signal(
         lambda v: angle_between(v.R_wb[:, 2], jnp.array(_UP, v.y.dtype)), "rad", "base, tilt"
     ),
@@ -135,7 +130,9 @@ _PANEL = {
         lambda v: angle_between(v.normal_w, v.direction), "rad", "panel, pointing error"
     ),
     "panel_spin": Signal(
-        lambda v: length(v.state.omega[v.system.index(PANEL)]), "rad/s", "panel, angular velocity"
+        lambda v: safe_norm(v.state.omega[v.system.index(PANEL)]),
+        "rad/s",
+        "panel, angular velocity",
     ),
     "stroke_2": Signal(lambda v: v.stroke(SLIDERS[0]), "m", "slider 2, stroke"),
     "stroke_3": Signal(lambda v: v.stroke(SLIDERS[1]), "m", "slider 3, stroke"),
@@ -147,7 +144,7 @@ _ANY = {
 
 
 def _at_joint(kind: str, k: int) -> Callable[[View], Array]:
-    return lambda v: length(getattr(v.reactions, kind)[k])
+    return lambda v: safe_norm(getattr(v.reactions, kind)[k])
 
 
 def signals(system: System) -> dict[str, Signal]:

@@ -53,8 +53,9 @@ class Motor:
     """Motors of the rotors with lag, inertia and limits.
 
     Attributes:
-        time_constant: [s]. inertia: of a rotor about its axis [kg m^2].
-        lowest, highest: speeds [rad/s]. The motors start at their commands.
+        time_constant: time constant of the speeds [s]. inertia: inertia of a rotor about its axis
+            [kg m^2].
+        lowest, highest: limits of the speeds [rad/s]. The motors start at their commands.
     """
 
     time_constant: Numbers | None = quantity("time constant of the speeds", "s")
@@ -64,8 +65,8 @@ class Motor:
 
 
 @dataclass(frozen=True)
-class BaseStart:
-    """Start of the hexacopter; numbers left out are zero.
+class AbstractStart:
+    """Start of a hexacopter; numbers left out are zero.
 
     Attributes:
         x, y, z: position [m]. roll, pitch, yaw: attitude R_z(yaw) R_y(pitch) R_x(roll) [rad].
@@ -87,29 +88,21 @@ class BaseStart:
 
 
 @dataclass(frozen=True)
-class FlightStart:
+class BaseStart(AbstractStart):
+    """Start of the bare hexacopter, as described by `AbstractStart`."""
+
+
+@dataclass(frozen=True)
+class FlightStart(AbstractStart):
     """Start of the hexacopter and of its tracker's panel.
 
     Numbers of the hexacopter left out are zero; those of the panel are the initial posture's, at
     rest.
 
     Attributes:
-        x, y, z, roll, pitch, yaw, vx, vy, vz, p, q, r: those of `BaseStart`.
-        phi, theta: panel angles [rad]. phi_rate, theta_rate: theirs [rad/s].
+        phi, theta: panel angles [rad]. phi_rate, theta_rate: rates of the panel angles [rad/s].
     """
 
-    x: Numbers = quantity("position, x", "m", default=0.0)
-    y: Numbers = quantity("position, y", "m", default=0.0)
-    z: Numbers = quantity("position, height", "m", default=0.0)
-    roll: Numbers = quantity("attitude, turn about x", "rad", default=0.0)
-    pitch: Numbers = quantity("attitude, turn about y", "rad", default=0.0)
-    yaw: Numbers = quantity("attitude, turn about z", "rad", default=0.0)
-    vx: Numbers = quantity("velocity, x", "m/s", default=0.0)
-    vy: Numbers = quantity("velocity, y", "m/s", default=0.0)
-    vz: Numbers = quantity("velocity, upwards", "m/s", default=0.0)
-    p: Numbers = quantity("angular velocity about its x axis", "rad/s", default=0.0)
-    q: Numbers = quantity("angular velocity about its y axis", "rad/s", default=0.0)
-    r: Numbers = quantity("angular velocity about its z axis", "rad/s", default=0.0)
     phi: Numbers | None = quantity("first panel angle", "rad")
     theta: Numbers | None = quantity("second panel angle", "rad")
     phi_rate: Numbers = quantity("rate of the first panel angle", "rad/s", default=0.0)

@@ -11,7 +11,7 @@ from ..parameters.table import Parameters
 from ..tracker.geometry import initial_angles, tracker_geometry
 from ..tracker.placement import posture, turn_about
 from ..tracker.tracker_options import PanelStart
-from .flight_options import BaseStart, FlightStart
+from .flight_options import AbstractStart, BaseStart, FlightStart
 
 # Note of a scene that starts elsewhere.
 STARTED = "The start is not the report's."
@@ -24,7 +24,7 @@ def _numbers(start: object, *names: str) -> Float[Array, " k"]:
     return jnp.stack([jnp.asarray(value, dtype=float) for value in values])
 
 
-def _base(start: BaseStart | FlightStart) -> tuple[Array, Array, Array, Array]:
+def _base(start: AbstractStart) -> tuple[Array, Array, Array, Array]:
     """Position, Euler parameters, velocity and angular velocity of the base."""
     turns = _numbers(start, "yaw", "pitch", "roll")
     yaw, pitch, roll = (turn_about(turns[k], axis) for k, axis in enumerate((2, 1, 0)))

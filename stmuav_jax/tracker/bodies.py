@@ -25,7 +25,7 @@ from .geometry import TrackerGeometry, check_closure, initial_angles, tracker_ge
 from .placement import TRACKER_BODIES, place
 
 
-class _Placed(NamedTuple):
+class _Posture(NamedTuple):
     """Poses of the bodies, points and axes of the joints by name, in the world."""
 
     poses: dict[str, tuple[Any, Any]]
@@ -41,7 +41,7 @@ _AXES = ("T12", "T13", "R14", "R26", "U35.i", "U35.j", "U47.i", "U47.j")
 def _place_all(
     geometry: TrackerGeometry, angles: Float[Array, "2"], displacement: Float[Array, "3"]
 ) -> tuple[Array, ...]:
-    """Arrays of `_Placed`, compiled as one: each small operation alone would cost a compilation."""
+    """Arrays of `_Posture`, compiled as one: each small operation alone would cost a compilation."""
     at = place(geometry, angles)
     points = jnp.stack([at.points[name] for name in _POINTS])
     return (
@@ -52,7 +52,7 @@ def _place_all(
     )
 
 
-def _placed(parameters: Parameters, displacement: Numbers) -> _Placed:
+def _placed(parameters: Parameters, displacement: Numbers) -> _Posture:
     geometry, angles = tracker_geometry(parameters), initial_angles(parameters)
     arrays = _place_all(geometry, angles, floats(displacement))
     if concrete(arrays):
@@ -60,7 +60,7 @@ def _placed(parameters: Parameters, displacement: Numbers) -> _Placed:
         if not np.all(np.isfinite(arrays[0])):
             check_closure(geometry, angles)
     r, p, points, axes = arrays
-    return _Placed(
+    return _Posture(
         {name: (r[k], p[k]) for k, name in enumerate(TRACKER_BODIES)},
         {name: points[k] for k, name in enumerate(_POINTS)},
         {name: axes[k] for k, name in enumerate(_AXES)},

@@ -26,7 +26,7 @@ class Most(eqx.Module):
     effort: Array
 
     def __call__(self, motion):
-        return jnp.abs(motion.inputs) / self.effort - 1
+        return jnp.abs(motion.extremes) / self.effort - 1
 
 
 @pytest.mark.slow
@@ -50,10 +50,54 @@ def test_a_limit_counts_only_beyond(cart):
     """A hundredfold share of what is passed, as a root mean square over the motion."""
     space, x = cart
     inputs = jnp.array([[8.0], [-12.0], [10.0], [15.0]])
-    motion = stm.flight.TunedMotion(jnp.arange(4.0), x, inputs, inputs, space, space.system)
+    motion = stm.flight.TunedMotion(jnp.arange(4.0), x, inputs, inputs, inputs, space, space.system)
     found = stm.flight.Limit(Most(jnp.asarray(10.0)))(motion)
     np.testing.assert_allclose(found, [[0.0], [10.0], [0.0], [25.0]], rtol=1e-12)
     np.testing.assert_allclose(stm.flight.roughness(motion), [[42.0], [-17.0]])
+
+
+def test_extremes_of_a_history(cart):
+    """Those of the spline at 20,001 times, to the square of their spacing; and so its derivative."""
+    space, x = cart
+    near = [stm.flight.departures(space, x)]
+    tuning = stm.flight.tune_inputs(
+        space, near, start=x, duration=1.5, inputs=["effort"], sizes=[10.0], knots=8
+    )
+    signals = tuning.residuals.cost.driven.signals
+    values = np.random.default_rng(0).normal(size=(3, 8, 1))
+    values[2] = np.array([0, 0, 1, 1, 1, 1, 0, 0.0])[:, None]  # pieces without a cubic part
+    ts = jnp.linspace(0.0, 1.5, 20_001)
+    most = jax.jit(lambda v: jnp.max(signals.extremes(v)))
+    dense = jax.jit(lambda v: jnp.max(jax.vmap(signals(v))(ts)))
+    for v in values:
+        assert 0 <= float(most(v) - dense(v)) < 1e-5
+        np.testing.assert_allclose(jax.grad(most)(v), jax.grad(dense)(v), atol=2e-3)
+
+
+@pytest.mark.slow
+def test_a_limit_is_kept_or_said_to_be_passed(cart):
+    """A force within its limit at all times; told so where the limit leaves too little of it."""
+    space, x = cart
+    target = space.retract(x, jnp.array([0.5, 0.0, 0.0, 0.0]))
+
+    def made(effort, weight=100.0):
+        limit = stm.flight.Limit(Most(jnp.asarray(effort)), jnp.asarray(weight))
+        return stm.flight.tune_inputs(
+            space, [stm.flight.end_at(space, target), limit], start=x, duration=1.5,
+            inputs=["effort"], sizes=[10.0], knots=8,
+        )  # fmt: skip
+
+    tuning = made(12.0)  # 14.6 N without a limit
+    found = tuning.search(steps=60, patience=20)
+    force = np.asarray(tuning.motion(found.values, 2000).inputs)
+    assert 11.9 < np.max(np.abs(force)) < 12.0 * (1 + 1e-4)
+    assert tuning.excess(found.values)[0] < 1e-4
+    # a limit that weighs next to nothing against the target is passed, and the search says so
+    weak = made(6.0, weight=1e-6)
+    found = weak.search(steps=60, patience=10)
+    assert weak.excess(found.values)[0] > 0.01
+    assert found.reason is stm.algebra.SearchReason.LIMIT_PASSED
+    assert "passes a limit" in found.words()
 
 
 @pytest.mark.slow

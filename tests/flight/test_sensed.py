@@ -138,5 +138,9 @@ def test_refused():
     with pytest.raises(stm.ModelError, match="one set of rotors"):
         sensed_flight(made.system, made.state0)
     made = stm.make_scene("hexacopter")
+    pair = [stm.Body(name, 1.0, np.eye(3), free=True) for name in ("load", "hexacopter")]
+    other = stm.System(pair, (), made.system.forces)
+    with pytest.raises(stm.ModelError, match=r"rotors are on body 'hexacopter', .* body, 'load'"):
+        sensed_flight(other, made.state0)
     with pytest.raises(stm.SettingError, match=r"one step of 0.005 s"):
         sensed_flight(made.system, made.state0, t1=0.001)

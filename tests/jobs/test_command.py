@@ -140,7 +140,9 @@ def test_columns_of_files(study, tmp_path, capsys):
     study.write_text(STUDY.replace('column = "q"', 'column = "w"'))
     assert main(["montecarlo", str(study), "--out", str(tmp_path / "x")]) == 2
     assert "no column 'w'" in " ".join(capsys.readouterr().err.split())
-    (tmp_path / "rates.csv").write_text("t,q\n0,fast\n")
     study.write_text(STUDY)
-    assert main(["montecarlo", str(study), "--out", str(tmp_path / "x")]) == 2
-    assert "'fast' in column 'q' is not a number" in " ".join(capsys.readouterr().err.split())
+    for entry in ("fast", "nan", "-inf"):
+        (tmp_path / "rates.csv").write_text(f"t,q\n0,{entry}\n")
+        assert main(["montecarlo", str(study), "--out", str(tmp_path / "x")]) == 2
+        words = f"'{entry}' in column 'q' is not a finite number"
+        assert words in " ".join(capsys.readouterr().err.split())

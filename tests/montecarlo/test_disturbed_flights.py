@@ -1,5 +1,6 @@
 """From drawn numbers to systems and starts."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -7,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from stmuav_jax import PART_II, SettingError, make_scene
+from stmuav_jax import PART_II, Body, SettingError, System, make_scene
 from stmuav_jax.dynamics import energy
 from stmuav_jax.dynamics.formulations.augmented import Augmented
-from stmuav_jax.montecarlo.disturbed_flights import Drawn, flights
+from stmuav_jax.montecarlo.disturbed_flights import Drawn, _trim_inputs, flights
+from stmuav_jax.rotorcraft import Rotors
 from stmuav_jax.tracker import PanelStart, Servo
 
 SEED = jnp.zeros((), jnp.uint32)
@@ -101,6 +103,17 @@ def test_a_trims_inputs_hold():
     assert level < 0.01
 
 
+def test_a_trim_of_another_scene():
+    """The rotors of the hexacopter at its trim carry its weight; a factor multiplies one of them."""
+    study = flights("hexacopter", inputs="trim")
+    systems = study.nominal()[0], build(study, input__rotor_1=1.1)[0]
+    held, drawn = (next(f for f in s.forces if isinstance(f, Rotors)) for s in systems)
+    weight = 9.81 * float(jnp.sum(systems[0].bodies.mass))
+    assert float(held.k_f * jnp.sum(held.speed_squared)) == pytest.approx(weight, rel=1e-10)
+    ratio = drawn.speed_squared / held.speed_squared
+    np.testing.assert_allclose(ratio, [1.1, 1, 1, 1, 1, 1], rtol=1e-15)
+
+
 @pytest.mark.parametrize(
     ("factor", "words"),
     [
@@ -123,8 +136,9 @@ def test_refusals():
         flights("hexacopter", gusts=True)
     with pytest.raises(SettingError, match="no airframe"):
         flights("tracker", drag=True)
-    with pytest.raises(SettingError, match="trim are for uav_tracker"):
-        flights("hexacopter", inputs="trim")
+    bare = System([Body("a", 1.0, np.eye(3), free=True)])
+    with pytest.raises(SettingError, match="bare has no inputs that a trim could find"):
+        _trim_inputs("bare", replace(make_scene("spin"), system=bare))
     with pytest.raises(SettingError, match="that it could multiply"):
         flights("hexacopter", relative=frozenset({"start.p"})).entry("start.p")
 

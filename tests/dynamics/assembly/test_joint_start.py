@@ -160,7 +160,10 @@ def test_the_tree_goes_through_the_given_joints(linkage):
             {"R": [0.1, 0.2]},
             r"coordinate of joint 'R' \(revolute\) must be 1 number \(angle \[rad\]\)",
         ),
-        ({"C": 0.1}, r"must be 2 numbers \(shift \[m\], angle \[rad\]\), but it has shape \(\)"),
+        (
+            {"C": 0.1},
+            r"must be 2 numbers \(displacement \[m\], angle \[rad\]\), but it has shape \(\)",
+        ),
         ({"W": 0.1}, "weld joint, which has no joint coordinates"),
         ({"R": np.nan}, "coordinate of joint 'R' must be finite"),
     ],
