@@ -28,7 +28,7 @@ SUITE = (
 )  # fmt: skip
 ALONE = (
     "stiff", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "failure",
-    "montecarlo",
+    "compile_times", "montecarlo",
 )  # fmt: skip
 # Result -> the script that measures it, with its arguments, in the order of running.
 BENCHMARKS: dict[str, tuple[str, ...]] = {

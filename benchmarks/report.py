@@ -16,6 +16,7 @@ from sections.state import state
 from sections.tables import (
     acceleration,
     batch,
+    compile_times,
     curves,
     gradient,
     hexacopter,
@@ -120,6 +121,9 @@ def build(results: Path, page: Path) -> Path:
             place = os.path.relpath(figure, page.parent)
             lines += [f"![{figure.stem.replace('_', ' ')}]({place})", ""]
         lines += write(result)
+    programs = results / "compile_times.json"
+    if programs.exists():
+        lines += ["", "## Compile times", "", *compile_times(json.loads(programs.read_text()))]
     text = "\n".join(lines).rstrip() + "\n"
     return write_atomically(page, text.encode())
 
