@@ -25,7 +25,7 @@ from shared.record import ALLOW, MEASURED, RESULTS, ROOT, commit, moved
 FOLDER = Path(__file__).parent
 ALONE = (
     "stiff", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "failure",
-    "montecarlo",
+    "compile_times", "montecarlo",
 )  # fmt: skip
 # Result -> the script that measures it, with its arguments, in the order of running.
 BENCHMARKS: dict[str, tuple[str, ...]] = {

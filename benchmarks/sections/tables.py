@@ -171,6 +171,21 @@ def gradient(result: Row) -> Lines:
     ]  # fmt: skip
 
 
+def compile_times(result: Row) -> Lines:
+    """Seconds to trace, lower and compile programs."""
+    whole_time = lambda row: number(sum(row[f"{k}_seconds"] for k in ("trace", "lower", "compile")))
+    return [
+        "Seconds of processor time, each program in a new process with empty caches and the "
+        f"package's options for short runs. The 20 parameters: {result['parameters']}.",
+        "",
+        *listed(
+            result["rows"], "program", ("trace [s]", "trace_seconds", number),
+            ("lower [s]", "lower_seconds", number), COMPILE, ("all [s]", None, whole_time),
+            "equations",
+        ),
+    ]  # fmt: skip
+
+
 def hexacopter(result: Row) -> Lines:
     """One free body, ours and by hand."""
     lines = listed(

@@ -23,9 +23,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..algebra.compiler import quick_jit
-from ..algebra.derivative import value_and_jacobian
-from ..algebra.least_squares import Search, search
+from ..algebra.least_squares import Search, search, value_and_columns
 from ..algebra.space import CyclicVector, Point, Vector
 from ..checks.errors import ModelError, SettingError, check_finite
 from ..checks.shapes import Numbers
@@ -220,10 +218,9 @@ class Misfit(eqx.Module):
         return (self.predict(self.start + self.sizes * z) - self.record) / self.sigma
 
 
-@quick_jit
-def _at(residuals: Misfit, z: Float[Array, " p"]) -> tuple[Float[Array, " n"], Float[Array, "n p"]]:
-    """Residuals and their Jacobian at scaled parameters z."""
-    r, J = value_and_jacobian(residuals, z)
+def _at(residuals: Misfit, z: Float[Array, " p"]) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (n,) and their Jacobian (n, p) at scaled parameters z, by the search's program."""
+    r, J = map(np.asarray, value_and_columns(residuals, z))
     return r.reshape(-1), J.reshape(-1, z.shape[0])
 
 
