@@ -27,8 +27,8 @@ SUITE = (
     "published", "stiff",
 )  # fmt: skip
 ALONE = (
-    "stiff", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "failure",
-    "montecarlo",
+    "stiff", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "waiting",
+    "failure", "montecarlo",
 )  # fmt: skip
 # Result -> the script that measures it, with its arguments, in the order of running.
 BENCHMARKS: dict[str, tuple[str, ...]] = {
@@ -36,7 +36,7 @@ BENCHMARKS: dict[str, tuple[str, ...]] = {
     **{name: (f"{name}.py",) for name in ALONE},
 }
 # These measure more than one core, or the command line as a user starts it.
-ALL_CORES = ("montecarlo", "first_result")
+ALL_CORES = ("montecarlo", "first_result", "waiting")
 THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
