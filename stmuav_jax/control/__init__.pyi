@@ -5,9 +5,32 @@ from .closed_loop import (
     LoopRun as LoopRun,
     close_loop as close_loop,
 )
+from .flying import (
+    FlightController as FlightController,
+    FlightMemory as FlightMemory,
+    mass_properties as mass_properties,
+    within_limits as within_limits,
+)
+from .geometric import (
+    BaseMotion as BaseMotion,
+    FlightGains as FlightGains,
+    MassProperties as MassProperties,
+    Waypoint as Waypoint,
+    along as along,
+    at_point as at_point,
+    wrench_for as wrench_for,
+)
 from .instruments import (
     Instrument as Instrument,
     Reading as Reading,
+)
+from .panel import (
+    PanelServo as PanelServo,
+    StrokeServo as StrokeServo,
+    facing as facing,
+    inverse_dynamics as inverse_dynamics,
+    panel_bodies as panel_bodies,
+    panel_motion as panel_motion,
 )
 from .plant import (
     Plant as Plant,
@@ -25,4 +48,8 @@ from .rolling import (
     Rollout as Rollout,
     Sample as Sample,
     rollout as rollout,
+)
+from .uav import (
+    UavController as UavController,
+    UavReference as UavReference,
 )

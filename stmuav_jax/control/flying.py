@@ -4,15 +4,14 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..checks.errors import ModelError
 from ..flight.sensed import centre_of_mass, inertia_about_centre, inner_momentum
 from ..mechanics.state import State
 from ..mechanics.system import System
-from ..rotorcraft.allocation import RotorLimits, allocate, check_lift, wrench_map
+from ..rotorcraft.allocation import RotorLimits, check_lift, wrench_map
 from ..rotorcraft.motor import MotorRotors
 from ..rotorcraft.rotor import Rotors
 from ..sensing.sensors import gravity_of
@@ -23,9 +22,6 @@ from .geometric import (
     base_motion,
     wrench_for,
 )
-
-# Weights of thrust and three moments where the limits do not allow all: yaw is given up first.
-_PRIORITY = (1.0, 1.0, 1.0, 0.01)
 
 
 class FlightMemory(NamedTuple):
@@ -97,6 +93,11 @@ class FlightController(eqx.Module):
         # moments are about the base's centre of mass: the map does not change with the posture
         self.wrenches = wrench_map(rotors, system.bodies.com[0])
         self.inverse = jnp.linalg.pinv(self.wrenches)
+        if not bool(jnp.all(self.inverse[:, 0] > 0)):
+            raise ModelError(
+                "Not every rotor adds to the thrust where its moments balance: the base's centre of "
+                "mass is too far from the rotors' middle for this flight controller."
+            )
         self.gains = FlightGains() if gains is None else gains
         self.limits, self.period = limits, jnp.asarray(1.0 / rate)
         self.mass = mass_properties(system, system.reference) if mass is None else mass
@@ -128,20 +129,49 @@ class FlightController(eqx.Module):
     def _allocated(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
         """Squared speeds, and whether they give the wrench."""
         least = self.inverse @ wrench
-        limits = self.limits
-        if limits is None:
+        if self.limits is None:
             return least, jnp.ones((), bool)
-        lower, upper = limits.squared(least.shape[0])
-        inside = jnp.all((least >= lower) & (least <= upper))
+        lower, upper = self.limits.squared(least.shape[0])
+        return within_limits(self.inverse, wrench, lower, upper)
 
-        def at_limits() -> tuple[Array, Array]:
-            # a wrench that is not finite has no allocation, and stays what it is
-            finite = jnp.where(jnp.all(jnp.isfinite(wrench)), 1.0, jnp.nan)
-            found = allocate(self.wrenches, jnp.nan_to_num(wrench), limits, priority=_PRIORITY)
-            return finite * found.speed_squared, found.reason == 0
 
-        # the search by active sets takes much longer than the rest, and is rarely needed
-        return jax.lax.cond(inside, lambda: (least, jnp.ones((), bool)), at_limits)
+def within_limits(
+    inverse: Float[Array, "k 4"],
+    wrench: Float[Array, "4"],
+    lower: Float[Array, " k"],
+    upper: Float[Array, " k"],
+) -> tuple[Float[Array, " k"], Bool[Array, ""]]:
+    """Squared rotor speeds within limits, and whether they give the wrench.
+
+    Minimum-norm speeds where these are within the limits. Otherwise, in this order: the largest
+    share of the tilting moment that some thrust allows, the thrust nearest to the wanted one, and
+    the largest share of the turning moment. `rotorcraft.allocate` also finds the other speeds that
+    give a wrench; this takes no search, and next to no time.
+
+    Args:
+        inverse: minimum-norm squared speeds per unit of the wrench; those of thrust positive.
+        lower, upper: limits (k,) [rad^2/s^2].
+    """
+    lift, tilt, turn = inverse[:, 0], inverse[:, 1:3] @ wrench[1:3], inverse[:, 3] * wrench[3]
+    # lower_i <= lift_i T + a tilt_i <= upper_i has a solution T where, for all i and j,
+    #   a (tilt_j / lift_j - tilt_i / lift_i) <= upper_j / lift_j - lower_i / lift_i
+    slope = tilt / lift
+    rise = slope[None, :] - slope[:, None]
+    room = (upper / lift)[None, :] - (lower / lift)[:, None]
+    a = _share(rise, room)
+    least, most = jnp.max((lower - a * tilt) / lift), jnp.min((upper - a * tilt) / lift)
+    thrust = jnp.minimum(jnp.maximum(wrench[0], least), most)
+    u = lift * thrust + a * tilt
+    b = _share(jnp.abs(turn), jnp.where(turn > 0, upper - u, u - lower))
+    given = (a == 1.0) & (b == 1.0) & (thrust == wrench[0])
+    return u + b * turn, given
+
+
+def _share(rise: Float[Array, "*s"], room: Float[Array, "*s"]) -> Float[Array, ""]:
+    """Largest share a in [0, 1] with a rise <= room everywhere; NaN stays NaN."""
+    limited = rise > jnp.maximum(room, 0.0)
+    shares = jnp.where(limited, jnp.maximum(room, 0.0) / jnp.where(limited, rise, 1.0), 1.0)
+    return jnp.min(shares) + 0.0 * jnp.sum(rise)
 
 
 def _rotors(force: Rotors | MotorRotors) -> Rotors:

@@ -35,16 +35,19 @@ class Waypoint(NamedTuple):
 
     Attributes:
         r, v, a: position, velocity, acceleration of the base, world (3,) [m], [m/s], [m/s^2].
-        jerk: rate of the acceleration (3,) [m/s^3].
-        heading: yaw of the base's x axis [rad]. turning: its rate [rad/s].
+        jerk, snap: first and second rate of the acceleration (3,) [m/s^3], [m/s^4].
+        heading: yaw of the base's x axis [rad]. turning, turning_rate: its first and second rate
+            [rad/s], [rad/s^2].
     """
 
     r: Float[Array, "3"]
     v: Float[Array, "3"]
     a: Float[Array, "3"]
     jerk: Float[Array, "3"]
+    snap: Float[Array, "3"]
     heading: Float[Array, ""]
     turning: Float[Array, ""]
+    turning_rate: Float[Array, ""]
 
 
 def at_point(r: Numbers, heading: Numbers = 0.0) -> Waypoint:
@@ -52,7 +55,7 @@ def at_point(r: Numbers, heading: Numbers = 0.0) -> Waypoint:
     place = numbers(r, (3,), "The position of a waypoint", "m")
     yaw = numbers(heading, (), "The heading of a waypoint", "rad")
     zero = jnp.zeros(3)
-    return Waypoint(place, zero, zero, zero, yaw, jnp.zeros(()))
+    return Waypoint(place, zero, zero, zero, zero, yaw, jnp.zeros(()), jnp.zeros(()))
 
 
 def along(path: Callable[[Array], Any], heading: Callable[[Array], Any] | None = None) -> Any:
@@ -70,10 +73,14 @@ def along(path: Callable[[Array], Any], heading: Callable[[Array], Any] | None =
     v = rate(place)
     a = rate(v)
     jerk = rate(a)
+    snap = rate(jerk)
+    turning = rate(yaw)
 
     def at(t: Array) -> Waypoint:
         t = jnp.asarray(t, dtype=float)
-        return Waypoint(place(t), v(t), a(t), jerk(t), yaw(t), rate(yaw)(t))
+        return Waypoint(
+            place(t), v(t), a(t), jerk(t), snap(t), yaw(t), turning(t), rate(turning)(t)
+        )
 
     return at
 
@@ -221,14 +228,15 @@ def wrench_for(
         step = wanted._replace(
             r=wanted.r + s * wanted.v + s**2 / 2 * wanted.a,
             v=wanted.v + s * wanted.a + s**2 / 2 * wanted.jerk,
-            a=wanted.a + s * wanted.jerk,
+            a=wanted.a + s * wanted.jerk + s**2 / 2 * wanted.snap,
         )
         r, v = base.r + s * base.v + s**2 / 2 * a, base.v + s * a + s**2 / 2 * a_rate
         return force(r, v, step, integral + s * (base.r - wanted.r))
 
     def turning(s: Array) -> tuple[Array, Array]:
         """R_d a time s later, and W_d."""
-        attitude = lambda s: attitude_of(ahead(s), wanted.heading + s * wanted.turning)
+        yaw = lambda s: wanted.heading + s * wanted.turning + s**2 / 2 * wanted.turning_rate
+        attitude = lambda s: attitude_of(ahead(s), yaw(s))
         R_d, rate = jax.jvp(attitude, (s,), (jnp.ones_like(s),))
         return R_d, vee(R_d.T @ rate)
 

@@ -137,7 +137,7 @@ class PanelServo(eqx.Module):
     damping: Float[Array, ""]
 
     def __init__(
-        self, bodies: PanelBodies, frequency: Numbers = 40.0, damping: Numbers = 1.0
+        self, bodies: PanelBodies, frequency: Numbers = 120.0, damping: Numbers = 1.0
     ) -> None:
         self.bodies = bodies
         self.frequency = positive(frequency, "The frequency of the panel's servo", "rad/s")

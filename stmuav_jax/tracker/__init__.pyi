@@ -22,6 +22,7 @@ from .geometry import (
     tracker_geometry as tracker_geometry,
 )
 from .kinematics import (
+    PairMotion as PairMotion,
     Reason as Reason,
     panel_angles as panel_angles,
     panel_normal as panel_normal,
