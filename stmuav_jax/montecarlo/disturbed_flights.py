@@ -244,7 +244,8 @@ class Flights:
                 shares = [values.get(name) for name in _rotor_inputs(force)]
                 if any(share is not None for share in shares):
                     ones = [jnp.asarray(1.0 if x is None else x, dtype=float) for x in shares]
-                    squared = force.speed_squared * jnp.stack(ones)
+                    squared: Any = force.speed_squared
+                    squared = squared * jnp.stack(ones)
                     forces[k] = eqx.tree_at(lambda f: f.speed_squared, force, squared)
             elif isinstance(force, LinearActuator):
                 push, more = force.force, values.get(_actuator_input(force))
@@ -294,7 +295,7 @@ def _uav_hover(table: Parameters) -> Float[np.ndarray, " m"]:
     if int(found.reason) != TrimReason.VALID:
         raise SettingError(
             "There is no hover at the initial posture of these parameters: "
-            f"{TrimReason(int(found.reason)).words}."
+            f"{TrimReason(int(found.reason)).name.lower().replace('_', ' ')}."
         )
     return np.concatenate([np.asarray(x) for x in found.inputs])
 

@@ -1,5 +1,7 @@
 """Tuned inputs, identification and flight conditions of mechanisms that are not the UAV."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -63,7 +65,8 @@ def test_extremes_of_a_history(cart):
     tuning = stm.flight.tune_inputs(
         space, near, start=x, duration=1.5, inputs=["effort"], sizes=[10.0], knots=8
     )
-    signals = tuning.residuals.cost.driven.signals
+    cost: Any = tuning.residuals.cost
+    signals = cost.driven.signals
     values = np.random.default_rng(0).normal(size=(3, 8, 1))
     values[2] = np.array([0, 0, 1, 1, 1, 1, 0, 0.0])[:, None]  # pieces without a cubic part
     ts = jnp.linspace(0.0, 1.5, 20_001)

@@ -106,6 +106,8 @@ def test_a_trims_inputs_hold():
 def test_a_trim_of_another_scene():
     """The rotors of the hexacopter at its trim carry its weight; a factor multiplies one of them."""
     study = flights("hexacopter", inputs="trim")
+    held: Any
+    drawn: Any
     systems = study.nominal()[0], build(study, input__rotor_1=1.1)[0]
     held, drawn = (next(f for f in s.forces if isinstance(f, Rotors)) for s in systems)
     weight = 9.81 * float(jnp.sum(systems[0].bodies.mass))
