@@ -14,13 +14,11 @@ from jaxtyping import Array, Float
 
 from ..algebra.compiler import program
 from ..algebra.rotation import conjugate, product, to_rotation_vector
-from ..checks.errors import ModelError, SettingError, SimulationError
+from ..checks.errors import SettingError, SimulationError
 from ..checks.numbers import numbers
-from ..dynamics.assembly.initial import rank_of
-from ..dynamics.checks import check_consistent, check_loads, check_start
+from ..dynamics.certify import inspect_start
+from ..dynamics.checks import check_start
 from ..dynamics.conserved import energy
-from ..dynamics.evaluation import look
-from ..dynamics.formulations.augmented import Augmented
 from ..dynamics.run import relative
 from ..mechanics.state import State
 from .instruments import whole_periods
@@ -202,23 +200,12 @@ def _carried_out(run: _Loop, plant: Plant, key: Any) -> tuple[Any, float, float]
 
 def _inspected(plant: Plant) -> Plant:
     """Plant with a checked start, and a formulation that allows for rows that depend on others."""
-    system, state = plant.system, plant.state0
-    check_start(system, state)
-    rows = Augmented().prepare(system)
-    seen = look(rows, state, 0.0)
-    check_loads(system, seen.finite_loads, 0.0)
-    check_consistent(system, rows, seen.residuals, seen.rates)
-    rank = rank_of(system, rows, state, 0.0, seen.singular_values)
-    method = plant.motion.problem.method
-    if rank.rank == rank.rows:
+    check_start(plant.system, plant.state0)
+    own = plant.motion.problem.method.formulation
+    formulation, *_ = inspect_start(plant.system, plant.state0, 0.0, own)
+    if formulation is own:
         return plant
-    allowing = method.formulation.allowing_dependent_rows()
-    if allowing is None:
-        raise ModelError(
-            f"Dependent constraint rows in {', '.join(rank.redundant)}, for which "
-            f"{type(method.formulation).__name__} does not allow."
-        )
-    return plant.with_motion(plant.motion.with_method(formulation=allowing))
+    return plant.with_motion(plant.motion.with_method(formulation=formulation))
 
 
 def _difference(run: _Loop, plant: Plant, key: Any, first: Rollout) -> tuple[float, float]:

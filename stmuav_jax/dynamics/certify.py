@@ -5,11 +5,16 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ..checks.errors import ModelError
+from ..mechanics.internal import internal_states
+from ..mechanics.state import State
 from ..mechanics.system import System
-from .assembly.initial import Rank
+from .assembly.initial import Rank, rank_of
+from .checks import check_consistent, check_loads
 from .error_estimate import ErrorEstimate
 from .evaluation import Balances, RowsAt, Saved, accelerations, balances, rows_at, singular_values
 from .formulations.augmented import Augmented, Model
+from .formulations.base import AbstractFormulation
 from .formulations.constraints import Constraints
 from .integration.advance import Trajectory
 from .integration.problem import Problem
@@ -23,6 +28,55 @@ class Start(NamedTuple):
     rows: RowsAt
     rank: Rank
     norm: float
+
+
+def inspect_start(
+    system: System, state: State, t: float, formulation: AbstractFormulation
+) -> tuple[AbstractFormulation, Model, Start]:
+    """Check an initial state and its loads, determine the rank, and allow for dependent rows.
+
+    Returns:
+        formulation, or one that allows for dependent rows if there are any; system prepared for
+        maximal coordinates, with the rows of all joints; and what was found.
+
+    Raises:
+        StateError: the state is not consistent with the joints. ModelError: a load is not finite,
+            the constraints contradict each other, or the formulation allows for no dependent rows.
+    """
+    rows = Augmented().prepare(system)
+    row = lambda x: np.asarray(x)[None]
+    here = Saved(np.array([t]), *jax.tree.map(row, (state, internal_states(system))))
+    seen = rows_at(rows, here)
+    residuals, rates, matrix, gamma, finite_loads = (x[0] for x in seen)
+    check_loads(system, finite_loads, t)
+    check_consistent(system, rows, residuals, rates)
+    rank = rank_of(system, rows, state, t, matrix)
+    if rank.rank < rank.rows:
+        formulation = _allowing(formulation, rank, matrix, gamma)
+    off_unit = np.max(np.abs(np.sum(np.asarray(state.p) ** 2, axis=-1) - 1))
+    return formulation, rows, Start(seen, rank, float(off_unit))
+
+
+def _allowing(
+    formulation: AbstractFormulation, rank: Rank, matrix: np.ndarray, gamma: np.ndarray
+) -> AbstractFormulation:
+    """Formulation that allows for the dependent rows, which must not contradict each other."""
+    allowing = formulation.allowing_dependent_rows()
+    if allowing is None:
+        raise ModelError(
+            f"Dependent constraint rows in {', '.join(rank.redundant)}, for which "
+            f"{type(formulation).__name__} does not allow."
+        )
+    nearest = np.linalg.lstsq(matrix, gamma, rcond=1e-9)[0]
+    misfit = np.max(np.abs(matrix @ nearest - gamma))
+    if not misfit <= 1e-6 * (1 + np.max(np.abs(nearest))):
+        raise ModelError(
+            "The constraints contradict each other: no accelerations satisfy all of them "
+            f"(misfit {misfit:.3g}). Among the dependent rows are those of "
+            f"{', '.join(rank.redundant)}. Where only this posture makes them dependent, it is "
+            "the velocities that fit no motion through it."
+        )
+    return allowing
 
 
 # Largest number of saved states at which the standard certificate looks at the rank.

@@ -12,16 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..checks.errors import ModelError, SettingError, SimulationError
-from ..mechanics.internal import internal_states, with_internal
+from ..checks.errors import SettingError, SimulationError
+from ..mechanics.internal import with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .assembly.initial import rank_of, singular_posture
-from .certify import Checked, Start, certify, check_saved, violations
-from .checks import check_consistent, check_loads, check_method, check_start, output_times, scene_of
+from .assembly.initial import singular_posture
+from .certify import Checked, certify, check_saved, inspect_start, violations
+from .checks import check_method, check_start, output_times, scene_of
 from .error_estimate import LOOSER, ErrorEstimate, SecondRun, estimated, without
-from .evaluation import Saved, accelerations, rows_at
-from .formulations.augmented import Augmented, Model
+from .evaluation import accelerations
 from .integration.advance import Trajectory
 from .integration.march import CHUNK, March
 from .integration.problem import Problem, prepare
@@ -127,7 +126,11 @@ def _carried_out(
     clock = time.perf_counter()
     problem = prepare(scene.system, method)
     prepared = time.perf_counter() - clock
-    problem, rows, start = _inspect(scene, problem)
+    how = method.formulation
+    formulation, rows, start = inspect_start(scene.system, scene.state0, scene.t0, how)
+    if formulation is not how:
+        method = dataclasses.replace(problem.method, formulation=formulation)
+        problem = dataclasses.replace(problem, method=method)
     looked = time.perf_counter() - clock - prepared
     done = _run(scene, problem, times, progress, wanted.estimate)
     clock = time.perf_counter()
@@ -156,42 +159,6 @@ def _solver(scene: Scene, method: Method) -> diffrax.AbstractSolver:
         return method.solver
     how = method.formulation
     return choose_solver(scene.system, scene.state0, scene.t0, formulation=how)
-
-
-def _inspect(scene: Scene, problem: Problem) -> tuple[Problem, Model, Start]:
-    """Check the initial state and its loads, determine the rank, and allow for dependent rows.
-
-    The rows of all joints are those of maximal coordinates, whatever the problem's formulation.
-    """
-    system, formulation, state = scene.system, problem.method.formulation, scene.state0
-    rows = Augmented().prepare(system)
-    row = lambda x: np.asarray(x)[None]
-    here = Saved(np.array([scene.t0]), *jax.tree.map(row, (state, internal_states(system))))
-    seen = rows_at(rows, here)
-    residuals, rates, matrix, gamma, finite_loads = (x[0] for x in seen)
-    check_loads(system, finite_loads, scene.t0)
-    check_consistent(system, rows, residuals, rates)
-    rank = rank_of(system, rows, state, scene.t0, matrix)
-    if rank.rank < rank.rows:
-        allowing = formulation.allowing_dependent_rows()
-        if allowing is None:
-            raise ModelError(
-                f"Dependent constraint rows in {', '.join(rank.redundant)}, for which "
-                f"{type(formulation).__name__} does not allow."
-            )
-        method = dataclasses.replace(problem.method, formulation=allowing)
-        problem = dataclasses.replace(problem, method=method)
-        nearest = np.linalg.lstsq(matrix, gamma, rcond=1e-9)[0]
-        misfit = np.max(np.abs(matrix @ nearest - gamma))
-        if not misfit <= 1e-6 * (1 + np.max(np.abs(nearest))):
-            raise ModelError(
-                "The constraints contradict each other: no accelerations satisfy all of them "
-                f"(misfit {misfit:.3g}). Among the dependent rows are those of "
-                f"{', '.join(rank.redundant)}. Where only this posture makes them dependent, it is "
-                "the velocities that fit no motion through it."
-            )
-    off_unit = np.max(np.abs(np.sum(np.asarray(state.p) ** 2, axis=-1) - 1))
-    return problem, rows, Start(seen, rank, float(off_unit))
 
 
 class _Done(NamedTuple):
