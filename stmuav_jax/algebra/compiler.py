@@ -221,13 +221,10 @@ def _compiled_now(
         result[:] = [jax.tree.unflatten(tree, marked)]
         return numbers
 
-    run.__name__ = run.__qualname__ = getattr(function, "__name__", "run")
-    options = compiler_options(quick=True)
-    if key is None:
-        return jax.jit(run, compiler_options=options).lower(arrays).compile(), result[0]
-    with kept.beside_jax_cache(run):
-        lowered = jax.jit(run, compiler_options=options).lower(arrays)
-        compiled = lowered.compile()
+    name = getattr(function, "__name__", "run")
+    run.__name__ = run.__qualname__ = name if key is None else kept.new_name(name)
+    lowered = jax.jit(run, compiler_options=compiler_options(quick=True)).lower(arrays)
+    compiled = lowered.compile()
     kept.store(key, lowered, compiled, len(arrays), result[0])
     return compiled, result[0]
 

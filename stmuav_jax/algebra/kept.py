@@ -24,7 +24,7 @@ import stat
 import sys
 import tempfile
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -143,21 +143,13 @@ def load(key: str | None) -> tuple[Call, Any] | None:
     return call, result
 
 
-@contextlib.contextmanager
-def beside_jax_cache(function: Any) -> Iterator[None]:
-    """Compile a function without JAX's own cache, neither read nor written, within the context.
+def new_name(name: str) -> str:
+    """Name for a program that is to be kept, which JAX's own cache has never seen.
 
     XLA serialises a program that came out of that cache without its code: it can be loaded, but
-    not run. A name that never occurred is in no cache.
+    not run.
     """
-    shortest = "jax_persistent_cache_min_compile_time_secs"
-    before = getattr(jax.config, shortest)
-    function.__name__ = f"{function.__name__}_{secrets.token_hex(8)}"
-    jax.config.update(shortest, 1e9)
-    try:
-        yield
-    finally:
-        jax.config.update(shortest, before)
+    return f"{name}_{secrets.token_hex(8)}"
 
 
 def store(key: str | None, lowered: Any, compiled: Any, count: int, result: Any) -> None:
