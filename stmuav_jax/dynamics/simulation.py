@@ -168,7 +168,7 @@ def _inspect(scene: Scene, problem: Problem) -> tuple[Problem, Model, Start]:
     row = lambda x: np.asarray(x)[None]
     here = Saved(np.array([scene.t0]), *jax.tree.map(row, (state, internal_states(system))))
     seen = rows_at(rows, here)
-    residuals, rates, matrix, gamma, finite_loads = (x[0] for x in seen)
+    residuals, rates, matrix, gamma, finite_loads = (np.asarray(x)[0] for x in seen)
     check_loads(system, finite_loads, scene.t0)
     check_consistent(system, rows, residuals, rates)
     rank = rank_of(system, rows, state, scene.t0, matrix)
