@@ -130,8 +130,8 @@ def measured(name: str) -> dict[str, Any]:
     lowered.compile()
     marks.append(time.process_time())
     kinds = ("trace_seconds", "lower_seconds", "compile_seconds")
-    spent = dict(zip(kinds, (b - a for a, b in pairwise(marks)), strict=True))
-    return {"program": name, **spent, "equations": equations(traced.jaxpr.jaxpr)}
+    spent = zip(kinds, (b - a for a, b in pairwise(marks)), strict=True)
+    return {"program": name, **dict(spent), "equations": equations(traced.jaxpr.jaxpr)}
 
 
 def apart(name: str) -> dict[str, Any]:

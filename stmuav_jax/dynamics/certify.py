@@ -47,7 +47,7 @@ def inspect_start(
     row = lambda x: np.asarray(x)[None]
     here = Saved(np.array([t]), *jax.tree.map(row, (state, internal_states(system))))
     seen = rows_at(rows, here)
-    residuals, rates, matrix, gamma, finite_loads = (x[0] for x in seen)
+    residuals, rates, matrix, gamma, finite_loads = (np.asarray(x)[0] for x in seen)
     check_loads(system, finite_loads, t)
     check_consistent(system, rows, residuals, rates)
     rank = rank_of(system, rows, state, t, matrix)

@@ -70,9 +70,9 @@ class RowsAt(NamedTuple):
 class Saved(NamedTuple):
     """Times (k,) [s], states (k, n, .) and actuator states of the forces (k, m) of a run."""
 
-    ts: Float[Array, " k"] | np.ndarray
+    ts: Any
     states: State
-    internal: Float[Array, "k m"] | np.ndarray
+    internal: Any
 
 
 @kept_jit
@@ -131,7 +131,8 @@ def snapshots(formulation: AbstractFormulation, model: Any, saved: Saved) -> Sna
         model: system prepared for the formulation.
     """
     found = _in_blocks(lambda at: _dynamics(formulation, model, at, True), saved)
-    return Snapshot(*found, *balances(model.system, saved))
+    now = balances(model.system, saved)
+    return Snapshot(found[0], found[1], now.kinetic, now.potential, now.momentum)
 
 
 def accelerations(formulation: AbstractFormulation, model: Any, saved: Saved) -> Accelerations:
