@@ -284,6 +284,15 @@ def _chord() -> Any:
     return diffrax.with_stepsize_controller_tols(optx.Chord)()
 
 
+def own_iterations(solver: Any) -> bool:
+    """True for the methods of `kvaerno3` and `kvaerno5`, whose stages `esdirk` solves.
+
+    A method with any other root finder is carried out by diffrax with that.
+    """
+    known = isinstance(solver, diffrax.Kvaerno3 | diffrax.Kvaerno4 | diffrax.Kvaerno5)
+    return known and isinstance(solver.root_finder, optx.Chord)
+
+
 def error_norm(n_state: int) -> Callable[[Vector], Float[Array, ""]]:
     """Root-mean-square norm of the first `n_state` entries, which leaves out quadratures."""
 
