@@ -270,7 +270,8 @@ def kvaerno3() -> diffrax.Kvaerno3:
     """Implicit method Kvaerno3 of diffrax, with the chord method as root finder.
 
     diffrax's default root finder takes few iterations and rejects the step if they do not
-    converge, which on the seven-body UAV means many more steps than with the chord method.
+    converge, which on the seven-body UAV means many more steps than with the chord method. Without an event
+    `Method` solves the stages by `esdirk`, with one Jacobian for many steps.
     """
     return diffrax.Kvaerno3(root_finder=_chord())
 
