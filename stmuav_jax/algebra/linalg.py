@@ -112,8 +112,8 @@ def solve_lower(L: Matrix, B: Matrix, *, transpose: bool = False) -> Matrix:
         how: dict[str, bool] = {"left_side": True, "lower": True, "transpose_a": transpose}
         return jax.lax.linalg.triangular_solve(L, B, **how)
     columns = jax.lax.stop_gradient(L)
-    down = lambda _, b: loops.solve_columns(columns.T, b, upper=False, unit=False)
-    up = lambda _, b: loops.solve_columns(columns, b, upper=True, unit=False)
+    down = lambda _, b: loops.solve_columns(columns.T, b, upper=False)
+    up = lambda _, b: loops.solve_columns(columns, b, upper=True)
     A = jnp.tril(L).T if transpose else jnp.tril(L)
     ways = (up, down) if transpose else (down, up)
     return jax.lax.custom_linear_solve(lambda x: A @ x, B, *ways)
@@ -152,9 +152,6 @@ class LU(eqx.Module):
 
     def _triangular(self, b: Vector, *, upper: bool, transposed: bool) -> Vector:
         """Solution by the factor U or L, or its transpose."""
-        if _in_loops(self.factors):
-            columns = self.factors if transposed else self.factors.T
-            return loops.solve_columns(columns, b, upper=upper != transposed, unit=not upper)
         how = {"lower": not upper, "transpose_a": transposed, "unit_diagonal": not upper}
         return jax.lax.linalg.triangular_solve(self.factors, b[:, None], left_side=True, **how)[
             :, 0
@@ -163,10 +160,7 @@ class LU(eqx.Module):
 
 def lu(A: Matrix) -> LU:
     """Factorise a general square matrix, shape (k, k)."""
-    constant = jax.lax.stop_gradient(A)
-    if _in_loops(A):
-        return LU(A, *loops.lu(constant))
-    factors, _, order = jax.lax.linalg.lu(constant)
+    factors, _, order = jax.lax.linalg.lu(jax.lax.stop_gradient(A))
     return LU(A, factors, order)
 
 

@@ -3,8 +3,8 @@
 XLA's CPU compiler turns an integration's `while` loop into one native function, without dispatching
 its some hundred kernels one by one, if the loop's buffers are below a threshold, by default 1 kB.
 With a larger one a single flight runs faster, and its program takes longer to compile; batches of many
-flights run slower. A loop that calls a library gains nothing, so the factorisations of small matrices
-are then loops themselves (`loops`).
+flights run slower. A loop that calls a library gains nothing: Cholesky factorisations of small matrices
+are then loops themselves (`loops`); the implicit methods still call LAPACK and gain nothing.
 """
 
 import os

@@ -21,9 +21,17 @@ from ...mechanics.system import System
 from ..formulations.base import AbstractFormulation, AbstractModel, Residuals
 from ..formulations.stabilisation import AbstractStabilisation
 from .closed_over import opened
+from .esdirk import NonDenseESDIRK
 from .explicit import NonDenseRungeKutta
 from .step_bound import Guard, guard
-from .stepping import ProjectedSolver, ProjectionLimit, StepSizeMemory, error_norm, stage_loop
+from .stepping import (
+    ProjectedSolver,
+    ProjectionLimit,
+    StepSizeMemory,
+    error_norm,
+    own_iterations,
+    stage_loop,
+)
 
 # Step size control. In comparison with diffrax's defaults (0, 1, 0, 0.9, 10), measured on the
 # tracker and the UAV: as many or a few fewer step attempts, a third to half as many of them
@@ -189,6 +197,9 @@ class Problem(eqx.Module):
         inner: Any = self.method.solver
         if isinstance(inner, diffrax.AbstractERK) and self.method.event is None:
             inner = NonDenseRungeKutta(inner)
+        if self.method.event is None and own_iterations(inner):
+            size = n + self.n_internal
+            inner = NonDenseESDIRK(inner, self.method.rtol, self.method.atol, size)
         inner = stage_loop(inner, self.method.adjoint)
         held = project if iterations else None
         far = ProjectionLimit(self.method.rtol, self.method.atol, n) if held is not None else None

@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...algebra.linalg import lu
-from ...algebra.native import native_loops
 
 Vector = Float[Array, " k"]
 
@@ -177,9 +176,5 @@ def _derivatives(
     size = y.shape[0]
     directions = jnp.eye(size + 1, dtype=y.dtype)
     push = lambda v: jax.jvp(field, (t, y), (v[size], v[:size]))[1]
-    if native_loops():
-        # one direction at a time: XLA's native loops are slow at many directions side by side
-        columns = jax.lax.map(push, directions).T
-    else:
-        columns = jax.vmap(push, out_axes=1)(directions)
+    columns = jax.vmap(push, out_axes=1)(directions)
     return columns[:, :size], columns[:, size]

@@ -273,7 +273,8 @@ def kvaerno3() -> diffrax.Kvaerno3:
     """Implicit method Kvaerno3 of diffrax, with the chord method as root finder.
 
     diffrax's default root finder takes few iterations and rejects the step if they do not
-    converge, which on the seven-body UAV means many more steps than with the chord method.
+    converge, which on the seven-body UAV means many more steps than with the chord method. Without an event
+    `Method` solves the stages by `esdirk`, with one Jacobian for many steps.
     """
     return diffrax.Kvaerno3(root_finder=_chord())
 
@@ -285,6 +286,15 @@ def kvaerno5() -> diffrax.Kvaerno5:
 
 def _chord() -> Any:
     return diffrax.with_stepsize_controller_tols(optx.Chord)()
+
+
+def own_iterations(solver: Any) -> bool:
+    """True for the methods of `kvaerno3` and `kvaerno5`, whose stages `esdirk` solves.
+
+    A method with any other root finder is carried out by diffrax with that.
+    """
+    known = isinstance(solver, diffrax.Kvaerno3 | diffrax.Kvaerno4 | diffrax.Kvaerno5)
+    return known and isinstance(solver.root_finder, optx.Chord)
 
 
 def error_norm(n_state: int) -> Callable[[Vector], Float[Array, ""]]:
