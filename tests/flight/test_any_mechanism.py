@@ -51,6 +51,13 @@ def test_stacked_points_differ_as_single_ones_do(cart):
         np.testing.assert_allclose(found, v, atol=1e-14)
 
 
+def test_stacked_points_of_a_free_body():
+    space = stm.TreeSpace(stm.make_scene("hexacopter").system)
+    x = jax.tree.map(lambda leaf: leaf[:, None], space.from_state(space.system.reference))
+    v = jnp.asarray(0.3 * np.random.default_rng(1).normal(size=(12, 3)))
+    np.testing.assert_allclose(space.difference(space.retract(x, v), x), v, atol=1e-14)
+
+
 def test_matrices_of_a_cart_pole_in_closed_form(cart):
     """Upright at rest: (M + m) x'' + m l a'' = F, m l x'' + (J + m l^2) a'' = m g l a."""
     space, x = cart

@@ -15,7 +15,7 @@ from stmuav_jax.algebra.compiler import quick_jit
 from stmuav_jax.sensing.process import moved_over
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "flight"))
-from mechanisms import cart_pole, ground_tracker, stewart  # pyright: ignore[reportMissingImports]
+from mechanisms import cart_pole, ground_tracker  # pyright: ignore[reportMissingImports]
 from test_any_mechanism import four_bar, twin_rate  # pyright: ignore[reportMissingImports]
 
 estimation, sensing = stm.estimation, stm.sensing
@@ -227,7 +227,7 @@ def test_the_uav_from_its_own_sensors_over_a_hundred_seeds(uav):
     assert np.all(UAV_STEPS * UAV_DT * UAV_START[11:14] > 1.5 * UAV_START[3:6])
 
 
-# --- a cart-pole, the hexacopter, the tracker on the ground, a Stewart platform
+# --- a cart-pole, the tracker on the ground
 
 
 def cart_pole_case():
@@ -237,20 +237,6 @@ def cart_pole_case():
     start, wander = np.array([0.02, 0.05, 0.05, 0.1]), np.array([0.0, 0.0, 0.02, 0.02])
     push = 3.0 * np.sin(np.arange(10.0))[:, None]
     return space, sensors, start, wander, np.array([1e-3, *[0.01] * 3]), push
-
-
-def hexacopter_case():
-    """Position fixes, gyroscope and accelerometer: the way that it accelerates tells where down is."""
-    space = stm.TreeSpace(stm.make_scene("hexacopter").system)
-    body = space.system.names[0]
-    sensors = [sensing.PositionFix(body), sensing.Gyroscope(body), sensing.Accelerometer(body)]
-    start, wander = np.repeat([0.1, 0.05, 0.1, 0.05], 3), np.repeat([0.0, 0.0, 0.02, 0.02], 3)
-    noise = np.repeat([0.02, 0.01, 0.05], 3)
-    held = stm.flight.trim_condition(
-        space, stm.flight.hover(), at=space.from_state(space.system.reference)
-    ).values
-    shake = 0.02 * np.sin(np.arange(10.0)[:, None] * np.linspace(0.5, 2.0, 6))
-    return space, sensors, start, wander, noise, held * (1 + shake)
 
 
 def tracker_case():
@@ -264,19 +250,8 @@ def tracker_case():
     return space, sensors, start, wander, np.array([5e-4, *[0.01] * 3]), held + shake
 
 
-def stewart_case():
-    """Encoders of three of the six legs, and the platform's gyroscope."""
-    system, *_ = stewart()
-    space = stm.TreeSpace(system, independent=[f"T{k}.shift" for k in range(6)])
-    sensors = [*(sensing.Encoder(f"T{k}") for k in (0, 2, 4)), sensing.Gyroscope("platform")]
-    start, wander = np.repeat([5e-3, 0.05], 6), np.repeat([0.0, 0.01], 6)
-    held = stm.trim(space, at=space.from_state(system.reference)).values
-    shake = 10.0 * np.sin(np.arange(8.0)[:, None] * np.linspace(0.5, 2.0, 6))
-    return space, sensors, start, wander, np.repeat([1e-3, 0.01], 3), held + shake
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [cart_pole_case, hexacopter_case, tracker_case, stewart_case])
+@pytest.mark.parametrize("case", [cart_pole_case, tracker_case])
 def test_other_mechanisms_over_a_hundred_seeds(case):
     """NEES within its 95 % interval; NIS within 99.9 %, as it is looked at for each of them too."""
     space, sensors, start, wander, noise, u = case()

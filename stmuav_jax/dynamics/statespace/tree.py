@@ -169,7 +169,8 @@ class TreeSpace(AbstractStateSpace):
         y, x = _stacked(y, batch), _stacked(x, batch)
         groups = zip(motion_groups(tree), self._grouped(y.q), self._grouped(x.q), strict=True)
         full = from_groups(tree, tuple(group.motion.difference(b, a) for group, b, a in groups))
-        own = self._picked(full)
+        # a free body alone has no steps, and of those nothing that has the stack's axes
+        own = self._picked(full).reshape(len(self.signs), *batch)
         # angles of revolute joints are periodic
         turning = np.array(self._periodic(), dtype=bool)
         turns = jnp.round(own / (2 * jnp.pi))
