@@ -18,21 +18,18 @@ import sys
 import time
 from pathlib import Path
 
+from report import PARTS
 from shared.command import begin, parser
 from shared.record import ALLOW, MEASURED, RESULTS, ROOT, commit, moved
 
 FOLDER = Path(__file__).parent
-SUITE = (
-    "work_precision", "acceleration", "batch", "scaling", "gradient", "hexacopter", "scenes",
-    "published", "stiff",
-)  # fmt: skip
 ALONE = (
-    "stiff", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "failure",
-    "montecarlo",
+    "stiff", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "waiting",
+    "failure", "compile_times", "montecarlo",
 )  # fmt: skip
 # Result -> the script that measures it, with its arguments, in the order of running.
 BENCHMARKS: dict[str, tuple[str, ...]] = {
-    **{f"suite_{name}": ("suite.py", "--only", name, "--no-report") for name in SUITE},
+    **{f"suite_{name}": ("suite.py", "--only", name, "--no-report") for name in PARTS},
     **{name: (f"{name}.py",) for name in ALONE},
 }
 # Parts of a result that no script measures any more: their question is settled, and they stay as
@@ -42,7 +39,7 @@ FINISHED = {
     "long_horizon": {"symmetric"},
 }
 # These measure more than one core, or the command line as a user starts it.
-ALL_CORES = ("montecarlo", "first_result")
+ALL_CORES = ("montecarlo", "first_result", "waiting")
 THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 

@@ -155,13 +155,10 @@ def run_problem(
     kept = [row for row in former.get("runs", []) if row["solver"] in SYMMETRIC]
     runs = [*(row for row, _ in found), *kept]
     return {
-        "name": problem.name,
-        "title": problem.title,
-        "scale": scale,
-        "runs": runs,
+        "name": problem.name, "title": problem.title, "scale": scale, "runs": runs,
         "cheapest": {str(level): cheapest(runs, level) for level in LEVELS},
         "answers": former.get("answers", {}),
-    }
+    }  # fmt: skip
 
 
 def errors(path: Any, scale: float) -> np.ndarray:

@@ -102,6 +102,14 @@ def build(results: Path, page: Path) -> Path:
             place = os.path.relpath(figure, page.parent)
             lines += [f"![{figure.stem.replace('_', ' ')}]({place})", ""]
         lines += write(result)
+    programs = results / "compile_times.json"
+    if programs.exists():
+        lines += [
+            "",
+            "## Compile times",
+            "",
+            *tables.compile_times(json.loads(programs.read_text())),
+        ]
     text = "\n".join(lines).rstrip() + "\n"
     return write_atomically(page, text.encode())
 

@@ -7,6 +7,7 @@ one trim at a time. One core:
 """
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -48,17 +49,13 @@ def ours(size: Size, flyer: stm.flight.Flyer, angles: Any) -> dict[str, Any]:
     timing, found = measure(lambda: many(angles), repeats=size.repeats)
     reason = np.asarray(found.reason)
     fine = reason == stm.flight.TrimReason.VALID
-    names, counts = np.unique(reason, return_counts=True)
+    counts = Counter(stm.flight.TrimReason(int(k)).name for k in np.sort(reason))
     return {
-        "seconds": timing.to_dict(),
-        "first_call_seconds": first,
-        "per_second": size.orientations / timing.median,
-        "reasons": {
-            stm.flight.TrimReason(int(k)).name: int(n) for k, n in zip(names, counts, strict=True)
-        },
+        "seconds": timing.to_dict(), "first_call_seconds": first,
+        "per_second": size.orientations / timing.median, "reasons": dict(counts),
         "largest_residual": float(np.max(np.asarray(found.residual)[fine])),
         "largest_steps": int(np.max(np.asarray(found.steps)[fine])),
-    }
+    }  # fmt: skip
 
 
 def with_scipy(size: Size, flyer: stm.flight.Flyer, angles: Any) -> dict[str, Any]:
@@ -69,9 +66,8 @@ def with_scipy(size: Size, flyer: stm.flight.Flyer, angles: Any) -> dict[str, An
     start[2] = 9.81 * mass
     of(start, angles[0]).block_until_ready()
     began = time.perf_counter()
-    found = [
-        root(lambda z, a=a: np.asarray(of(z, a)), start, tol=1e-12) for a in angles[: size.peer]
-    ]
+    solve = lambda a: root(lambda z: np.asarray(of(z, a)), start, tol=1e-12)
+    found = [solve(a) for a in angles[: size.peer]]
     seconds = time.perf_counter() - began
     left = [float(np.max(np.abs(r.fun))) for r in found]
     return {"per_second": size.peer / seconds, "median_residual": float(np.median(left))}

@@ -5,7 +5,7 @@ Comput. 18, 1997: error in the maximum norm), and the classical Runge-Kutta meth
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,8 @@ from scipy.integrate import RK45
 
 Array = np.ndarray
 Field = Callable[[float, Array], Array]
+# Accepted steps: the time and state at the end of each, and the states between [s].
+Steps = Iterator[tuple[float, Array, Callable[[float], Array]]]
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class Scheme:
 
 @dataclass
 class History:
-    """States (k, 99) at the wanted times that were reached, steps taken, and how it ended.
+    """States (k, m) at the wanted times that were reached, steps taken, and how it ended.
 
     `ends` and `sizes` are of accepted steps [s]; `failure` is empty if the end was reached. They
     are lists while the run goes on, and arrays when it has ended.
@@ -71,136 +73,115 @@ class History:
         return {"reached": self.stopped_at, "failure": self.failure, "steps": len(self.sizes)}
 
 
-class Ode45:
-    """Dormand and Prince's 5(4) pair under MATLAB's step size rule, last entry unchecked."""
+def ode45(f: Field, y: Array, t1: float, rtol: float, atol: float) -> Steps:
+    """Dormand and Prince's 5(4) pair under MATLAB's step size rule, with cubics between."""
 
-    def __init__(self, f: Field, y: Array, t1: float, rtol: float, atol: float) -> None:
-        self.f, self.t, self.y, self.t1 = f, 0.0, y, t1
-        self.rtol, self.threshold = rtol, atol / rtol
-        self.first = f(0.0, y)
-        self.largest = 0.1 * t1
-        rate = self._relative(self.first, y, y) / (0.8 * rtol**0.2)
-        self.h = min(self.largest, 1 / rate if rate > 0 else self.largest)
-        self.status = "running"
-        self.old: tuple[float, Array, Array] = (0.0, y, self.first)
+    def relative(change: Array, a: Array, b: Array) -> float:
+        size = np.maximum(np.maximum(np.abs(a), np.abs(b)), atol / rtol)
+        return float(np.max(np.abs(change / size)))
 
-    def _relative(self, change: Array, a: Array, b: Array) -> float:
-        size = np.maximum(np.maximum(np.abs(a), np.abs(b)), self.threshold)
-        return float(np.max(np.abs(change / size)[:-1]))
-
-    def _attempt(self, h: float) -> tuple[Array, Array, float]:
-        k = [self.first]
+    def attempt(h: float) -> tuple[Array, Array, float]:
+        k = [slope]
         for a, c in zip(RK45.A[1:], RK45.C[1:], strict=True):
-            slope = sum(float(w) * x for w, x in zip(a, k, strict=False))
-            k.append(self.f(self.t + c * h, self.y + h * slope))
-        y = self.y + h * sum(float(w) * x for w, x in zip(RK45.B, k, strict=True))
-        k.append(self.f(self.t + h, y))
+            k.append(f(t + c * h, y + h * sum(float(w) * x for w, x in zip(a, k, strict=False))))
+        end = y + h * sum(float(w) * x for w, x in zip(RK45.B, k, strict=True))
+        k.append(f(t + h, end))
         error = h * np.sum([float(w) * x for w, x in zip(RK45.E, k, strict=True)], axis=0)
-        return y, k[-1], self._relative(error, self.y, y)
+        return end, k[-1], relative(error, y, end)
 
-    def step(self) -> None:
-        """One accepted step, or status "failed"."""
-        smallest = 16 * np.spacing(self.t)
-        h = min(max(self.h, smallest), self.largest, self.t1 - self.t)
+    t, slope, largest = 0.0, f(0.0, y), 0.1 * t1
+    rate = relative(slope, y, y) / (0.8 * rtol**0.2)
+    wanted = min(largest, 1 / rate if rate > 0 else largest)
+    while t < t1 - 1e-14:
+        smallest = 16 * np.spacing(t)
+        h = min(max(wanted, smallest), largest, t1 - t)
         failed = False
-        while True:
-            y, last, error = self._attempt(h)
-            if error <= self.rtol:
-                break
-            if h <= smallest or not np.isfinite(self.t + h):
-                self.status = "failed"
-                return
-            shrink = 0.8 * (self.rtol / error) ** 0.2 if np.isfinite(error) else 0.1
+        while (tried := attempt(h))[2] > rtol or not np.isfinite(tried[2]):
+            error = tried[2]
+            if h <= smallest or not np.isfinite(t + h):
+                raise FloatingPointError("step size below the spacing of numbers")
+            shrink = 0.8 * (rtol / error) ** 0.2 if np.isfinite(error) else 0.1
             h = max(smallest, h * (0.5 if failed else max(0.1, shrink)))
             failed = True
-        self.old = (self.t, self.y, self.first)
-        self.t, self.y, self.first = self.t + h, y, last
-        grow = 1.25 * (error / self.rtol) ** 0.2
-        self.h = h if failed else h / max(grow, 0.2)
-        self.status = "finished" if self.t >= self.t1 - 1e-14 else "running"
-
-    def dense_output(self) -> Callable[[float], Array]:
-        """Between the last two states, cubic in their values and rates."""
-        (t0, y0, f0), y1, f1 = self.old, self.y, self.first
-        h = self.t - t0
-
-        def at(t: float) -> Array:
-            x = (t - t0) / h
-            bend = (1 - 2 * x) * (y1 - y0) + h * ((x - 1) * f0 + x * f1)
-            return (1 - x) * y0 + x * y1 + x * (x - 1) * bend
-
-        return at
+        end, last, error = tried
+        wanted = h if failed else h / max(1.25 * (error / rtol) ** 0.2, 0.2)
+        between = hermite(t, y, slope, t + h, end, last)
+        t, y, slope = t + h, end, last
+        yield t, y, between
 
 
-class Fixed:
-    """The classical Runge-Kutta method of order 4 with a fixed step."""
+def hermite(
+    t0: float, y0: Array, f0: Array, t1: float, y1: Array, f1: Array
+) -> Callable[[float], Array]:
+    """The cubic with given values and rates at t0 and t1."""
+    h = t1 - t0
 
-    def __init__(self, f: Field, y: Array, t1: float, h: float) -> None:
-        self.f, self.y, self.t, self.h = f, y, 0.0, h
-        self.count, self.total, self.status = 0, round(t1 / h), "running"
-        self.old: tuple[float, Array] = (0.0, y)
+    def at(t: float) -> Array:
+        x = (t - t0) / h
+        bend = (1 - 2 * x) * (y1 - y0) + h * ((x - 1) * f0 + x * f1)
+        return (1 - x) * y0 + x * y1 + x * (x - 1) * bend
 
-    def step(self) -> None:
-        """One step."""
-        t, y, h = self.t, self.y, self.h
-        a = self.f(t, y)
-        b = self.f(t + h / 2, y + h / 2 * a)
-        c = self.f(t + h / 2, y + h / 2 * b)
-        slope = (a + 2 * b + 2 * c + self.f(t + h, y + h * c)) / 6
-        self.old = (t, y)
-        self.y, self.count = y + h * slope, self.count + 1
-        self.t = self.count * h
-        self.status = "finished" if self.count >= self.total else "running"
+    return at
 
-    def dense_output(self) -> Callable[[float], Array]:
-        """Linear: wanted times are meant to be those of steps."""
-        (t0, y0), t1, y1 = self.old, self.t, self.y
-        return lambda t: y0 + (t - t0) / (t1 - t0) * (y1 - y0)
+
+def runge_kutta(f: Field, y: Array, t1: float, h: float) -> Steps:
+    """The classical method of order 4; wanted times are meant to be those of steps."""
+    for count in range(round(t1 / h)):
+        t = count * h
+        a = f(t, y)
+        b = f(t + h / 2, y + h / 2 * a)
+        c = f(t + h / 2, y + h / 2 * b)
+        first, y = y, y + h * (a + 2 * b + 2 * c + f(t + h, y + h * c)) / 6
+        line = lambda s, t=t, a=first, b=y: a + (s - t) / h * (b - a)
+        yield (count + 1) * h, y, line
 
 
 def integrate(
     f: Field, y0: Array, times: Array, scheme: Scheme, limits: Limits | None = None
 ) -> History:
     """Integrate y' = f(t, y) from times[0] = 0 and keep the states at `times`."""
-    log = History([0.0], [y0], [], [])
+    log, limits = History([0.0], [y0], [], []), limits or Limits()
+    started, end = time.perf_counter(), float(times[-1])
 
     def counted(t: float, y: Array) -> Array:
         log.evaluations += 1
         return f(t, y)
 
-    started = time.perf_counter()
+    adaptive = lambda: ode45(counted, y0, end, scheme.rtol, scheme.atol)
+    steps = runge_kutta(counted, y0, end, scheme.step) if scheme.step else adaptive()
     with np.errstate(all="ignore"):
-        end = float(times[-1])
-        adaptive = lambda: Ode45(counted, y0, end, scheme.rtol, scheme.atol)
-        stepper = Fixed(counted, y0, end, scheme.step) if scheme.step else adaptive()
-        while not log.failure and len(log.times) < len(times):
-            log.failure = _advance(stepper, times, log, limits or Limits(), started)
-    log.seconds, log.stopped_at = time.perf_counter() - started, float(stepper.t)
+        try:
+            for t, y, between in steps:
+                h, log.stopped_at = t - log.stopped_at, t
+                check_size(y, limits)
+                log.ends.append(t)
+                log.sizes.append(h)
+                left = times[len(log.times) :]
+                for wanted in left[left <= t + 1e-12]:
+                    log.times.append(float(wanted))
+                    log.states.append(np.array(between(wanted)))
+                seconds = time.perf_counter() - started
+                if len(log.times) < len(times) and h < limits.step:
+                    raise FloatingPointError(f"step size below {limits.step:.0e} s")
+                if log.evaluations >= limits.evaluations:
+                    raise FloatingPointError(f"{limits.evaluations} evaluations")
+                if seconds > limits.seconds:
+                    raise FloatingPointError(f"{limits.seconds:g} s of wall time")
+        except FloatingPointError as stop:
+            log.failure = str(stop)
+    log.seconds = time.perf_counter() - started
     for name in ("times", "states", "ends", "sizes"):
         setattr(log, name, np.array(getattr(log, name)))
     return log
 
 
-def _advance(stepper: Any, times: Array, log: History, limits: Limits, started: float) -> str:
-    """Make one step and keep it; why the run stops there, in words."""
-    before = stepper.t
-    stepper.step()
-    if stepper.status == "failed":
-        return "step size below the spacing of numbers"
-    if not np.all(np.isfinite(stepper.y)):
-        return "state not finite"
-    if np.max(np.abs(stepper.y[:-1])) > limits.size:
-        return f"state above {limits.size:.0e}"
-    log.ends.append(stepper.t)
-    log.sizes.append(stepper.t - before)
-    between = stepper.dense_output()
-    for t in times[len(log.times) :][times[len(log.times) :] <= stepper.t + 1e-12]:
-        log.times.append(float(t))
-        log.states.append(np.array(between(t)))
-    if log.sizes[-1] < limits.step and stepper.status != "finished":
-        return f"step size below {limits.step:.0e} s"
-    if log.evaluations >= limits.evaluations:
-        return f"{limits.evaluations} evaluations"
-    if time.perf_counter() - started > limits.seconds:
-        return f"{limits.seconds:g} s of wall time"
-    return ""
+def check_size(y: Array, limits: Limits) -> None:
+    """Raise where a state is not finite or too large.
+
+    Raises:
+        FloatingPointError: in words.
+    """
+    if not np.all(np.isfinite(y)):
+        raise FloatingPointError("state not finite")
+    if np.max(np.abs(y)) > limits.size:
+        raise FloatingPointError(f"state above {limits.size:.0e}")

@@ -14,12 +14,11 @@ Source: AFRL-AFOSR-JP-TR-2019-0058, Part I, Table 3.1 and Eq. 4.19 (Part II, 4.1
 their misprints corrected.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from dense.tables import KINDS, Array, Rows, Tables, Variant, cross, g_and_l, times
-from problems.plain import Plain, Start, plain, start
+from problems.plain import plain, start
 from problems.tree import in_plane
 
 from stmuav_jax import Scene
@@ -27,25 +26,6 @@ from stmuav_jax import Scene
 # Singular values below this, relative to the largest, are those of dependent rows.
 DEPENDENT = 1e-13
 _UP = np.array([0.0, 0.0, 1.0])
-
-
-def in_units(model: Plain, unit: float) -> Plain:
-    """The numbers of a mechanism without springs and servos in kg, `unit` metres and seconds."""
-    scaled = lambda s: replace(s, amplitude=s.amplitude / unit)
-    joints = (
-        replace(one, point_i=one.point_i / unit, point_j=one.point_j / unit) for one in model.joints
-    )
-    actuators = (replace(a, arm=a.arm / unit, force=scaled(a.force)) for a in model.actuators)
-    return replace(
-        model,
-        inertia=model.inertia / unit**2,
-        joints=tuple(joints),
-        gravity=model.gravity / unit,
-        wrenches=tuple((k, f / unit, m / unit**2) for k, f, m in model.wrenches),
-        actuators=tuple(actuators),
-        forces=tuple((k, scaled(f)) for k, f in model.forces),
-        moments=tuple((k, m / unit**2) for k, m in model.moments),
-    )
 
 
 class Dense:
@@ -56,8 +36,7 @@ class Dense:
         model = plain(scene, any_couple=True)
         # planar loops of spatial joints
         self.redundant = in_plane(model) is not None and len(model.joints) > model.n
-        unit = self.variant.metres
-        self.model = model if unit == 1 else in_units(model, unit)
+        self.model = model
         self.tables, n = Tables(self.model.joints), self.model.n
         self.K = np.zeros((7 * n + self.tables.count, 7 * n + self.tables.count))
         for k in range(n):
@@ -75,11 +54,10 @@ class Dense:
 
     def start(self, scene: Scene, p: dict[str, Any] | None = None) -> Array:
         """The scene's initial state; `p` replaces Euler parameters by name, as they are."""
-        first, unit = start(scene), self.variant.metres
+        first = start(scene)
         turned = np.array(first.p)
         for name, value in (p or {}).items():
             turned[self.model.names.index(name)] = value
-        first = Start(first.r / unit, turned, first.v / unit, first.omega)
         p_rate = 0.5 * np.einsum("nap,na->np", g_and_l(turned)[1], first.omega)
         parts = (first.r, turned), (first.v, p_rate)
         return np.concatenate([np.concatenate(part, axis=1).ravel() for part in parts])
@@ -95,14 +73,13 @@ class Dense:
     def positions(self, x: Array) -> Array:
         """Centres of mass (..., n, 3) [m] of one or many states."""
         n = self.model.n
-        return x[..., : 7 * n].reshape(*x.shape[:-1], n, 7)[..., :3] * self.variant.metres
+        return x[..., : 7 * n].reshape(*x.shape[:-1], n, 7)[..., :3]
 
-    def loads(self, t: float, r: Array, A: Array, gravity: bool = True) -> tuple[Array, Array]:
+    def loads(self, t: float, r: Array, A: Array) -> tuple[Array, Array]:
         """World forces and body moments (n + 1, 3), ground last."""
         model = self.model
         force, moment = np.zeros((model.n + 1, 3)), np.zeros((model.n + 1, 3))
-        if gravity:
-            force[:-1] = model.mass[:, None] * model.gravity
+        force[:-1] = model.mass[:, None] * model.gravity
         for k, f, n in model.wrenches:
             force[k] += A[k] @ f
             moment[k] += n
@@ -188,9 +165,7 @@ class Dense:
     def accelerations(self, t: float, x: Array) -> Array:
         """(rddot, pddot) of every body, (n, 7)."""
         (K, right), n = self.matrix(t, x), self.model.n
-        if self.variant.inverse:
-            found = np.linalg.inv(K) @ right
-        elif self.redundant:
+        if self.redundant:
             found = np.linalg.lstsq(K, right, rcond=DEPENDENT)[0]
         else:
             found = np.linalg.solve(K, right)
@@ -202,7 +177,7 @@ class Dense:
         return np.concatenate([x[7 * n : 14 * n], self.accelerations(t, x).ravel()])
 
     def residuals(self, x: Array) -> dict[str, float]:
-        """Largest residual of each kind, all rows of cross products counted, in the unit or 1."""
+        """Largest residual of each kind, all rows of cross products counted [m or 1]."""
         q, u = self.split(x)
         G, L = g_and_l(q[:, 3:])
         rows: dict[str, Rows] = self.tables.rows(q, 0 * u, G, (0 * G, 0 * L), Variant())
@@ -211,4 +186,4 @@ class Dense:
     def gap(self, x: Array) -> float:
         """Largest residual of the rows that are lengths [m]."""
         found = self.residuals(x)
-        return max(found["point"], found["p2"]) * self.variant.metres
+        return max(found["point"], found["p2"])

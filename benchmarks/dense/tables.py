@@ -36,8 +36,6 @@ class Variant:
         transposed_jacobian: Phi_pi of p2,2 with -2 d~^T G_i for -2 d~ G_i.
         shared_index: h_j = -2 Gdot_j Ldot_i^T s'_j, with body i's rate for body j.
         frozen: the two of three rows are chosen at the start and kept.
-        inverse: multiply by the inverse matrix instead of solving.
-        metres: length of the unit [m]; 1e-3 works in kg, mm, s.
     """
 
     lost_dots: bool = False
@@ -45,8 +43,6 @@ class Variant:
     transposed_jacobian: bool = False
     shared_index: bool = False
     frozen: bool = False
-    inverse: bool = False
-    metres: float = 1.0
 
 
 def skew(a: Array) -> Array:

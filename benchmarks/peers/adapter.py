@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from stmuav_jax import Scene
+from stmuav_jax import Scene, State
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,16 @@ class Setting:
     tolerance: float | None = None
     step: float | None = None
     options: dict[str, Any] = field(default_factory=dict)
+
+
+def tolerances(solver: str, powers: Iterable[int] = range(4, 13)) -> list[Setting]:
+    """Tolerances of 10^-k."""
+    return [Setting(solver, tolerance=10.0**-k) for k in powers]
+
+
+def steps(solver: str, *lengths: float) -> list[Setting]:
+    """Fixed steps [s]."""
+    return [Setting(solver, step=length) for length in lengths]
 
 
 @dataclass(frozen=True)
@@ -113,23 +123,29 @@ class Peer(ABC):
 
     def unsupported(self, scene: Scene) -> str:
         """What our adapter lacks for this scene; empty if it can be run."""
-        del scene
         return ""
 
     @abstractmethod
-    def settings(self) -> list[Setting]:
-        """From coarse to fine."""
-
-    def settings_for(self, scene: Scene) -> list[Setting]:
-        """Those for a scene, where that makes a difference."""
-        del scene
-        return self.settings()
+    def settings(self, scene: Scene | None = None) -> list[Setting]:
+        """From coarse to fine; those for a scene, where that makes a difference."""
 
     @abstractmethod
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         """Build the model and, where there is something to compile, compile it."""
 
+    def throughput(
+        self, scene: Scene, states: State, t1: float, setting: Setting
+    ) -> tuple[float, np.ndarray] | None:
+        """Trajectories per second on one thread, and where they end; None without such a mode.
+
+        Args:
+            states: consistent starts, arrays (k, n, .). t1: end [s].
+
+        Returns:
+            The median rate [1/s]; centres of mass at t1 (k, n, 3) [m].
+        """
+        return None
+
     def acceleration_seconds(self, scene: Scene) -> float | None:
         """Cost of one evaluation of all accelerations at the start [s], in a tight loop."""
-        del scene
         return None

@@ -7,10 +7,10 @@ import math
 from typing import Any
 
 import numpy as np
-from problems.plain import Plain, PlainJoint, Start, plain, start, why_not
+from problems.plain import Plain, PlainJoint, Sinus, Start, plain, start, why_not
 from problems.tree import in_plane, span
 
-from peers.adapter import Outcome, Peer, Prepared, Setting
+from peers.adapter import Outcome, Peer, Prepared, Setting, steps
 from peers.mujoco_c import whole_steps
 from stmuav_jax import Scene
 
@@ -49,20 +49,14 @@ class Mechanism:
         self.mbs.Assemble()
 
     def _body(self, k: int) -> Any:
-        from exudyn.rigidBodyUtilities import (  # pyright: ignore[reportMissingImports]
-            RigidBodyInertia,
-        )
+        from exudyn import rigidBodyUtilities  # pyright: ignore[reportMissingImports]
 
         s, R = self.first, self.first.R_wb[k]
         return self.mbs.CreateRigidBody(
-            inertia=RigidBodyInertia(self.model.mass[k], self.model.inertia[k]),
-            referencePosition=s.r[k],
-            referenceRotationMatrix=R,
-            initialVelocity=s.v[k],
-            initialAngularVelocity=R @ s.omega[k],
-            gravity=self.model.gravity,
-            show=False,
-        )
+            inertia=rigidBodyUtilities.RigidBodyInertia(self.model.mass[k], self.model.inertia[k]),
+            referencePosition=s.r[k], referenceRotationMatrix=R, initialVelocity=s.v[k],
+            initialAngularVelocity=R @ s.omega[k], gravity=self.model.gravity, show=False,
+        )  # fmt: skip
 
     def _marker(self, body: int, point: np.ndarray, frame: np.ndarray | None = None) -> Any:
         place = self.exu.HT(rotation=np.eye(3) if frame is None else frame, translation=point)
@@ -95,10 +89,10 @@ class Mechanism:
             on_slider = R[s].T @ R[b] @ along
             for body, point, force in ((b, act.arm, -along), (s, arm, on_slider)):
                 at = self._marker(body, point)
-                self._wave(at, force, act.force.rate, act.force.phase, body_fixed=True)
+                self._wave(at, force, act.force, body_fixed=True)
         for k, force in model.forces:
             at = self._marker(k, zero)
-            self._wave(at, force.amplitude, force.rate, force.phase, body_fixed=False)
+            self._wave(at, force.amplitude, force, body_fixed=False)
         for k, moment in model.moments:
             torque = self.items.Torque
             self.mbs.AddLoad(torque(markerNumber=self._marker(k, zero), loadVector=moment))
@@ -108,35 +102,23 @@ class Mechanism:
         """Exudyn's own connectors, whose laws are compiled."""
         for s in model.springs:
             ends = [self._marker(s.i, s.point_i), self._marker(s.j, s.point_j)]
-            spring = self.items.SpringDamper(
-                markerNumbers=ends, referenceLength=s.length, stiffness=s.stiffness,
-                damping=s.damping,
-            )  # fmt: skip
-            self.mbs.AddObject(spring)
+            law = {"stiffness": s.stiffness, "damping": s.damping, "referenceLength": s.length}
+            self.mbs.AddObject(self.items.SpringDamper(markerNumbers=ends, **law))
         for servo in model.servos:
-            joint = model.joints[servo.joint]
-            ends = self._ends(joint)
-            spring = self.items.LinearSpringDamper(
-                markerNumbers=ends, axisMarker0=[0, 0, 1], offset=servo.target,
-                stiffness=servo.stiffness, damping=servo.damping,
-            )  # fmt: skip
-            self.mbs.AddObject(spring)
+            ends = self._ends(model.joints[servo.joint])
+            law = {"stiffness": servo.stiffness, "damping": servo.damping, "offset": servo.target}
+            spring = self.items.LinearSpringDamper
+            self.mbs.AddObject(spring(markerNumbers=ends, axisMarker0=[0, 0, 1], **law))
 
-    def _wave(
-        self, marker: Any, amplitude: np.ndarray, rate: float, phase: float, *, body_fixed: bool
-    ) -> None:
-        x, y, z = (float(a) for a in amplitude)
+    def _wave(self, marker: Any, amplitude: np.ndarray, wave: Sinus, *, body_fixed: bool) -> None:
+        (x, y, z), rate, phase = map(float, amplitude), wave.rate, wave.phase
 
         def value(mbs: Any, t: float, load: Any) -> list[float]:
-            del mbs, load
             now = math.sin(rate * t + phase)
             return [x * now, y * now, z * now]
 
-        force = self.items.Force(
-            markerNumber=marker, loadVector=amplitude, bodyFixed=body_fixed,
-            loadVectorUserFunction=value,
-        )  # fmt: skip
-        self.mbs.AddLoad(force)
+        how = {"markerNumber": marker, "loadVector": amplitude, "bodyFixed": body_fixed}
+        self.mbs.AddLoad(self.items.Force(**how, loadVectorUserFunction=value))
 
     def settings(self, t0: float, end: float, steps: int, write_period: float) -> Any:
         """Fixed steps, files and messages off."""
@@ -191,9 +173,8 @@ class ExudynPeer(Peer):
             return "An actuator on a body that does not slide on its base is not written."
         return ""
 
-    def settings(self) -> list[Setting]:
-        steps = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5)
-        return [Setting("generalised-alpha", step=step) for step in steps]
+    def settings(self, scene: Scene | None = None) -> list[Setting]:
+        return steps("generalised-alpha", 1e-3, 5e-4, 2e-4, 1e-4, 5e-5)
 
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         mechanism, step = Mechanism(scene), setting.step or 1e-3

@@ -12,7 +12,7 @@ from problems.plain import Sinus, Start, UnsupportedError, loop_seconds, plain, 
 from problems.tree import coordinates
 from scipy.spatial.transform import Rotation
 
-from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at
+from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at, steps
 from peers.pinocchio_model import LinkModel, linked, why_no_joint_forces
 from stmuav_jax import Scene, State
 
@@ -197,15 +197,12 @@ class MujocoC(Peer):
     def unsupported(self, scene: Scene) -> str:
         return why_no_mujoco(scene)
 
-    def settings(self) -> list[Setting]:
-        steps = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1.6e-5)
-        return [Setting("RK4", step=step) for step in steps]
-
-    def settings_for(self, scene: Scene) -> list[Setting]:
+    def settings(self, scene: Scene | None = None) -> list[Setting]:
         """RK4, and with servos also MuJoCo's integrator that takes damping implicitly."""
-        steps = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
-        stiff = [Setting("implicitfast", step=step) for step in steps]
-        return [*self.settings(), *(stiff if plain(scene).servos else [])]
+        lengths = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5)
+        stiff = scene is not None and plain(scene).servos
+        implicit = steps("implicitfast", *lengths, 1e-5) if stiff else []
+        return [*steps("RK4", *lengths, 1.6e-5), *implicit]
 
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         rollout: Any = importlib.import_module("mujoco.rollout")
@@ -231,24 +228,15 @@ class MujocoC(Peer):
         return loop_seconds(lambda: world.mujoco.mj_forward(world.model, world.data))
 
     def throughput(
-        self, scene: Scene, states: State, t1: float, setting: Setting, threads: int = 1
+        self, scene: Scene, states: State, t1: float, setting: Setting
     ) -> tuple[float, np.ndarray]:
-        """Trajectories per second of a rollout on some threads, and where they end.
-
-        Args:
-            states: consistent starts, arrays (k, n, .). t1: end [s].
-
-        Returns:
-            The median rate of three [1/s]; centres of mass at t1 (k, n, 3) [m].
-        """
         rollout: Any = importlib.import_module("mujoco.rollout")
 
         world = World(scene, setting.step or 1e-3)
         count = int(whole_steps(scene.t0, np.array([t1]), world.step)[0])
         first = np.stack([world.begin(state) for state in starts(states)])
         controls = np.broadcast_to(world.control(count), (len(first), count, world.model.nu))
-        datas = [world.mujoco.MjData(world.model) for _ in range(max(threads, 1))]
-        with rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
-            call = lambda: pool.rollout(world.model, datas, first, controls, nstep=count)[0]
+        with rollout.Rollout(nthread=0) as pool:
+            call = lambda: pool.rollout(world.model, world.data, first, controls, nstep=count)[0]
             seconds, ends = loop_seconds(call, loops=1, repeats=3), call()[:, -1]
         return len(first) / seconds, np.stack([world.positions(end)[0] for end in ends])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from problems.plain import loop_seconds, start
 
-from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at
+from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at, steps
 from peers.mujoco_c import World, whole_steps, why_no_mujoco
 from stmuav_jax import Scene
 
@@ -35,8 +35,8 @@ class MujocoMjx(Peer):
     def unsupported(self, scene: Scene) -> str:
         return why_no_mujoco(scene)
 
-    def settings(self) -> list[Setting]:
-        return [Setting("RK4", step=step) for step in (1e-3, 5e-4, 2e-4, 1e-4)]
+    def settings(self, scene: Scene | None = None) -> list[Setting]:
+        return steps("RK4", 1e-3, 5e-4, 2e-4, 1e-4)
 
     def _model(self, scene: Scene, step: float) -> tuple[Any, World, Any, Any]:
         """MJX, the C engine's world, and MJX's model and data at the start."""

@@ -19,7 +19,7 @@ import numpy as np
 from problems.plain import Start, plain, start, starts, why_not
 from problems.tree import why_no_tree
 
-from peers.adapter import Outcome, Peer, Prepared, Setting
+from peers.adapter import Outcome, Peer, Prepared, Setting, tolerances
 from peers.pinocchio_model import linked, model_text, start_vectors, starts_text
 from stmuav_jax import Scene, State
 
@@ -146,8 +146,8 @@ class PinocchioCpp(Peer):
     def unsupported(self, scene: Scene) -> str:
         return why_not(scene) or why_no_tree(plain(scene))
 
-    def settings(self) -> list[Setting]:
-        return [Setting("rkf78", tolerance=10.0**-k) for k in (4, 5, 6, 7, 8, 9, 10, 11, 12)]
+    def settings(self, scene: Scene | None = None) -> list[Setting]:
+        return tolerances("rkf78")
 
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         program, seconds = compile_program()
@@ -176,14 +176,6 @@ class PinocchioCpp(Peer):
     def throughput(
         self, scene: Scene, states: State, t1: float, setting: Setting
     ) -> tuple[float, np.ndarray]:
-        """Trajectories per second on one thread, one after the other, and where they end.
-
-        Args:
-            states: consistent starts, arrays (k, n, .). t1: end [s].
-
-        Returns:
-            The median rate [1/s]; centres of mass at t1 (k, n, 3) [m].
-        """
         program, _ = compile_program()
         texts, tolerance = Texts(scene, starts(states)), setting.tolerance or 1e-6
         words = texts.call(program, "many", tolerance, self.repeats, t1)

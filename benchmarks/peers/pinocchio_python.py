@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from problems.plain import loop_seconds, start
 
-from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at
+from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at, tolerances
 from peers.pinocchio_model import generalised, linked, start_vectors, why_no_joint_forces
 from peers.scipy_dense import follow
 from stmuav_jax import Scene
@@ -141,8 +141,8 @@ class PinocchioPython(Peer):
     def unsupported(self, scene: Scene) -> str:
         return why_no_joint_forces(scene)
 
-    def settings(self) -> list[Setting]:
-        return [Setting("DOP853", tolerance=10.0**-k) for k in (4, 5, 6, 7, 8, 9, 10, 11, 12)]
+    def settings(self, scene: Scene | None = None) -> list[Setting]:
+        return tolerances("DOP853")
 
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         dynamics = Dynamics(scene)

@@ -3,13 +3,12 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from dense.system import Dense
 from problems.plain import loop_seconds, why_not
 
-from peers.adapter import Outcome, Peer, Prepared, Setting
+from peers.adapter import Outcome, Peer, Prepared, Setting, tolerances
 from stmuav_jax import Scene
 
 # Seconds of the clock after which a run is given up. Rows that depend on each other leave a method
@@ -43,42 +42,33 @@ def follow(
     method: str,
     tolerance: float,
 ) -> Path:
-    """Integrate from t0 [s] with rtol = atol = tolerance; steps end at the wanted times.
+    """Integrate from t0 [s] with rtol = atol = tolerance; steps end at the wanted times."""
+    from scipy.integrate import solve_ivp
 
-    Every wanted time ends one solver, since the dense output is of lower order than the
-    steps; the next solver begins with the last step's length.
-    """
-    import scipy.integrate
-
-    make: Any = getattr(scipy.integrate, method)
-    states = np.full((len(times), len(x)), np.nan)
-    t, evaluations, accepted, attempts, failure = t0, 0, 0, 0, ""
+    states, counts, failure = np.full((len(times), len(x)), np.nan), np.zeros(3, int), ""
     began = time.perf_counter()
-    length: float | None = None
+
+    def watched(t: float, x: np.ndarray) -> np.ndarray:
+        if time.perf_counter() - began > MOST_SECONDS:
+            said = f"Ended by us after {MOST_SECONDS:g} s of the clock, at t = {t:.3g} s."
+            raise TimeoutError(said)
+        return rate(t, x)
+
     for k, end in enumerate(times):
-        if end > t:
-            first = None if length is None else min(length, end - t)
-            solver = make(rate, t, x, end, rtol=tolerance, atol=tolerance, first_step=first)
-            while solver.status == "running":
-                failure = solver.step() or ""
-                accepted += solver.status != "failed"
-                if time.perf_counter() - began > MOST_SECONDS:
-                    failure = (
-                        f"Ended by us after {MOST_SECONDS:g} s of the clock and {accepted:,} steps, "
-                        f"at t = {solver.t:.3g} s."
-                    )
-                    break
-                # the last step is cut short, so its length says little
-                if solver.status == "running":
-                    length = solver.h_abs
-            evaluations += solver.nfev
-            attempts += (solver.nfev - (2 if first is None else 1)) // _PER_STEP[method]
-            t, x = solver.t, solver.y
-            if failure or not np.all(np.isfinite(x)):
-                failure = failure or "The state is not finite."
-                break
+        try:
+            done = solve_ivp(watched, (t0, end), x, method, rtol=tolerance, atol=tolerance)
+        except TimeoutError as late:
+            failure = str(late)
+            break
+        # two evaluations choose the first step
+        accepted, tried = len(done.t) - 1, (done.nfev - 2) // _PER_STEP[method]
+        counts += (done.nfev, accepted, tried - accepted)
+        t0, x, failure = end, done.y[:, -1], "" if done.success else done.message
+        if failure or not np.all(np.isfinite(x)):
+            failure = failure or "The state is not finite."
+            break
         states[k] = x
-    return Path(states, evaluations, accepted, attempts - accepted, failure)
+    return Path(states, *map(int, counts), failure)
 
 
 class ScipyDense(Peer):
@@ -103,11 +93,8 @@ class ScipyDense(Peer):
     def unsupported(self, scene: Scene) -> str:
         return why_not(scene)
 
-    def settings(self) -> list[Setting]:
-        return [
-            *(Setting("RK45", tolerance=10.0**-k) for k in (4, 6, 8)),
-            *(Setting("DOP853", tolerance=10.0**-k) for k in (4, 6, 8, 10, 12)),
-        ]
+    def settings(self, scene: Scene | None = None) -> list[Setting]:
+        return [*tolerances("RK45", (4, 6, 8)), *tolerances("DOP853", (4, 6, 8, 10, 12))]
 
     def prepare(self, scene: Scene, times: np.ndarray, setting: Setting) -> Prepared:
         dense, tolerance = Dense(scene), setting.tolerance or 1e-6

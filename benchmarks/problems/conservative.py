@@ -7,8 +7,7 @@ Part I.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,14 +24,8 @@ FAST = (0.0, 150.0, -4.61538)  # rad/s, body axes
 SLOW = (0.0, 1.5, -0.0461538)
 
 
-@dataclass(frozen=True)
-class Problem:
-    """A conservative system and its start.
-
-    Attributes:
-        name, title: for records and figures.
-        redundant: whether the cut joints have dependent rows.
-    """
+class Problem(NamedTuple):
+    """A conservative system and its start; redundant: whether cut joints have dependent rows."""
 
     name: str
     title: str

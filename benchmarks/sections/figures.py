@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from shared.pages import Row, legend_of, panels, save
+from shared.pages import Row, legend_of, ours, panels, save
 
 MARKS = "osD^vP*X<>h8"
 # Twelve colours that stay apart for the colour-blind, those of Okabe and Ito first.
@@ -52,8 +52,8 @@ def work_precision(curve: Row) -> Figure:
                 continue
             x = [row["error"] for row in rows]
             y = [1e3 * row["seconds"]["median"] for row in rows]
-            ours = method.startswith("stmuav-jax")
-            style = {"lw": 2.0, "ls": "-"} if ours else {"lw": 1.0, "ls": "--"}
+            mine = method.startswith("stmuav-jax")
+            style = {"lw": 2.0, "ls": "-"} if mine else {"lw": 1.0, "ls": "--"}
             name = method if solver in method else f"{method}, {solver}"
             color = COLORS[k % len(COLORS)]
             axes.loglog(x, y, marker=MARKS[k % len(MARKS)], ms=5, color=color, label=name, **style)
@@ -103,14 +103,10 @@ def missing(absent: list[tuple[str, str]], width: int) -> str:
     return "\n".join(textwrap.wrap(f"Not shown: {text}.", width))
 
 
-def _ours(rows: list[Row]) -> list[Row]:
-    return [row for row in rows if row["method"].startswith("stmuav-jax")]
-
-
 def batch(result: Row) -> Figure:
     """Throughput against block size; one trajectory and peers as lines."""
     figure, (axes,) = panels(1, 1, 7, 4.4)
-    rows = [row for row in _ours(result["rows"]) if row["per_second"] is not None]
+    rows = [row for row in ours(result["rows"]) if row["per_second"] is not None]
     for k, count in enumerate(dict.fromkeys(row["trajectories"] for row in rows)):
         some = sorted((r for r in rows if r["trajectories"] == count), key=lambda r: r["block"])
         x, y = [r["block"] for r in some], [r["per_second"] for r in some]
@@ -177,8 +173,8 @@ def acceleration(result: Row) -> Figure:
     names = [
         _program(row) + (f", {row['batch']} at once" if row["batch"] > 1 else "") for row in rows
     ]
-    ours = ["C0" if row in _ours(rows) else "0.6" for row in rows]
-    axes.scatter(values, range(len(rows)), color=ours, s=30, zorder=3)
+    colors = ["C0" if row in ours(rows) else "0.6" for row in rows]
+    axes.scatter(values, range(len(rows)), color=colors, s=30, zorder=3)
     axes.grid(alpha=0.3)
     for k, value in enumerate(values):
         axes.annotate(

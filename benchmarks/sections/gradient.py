@@ -86,7 +86,6 @@ def modes(scene: stm.Scene, size: Size) -> dict[str, tuple[Callable[..., Any], W
 
 def gradient(size: Size, others: list[Peer]) -> dict[str, Any]:
     """Forward and reverse mode against one simulation and against central differences."""
-    del others
     scene = tracker(size.horizons).scene
     zero, tight = jnp.zeros(size.parameters), jnp.asarray(max(size.reference, 1e-13))
     rows: list[dict[str, Any]] = []
@@ -124,9 +123,6 @@ def gradient(size: Size, others: list[Peer]) -> dict[str, Any]:
             )
     return {
         "what": "gradient of the panel's final position, uav_tracker case 2, tree, Dopri8",
-        "horizon": size.gradient_horizon,
-        "parameters": PARAMETERS,
-        "count": size.parameters,
-        "differences": {"steps": DIFFERENCES, "own_error": own},
-        "rows": rows,
-    }
+        "horizon": size.gradient_horizon, "parameters": PARAMETERS, "count": size.parameters,
+        "differences": {"steps": DIFFERENCES, "own_error": own}, "rows": rows,
+    }  # fmt: skip

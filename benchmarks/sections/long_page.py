@@ -32,7 +32,7 @@ def show(path: Path, folder: Path) -> str:
     record = json.loads(path.read_text())
     problems = record["problems"]
     parts = [cheapest(problems, level) for level in problems[0]["cheapest"]]
-    parts += [at_tolerance(problems), answers(problems), finest(problems)]
+    parts += [at_tolerance(problems), finest(problems)]
     figures = {
         "long_horizon_work": work(record, "seconds", "run time [s]"),
         "long_horizon_evaluations": work(record, "evaluations", "evaluations of x' = f(t, x)"),
@@ -86,25 +86,6 @@ def at_tolerance(problems: list[Row]) -> str:
         ("error", "largest", power), ("drift [1/s]", "drift", power),
         ("run [s]", "seconds", power), ("joints off by [m]", "residual", power),
     )  # fmt: skip
-
-
-def answers(problems: list[Row]) -> str:
-    """How often a projected explicit run is better than a fixed-step run that costs as much."""
-
-    def of(family: str, cost: str) -> Any:
-        def cell(found: Row) -> str:
-            pairs = [p for p in found[cost]["pairs"] if p["family"] == family] if found else []
-            ratios = [p["ratio"] for p in pairs if p["ratio"] is not None]
-            span = f", {min(ratios):.0e} to {max(ratios):.0e}" if ratios else ""
-            return f"{sum(ratio > 1 for ratio in ratios)} of {len(ratios)}{span}"
-
-        short = family.replace("gauss", "Gauss").replace("projection", "projected")
-        return (f"{short}, by {cost}", "answers", cell)
-
-    families = ("gauss, projection", "gauss, none", "midpoint, projection")
-    columns = [of(family, cost) for cost in ("seconds", "evaluations") for family in families]
-    title = "Projected explicit better at equal cost, ratios of the errors"
-    return titled(title, problems, ("problem", "title"), *columns)
 
 
 def work(record: Row, cost: str, label: str) -> Figure:

@@ -52,7 +52,7 @@ class Ours(Peer):
     def version(self) -> str:
         return stm.__version__
 
-    def settings(self) -> list[Setting]:
+    def settings(self, scene: stm.Scene | None = None) -> list[Setting]:
         return self._settings
 
     def prepare(self, scene: stm.Scene, times: np.ndarray, setting: Setting) -> Prepared:

@@ -61,7 +61,7 @@ def line(
     """A method's runs from coarse to fine; those left out are rows too."""
     rows: list[dict[str, Any]] = []
     slow: dict[str, str] = {}
-    for setting in peer.settings_for(problem.scene):
+    for setting in peer.settings(problem.scene):
         row: dict[str, Any] = {
             "method": peer.name, "solver": setting.solver, "tolerance": setting.tolerance,
             "step": setting.step, "horizon": end, "error": None, "seconds": None,

@@ -23,7 +23,6 @@ TOLERANCES = (1e-6, 1e-8, 1e-10)
 
 def scenes(size: Size, others: list[Peer]) -> dict[str, Any]:
     """All scenes and cases, tree and Dopri8."""
-    del others
     names = [(name, case) for name, entry in stm.SCENES.items() for case in entry.cases or (None,)]
     rows = []
     for name, case in names[: size.scenes]:
@@ -98,7 +97,6 @@ def run_times(
 
 def hexacopter(size: Size, others: list[Peer]) -> dict[str, Any]:
     """What the generality costs on one free body, where nothing of it is needed."""
-    del others
     scene = stm.make_scene("hexacopter")
     state, end = scene.state0, jnp.asarray(size.span)
     flat = jnp.concatenate([x[0] for x in (state.r, state.p, state.v, state.omega)])

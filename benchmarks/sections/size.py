@@ -8,17 +8,15 @@ class Size:
     """Extents of all sections.
 
     Attributes:
-        horizons: [s]. tolerances, stiff_tolerances: from coarse to fine.
-        reference: tolerance of the reference run. methods: how many of our methods.
-        problems: how many of a list of problems; stiff_problems: from its end.
+        horizons: [s]. tolerances, stiff_tolerances: from coarse to fine. reference: tolerance of
+            the reference run. methods, problems, scenes: how many; stiff_problems: from the end.
         repeats: timed calls, as far as `budget` [s] allows.
         evaluations: in a loop, to time one. batches: states evaluated together.
-        trajectories: in one batch, the middle one for all block sizes in `blocks`.
-        peer_trajectories: for the peers' throughput.
+        trajectories: in one batch, the middle one for all block sizes in `blocks`;
+            peer_trajectories: those of peers.
         batch_tolerances: tried for `batch_error` [m] against runs at `tight`.
         loops: of the four-bar chains; run_loops: those that are integrated, too.
-        gradient_horizon: [s]. parameters: of the gradient.
-        scenes: how many. span: of scenes and hexacopter [s].
+        gradient_horizon: [s]. parameters: of the gradient. span: of scenes and hexacopter [s].
     """
 
     horizons: tuple[float, ...] = (0.5, 1.0)

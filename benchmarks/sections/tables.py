@@ -1,7 +1,5 @@
 """The sections of the suite's page as Markdown: only what the JSON files hold."""
 
-from collections.abc import Sequence
-
 from shared.pages import (
     Lines,
     Row,
@@ -9,6 +7,7 @@ from shared.pages import (
     micro,
     milliseconds,
     number,
+    ours,
     power,
     setting,
     table,
@@ -83,10 +82,6 @@ def _cheapest(curve: Row, end: float) -> Lines:
     return [said + "stmuav-jax that reaches it:", "", *listed(rows, "method", "solver", *columns)]
 
 
-def _ours(rows: Sequence[Row]) -> list[Row]:
-    return [row for row in rows if row["method"].startswith("stmuav")]
-
-
 def acceleration(result: Row) -> Lines:
     """One evaluation: ours single and batched, peers."""
     lines = listed(
@@ -100,9 +95,9 @@ def acceleration(result: Row) -> Lines:
     ]
     done = [row for row in result["rows"] if row["seconds"] is not None]
     cpp = next((row for row in done if row["method"].startswith("Pinocchio (C++)")), None)
-    ours = sorted(_ours(done), key=lambda r: r["seconds"])
-    if cpp and ours:
-        best, alone = ours[0], next(r for r in ours if r["batch"] == 1)
+    mine = sorted(ours(done), key=lambda r: r["seconds"])
+    if cpp and mine:
+        best, alone = mine[0], next(r for r in mine if r["batch"] == 1)
         ratios = [f"{row['seconds'] / cpp['seconds']:.2g}" for row in (alone, best)]
         lines += [
             "",
@@ -131,11 +126,11 @@ def batch(result: Row) -> Lines:
         ("failed", "failed", whole), COMPILE, "failure",
     )  # fmt: skip
     done = [row for row in result["rows"] if row["per_second"] is not None]
-    rate = max(row["per_second"] for row in _ours(done))
+    rate = max(row["per_second"] for row in ours(done))
     said = [f"{rate / single['per_second']:.2g} times that of one trajectory after the other"]
     for row in done:
         fine = row["largest_error"] is not None and row["largest_error"] <= wanted
-        if fine and row not in _ours(done):
+        if fine and row not in ours(done):
             said.append(f"{rate / row['per_second']:.2g} times that of {row['method']}")
     return [*lines, "", f"Throughput of the fastest batch: {'; '.join(said)}."]
 
@@ -172,6 +167,21 @@ def gradient(result: Row) -> Lines:
         *listed(
             result["rows"], "mode", SETTING, RUN, ("in simulations", "cost_in_simulations", number),
             ("relative error", "error", power), COMPILE, "failure",
+        ),
+    ]  # fmt: skip
+
+
+def compile_times(result: Row) -> Lines:
+    """Seconds to trace, lower and compile programs."""
+    whole_time = lambda row: number(sum(row[f"{k}_seconds"] for k in ("trace", "lower", "compile")))
+    return [
+        "Seconds of processor time, each program in a new process with empty caches and the "
+        f"package's options for short runs. The 20 parameters: {result['parameters']}.",
+        "",
+        *listed(
+            result["rows"], "program", ("trace [s]", "trace_seconds", number),
+            ("lower [s]", "lower_seconds", number), COMPILE, ("all [s]", None, whole_time),
+            "equations",
         ),
     ]  # fmt: skip
 

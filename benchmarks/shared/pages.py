@@ -85,6 +85,11 @@ def setting(row: Row) -> str:
     return f"h = {row['step']:g} s" if row.get("step") is not None else "-"
 
 
+def ours(rows: Sequence[Row]) -> list[Row]:
+    """The rows of this package."""
+    return [row for row in rows if row["method"].startswith("stmuav-jax")]
+
+
 def panels(
     rows: int, columns: int, width: float, height: float, **shared: Any
 ) -> tuple[Figure, list[Any]]:

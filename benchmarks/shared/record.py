@@ -83,17 +83,12 @@ def environment() -> dict[str, Any]:
     """Commit, what differs from it, versions, machine and date."""
     changed = changes()
     return {
-        "commit": commit(),
-        "dirty": bool(changed),
-        "changed": changed,
-        "package_from_elsewhere": bool(elsewhere()),
-        "allow_dirty": allowed(),
-        "versions": versions(),
-        "cpu": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "load_at_start": os.getloadavg()[0],
+        "commit": commit(), "dirty": bool(changed), "changed": changed,
+        "package_from_elsewhere": bool(elsewhere()), "allow_dirty": allowed(),
+        "versions": versions(), "cpu": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(), "load_at_start": os.getloadavg()[0],
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
+    }  # fmt: skip
 
 
 def allowed() -> bool:

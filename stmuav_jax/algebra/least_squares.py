@@ -75,51 +75,67 @@ class Search:
         }[self.reason]
 
 
-def all_at_once(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Wrap a function so that its directional derivatives come from its whole Jacobian.
+@quick_jit
+def value_and_columns(function: Callable[[Any], Any], values: Any) -> tuple[Any, Any]:
+    """Value of a function and the columns of its Jacobian, one last axis more, in one pass.
 
-    Methods that need the whole Jacobian get values and all columns in one pass; linearising first
-    would compile and evaluate the function, such as a simulation, once more.
+    Every search and every other caller with a function of the same form shares one program.
     """
+    flat, unravel = ravel_pytree(values)
+    return value_and_jacobian(lambda x: function(unravel(x)), flat)
+
+
+def _with_columns(value: Any, columns: Any) -> Callable[[Any], Any]:
+    """Function with this value and Jacobian at the one point where it is called."""
 
     @jax.custom_jvp
     def of(values: Any) -> Any:
-        return function(values)
+        del values
+        return value
 
     @of.defjvp
     def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
-        flat, unravel = ravel_pytree(primals[0])
+        del primals
         along = ravel_pytree(tangents[0])[0]
-        value, columns = value_and_jacobian(lambda x: function(unravel(x)), flat)
         return value, jax.tree.map(lambda J: J @ along, columns)
 
     return of
 
 
 class _Stepper(eqx.Module):
-    """Optimisation method together with the function and the shape of its result."""
+    """Optimisation method together with the function and the shape of its result.
+
+    Methods that need the whole Jacobian evaluate the function at `y_eval` of their state only:
+    they are given `seen`, its value and columns there, and no copy of the function is compiled
+    with the method's own equations. `seen` is None for the other methods.
+    """
 
     function: Callable[[Any], Any]
     method: Method
     shape: Any = eqx.field(static=True)
 
-    def of(self, values: Any, _: Any) -> tuple[Any, None]:
-        squares = isinstance(self.method, optx.AbstractLeastSquaresSolver)
-        function = all_at_once(self.function) if squares else self.function
-        return function(values), None
+    @property
+    def squares(self) -> bool:
+        return isinstance(self.method, optx.AbstractGaussNewton)
+
+    def of(self, seen: Any) -> Callable[[Any, Any], tuple[Any, None]]:
+        function = self.function if seen is None else _with_columns(*seen)
+        return lambda values, _: (function(values), None)
 
     @quick_jit
-    def begin(self, values: Any) -> tuple[Any, Any]:
+    def begin(self, values: Any, seen: Any) -> tuple[Any, Any]:
         """Initial state of the method: its arrays, and the other leaves, which stay constant."""
-        state = self.method.init(self.of, values, None, {}, self.shape, None, frozenset())
+        state = self.method.init(self.of(seen), values, None, {}, self.shape, None, frozenset())
         return eqx.partition(state, eqx.is_array)
 
     @quick_jit
-    def step(self, values: Any, arrays: Any, rest: Any) -> tuple[Any, Any, Any, Array, Array]:
+    def step(
+        self, values: Any, arrays: Any, rest: Any, seen: Any
+    ) -> tuple[Any, Any, Any, Array, Array]:
         """Next values and state, the values of known loss, their loss, and the flag of the end."""
-        state = eqx.combine(arrays, rest)
-        after, state, _ = self.method.step(self.of, values, None, {}, state, frozenset())
-        done, _ = self.method.terminate(self.of, after, None, {}, state, frozenset())
+        state, of = eqx.combine(arrays, rest), self.of(seen)
+        after, state, _ = self.method.step(of, values, None, {}, state, frozenset())
+        done, _ = self.method.terminate(of, after, None, {}, state, frozenset())
         # a minimiser of optax knows the loss before its step, all other methods the loss after it
         behind = isinstance(self.method, optx.OptaxMinimiser)
         known, loss = (values, state.f) if behind else (after, state.f_info.as_min())
@@ -166,17 +182,21 @@ def search(
     if resume is not None:
         _check_form(resume.values, values)
         values = resume.values
-    shape = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype),
-        eqx.filter_eval_shape(_called, function, values),
-    )
+    seen = None
+    if isinstance(method, optx.AbstractGaussNewton):
+        seen = value_and_columns(function, values)
+        found = seen[0]
+    else:
+        found = eqx.filter_eval_shape(_called, function, values)
+    shape = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), found)
     stepper = _Stepper(function, method, shape)
-    return _go(stepper, values, resume, steps, patience, gain, report)
+    return _go(stepper, values, seen, resume, steps, patience, gain, report)
 
 
 def _go(
     stepper: _Stepper,
     values: Any,
+    seen: Any,
     now: Search | None,
     steps: int,
     patience: int,
@@ -187,9 +207,12 @@ def _go(
     mark, mark_loss = (now.steps, now.loss) if now is not None else (0, np.inf)
     reason = SearchReason.STEPS
     try:
-        arrays, rest = stepper.begin(values)
+        arrays, rest = stepper.begin(values, seen)
         while now is None or now.steps < steps:
-            values, arrays, known, loss, done = stepper.step(values, arrays, rest)
+            if seen is None and stepper.squares:
+                seen = value_and_columns(stepper.function, arrays.y_eval)
+            values, arrays, known, loss, done = stepper.step(values, arrays, rest, seen)
+            seen = None
             if begun:
                 # the first step of a resumed search only evaluates the loss where it starts
                 begun = False

@@ -1,14 +1,16 @@
 """Linear solvers of constrained dynamics, for small full matrices, symmetric or general."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..checks.shapes import Matrix, Vector
+from . import loops
+from .native import native_loops
 from .stacked import transposed_multiply
 
 # Weight w of the proximal term relative to rows of unit size, and number of iterations. The error
@@ -81,14 +83,91 @@ class Proximal(eqx.Module):
         return x[:, 0] if b.ndim == 1 else x
 
 
+def _in_loops(A: Matrix) -> bool:
+    """True if the factorisation of a matrix is a loop of its own, and not a call of LAPACK."""
+    return native_loops() and A.ndim == 2 and 0 < A.shape[0] <= loops.LARGEST
+
+
 def cholesky(S: Matrix) -> Matrix:
     """Lower Cholesky factor of a symmetric positive definite matrix; NaN for any other."""
-    return jax.lax.linalg.cholesky(S, symmetrize_input=False)
+    return _cholesky(S) if _in_loops(S) else jax.lax.linalg.cholesky(S, symmetrize_input=False)
+
+
+@jax.custom_jvp
+def _cholesky(S: Matrix) -> Matrix:
+    return loops.cholesky(S)
+
+
+@_cholesky.defjvp
+def _cholesky_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matrix, Matrix]:
+    """Derivative L' = L F, with F the lower half of L^-1 S' L^-T and half its diagonal."""
+    L = _cholesky(*primals)
+    middle = solve_lower(L, solve_lower(L, tangents[0]).T)
+    return L, L @ (jnp.tril(middle) - 0.5 * jnp.diag(jnp.diagonal(middle)))
 
 
 def solve_lower(L: Matrix, B: Matrix, *, transpose: bool = False) -> Matrix:
     """Solution L^-1 B, or L^-T B, for a lower triangular matrix L."""
-    return jax.lax.linalg.triangular_solve(L, B, left_side=True, lower=True, transpose_a=transpose)
+    if not _in_loops(L):
+        how: dict[str, bool] = {"left_side": True, "lower": True, "transpose_a": transpose}
+        return jax.lax.linalg.triangular_solve(L, B, **how)
+    columns = jax.lax.stop_gradient(L)
+    down = lambda _, b: loops.solve_columns(columns.T, b, upper=False, unit=False)
+    up = lambda _, b: loops.solve_columns(columns, b, upper=True, unit=False)
+    A = jnp.tril(L).T if transpose else jnp.tril(L)
+    ways = (up, down) if transpose else (down, up)
+    return jax.lax.custom_linear_solve(lambda x: A @ x, B, *ways)
+
+
+def product_transposed(A: Float[Array, "m k"], B: Float[Array, "n k"]) -> Float[Array, "m n"]:
+    """Product A B^T."""
+    return loops.multiply_rows(A, B) if _in_loops(A) else A @ B.T
+
+
+class LU(eqx.Module):
+    """LU factorisation of a general square matrix A with partial pivoting, for many solutions.
+
+    The factors are constants for differentiation; derivatives of a solution follow from A x = b.
+    """
+
+    matrix: Matrix
+    factors: Matrix
+    order: Int[Array, " k"]
+
+    def solve(self, b: Vector) -> Vector:
+        """Solution x of A x = b, shape (k,); not finite if A is singular."""
+        multiply = lambda x: self.matrix @ x
+        return jax.lax.custom_linear_solve(multiply, b, self._solve, self._solve_transposed)
+
+    def _solve(self, multiply: Any, b: Vector) -> Vector:
+        del multiply
+        y = self._triangular(b[self.order], upper=False, transposed=False)
+        return self._triangular(y, upper=True, transposed=False)
+
+    def _solve_transposed(self, multiply: Any, b: Vector) -> Vector:
+        del multiply
+        y = self._triangular(b, upper=True, transposed=True)
+        y = self._triangular(y, upper=False, transposed=True)
+        return jnp.zeros_like(y).at[self.order].set(y)
+
+    def _triangular(self, b: Vector, *, upper: bool, transposed: bool) -> Vector:
+        """Solution by the factor U or L, or its transpose."""
+        if _in_loops(self.factors):
+            columns = self.factors if transposed else self.factors.T
+            return loops.solve_columns(columns, b, upper=upper != transposed, unit=not upper)
+        how = {"lower": not upper, "transpose_a": transposed, "unit_diagonal": not upper}
+        return jax.lax.linalg.triangular_solve(self.factors, b[:, None], left_side=True, **how)[
+            :, 0
+        ]
+
+
+def lu(A: Matrix) -> LU:
+    """Factorise a general square matrix, shape (k, k)."""
+    constant = jax.lax.stop_gradient(A)
+    if _in_loops(A):
+        return LU(A, *loops.lu(constant))
+    factors, _, order = jax.lax.linalg.lu(constant)
+    return LU(A, factors, order)
 
 
 def _scaled(S: Matrix) -> tuple[Matrix, Vector]:

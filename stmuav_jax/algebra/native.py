@@ -2,9 +2,9 @@
 
 XLA's CPU compiler turns an integration's `while` loop into one native function, without dispatching
 its some hundred kernels one by one, if the loop's buffers are below a threshold, by default 1 kB.
-With a larger one a single flight runs faster, and its program takes longer to compile. Loops that
-call LAPACK (`Augmented`, `Rodas5P`, the implicit Runge-Kutta methods) gain nothing, and batches of
-many flights run slower.
+With a larger one a single flight runs faster, and its program takes longer to compile; batches of many
+flights run slower. A loop that calls a library gains nothing, so the factorisations of small matrices
+are then loops themselves (`loops`).
 """
 
 import os
@@ -27,7 +27,7 @@ def use_native_loops() -> None:
     Raises:
         SettingError: JAX's backend has already started, which reads the variable only once.
     """
-    if _OPTION in os.environ.get("XLA_FLAGS", ""):
+    if native_loops():
         return
     if _backend_has_started():
         raise SettingError(
@@ -40,6 +40,11 @@ def use_native_loops() -> None:
     kept = [flag for flag in flags if not flag.startswith(_LIST)]
     options = [flag.removeprefix(_LIST) for flag in others] + [f"{_OPTION}={_THRESHOLD}"]
     os.environ["XLA_FLAGS"] = " ".join([*kept, _LIST + ",".join(options)])
+
+
+def native_loops() -> bool:
+    """True if the environment asks XLA to compile loops into native functions."""
+    return _OPTION in os.environ.get("XLA_FLAGS", "")
 
 
 def _backend_has_started() -> bool:

@@ -100,6 +100,7 @@ def table_of(params: Path | None) -> "Parameters":
 
 def wanted_of(given: SteadyFlight, values: "Parameters") -> Any:
     """The flight condition that the options describe."""
+    from ..checks.numbers import floats
     from ..flight.flight_trim import climb, cruise, steady_turn
     from ..tracker.geometry import initial_angles
 
@@ -126,7 +127,7 @@ def wanted_of(given: SteadyFlight, values: "Parameters") -> Any:
     else:
         wanted = cruise(given.speed, course, angles, yaw, sun=sun)
     up = climb(given.climb, angles, yaw, sun=sun)
-    return wanted._replace(v=wanted.v + up.v)
+    return wanted._replace(v=floats(np.asarray(wanted.v) + np.asarray(up.v)))
 
 
 def _limits(command: TrimCommand) -> Any:
@@ -143,14 +144,13 @@ def _solved(
     command: TrimCommand, given: "Parameters", limits: Any
 ) -> tuple[Any, dict[str, np.ndarray]]:
     """The trim, and the derivatives of its values by parameters of the table, by name."""
-    import jax.numpy as jnp
-
+    from ..checks.numbers import floats
     from ..flight.flight_trim import TrimReason, trim_flight
     from ..flight.slopes import trim_slopes
     from ..scenes.uav_tracker import uav_flyer
 
     wanted = wanted_of(command.flight, given)
-    values = {name: jnp.asarray(given.value(name), dtype=float) for name in command.by}
+    values = {name: floats(given.value(name)) for name in command.by}
     if values:
         build = lambda values: uav_flyer(given.replaced(values))
         found, slopes = trim_slopes(build, values, wanted, limits)
@@ -170,7 +170,7 @@ def run_trim(command: TrimCommand) -> int:
     unknowns, labels = np.asarray(found.vector), found.names
     out = Console()
     out.print(_trim_table(unknowns, labels))
-    degrees = [math.degrees(float(a)) for a in found.coordinates.angles]
+    degrees = [math.degrees(float(a)) for a in np.asarray(found.coordinates.angles)]
     angles = ", ".join(f"{a:.4f}" for a in degrees)
     line(
         out,
@@ -235,8 +235,7 @@ def modes_table(modes: Sequence[Any]) -> Table:
 
 def run_linearize(command: Linearize) -> int:
     """Linearise, print the modes and write linear.npz; return the exit code."""
-    import jax.numpy as jnp
-
+    from ..checks.numbers import floats
     from ..figures.tuning import save_linear
     from ..flight.flight_trim import trim_flight
     from ..flight.linear import linearize
@@ -250,7 +249,7 @@ def run_linearize(command: Linearize) -> int:
     flyer = uav_flyer(given)
     found = trim_flight(flyer, wanted_of(command.flight, given))
     outputs = list(command.outputs) or None
-    values = jnp.concatenate(found.inputs)
+    values = floats(np.concatenate([np.asarray(x) for x in found.inputs]))
     linear = linearize(flyer, found.coordinates, values=values, outputs=outputs)
     out = Console()
     out.print(modes_table(linear.modes()))

@@ -27,6 +27,7 @@ from ..algebra.derivative import safe_sqrt
 from ..algebra.newton import Implicit, Newton
 from ..algebra.rotation import product, rotation_matrix, to_rotation_vector
 from ..checks.errors import ModelError, StateError, concrete
+from ..checks.numbers import floats
 from ..checks.reason import first_reason
 from ..dynamics.tree.formulation import TreeModel
 from ..mechanics.forces.applied import Gravity
@@ -132,8 +133,7 @@ class FlightTrim(eqx.Module):
     @property
     def vector(self) -> Float[Array, " n"]:
         """Values of the trim: rotation vector of the attitude [degrees], speeds, forces (n,)."""
-        turned = jnp.degrees(to_rotation_vector(self.coordinates.p))
-        return jnp.concatenate([turned, self.speeds, self.inputs.forces])
+        return _vector(self.coordinates.p, self.speeds, self.inputs.forces)
 
     @property
     def names(self) -> list[tuple[str, str]]:
@@ -217,18 +217,25 @@ def trim_flight(
         if throw:
             check_lift(flyer.propellers, limits.rotors, _weight(flyer))
     # limits are arrays, so that other values do not need another compilation
-    bounds: Any = jax.tree.map(lambda x: jnp.asarray(x, dtype=float), limits)
+    bounds: Any = jax.tree.map(floats, limits)
     found = _found(_Setting(flyer, flyer.model(), wanted), bounds)
     if throw and concrete(found.reason):
         _raise(TrimReason(int(found.reason)), found, flyer, limits)
     balanced = (TrimReason.VALID, TrimReason.ACTUATOR_LIMIT, *_OUTSIDE)
-    fine = jnp.isin(found.reason, jnp.array(balanced, found.reason.dtype))
-    keep = lambda tree: jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), tree)
-    at, inputs, speeds = keep((found.coordinates, found.inputs, found.speeds))
+    own = (found.coordinates, found.inputs, found.speeds)
+    at, inputs, speeds = own
+    if not concrete(found.reason) or int(found.reason) not in balanced:
+        fine = jnp.isin(found.reason, jnp.array(balanced, found.reason.dtype))
+        at, inputs, speeds = jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), own)
     at = at._replace(internal=speeds) if lagging else at
     return FlightTrim(
         at, inputs, speeds, found.residual, found.conditioning, found.reason, found.steps
     )
+
+
+@kept_jit
+def _vector(p: Array, speeds: Array, forces: Array) -> Array:
+    return jnp.concatenate([jnp.degrees(to_rotation_vector(p)), speeds, forces])
 
 
 def _check_kinds(flyer: Any, wanted: Any, limits: Any) -> None:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import kept_jit
 from ..algebra.rotation import (
     conjugate,
     from_rotation_vector,
@@ -25,6 +26,7 @@ from ..algebra.rotation import (
 )
 from ..algebra.sampled import Sampled
 from ..checks.errors import ModelError
+from ..checks.numbers import floats
 from ..dynamics.formulations.stabilisation import Unstabilised
 from ..dynamics.statespace.base import AbstractStateSpace, Time
 from ..dynamics.statespace.names import BASE
@@ -114,6 +116,12 @@ class FlyerAccelerations(NamedTuple):
     angles: Float[Array, "2"]
 
 
+@kept_jit
+def _conditioning(geometry: TrackerGeometry, angles: Float[Array, "2"]) -> Float[Array, ""]:
+    values = jnp.linalg.svd(stroke_jacobian(geometry, angles), compute_uv=False)
+    return values[-1] / values[0]
+
+
 class Flyer(AbstractStateSpace):
     """Reduced-coordinate model of base and tracker, with rotors and actuators.
 
@@ -157,7 +165,7 @@ class Flyer(AbstractStateSpace):
                 f"system has {len(rotors)} and those for {', '.join(sorted(pushers)) or 'none'}."
             )
         self.system, self.geometry = system, geometry
-        self.displacement, self.limits = jnp.asarray(displacement, dtype=float), limits
+        self.displacement, self.limits = floats(displacement), limits
         self.rotors = rotors[0]
         self.actuators = (pushers["slider_2"], pushers["slider_3"])
         self.dof, self.is_flat = 8, False
@@ -282,8 +290,7 @@ class Flyer(AbstractStateSpace):
 
     def conditioning(self, x: FlyerPoint, t: Time = 0.0) -> Float[Array, ""]:
         del t
-        values = jnp.linalg.svd(stroke_jacobian(self.geometry, x.angles), compute_uv=False)
-        return values[-1] / values[0]
+        return _conditioning(self.geometry, x.angles)
 
     def model(self) -> TreeModel:
         """Parameters of the spanning tree, which do not depend on the inputs."""

@@ -23,9 +23,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..algebra.compiler import quick_jit
-from ..algebra.derivative import value_and_jacobian
-from ..algebra.least_squares import Search, search
+from ..algebra.least_squares import Search, search, value_and_columns
 from ..algebra.space import CyclicVector, Point, Vector
 from ..checks.errors import ModelError, SettingError, check_finite
 from ..checks.shapes import Numbers
@@ -204,6 +202,12 @@ def _read(
     return jax.vmap(see)(ts, path)
 
 
+@eqx.filter_jit
+def predicted(predict: Predict, q: Float[Array, " p"]) -> Float[Array, "k m"]:
+    """Predictions at parameters q, traced once for their shapes, their derivatives and the search."""
+    return predict(q)
+
+
 class Misfit(eqx.Module):
     """Residuals (k, m) of a record over sigma, as a function of z (p,), q = start + sizes z.
 
@@ -217,13 +221,14 @@ class Misfit(eqx.Module):
     sizes: Float[Array, " p"]
 
     def __call__(self, z: Float[Array, " p"]) -> Float[Array, "k m"]:
-        return (self.predict(self.start + self.sizes * z) - self.record) / self.sigma
+        return (predicted(self.predict, self.start + self.sizes * z) - self.record) / self.sigma
 
 
-@quick_jit
-def _at(residuals: Misfit, z: Float[Array, " p"]) -> tuple[Float[Array, " n"], Float[Array, "n p"]]:
-    """Residuals and their Jacobian at scaled parameters z."""
-    r, J = value_and_jacobian(residuals, z)
+def residuals_and_jacobian(
+    residuals: Misfit, z: Float[Array, " p"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (n,) and their Jacobian (n, p) at scaled parameters z, by the search's program."""
+    r, J = map(np.asarray, value_and_columns(residuals, z))
     return r.reshape(-1), J.reshape(-1, z.shape[0])
 
 
@@ -290,7 +295,7 @@ def identify(
     _check(predict, record, sigma, q0, sizes, names)
     numbers = (jnp.asarray(x, dtype=float) for x in (record, sigma, q0, sizes))
     residuals = Misfit(predict, *numbers)
-    r, J = (np.asarray(x) for x in _at(residuals, jnp.zeros_like(q0)))
+    r, J = (np.asarray(x) for x in residuals_and_jacobian(residuals, jnp.zeros_like(q0)))
     _check_start(r, J, q0, names)
     check_identifiable(J, names, min_singular_value)
     return _fitted(residuals, names, min_singular_value, steps, report, resume)
@@ -338,7 +343,7 @@ def _fitted(
     zero = jnp.zeros_like(residuals.start)
     method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
     found = search(residuals, zero, method, steps=steps, report=report, resume=resume)
-    r, J = (np.asarray(x) for x in _at(residuals, found.values))
+    r, J = (np.asarray(x) for x in residuals_and_jacobian(residuals, found.values))
     singular_values = check_identifiable(J, names, min_singular_value)
     scale = np.asarray(residuals.sizes)
     covariance = scale[:, None] * np.linalg.inv(J.T @ J) * scale
@@ -369,7 +374,7 @@ def _check(
 ) -> None:
     for value, what in ((record, "The record"), (sigma, "The deviations of the record")):
         check_finite(value, what, "")
-    shape = jax.eval_shape(predict, q0).shape
+    shape = eqx.filter_eval_shape(predicted, predict, q0).shape
     if np.shape(record) != shape:
         raise ModelError(f"The record has shape {np.shape(record)}, but predictions have {shape}.")
     if np.shape(sigma) != shape[-1:] or not np.all(np.asarray(sigma) > 0):

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from ..algebra.rotation import conjugate, product, rotation_matrix, to_rotation_vector
 from ..algebra.space import Point
 from ..checks.errors import ModelError, SettingError, concrete
-from ..checks.numbers import numbers
+from ..checks.numbers import array_module, as_numpy, floats, numbers
 from ..checks.shapes import Numbers
 from ..dynamics.statespace.base import AbstractStateSpace, places_of
 from ..dynamics.statespace.names import BASE
@@ -67,7 +67,7 @@ def hover(angles: Any = None, yaw: Any = 0.0, *, sun: Any = None) -> FlightCondi
 def climb(speed: Any, angles: Any = None, yaw: Any = 0.0, *, sun: Any = None) -> FlightCondition:
     """Straight up at a speed [m/s]; negative for a descent."""
     speed = numbers(speed, (), "The speed of the climb", "m/s")
-    return _flight(angles, sun, yaw, speed * _UP, 0.0)
+    return _flight(angles, sun, yaw, floats(as_numpy(speed) * _UP), 0.0)
 
 
 def cruise(
@@ -76,8 +76,9 @@ def cruise(
     """Level flight at a speed [m/s] towards a course from x to y [rad]."""
     speed = numbers(speed, (), "The level speed", "m/s")
     course = numbers(course, (), "The course", "rad")
-    along = jnp.stack([jnp.cos(course), jnp.sin(course), jnp.zeros_like(course)])
-    return _flight(angles, sun, yaw, speed * along, 0.0)
+    module, (speed, course) = array_module(speed, course), as_numpy((speed, course))
+    along = module.stack([module.cos(course), module.sin(course), module.zeros_like(course)])
+    return _flight(angles, sun, yaw, floats(speed * along), 0.0)
 
 
 def steady_turn(
@@ -191,7 +192,7 @@ def _flight(angles: Any, sun: Any, yaw: Any, v: Array, rate: Any) -> FlightCondi
         angles = numbers(angles, (2,), "The pair of the panel's angles", "rad")
     if sun is not None:
         sun = numbers(sun, (3,), "The direction to the sun", "")
-        if concrete(sun) and not float(jnp.linalg.norm(sun)) > 0:
+        if concrete(sun) and not np.linalg.norm(np.asarray(sun)) > 0:
             raise ModelError("The direction to the sun must not be zero.")
     yaw = numbers(yaw, (), "The heading", "rad")
-    return FlightCondition(angles, sun, yaw, v, jnp.asarray(rate, dtype=float), jnp.zeros(3))
+    return FlightCondition(angles, sun, yaw, v, floats(rate), floats(np.zeros(3)))

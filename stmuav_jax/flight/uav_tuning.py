@@ -113,7 +113,8 @@ def holding_time(
 
     To 5 ms; at most `max_time`.
     """
-    method = Method(rtol=1e-10, atol=1e-12) if method is None else method
+    # nothing is differentiated here, so that no modes need to bound the steps
+    method = Method(rtol=1e-10, atol=1e-12, steps="state") if method is None else method
     ts = jnp.arange(0.0, max_time + 2.5e-3, 5e-3)
     reached, turned = map(np.asarray, _departures(flyer, inputs, start, ts, method))
     out = ~(turned < limit) | (np.diff(reached, prepend=-1.0) <= 0)

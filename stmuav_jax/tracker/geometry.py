@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import kept_jit
 from ..algebra.derivative import safe_sqrt
 from ..checks.errors import ModelError, check_finite, check_shape, concrete
 from ..checks.numbers import floats
@@ -203,6 +204,11 @@ def close_loops(geometry: TrackerGeometry, turn: Turn) -> Loops:
     return Loops(lever, lean, post_square, rise, balls, beside, squares)
 
 
+@kept_jit
+def _loops_at(geometry: TrackerGeometry, angles: Float[Array, "2"]) -> Loops:
+    return close_loops(geometry, turn_by_angles(angles))
+
+
 def check_closure(geometry: TrackerGeometry, angles: Float[Array, "2"]) -> None:
     """Raise `ModelError` unless post and rods reach at one posture.
 
@@ -214,7 +220,7 @@ def check_closure(geometry: TrackerGeometry, angles: Float[Array, "2"]) -> None:
     """
     if not concrete(geometry, angles):
         return
-    loops = close_loops(geometry, turn_by_angles(angles))
+    loops = _loops_at(geometry, angles)
     phi, theta = np.degrees(np.asarray(angles))
     posture = f"at phi = {phi:.4g}, theta = {theta:.4g} degrees"
     lean = abs(float(loops.lean))

@@ -29,7 +29,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..algebra.compiler import kept_jit
 from ..checks.errors import ModelError, check_finite, check_shape, concrete
+from ..checks.numbers import floats
 from ..checks.reason import first_reason
 from ..checks.shapes import Numbers
 from ..parameters.table import Parameters
@@ -73,11 +75,11 @@ class Limits(eqx.Module):
         tilt: Numbers = np.pi / 3,
         margin: Numbers = 0.0,
     ) -> None:
-        self.home = jnp.asarray(home, dtype=float)
-        self.lower = jnp.asarray(lower, dtype=float)
-        self.upper = jnp.asarray(upper, dtype=float)
-        self.tilt = jnp.asarray(tilt, dtype=float)
-        self.margin = jnp.asarray(margin, dtype=float)
+        self.home = floats(home)
+        self.lower = floats(lower)
+        self.upper = floats(upper)
+        self.tilt = floats(tilt)
+        self.margin = floats(margin)
         for name in ("home", "lower", "upper"):
             check_shape(getattr(self, name), (2,), f"{name} of the workspace's limits")
         check_finite(self.home, "home of the workspace's limits", "m")
@@ -106,7 +108,7 @@ def tracker_limits(parameters: Parameters) -> Limits:
     geometry, angles = tracker_geometry(parameters), initial_angles(parameters)
     check_closure(geometry, angles)
     return Limits(
-        home=strokes(geometry, angles),
+        home=kept_jit(strokes)(geometry, angles),
         lower=parameters.value("stop.lower"),
         upper=parameters.value("stop.upper"),
         tilt=parameters.value("workspace.tilt"),

@@ -7,7 +7,6 @@ import threading
 from collections import OrderedDict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -143,9 +142,6 @@ def test_numbers_that_become_part_of_the_program_change_its_name(folder):
     def scaled(number):
         return lambda a, b: number * a + b
 
-    def written(number):
-        return Written(np.asarray(number), A)
-
     for one, other in (
         (scaled(jnp.asarray(2.0)), scaled(jnp.asarray(3.0))),
         (partial(dot, A), partial(dot, B)),
@@ -153,14 +149,6 @@ def test_numbers_that_become_part_of_the_program_change_its_name(folder):
     ):
         assert key(one) is not None
         assert key(one) != key(other)
-    assert key(dot, written(2.0)) != key(dot, written(3.0))
-
-
-class Written(eqx.Module):
-    """Numbers that JAX looks into, and some that it does not."""
-
-    number: Any = eqx.field(static=True)
-    array: Any
 
 
 def test_quick_programs_are_kept_too(folder, monkeypatch):

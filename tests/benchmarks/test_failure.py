@@ -40,17 +40,12 @@ def moving():
 
 def accelerations(scene, variant, t=0.1):
     model = Report(scene, variant)
-    y = model.begin(scene)
-    q = model.accelerations(t, y)
+    q = model.accelerations(t, model.start(scene))
     L = g_and_l(np.asarray(scene.state0.p))[1]
-    return q[:, :3] * variant.metres, 2 * (L @ q[:, 3:, None])[..., 0]
+    return q[:, :3], 2 * (L @ q[:, 3:, None])[..., 0]
 
 
-@pytest.mark.parametrize(
-    "variant",
-    [Variant(), Variant(frozen=True), Variant(inverse=True), Variant(metres=1e-3)],
-    ids=["corrected", "frozen", "inverse", "millimetres"],
-)
+@pytest.mark.parametrize("variant", [Variant(), Variant(frozen=True)], ids=["corrected", "frozen"])
 @pytest.mark.parametrize("couple", ["consistent", "printed"])
 def test_accelerations_are_those_of_the_package(moving, variant, couple):
     system = stm.make_scene("uav_tracker", 2, actuators=couple).system
@@ -67,14 +62,10 @@ def test_misprints_change_the_accelerations(moving, variant):
     assert np.max(np.abs(wrong - right)) > 1e-4 * np.max(np.abs(right))
 
 
-def test_energy_and_residuals_of_the_start(moving):
-    for metres in (1.0, 1e-3):
-        model = Report(moving, Variant(metres=metres))
-        y = model.begin(moving)
-        want = stm.dynamics.energy(moving.system, moving.state0, jnp.zeros(())).total
-        assert abs(model.energy(y) - want) <= 1e-12 * abs(want)
-        assert model.violation(y) < 1e-10
-        assert model.norm_error(y) < 1e-15
+def test_residuals_of_the_start(moving):
+    model = Report(moving)
+    assert model.violation(model.start(moving)) < 1e-10
+    assert model.norm_error(model.start(moving)) < 1e-15
 
 
 @pytest.mark.parametrize(

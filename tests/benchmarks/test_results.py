@@ -17,6 +17,9 @@ RESULTS = sorted(record.RESULTS.glob("*.json"))
 # Results whose commit is not in the history, each with the reason. There is none, and none may come.
 KNOWN_STALE: dict[str, str] = {}
 
+# Benchmarks that have not been run on a quiet machine yet. A name leaves with its first result.
+NOT_RUN_YET = {"compile_times"}
+
 
 def commits(path: Path) -> set[str]:
     """All commits that a result names: its own, and those of its parts."""
@@ -49,7 +52,7 @@ def test_the_list_of_stale_results_names_results():
 
 
 def test_every_result_belongs_to_a_benchmark_that_all_runs():
-    assert {path.stem for path in RESULTS} == set(everything.BENCHMARKS)
+    assert {path.stem for path in RESULTS} == set(everything.BENCHMARKS) - NOT_RUN_YET
     scripts = {FOLDER / script for script, *_ in everything.BENCHMARKS.values()}
     assert all(script.exists() for script in scripts)
 

@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
 import stmuav_jax as stm
+from stmuav_jax.tracker.drive import SLIDER_JOINTS
 
 G = 9.81
 
@@ -66,3 +68,45 @@ def four_bar(angle=1.0, torque=0.0, masses=MASSES, damping=None):
     if damping is not None:
         forces.append(stm.mechanics.JointDamping("D", turning=damping))
     return stm.System(bodies, joints, forces)
+
+
+def stewart():
+    """A platform on six legs of universal, translational and spherical joints, each pushed."""
+    turn = lambda k, r, z, off: np.array(
+        [r * np.cos(k * np.pi / 3 + off), r * np.sin(k * np.pi / 3 + off), z]
+    )
+    feet = [turn(k, 1.0, 0.0, 0.15 * (-1) ** k) for k in range(6)]
+    heads = [turn(k, 0.6, 1.2, -0.25 * (-1) ** k) for k in range(6)]
+    bodies = [stm.Body("platform", 20.0, np.diag([1.0, 1.2, 1.8]), position=[0.0, 0.0, 1.25])]
+    joints, efforts = [], []
+    for k, (foot, head) in enumerate(zip(feet, heads, strict=True)):
+        axis = (head - foot) / np.linalg.norm(head - foot)
+        across = np.cross(axis, [0.0, 0.0, 1.0])
+        across /= np.linalg.norm(across)
+        other = np.cross(axis, across)
+        for part, share, mass in (("barrel", 0.25, 0.8), ("rod", 0.75, 0.5)):
+            place = foot + share * (head - foot)
+            bodies.append(stm.Body(f"{part}_{k}", mass, np.eye(3) * 0.01, position=place))
+        joints += [
+            stm.universal(
+                f"U{k}", "ground", f"barrel_{k}", point=foot, axis_i=across, axis_j=other
+            ),
+            stm.translational(
+                f"T{k}", f"barrel_{k}", f"rod_{k}", point=(foot + head) / 2, axis=axis
+            ),
+            stm.spherical(f"S{k}", f"rod_{k}", "platform", point=head),
+        ]
+        efforts.append(stm.JointEffort(f"T{k}", 0.0))
+    return (
+        stm.System(bodies, joints, [stm.Gravity([0.0, 0.0, -G]), *efforts]),
+        np.array(feet),
+        np.array(heads),
+    )
+
+
+def ground_tracker():
+    """The report's tracker on the ground, each of its sliders pushed by an effort of its joint."""
+    scene = stm.make_scene("tracker")
+    efforts = [stm.JointEffort(name, 0.0) for name in SLIDER_JOINTS]
+    forces = (stm.Gravity([0.0, 0.0, -G]), *efforts)
+    return eqx.tree_at(lambda s: s.forces, scene.system, forces)

@@ -4,7 +4,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import BASE, COUPLER, CRANK, INERTIAS, MASSES, ROCKER, G, cart_pole, four_bar
+from mechanisms import (
+    BASE,
+    COUPLER,
+    CRANK,
+    INERTIAS,
+    MASSES,
+    ROCKER,
+    G,
+    cart_pole,
+    four_bar,
+    ground_tracker,
+    stewart,
+)
 
 import stmuav_jax as stm
 
@@ -24,6 +36,19 @@ def test_names_of_a_cart_pole(cart):
     assert (space.dof, space.size) == (2, 4)
     assert stm.inputs_of(space.system).names == (("effort", "N or N m"),)
     assert float(space.conditioning(x)) == 1.0
+
+
+def test_stacked_points_differ_as_single_ones_do(cart):
+    """A stack of errors along the last axis, with an angle beyond half a turn."""
+    space, x = cart
+    x = jax.tree.map(lambda leaf: leaf[:, None, None], x)
+    v = 0.3 * np.random.default_rng(1).normal(size=(4, 2, 3))
+    v[1, 0, 0] = 3.0
+    turned = v.copy()
+    turned[1, 0, 0] += 2 * np.pi
+    for given in (v, turned):
+        found = space.difference(space.retract(x, jnp.asarray(given)), x)
+        np.testing.assert_allclose(found, v, atol=1e-14)
 
 
 def test_matrices_of_a_cart_pole_in_closed_form(cart):
@@ -167,41 +192,61 @@ def test_a_singular_posture_is_reported():
         stm.TreeSpace(stm.System(bodies, joints))
 
 
+# --- the hexacopter in hover, against the rigid body's closed form
+
+
+def test_matrices_of_a_hexacopter_in_closed_form():
+    """Level, with errors (r, turn in body axes, v, omega): v' = g turn x z + lift z / m, J omega' = M u."""
+    scene = stm.make_scene("hexacopter")
+    space = stm.TreeSpace(scene.system)
+    x = space.from_state(scene.system.reference)
+    rotors = scene.system.forces[1]
+    held = stm.flight.trim_condition(space, stm.flight.hover(), at=x)
+    found = stm.linearize(space, held.point, values=held.values)
+    mass, J = float(scene.system.bodies.mass[0]), np.asarray(scene.system.bodies.inertia[0])
+    arms, spin = np.asarray(rotors.arms) - np.asarray(scene.system.bodies.com[0]), rotors.spin
+    k_f, up = float(rotors.k_f), np.array([0.0, 0.0, 1.0])
+    A, B = np.zeros((12, 12)), np.zeros((12, 6))
+    A[:6, 6:] = np.eye(6)
+    A[6, 4], A[7, 3] = G, -G
+    B[8] = k_f / mass
+    moments = k_f * np.cross(arms, up) - float(rotors.k_tau) * np.outer(spin, up)
+    B[9:] = np.linalg.solve(J, moments.T)
+    np.testing.assert_allclose(found.A, A, atol=1e-12 * G)
+    np.testing.assert_allclose(found.B, B, atol=1e-12 * np.max(np.abs(B)))
+
+
+# --- the tracker on the ground, against its energies
+
+
+@pytest.mark.slow
+def test_matrices_of_the_tracker_on_the_ground():
+    """At rest, M q'' = -K q + S^T f, with M, K and S from the energies and the strokes."""
+    space = stm.TreeSpace(ground_tracker())
+    x, bodies = space.from_state(space.system.reference), space.system.bodies
+    held = stm.trim(space, at=x).values
+    found = stm.linearize(space, x, values=held)
+    sliders = np.array([space.system.index(name) for name in ("slider_2", "slider_3")])
+
+    def potential(q):
+        r = space.to_state(space.retract(x, jnp.concatenate([q, jnp.zeros(2)]))).r
+        return G * (bodies.mass @ r[:, 2]) - held @ r[sliders, 2]
+
+    def speeds(u):
+        state = space.to_state(space.retract(x, jnp.concatenate([jnp.zeros(2), u])))
+        return state.v, state.omega
+
+    zero = jnp.zeros(2)
+    K = np.asarray(jax.jit(jax.jacfwd(jax.jacfwd(potential)))(zero))
+    v, omega = (np.asarray(part) for part in jax.jit(jax.jacfwd(speeds))(zero))
+    M = np.einsum("b,bik,bil->kl", bodies.mass, v, v)
+    M += np.einsum("bik,bij,bjl->kl", omega, bodies.inertia, omega)
+    np.testing.assert_allclose(found.A[2:, :2], -np.linalg.solve(M, K), rtol=1e-8)
+    np.testing.assert_allclose(found.B[2:], np.linalg.solve(M, v[sliders, 2].T), rtol=1e-8)
+    np.testing.assert_allclose(found.A[2:, 2:], 0.0, atol=1e-9)
+
+
 # --- a Stewart platform: six legs, six degrees of freedom
-
-
-def stewart():
-    """A platform on six legs of universal, translational and spherical joints, each pushed."""
-    turn = lambda k, r, z, off: np.array(
-        [r * np.cos(k * np.pi / 3 + off), r * np.sin(k * np.pi / 3 + off), z]
-    )
-    feet = [turn(k, 1.0, 0.0, 0.15 * (-1) ** k) for k in range(6)]
-    heads = [turn(k, 0.6, 1.2, -0.25 * (-1) ** k) for k in range(6)]
-    bodies = [stm.Body("platform", 20.0, np.diag([1.0, 1.2, 1.8]), position=[0.0, 0.0, 1.25])]
-    joints, efforts = [], []
-    for k, (foot, head) in enumerate(zip(feet, heads, strict=True)):
-        axis = (head - foot) / np.linalg.norm(head - foot)
-        across = np.cross(axis, [0.0, 0.0, 1.0])
-        across /= np.linalg.norm(across)
-        other = np.cross(axis, across)
-        for part, share, mass in (("barrel", 0.25, 0.8), ("rod", 0.75, 0.5)):
-            place = foot + share * (head - foot)
-            bodies.append(stm.Body(f"{part}_{k}", mass, np.eye(3) * 0.01, position=place))
-        joints += [
-            stm.universal(
-                f"U{k}", "ground", f"barrel_{k}", point=foot, axis_i=across, axis_j=other
-            ),
-            stm.translational(
-                f"T{k}", f"barrel_{k}", f"rod_{k}", point=(foot + head) / 2, axis=axis
-            ),
-            stm.spherical(f"S{k}", f"rod_{k}", "platform", point=head),
-        ]
-        efforts.append(stm.JointEffort(f"T{k}", 0.0))
-    return (
-        stm.System(bodies, joints, [stm.Gravity([0.0, 0.0, -G]), *efforts]),
-        np.array(feet),
-        np.array(heads),
-    )
 
 
 @pytest.fixture(scope="module")
@@ -223,8 +268,31 @@ def test_stewart_platform(platform):
     linear = stm.linearize(space, found.point, values=found.values)
     assert linear.A.shape == (12, 12)
     np.testing.assert_allclose(linear.A[:6, 6:], np.eye(6), atol=1e-12)
-    # the inverse of the mass matrix in the legs' lengths is symmetric
-    np.testing.assert_allclose(linear.B[6:], linear.B[6:].T, atol=1e-9 * np.max(np.abs(linear.B)))
+    exact = np.linalg.inv(mass_by_lengths(feet, heads))
+    np.testing.assert_allclose(linear.B[6:], exact, atol=1e-9 * np.max(np.abs(exact)))
+
+
+def mass_by_lengths(feet, heads):
+    """Mass matrix in the legs' lengths (6, 6), from the velocities of all bodies written out.
+
+    A leg turns about the two axes of its universal joint, which are across it here.
+    """
+    legs, centre = heads - feet, np.array([0.0, 0.0, 1.25])
+    length = np.linalg.norm(legs, axis=1)
+    axes = legs / length[:, None]
+    arms = heads - centre
+    twist = np.linalg.inv(np.concatenate([axes, np.cross(arms, axes)], axis=1))
+    # columns: what a unit rate of each length does
+    v, omega = twist[:3], twist[3:]
+    M = 20.0 * v.T @ v + omega.T @ np.diag([1.0, 1.2, 1.8]) @ omega
+    for k in range(6):
+        head = v + np.cross(omega, arms[k], axis=0)
+        turning = np.cross(axes[k], head, axis=0) / length[k]
+        barrel = np.cross(turning, 0.25 * legs[k], axis=0)
+        rod = np.cross(turning, 0.75 * legs[k], axis=0)
+        rod[:, k] += axes[k]
+        M += 0.8 * barrel.T @ barrel + 0.5 * rod.T @ rod + 0.02 * turning.T @ turning
+    return M
 
 
 def static_forces(feet, heads):

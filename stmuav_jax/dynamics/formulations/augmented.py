@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ...algebra.linalg import Factor, MinimumNorm, factorise, solve_general
+from ...algebra.linalg import Factor, MinimumNorm, factorise, product_transposed, solve_general
 from ...algebra.rotation import (
     euler_parameter_rate,
     from_rotation_vector,
@@ -167,7 +167,8 @@ class Augmented(AbstractFormulation):
         return Accelerations(total[:, :3], total[:, 3:], multipliers), eq.target
 
     def _factor(self, eq: Equations, weighed: Float[Array, "m k"]) -> Factor | MinimumNorm:
-        return factorise(weighed @ eq.matrix.T, redundant=self.redundant, rcond=self.rcond)
+        S = product_transposed(weighed, eq.matrix)
+        return factorise(S, redundant=self.redundant, rcond=self.rcond)
 
     def _dense(
         self,

@@ -20,6 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...algebra.linalg import lu
+from ...algebra.native import native_loops
+
 Vector = Float[Array, " k"]
 
 _GAMMA = 0.21193756319429014
@@ -136,7 +139,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         t0 = jnp.asarray(t0, y0.dtype)
         J, by_time = _derivatives(field, t0, y0)
         W = jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - J
-        factor = jax.scipy.linalg.lu_factor(W)
+        factor = lu(W)
         A, C = _weights(), _table(_C)
         c = np.array([0.0, *_POINTS, 1.0, 1.0, 1.0])
         d = np.array([*_D, 0.0, 0.0, 0.0])
@@ -145,7 +148,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
             a, of_h, point, weight, number = at
             y = y0 + jnp.sum(a[:, None] * found, axis=0)
             right = field(t0 + point * h, y) + jnp.sum(of_h[:, None] * found, axis=0) / h
-            k = jax.scipy.linalg.lu_solve(factor, right + h * weight * by_time)
+            k = factor.solve(right + h * weight * by_time)
             return jax.lax.dynamic_update_index_in_dim(found, k, number, 0), None
 
         table = (*map(jnp.asarray, (A, C, c, d)), jnp.arange(_STAGES))
@@ -174,5 +177,9 @@ def _derivatives(
     size = y.shape[0]
     directions = jnp.eye(size + 1, dtype=y.dtype)
     push = lambda v: jax.jvp(field, (t, y), (v[size], v[:size]))[1]
-    columns = jax.vmap(push, out_axes=1)(directions)
+    if native_loops():
+        # one direction at a time: XLA's native loops are slow at many directions side by side
+        columns = jax.lax.map(push, directions).T
+    else:
+        columns = jax.vmap(push, out_axes=1)(directions)
     return columns[:, :size], columns[:, size]

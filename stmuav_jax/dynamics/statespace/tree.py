@@ -173,7 +173,7 @@ class TreeSpace(AbstractStateSpace):
         # angles of revolute joints are periodic
         turning = np.array(self._periodic(), dtype=bool)
         turns = jnp.round(own / (2 * jnp.pi))
-        own = own - 2 * jnp.pi * jnp.where(aligned(turning, own.ndim - 1), turns, 0.0)
+        own = own - 2 * jnp.pi * jnp.where(aligned(turning, own.ndim), turns, 0.0)
         base = (
             [y.r - x.r, to_rotation_vector(product(conjugate(x.p), y.p))] if tree.floating else []
         )

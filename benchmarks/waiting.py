@@ -1,0 +1,98 @@
+"""How long each command of the command line keeps its user waiting: times and peak memory.
+
+Each command with the example of its help, as a process of its own. Cold is a new cache folder for
+each run, warm the same folder again. CPU time is that of all threads, user and system.
+"""
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from shared.command import begin, parser
+from shared.record import write
+
+COMMANDS = {
+    "list": "list",
+    "simulate": "simulate uav_tracker --case 2",
+    "simulate, loads": "simulate uav_tracker --case 2 --t1 1 --loads",
+    "sun": "sun --lat 11.55 --lon 104.92 --date 2024-03-21 --timezone Asia/Phnom_Penh",
+    "trim": "trim --phi 10 --theta -5",
+    "trim, sensitivities": "trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods",
+    "linearize": "linearize --sun 150 60 --outputs phi theta",
+    "tune hold": "tune hold --t1 0.4",
+    "tune slew": "tune slew",
+    "tune identify": "tune identify",
+    "estimate": "estimate",
+}
+
+
+def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
+    """Times [s] and peak memory [MB] of one run of the command line, and its exit code."""
+    given = [*words.split(), *(["--out", str(out)] if words != "list" else [])]
+    command = [sys.executable, "-m", "stmuav_jax.cli", *given]
+    clock = time.perf_counter()
+    process = subprocess.Popen(
+        command,
+        env={**os.environ, "XDG_CACHE_HOME": str(cache)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    return {
+        "wall": time.perf_counter() - clock,
+        "cpu": used.ru_utime + used.ru_stime,
+        "memory": used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3),
+        "exit": process.returncode,
+    }
+
+
+def least(runs: list[dict[str, Any]]) -> dict[str, float]:
+    """Least CPU time, which the machine's other work lengthens, and medians of the rest."""
+    median = lambda name: statistics.median(run[name] for run in runs)
+    return {
+        "cpu": min(run["cpu"] for run in runs),
+        "wall": median("wall"),
+        "memory": median("memory"),
+    }
+
+
+def measured(words: str, repeats: int) -> dict[str, Any]:
+    """Cold and warm runs of one command."""
+    runs: dict[str, list[dict[str, Any]]] = {"cold": [], "warm": []}
+    for _ in range(repeats):
+        with tempfile.TemporaryDirectory() as folder:
+            for kind in runs:
+                runs[kind].append(one(words, Path(folder) / "cache", Path(folder) / "out"))
+    return {"words": words, **{kind: {**least(own), "runs": own} for kind, own in runs.items()}}
+
+
+def main() -> None:
+    """Run and write `waiting.json`, after each command what there is so far."""
+    made = parser(__doc__, quick="the command `list` once, for a smoke test")
+    made.add_argument("--repeats", type=int, default=3)
+    made.add_argument("--only", nargs="+", choices=tuple(COMMANDS), default=tuple(COMMANDS))
+    options = made.parse_args()
+    begin(options)
+    names = ("list",) if options.quick else options.only
+    found: dict[str, Any] = {}
+    for name in names:
+        found[name] = measured(COMMANDS[name], 1 if options.quick else options.repeats)
+        for kind in ("cold", "warm"):
+            own = found[name][kind]
+            print(
+                f"{name}, {kind}: "
+                + ", ".join(f"{k} {own[k]:.1f}" for k in ("cpu", "wall", "memory"))
+            )
+        about = "stmuav, whole process: CPU and wall time [s], peak memory [MB]"
+        path = write("waiting", {"what": about, "commands": found}, options.results)
+    print(path)
+
+
+if __name__ == "__main__":
+    main()
