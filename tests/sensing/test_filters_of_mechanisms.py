@@ -266,7 +266,7 @@ def test_other_mechanisms_over_a_hundred_seeds(case):
     parts = {"all": slice(0, space.size)}
     out = consistent(model, fine, prior, start, wander, jnp.asarray(u), 0.02, parts, level=0.999)
     # what is known at the end is more than what was known at the start
-    after = np.sum(np.log(np.asarray(jnp.mean(out.deviation[-1], axis=-1)) / start))
+    after = np.sum(np.log(np.asarray(jnp.mean(out.standard_deviation[-1], axis=-1)) / start))
     assert after < -1.0
 
 
