@@ -90,7 +90,8 @@ def integration(solver: diffrax.AbstractSolver, hold: str, redundant: bool) -> C
         good = found.ts >= ts * (1 - 1e-12)
         of = jax.vmap(lambda state: stm.dynamics.energy(system, state, jnp.zeros(())))(found.states)
         took, not_taken = found.counts.accepted[-1], found.counts.rejected[-1]
-        worst, calls = found.worst.position[-1], evaluations(solver, took + not_taken)
+        worst = found.worst.position[-1]
+        calls: Any = evaluations(solver, took + not_taken)
         return Path(good, of.kinetic + of.potential, of.kinetic, took, not_taken, calls, worst)
 
     return run

@@ -29,6 +29,7 @@ COMMANDS = {
     "tune identify": "tune identify",
     "estimate": "estimate",
 }
+ABOUT = "stmuav, whole process: CPU and wall time [s], peak memory [MB]"
 
 
 def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
@@ -89,9 +90,7 @@ def main() -> None:
                 f"{name}, {kind}: "
                 + ", ".join(f"{k} {own[k]:.1f}" for k in ("cpu", "wall", "memory"))
             )
-        about = "stmuav, whole process: CPU and wall time [s], peak memory [MB]"
-        path = write("waiting", {"what": about, "commands": found}, options.results)
-    print(path)
+        print(write("waiting", {"what": ABOUT, "commands": found}, options.results))
 
 
 if __name__ == "__main__":

@@ -68,7 +68,8 @@ def follow(
             failure = failure or "The state is not finite."
             break
         states[k] = x
-    return Path(states, *map(int, counts), failure)
+    evaluations, accepted, rejected = map(int, counts)
+    return Path(states, evaluations, accepted, rejected, failure)
 
 
 class ScipyDense(Peer):

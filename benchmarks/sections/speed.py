@@ -257,8 +257,8 @@ def exponent(rows: list[dict[str, Any]], key: str, least: int) -> float | None:
     """k of seconds ~ N^k by least squares over rows with N >= least."""
     read = lambda row: row[key]["median"] if isinstance(row[key], dict) else row[key]
     fits = (row for row in rows if row["loops"] >= least and not row["failure"] and row[key])
-    good = [(row["loops"], read(row)) for row in fits]
-    return float(np.polyfit(*np.log(good).T, 1)[0]) if len(good) > 1 else None
+    good = np.log([(row["loops"], read(row)) for row in fits])
+    return float(np.polyfit(good[:, 0], good[:, 1], 1)[0]) if len(good) > 1 else None
 
 
 def scaling(size: Size, others: list[Peer]) -> dict[str, Any]:

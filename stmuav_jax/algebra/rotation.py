@@ -88,7 +88,7 @@ def rotation_matrix(p: Quats) -> Float[Array, "3 3 ..."]:
 
     Source: report Part II, Eq. 6.10, corrected (its (1,1) entry is misprinted).
     """
-    return rotation_matrix_in(jnp, p)
+    return jnp.asarray(rotation_matrix_in(jnp, p))
 
 
 def rotation_matrix_in(module: Any, p: Quats) -> Float[Array | np.ndarray, "3 3 ..."]:

@@ -15,7 +15,9 @@ def dot(a: Float[Array, "k *#s"], b: Float[Array, "k *#s"]) -> Float[Array, "...
     return jnp.sum(a * b, axis=0)
 
 
-def apply(A: Float[Array, "i j *#s"], b: Float[Array, "j *#s"]) -> Float[Array, "i ..."]:
+def apply(
+    A: Float[Array, "i j *#s"], b: Float[Array | np.ndarray, "j *#s"]
+) -> Float[Array, "i ..."]:
     """Product A b of a matrix and a vector."""
     return jnp.sum(A * b[None], axis=1)
 

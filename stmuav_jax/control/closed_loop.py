@@ -155,9 +155,10 @@ def close_loop(
     if balances:
         plant = plant.with_motion(plant.motion.with_method(balances=True))
     run = _Loop(controller, reference, memory, signals, samples)
-    (found, total), *seconds = _carried_out(run, plant, key)
+    (found, total), *times = _carried_out(run, plant, key)
+    compiling, running = times
     difference = _difference(run, plant, key, found) if check_steps else (None, None)
-    certificate, failure = _certified(plant, found, total, tuple(seconds), difference)
+    certificate, failure = _certified(plant, found, total, (compiling, running), difference)
     result = LoopRun(plant, found, certificate, failure)
     if failure and throw:
         raise SimulationError(failure, result)

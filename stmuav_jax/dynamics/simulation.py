@@ -129,8 +129,8 @@ def _carried_out(
     how = method.formulation
     formulation, rows, start = inspect_start(scene.system, scene.state0, scene.t0, how)
     if formulation is not how:
-        method = dataclasses.replace(problem.method, formulation=formulation)
-        problem = dataclasses.replace(problem, method=method)
+        allowing = dataclasses.replace(problem.method, formulation=formulation)
+        problem = dataclasses.replace(problem, method=allowing)
     looked = time.perf_counter() - clock - prepared
     done = _run(scene, problem, times, progress, wanted.estimate)
     clock = time.perf_counter()

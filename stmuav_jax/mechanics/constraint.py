@@ -25,7 +25,7 @@ automatic differentiation. Derivation: docs/dynamics.md.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -148,7 +148,9 @@ class Row(eqx.Module):
     gamma: Float[Array, "k *batch"]
 
 
-def jet(body: BodyKinematics, fixed: Float[Array, "3 *batch"], form: Form) -> BodyVector:
+def jet(
+    body: BodyKinematics, fixed: Float[Array | np.ndarray, "3 *batch"], form: Form
+) -> BodyVector:
     """World vector with derivatives of a vector fixed in a body, `fixed` in body axes (3,)."""
     s = apply(body.R_wb, fixed)
     rate = cross(body.omega_w, s)
@@ -321,7 +323,7 @@ def screw(i: BodyKinematics, j: BodyKinematics, data: Data, form: Form) -> Row:
     The angle is known up to whole turns, and the value thus up to their displacement; the value
     nearest to zero is taken. `axis_j` is perpendicular to the axis of the screw.
     """
-    h = data.length
+    h: Any = data.length
     along = n2(i, j, data, form)
     across = cross(data.axis_i, data.side_i)
     twisted = dataclasses.replace(data, axis_i=data.side_i, side_i=across)

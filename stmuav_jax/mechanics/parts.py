@@ -210,4 +210,4 @@ def _about(arm: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def _of_body(body: Body) -> Part:
     R = rotation_matrix(body.orientation)
     tensor = R @ body.inertia @ R.T
-    return Part(body.mass, body.com_position, 0.5 * (tensor + tensor.T))
+    return Part(body.mass, jnp.asarray(body.com_position), 0.5 * (tensor + tensor.T))

@@ -118,7 +118,7 @@ class System(eqx.Module):
         return mass @ state.r / jnp.sum(mass)
 
 
-def check_precision(array: Float[Array, "..."], allow_float32: bool) -> None:
+def check_precision(array: Float[Array | np.ndarray, "..."], allow_float32: bool) -> None:
     """Raise `SettingError` for single precision that is not allowed."""
     if jnp.result_type(array) != jnp.float64 and not allow_float32:
         raise SettingError(

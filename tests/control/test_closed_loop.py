@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -111,6 +112,7 @@ def test_regulators_are_those_of_the_closed_form():
     A_d = np.array([[1.0, 0.1], [0.0, 1.0]])
     B_d = np.array([[0.005], [0.1]])
     S, Q, R = np.zeros((2, 2)), np.eye(2) / 10, np.eye(1) / 10
+    K = np.zeros((1, 2))
     for _ in range(3000):
         K = np.linalg.solve(R + B_d.T @ S @ B_d, B_d.T @ S @ A_d)
         S = Q + A_d.T @ S @ (A_d - B_d @ K)
@@ -272,7 +274,7 @@ def test_controllers_that_fail_say_when_and_where():
 
     with pytest.raises(stm.SimulationError, match=r"nan for the input 'effort' .* t = 0\.035") as e:
         control.close_loop(plant, breaks, 0.1, memory=0)
-    run = e.value.run
+    run: Any = e.value.run
     assert run.certificate.t_end == pytest.approx(0.03)
     assert run.certificate.result == "inputs not finite"
     assert np.all(np.isfinite(run.states.r[:8]))

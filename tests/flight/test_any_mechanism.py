@@ -1,5 +1,7 @@
 """Trim and linearisation of mechanisms that are not the report's: against closed forms and twins."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -207,7 +209,7 @@ def test_matrices_of_a_hexacopter_in_closed_form():
     scene = stm.make_scene("hexacopter")
     space = stm.TreeSpace(scene.system)
     x = space.from_state(scene.system.reference)
-    rotors = scene.system.forces[1]
+    rotors: Any = scene.system.forces[1]
     held = stm.flight.trim_condition(space, stm.flight.hover(), at=x)
     found = stm.linearize(space, held.point, values=held.values)
     mass, J = float(scene.system.bodies.mass[0]), np.asarray(scene.system.bodies.inertia[0])

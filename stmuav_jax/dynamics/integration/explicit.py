@@ -24,8 +24,8 @@ class RungeKutta4(diffrax.AbstractERK):
     section II.1.
     """
 
-    scan_kind: None = None
-    tableau: ClassVar[diffrax.ButcherTableau] = diffrax.ButcherTableau(
+    scan_kind: None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    tableau: ClassVar[diffrax.ButcherTableau] = diffrax.ButcherTableau(  # pyright: ignore[reportIncompatibleVariableOverride]
         a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
         b_sol=np.array([1.0, 2.0, 2.0, 1.0]) / 6.0,
         b_error=np.zeros(4),

@@ -199,7 +199,8 @@ class Problem(eqx.Module):
             inner = NonDenseRungeKutta(inner)
         if self.method.event is None and own_iterations(inner):
             size = n + self.n_internal
-            inner = NonDenseESDIRK(inner, self.method.rtol, self.method.atol, size)
+            own: Any = inner
+            inner = NonDenseESDIRK(own, self.method.rtol, self.method.atol, size)
         inner = stage_loop(inner, self.method.adjoint)
         held = project if iterations else None
         far = ProjectionLimit(self.method.rtol, self.method.atol, n) if held is not None else None

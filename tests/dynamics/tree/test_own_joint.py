@@ -1,6 +1,7 @@
 """A joint of a user's own, put together from primitives and motions that there are."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +21,14 @@ def test_a_planar_joint_is_one_entry_of_the_catalogue(monkeypatch):
     """Coordinates and rates come back from a state; accelerations are those of all bodies' rows."""
     monkeypatch.setitem(CATALOGUE, "planar", PLANAR)
     rng = np.random.default_rng(4)
-    place = lambda: dict(position=rng.normal(size=3), com=0.1 * rng.normal(size=3))
-    bodies = [stm.Body(name, 1.5, np.diag([0.1, 0.2, 0.25]), **place()) for name in "ab"]
+    own = lambda name: stm.Body(
+        name,
+        1.5,
+        np.diag([0.1, 0.2, 0.25]),
+        position=rng.normal(size=3),
+        com=0.1 * rng.normal(size=3),
+    )
+    bodies = [own(name) for name in "ab"]
     like = stm.cylindrical("plane", "a", "b", axis=[0.3, 0.2, 1.0], point=[0.4, 0.2, 0.1])
     hinge = stm.revolute("hinge", "ground", "a", point=[0.0, 0.0, 0.0], axis=[1.0, 0.2, 0.0])
     joints = [hinge, dataclasses.replace(like, kind="planar")]
@@ -38,9 +45,10 @@ def test_a_planar_joint_is_one_entry_of_the_catalogue(monkeypatch):
     def routes(x):
         state = space.to_state(space.retract(x, v))
         back = space.difference(space.from_state(state), x)
+        formulations: list[Any] = [stm.Tree(), stm.Augmented()]
         rates = [
             how.accelerations(how.prepare(system), jnp.zeros(()), state, stm.Unstabilised())
-            for how in (stm.Tree(), stm.Augmented())
+            for how in formulations
         ]
         return back, rates
 
