@@ -89,7 +89,7 @@ class Body(eqx.Module):
     def com_position(self) -> Float[Array | np.ndarray, "3"]:
         """World position of the centre of mass at the reference posture (3,) [m]."""
         position, p, com = as_numpy((self.position, self.orientation, self.com))
-        return position + rotation_matrix_in(array_module(p), p) @ com
+        return position + rotation_matrix_in(array_module(p, position, com), p) @ com
 
 
 class Bodies(eqx.Module):

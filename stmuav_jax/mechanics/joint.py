@@ -188,7 +188,7 @@ def resolve(joint: Joint, i: Body | None, j: Body | None) -> Joint:
         if body is None:
             return point, frame
         point, frame, p, position = as_numpy((point, frame, body.orientation, body.position))
-        R_bw = rotation_matrix_in(array_module(p), p).T
+        R_bw = rotation_matrix_in(array_module(p, point, frame, position), p).T
         return floats(R_bw @ (point - position)), floats(R_bw @ frame)
 
     point_i, frame_i = fix(i, joint.point_i, joint.frame_i)

@@ -104,6 +104,6 @@ def hover_speed_squared(
         k_f: thrust coefficient [N s^2/rad^2].
         count: number k of rotors.
     """
-    module = array_module(mass, gravity, k_f)
     m, g, k = as_numpy((floats(mass), floats(gravity), floats(k_f)))
+    module = array_module(m, g, k)
     return floats(module.full(count, 1.0) * (m * module.sqrt(g @ g)) / (count * k))

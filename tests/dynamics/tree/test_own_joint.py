@@ -35,8 +35,8 @@ def test_a_planar_joint_is_one_entry_of_the_catalogue(monkeypatch):
     system = stm.System(bodies, joints, [stm.Gravity([0.0, 0.0, -9.81])])
     space = stm.TreeSpace(system)
     assert [name for name, _ in space.names[1:4]] == [
-        "plane.shift_1",
-        "plane.shift_2",
+        "plane.displacement_1",
+        "plane.displacement_2",
         "plane.angle",
     ]
     x, v = space.from_state(system.reference), jnp.asarray(rng.normal(size=8))
