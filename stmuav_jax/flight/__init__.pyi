@@ -1,5 +1,13 @@
 """Public names of this folder; `__init__.py` imports each when it is first used."""
 
+from .endurance import (
+    HoverEndurance as HoverEndurance,
+    Outfit as Outfit,
+    day_endurance as day_endurance,
+    hover_demand as hover_demand,
+    uav_mass as uav_mass,
+    uav_outfits as uav_outfits,
+)
 from .equilibrium import (
     Trim as Trim,
     trim as trim,
@@ -34,6 +42,12 @@ from .multiple_shooting import (
     growth as growth,
     shooting as shooting,
     transition as transition,
+)
+from .panel_design import (
+    BreakEven as BreakEven,
+    PanelDesign as PanelDesign,
+    break_even as break_even,
+    panel_gain as panel_gain,
 )
 from .sensed import (
     SensedFlight as SensedFlight,

@@ -6,6 +6,9 @@ from .airframe import (
     PRINTED_CENTRES as PRINTED_CENTRES,
     PRINTED_ORIENTATIONS as PRINTED_ORIENTATIONS,
 )
+from .energy import (
+    ENERGY as ENERGY,
+)
 from .table import (
     Parameter as Parameter,
     Parameters as Parameters,

@@ -1,4 +1,4 @@
-"""Rotors, motors, drag, and the allocation of rotor speeds. Floor 7."""
+"""Rotors, motors, drag, allocation of rotor speeds, power and battery. Floor 7."""
 
 import lazy_loader
 

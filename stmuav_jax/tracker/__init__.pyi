@@ -7,6 +7,9 @@ from .bodies import (
     tracker_bodies as tracker_bodies,
     tracker_joints as tracker_joints,
 )
+from .cells import (
+    SolarCells as SolarCells,
+)
 from .day import (
     Day as Day,
     Imperfections as Imperfections,
