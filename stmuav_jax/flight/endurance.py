@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..algebra.compiler import outer_jit
-from ..checks.errors import ModelError, SettingError, nearest_names
+from ..checks.errors import ModelError, SettingError, concrete, nearest_names
 from ..checks.numbers import floats
 from ..checks.shapes import Numbers
 from ..parameters.airframe import PART_II
@@ -89,7 +89,7 @@ def hover_demand(
         ModelError: an efficiency that is not positive.
     """
     efficiency = energy.value("rotor.efficiency")
-    if not isinstance(efficiency, jax.core.Tracer) and not 0.0 < float(efficiency) <= 1.0:
+    if concrete(efficiency) and not 0.0 < float(efficiency) <= 1.0:
         raise ModelError(
             f"The efficiency of the motors must lie above 0 and up to 1, but it is {efficiency}."
         )

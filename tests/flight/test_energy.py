@@ -1,6 +1,7 @@
 """Endurance over a day, and break-even of a panel: closed form, root finding, derivatives."""
 
 from datetime import date, timedelta, timezone
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ def test_break_even_against_root_finding(fixed):
     gain = lambda A: p * A - a * ((m0 + f + sigma * A) ** 1.5 - m0**1.5)
     found = break_even(design)
     assert bool(found.pays)
-    best = minimize_scalar(
+    best: Any = minimize_scalar(
         lambda A: -gain(A), bounds=(0, 100), method="bounded", options={"xatol": 1e-10}
     )
     assert float(found.best) == pytest.approx(best.x, rel=1e-6)
@@ -89,7 +90,7 @@ def day():
 def test_endurance_over_a_day(day):
     """At night the flight is that of constant power; by day longer by what the panel gives."""
     outfits = stm.flight.uav_outfits()
-    assert float(outfits["bare"].mass) == pytest.approx(5.407)
+    assert outfits["bare"].mass == pytest.approx(5.407)
     hours = [0.0, 12.0]
     found = {name: day_endurance(day, outfit, hours) for name, outfit in outfits.items()}
     battery, cells = stm.rotorcraft.Battery.of(), stm.tracker.SolarCells.of()
