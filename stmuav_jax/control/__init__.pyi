@@ -5,6 +5,11 @@ from .closed_loop import (
     LoopRun as LoopRun,
     close_loop as close_loop,
 )
+from .estimator import (
+    EstimatorMemory as EstimatorMemory,
+    MotionEstimate as MotionEstimate,
+    MotionEstimator as MotionEstimator,
+)
 from .flying import (
     FlightController as FlightController,
     FlightMemory as FlightMemory,
