@@ -9,6 +9,10 @@ rates and late by their delays, over which acceleration and angular velocity are
 The error of the attitude is a rotation vector in the base's axes. The panel angles are estimated
 beside it from the encoders of the strokes, their accelerations taken as white noise.
 
+The filters of `stm.estimation` give the same numbers for any model; this one has its derivatives in
+closed form and takes one component of a fix after the other, which needs no factorisations: these
+would take longer than the rest of the loop.
+
 Source: J. Sola, Quaternion kinematics for the error-state Kalman filter, arXiv:1711.02508 (2017),
 ch. 5 and 6; J. L. Crassidis, J. L. Junkins, Optimal Estimation of Dynamic Systems (2011), ch. 7.
 """
@@ -33,10 +37,6 @@ from ..algebra.space import Composite, Point, Rotation, Vector
 from ..checks.errors import SettingError
 from ..checks.numbers import numbers
 from ..checks.shapes import Numbers
-from ..estimation.gaussians import Gaussian
-from ..estimation.model import Sensor, StateSpaceModel
-from ..estimation.sigma import Linearised
-from ..estimation.update import GaussianFilter
 from ..flight.flyer import FlyerPoint, whole_state
 from ..mechanics.state import State
 from ..mechanics.system import System
@@ -49,20 +49,28 @@ from ..sensing.sensors import (
     gravity_of,
 )
 from ..tracker.drive import SLIDER_JOINTS
-from ..tracker.geometry import TrackerGeometry
-from ..tracker.kinematics import strokes
+from ..tracker.kinematics import stroke_jacobian, strokes
+from .geometric import hat
 from .instruments import Instrument, Reading
 from .panel import PanelBodies, panel_motion
 
-_FILTER = GaussianFilter(Linearised(), "covariance")
 _BASE = Composite(
     p=Rotation(), r=Vector(3), v=Vector(3), gyroscope_bias=Vector(3), accelerometer_bias=Vector(3)
 )
-_NAMES = tuple(
-    f"{what} {axis}"
-    for what in ("attitude", "position", "velocity", "gyroscope bias", "accelerometer bias")
-    for axis in "xyz"
-)
+
+
+class Belief(NamedTuple):
+    """Mean of an estimate, and the covariance of its errors.
+
+    Attributes:
+        mean: of a base, "p", "r", "v", "gyroscope_bias" [rad/s] and "accelerometer_bias" [m/s^2]; of a
+            panel, its angles [rad] and their rates (4,).
+        covariance: of a base's errors (15, 15) in this order, that of p in its own axes [rad]; of a
+            panel's (4, 4).
+    """
+
+    mean: Any
+    covariance: Float[Array, "n n"]
 
 
 class MotionEstimate(NamedTuple):
@@ -70,16 +78,15 @@ class MotionEstimate(NamedTuple):
 
     Attributes:
         state: estimated state of base and tracker; without a tracker that of the base alone.
-        base: Gaussian of the base: `mean` with "p", "r", "v", "gyroscope_bias" [rad/s] and
-            "accelerometer_bias" [m/s^2]; errors (15,) in this order, that of p in its own axes [rad].
-        panel: Gaussian of the panel angles and their rates (4,); None without a tracker.
+        base: mean and covariance of the base and of the biases.
+        panel: those of the panel angles and their rates; None without a tracker.
         nis: normalised innovation squared of the fixes that arrived now.
         components: number of their components, zero where none arrived.
     """
 
     state: State
-    base: Gaussian
-    panel: Gaussian | None
+    base: Belief
+    panel: Belief | None
     nis: Float[Array, ""]
     components: Float[Array, ""]
 
@@ -88,65 +95,73 @@ class EstimatorMemory(NamedTuple):
     """Memory of a `MotionEstimator`.
 
     Attributes:
-        base, panel: Gaussians as in `MotionEstimate`.
+        base, panel: means and covariances as in `MotionEstimate`.
         turning: last reading of the gyroscope, base axes (3,) [rad/s].
         begun: false before the first sample.
     """
 
-    base: Gaussian
-    panel: Gaussian | None
+    base: Belief
+    panel: Belief | None
     turning: Float[Array, "3"]
     begun: Bool[Array, ""]
 
 
-class _Strapdown(eqx.Module):
-    """Motion of the base by the readings u: mean "turning" over the step, and "force" (3,)."""
-
-    gravity: Float[Array, "3"]
-
-    def __call__(self, x: Point, u: Any, h: Any) -> Point:
-        half = from_rotation_vector(h / 2 * (u["turning"] - x["gyroscope_bias"]))
-        middle = product(x["p"], half)
-        a = rotation_matrix(middle) @ (u["force"] - x["accelerometer_bias"]) + self.gravity
-        moved = {"p": normalise(product(middle, half)), "v": x["v"] + h * a}
-        return {**x, **moved, "r": x["r"] + h * x["v"] + h**2 / 2 * a}
+def _turn(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    return rotation_matrix(from_rotation_vector(v))
 
 
-class _Fixes(eqx.Module):
-    """Position of a point, and rotation vector from an attitude u["p"], as they were before delays.
+def strapdown(
+    x: Point,
+    turning: Float[Array, "3"],
+    force: Float[Array, "3"],
+    gravity: Float[Array, "3"],
+    h: Float[Array, ""],
+) -> tuple[Point, Float[Array, "15 15"]]:
+    """Motion of a base over a step h [s] by readings of gyroscope and accelerometer.
 
-    Attributes:
-        strapdown: motion of the base. arm: point from the centre of mass, base axes (3,) [m].
-        late: delays of position and attitude (2,) [s].
+    Returns:
+        point at its end, and the matrix of errors there by those before, to first order in h for
+        the gyroscope's bias.
     """
+    omega, felt = turning - x["gyroscope_bias"], force - x["accelerometer_bias"]
+    half = from_rotation_vector(h / 2 * omega)
+    middle = product(x["p"], half)
+    R = rotation_matrix(middle)
+    a = R @ felt + gravity
+    moved = {"p": normalise(product(middle, half)), "v": x["v"] + h * a}
+    moved = {**x, **moved, "r": x["r"] + h * x["v"] + h**2 / 2 * a}
+    back = rotation_matrix(half).T
+    by_attitude = -R @ hat(felt) @ back
+    one, none = jnp.eye(3), jnp.zeros((3, 3))
+    errors = jnp.block(
+        [
+            [back @ back, none, none, -h * one, none],
+            [h**2 / 2 * by_attitude, one, h * one, none, -(h**2) / 2 * R],
+            [h * by_attitude, none, one, none, -h * R],
+            [none, none, none, one, none],
+            [none, none, none, none, one],
+        ]
+    )
+    return moved, errors
 
-    strapdown: _Strapdown
-    arm: Float[Array, "3"]
-    late: Float[Array, "2"]
 
-    def __call__(self, x: Point, u: Any) -> Float[Array, "6"]:
-        where, attitude = (self.strapdown(x, u, -late) for late in self.late)
-        r = where["r"] + rotation_matrix(where["p"]) @ self.arm
-        return jnp.concatenate([r, to_rotation_vector(product(conjugate(u["p"]), attitude["p"]))])
-
-
-def _turn_on(x: Float[Array, "4"], u: Any, h: Any) -> Float[Array, "4"]:
-    """Panel angles and rates a time h [s] later."""
-    del u
-    return x.at[:2].add(h * x[2:])
-
-
-class _Strokes(eqx.Module):
-    """Displacements of the sliders from those at home (2,) [m], as they were before delays [s]."""
-
-    geometry: TrackerGeometry
-    home: Float[Array, "2"]
-    late: Float[Array, "2"]
-
-    def __call__(self, x: Float[Array, "4"], u: Any) -> Float[Array, "2"]:
-        del u
-        at = [strokes(self.geometry, x[:2] - late * x[2:])[k] for k, late in enumerate(self.late)]
-        return jnp.stack(at) - self.home
+def _corrected(
+    P: Float[Array, "n n"],
+    H: Float[Array, "m n"],
+    variance: Float[Array, " m"],
+    error: Float[Array, " m"],
+    fresh: Bool[Array, " m"],
+) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
+    """Move of the mean, covariance and NIS after the fresh components, one after the other."""
+    move, nis = jnp.zeros(P.shape[0]), jnp.zeros(())
+    for row, r, nu, new in zip(H, variance, error, fresh, strict=True):
+        along = P @ row
+        weight = jnp.where(new, 1 / (row @ along + r), 0.0)
+        left = nu - row @ move
+        move = move + weight * left * along
+        P = P - weight * along[:, None] * along[None, :]
+        nis = nis + weight * left**2
+    return move, P, nis
 
 
 class MotionEstimator(eqx.Module):
@@ -172,10 +187,15 @@ class MotionEstimator(eqx.Module):
             slow or late, an accelerometer off the centre of mass.
     """
 
-    base: StateSpaceModel
-    panel: StateSpaceModel | None
-    axes: Float[Array, "2 3 3"]
     tracker: PanelBodies | None
+    axes: Float[Array, "2 3 3"]
+    gravity: Float[Array, "3"]
+    arm: Float[Array, "3"]
+    late: Float[Array, " f"]
+    variance: Float[Array, " c"]
+    walk: Float[Array, "15 15"]
+    panel_walk: Float[Array, "4 4"]
+    home: Float[Array, "2"]
     period: Float[Array, ""]
     names: tuple[str, ...] = eqx.field(static=True)
 
@@ -208,14 +228,12 @@ class MotionEstimator(eqx.Module):
         self.names = tuple(one.name for one in found)
         self.axes = jnp.stack([getattr(one.sensor, "axes") for one in found[:2]])  # noqa: B009
         self.tracker, self.period = tracker, jnp.asarray(1.0 / rate)
+        self.late = jnp.array([one.delay for one in found[2:]])
         noise = [_noise(one, system) for one in found]
+        self.variance = jnp.concatenate(noise[2:]) ** 2
         point = getattr(found[2].sensor, "point", None)
-        com = system.bodies.com[0]
-        fixes = _Fixes(
-            _Strapdown(gravity_of(system)),
-            jnp.zeros(3) if point is None else point - com,
-            jnp.array([one.delay for one in found[2:4]]),
-        )
+        self.arm = jnp.zeros(3) if point is None else point - system.bodies.com[0]
+        self.gravity = gravity_of(system)
         h = self.period
         drift = [
             numbers(value, (), f"The drift of the {what}'s bias", unit) * jnp.sqrt(h) * jnp.ones(3)
@@ -226,21 +244,15 @@ class MotionEstimator(eqx.Module):
         ]
         steps = [h * noise[0], h**2 / 2 * noise[1], h * noise[1], *drift]
         Q = jnp.diag(jnp.concatenate(steps) ** 2)
-        # both come from one reading of the accelerometer
-        shared = jnp.arange(3)
-        cross = h**3 / 2 * noise[1] ** 2
-        Q = Q.at[3 + shared, 6 + shared].set(cross).at[6 + shared, 3 + shared].set(cross)
-        seen = Sensor(fixes, jnp.diag(jnp.concatenate(noise[2:4]) ** 2))
-        self.base = StateSpaceModel(fixes.strapdown, Q, seen, space=_BASE, names=_NAMES)
-        self.panel = None
+        # errors of position and velocity come from one reading of the accelerometer
+        k, cross = jnp.arange(3), h**3 / 2 * noise[1] ** 2
+        self.walk = Q.at[3 + k, 6 + k].set(cross).at[6 + k, 3 + k].set(cross)
+        q = numbers(panel_noise, (), "The noise of the panel", "rad/s^2/sqrt(Hz)") ** 2
+        one = q * jnp.array([[h**3 / 3, h**2 / 2], [h**2 / 2, h]])
+        self.panel_walk = jnp.kron(one, jnp.eye(2))
+        self.home = jnp.zeros(2)
         if tracker is not None:
-            q = numbers(panel_noise, (), "The noise of the panel", "rad/s^2/sqrt(Hz)") ** 2
-            one = q * jnp.array([[h**3 / 3, h**2 / 2], [h**2 / 2, h]])
-            home = strokes(tracker.geometry, panel_motion(system.reference).value)
-            late = jnp.array([found[k].delay for k in (4, 5)])
-            encoders = _Strokes(tracker.geometry, home, late)
-            own = Sensor(encoders, jnp.diag(jnp.concatenate(noise[4:]) ** 2))
-            self.panel = StateSpaceModel(_turn_on, jnp.kron(one, jnp.eye(2)), own)
+            self.home = strokes(tracker.geometry, panel_motion(system.reference).value)
 
     def start(
         self,
@@ -267,13 +279,12 @@ class MotionEstimator(eqx.Module):
             "gyroscope_bias": zero, "accelerometer_bias": zero,
         }  # fmt: skip
         each = (attitude, position, velocity, gyroscope_bias, accelerometer_bias)
-        base = Gaussian(mean, _spread(each, 3))
+        base = Belief(mean, _spread(each, 3))
         angles = None
-        if self.panel is not None:
+        if self.tracker is not None:
             now = panel_motion(state)
-            angles = Gaussian(
-                jnp.concatenate([now.value, now.rate]), _spread((panel, panel_rate), 2)
-            )
+            spread = _spread((panel, panel_rate), 2)
+            angles = Belief(jnp.concatenate([now.value, now.rate]), spread)
         return EstimatorMemory(base, angles, zero, jnp.zeros((), bool))
 
     def __call__(
@@ -287,26 +298,67 @@ class MotionEstimator(eqx.Module):
         )
         h = jnp.where(memory.begun, self.period, 0.0)
         before = jnp.where(memory.begun, memory.turning, turning)
-        u = {"turning": (before + turning) / 2, "force": force}
-        predicted = _FILTER.predict(self.base, memory.base, u, h)
-        p = predicted.mean["p"]
-        error = to_rotation_vector(product(conjugate(p), attitude.value))
-        y = jnp.concatenate([position.value, error])
-        fresh = jnp.repeat(jnp.stack([position.fresh, attitude.fresh]), 3)
-        base, nis = _updated(self.base, predicted, y, fresh, {**u, "turning": turning, "p": p})
-        panel = None
-        if self.panel is not None and memory.panel is not None:
-            moved = _FILTER.predict(self.panel, memory.panel, None, h)
-            y = jnp.concatenate([x.value for x in encoders])
-            seen = jnp.stack([x.fresh for x in encoders])
-            panel, _ = _updated(self.panel, moved, y, seen, None)
-        state = self._state(base.mean, turning - base.mean["gyroscope_bias"], panel)
-        count = jnp.sum(fresh).astype(nis.dtype)
-        return MotionEstimate(state, base, panel, nis, count), EstimatorMemory(
-            base, panel, turning, jnp.ones((), bool)
+        (x, P), mean_rate = memory.base, (before + turning) / 2
+        x, errors = strapdown(x, mean_rate, force, self.gravity, h)
+        P = errors @ P @ errors.T + self.walk
+        fresh = jnp.stack([position.fresh, attitude.fresh])
+        base, nis = jax.lax.cond(
+            jnp.any(fresh),
+            lambda x, P: self._fixed(x, P, turning, force, position, attitude),
+            lambda x, P: (Belief(x, P), jnp.zeros(())),
+            x,
+            0.5 * (P + P.T),
         )
+        panel = None if memory.panel is None else self._panel(memory.panel, h, encoders)
+        state = self._state(base.mean, turning - base.mean["gyroscope_bias"], panel)
+        found = MotionEstimate(state, base, panel, nis, 3.0 * jnp.sum(fresh))
+        return found, EstimatorMemory(base, panel, turning, jnp.ones((), bool))
 
-    def _state(self, x: Point, omega: Float[Array, "3"], panel: Gaussian | None) -> State:
+    def _fixed(
+        self,
+        x: Point,
+        P: Float[Array, "15 15"],
+        turning: Float[Array, "3"],
+        force: Float[Array, "3"],
+        position: Reading,
+        attitude: Reading,
+    ) -> tuple[Belief, Float[Array, ""]]:
+        """Belief after position and attitude fix, and their NIS."""
+        late = self.late
+        then, _ = strapdown(x, turning, force, self.gravity, -late[0])
+        facing, _ = strapdown(x, turning, force, self.gravity, -late[1])
+        R = rotation_matrix(then["p"])
+        off = position.value - then["r"] - R @ self.arm
+        turned = to_rotation_vector(product(conjugate(facing["p"]), attitude.value))
+        omega = turning - x["gyroscope_bias"]
+        one, none = jnp.eye(3), jnp.zeros((3, 3))
+        H = jnp.block(
+            [
+                [-R @ hat(self.arm) @ _turn(late[0] * omega), one, -late[0] * one, none, none],
+                [_turn(late[1] * omega), none, none, late[1] * one, none],
+            ]
+        )
+        fresh = jnp.repeat(jnp.stack([position.fresh, attitude.fresh]), 3)
+        error = jnp.concatenate([off, turned])
+        move, P, nis = _corrected(P, H, self.variance[:6], error, fresh)
+        return Belief(_BASE.retract(x, move), P), nis
+
+    def _panel(self, before: Belief, h: Float[Array, ""], encoders: list[Reading]) -> Belief:
+        """Belief about the panel a step h [s] later, after its encoders."""
+        assert self.tracker is not None
+        geometry = self.tracker.geometry
+        F = jnp.eye(4).at[:2, 2:].add(h * jnp.eye(2))
+        x = F @ before.mean
+        P = F @ before.covariance @ F.T + self.panel_walk
+        J, now = stroke_jacobian(geometry, x[:2]), strokes(geometry, x[:2]) - self.home
+        late = self.late[2:, None] * J
+        error = jnp.concatenate([one.value for one in encoders]) - now + late @ x[2:]
+        fresh = jnp.stack([one.fresh for one in encoders])
+        H = jnp.concatenate([J, -late], axis=1)
+        move, P, _ = _corrected(0.5 * (P + P.T), H, self.variance[6:], error, fresh)
+        return Belief(x + move, P)
+
+    def _state(self, x: Point, omega: Float[Array, "3"], panel: Belief | None) -> State:
         if panel is None or self.tracker is None:
             return State(x["r"][None], x["p"][None], x["v"][None], omega[None])
         angles, rates = panel.mean[:2], panel.mean[2:]
@@ -319,24 +371,9 @@ def state_of(estimate: Any) -> Any:
     return estimate.state if isinstance(estimate, MotionEstimate) else estimate
 
 
-def _updated(
-    model: StateSpaceModel, predicted: Gaussian, y: Array, fresh: Array, u: Any
-) -> tuple[Gaussian, Float[Array, ""]]:
-    """Gaussian after those components of y that are fresh, and their NIS."""
-
-    def seen(prior: Gaussian) -> tuple[Gaussian, Array]:
-        given = jnp.where(fresh, y, jnp.nan)
-        after, innovation = _FILTER.update(prior, given, model.sensor, u, model=model)
-        return after, innovation.nis
-
-    return jax.lax.cond(
-        jnp.any(fresh), seen, lambda prior: (prior, jnp.zeros((), y.dtype)), predicted
-    )
-
-
 def _spread(deviations: Sequence[Numbers], size: int) -> Float[Array, "n n"]:
     each = [jnp.broadcast_to(jnp.asarray(x, float), (size,)) for x in deviations]
-    return jnp.diag(jnp.concatenate(each))
+    return jnp.diag(jnp.concatenate(each) ** 2)
 
 
 def _of_name(instruments: Sequence[Any], name: str) -> Instrument:

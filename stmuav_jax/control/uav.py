@@ -32,8 +32,8 @@ class UavReference(NamedTuple):
 class UavController(eqx.Module):
     """Controller of the scene `uav_tracker`: six rotors first, then the forces of two sliders.
 
-    The estimate is the `State` of all bodies, or a `MotionEstimate`. Centre of mass, inertia and angular momentum of the
-    moving tracker are fed forward to the rotors, as is the moment that its servo takes.
+    The estimate is the `State` of all bodies, or a `MotionEstimate`. Centre of mass, inertia and
+    angular momentum of the moving tracker are fed forward to the rotors, as is the moment that its servo takes.
 
     Attributes:
         system: machine whose masses the controller believes.
