@@ -5,6 +5,13 @@ from .closed_loop import (
     LoopRun as LoopRun,
     close_loop as close_loop,
 )
+from .estimator import (
+    Belief as Belief,
+    EstimatorMemory as EstimatorMemory,
+    MotionEstimate as MotionEstimate,
+    MotionEstimator as MotionEstimator,
+    strapdown as strapdown,
+)
 from .flying import (
     FlightController as FlightController,
     FlightMemory as FlightMemory,

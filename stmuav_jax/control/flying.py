@@ -15,6 +15,7 @@ from ..rotorcraft.allocation import RotorLimits, check_lift, wrench_map
 from ..rotorcraft.motor import MotorRotors
 from ..rotorcraft.rotor import Rotors
 from ..sensing.sensors import gravity_of
+from .estimator import state_of
 from .geometric import (
     FlightGains,
     MassProperties,
@@ -37,8 +38,8 @@ class FlightMemory(NamedTuple):
 class FlightController(eqx.Module):
     """Controller of the rotors: position and heading of the machine's base follow a `Waypoint`.
 
-    The estimate is a `State` of all bodies, or the `BaseMotion` of the base; the reference is a
-    `Waypoint`, the memory a `FlightMemory`. While the rotors cannot give the wanted wrench, the
+    The estimate is a `State` of all bodies, a `MotionEstimate`, or the `BaseMotion` of the base; the
+    reference is a `Waypoint`, the memory a `FlightMemory`. While the rotors cannot give the wanted wrench, the
     integral of the position error stands still.
 
     Args:
@@ -110,6 +111,7 @@ class FlightController(eqx.Module):
         self, estimate: Any, reference: Waypoint, memory: FlightMemory
     ) -> tuple[Float[Array, " k"], FlightMemory]:
         """Squared rotor speeds (k,) [rad^2/s^2], and the memory."""
+        estimate = state_of(estimate)
         mass = self.mass(estimate) if callable(self.mass) else self.mass
         return self.command(estimate, reference, memory, mass)
 

@@ -10,6 +10,7 @@ from ..algebra.rotation import rotation_matrix
 from ..mechanics.state import State
 from ..mechanics.system import System
 from ..tracker.kinematics import PairMotion
+from .estimator import MotionEstimate, state_of
 from .flying import FlightController, FlightMemory, mass_properties
 from .geometric import Waypoint
 from .panel import PanelServo, StrokeServo, facing, panel_motion
@@ -31,8 +32,8 @@ class UavReference(NamedTuple):
 class UavController(eqx.Module):
     """Controller of the scene `uav_tracker`: six rotors first, then the forces of two sliders.
 
-    The estimate is the `State` of all bodies. Centre of mass, inertia and angular momentum of the
-    moving tracker are fed forward to the rotors, as is the moment that its servo takes.
+    The estimate is the `State` of all bodies, or a `MotionEstimate`. Centre of mass, inertia and
+    angular momentum of the moving tracker are fed forward to the rotors, as is the moment that its servo takes.
 
     Attributes:
         system: machine whose masses the controller believes.
@@ -51,9 +52,10 @@ class UavController(eqx.Module):
         return self.flight.start()
 
     def __call__(
-        self, estimate: State, reference: UavReference, memory: FlightMemory
+        self, estimate: State | MotionEstimate, reference: UavReference, memory: FlightMemory
     ) -> tuple[Float[Array, " m"], FlightMemory]:
         """Inputs (k + 2,): squared rotor speeds [rad^2/s^2] and forces [N]; and the memory."""
+        estimate = state_of(estimate)
         flight, at = self.flight, reference.waypoint
         assert isinstance(flight.mass, tuple)
         mass: Any = mass_properties(self.system, estimate) if self.feedforward else flight.mass
