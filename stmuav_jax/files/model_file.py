@@ -1,6 +1,7 @@
 """Models of mechanisms as TOML files: loaded as scenes, and saved again to the last bit."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import re
@@ -20,6 +21,7 @@ from ..dynamics.assembly.joint_start import state_from_joints
 from ..dynamics.scene import Scene
 from ..mechanics.body import GROUND, Body
 from ..mechanics.joint import Joint
+from ..mechanics.load import SineMotion
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .model_schema import (
@@ -62,10 +64,10 @@ def load_model(path: str | os.PathLike[str]) -> Scene:
     for name, table in given.bodies.items():
         with _within(f"{source}, [bodies.{name}]"):
             bodies.append(_body(name, table, parameters))
-    joints = []
+    joints: list[Joint] = []
     for name, table in given.joints.items():
         with _within(f"{source}, [joints.{name}]"):
-            joints.append(_joint(name, table, parameters))
+            joints.append(_joint(name, table, parameters, joints))
     forces = []
     for name, table in given.forces.items():
         with _within(f"{source}, [forces.{name}]"):
@@ -85,7 +87,7 @@ def load_model(path: str | os.PathLike[str]) -> Scene:
         t0=given.t0,
         t1=given.t1,
         save_every=given.save_every,
-        parameters={name: each.model_dump() for name, each in parameters.items()},
+        parameters={name: each.model_dump(mode="json") for name, each in parameters.items()},
         notes=given.notes,
         watch=given.watch,
     )
@@ -122,13 +124,27 @@ def _placed(system: System, places: list[Any]) -> System:
     return eqx.tree_at(lambda s: s.reference.r, system, floats(r))
 
 
-def _joint(name: str, table: Mapping[str, Any], parameters: Table) -> Joint:
+def _joint(name: str, table: Mapping[str, Any], parameters: Table, before: list[Joint]) -> Joint:
+    """Joint of a table; a driver is one of the joints before it with a prescribed coordinate."""
     kind = kind_of(table, JOINTS, "A joint")
     what = f"A joint of kind {table['kind']}"
-    if "in_bodies" not in table:
-        found = entries(table, kind.slots, parameters, what, owner="bodies", kind=True)
+    if "in_bodies" not in table or kind.owner == "joint":
+        found = entries(table, kind.slots, parameters, what, owner=kind.owner, kind=True)
         del found["kind"]
-        return kind.make(name, *found.pop("bodies"), **found)
+        if kind.owner == "bodies":
+            return kind.make(name, *found.pop("bodies"), **found)
+        driven, known = found.pop("joint"), {joint.name: joint for joint in before}
+        if driven not in known:
+            raise SettingError(
+                f"'joint' must be a joint of a table before this one, but it is '{driven[:SHOWN]}'."
+                f"{nearest_names(driven[:SHOWN], known)}"
+            )
+        return kind.make(name, known[driven], **found)
+    return _in_bodies(name, table, parameters, what)
+
+
+def _in_bodies(name: str, table: Mapping[str, Any], parameters: Table, what: str) -> Joint:
+    """Joint with its geometry in its bodies' reference frames."""
     rest = {key: value for key, value in table.items() if key != "in_bodies"}
     (i, j) = entries(rest, {}, parameters, f"{what} with 'in_bodies'", owner="bodies", kind=True)[
         "bodies"
@@ -205,8 +221,8 @@ def model_to_text(scene: Scene) -> str:
     are kept as a record.
 
     Raises:
-        SettingError: the file cannot hold the system: a driver, a load that is a function of
-            time, a force element of another class, or single precision.
+        SettingError: the file cannot hold the system: a load or a driver's motion that is
+            another function of time, a force element of another class, or single precision.
     """
     system = scene.system
     if system.allow_float32:
@@ -222,8 +238,8 @@ def model_to_text(scene: Scene) -> str:
     floating = _floating(system)
     for k, name in enumerate(system.names):
         tables["bodies", name] = _body_table(system, k) | ({"free": True} if k in floating else {})
-    for joint in system.joints:
-        tables["joints", joint.name] = _joint_table(joint)
+    for k, joint in enumerate(system.joints):
+        tables["joints", joint.name] = _joint_table(joint, system.joints[:k])
     for k, force in enumerate(system.forces, start=1):
         kind, table = _force_table(force)
         tables["forces", f"{kind}_{k}"] = table
@@ -277,15 +293,29 @@ def _body_table(system: System, k: int) -> dict[str, Any]:
     return table | ({"triangle_tolerance": 1.01 * excess} if excess > 0 else {})
 
 
-def _joint_table(joint: Joint) -> dict[str, Any]:
-    if joint.kind not in JOINTS:
-        raise SettingError(
-            f"Joint '{joint.name}' is a {joint.kind}, which prescribes a function of time; a "
-            f"model's file holds these kinds: {', '.join(JOINTS)}."
-        )
+def _joint_table(joint: Joint, before: tuple[Joint, ...]) -> dict[str, Any]:
+    if JOINTS[joint.kind].owner == "joint":
+        return _driver_table(joint, before)
     geometry = {key: getattr(joint, key) for key in IN_BODIES}
     ends = [joint.body_i, joint.body_j]
     return {"kind": joint.kind, "bodies": ends, "in_bodies": geometry}
+
+
+def _driver_table(driver: Joint, before: tuple[Joint, ...]) -> dict[str, Any]:
+    if not isinstance(driver.motion, SineMotion):
+        raise SettingError(
+            f"A model's file cannot hold the motion of the driver '{driver.name}', only a "
+            "stmuav_jax.mechanics.SineMotion."
+        )
+    for joint in before:
+        other = dataclasses.replace(joint, name=driver.name, kind=driver.kind, motion=driver.motion)
+        if joint.motion is None and eqx.tree_equal(other, driver):
+            return {
+                "kind": driver.kind,
+                "joint": joint.name,
+                **{key: getattr(driver.motion, key) for key in JOINTS[driver.kind].slots},
+            }
+    raise SettingError(f"No joint before the driver '{driver.name}' is the one that it drives.")
 
 
 def _force_table(force: Any) -> tuple[str, dict[str, Any]]:

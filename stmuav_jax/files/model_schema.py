@@ -17,6 +17,7 @@ from ..mechanics.body import Body
 from ..mechanics.forces import applied
 from ..mechanics.forces.effort import JointEffort
 from ..mechanics.forces.joint import EndStop, JointFriction, JointServo
+from ..mechanics.load import SineMotion
 from ..montecarlo.schema import Name
 from ..rotorcraft.rotor import Rotors
 
@@ -88,12 +89,27 @@ def _maybe(slot: Slot) -> Slot:
     return slot._replace(needed=False)
 
 
+def _driver(coordinate: Any) -> Callable[..., joints.Joint]:
+    def make(name: str, joint: joints.Joint, **numbers: Any) -> joints.Joint:
+        return joints.drive(name, joint, SineMotion(**numbers), coordinate=coordinate)
+
+    return make
+
+
 _POINT, _AXIS = Slot(Vector, "m"), Slot(Vector, "1")
 _LENGTH = Slot(Finite, "m", needed=False)
 _WHICH = Slot(Literal["angle", "displacement"], needed=False)
 _FRAME = Slot(Literal["world", "body"], needed=False)
 _ALONG = {"point": _maybe(_POINT), "axis": _AXIS}
 _ENDS = {"point_i": _POINT, "point_j": _POINT, "length": _LENGTH}
+_SWING = Slot(Finite, "m or rad", needed=False)
+_MOTION = {
+    "start": _SWING,
+    "rate": Slot(Finite, "m/s or rad/s", needed=False),
+    "amplitude": _SWING,
+    "angular_frequency": Slot(Finite, "rad/s", needed=False),
+    "phase": Slot(Finite, "rad", needed=False),
+}
 
 JOINTS: dict[str, Kind] = {
     "weld": Kind(joints.weld, "bodies", {"point": _maybe(_POINT)}),
@@ -109,6 +125,8 @@ JOINTS: dict[str, Kind] = {
     ),
     "distance": Kind(joints.distance, "bodies", _ENDS),
     "revolute_spherical": Kind(joints.revolute_spherical, "bodies", {"axis": _AXIS, **_ENDS}),
+    "drive_angle": Kind(_driver("angle"), "joint", _MOTION),
+    "drive_displacement": Kind(_driver("displacement"), "joint", _MOTION),
 }
 
 # Geometry of a joint in the reference frames of its bodies, by which saved models give it.

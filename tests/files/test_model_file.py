@@ -16,7 +16,7 @@ from stmuav_jax.cli import main
 from stmuav_jax.dynamics import evaluate
 from stmuav_jax.files import FileError, load_model, model_to_text, save_model
 from stmuav_jax.files.model_schema import BODY, FORCES, IN_BODIES, JOINTS, START_BODY
-from stmuav_jax.mechanics import EndStop, JointFriction, JointServo, joint_motion
+from stmuav_jax.mechanics import EndStop, JointFriction, JointServo, SineMotion, joint_motion
 from stmuav_jax.mechanics.joint import CATALOGUE
 from stmuav_jax.rotorcraft import Rotors
 
@@ -156,6 +156,12 @@ def everything():
         getattr(stm, kind)(kind, "ground", body, **more)
         for body, (kind, more) in zip(names, given.items(), strict=True)
     ]
+    which = {"revolute": "angle", "translational": "displacement"}
+    by_name = {joint.name: joint for joint in joints}
+    joints += [
+        stm.drive(f"drive {n}", by_name[n], SineMotion(0.1, 1 / 3, -0.0, 7.0, 1e-3), coordinate=c)
+        for n, c in which.items()
+    ]
     forces = [
         stm.Gravity(),
         stm.LinearSpringDamper("b0", "ground", stiffness=1.1, length=0.3),
@@ -175,7 +181,7 @@ def everything():
     )
     p = np.asarray(state.p) / np.linalg.norm(state.p, axis=1, keepdims=True)
     state = stm.State(state.r, jnp.asarray(p), state.v, state.omega)
-    table = {"l.1": {"value": (1.0, 2.0), "unit": "m", "source": 'a "book" \\ p. 3'}}
+    table = {"l.1": {"value": [1.0, 2.0], "unit": "m", "source": 'a "book" \\ p. 3'}}
     return stm.Scene(
         "all",
         "Every kind",
@@ -191,7 +197,7 @@ def everything():
 def test_every_kind_comes_back_to_the_last_bit(tmp_path):
     scene = everything()
     assert {joint.kind for joint in scene.system.joints} == set(JOINTS)
-    assert set(JOINTS) == {kind for kind in CATALOGUE if not kind.startswith("drive")}
+    assert set(JOINTS) == set(CATALOGUE)
     assert {type(force) for force in scene.system.forces} == {kind.make for kind in FORCES.values()}
     path = save_model(scene, tmp_path / "all.toml")
     again = load_model(path)
@@ -204,7 +210,7 @@ def test_what_a_file_cannot_hold_is_refused(gallery):
     system = gallery["pendulum"].system
     pin = system.joints[0]
     cases = {
-        "prescribes a function of time": (
+        "the motion of the driver 'd'": (
             [stm.drive("d", pin, lambda t: t, coordinate="angle")],
             [],
         ),
@@ -286,6 +292,10 @@ BAD = [
     ("pin = 0.1", "pin = 0.1\n[start.bodies.rod]\nspeed = 1", "'bodies.rod' has no entry 'speed'"),
     ("pin = 0.1", "pin = 0.1\n[start.bodies.rod]\norientation = [0, 0, 0, 2]", "[start]: "),
     ("[joints.pin]", "[joints.pin]\nin_bodies = 3", "no entry 'point'"),
+    ("[forces.weight]", "[joints.motor]\nkind = 'drive_angle'\njoint = 'pn'\n[forces.weight]",
+     "[joints.motor]: 'joint' must be a joint of a table before this one, but it is 'pn'. Did you"),
+    ("[forces.weight]", "[joints.motor]\nkind = 'drive_displacement'\njoint = 'pin'\n[forces.weight]",
+     "[joints.motor]: Driver 'motor' prescribes the displacement of joint 'pin', but a revolute"),
 ]  # fmt: skip
 
 
@@ -297,6 +307,27 @@ def test_errors_name_file_table_entry_and_what_is_valid(old, new, words, tmp_pat
     with pytest.raises(FileError, match=re.escape(words)) as caught:
         load_model(path)
     assert str(caught.value).startswith(str(path))
+
+
+def test_a_driver_moves_as_its_numbers_say(tmp_path):
+    motor = """[joints.motor]
+kind = "drive_angle"
+joint = "pin"
+start = 0.1
+rate = 2
+amplitude = 0.5
+angular_frequency = 3
+phase = 0.2
+"""
+    path = tmp_path / "driven.toml"
+    path.write_text(
+        SMALL.replace("[forces.weight]", motor + "[forces.weight]").partition("[start")[0]
+    )
+    motion = load_model(path).system.joints[1].motion
+    assert motion is not None
+    assert float(motion(jnp.asarray(0.7))) == pytest.approx(
+        0.1 + 1.4 + 0.5 * math.sin(2.3), rel=1e-15
+    )
 
 
 def test_frames_of_saved_joints_are_checked(tmp_path):
