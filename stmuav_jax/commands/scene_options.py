@@ -95,14 +95,17 @@ def _shown(usual: Any) -> str:
 
 
 def scene_among(words: Sequence[str], flags: Sequence[str]) -> str | None:
-    """The scene that the words after `simulate` name, if one does; a value of an option does not.
+    """The scene or the model's file (.toml) that the words after `simulate` name, if they name one.
+
+    A value of an option is neither.
 
     Args:
         flags: options that no value follows.
     """
     before = ""
     for word in words:
-        if word in SCENES and not (before.startswith("--") and before not in flags):
+        named = word in SCENES or (word.endswith(".toml") and not word.startswith("--"))
+        if named and not (before.startswith("--") and before not in flags):
             return word
         before = word
     return None

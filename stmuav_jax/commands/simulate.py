@@ -76,10 +76,11 @@ class Settings:
     """Keep compiled code in the user's cache folder for the next run."""
 
 
-ABOUT = """Simulate a scene; write run.nc, certificate.json and figures.
+ABOUT = """Simulate a scene, or a model's file; write run.nc, certificate.json and figures.
 
 Example: stmuav simulate uav_tracker --case 2 --t1 1 --loads. A scene has options of its own, such as
---drag or --servo.stiffness 1e6: `stmuav simulate SCENE --help` lists them with these.
+--drag or --servo.stiffness 1e6: `stmuav simulate SCENE --help` lists them with these. A model's file
+has none: stmuav simulate model.toml --t1 1 (docs/models.md).
 """
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(Settings))
@@ -96,13 +97,14 @@ def simulate_class(words: Sequence[str]) -> type:
     """
     flags = [f"--{no}{name}".replace("_", "-") for name in _FLAGS for no in ("", "no-")]
     scene = scene_among(words, flags)
-    about = tyro.conf.arg(help="Which scene; see `stmuav list`.")
+    about = tyro.conf.arg(help="Which scene, see `stmuav list`; or a model's file, model.toml.")
     flat = tyro.conf.arg(name="")
+    model = () if scene is None or scene in SCENES else (scene,)
     fields: list[Any] = [
-        ("scene", Annotated[tyro.conf.Positional[Literal[tuple(SCENES)]], about]),  # pyright: ignore[reportInvalidTypeForm]
+        ("scene", Annotated[tyro.conf.Positional[Literal[(*SCENES, *model)]], about]),  # pyright: ignore[reportInvalidTypeForm]
         ("settings", Annotated[Settings, flat]),
     ]
-    if scene is not None:
+    if scene in SCENES:
         own = [f"--{name}".replace("_", "-") for name in _FIELDS]
         check_known(scene, words, [*own, *flags, "--help"])
         titled = tyro.conf.arg(name=scene)
@@ -115,17 +117,33 @@ def simulate_class(words: Sequence[str]) -> type:
 
 
 def scene_of(command: Any) -> "Scene":
-    """The scene with its case, parameters and options."""
+    """The scene with its case, parameters and options, or that of a model's file."""
+    settings: Settings = command.settings
+    scene = _loaded(command) if command.scene not in SCENES else _registered(command)
+    if settings.loads and not scene.system.joints:
+        raise SettingError(f"--loads is for scenes with joints; {command.scene} has none.")
+    return scene
+
+
+def _registered(command: Any) -> "Scene":
     from ..files.netcdf import load_parameters
     from ..scenes.registry import make_scene, options_from_plain
 
     settings: Settings = command.settings
     table = load_parameters(settings.params, SCENES[command.scene].parameters)
     options = options_from_plain(command.scene, plain_of(command.scene, command.options))
-    scene = make_scene(command.scene, settings.case, table, **options)
-    if settings.loads and not scene.system.joints:
-        raise SettingError(f"--loads is for scenes with joints; {command.scene} has none.")
-    return scene
+    return make_scene(command.scene, settings.case, table, **options)
+
+
+def _loaded(command: Any) -> "Scene":
+    from ..files.model_file import load_model
+
+    for option in ("case", "params"):
+        if getattr(command.settings, option) is not None:
+            raise SettingError(
+                f"--{option} is for the report's scenes; a model's file holds its own numbers."
+            )
+    return load_model(command.scene)
 
 
 def run_scene(scene: "Scene", settings: Settings, console: Console) -> "Run":

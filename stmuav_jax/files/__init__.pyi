@@ -1,5 +1,10 @@
 """Public names of this folder; `__init__.py` imports each when it is first used."""
 
+from .model_file import (
+    load_model as load_model,
+    model_to_text as model_to_text,
+    save_model as save_model,
+)
 from .netcdf import (
     FileError as FileError,
     load as load,

@@ -52,6 +52,7 @@ from .load import (
     ActsOn as ActsOn,
     Load as Load,
     Sine as Sine,
+    SineMotion as SineMotion,
 )
 from .parts import (
     Part as Part,

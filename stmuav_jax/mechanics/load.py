@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from ..algebra.rotation import cross
 from ..algebra.stacked import apply_transposed, dot
 from ..checks.errors import ModelError, check_finite, check_shape
-from ..checks.numbers import floats
+from ..checks.numbers import floats, scalar
 from ..checks.shapes import Numbers
 from .joint import Which
 from .state import Kinematics
@@ -103,6 +103,42 @@ class Sine(eqx.Module):
     def __call__(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "*shape"]:
         del kin
         return self.amplitude * jnp.sin(self.angular_frequency * t)
+
+
+class SineMotion(eqx.Module):
+    """Motion start + rate t + amplitude sin(omega t + phase) of a driver; its numbers are leaves.
+
+    Args:
+        start: [m] or [rad]. rate: [m/s] or [rad/s]. amplitude: [m] or [rad].
+        angular_frequency: omega [rad/s]. phase: [rad].
+
+    Raises:
+        ModelError: a number is not finite.
+    """
+
+    start: Float[Array, ""]
+    rate: Float[Array, ""]
+    amplitude: Float[Array, ""]
+    angular_frequency: Float[Array, ""]
+    phase: Float[Array, ""]
+
+    def __init__(
+        self,
+        start: Numbers = 0.0,
+        rate: Numbers = 0.0,
+        amplitude: Numbers = 0.0,
+        angular_frequency: Numbers = 0.0,
+        phase: Numbers = 0.0,
+    ) -> None:
+        self.start = scalar(start, "The start of a driver's motion", "m or rad")
+        self.rate = scalar(rate, "The rate of a driver's motion", "m/s or rad/s")
+        self.amplitude = scalar(amplitude, "The amplitude of a driver's motion", "m or rad")
+        self.angular_frequency = scalar(angular_frequency, "The angular frequency", "rad/s")
+        self.phase = scalar(phase, "The phase of a driver's motion", "rad")
+
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        swing = self.amplitude * jnp.sin(self.angular_frequency * t + self.phase)
+        return self.start + self.rate * t + swing
 
 
 class Load(eqx.Module):

@@ -1,0 +1,365 @@
+"""Models as files: the gallery's numbers, a round trip to the last bit, errors that name the place."""
+
+import math
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import ellipk
+
+import stmuav_jax as stm
+from stmuav_jax.cli import main
+from stmuav_jax.dynamics import evaluate
+from stmuav_jax.files import FileError, load_model, model_to_text, save_model
+from stmuav_jax.files.model_schema import BODY, FORCES, IN_BODIES, JOINTS, START_BODY
+from stmuav_jax.mechanics import EndStop, JointFriction, JointServo, SineMotion, joint_motion
+from stmuav_jax.mechanics.joint import CATALOGUE
+from stmuav_jax.rotorcraft import Rotors
+
+DOCS = Path(__file__).parents[2] / "docs"
+GALLERY = sorted((DOCS / "models").glob("*.toml"))
+
+
+@pytest.fixture(scope="module")
+def gallery():
+    return {path.stem: load_model(path) for path in GALLERY}
+
+
+def bits(scene):
+    trees = scene.system, scene.state0
+    return jax.tree.structure(trees), [np.asarray(x).tobytes() for x in jax.tree.leaves(trees)]
+
+
+# --- the gallery's numbers, which docs/models.md shows
+
+
+def test_a_period_of_the_pendulum_by_the_command_line(tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    path = str(DOCS / "models" / "pendulum.toml")
+    words = ["--no-error-estimate", "--figures", "none", "--no-cache"]
+    assert main(["simulate", path, *words, "--out", str(tmp_path)]) == 0
+    run = stm.load(tmp_path / "run.nc")
+    period = 4 * math.sqrt(2 / (3 * 9.81)) * ellipk(math.sin(math.pi / 6) ** 2)
+    assert float(run["time"][-1]) == pytest.approx(period, rel=1e-14)
+    r = run["position"].values[:, 0]
+    assert r[-1] == pytest.approx(r[0], abs=1e-8)
+    assert np.abs(r[len(r) // 2] - r[0]).max() > 0.8
+
+
+def test_the_cart_and_pole_accelerate_as_published(gallery):
+    scene = gallery["cart_pole"]
+    found = evaluate(scene.system, scene.state0).accelerations
+    # Florian (2007), Eq. 23 and 24, without friction
+    angle, rate, force, m, half, g = 0.2, 0.5, 10.0, 0.1, 0.5, 9.8
+    push = (-force - m * half * rate**2 * math.sin(angle)) / 1.1
+    own = half * (4 / 3 - m * math.cos(angle) ** 2 / 1.1)
+    turning = (g * math.sin(angle) + math.cos(angle) * push) / own
+    spin = rate**2 * math.sin(angle) - turning * math.cos(angle)
+    cart = (force + m * half * spin) / 1.1
+    assert found.omega_rate[1, 1] == pytest.approx(turning, rel=1e-12)
+    assert found.v_rate[0] == pytest.approx([cart, 0, 0], rel=1e-12, abs=1e-12)
+    assert (turning, cart) == pytest.approx((-11.1795829, 9.5912001), abs=1e-7)
+
+
+def test_the_rocker_of_the_four_bar_obeys_freudenstein(gallery):
+    scene = gallery["four_bar"]
+    rocker = joint_motion(scene.system, scene.state0, "D")
+    crank, coupler, length, ground, a = 1.0, 3.0, 2.5, 3.0, 0.5
+    # ground/crank cos c - ground/length cos a + (...) = cos(a - c)
+    k = (crank**2 - coupler**2 + length**2 + ground**2) / (2 * crank * length)
+    one = lambda c: (
+        ground / crank * math.cos(c) - ground / length * math.cos(a) + k - math.cos(a - c)
+    )
+    reference = math.atan2(2.4803918541230536, -0.3125)
+    exact = float(brentq(one, 1.4, 2.5, xtol=1e-14))  # pyright: ignore[reportArgumentType]
+    assert float(rocker.angle) + reference == pytest.approx(exact, abs=1e-9)
+    # the links' velocities across the coupler: rate of the rocker by the law of instant centres
+    coupling = math.atan2(
+        length * math.sin(exact) - crank * math.sin(a),
+        ground + length * math.cos(exact) - crank * math.cos(a),
+    )
+    rate = 2 * crank * math.sin(coupling - a) / (length * math.sin(coupling - exact))
+    assert float(rocker.angle_rate) == pytest.approx(rate, rel=1e-9)
+    assert (exact, rate) == pytest.approx((1.5320736, -0.2646124), abs=1e-7)
+
+
+def test_the_slider_is_where_the_crank_puts_it(gallery):
+    scene = gallery["slider_crank"]
+    slider = joint_motion(scene.system, scene.state0, "guide")
+    r, rod, a, rate = 0.3, 0.5, math.pi / 2 - 0.5, 10.0
+    height, reach = r * math.sin(a), math.sqrt(rod**2 - (r * math.sin(a)) ** 2)
+    x = r * math.cos(a) + reach
+    assert float(slider.displacement) + 0.4 == pytest.approx(x, abs=1e-10)
+    speed = -rate * (height + height * r * math.cos(a) / reach)
+    assert float(slider.displacement_rate) == pytest.approx(speed, rel=1e-9)
+    assert (x, speed) == pytest.approx((0.5688999, -3.5235656), abs=1e-7)
+
+
+def test_the_gyroscope_precesses_steadily(gallery):
+    scene = gallery["gyroscope"]
+    found = evaluate(scene.system, scene.state0).accelerations
+    precession = 1.0 * 9.81 * 0.1 / (0.002 * 300)
+    # its centre of mass moves on a level circle
+    assert scene.state0.v[0] == pytest.approx([0, 0.1 * precession, 0], abs=1e-14)
+    assert found.v_rate[0] == pytest.approx([-(precession**2) * 0.1, 0, 0], abs=1e-11)
+
+
+def test_the_legs_of_the_stewart_platform_share_its_weight(gallery):
+    scene = gallery["stewart_platform"]
+    found = evaluate(scene.system, scene.state0)
+    leg = float(scene.system.joints[0].length)
+    each = 12 * 9.81 * leg / 6
+    assert np.linalg.norm(found.reactions.force, axis=1) == pytest.approx(np.full(6, each))
+    assert each == pytest.approx(23.5501, abs=1e-4)
+    assert found.accelerations.v_rate == pytest.approx(np.zeros((1, 3)), abs=1e-9)
+
+
+# --- round trips
+
+
+@pytest.mark.parametrize("path", GALLERY, ids=lambda p: p.stem)
+def test_gallery_models_are_short_and_come_back_to_the_last_bit(path, gallery, tmp_path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) < 60
+    scene = gallery[path.stem]
+    again = load_model(save_model(scene, tmp_path / "any.toml"))
+    assert bits(again) == bits(scene)
+    for name in ("name", "title", "t0", "t1", "save_every", "parameters", "notes", "watch"):
+        assert getattr(again, name) == getattr(scene, name), name
+
+
+def everything():
+    """Scene with every kind of joint and force element, odd numbers and odd names."""
+    odd = np.array([0.1, -0.0, 1 / 3])
+    tensor = np.array([[2.0, 0.1, 0.0], [0.1, 3.0, -0.2], [0.0, -0.2, 4.0]]) / 7
+    turn = np.array([1.0, 2.0, -3.0, 0.5]) / np.sqrt(14.25)
+    names = [f"b{k}" for k in range(9)]
+    bodies = [
+        stm.Body(n, 1 / 3 + k, tensor, com=odd, position=odd * k, orientation=turn)
+        for k, n in enumerate(names)
+    ]
+    bodies.append(
+        stm.Body('ä "b"\n', 5e-324, (1.0, 1.0, 2.0 + 1e-6), free=True, triangle_tolerance=1e-5)
+    )
+    axis = {"axis": [0, 1, 1.7]}
+    at = {"point": odd}
+    ends = {"point_i": odd, "point_j": [1.0, 2.0, 3.0]}
+    given = {
+        "weld": {}, "spherical": at, "universal": at | {"axis_i": [1, 0, 0], "axis_j": [0, 1, 0]},
+        "revolute": at | axis, "translational": axis, "cylindrical": axis,
+        "screw": at | axis | {"pitch": -0.01}, "distance": ends, "revolute_spherical": ends | axis,
+    }  # fmt: skip
+    joints = [
+        getattr(stm, kind)(kind, "ground", body, **more)
+        for body, (kind, more) in zip(names, given.items(), strict=True)
+    ]
+    which = {"revolute": "angle", "translational": "displacement"}
+    by_name = {joint.name: joint for joint in joints}
+    joints += [
+        stm.drive(f"drive {n}", by_name[n], SineMotion(0.1, 1 / 3, -0.0, 7.0, 1e-3), coordinate=c)
+        for n, c in which.items()
+    ]
+    forces = [
+        stm.Gravity(),
+        stm.LinearSpringDamper("b0", "ground", stiffness=1.1, length=0.3),
+        stm.TorsionalSpringDamper("revolute", stiffness=1.0, angle=0.1),
+        stm.JointDamping("revolute", turning=0.1),
+        JointServo("cylindrical", stiffness=1, damping=2, target=0.1, coordinate="angle"),
+        EndStop("translational", lower=-1 / 3, stiffness=1e9, damping=0, width=1e-3),
+        JointFriction("revolute", coulomb=1, speed=1e-3),
+        stm.JointEffort("translational", 3.0),
+        stm.AppliedForce("b1", odd, frame="body", point=odd),
+        stm.AppliedMoment("b1", odd),
+        Rotors("b2", arms=np.eye(3), spin=[1, -1, 1], k_f=1e-6, k_tau=1e-8, speed_squared=odd),
+    ]
+    system = stm.System(bodies, joints, forces)
+    state = jax.tree.map(
+        lambda x: x + 0.1 * jnp.sin(jnp.arange(x.size).reshape(x.shape)), system.reference
+    )
+    p = np.asarray(state.p) / np.linalg.norm(state.p, axis=1, keepdims=True)
+    state = stm.State(state.r, jnp.asarray(p), state.v, state.omega)
+    table = {"l.1": {"value": [1.0, 2.0], "unit": "m", "source": 'a "book" \\ p. 3'}}
+    return stm.Scene(
+        "all",
+        "Every kind",
+        system,
+        state,
+        t0=-1.0,
+        notes=("One.",),
+        watch=("b1",),
+        parameters=table,
+    )
+
+
+def test_every_kind_comes_back_to_the_last_bit(tmp_path):
+    scene = everything()
+    assert {joint.kind for joint in scene.system.joints} == set(JOINTS)
+    assert set(JOINTS) == set(CATALOGUE)
+    assert {type(force) for force in scene.system.forces} == {kind.make for kind in FORCES.values()}
+    path = save_model(scene, tmp_path / "all.toml")
+    again = load_model(path)
+    assert bits(again) == bits(scene)
+    assert again.parameters == scene.parameters
+    assert model_to_text(again) == path.read_text(encoding="utf-8")
+
+
+def test_what_a_file_cannot_hold_is_refused(gallery):
+    system = gallery["pendulum"].system
+    pin = system.joints[0]
+    cases = {
+        "the motion of the driver 'd'": (
+            [stm.drive("d", pin, lambda t: t, coordinate="angle")],
+            [],
+        ),
+        "'effort' of the JointEffort on pin; set it": ([], [stm.JointEffort("pin", lambda t: t)]),
+    }
+    rod = stm.Body("rod", 1.0, (1.0, 1.0, 1.0))
+    joint = stm.revolute("pin", "ground", "rod", point=[0, 0, 0], axis=[0, 1, 0])
+    for words, (joints, forces) in cases.items():
+        other = stm.System([rod], [joint, *joints], forces)
+        with pytest.raises(stm.SettingError, match=words):
+            model_to_text(stm.Scene("x", "", other, other.reference))
+
+
+# --- errors
+
+SMALL = """format = 1
+[parameters]
+mass = {value = 1.0, unit = "kg", source = "chosen"}
+[bodies.rod]
+mass = "mass"
+inertia = [1, 1, 1]
+[joints.pin]
+kind = "revolute"
+bodies = ["ground", "rod"]
+point = [0, 0, 0]
+axis = [0, 1, 0]
+[forces.weight]
+kind = "gravity"
+[start.coordinates]
+pin = 0.1
+"""
+
+BAD = [
+    ("format = 1", "format = 2", "'format' is 2, but this version reads format 1"),
+    ("format = 1", "", "A model needs 'format'"),
+    ("format = 1", "format = 1\ntitel = 'x'", "no entry 'titel'. Did you mean 'title'?"),
+    ("format = 1", "format = 1\nt1 = 'x'", "'t1' must be a number, but it is 'x'"),
+    ("format = 1", "format = 1\nsave_every = 0", "'save_every' must be finite and positive"),
+    ("format = 1", "format = 1\nwatch = ['rd']", "There is no body 'rd'. Did you mean 'rod'?"),
+    ("format = 1", "format 1", "not a readable TOML file"),
+    ("value = 1.0", "value = 'x'", "'parameters.mass.value' must be finite numbers, but it is 'x'"),
+    ("value = 1.0", "value = inf", "'parameters.mass.value' must be finite numbers"),
+    (', source = "chosen"', "", "'parameters.mass' needs 'source'"),
+    ('unit = "kg"', 'unit = "g"', "[bodies.rod]: 'mass' is a quantity in kg, but the parameter "
+     "'mass' is in 'g'"),
+    ('mass = "mass"', 'mass = "mas"', "[bodies.rod]: 'mass' must be numbers or the names of "
+     "parameters, but there is no parameter 'mas'. Did you mean 'mass'?"),
+    ('mass = "mass"', "", "[bodies.rod]: A body needs 'mass'"),
+    ('mass = "mass"', "mass = -1", "[bodies.rod]: The mass of body 'rod' must be finite and positive"),
+    ("[1, 1, 1]", "[1, 1]", "'inertia' must be three moments or three rows of three"),
+    ("[1, 1, 1]", "[1, 1, 9]", "[bodies.rod]: No body has the inertia tensor"),
+    ("[1, 1, 1]", "[1, 1, 1]\norientation = [2, 0, 0, 0]", "[bodies.rod]: "),
+    ("[1, 1, 1]", "[1, 1, 1]\nposition = [0, 0, 0]\ncom_position = [0, 0, 0]", "not both"),
+    ("[1, 1, 1]", "[1, 1, 1]\nposition = [[0, 0], 0, 0]", "'position.0' must be a number"),
+    ("bodies.rod", "bodies.ground", "[bodies.ground]: A body cannot be named 'ground'"),
+    ("revolute", "revolut", "[joints.pin]: A joint has the kind 'revolut'. Did you mean 'revolute'?"),
+    ('kind = "revolute"', "", "[joints.pin]: A joint needs 'kind'"),
+    ('kind = "revolute"', "kind = 3", "[joints.pin]: A joint has the kind 3"),
+    ('"rod"]', '"rood"]', "Joint 'pin' names the unknown body 'rood'. Did you mean 'rod'?"),
+    ('["ground", "rod"]', '["rod", "rod"]', "[joints.pin]: Joint 'pin' joins body 'rod' to itself"),
+    ('["ground", "rod"]', '"rod"', "'bodies' must be a list, but it is 'rod'"),
+    ('["ground", "rod"]', '["rod"]', "'bodies' must have more entries"),
+    ("axis = [0, 1, 0]", "axis = [0, 0, 0]", "[joints.pin]: The axis of joint 'pin' has zero length"),
+    ("axis = [0, 1, 0]", "axes = [0, 1, 0]", "A joint of kind revolute has no entry 'axes'. Did you "
+     "mean 'axis'?"),
+    ("axis = [0, 1, 0]", "", "[joints.pin]: A joint of kind revolute needs 'axis'"),
+    ('kind = "gravity"', 'kind = "spring"\nbodies = ["rod", "ground"]\nstiffness = -1',
+     "[forces.weight]: The stiffness of the spring between 'rod' and 'ground' must not be negative"),
+    ('kind = "gravity"', 'kind = "servo"\njoint = "pn"\nstiffness = 1\ndamping = 1\ntarget = 0',
+     "A JointServo names the unknown joint 'pn'. Did you mean 'pin'?"),
+    ('kind = "gravity"', 'kind = "effort"\njoint = "pin"\neffort = 1\ncoordinate = "angel"',
+     "'coordinate' must be angle or displacement, not 'angel'. Did you mean 'angle'?"),
+    ('kind = "gravity"', 'kind = "moment"\nbody = "rod"\nmoment = ["mass", 0, 0]',
+     "'moment' is a quantity in N m, but the parameter 'mass' is in 'kg'"),
+    ("pin = 0.1", "pn = 0.1", "[start]: There is no joint 'pn'. Did you mean 'pin'?"),
+    ("pin = 0.1", "pin = [0.1, 0.2]", "[start]: The coordinate of joint 'pin'"),
+    ("pin = 0.1", "pin = true", "[start]: 'coordinates.pin' must be a number"),
+    ("pin = 0.1", "pin = 0.1\n[start.bodies.rd]", "[start]: There is no body 'rd'. Did you mean"),
+    ("pin = 0.1", "pin = 0.1\n[start.bodies.rod]\nspeed = 1", "'bodies.rod' has no entry 'speed'"),
+    ("pin = 0.1", "pin = 0.1\n[start.bodies.rod]\norientation = [0, 0, 0, 2]", "[start]: "),
+    ("[joints.pin]", "[joints.pin]\nin_bodies = 3", "no entry 'point'"),
+    ("[forces.weight]", "[joints.motor]\nkind = 'drive_angle'\njoint = 'pn'\n[forces.weight]",
+     "[joints.motor]: 'joint' must be a joint of a table before this one, but it is 'pn'. Did you"),
+    ("[forces.weight]", "[joints.motor]\nkind = 'drive_displacement'\njoint = 'pin'\n[forces.weight]",
+     "[joints.motor]: Driver 'motor' prescribes the displacement of joint 'pin', but a revolute"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "words"), BAD)
+def test_errors_name_file_table_entry_and_what_is_valid(old, new, words, tmp_path):
+    path = tmp_path / "bad.toml"
+    assert SMALL.count(old) == 1
+    path.write_text(SMALL.replace(old, new))
+    with pytest.raises(FileError, match=re.escape(words)) as caught:
+        load_model(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_driver_moves_as_its_numbers_say(tmp_path):
+    motor = """[joints.motor]
+kind = "drive_angle"
+joint = "pin"
+start = 0.1
+rate = 2
+amplitude = 0.5
+angular_frequency = 3
+phase = 0.2
+"""
+    path = tmp_path / "driven.toml"
+    path.write_text(
+        SMALL.replace("[forces.weight]", motor + "[forces.weight]").partition("[start")[0]
+    )
+    motion = load_model(path).system.joints[1].motion
+    assert motion is not None
+    assert float(motion(jnp.asarray(0.7))) == pytest.approx(
+        0.1 + 1.4 + 0.5 * math.sin(2.3), rel=1e-15
+    )
+
+
+def test_frames_of_saved_joints_are_checked(tmp_path):
+    text = model_to_text(everything())
+    path = tmp_path / "bad.toml"
+    other = "frame_i = [[1, 0, 0], [0, 1, 0], [0, 0, 2]]"
+    path.write_text(re.sub(r"frame_i = \[\[.*?\]\]", other, text, count=1))
+    with pytest.raises(FileError, match=r"\[joints.weld\]: 'frame_i' must be a rotation matrix"):
+        load_model(path)
+
+
+def test_the_command_line_refuses_what_a_model_has_not(tmp_path, capsys):
+    path = tmp_path / "bad.toml"
+    assert main(["simulate", str(path), "--no-cache"]) == 2
+    assert "There is no file" in capsys.readouterr().err
+    path.write_text(SMALL)
+    assert main(["simulate", str(path), "--case", "1", "--no-cache"]) == 2
+    assert "--case is for the report's scenes" in capsys.readouterr().err
+
+
+# --- the page
+
+
+def test_the_page_lists_every_entry_with_its_unit():
+    page = (DOCS / "models.md").read_text(encoding="utf-8")
+    for kinds in (JOINTS, FORCES):
+        for name, kind in kinds.items():
+            row = next(line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
+            for key, slot in kind.slots.items():
+                shown = f"`{key}`" if slot.needed else f"*`{key}`*"
+                assert (f"{shown} [{slot.unit}]" if slot.unit else shown) in row, (name, key)
+    for key in (*BODY.slots, *IN_BODIES, *START_BODY):
+        assert f"`{key}`" in page, key
+    for path in GALLERY:
+        assert f"(models/{path.name})" in page
