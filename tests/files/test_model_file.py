@@ -3,6 +3,7 @@
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -156,7 +157,7 @@ def everything():
         getattr(stm, kind)(kind, "ground", body, **more)
         for body, (kind, more) in zip(names, given.items(), strict=True)
     ]
-    which = {"revolute": "angle", "translational": "displacement"}
+    which: dict[str, Any] = {"revolute": "angle", "translational": "displacement"}
     by_name = {joint.name: joint for joint in joints}
     joints += [
         stm.drive(f"drive {n}", by_name[n], SineMotion(0.1, 1 / 3, -0.0, 7.0, 1e-3), coordinate=c)
