@@ -55,16 +55,16 @@ class UavController(eqx.Module):
         self, estimate: State | MotionEstimate, reference: UavReference, memory: FlightMemory
     ) -> tuple[Float[Array, " m"], FlightMemory]:
         """Inputs (k + 2,): squared rotor speeds [rad^2/s^2] and forces [N]; and the memory."""
-        estimate = state_of(estimate)
+        state: State = state_of(estimate)
         flight, at = self.flight, reference.waypoint
         assert isinstance(flight.mass, tuple)
-        mass: Any = mass_properties(self.system, estimate) if self.feedforward else flight.mass
-        gravity_b = rotation_matrix(estimate.p[0]).T @ (flight.gravity - at.a)
+        mass: Any = mass_properties(self.system, state) if self.feedforward else flight.mass
+        gravity_b = rotation_matrix(state.p[0]).T @ (flight.gravity - at.a)
         wanted = reference.panel
         if not isinstance(wanted, PairMotion):
-            wanted = facing(jnp.asarray(wanted), estimate)
-        moved = self.servo.command(panel_motion(estimate), wanted, gravity_b, mass.centre)
+            wanted = facing(jnp.asarray(wanted), state)
+        moved = self.servo.command(panel_motion(state), wanted, gravity_b, mass.centre)
         if self.feedforward:
             mass = mass._replace(moment=moved.moment)
-        squared, after = flight.command(estimate, at, memory, mass)
+        squared, after = flight.command(state, at, memory, mass)
         return jnp.concatenate([squared, moved.forces]), after

@@ -187,6 +187,8 @@ def mass_matrix(
     tree: SpanningTree, S: Float[Array, "6 m *s"], at: Inertia
 ) -> Float[Array, "k k *s"]:
     """Mass matrix in the velocities (omega and v of a floating base in its axes, u)."""
+    if tree.floating and not tree.steps:
+        return base_inertia(at)
     frame = columns(tree).frame
     F = momenta(frame, S, at)
     above = support(tree)[np.ix_(frame, frame)]
@@ -203,6 +205,8 @@ def mass_matrix(
 
 def bias(tree: SpanningTree, S: Float[Array, "6 m *s"], at: Inertia) -> Float[Array, "k *s"]:
     """Bias force h of M du/dt + h = J^T lambda, in the order of `mass_matrix`."""
+    if tree.floating and not tree.steps:
+        return at.wrench[:, 0]
     wrench = pick(at.wrench, columns(tree).frame, 1)
     own = jnp.asarray(sum(S[i] * wrench[i] for i in range(6)))
     return jnp.concatenate([at.wrench[:, 0], own]) if tree.floating else own
