@@ -20,7 +20,7 @@ from pathlib import Path
 
 from report import PARTS
 from shared.command import begin, parser
-from shared.record import ALLOW, MEASURED, RESULTS, ROOT, commit, moved
+from shared.record import ALLOW, MEASURED, RESULTS, ROOT, commit, moved, traced
 
 FOLDER = Path(__file__).parent
 ALONE = (
@@ -56,7 +56,8 @@ def why_again(name: str, results: Path) -> str:
     for part in (about, *now):
         if part["dirty"] or part.get("package_from_elsewhere"):
             return f"Measured on {part['commit'][:10]} with changes."
-        since = moved(part["commit"], *MEASURED)
+        code = traced(part)
+        since = code and moved(code, *MEASURED)
         if since is None:
             return f"Measured on {part['commit'][:10]}, which is not in the history."
         if since:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from shared.clock import Timing, measure
 from shared.command import benchmark
+from shared.native import with_native_loops
 
 from stmuav_jax.algebra.compiler import compiler_options
 from stmuav_jax.estimation.bank import filter_bank
@@ -205,6 +206,7 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
     """Our filters, and those of other programs that are installed."""
     u, y = record_of_case(2, size.steps)
     content: dict[str, Any] = {"ours": ours(size, u, y)}
+    content["native_loops"] = with_native_loops(ours, size, u, y)
     for name, peer in (("filterpy", with_filterpy), ("dynamax", with_dynamax)):
         try:
             content[name] = peer(size, u, y)

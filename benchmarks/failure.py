@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from dense.report import attempt
 from dense.steps import Scheme
+from dense.system import attempt
 from dense.tables import Variant
 from shared.command import benchmark
 from shared.record import RESULTS, environment

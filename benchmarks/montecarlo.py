@@ -51,10 +51,13 @@ class Size:
     tolerances: tuple[float, ...] = (1e-8, 3e-9, 1e-9)
     tight: float = 1e-12
     repeats: int = 3
+    scene: str = "uav_tracker"
+    case: int | None = 2
 
 
 FULL = Size()
-ONE = Size(flights=4, lanes=(2,), checked=2, t1=0.02, tolerances=(1e-6,), tight=1e-9, repeats=1)
+ONE = Size(flights=4, lanes=(2,), checked=2, t1=0.02, tolerances=(1e-6,), tight=1e-9, repeats=1,
+           scene="hexacopter", case=None)  # fmt: skip
 
 
 def study(size: Size, tolerance: float) -> stm.montecarlo.Study:
@@ -63,7 +66,7 @@ def study(size: Size, tolerance: float) -> stm.montecarlo.Study:
     names = ("vx", "vy", "vz", "p", "q", "r")
     return study_from_plain(
         {
-            "name": "throughput", "scene": "uav_tracker", "case": 2, "t1": size.t1, "seed": 1,
+            "name": "throughput", "scene": size.scene, "case": size.case, "t1": size.t1, "seed": 1,
             "rtol": tolerance, "atol": tolerance,
             "factors": {f"start.{name}": normal for name in names},
             "quantities": {name: {"signal": name, "take": "final"} for name in "xyz"},
@@ -175,10 +178,11 @@ def run(size: Size) -> dict[str, Any]:
     alone, few = Bare(size, tolerance, 1), min(64, size.flights)
     single, _ = measure(lambda: alone.fly(few), repeats=size.repeats)
     cores = sorted({1, os.cpu_count() or 1})
-    given = (stm.make_scene("uav_tracker", 2), tight.starts(size.checked), size.t1)
+    label = size.scene if size.case is None else f"{size.scene} case {size.case}"
+    given = (stm.make_scene(size.scene, size.case), tight.starts(size.checked), size.t1)
     found = [row for peer in peers()[0] for row in throughput(peer, given, exact, WANTED, 30.0)]
     return {
-        "what": "flights per second, uav_tracker case 2", "t1": size.t1, "flights": size.flights,
+        "what": f"flights per second, {label}", "t1": size.t1, "flights": size.flights,
         "wanted_error": WANTED, "tolerance": tolerance, "tried": tried, "rows": rows,
         "best_lanes": best["lanes"], "one_lane_per_second": few / single.median, "peers": found,
         "cores": [on_devices(size, tolerance, count) for count in cores],

@@ -16,25 +16,34 @@ from typing import Any
 from shared.command import begin, parser
 from shared.record import write
 
+# Words of each command, with the folder for its results in the place of {out}.
 COMMANDS = {
     "list": "list",
-    "simulate": "simulate uav_tracker --case 2",
-    "simulate, loads": "simulate uav_tracker --case 2 --t1 1 --loads",
-    "sun": "sun --lat 11.55 --lon 104.92 --date 2024-03-21 --timezone Asia/Phnom_Penh",
-    "trim": "trim --phi 10 --theta -5",
-    "trim, sensitivities": "trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods",
-    "linearize": "linearize --sun 150 60 --outputs phi theta",
-    "tune hold": "tune hold --t1 0.4",
-    "tune slew": "tune slew",
-    "tune identify": "tune identify",
-    "estimate": "estimate",
+    "show": "show uav_tracker --out {out}",
+    "check": "check uav_tracker --case 2",
+    "simulate": "simulate uav_tracker --case 2 --out {out}",
+    "simulate, loads": "simulate uav_tracker --case 2 --t1 1 --loads --out {out}",
+    "view": "view {out} --html {out}/flight.html --sun 135 50",
+    "fly": "fly case-1 --t1 5 --out {out}",
+    "sun": "sun --lat 11.55 --lon 104.92 --date 2024-03-21 --timezone Asia/Phnom_Penh --out {out}",
+    "trim": "trim --phi 10 --theta -5 --out {out}",
+    "trim, sensitivities": "trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods --out {out}",
+    "linearize": "linearize --sun 150 60 --outputs phi theta --out {out}",
+    "tune hold": "tune hold --t1 0.4 --out {out}",
+    "tune slew": "tune slew --out {out}",
+    "tune identify": "tune identify --out {out}",
+    "estimate": "estimate --out {out}",
+    "montecarlo": "montecarlo collapse --samples 64 --out {out}",
+    "report": "report {out}/study.zarr --out {out}",
 }
+# Commands that read what another has written, which is run before them and not measured.
+BEFORE = {"view": "simulate", "report": "montecarlo"}
 ABOUT = "stmuav, whole process: CPU and wall time [s], peak memory [MB]"
 
 
 def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
     """Times [s] and peak memory [MB] of one run of the command line, and its exit code."""
-    given = [*words.split(), *(["--out", str(out)] if words != "list" else [])]
+    given = words.format(out=out).split()
     command = [sys.executable, "-m", "stmuav_jax.cli", *given]
     clock = time.perf_counter()
     process = subprocess.Popen(
@@ -63,13 +72,17 @@ def least(runs: list[dict[str, Any]]) -> dict[str, float]:
     }
 
 
-def measured(words: str, repeats: int) -> dict[str, Any]:
+def measured(name: str, repeats: int) -> dict[str, Any]:
     """Cold and warm runs of one command."""
+    words = COMMANDS[name]
     runs: dict[str, list[dict[str, Any]]] = {"cold": [], "warm": []}
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "out"
+            if name in BEFORE:
+                one(COMMANDS[BEFORE[name]], Path(folder) / "other", out)
             for kind in runs:
-                runs[kind].append(one(words, Path(folder) / "cache", Path(folder) / "out"))
+                runs[kind].append(one(words, Path(folder) / "cache", out))
     return {"words": words, **{kind: {**least(own), "runs": own} for kind, own in runs.items()}}
 
 
@@ -83,7 +96,7 @@ def main() -> None:
     names = ("list",) if options.quick else options.only
     found: dict[str, Any] = {}
     for name in names:
-        found[name] = measured(COMMANDS[name], 1 if options.quick else options.repeats)
+        found[name] = measured(name, 1 if options.quick else options.repeats)
         for kind in ("cold", "warm"):
             own = found[name][kind]
             print(

@@ -14,6 +14,7 @@ from . import (
     flight as flight,
     jobs as jobs,
     mechanics as mechanics,
+    missions as missions,
     montecarlo as montecarlo,
     parameters as parameters,
     quadrotor as quadrotor,
@@ -21,6 +22,7 @@ from . import (
     scenes as scenes,
     sensing as sensing,
     tracker as tracker,
+    viewer as viewer,
 )
 from .algebra import rotation as rotation
 from .checks.errors import (
@@ -42,6 +44,9 @@ from .dynamics.formulations.stabilisation import (
     Baumgarte as Baumgarte,
     Projection as Projection,
     Unstabilised as Unstabilised,
+)
+from .dynamics.inspection import (
+    check as check,
 )
 from .dynamics.integration.rosenbrock import (
     Rodas5P as Rodas5P,
@@ -121,6 +126,12 @@ from .parameters.airframe import (
 from .scenes.registry import (
     SCENES as SCENES,
     make_scene as make_scene,
+)
+from .viewer.page import (
+    view as view,
+)
+from .viewer.sketch import (
+    draw as draw,
 )
 
 __version__: str

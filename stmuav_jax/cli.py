@@ -12,22 +12,27 @@ from typing import Annotated, Any, NamedTuple, Union
 import tyro
 from rich.console import Console
 
-from .commands.estimate import Estimate, run_estimate
-from .commands.flight import Linearize, TrimCommand, run_linearize, run_trim
+from .commands.check import check_class, run_check
+from .commands.estimate import estimate_options, run_estimate
+from .commands.flight import linear_options, run_linearize, run_trim, trim_options
+from .commands.fly import Fly, run_fly
 from .commands.listing import List, run_list
 from .commands.montecarlo import Montecarlo, Report, run_montecarlo, run_report
 from .commands.options import arguments_of, check_options, check_words
 from .commands.output import explain, working
+from .commands.show import run_show, show_class
 from .commands.simulate import run_simulate, simulate_class
 from .commands.sun import SunDay, run_sun
-from .commands.tune import Tune, run_tune
+from .commands.tune import run_tune, tune_options
+from .commands.view import View, run_view
 from .figures.terminal import line
 
 ABOUT = """Simulate, trim, tune and estimate a UAV that carries a parallel-mechanism solar tracker,
 from the command line. Results go to files in runs/; `stmuav COMMAND --help` describes a command.
 
 Examples: stmuav simulate uav_tracker --case 2; stmuav sun --lat 11.55 --lon 104.92 --date 2024-03-21;
-stmuav trim --phi 10 --theta -5. Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted.
+stmuav trim --phi 10 --theta -5; stmuav view runs/uav_tracker_2.
+Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted.
 `--version` prints the version; `--debug` with a command prints the traceback of an error.
 """
 
@@ -48,14 +53,18 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "list": Command(List, run_list),
+    "show": Command(show_class, run_show, "Building and drawing the mechanism"),
     "simulate": Command(simulate_class, run_simulate),
+    "fly": Command(Fly, run_fly),
+    "check": Command(check_class, run_check, "Compiling and inspecting"),
+    "view": Command(View, run_view, "Reading the run and writing the page"),
     "sun": Command(SunDay, run_sun, "Following the sun through the day"),
-    "trim": Command(TrimCommand, run_trim, "Compiling and solving the trim"),
+    "trim": Command(trim_options, run_trim, "Compiling and solving the trim"),
     "linearize": Command(
-        Linearize, run_linearize, "Compiling and solving trim and linear equations"
+        linear_options, run_linearize, "Compiling and solving trim and linear equations"
     ),
-    "tune": Command(Tune, run_tune),
-    "estimate": Command(Estimate, run_estimate, "Compiling and running the filters"),
+    "tune": Command(tune_options, run_tune),
+    "estimate": Command(estimate_options, run_estimate, "Compiling and running the filters"),
     "montecarlo": Command(Montecarlo, run_montecarlo),
     "report": Command(Report, run_report, "Reading the store and drawing"),
 }
@@ -68,6 +77,9 @@ def cache_folder() -> Path:
 
 
 def _configure(use_cache: bool) -> None:
+    # JAX's factorisations are OpenBLAS's, whose threads wait for each other over small matrices;
+    # it reads this when JAX loads it
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import jax
 
     from .algebra.kept import keep_programs

@@ -25,8 +25,7 @@ def test_waiting(tmp_path):
 
 def test_first_result(tmp_path):
     subprocess.run(
-        [sys.executable, FOLDER / "first_result.py", "--repeats", "1", "--t1", "0.01",
-         "--results", tmp_path],
+        [sys.executable, FOLDER / "first_result.py", "--quick", "--results", tmp_path],
         check=True, capture_output=True, timeout=600,
     )  # fmt: skip
     record = json.loads((tmp_path / "first_result.json").read_text())

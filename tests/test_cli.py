@@ -190,6 +190,37 @@ def test_installed_command_and_import_leave_jax_alone():
 
 
 @pytest.mark.slow
+def test_a_command_that_was_run_before_compiles_nothing(tmp_path, monkeypatch):
+    words = [
+        "simulate",
+        "spin",
+        "--t1",
+        "0.01",
+        "--figures",
+        "none",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("JAX_LOG_COMPILES", "1")
+    said = [
+        subprocess.run(
+            [sys.executable, "-m", "stmuav_jax.cli", *words],
+            check=True, timeout=600, capture_output=True, text=True,
+        ).stderr.count("Finished XLA compilation")
+        for _ in range(2)
+    ]  # fmt: skip
+    assert said[0] > 3
+    assert said[1] == 0
+    # what is slow to import and not needed for it is not imported
+    code = (
+        "import sys; from stmuav_jax.cli import main; assert main(sys.argv[1:]) == 0; "
+        "assert not {'xarray', 'pandas', 'scipy', 'matplotlib', 'dask'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code, *words], check=True, timeout=600)
+
+
+@pytest.mark.slow
 def test_trim_command(tmp_path, capsys):
     """At the sun, with a sensitivity; then limits that cannot carry the weight."""
     given = ["trim", "--sun", "150", "70", "--out", str(tmp_path), "--no-cache"]

@@ -36,8 +36,10 @@ FLOORS = {
     "files": 13,
     "figures": 14,
     "jobs": 14,
-    "commands": 15,
-    "cli": 16,
+    "viewer": 14,
+    "missions": 15,
+    "commands": 16,
+    "cli": 17,
 }
 LINES, STEPS, IN_A_ROOM = 400, 60, 15
 

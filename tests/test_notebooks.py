@@ -1,5 +1,7 @@
 """Every notebook runs, its last cell asserts its claim, and it shows what it gives today."""
 
+import ast
+import importlib
 import math
 import os
 import re
@@ -20,6 +22,7 @@ LONG = (
     "08_parameters_from_a_record",
     "09_ten_thousand_collapses",
 )
+PICTURES = Path(__file__).parents[1] / "docs" / "make_pictures.py"
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 # Notebooks whose stored outputs are not those of the present package, with the reason. A notebook
@@ -99,6 +102,30 @@ def differences(stored: nbformat.NotebookNode, now: nbformat.NotebookNode) -> li
         off = [f"{a} was stored, {b} comes out" for a, b in pairs if not agree(a, b)]
         found += [f"cell {k}: {', '.join(off[:5])} ({len(off)} numbers differ)"] if off else []
     return found
+
+
+def code_of(path: Path) -> str:
+    """The Python of a script or of a notebook, whose magic commands are left out."""
+    if path.suffix == ".py":
+        return path.read_text(encoding="utf-8")
+    cells = nbformat.read(path, as_version=4).cells
+    lines = "\n".join(c.source for c in cells if c.cell_type == "code").splitlines()
+    return "\n".join(line for line in lines if not line.startswith("%"))
+
+
+@pytest.mark.parametrize("path", [*NOTEBOOKS, PICTURES], ids=lambda p: p.stem)
+def test_what_is_imported_exists(path, monkeypatch):
+    """Most notebooks run among the slow tests only, the pictures' script in none."""
+    monkeypatch.syspath_prepend(str(path.parent))
+    for node in ast.walk(ast.parse(code_of(path))):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                importlib.import_module(alias.name)
+        elif isinstance(node, ast.ImportFrom):
+            module = importlib.import_module(str(node.module))
+            for alias in node.names:
+                if not hasattr(module, alias.name):
+                    importlib.import_module(f"{node.module}.{alias.name}")
 
 
 @pytest.mark.parametrize(

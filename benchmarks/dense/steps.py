@@ -144,8 +144,12 @@ def integrate(
     started, end = time.perf_counter(), float(times[-1])
 
     def counted(t: float, y: Array) -> Array:
+        """y'. A state that is not finite gives one that is not, and no error."""
         log.evaluations += 1
-        return f(t, y)
+        try:
+            return f(t, y) if np.all(np.isfinite(y)) else np.full_like(y, np.nan)
+        except np.linalg.LinAlgError:
+            return np.full_like(y, np.nan)
 
     adaptive = lambda: ode45(counted, y0, end, scheme.rtol, scheme.atol)
     steps = runge_kutta(counted, y0, end, scheme.step) if scheme.step else adaptive()

@@ -17,6 +17,7 @@ their misprints corrected.
 from typing import Any
 
 import numpy as np
+from dense.steps import History, Scheme, integrate
 from dense.tables import KINDS, Array, Rows, Tables, Variant, cross, g_and_l, times
 from problems.plain import plain, start
 from problems.tree import in_plane
@@ -187,3 +188,24 @@ class Dense:
         """Largest residual of the rows that are lengths [m]."""
         found = self.residuals(x)
         return max(found["point"], found["p2"])
+
+    def violation(self, x: Array) -> float:
+        """Largest residual, all three rows of cross products counted [m], axes' rows [1]."""
+        found = self.residuals(x)
+        return max(self.gap(x), found["n1"], found["p1"])
+
+    def norm_error(self, x: Array) -> float:
+        """Largest | |p| - 1 |."""
+        return float(np.max(np.abs(np.linalg.norm(self.split(x)[0][:-1, 3:], axis=1) - 1)))
+
+
+def attempt(
+    scene: Scene,
+    times: Array,
+    scheme: Scheme,
+    variant: Variant | None = None,
+    p: dict[str, Any] | None = None,
+) -> tuple[Dense, History]:
+    """One run of the dense system, its states kept at `times`."""
+    model = Dense(scene, variant)
+    return model, integrate(model.rate, model.start(scene, p), times, scheme)

@@ -7,12 +7,12 @@ import math
 from typing import Any
 
 import numpy as np
-from problems.plain import Plain, PlainJoint, Sinus, Start, plain, start, why_not
+from problems.plain import Plain, PlainJoint, Sinus, axes, plain, start, why_not
 from problems.tree import in_plane, span
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, steps
 from peers.mujoco_c import whole_steps
-from stmuav_jax import Scene
+from stmuav_jax import Scene, State
 
 # Constrained axes (x, y, z, about x, about y, about z) of its generic joint.
 _AXES = {
@@ -39,7 +39,7 @@ class Mechanism:
         self.bodies.append(self.mbs.CreateGround())
         # a planar loop is closed in the plane, or its rows would be dependent
         plane = in_plane(self.model)
-        cut = span(self.model).cuts if plane is not None else ()
+        cut = span(scene, self.model).cuts if plane is not None else ()
         for joint in self.model.joints:
             axes = [1, 1, 0, 0, 0, 0] if joint in cut else _AXES[joint.kind]
             ends = self._ends(joint)
@@ -51,7 +51,7 @@ class Mechanism:
     def _body(self, k: int) -> Any:
         from exudyn import rigidBodyUtilities  # pyright: ignore[reportMissingImports]
 
-        s, R = self.first, self.first.R_wb[k]
+        s, R = self.first, axes(self.first.p[k])
         return self.mbs.CreateRigidBody(
             inertia=rigidBodyUtilities.RigidBodyInertia(self.model.mass[k], self.model.inertia[k]),
             referencePosition=s.r[k], referenceRotationMatrix=R, initialVelocity=s.v[k],
@@ -74,8 +74,8 @@ class Mechanism:
         make, how = self.items.SensorBody, {"outputVariableType": quantity, "storeInternal": True}
         return [self.mbs.AddSensor(make(bodyNumber=b, **how)) for b in self.bodies[:-1]]
 
-    def _loads(self, model: Plain, first: Start) -> None:
-        R = first.R_wb
+    def _loads(self, model: Plain, first: State) -> None:
+        R = axes(first.p)
         zero = np.zeros(3)
         for k, force, moment in model.wrenches:
             at = self._marker(k, zero)

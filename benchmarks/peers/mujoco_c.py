@@ -8,7 +8,7 @@ import importlib
 from typing import Any
 
 import numpy as np
-from problems.plain import Sinus, Start, UnsupportedError, loop_seconds, plain, start, starts
+from problems.plain import Sinus, UnsupportedError, loop_seconds, plain, start, starts
 from problems.tree import coordinates
 from scipy.spatial.transform import Rotation
 
@@ -125,7 +125,7 @@ class World:
         self.constant = len(self.links.wrenches) + len(self.links.moments)
         self.order = [self.model.body(f"link{k}").id for k, _ in self.links.bodies]
 
-    def begin(self, state: Start) -> np.ndarray:
+    def begin(self, state: State) -> np.ndarray:
         """Put the data at a start; returns MuJoCo's physics state."""
         mujoco, steps = self.mujoco, coordinates(self.tree, state)
         mujoco.mj_resetData(self.model, self.data)

@@ -1,5 +1,6 @@
 """MJX: MuJoCo's model compiled by JAX, fourth-order Runge-Kutta at a fixed step, on this CPU."""
 
+import importlib
 import importlib.util
 import time
 from typing import Any
@@ -40,8 +41,7 @@ class MujocoMjx(Peer):
 
     def _model(self, scene: Scene, step: float) -> tuple[Any, World, Any, Any]:
         """MJX, the C engine's world, and MJX's model and data at the start."""
-        from mujoco import mjx  # pyright: ignore[reportMissingImports]
-
+        mjx = importlib.import_module("mujoco.mjx")
         world = World(scene, step)
         # one Newton step solves a problem of equalities alone
         world.model.opt.iterations, world.model.opt.ls_iterations = 1, 4

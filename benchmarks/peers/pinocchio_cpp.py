@@ -16,7 +16,7 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
-from problems.plain import Start, plain, start, starts, why_not
+from problems.plain import start, starts, why_not
 from problems.tree import why_no_tree
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, tolerances
@@ -94,7 +94,7 @@ def compile_program() -> tuple[Path, float]:
 class Texts:
     """A scene's model and starts, as the program reads them from two files."""
 
-    def __init__(self, scene: Scene, states: list[Start] | None = None) -> None:
+    def __init__(self, scene: Scene, states: list[State] | None = None) -> None:
         tree, links = linked(scene)
         first = [start(scene)] if states is None else states
         self.model, self.bodies = model_text(links), len(links.bodies)
@@ -144,7 +144,7 @@ class PinocchioCpp(Peer):
         return f"No headers of {', '.join(lacking)} were found." if lacking else ""
 
     def unsupported(self, scene: Scene) -> str:
-        return why_not(scene) or why_no_tree(plain(scene))
+        return why_not(scene) or why_no_tree(scene)
 
     def settings(self, scene: Scene | None = None) -> list[Setting]:
         return tolerances("rkf78")

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from problems.plain import Plain, Sinus, Start, UnsupportedError, plain
+from problems.plain import Plain, Sinus, UnsupportedError, axes, plain
 from problems.tree import IDENTITY, Frame, Tree, coordinates, span
 
-from stmuav_jax import Scene
+from stmuav_jax import Scene, State
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class LinkModel:
 def linked(scene: Scene) -> tuple[Tree, LinkModel]:
     """A scene's tree, and the tree with every number in link axes."""
     model = plain(scene)
-    tree = span(model)
+    tree = span(scene, model)
     # a body's frame at its centre of mass, in the axes of the link that carries it
     body = [tree.links[link].on_child.inverse() for link in tree.carrier] + [IDENTITY]
     link = (*tree.carrier, -1)
@@ -159,13 +159,13 @@ def why_no_joint_forces(scene: Scene) -> str:
     return ""
 
 
-def start_vectors(tree: Tree, state: Start) -> tuple[np.ndarray, np.ndarray]:
+def start_vectors(tree: Tree, state: State) -> tuple[np.ndarray, np.ndarray]:
     """Pinocchio's q (quaternion x, y, z, w) and v (free joint: velocity in body axes)."""
     q, v = [], []
     for link, (position, rates) in zip(tree.links, coordinates(tree, state), strict=True):
         if link.kind == "free":
             position = position[[0, 1, 2, 4, 5, 6, 3]]
-            R = state.R_wb[link.child]
+            R = axes(state.p[link.child])
             rates = np.concatenate([R.T @ rates[:3], rates[3:]])
         elif link.kind == "ball":
             position = position[[1, 2, 3, 0]]

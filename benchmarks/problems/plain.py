@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -39,8 +40,9 @@ class Sinus:
 
 @dataclass(frozen=True)
 class PlainJoint:
-    """A joint: kind, bodies, and on each body a point (3,) [m] and a frame (3, 3)."""
+    """A joint: name, kind, bodies, and on each body a point (3,) [m] and a frame (3, 3)."""
 
+    name: str
     kind: str
     i: int
     j: int
@@ -119,25 +121,14 @@ class Plain:
         return len(self.names)
 
 
-@dataclass(frozen=True)
-class Start:
-    """A consistent state: r, v (n, 3) world, R_wb (n, 3, 3), omega (n, 3) body axes."""
-
-    r: np.ndarray
-    p: np.ndarray
-    v: np.ndarray
-    omega: np.ndarray
-
-    @property
-    def R_wb(self) -> np.ndarray:
-        """Body-to-world rotations (n, 3, 3)."""
-        return Rotation.from_quat(self.p, scalar_first=True).as_matrix()
-
-
-def start(scene: Scene) -> Start:
+def start(scene: Scene) -> State:
     """The scene's initial state in NumPy."""
-    s = scene.state0
-    return Start(*(np.asarray(x, dtype=float) for x in (s.r, s.p, s.v, s.omega)))
+    return jax.tree.map(np.asarray, scene.state0)
+
+
+def axes(p: Any) -> np.ndarray:
+    """Body-to-world rotations (..., 3, 3) of Euler parameters."""
+    return Rotation.from_quat(p, scalar_first=True).as_matrix()
 
 
 def plain(scene: Scene, *, any_couple: bool = False) -> Plain:
@@ -156,7 +147,7 @@ def plain(scene: Scene, *, any_couple: bool = False) -> Plain:
         i, j = index[joint.body_i], index[joint.body_j]
         points = np.asarray(joint.point_i) - com[i], np.asarray(joint.point_j) - com[j]
         frames = np.asarray(joint.frame_i), np.asarray(joint.frame_j)
-        joints.append(PlainJoint(joint.kind, i, j, *points, *frames))
+        joints.append(PlainJoint(joint.name, joint.kind, i, j, *points, *frames))
     loads: dict[str, tuple[Any, ...]] = {kind: () for kind in ("wrenches", "actuators", "forces")}
     gravity = np.zeros(3)
     for force in system.forces:
@@ -227,10 +218,9 @@ def why_not(scene: Scene) -> str:
     return ""
 
 
-def starts(states: State) -> list[Start]:
-    """Stacked states, arrays (k, n, .), as a list of starts."""
-    parts = (np.asarray(x, dtype=float) for x in (states.r, states.p, states.v, states.omega))
-    return [Start(*one) for one in zip(*parts, strict=True)]
+def starts(states: State) -> list[State]:
+    """Stacked states, arrays (k, n, .), one by one in NumPy."""
+    return [jax.tree.map(lambda x, k=k: np.asarray(x)[k], states) for k in range(len(states.r))]
 
 
 def loop_seconds(call: Callable[[], object], loops: int = 2000, repeats: int = 5) -> float:

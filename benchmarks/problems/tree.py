@@ -1,15 +1,25 @@
-"""A spanning tree of a scene for programs in relative coordinates: Pinocchio and MuJoCo.
+"""A scene's spanning tree for programs in relative coordinates: Pinocchio and MuJoCo.
 
-The joints with the most rows are kept, the others are cut and closed by constraints: ball joints,
-and hinges of planar mechanisms, where two rows in the plane say all that is left to say. Joints
-are listed depth first, parents before children; Pinocchio gives a wrong mass matrix otherwise.
+Tree and joint coordinates are the package's, so that all integrate in the same coordinates. The
+joints that it cuts are closed by constraints: ball joints, and hinges of planar mechanisms, where two
+rows in the plane say all that is left to say. Joints are listed depth first, parents before
+children; Pinocchio gives a wrong mass matrix otherwise.
 """
 
 from dataclasses import dataclass
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from problems.plain import ROWS, Plain, PlainJoint, Start, UnsupportedError
-from scipy.spatial.transform import Rotation
+from problems.plain import Plain, PlainJoint, UnsupportedError, plain
+
+from stmuav_jax import Scene, State
+from stmuav_jax.dynamics.tree.coordinates import read
+from stmuav_jax.dynamics.tree.frames import motion_groups
+from stmuav_jax.dynamics.tree.parameters import TreeParameters, tree_parameters
+from stmuav_jax.dynamics.tree.poses import by_group
+from stmuav_jax.dynamics.tree.topology import spanning_tree
 
 
 @dataclass(frozen=True)
@@ -53,12 +63,14 @@ class Tree:
     """Links, depth first; the joints that are cut; the link that carries each body.
 
     plane: (2, 3) world directions in which cut joints are closed; None: in all three.
+    parameters: the package's of this tree.
     """
 
     links: tuple[Link, ...]
     cuts: tuple[PlainJoint, ...]
     carrier: tuple[int, ...]
-    plane: np.ndarray | None = None
+    plane: np.ndarray | None
+    parameters: TreeParameters
 
 
 KINDS = {
@@ -66,36 +78,37 @@ KINDS = {
 }  # fmt: skip
 
 
-def span(model: Plain) -> Tree:
-    """A spanning tree from ground, or from the first body where nothing is tied to ground."""
-    kept = _kruskal(model)
-    tied = any(model.n in (joint.i, joint.j) for joint in model.joints)
+def span(scene: Scene, model: Plain | None = None) -> Tree:
+    """The scene's spanning tree, from ground or from the body that floats."""
+    model, spanned = model or plain(scene), spanning_tree(scene.system)
     links: list[Link] = []
     carrier = {model.n: -1}
 
     def grow(body: int) -> None:
-        for joint in kept:
-            if body not in (joint.i, joint.j):
+        for number, parent, child, forward in spanned.links:
+            if parent != body:
                 continue
-            child = joint.j if joint.i == body else joint.i
-            if child not in carrier:
-                links.append(_link(joint, body, child, carrier[body]))
-                carrier[child] = len(links) - 1
-                grow(child)
+            if number is None:
+                raise UnsupportedError("More than one floating part is not written.")
+            links.append(_link(model.joints[number], parent, child, carrier[body], forward))
+            carrier[child] = len(links) - 1
+            grow(child)
 
-    if not tied:
-        links.append(Link("free", model.n, 0, -1, IDENTITY, IDENTITY))
-        carrier[0] = 0
-    grow(model.n if tied else 0)
-    if len(carrier) != model.n + 1:
-        raise UnsupportedError("More than one floating part is not written.")
-    cuts = tuple(joint for joint in model.joints if joint not in kept)
+    if spanned.floating:
+        links.append(Link("free", model.n, spanned.root, -1, IDENTITY, IDENTITY))
+        carrier[spanned.root] = 0
+    grow(spanned.root)
+    cuts = tuple(model.joints[k] for k in spanned.cut)
     spatial = all(joint.kind == "spherical" for joint in cuts)
     plane = None if spatial else in_plane(model)
     if plane is None and not spatial:
         said = "Cutting a spatial loop at a joint that is not spherical is not written."
         raise UnsupportedError(said)
-    return Tree(tuple(links), cuts, tuple(carrier[k] for k in range(model.n)), plane)
+    bodies, parameters = (
+        tuple(carrier[k] for k in range(model.n)),
+        tree_parameters(scene.system, spanned),
+    )
+    return Tree(tuple(links), cuts, bodies, plane, parameters)
 
 
 def in_plane(model: Plain) -> np.ndarray | None:
@@ -116,71 +129,44 @@ def in_plane(model: Plain) -> np.ndarray | None:
     return np.linalg.svd(normals[model.n][None])[2][1:]
 
 
-def why_no_tree(model: Plain) -> str:
+def why_no_tree(scene: Scene) -> str:
     """Why there is no tree that the peers can use; empty if there is one."""
     try:
-        span(model)
+        span(scene)
     except UnsupportedError as error:
         return str(error)
     return ""
 
 
-def _kruskal(model: Plain) -> list[PlainJoint]:
-    """The joints that close no loop, those with the most rows first."""
-    group = list(range(model.n + 1))
-    kept = []
-    for joint in sorted(model.joints, key=lambda joint: -ROWS[joint.kind]):
-        a, b = group[joint.i], group[joint.j]
-        if a != b:
-            group = [a if g == b else g for g in group]
-            kept.append(joint)
-    return kept
-
-
-def _link(joint: PlainJoint, parent: int, child: int, ahead: int) -> Link:
-    first, second = Frame(joint.frame_i, joint.point_i), Frame(joint.frame_j, joint.point_j)
-    if joint.kind not in KINDS or (joint.kind == "universal" and parent != joint.i):
+def _link(joint: PlainJoint, parent: int, child: int, ahead: int, forward: bool) -> Link:
+    ends = Frame(joint.frame_i, joint.point_i), Frame(joint.frame_j, joint.point_j)
+    if joint.kind not in KINDS or (joint.kind == "universal" and not forward):
         said = f"A {joint.kind} joint from its second body to its first is not written."
         raise UnsupportedError(said)
-    if parent != joint.i:
-        first, second = second, first
+    first, second = ends if forward else ends[::-1]
     return Link(KINDS[joint.kind], parent, child, ahead, first, second, joint)
 
 
-def coordinates(tree: Tree, state: Start) -> list[tuple[np.ndarray, np.ndarray]]:
+_read = eqx.filter_jit(read)
+
+
+def coordinates(tree: Tree, state: State) -> list[tuple[np.ndarray, np.ndarray]]:
     """Each link's coordinates and their rates in a consistent state.
 
     A free link has r and Euler parameters (7,), world velocity and body angular velocity (6,); a
     ball Euler parameters (4,) and the relative angular velocity in the child's frame (3,).
     """
-    R = np.concatenate([state.R_wb, np.eye(3)[None]])
-    r, v = (np.concatenate([x, np.zeros((1, 3))]) for x in (state.r, state.v))
-    w = np.einsum("nab,nb->na", R, np.concatenate([state.omega, np.zeros((1, 3))]))
-    result = []
-    for link in tree.links:
-        a, b = link.parent, link.child
+    steps = tree.parameters.tree
+    parts = (state.r, state.p, state.v, state.omega)
+    at = _read(tree.parameters, jax.tree.map(jnp.asarray, state))
+    found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for group, *own in zip(motion_groups(steps), at.q, by_group(steps, at.u), strict=True):
+        for k, step in enumerate(group.steps):
+            q, v = (np.atleast_1d(np.asarray(x)[..., k]) for x in own)
+            found.setdefault(steps.steps[step].body, []).append((q, v))
+    for link in tree.links[:1]:
         if link.kind == "free":
-            rates = np.concatenate([state.v[b], state.omega[b]])
-            result.append((np.concatenate([state.r[b], state.p[b]]), rates))
-            continue
-        F = R[a] @ link.on_parent.R
-        T = F.T @ R[b] @ link.on_child.R
-        turning = F.T @ (w[b] - w[a])
-        if link.kind == "ball":
-            p = Rotation.from_matrix(T).as_quat(scalar_first=True)
-            result.append((p, T.T @ turning))
-        elif link.kind == "turn":
-            result.append((np.array([np.arctan2(T[1, 0], T[0, 0])]), turning[2:]))
-        elif link.kind == "universal":
-            first, second = np.arctan2(T[2, 1], T[1, 1]), np.arctan2(T[0, 2], T[0, 0])
-            swing = np.array([0.0, np.cos(first), np.sin(first)])
-            rates = np.array([turning[0], swing @ turning])
-            result.append((np.array([first, second]), rates))
-        else:
-            arm_a, arm_b = R[a] @ link.on_parent.x, R[b] @ link.on_child.x
-            d = r[b] + arm_b - r[a] - arm_a
-            d_rate = v[b] + np.cross(w[b], arm_b) - v[a] - np.cross(w[a], arm_a)
-            z = F[:, 2]
-            rates = np.array([z @ (d_rate - np.cross(w[a], d))])
-            result.append((np.array([z @ d]), rates))
-    return result
+            r, p, v, omega = (x[link.child] for x in parts)
+            found[link.child] = [(np.concatenate([r, p]), np.concatenate([v, omega]))]
+    each = [zip(*found[link.child], strict=True) for link in tree.links]
+    return [(np.concatenate(q), np.concatenate(v)) for q, v in each]

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from shared.pages import Row, legend_of, ours, panels, save
+from shared.pages import NATIVE, Row, legend_of, ours, panels, save
 
-MARKS = "osD^vP*X<>h8"
-# Twelve colours that stay apart for the colour-blind, those of Okabe and Ito first.
+MARKS = "osD^vP*X<>h8p"
+# Thirteen colours that stay apart for the colour-blind, those of Okabe and Ito first.
 COLORS = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00",
     "#56B4E9", "#882255", "#999933", "#666666", "#44AA99", "#332288",
+    "#DDCC77",
 )  # fmt: skip
 
 
@@ -43,10 +44,13 @@ def work_precision(curve: Row) -> Figure:
     ends = curve["horizons"]
     figure, sides = panels(1, len(ends), 1.5 + 4.6 * len(ends), 5.4, sharey=True)
     methods = list(dict.fromkeys((row["method"], row["solver"]) for row in curve["rows"]))
+    # a method with native loops is dotted, in the colour of the same without them
+    alike = [(name.removesuffix(NATIVE), solver) for name, solver in methods]
+    order = list(dict.fromkeys(alike))
     shown = [row for row in curve["rows"] if drawn(row)]
     for axes, end in zip(sides, ends, strict=True):
-        for k, (method, solver) in enumerate(methods):
-            which = (method, solver, end)
+        for (method, solver), like in zip(methods, alike, strict=True):
+            k, which = order.index(like), (method, solver, end)
             rows = [r for r in shown if (r["method"], r["solver"], r["horizon"]) == which]
             if not rows:
                 continue
@@ -54,6 +58,7 @@ def work_precision(curve: Row) -> Figure:
             y = [1e3 * row["seconds"]["median"] for row in rows]
             mine = method.startswith("stmuav-jax")
             style = {"lw": 2.0, "ls": "-"} if mine else {"lw": 1.0, "ls": "--"}
+            style |= {"ls": ":"} if method.endswith(NATIVE) else {}
             name = method if solver in method else f"{method}, {solver}"
             color = COLORS[k % len(COLORS)]
             axes.loglog(x, y, marker=MARKS[k % len(MARKS)], ms=5, color=color, label=name, **style)

@@ -76,9 +76,10 @@ def write_page(result: Path, page: Path) -> Path:
         "# Throughput of studies", "",
         "Made by `python benchmarks/montecarlo.py` from `benchmarks/results/montecarlo.json`; do not edit.",
         "",
-        f"Flights of uav_tracker case 2 to {content['t1']:g} s, {content['flights']} of them, Dopri8 at "
+        f"Flights of {content['what'].split(', ')[1]} to {content['t1']:g} s, {content['flights']} of them, Dopri8 at "
         f"{content['tolerance']:g}; medians. {about['cores']} cores, commit {about['commit'][:10]}"
-        f"{dirty}, {about['date'][:10]}.",
+        f"{dirty}, {about['date'][:10]}, load {about['load_at_start']:.0f} when it began (work that takes "
+        "all cores competes with other processes there).",
         "", f"![lanes]({picture.relative_to(page.parent)})", "", "## One core", "",
         *listed(rows, "lanes", ("flights per second", "per_second", one),
                 ("us per step and flight", "microseconds_per_step", one),

@@ -15,6 +15,8 @@ Row = dict[str, Any]
 # A column: the key that is also its head; or head and key; or head, key and format. A format with
 # no key is given the whole row.
 Column = str | tuple[Any, ...]
+# What the names of methods end with that run in the process with native loops.
+NATIVE = ", native loops"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> Lines:

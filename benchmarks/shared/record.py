@@ -3,8 +3,13 @@
 A result says which commit it was measured on. That is only worth something if the tree was that
 commit: results that are kept in the repository are not overwritten from a tree with changes, nor
 by a package from elsewhere, unless `--allow-dirty` says so, which the result then records.
+
+A commit's name is lost when commits are put together into one. Results therefore also name their
+sources: a digest of the package's and the benchmarks' files, by which any commit that has these
+files is found.
 """
 
+import hashlib
 import json
 import os
 import platform
@@ -54,6 +59,31 @@ def in_history(name: str) -> bool:
     return git("merge-base", "--is-ancestor", name, "HEAD") is not None
 
 
+def sources(name: str = "HEAD") -> str | None:
+    """Digest of the package's and the benchmarks' files at a commit, results left out."""
+    listed = git("ls-tree", "-r", name, "--", "stmuav_jax", "benchmarks")
+    if not listed:
+        return None
+    kept = [line for line in listed.splitlines() if "\tbenchmarks/results/" not in line]
+    return hashlib.sha256("\n".join(kept).encode()).hexdigest()[:40]
+
+
+def traced(about: dict[str, Any]) -> str | None:
+    """The commit of the history that has the code of a result; None if there is none.
+
+    Args:
+        about: the result's environment, or that of one of its parts.
+    """
+    if in_history(about["commit"]):
+        return about["commit"]
+    wanted = about.get("sources")
+    if wanted is None:
+        return None
+    # a commit that touches neither has the sources of the one before
+    touching = git("log", "--format=%H", "HEAD", "--", *MEASURED) or ""
+    return next((name for name in touching.split() if sources(name) == wanted), None)
+
+
 def moved(since: str, *places: str) -> int | None:
     """How many later commits touch the places; None if the commit is not in the history."""
     if not in_history(since):
@@ -83,7 +113,7 @@ def environment() -> dict[str, Any]:
     """Commit, what differs from it, versions, machine and date."""
     changed = changes()
     return {
-        "commit": commit(), "dirty": bool(changed), "changed": changed,
+        "commit": commit(), "sources": sources(), "dirty": bool(changed), "changed": changed,
         "package_from_elsewhere": bool(elsewhere()), "allow_dirty": allowed(),
         "versions": versions(), "cpu": platform.processor() or platform.machine(),
         "cores": os.cpu_count(), "load_at_start": os.getloadavg()[0],

@@ -16,6 +16,7 @@ from .sampled import (
 )
 from .space import (
     Composite as Composite,
+    Concatenated as Concatenated,
     CyclicVector as CyclicVector,
     Rotation as Rotation,
     Vector as Vector,

@@ -85,14 +85,15 @@ def _known(options: Options) -> bool:
 
 
 def outer_jit(function: Callable[..., Any]) -> Any:
-    """`eqx.filter_jit` with `compiler_options`, for the outermost function of a program."""
-    return eqx.filter_jit(function, compiler_options=compiler_options())  # pyright: ignore[reportCallIssue]
+    """`eqx.filter_jit` with `compiler_options`, for the outermost function of a program.
+
+    Where programs are kept for later processes (`keep_programs`), this one is too.
+    """
+    return _stored_jit(function, quick=False)
 
 
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`eqx.filter_jit` with `compiler_options(quick=True)`, determined at the first call.
-
-    Where programs are kept for later processes (`keep_programs`), this one is too.
+    """`outer_jit` with `compiler_options(quick=True)`, determined at the first call.
 
     Within a transformation (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a
     larger program.
@@ -100,23 +101,35 @@ def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     Args:
         function: function of positional arguments.
     """
+    return _stored_jit(function, quick=True)
+
+
+def _stored_jit(function: Callable[..., Any], *, quick: bool) -> Callable[..., Any]:
     within: Any = eqx.filter_jit(function)
 
     @cache
     def made() -> Any:
-        options = compiler_options(quick=True)
+        options = compiler_options(quick=quick)
         return eqx.filter_jit(function, compiler_options=options)  # pyright: ignore[reportCallIssue]
 
     @wraps(function)
-    def call(*args: Any) -> Any:
-        if transformed(args):
-            return within(*args)
+    def call(*args: Any, **named: Any) -> Any:
+        if transformed((args, named)):
+            return within(*args, **named)
+        if named:
+            return made()(*args, **named)
         # NumPy's arrays are arguments here, while kept programs take those of JAX only
         given = jax.tree.map(lambda x: as_jax(x) if isinstance(x, np.ndarray) else x, args)
-        key = kept.key_of(function, given, _NO_LIBRARY | _QUICK)
-        return made()(*args) if key is None else _by_key(key, function, given)(*given)
+        key = kept.key_of(function, given, _asked(quick))
+        return made()(*args) if key is None else _by_key(key, function, given, quick)(*given)
 
+    call.lower = lambda *args, **named: made().lower(*args, **named)  # pyright: ignore
     return call
+
+
+def _asked(quick: bool) -> Options:
+    """Options that are asked for, by which kept programs are found without a test of XLA."""
+    return _NO_LIBRARY | (_QUICK if quick else {})
 
 
 _programs: OrderedDict[Hashable, Callable[..., Any]] = OrderedDict()
@@ -174,7 +187,9 @@ def program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
     return _by_key((function, structure, setting, tuple(map(_kind, leaves))), function, args)
 
 
-def _by_key(key: Hashable, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+def _by_key(
+    key: Hashable, function: Callable[..., Any], args: tuple[Any, ...], quick: bool = True
+) -> Any:
     """Program of a key, compiled if there is none."""
     with _lock:
         found = _programs.get(key)
@@ -182,7 +197,7 @@ def _by_key(key: Hashable, function: Callable[..., Any], args: tuple[Any, ...]) 
             _programs.move_to_end(key)
             return found
     check_maps()
-    made = _compiled(function, args)
+    made = _compiled(function, args, quick)
     with _lock:
         _programs[key] = made
         while len(_programs) > MOST_PROGRAMS:
@@ -190,9 +205,11 @@ def _by_key(key: Hashable, function: Callable[..., Any], args: tuple[Any, ...]) 
     return made
 
 
-def _compiled(function: Callable[..., Any], args: tuple[Any, ...]) -> Callable[..., Any]:
-    key = kept.key_of(function, args, _NO_LIBRARY | _QUICK)
-    compiled, result = kept.load(key) or _compiled_now(function, args, key)
+def _compiled(
+    function: Callable[..., Any], args: tuple[Any, ...], quick: bool = True
+) -> Callable[..., Any]:
+    key = kept.key_of(function, args, _asked(quick))
+    compiled, result = kept.load(key) or _compiled_now(function, args, key, quick)
 
     def call(*args: Any) -> Any:
         arrays = [leaf for leaf in jax.tree.leaves(args) if eqx.is_array(leaf)]
@@ -203,7 +220,7 @@ def _compiled(function: Callable[..., Any], args: tuple[Any, ...]) -> Callable[.
 
 
 def _compiled_now(
-    function: Callable[..., Any], args: tuple[Any, ...], key: str | None
+    function: Callable[..., Any], args: tuple[Any, ...], key: str | None, quick: bool
 ) -> tuple[Callable[[list[Any]], list[Any]], Any]:
     """Program of lists of arrays, and the result's pytree with a `Slot` for each of them."""
     leaves, structure = jax.tree.flatten(args)
@@ -223,7 +240,7 @@ def _compiled_now(
 
     name = getattr(function, "__name__", "run")
     run.__name__ = run.__qualname__ = name if key is None else kept.new_name(name)
-    lowered = jax.jit(run, compiler_options=compiler_options(quick=True)).lower(arrays)
+    lowered = jax.jit(run, compiler_options=compiler_options(quick=quick)).lower(arrays)
     compiled = lowered.compile()
     kept.store(key, lowered, compiled, len(arrays), result[0])
     return compiled, result[0]

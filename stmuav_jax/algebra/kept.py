@@ -40,7 +40,9 @@ MOST_BYTES = 300_000_000
 
 # Packages whose functions and classes are described by their names, because the text has their
 # versions; of this package it has the source.
-_PACKAGES = ("stmuav_jax", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy")
+_PACKAGES = (
+    "stmuav_jax", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "optax", "numpy",
+)  # fmt: skip
 _OF_PYTHON = ("builtins", "operator", "functools", "math")
 
 _SUFFIX = ".program"
@@ -256,6 +258,8 @@ def _text(x: Any, constant: bool = False) -> Any:
     if isinstance(x, jax.Array):
         kind = (x.shape, str(x.dtype), getattr(x, "weak_type", False))
         return "array", kind, _digest(np.asarray(x)) if constant else ""
+    if isinstance(x, jax.ShapeDtypeStruct) and x.sharding is None:
+        return "shape", x.shape, str(x.dtype), getattr(x, "weak_type", False)
     if isinstance(x, np.ndarray | np.generic):
         return "numpy", x.shape, str(x.dtype), _digest(x)
     if isinstance(x, np.dtype):

@@ -122,24 +122,35 @@ class _Stepper(eqx.Module):
         function = self.function if seen is None else _with_columns(*seen)
         return lambda values, _: (function(values), None)
 
+    def _initial(self, values: Any, seen: Any) -> Any:
+        return self.method.init(self.of(seen), values, None, {}, self.shape, None, frozenset())
+
+    def _read(self, state: Any) -> tuple[list[Any], Any]:
+        """Arrays of a state of the method, and where such a method evaluates next."""
+        return jax.tree.leaves(eqx.filter(state, eqx.is_array)), getattr(state, "y_eval", None)
+
+    # The other leaves of a state are the same in every state. Some of them, such as traced
+    # functions, no other process could read: a program that is kept makes them again.
+
     @quick_jit
-    def begin(self, values: Any, seen: Any) -> tuple[Any, Any]:
-        """Initial state of the method: its arrays, and the other leaves, which stay constant."""
-        state = self.method.init(self.of(seen), values, None, {}, self.shape, None, frozenset())
-        return eqx.partition(state, eqx.is_array)
+    def begin(self, values: Any, seen: Any) -> tuple[list[Any], Any]:
+        """Arrays of the initial state of the method, and where it evaluates first."""
+        return self._read(self._initial(values, seen))
 
     @quick_jit
     def step(
-        self, values: Any, arrays: Any, rest: Any, seen: Any
-    ) -> tuple[Any, Any, Any, Array, Array]:
+        self, values: Any, arrays: list[Array], seen: Any
+    ) -> tuple[Any, tuple[list[Any], Any], Any, Array, Array]:
         """Next values and state, the values of known loss, their loss, and the flag of the end."""
-        state, of = eqx.combine(arrays, rest), self.of(seen)
+        own, rest = eqx.partition(self._initial(values, seen), eqx.is_array)
+        state = eqx.combine(jax.tree.unflatten(jax.tree.structure(own), arrays), rest)
+        of = self.of(seen)
         after, state, _ = self.method.step(of, values, None, {}, state, frozenset())
         done, _ = self.method.terminate(of, after, None, {}, state, frozenset())
         # a minimiser of optax knows the loss before its step, all other methods the loss after it
         behind = isinstance(self.method, optx.OptaxMinimiser)
         known, loss = (values, state.f) if behind else (after, state.f_info.as_min())
-        return after, eqx.filter(state, eqx.is_array), known, loss, done
+        return after, self._read(state), known, loss, done
 
 
 # Jitted, so that a second search for a function of the same form does not trace it again.
@@ -207,11 +218,11 @@ def _go(
     mark, mark_loss = (now.steps, now.loss) if now is not None else (0, np.inf)
     reason = SearchReason.STEPS
     try:
-        arrays, rest = stepper.begin(values, seen)
+        arrays, place = stepper.begin(values, seen)
         while now is None or now.steps < steps:
             if seen is None and stepper.squares:
-                seen = value_and_columns(stepper.function, arrays.y_eval)
-            values, arrays, known, loss, done = stepper.step(values, arrays, rest, seen)
+                seen = value_and_columns(stepper.function, place)
+            values, (arrays, place), known, loss, done = stepper.step(values, arrays, seen)
             seen = None
             if begun:
                 # the first step of a resumed search only evaluates the loss where it starts

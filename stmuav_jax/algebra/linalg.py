@@ -1,12 +1,12 @@
 """Linear solvers of constrained dynamics, for small full matrices, symmetric or general."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ..checks.shapes import Matrix, Vector
 from . import loops
@@ -124,44 +124,26 @@ def product_transposed(A: Float[Array, "m k"], B: Float[Array, "n k"]) -> Float[
     return loops.multiply_rows(A, B) if _in_loops(A) else A @ B.T
 
 
-class LU(eqx.Module):
-    """LU factorisation of a general square matrix A with partial pivoting, for many solutions.
+class Inverse(eqx.Module):
+    """Inverse of a general square matrix A, for many solutions x of A x = b.
 
-    The factors are constants for differentiation; derivatives of a solution follow from A x = b.
+    Products with it call no library, so that the loop in which they are can be native (`native`). It is
+    a constant for differentiation; derivatives of a solution follow from A x = b.
     """
 
     matrix: Matrix
-    factors: Matrix
-    order: Int[Array, " k"]
+    inverse: Matrix
 
     def solve(self, b: Vector) -> Vector:
         """Solution x of A x = b, shape (k,); not finite if A is singular."""
         multiply = lambda x: self.matrix @ x
-        return jax.lax.custom_linear_solve(multiply, b, self._solve, self._solve_transposed)
-
-    def _solve(self, multiply: Any, b: Vector) -> Vector:
-        del multiply
-        y = self._triangular(b[self.order], upper=False, transposed=False)
-        return self._triangular(y, upper=True, transposed=False)
-
-    def _solve_transposed(self, multiply: Any, b: Vector) -> Vector:
-        del multiply
-        y = self._triangular(b, upper=True, transposed=True)
-        y = self._triangular(y, upper=False, transposed=True)
-        return jnp.zeros_like(y).at[self.order].set(y)
-
-    def _triangular(self, b: Vector, *, upper: bool, transposed: bool) -> Vector:
-        """Solution by the factor U or L, or its transpose."""
-        how = {"lower": not upper, "transpose_a": transposed, "unit_diagonal": not upper}
-        return jax.lax.linalg.triangular_solve(self.factors, b[:, None], left_side=True, **how)[
-            :, 0
-        ]
+        ahead, back = lambda _, b: self.inverse @ b, lambda _, b: self.inverse.T @ b
+        return jax.lax.custom_linear_solve(multiply, b, ahead, back)
 
 
-def lu(A: Matrix) -> LU:
-    """Factorise a general square matrix, shape (k, k)."""
-    factors, _, order = jax.lax.linalg.lu(jax.lax.stop_gradient(A))
-    return LU(A, factors, order)
+def inverted(A: Matrix) -> Inverse:
+    """Invert a general square matrix, shape (k, k), by LU factorisation with partial pivoting."""
+    return Inverse(A, jnp.linalg.inv(jax.lax.stop_gradient(A)))
 
 
 def _scaled(S: Matrix) -> tuple[Matrix, Vector]:

@@ -7,8 +7,9 @@ columns before it, so that only this column is written:
 
     v = S_j - L L_j,    L_j = v / sqrt(v_j).
 
-There is no such loop for an LU factorisation: with pivots it takes three times as long as LAPACK's, and
-its call keeps the steps of an implicit method from becoming one function, which compiles for minutes.
+There is no such loop for an LU factorisation: with pivots it takes three times as long as LAPACK's. The
+implicit methods have one a step, and its call keeps their steps, with all that is in them, from becoming
+one function, which would compile for minutes.
 
 The functions take part in derivatives by rules for the solution, not by differentiation of the loops.
 

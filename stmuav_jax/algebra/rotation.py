@@ -95,9 +95,11 @@ def rotation_matrix_in(module: Any, p: Quats) -> Float[Array | np.ndarray, "3 3 
     """`rotation_matrix` by the functions of a module, `numpy` or `jax.numpy`."""
     e0, e1, e2, e3 = p[0], p[1], p[2], p[3]
     s0, s1, s2, s3 = e0 * e0, e1 * e1, e2 * e2, e3 * e3
-    r0 = module.stack([s0 + s1 - s2 - s3, 2 * (e1 * e2 - e0 * e3), 2 * (e1 * e3 + e0 * e2)])
-    r1 = module.stack([2 * (e1 * e2 + e0 * e3), s0 - s1 + s2 - s3, 2 * (e2 * e3 - e0 * e1)])
-    r2 = module.stack([2 * (e1 * e3 - e0 * e2), 2 * (e2 * e3 + e0 * e1), s0 - s1 - s2 + s3])
+    e01, e02, e03 = e0 * e1, e0 * e2, e0 * e3
+    e12, e13, e23 = e1 * e2, e1 * e3, e2 * e3
+    r0 = module.stack([s0 + s1 - s2 - s3, 2 * (e12 - e03), 2 * (e13 + e02)])
+    r1 = module.stack([2 * (e12 + e03), s0 - s1 + s2 - s3, 2 * (e23 - e01)])
+    r2 = module.stack([2 * (e13 - e02), 2 * (e23 + e01), s0 - s1 - s2 + s3])
     return module.stack([r0, r1, r2])
 
 

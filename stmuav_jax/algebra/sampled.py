@@ -67,9 +67,20 @@ class Sampled(eqx.Module):
 
     def __call__(self, t: Float[Array, ""], kin: object = None) -> Float[Array, "*m"]:
         del kin
-        last = self.coefficients.shape[1] - 1
-        piece = jnp.clip(jnp.searchsorted(self.breaks, t, side="right") - 1, 0, last)
-        s, value = t - self.breaks[piece], jnp.zeros_like(self.coefficients[0, 0])
-        for row in self.coefficients:
-            value = value * s + row[piece]
-        return value
+        return piecewise(self.breaks, self.coefficients, t)
+
+
+def piecewise(
+    breaks: Float[Array, " k"], coefficients: Float[Array, "d p *m"], t: Float[Array, ""]
+) -> Float[Array, "*m"]:
+    """Value at t of polynomials between breaks; outside, the first or the last one goes on.
+
+    Args:
+        coefficients: of the powers of t less the piece's first break, the highest power first.
+    """
+    last = coefficients.shape[1] - 1
+    piece = jnp.clip(jnp.searchsorted(breaks, t, side="right") - 1, 0, last)
+    s, value = t - breaks[piece], jnp.zeros_like(coefficients[0, 0])
+    for row in coefficients:
+        value = value * s + row[piece]
+    return value

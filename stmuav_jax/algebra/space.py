@@ -138,6 +138,47 @@ class Composite(AbstractSpace):
             part.check(x[name], f"{what}['{name}']")
 
 
+class Concatenated(AbstractSpace):
+    """Product of vectors and rotations, whose points are one array: one part after the other.
+
+    Raises:
+        ModelError: a part's points are no arrays.
+    """
+
+    parts: tuple[AbstractSpace, ...]
+    lengths: tuple[int, ...] = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    is_flat: bool = eqx.field(static=True)
+
+    def __init__(self, *parts: AbstractSpace) -> None:
+        for part in parts:
+            if not isinstance(part, Vector | CyclicVector | Rotation):
+                raise ModelError(
+                    f"Points of {type(part).__name__} are no arrays to be put together."
+                )
+        self.parts = parts
+        self.lengths = tuple(4 if isinstance(part, Rotation) else part.size for part in parts)
+        self.size = sum(part.size for part in parts)
+        self.is_flat = all(part.is_flat for part in parts)
+
+    def _split(self, x: Point) -> list[Point]:
+        return jnp.split(x, np.cumsum(self.lengths)[:-1])
+
+    def retract(self, x: Point, v: Error) -> Point:
+        errors = jnp.split(v, np.cumsum([part.size for part in self.parts])[:-1])
+        each = zip(self.parts, self._split(x), errors, strict=True)
+        return jnp.concatenate([part.retract(own, error) for part, own, error in each])
+
+    def difference(self, y: Point, x: Point) -> Error:
+        each = zip(self.parts, self._split(y), self._split(x), strict=True)
+        return jnp.concatenate([part.difference(b, a) for part, b, a in each])
+
+    def check(self, x: Point, what: str) -> None:
+        _check_components(x, sum(self.lengths), what)
+        for part, own in zip(self.parts, self._split(x), strict=True):
+            part.check(own, what)
+
+
 def _check_components(x: Any, size: int, what: str) -> None:
     shape = jnp.shape(x)
     if not shape or shape[0] != size:

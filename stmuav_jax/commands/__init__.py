@@ -1,1 +1,1 @@
-"""Commands of the command line. Floor 15."""
+"""Commands of the command line. Floor 16."""

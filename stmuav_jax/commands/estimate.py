@@ -1,19 +1,24 @@
 """Command `stmuav estimate`: the report's eight cases of estimation, and the hover."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from rich.console import Console
 from rich.table import Table
 
+from .models.estimation import EstimateSettings, estimate_class, run_estimate_model
 from .options import END, SEED, Number, count, default
 from .output import written
+from .simulate import named_scene
 
 
 @dataclasses.dataclass
 class Estimate:
     """Estimate the centre of mass in the report's cases; write NetCDF files and figures.
+
+    Of a model's file with sensors: `stmuav estimate model.toml`, which `--help` after it describes.
 
     Exit code: 0 all filters are consistent with their innovations; 1 a filter lost its covariance;
     2 wrong input; 3 done, but a filter's own account of its errors cannot be trusted. The report's
@@ -50,8 +55,17 @@ class Estimate:
 UNTRUSTED = 3
 
 
-def run_estimate(command: Estimate) -> int:
+def estimate_options(words: Sequence[str]) -> type:
+    """Command on the model's file that the words name; without one, on the report's cases."""
+    if named_scene(EstimateSettings, words) is None:
+        return Estimate
+    return estimate_class(words)
+
+
+def run_estimate(command: Any) -> int:
     """Run the command and print its table; return the exit code."""
+    if not isinstance(command, Estimate):
+        return run_estimate_model(command)
     from ..checks.errors import SettingError
     from ..figures.estimate import verdict_lines
     from ..files.netcdf import load_parameters
@@ -79,9 +93,9 @@ def run_estimate(command: Estimate) -> int:
 def _cases(
     command: Estimate, names: tuple, table: Any, believed: Any
 ) -> tuple[Table, list[Path], dict[str, Any]]:
-    from ..figures.estimate import CASE_FIGURES, case_dataset, summary_table
+    from ..figures.estimate import CASE_FIGURES, labelled_case, summary_table
     from ..figures.plot import save_figures
-    from ..files.netcdf import save_dataset
+    from ..files.netcdf import save_labelled
     from ..quadrotor.assess import study_case
     from ..quadrotor.tuning import consistent_tuning, report_tuning
 
@@ -113,7 +127,7 @@ def _cases(
         folder = Path("runs") / f"estimate_{case}"
         if command.out is not None:
             folder = command.out if len(cases) == 1 else command.out / f"case_{case}"
-        paths.append(save_dataset(case_dataset(study), folder / "estimate.nc"))
+        paths.append(save_labelled(labelled_case(study), folder / "estimate.nc"))
         if command.figures != "none":
             paths += save_figures(CASE_FIGURES, folder, command.figures, study)
     verdicts = {f"Case {s.case}, {s.tuning} tuning": s.verdict for s in summaries}
@@ -124,9 +138,9 @@ def _hover(
     command: Estimate, names: tuple, table: Any, believed: Any
 ) -> tuple[Table, list[Path], dict[str, Any]]:
     from ..checks.errors import SettingError
-    from ..figures.estimate import hover, hover_dataset, hover_table
+    from ..figures.estimate import hover, hover_table, labelled_hover
     from ..figures.plot import save_figures
-    from ..files.netcdf import save_dataset
+    from ..files.netcdf import save_labelled
     from ..quadrotor.hover import simulate_hover
 
     if command.model != "default":
@@ -141,7 +155,7 @@ def _hover(
         for name in names
     }  # fmt: skip
     folder = command.out if command.out is not None else Path("runs") / "hover"
-    paths = [save_dataset(hover_dataset(flights), folder / "hover.nc")]
+    paths = [save_labelled(labelled_hover(flights), folder / "hover.nc")]
     if command.figures != "none":
         paths += save_figures({"hover": hover}, folder, command.figures, flights)
     verdicts = {f"Hover, {name} tuning": flight.verdict() for name, flight in flights.items()}

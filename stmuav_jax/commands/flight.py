@@ -13,8 +13,18 @@ from rich.table import Table
 
 from ..checks.errors import ModelError, SettingError
 from ..figures.terminal import line, row, table
+from .models.steady import (
+    LinearSettings,
+    TrimSettings,
+    linear_class,
+    modes_table,
+    run_linearize_scene,
+    run_trim_scene,
+    trim_class,
+)
 from .options import ANGLE, FORCE, SPEED, Number, default
 from .output import written
+from .simulate import named_scene
 
 if TYPE_CHECKING:
     from ..parameters.table import Parameters
@@ -52,7 +62,8 @@ _Flight = Annotated[SteadyFlight, tyro.conf.arg(name="")]
 class TrimCommand:
     """Find attitude, rotor speeds and actuator forces of a steady flight; write trim.json.
 
-    Example: stmuav trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods
+    Example: stmuav trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods. Of another mechanism: `stmuav trim
+    model.toml`, or a scene's name; `stmuav trim model.toml --help` describes that.
     """
 
     flight: _Flight = dataclasses.field(default_factory=SteadyFlight)
@@ -76,7 +87,8 @@ class TrimCommand:
 class Linearize:
     """Linearise about a steady flight; write A, B, C, D with names to linear.npz.
 
-    Example: stmuav linearize --sun 150 60 --outputs phi theta
+    Example: stmuav linearize --sun 150 60 --outputs phi theta. Of another mechanism: `stmuav linearize
+    model.toml`, or a scene's name; `stmuav linearize model.toml --help` describes that.
     """
 
     flight: _Flight = dataclasses.field(default_factory=SteadyFlight)
@@ -88,6 +100,20 @@ class Linearize:
     """Folder for the results."""
     cache: bool = True
     """Keep compiled code in the user's cache folder for the next run."""
+
+
+def trim_options(words: Sequence[str]) -> type:
+    """Command on the scene or model's file that the words name; without one, on the UAV's flight."""
+    if named_scene(TrimSettings, words) is None:
+        return TrimCommand
+    return trim_class(words)
+
+
+def linear_options(words: Sequence[str]) -> type:
+    """Command on the scene or model's file that the words name; without one, on the UAV's flight."""
+    if named_scene(LinearSettings, words) is None:
+        return Linearize
+    return linear_class(words)
 
 
 def table_of(params: Path | None) -> "Parameters":
@@ -159,8 +185,10 @@ def _solved(
     return trim_flight(uav_flyer(given), wanted, limits), {}
 
 
-def run_trim(command: TrimCommand) -> int:
+def run_trim(command: Any) -> int:
     """Find the trim, print it and write trim.json; return the exit code."""
+    if not isinstance(command, TrimCommand):
+        return run_trim_scene(command)
     import json
 
     from ..files.netcdf import versions, write_atomically
@@ -216,25 +244,10 @@ def _slope_table(
     return shown
 
 
-def modes_table(modes: Sequence[Any]) -> Table:
-    """Table of the modes other than those of a free rigid body, which have eigenvalue zero."""
-    shown = table("s [1/s]", "doubles or halves in [s]", "states that take part", title="Modes")
-    for mode in modes:
-        if abs(mode.eigenvalue) < 1e-3:
-            continue
-        s = f"{mode.eigenvalue.real:.4g}"
-        if abs(mode.eigenvalue.imag) > 1e-9 * abs(mode.eigenvalue):
-            s += f" {'+' if mode.eigenvalue.imag > 0 else '-'} {abs(mode.eigenvalue.imag):.4g} i"
-        time = "neither"
-        if math.isfinite(mode.doubling_time):
-            time = f"{'doubles' if mode.doubling_time > 0 else 'halves'} in {abs(mode.doubling_time):.4g}"
-        parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in mode.states[:3])
-        row(shown, s, time, parts)
-    return shown
-
-
-def run_linearize(command: Linearize) -> int:
+def run_linearize(command: Any) -> int:
     """Linearise, print the modes and write linear.npz; return the exit code."""
+    if not isinstance(command, Linearize):
+        return run_linearize_scene(command)
     from ..checks.numbers import floats
     from ..figures.tuning import save_linear
     from ..flight.flight_trim import trim_flight

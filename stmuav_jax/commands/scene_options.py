@@ -16,6 +16,9 @@ from ..checks.quantity import Quantity, quantities
 from ..scenes.registry import SCENES
 from ..scenes.signature import SceneOption
 
+# Ends of the names of files that hold a model: TOML, MJCF, URDF.
+MODEL_FILES = (".toml", ".xml", ".mjcf", ".urdf")
+
 _METAVARS = {float: "FLOAT", int: "INT"}
 
 
@@ -95,7 +98,7 @@ def _shown(usual: Any) -> str:
 
 
 def scene_among(words: Sequence[str], flags: Sequence[str]) -> str | None:
-    """The scene or the model's file (.toml) that the words after `simulate` name, if they name one.
+    """The scene or the model's file that the words after a command name, if they name one.
 
     A value of an option is neither.
 
@@ -104,7 +107,7 @@ def scene_among(words: Sequence[str], flags: Sequence[str]) -> str | None:
     """
     before = ""
     for word in words:
-        named = word in SCENES or (word.endswith(".toml") and not word.startswith("--"))
+        named = word in SCENES or (word.endswith(MODEL_FILES) and not word.startswith("--"))
         if named and not (before.startswith("--") and before not in flags):
             return word
         before = word

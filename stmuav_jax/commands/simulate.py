@@ -20,6 +20,8 @@ from ..dynamics.choices import (
     solver_named,
     stabilisation_named,
 )
+from ..figures.drawing import Drawer, drawing
+from ..figures.numbers import numbers_of
 from ..figures.terminal import line
 from ..scenes.registry import SCENES
 from .options import END, TOLERANCE, Number, count, default
@@ -80,47 +82,71 @@ ABOUT = """Simulate a scene, or a model's file; write run.nc, certificate.json a
 
 Example: stmuav simulate uav_tracker --case 2 --t1 1 --loads. A scene has options of its own, such as
 --drag or --servo.stiffness 1e6: `stmuav simulate SCENE --help` lists them with these. A model's file
-has none: stmuav simulate model.toml --t1 1 (docs/models.md).
+has none: stmuav simulate model.toml --t1 1 (docs/models.md). Robots in URDF or MJCF need MuJoCo.
 """
-
-_FIELDS = tuple(field.name for field in dataclasses.fields(Settings))
-_FLAGS = tuple(field.name for field in dataclasses.fields(Settings) if field.type is bool)
 
 
 def simulate_class(words: Sequence[str]) -> type:
-    """The command for tyro, with the options of the scene that the words after `simulate` name.
+    """The command for tyro, see `scene_command`."""
+    return scene_command("Simulate", Settings, ABOUT, words)
 
-    Its fields are scene, settings (a `Settings`) and, if the scene is known, options.
+
+def _flags(settings: type) -> list[str]:
+    """Options of a dataclass that no value follows."""
+    switches = [field.name for field in dataclasses.fields(settings) if field.type is bool]
+    return [f"--{no}{each}".replace("_", "-") for each in switches for no in ("", "no-")]
+
+
+def named_scene(settings: type, words: Sequence[str]) -> str | None:
+    """Scene or model's file that the words after a command name; None if there is none."""
+    return scene_among(words, _flags(settings))
+
+
+def scene_command(
+    name: str, settings: type, about: str, words: Sequence[str], before: Sequence[Any] = ()
+) -> type:
+    """Command on a scene for tyro, with the options of the scene that the words after it name.
+
+    Its fields are scene, settings and, if the scene is known, options.
+
+    Args:
+        settings: dataclass of the options that all scenes share. about: the command's help.
+        before: fields of positional arguments in front of the scene.
 
     Raises:
         SettingError: an option that the scene does not have.
     """
-    flags = [f"--{no}{name}".replace("_", "-") for name in _FLAGS for no in ("", "no-")]
-    scene = scene_among(words, flags)
-    about = tyro.conf.arg(help="Which scene, see `stmuav list`; or a model's file, model.toml.")
+    shared, flags = dataclasses.fields(settings), _flags(settings)
+    scene = named_scene(settings, words)
+    which = tyro.conf.arg(
+        help="Which scene, see `stmuav list`; or a model's file: .toml, .xml, .urdf."
+    )
     flat = tyro.conf.arg(name="")
     model = () if scene is None or scene in SCENES else (scene,)
     fields: list[Any] = [
-        ("scene", Annotated[tyro.conf.Positional[Literal[(*SCENES, *model)]], about]),  # pyright: ignore[reportInvalidTypeForm]
-        ("settings", Annotated[Settings, flat]),
+        *before,
+        ("scene", Annotated[tyro.conf.Positional[Literal[(*SCENES, *model)]], which]),  # pyright: ignore[reportInvalidTypeForm]
+        ("settings", Annotated[settings, flat]),
     ]
     if scene in SCENES:
-        own = [f"--{name}".replace("_", "-") for name in _FIELDS]
+        own = [f"--{field.name}".replace("_", "-") for field in shared]
         check_known(scene, words, [*own, *flags, "--help"])
         titled = tyro.conf.arg(name=scene)
         own = options_class(scene)
         fields.append(("options", Annotated[own, titled, tyro.conf.OmitArgPrefixes]))
     cache = property(lambda command: command.settings.cache)
-    return dataclasses.make_dataclass(
-        "Simulate", fields, namespace={"__doc__": ABOUT, "cache": cache}
-    )
+    return dataclasses.make_dataclass(name, fields, namespace={"__doc__": about, "cache": cache})
+
+
+def chosen_scene(command: Any) -> "Scene":
+    """Scene of a `scene_command`, with its case, parameters and options, or of a model's file."""
+    return _loaded(command) if command.scene not in SCENES else _registered(command)
 
 
 def scene_of(command: Any) -> "Scene":
     """The scene with its case, parameters and options, or that of a model's file."""
-    settings: Settings = command.settings
-    scene = _loaded(command) if command.scene not in SCENES else _registered(command)
-    if settings.loads and not scene.system.joints:
+    scene = chosen_scene(command)
+    if command.settings.loads and not scene.system.joints:
         raise SettingError(f"--loads is for scenes with joints; {command.scene} has none.")
     return scene
 
@@ -129,7 +155,7 @@ def _registered(command: Any) -> "Scene":
     from ..files.netcdf import load_parameters
     from ..scenes.registry import make_scene, options_from_plain
 
-    settings: Settings = command.settings
+    settings = command.settings
     table = load_parameters(settings.params, SCENES[command.scene].parameters)
     options = options_from_plain(command.scene, plain_of(command.scene, command.options))
     return make_scene(command.scene, settings.case, table, **options)
@@ -137,13 +163,15 @@ def _registered(command: Any) -> "Scene":
 
 def _loaded(command: Any) -> "Scene":
     from ..files.model_file import load_model
+    from ..files.mujoco_import import load_robot
 
     for option in ("case", "params"):
         if getattr(command.settings, option) is not None:
             raise SettingError(
                 f"--{option} is for the report's scenes; a model's file holds its own numbers."
             )
-    return load_model(command.scene)
+    load = load_model if command.scene.endswith(".toml") else load_robot
+    return load(command.scene)
 
 
 def run_scene(scene: "Scene", settings: Settings, console: Console) -> "Run":
@@ -191,17 +219,18 @@ def run_scene(scene: "Scene", settings: Settings, console: Console) -> "Run":
         )
 
 
-def write_results(run: "Run", settings: Settings) -> list[Path]:
+def write_results(run: "Run", settings: Settings, drawer: Drawer) -> list[Path]:
     """Write results, certificate and figures; their paths."""
-    from ..files.netcdf import save, save_certificate
+    from ..files.netcdf import save, save_certificate, write_atomically
 
     folder = settings.out if settings.out is not None else Path("runs") / run.scene.name
+    if settings.figures != "none":
+        drawer.ask(numbers_of(run), settings.figures)
     paths = [save(run, folder / "run.nc"), save_certificate(run, folder / "certificate.json")]
     if settings.figures != "none":
-        # matplotlib is slow to import: only where figures are drawn
-        from ..figures.plot import FIGURES, save_figures
-
-        paths += save_figures(FIGURES, folder, settings.figures, run)
+        for name, content in drawer.files().items():
+            path = folder / f"{name}.{settings.figures}"
+            paths.append(write_atomically(path, content))
     return paths
 
 
@@ -226,10 +255,11 @@ def run_simulate(command: Any) -> int:
     from ..figures.report import certificate_table
 
     settings: Settings = command.settings
-    run = run_scene(scene_of(command), settings, Console(stderr=True))
-    clock = time.perf_counter()
-    paths = write_results(run, settings)
-    writing = time.perf_counter() - clock
+    with drawing(settings.figures != "none") as drawer:
+        run = run_scene(scene_of(command), settings, Console(stderr=True))
+        clock = time.perf_counter()
+        paths = write_results(run, settings, drawer)
+        writing = time.perf_counter() - clock
     out = Console()
     out.print(certificate_table(run))
     if settings.loads:

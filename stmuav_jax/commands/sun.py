@@ -67,9 +67,9 @@ def run_sun(command: SunDay) -> int:
 
     from ..environment.ephemeris import Place
     from ..environment.sun import attitude
-    from ..figures.day import DAY_FIGURES, day_dataset, day_tables, load_attitude
+    from ..figures.day import DAY_FIGURES, day_tables, labelled_day, load_attitude
     from ..figures.plot import save_figures
-    from ..files.netcdf import load_parameters, save_dataset
+    from ..files.netcdf import load_parameters, save_labelled
     from ..parameters.airframe import PART_II
     from ..tracker.day import Imperfections, day_zone, parse_date, track_day
     from ..tracker.heading import best_heading
@@ -94,7 +94,7 @@ def run_sun(command: SunDay) -> int:
         R_wb = turn(yaw)
     day = track_day(place, day_of, zone, R_wb, step=command.step, flaws=flaws, **settings)
     folder = command.out if command.out is not None else Path("runs") / f"sun_{command.date}"
-    paths = [save_dataset(day_dataset(day), folder / "day.nc")]
+    paths = [save_labelled(labelled_day(day), folder / "day.nc")]
     if command.figures != "none":
         paths += save_figures(DAY_FIGURES, folder, command.figures, day)
     out = Console()

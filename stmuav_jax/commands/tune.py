@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,8 +15,10 @@ from rich.table import Table
 from ..checks.errors import SettingError
 from ..figures.terminal import line, row, table
 from .flight import table_of
+from .models.tuning import TuneSettings, run_tune_scene, tune_class
 from .options import ANGLE, END, FORCE, SEED, Number, count, default
 from .output import written
+from .simulate import named_scene
 
 if TYPE_CHECKING:
     from ..algebra.least_squares import Search
@@ -36,7 +39,8 @@ _LONGEST = {"hold": 0.05, "slew": 0.2}
 class Tune:
     """Tune by gradients through the flight; write inputs or parameters, history and figures.
 
-    Example: stmuav tune hold --t1 0.4. A search that does not converge ends with exit code 1.
+    Example: stmuav tune hold --t1 0.4. Of another mechanism: `stmuav tune hold model.toml`, or a scene's name;
+    `stmuav tune hold model.toml --help` describes that. A search that does not converge ends with exit code 1.
     """
 
     what: tyro.conf.Positional[Literal["hold", "slew", "identify"]]
@@ -88,7 +92,7 @@ class _Watch:
         save_search(now, self.problem, self.path)
 
 
-def _watched(command: Tune, folder: Path, problem: str, start: Any, run: Any) -> Any:
+def _watched(command: Any, folder: Path, problem: str, start: Any, run: Any) -> Any:
     """Call run(steps=, report=, resume=) with progress, checkpoints and the search to resume."""
     from ..figures.tuning import load_search
 
@@ -104,8 +108,17 @@ def _search(command: Tune, folder: Path, tuning: "InputTuning") -> "Search":
     return _watched(command, folder, tuning.name, tuning.start, run)
 
 
-def run_tune(command: Tune) -> int:
+def tune_options(words: Sequence[str]) -> type:
+    """Command on the scene or model's file that the words name; without one, on the UAV."""
+    if named_scene(TuneSettings, words) is None:
+        return Tune
+    return tune_class(words)
+
+
+def run_tune(command: Any) -> int:
     """Run the command; return the exit code."""
+    if not isinstance(command, Tune):
+        return run_tune_scene(command, _watched)
     from ..algebra.least_squares import SearchReason
 
     given = table_of(command.params)
@@ -158,8 +171,7 @@ def titled(title: str, found: "Search", done: bool) -> str:
 def _hold(
     command: Tune, given: "Parameters", folder: Path
 ) -> tuple["Search", Table, list[Path], bool]:
-    import jax.numpy as jnp
-
+    from ..checks.numbers import as_numpy, floats
     from ..flight.flyer import RotorsAndForces, rotors_and_forces
     from ..flight.uav_tuning import at_rest, hold, holding_time
     from ..rotorcraft.rotor import hover_speed_squared
@@ -168,18 +180,20 @@ def _hold(
 
     flyer = uav_flyer(given)
     rotors = flyer.propellers
-    mass = jnp.sum(flyer.system.bodies.mass)
+    mass = np.sum(as_numpy(flyer.system.bodies.mass))
     count = rotors.spin.shape[0]
     equal = hover_speed_squared(mass, given.value("gravity"), rotors.k_f, count)
-    untuned = RotorsAndForces(equal, jnp.zeros(2))
+    untuned = RotorsAndForces(equal, floats(np.zeros(2)))
     angles = initial_angles(given)
     tuning = hold(flyer, angles, untuned, horizon=_time(command), segments=_segments(command))
     found = _search(command, folder, tuning)
     # a search may come to rest where nothing holds
     done = _converged(found) and found.loss < _HOLDS
-    inputs = rotors_and_forces(tuning.inputs(found.values))
+    values = np.asarray(tuning.inputs(found.values))
+    inputs = RotorsAndForces(*(floats(part) for part in rotors_and_forces(values)))
     start = at_rest(angles)
     times = [holding_time(flyer, each, start) for each in (untuned, inputs)]
+    untuned, inputs = as_numpy((untuned, inputs))
     shown = table("", "untuned", "tuned", title=titled("Constant inputs that hold", found, done))
     for k in range(count):
         pair = (untuned.speed_squared[k], inputs.speed_squared[k])

@@ -5,6 +5,20 @@ from .closed_loop import (
     LoopRun as LoopRun,
     close_loop as close_loop,
 )
+from .design.gains import (
+    TunedGains as TunedGains,
+    tune_gains as tune_gains,
+)
+from .design.margin import (
+    InputMargin as InputMargin,
+    input_margin as input_margin,
+    without_states as without_states,
+)
+from .design.schedule import (
+    GainSchedule as GainSchedule,
+    ScheduledFeedback as ScheduledFeedback,
+    schedule_regulator as schedule_regulator,
+)
 from .estimator import (
     Belief as Belief,
     EstimatorMemory as EstimatorMemory,
@@ -55,6 +69,14 @@ from .rolling import (
     Rollout as Rollout,
     Sample as Sample,
     rollout as rollout,
+)
+from .training.environment import (
+    Environment as Environment,
+    Episode as Episode,
+)
+from .training.gymnasium_env import (
+    gymnasium_env as gymnasium_env,
+    gymnasium_vector_env as gymnasium_vector_env,
 )
 from .uav import (
     UavController as UavController,

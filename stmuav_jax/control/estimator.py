@@ -40,14 +40,7 @@ from ..checks.shapes import Numbers
 from ..flight.flyer import FlyerPoint, whole_state
 from ..mechanics.state import State
 from ..mechanics.system import System
-from ..sensing.sensors import (
-    Accelerometer,
-    AttitudeFix,
-    Encoder,
-    Gyroscope,
-    PositionFix,
-    gravity_of,
-)
+from ..sensing.sensors import SENSORS, gravity_of
 from ..tracker.drive import SLIDER_JOINTS
 from ..tracker.kinematics import stroke_jacobian, strokes
 from .geometric import hat
@@ -211,9 +204,9 @@ class MotionEstimator(eqx.Module):
         panel_noise: Numbers = 5.0,
     ) -> None:
         name = system.names[0]
-        wanted: list[Any] = [Gyroscope(name), Accelerometer(name), PositionFix(name)]
-        wanted += [AttitudeFix(name)]
-        wanted += [] if tracker is None else [Encoder(joint) for joint in SLIDER_JOINTS]
+        kinds = ("gyroscope", "accelerometer", "position", "attitude")
+        wanted = [SENSORS[kind](name) for kind in kinds]
+        wanted += [] if tracker is None else [SENSORS["encoder"](joint) for joint in SLIDER_JOINTS]
         found = [_of_name(instruments, one.name) for one in wanted]
         for one in found[:2]:
             if one.periods(rate) != 1 or one.delay != 0:

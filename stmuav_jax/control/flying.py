@@ -1,6 +1,6 @@
 """Controller of a flying machine's rotors: the geometric controller with control allocation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,6 +23,7 @@ from .geometric import (
     base_motion,
     wrench_for,
 )
+from .outage import as_it_turns, inverse_without_yaw, working_rotors
 
 
 class FlightMemory(NamedTuple):
@@ -49,9 +50,13 @@ class FlightController(eqx.Module):
         limits: limits of the rotor speeds; by default those of the machine's motors, if any.
         mass: mass properties of all bodies, or a function of the estimate that returns them; by
             default those of the system's reference posture.
+        lost: numbers of rotors that are lost, the first being 1. The controller then gives up
+            yaw: thrust and tilt are allocated to the working rotors first, and with what is left
+            of their limits, which it needs, the turning about the base's z axis is slowed down.
 
     Raises:
-        ModelError: not one set of rotors, no gravity, or limits that cannot carry the weight.
+        ModelError: not one set of rotors, no gravity, limits that cannot carry the weight, or lost
+            rotors without which the others cannot hold thrust and tilt.
     """
 
     gains: FlightGains
@@ -61,6 +66,7 @@ class FlightController(eqx.Module):
     inverse: Float[Array, "k 4"]
     limits: RotorLimits | None
     period: Float[Array, ""]
+    working: tuple[int, ...] | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -70,6 +76,7 @@ class FlightController(eqx.Module):
         gains: FlightGains | None = None,
         limits: RotorLimits | None = None,
         mass: MassProperties | Callable[[Any], MassProperties] | None = None,
+        lost: Sequence[int] = (),
     ) -> None:
         found = [f for f in system.forces if isinstance(f, Rotors | MotorRotors)]
         self.gravity = gravity_of(system)
@@ -93,12 +100,16 @@ class FlightController(eqx.Module):
             check_lift(rotors, limits, weight)
         # moments are about the base's centre of mass: the map does not change with the posture
         self.wrenches = wrench_map(rotors, system.bodies.com[0])
-        self.inverse = jnp.linalg.pinv(self.wrenches)
-        if not bool(jnp.all(self.inverse[:, 0] > 0)):
-            raise ModelError(
-                "Not every rotor adds to the thrust where its moments balance: the base's centre of "
-                "mass is too far from the rotors' middle for this flight controller."
-            )
+        self.working = working_rotors(lost, rotors.spin.shape[0])
+        if self.working is None:
+            self.inverse = jnp.linalg.pinv(self.wrenches)
+            if not bool(jnp.all(self.inverse[:, 0] > 0)):
+                raise ModelError(
+                    "Not every rotor adds to the thrust where its moments balance: the base's centre "
+                    "of mass is too far from the rotors' middle for this flight controller."
+                )
+        else:
+            self.inverse = inverse_without_yaw(self.wrenches, self.working, limits, weight)
         self.gains = FlightGains() if gains is None else gains
         self.limits, self.period = limits, jnp.asarray(1.0 / rate)
         self.mass = mass_properties(system, system.reference) if mass is None else mass
@@ -120,10 +131,15 @@ class FlightController(eqx.Module):
     ) -> tuple[Float[Array, " k"], FlightMemory]:
         """Squared rotor speeds (k,) and the memory, with given mass properties."""
         base = base_motion(estimate) if isinstance(estimate, State) else estimate
-        found = wrench_for(base, reference, mass, self.gains, self.gravity, memory.integral)
+        wanted = reference if self.working is None else as_it_turns(reference, base)
+        found = wrench_for(base, wanted, mass, self.gains, self.gravity, memory.integral)
         lever = jnp.cross(mass.centre, jnp.array([0.0, 0.0, 1.0]) * found.wrench[0])
         wrench = found.wrench.at[1:].add(lever)
-        squared, given = self._allocated(wrench)
+        if self.working is None:
+            squared, given = self._allocated(wrench)
+        else:
+            wrench = wrench.at[3].add(-self.gains.rate * mass.J[2, 2] * base.omega[2])
+            squared, given = self._allocated_to_working(wrench)
         error = base.r - reference.r
         integral = memory.integral + jnp.where(given, self.period, 0.0) * error
         return squared, FlightMemory(integral)
@@ -135,6 +151,17 @@ class FlightController(eqx.Module):
             return least, jnp.ones((), bool)
         lower, upper = self.limits.squared(least.shape[0])
         return within_limits(self.inverse, wrench, lower, upper)
+
+    def _allocated_to_working(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
+        """Squared speeds, those of lost rotors zero, and whether they give thrust and tilt."""
+        assert self.limits is not None
+        places, count = jnp.array(self.working), self.wrenches.shape[1]
+        lower, upper = (x[places] for x in self.limits.squared(count))
+        u, given = _lifted(self.inverse, wrench, lower, upper)
+        # yaw is what the others leave of it, and is changed where the limits still allow it
+        turn = self.inverse[:, 3] * (wrench[3] - self.wrenches[3, places] @ u)
+        b = _share(jnp.abs(turn), jnp.where(turn > 0, upper - u, u - lower))
+        return jnp.zeros(count).at[places].set(u + b * turn), given
 
 
 def within_limits(
@@ -154,7 +181,20 @@ def within_limits(
         inverse: minimum-norm squared speeds per unit of the wrench; those of thrust positive.
         lower, upper: limits (k,) [rad^2/s^2].
     """
-    lift, tilt, turn = inverse[:, 0], inverse[:, 1:3] @ wrench[1:3], inverse[:, 3] * wrench[3]
+    u, held = _lifted(inverse, wrench, lower, upper)
+    turn = inverse[:, 3] * wrench[3]
+    b = _share(jnp.abs(turn), jnp.where(turn > 0, upper - u, u - lower))
+    return u + b * turn, held & (b == 1.0)
+
+
+def _lifted(
+    inverse: Float[Array, "k 4"],
+    wrench: Float[Array, "4"],
+    lower: Float[Array, " k"],
+    upper: Float[Array, " k"],
+) -> tuple[Float[Array, " k"], Bool[Array, ""]]:
+    """Squared speeds for thrust and tilting moments, and whether they give these."""
+    lift, tilt = inverse[:, 0], inverse[:, 1:3] @ wrench[1:3]
     # lower_i <= lift_i T + a tilt_i <= upper_i has a solution T where, for all i and j,
     #   a (tilt_j / lift_j - tilt_i / lift_i) <= upper_j / lift_j - lower_i / lift_i
     slope = tilt / lift
@@ -163,10 +203,7 @@ def within_limits(
     a = _share(rise, room)
     least, most = jnp.max((lower - a * tilt) / lift), jnp.min((upper - a * tilt) / lift)
     thrust = jnp.minimum(jnp.maximum(wrench[0], least), most)
-    u = lift * thrust + a * tilt
-    b = _share(jnp.abs(turn), jnp.where(turn > 0, upper - u, u - lower))
-    given = (a == 1.0) & (b == 1.0) & (thrust == wrench[0])
-    return u + b * turn, given
+    return lift * thrust + a * tilt, (a == 1.0) & (thrust == wrench[0])
 
 
 def _share(rise: Float[Array, "*s"], room: Float[Array, "*s"]) -> Float[Array, ""]:

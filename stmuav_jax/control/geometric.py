@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import rotation_matrix
-from ..checks.numbers import numbers, positive
+from ..checks.numbers import nonnegative, numbers, positive
 from ..checks.shapes import Numbers
 from ..mechanics.state import State
 
@@ -129,7 +129,7 @@ class FlightGains(eqx.Module):
         what = "gain of the flight controller"
         self.position = positive(position, f"The position {what}", "1/s^2")
         self.velocity = positive(velocity, f"The velocity {what}", "1/s")
-        self.integral = jnp.asarray(integral, dtype=float)
+        self.integral = nonnegative(integral, f"The integral {what}", "1/s^3")
         self.attitude = positive(attitude, f"The attitude {what}", "1/s^2")
         self.rate = positive(rate, f"The rate {what}", "1/s")
 

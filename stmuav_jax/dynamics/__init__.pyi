@@ -45,6 +45,11 @@ from .formulations.stabilisation import (
     Projection as Projection,
     Unstabilised as Unstabilised,
 )
+from .inspection import (
+    Finding as Finding,
+    Inspection as Inspection,
+    check as check,
+)
 from .integration.adjoint import DiscreteAdjoint as DiscreteAdjoint
 from .integration.advance import (
     Trajectory as Trajectory,

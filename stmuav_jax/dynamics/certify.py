@@ -52,15 +52,19 @@ def inspect_start(
     check_consistent(system, rows, residuals, rates)
     rank = rank_of(system, rows, state, t, matrix)
     if rank.rank < rank.rows:
-        formulation = _allowing(formulation, rank, matrix, gamma)
+        formulation = allow_dependent(formulation, rank, matrix, gamma)
     off_unit = np.max(np.abs(np.sum(np.asarray(state.p) ** 2, axis=-1) - 1))
     return formulation, rows, Start(seen, rank, float(off_unit))
 
 
-def _allowing(
+def allow_dependent(
     formulation: AbstractFormulation, rank: Rank, matrix: np.ndarray, gamma: np.ndarray
 ) -> AbstractFormulation:
-    """Formulation that allows for the dependent rows, which must not contradict each other."""
+    """Formulation that allows for the dependent rows.
+
+    Raises:
+        ModelError: the rows contradict each other, or the formulation allows for no dependent ones.
+    """
     allowing = formulation.allowing_dependent_rows()
     if allowing is None:
         raise ModelError(

@@ -24,7 +24,7 @@ from ..algebra.rotation import from_rotation_vector, product
 from ..checks.numbers import floats
 from ..mechanics.state import State
 from .integration.advance import Trajectory
-from .integration.march import March
+from .integration.march import March, same_result
 from .integration.problem import Problem
 
 # Below the first tolerance round-off leaves no room for a tenth of it, below the second for any
@@ -175,7 +175,8 @@ def estimated(
     parts = np.full((4, k, n), np.nan)
     if m:
         parts[:, :m] = _apart(_rows(first.states, slice(m)), _rows(states, slice(m)))
-    if 0 < m == k - 1 < len(ts) and first.result == diffrax.RESULTS.event_occurred:
+    happened = same_result(first.result, diffrax.RESULTS.event_occurred)
+    if 0 < m == k - 1 < len(ts) and happened:
         # the second run has found the event at a slightly different time
         later = times[m] - ts[m]
         if abs(later) <= 1e-3 * (times[m] - times[m - 1]):

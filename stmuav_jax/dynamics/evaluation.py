@@ -135,6 +135,11 @@ def snapshots(formulation: AbstractFormulation, model: Any, saved: Saved) -> Sna
     return Snapshot(found[0], found[1], now.kinetic, now.potential, now.momentum)
 
 
+def reactions(formulation: AbstractFormulation, model: Any, saved: Saved) -> Reactions:
+    """Reactions of saved states, as those of `snapshots` and by their program."""
+    return _in_blocks(lambda at: _dynamics(formulation, model, at, True), saved)[1]
+
+
 def accelerations(formulation: AbstractFormulation, model: Any, saved: Saved) -> Accelerations:
     """Accelerations of saved states by a formulation, as those of `snapshots`."""
     return _in_blocks(lambda at: _dynamics(formulation, model, at, False), saved)[0]

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.compiler import kept_jit
 from ..checks.errors import SettingError
+from ..checks.numbers import as_jax
 from ..checks.shapes import Numbers
 from ..mechanics.internal import with_internal
 from ..mechanics.state import State
@@ -44,9 +45,9 @@ def between(run: Run, times: Numbers) -> tuple[State, np.ndarray]:
         )
     before = np.searchsorted(run.ts, ts, side="right") - 1
     saved = (run.states, run.trajectory.internal)
-    starts = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[before]), saved)
+    starts = jax.tree.map(lambda x: as_jax(np.asarray(x)[before]), saved)
     method = dataclasses.replace(run.method, event=None)
-    spans = jnp.asarray(np.stack([run.ts[before], ts], axis=1))
+    spans = as_jax(np.stack([run.ts[before], ts], axis=1))
     found = _ends(run.scene.system, method, starts, spans)
     return jax.tree.map(np.asarray, found)
 

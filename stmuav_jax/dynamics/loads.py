@@ -18,9 +18,11 @@ from jaxtyping import Array, Float, Int
 from ..algebra.compiler import in_blocks, kept_jit
 from ..algebra.derivative import safe_norm
 from ..checks.errors import SettingError, concrete
+from ..checks.numbers import array_module, as_jax, as_numpy, floats
 from ..checks.shapes import Numbers
 from ..mechanics.state import State
 from ..mechanics.system import System
+from .evaluation import Saved, reactions
 from .formulations.base import AbstractFormulation, Reactions
 from .formulations.reactions import in_joint_axes
 from .formulations.stabilisation import Unstabilised
@@ -53,12 +55,14 @@ class JointLoads(eqx.Module):
     joints: tuple[str, ...] = eqx.field(static=True)
 
     @property
-    def components(self) -> Float[Array, "*b k joints 8"]:
+    def components(self) -> Float[Array | np.ndarray, "*b k joints 8"]:
         """Force and its magnitude [N], moment and its magnitude [N m]: see `COMPONENTS`."""
+        xp = array_module(self.force, self.moment)
+        size = safe_norm if xp is jnp else np.linalg.norm
         parts = []
-        for vector in (self.force, self.moment):
-            parts += [vector, safe_norm(vector, axis=-1)[..., None]]
-        return jnp.concatenate(parts, axis=-1)
+        for vector in as_numpy((self.force, self.moment)):
+            parts += [vector, size(vector, axis=-1)[..., None]]
+        return xp.concatenate(parts, axis=-1)
 
 
 class Envelope(eqx.Module):
@@ -110,10 +114,16 @@ def joint_loads(
 
 def run_loads(run: Run) -> JointLoads:
     """Reaction loads at the saved times of a run, from its analysis."""
-    system, ts = run.scene.system, jnp.asarray(run.ts)
-    states, world = jax.tree.map(jnp.asarray, (run.states, run.snapshot.reactions))
-    found = _turned(system, states, world)
-    return JointLoads(ts, found.force, found.moment, tuple(j.name for j in system.joints))
+    system = run.scene.system
+    found = _in_joint_axes(system, run.states, run.snapshot.reactions)
+    force, moment = floats(found.force), floats(found.moment)
+    return JointLoads(floats(run.ts), force, moment, tuple(j.name for j in system.joints))
+
+
+def _in_joint_axes(system: System, states: State, world: Reactions) -> Reactions:
+    """Reactions at many states (k, joints, 3) in the joints' axes, as NumPy arrays."""
+    turned = lambda *at: _turned(system, *jax.tree.map(as_jax, at))
+    return in_blocks(turned, _BLOCK, states, world)
 
 
 @kept_jit
@@ -153,23 +163,20 @@ def resolved_loads(run: Run, rtol: float = 0.01) -> JointLoads:
         curved = np.any(off > rtol * scale, axis=(1, 2, 3)) | (turn < 2)
         halves = np.stack([todo[:, 0], middle, middle, todo[:, 1]], axis=1)
         todo = halves[curved].reshape(-1, 2)
-    return JointLoads(
-        jnp.asarray(ts), jnp.asarray(values[..., :3]), jnp.asarray(values[..., 3:]), first.joints
-    )
+    return JointLoads(floats(ts), floats(values[..., :3]), floats(values[..., 3:]), first.joints)
 
 
 def _between(run: Run, ts: np.ndarray) -> np.ndarray:
     """Force and moment at all joints, at any times of a run (k, joints, 6)."""
 
     def block(ts: np.ndarray) -> np.ndarray:
-        states, own = jax.tree.map(jnp.asarray, between(run, ts))
-        loads = _compiled(run.scene.system, jnp.asarray(ts), states, run.method.formulation, own)
-        return np.concatenate([np.asarray(loads.force), np.asarray(loads.moment)], axis=-1)
+        states, own = between(run, ts)
+        # by the programs of the run's analysis, which are compiled already
+        world = reactions(run.method.formulation, run.model, Saved(ts, states, own))
+        loads = _in_joint_axes(run.scene.system, states, world)
+        return np.concatenate([loads.force, loads.moment], axis=-1)
 
     return in_blocks(block, _BLOCK, ts)
-
-
-_compiled = kept_jit(joint_loads)
 
 
 def envelope(loads: JointLoads) -> Envelope:
@@ -177,17 +184,19 @@ def envelope(loads: JointLoads) -> Envelope:
 
     The derivative of an extreme is that of the load at its time and run.
     """
+    xp = array_module(loads)
+    loads = as_numpy(loads)
     values = loads.components
     count, joints = loads.ts.shape[-1], len(loads.joints)
     rows = values.reshape(loads.ts.size, joints, len(COMPONENTS))
     times = loads.ts.reshape(-1)
 
-    def at(index: Int[Array, "joints 8"]) -> tuple[Array, Array, Array]:
-        value = jnp.take_along_axis(rows, index[None], axis=0)[0]
-        return value, times[index], index // count
+    def at(index: Any) -> list[Array]:
+        value = xp.take_along_axis(rows, index[None], axis=0)[0]
+        return [as_jax(x) for x in (value, times[index], index // count)]
 
-    least, t_least, run_least = at(jnp.argmin(rows, axis=0))
-    most, t_most, run_most = at(jnp.argmax(rows, axis=0))
+    least, t_least, run_least = at(xp.argmin(rows, axis=0))
+    most, t_most, run_most = at(xp.argmax(rows, axis=0))
     return Envelope(least, most, t_least, t_most, run_least, run_most, loads.joints)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from ..mechanics.state import State
 from ..mechanics.system import System
@@ -20,6 +21,9 @@ class Scene:
             "unit" and "source"; kept with the results.
         notes: facts that the reader of a result must know, one sentence each.
         watch: names of the bodies that figures show.
+        links_between: names of the bodies of nearly no mass that an import put between several
+            joints of one body.
+        sensors: instruments of the mechanism (`stmuav_jax.control.Instrument`) by name.
     """
 
     name: str
@@ -32,3 +36,5 @@ class Scene:
     parameters: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     watch: tuple[str, ...] = ()
+    links_between: tuple[str, ...] = ()
+    sensors: Mapping[str, Any] = field(default_factory=dict)

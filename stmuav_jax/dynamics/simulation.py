@@ -22,7 +22,7 @@ from .checks import check_method, check_start, output_times, scene_of
 from .error_estimate import LOOSER, ErrorEstimate, SecondRun, estimated, without
 from .evaluation import accelerations
 from .integration.advance import Trajectory
-from .integration.march import CHUNK, March
+from .integration.march import CHUNK, March, same_result
 from .integration.problem import Problem, prepare
 from .method import Method
 from .run import Run, Seconds, saved
@@ -213,7 +213,8 @@ def _errors(scene: Scene, problem: Problem, done: _Done, analysis: bool) -> Erro
     if second is None:
         return without(first, "none was asked for")
     rates = None
-    if analysis and first.result == diffrax.RESULTS.event_occurred:
+    happened = same_result(first.result, diffrax.RESULTS.event_occurred)
+    if analysis and happened:
         # the second run's event is at another time, by which its end is moved
         last = jax.tree.map(lambda x: np.asarray(x)[-1:], saved(first))
         found = accelerations(problem.method.formulation, problem.model, last)
@@ -221,7 +222,7 @@ def _errors(scene: Scene, problem: Problem, done: _Done, analysis: bool) -> Erro
     if done.stopped:
         return estimated(first, second, rates, "the run was interrupted")
     found = estimated(first, second, rates)
-    if not found.note or first.result == diffrax.RESULTS.event_occurred:
+    if not found.note or happened:
         return found
     looser = SecondRun(second.first, float(first.ts[0]), scene.state0, factor=LOOSER)
     with contextlib.suppress(KeyboardInterrupt):
@@ -238,7 +239,7 @@ def _words(trajectory: Trajectory) -> str:
         (diffrax.RESULTS.dt_min_reached, "step size collapsed"),
     )
     for code, words in names:
-        if trajectory.result == code:
+        if same_result(trajectory.result, code):
             return words
     return diffrax.RESULTS[trajectory.result].splitlines()[0]
 

@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.derivative import safe_sqrt
 from ..checks.errors import SettingError, check_finite, concrete
+from ..checks.numbers import array_module, as_numpy, floats
 from ..checks.shapes import Numbers
 
 DAY = 86400.0  # [s]
@@ -84,11 +85,8 @@ class Place(eqx.Module):
     @staticmethod
     def degrees(latitude: Numbers, longitude: Numbers, altitude: Numbers = 0.0) -> "Place":
         """Place from latitude and longitude in degrees; altitude and errors as for `Place`."""
-        return Place(
-            jnp.radians(jnp.asarray(latitude, dtype=float)),
-            jnp.radians(jnp.asarray(longitude, dtype=float)),
-            altitude,
-        )
+        turn = lambda angle: floats(array_module(angle).radians(angle))
+        return Place(turn(latitude), turn(longitude), altitude)
 
 
 def _check_place(place: Place) -> None:
@@ -154,13 +152,13 @@ class Air(eqx.Module):
 
         Source: US Standard Atmosphere 1976, troposphere.
         """
-        height = jnp.asarray(altitude, dtype=float)
+        height = floats(altitude)
         check_finite(height, "The altitude", "m", SettingError)
         if concrete(height) and np.any((np.asarray(height) < -500) | (np.asarray(height) > 11000)):
             raise SettingError(
                 f"The standard atmosphere is known from -500 to 11000 m, not at {height} m."
             )
-        return Air(101325.0 * (1.0 - 2.25577e-5 * height) ** 5.25588, temperature)
+        return Air(101325.0 * (1.0 - 2.25577e-5 * as_numpy(height)) ** 5.25588, temperature)
 
 
 def unix_time(when: datetime | Iterable[datetime]) -> Float[np.ndarray, "*s"]:

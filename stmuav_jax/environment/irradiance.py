@@ -13,7 +13,6 @@ import math
 import warnings
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -147,4 +146,4 @@ def energy(unix: Samples, irradiance: Samples) -> float:
 
 def level_normals(n: int) -> Normals:
     """Unit normals (3, n) of a horizontal panel."""
-    return np.asarray(jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0])[:, None], (3, n)))
+    return np.repeat(np.array([[0.0], [0.0], [1.0]]), n, axis=1)

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..checks.errors import StateError, check_finite, concrete
+from ..checks.numbers import array_module, floats
 from ..checks.reason import AbstractReason, first_reason
 from ..checks.shapes import Numbers
 from .ephemeris import Air, Place, azimuth, elevation, sun_direction, unix_time
@@ -210,15 +211,16 @@ def attitude(
     All angles [rad] are right-handed about body axes; the world is x east, y north, z up, so
     that yaw turns the body's x axis from east towards north, and a positive pitch lowers it.
     """
-    angles = [jnp.asarray(angle, dtype=float) for angle in (roll, pitch, yaw)]
-    (sr, cr), (sp, cp), (sy, cy) = [(jnp.sin(angle), jnp.cos(angle)) for angle in angles]
+    xp = array_module(roll, pitch, yaw)
+    angles = [xp.asarray(angle, dtype=float) for angle in (roll, pitch, yaw)]
+    (sr, cr), (sp, cp), (sy, cy) = [(xp.sin(angle), xp.cos(angle)) for angle in angles]
     rows = (
         (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
         (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
         (-sp, cp * sr, cp * cr),
     )
-    flat = jnp.broadcast_arrays(*(entry for row in rows for entry in row))
-    return jnp.stack([jnp.stack(flat[3 * k : 3 * k + 3]) for k in range(3)])
+    flat = xp.broadcast_arrays(*(entry for row in rows for entry in row))
+    return floats(xp.stack([xp.stack(flat[3 * k : 3 * k + 3]) for k in range(3)]))
 
 
 def check_attitude(R_wb: Numbers) -> None:

@@ -43,6 +43,7 @@ from .propagate import (
     rk4 as rk4,
 )
 from .sigma import (
+    AbstractRule as AbstractRule,
     Cubature as Cubature,
     Cubature5 as Cubature5,
     Linearised as Linearised,

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..algebra import linalg
+from ..algebra.native import native_loops
 from ..algebra.stacked import multiply
 
 Root = Float[Array, "k k *s"]
@@ -25,8 +26,9 @@ Root = Float[Array, "k k *s"]
 # Round-off in a pivot that should be zero, in units of epsilon.
 _ROUND_OFF = 100
 
-# Number of columns up to which written-out code is faster than LAPACK for a single matrix.
-_FEW = 3
+# Number of columns up to which written-out code is faster than LAPACK for a single matrix, and
+# that in native loops, which LAPACK's calls would prevent.
+_FEW, _FEW_NATIVE = 3, 12
 
 
 def triangularise(rows: Float[Array, "r k *s"]) -> Root:
@@ -35,7 +37,7 @@ def triangularise(rows: Float[Array, "r k *s"]) -> Root:
     The rows are never squared, so parts of L that are small beside others keep their digits.
     """
     r, k = rows.shape[:2]
-    if rows.ndim == 2 and k > _FEW:
+    if rows.ndim == 2 and k > (_FEW_NATIVE if native_loops() else _FEW):
         if r < k:
             rows = jnp.concatenate([rows, jnp.zeros((k - r, k), rows.dtype)])
         R = jnp.linalg.qr(rows, mode="r")

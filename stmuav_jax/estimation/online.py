@@ -149,7 +149,9 @@ class OnlineFilter:
 
     def warm_up(self, u: Inputs = None, *, y: Any = None) -> None:
         """Compile the step for inputs and a measurement (by default m numbers) of these shapes."""
-        y = np.full(self.model.sensor.space.size, np.nan) if y is None else y
+        if y is None:
+            seen = jax.eval_shape(self.model.sensor, self._prior.mean, u)
+            y = np.full(seen.shape, np.nan)
         program, given = self._prepared(y, 0.0, u)
         jax.block_until_ready(program(self._now, given))
 

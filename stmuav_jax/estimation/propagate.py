@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -13,9 +14,31 @@ Rates = Callable[[Float[Array, "n *s"], Any], Float[Array, "n *s"]]
 Step = Callable[[Float[Array, "n *s"], Any, Any], Float[Array, "n *s"]]
 
 
+class EulerStep(eqx.Module):
+    """Step x + dt rates(x, u) of Euler's method; see `euler`."""
+
+    rates: Rates
+
+    def __call__(self, x: Array, u: Any, dt: Any) -> Array:
+        return x + dt * self.rates(x, u)
+
+
+class RungeKuttaStep(eqx.Module):
+    """Step of the classical fourth-order Runge-Kutta method; see `rk4`."""
+
+    rates: Rates
+    substeps: int = eqx.field(static=True)
+
+    def __call__(self, x: Array, u: Any, dt: Any) -> Array:
+        h = dt / self.substeps
+        for _ in range(self.substeps):
+            x = rk4_step(lambda x, _: self.rates(x, u), x, h)
+        return x
+
+
 def euler(rates: Rates) -> Step:
     """Step x + dt rates(x, u) of Euler's method."""
-    return lambda x, u, dt: x + dt * rates(x, u)
+    return EulerStep(rates)
 
 
 def rk4_step(rate: Callable[[Array, Any], Array], x: Array, h: Any) -> Array:
@@ -53,11 +76,4 @@ def rk4(rates: Rates, substeps: int = 1) -> Step:
     """
     if substeps < 1:
         raise SettingError(f"rk4 needs at least one substep, not {substeps}.")
-
-    def step(x: Array, u: Any, dt: Any) -> Array:
-        h = dt / substeps
-        for _ in range(substeps):
-            x = rk4_step(lambda x, _: rates(x, u), x, h)
-        return x
-
-    return step
+    return RungeKuttaStep(rates, substeps)

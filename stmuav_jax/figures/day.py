@@ -5,25 +5,29 @@ import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 from rich.text import Text
 
+from ..algebra.compiler import quick_jit
 from ..environment.sun import attitude
+from ..files.labelled import Labelled
 from ..files.netcdf import FileError, labelled
 from ..tracker.day import PANELS, Day
-from ..tracker.kinematics import Reason, panel_angles, panel_normal
-from ..tracker.workspace import direction_grid, survey
+from ..tracker.geometry import TrackerGeometry
+from ..tracker.kinematics import Reason, panel_angles
+from ..tracker.workspace import Limits, direction_grid, survey
 from .plot import STYLES, grid
 from .terminal import row, table
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 FORMAT = "stmuav_jax day"
 FORMAT_VERSION = 1
@@ -117,13 +121,18 @@ def day_tables(day: Day) -> tuple[Table, Table]:
 # --- files
 
 
-def day_dataset(day: Day) -> xr.Dataset:
+def day_dataset(day: Day) -> "xr.Dataset":
     """Labelled dataset of the day, with times in seconds since local midnight.
 
     Dimensions: time, axis (x, y, z; the world is east, north, up), axis_b (of the UAV), angle,
     leg, panel. Every variable has `units` and `description`; attributes hold place, date and
     settings.
     """
+    return labelled_day(day).dataset()
+
+
+def labelled_day(day: Day) -> Labelled:
+    """Content of a saved day; see `day_dataset`."""
     s = "time"
     table = {
         "unix_time": ((s,), day.unix, "s", "UTC since 1970-01-01, without leap seconds"),
@@ -146,7 +155,7 @@ def day_dataset(day: Day) -> xr.Dataset:
     }  # fmt: skip
     words = {"units": "s", "description": "since local midnight"}
     coordinates = {
-        "time": xr.Variable((s,), day.unix - day.unix[0], words),
+        "time": ((s,), day.unix - day.unix[0], words),
         "axis": ["x", "y", "z"],
         "axis_b": ["x", "y", "z"],
         "angle": ["phi", "theta"],
@@ -252,12 +261,11 @@ def sky(day: Day) -> Figure:
     figure, axes = grid(1, 1, 5.2, subplot_kw={"projection": "polar"})
     ax: Any = axes[0, 0]
     turn, tilt = np.radians(np.arange(0, 361, 1.0)), np.radians(np.arange(0, 90.1, 0.5))
-    room = jax.jit(lambda direction_b: _room(day, direction_b))
-    inside = np.asarray(room(direction_grid(turn, tilt))).T
+    inside = np.asarray(_room(day.geometry, day.limits, turn, tilt)).T
     ax.contourf(turn, np.degrees(tilt), inside, levels=[0.0, np.inf], colors=["#DDEEDD"])
     ax.contour(turn, np.degrees(tilt), inside, levels=[0.0], colors=["#009E73"], linewidths=1.0)
     up = day.is_up
-    panel_b = np.asarray(panel_normal(jnp.asarray(day.angles)))
+    panel_b = np.einsum("jin,jn->in", day.R_wb, day.normals_w)
     for way, words, (color, dash) in zip(
         (day.s_b, panel_b), ("sun", "panel's normal"), STYLES, strict=False
     ):
@@ -276,9 +284,13 @@ def sky(day: Day) -> Figure:
     return figure
 
 
-def _room(day: Day, direction_b: Float[Array, "3 *s"]) -> Float[Array, "*s"]:
+@quick_jit
+def _room(
+    geometry: TrackerGeometry, limits: Limits, turn: Float[Array, " n"], tilt: Float[Array, " m"]
+) -> Float[Array, "n m"]:
     """Smallest scaled margin: positive in the workspace, zero on its boundary."""
-    m = survey(day.geometry, panel_angles(direction_b), day.limits).margins
+    angles = panel_angles(direction_grid(turn, tilt))
+    m = survey(geometry, angles, limits).margins
     parts = jnp.stack([m.tilt, m.parallel, *(m.lower / 0.05), *(m.upper / 0.05)])
     # compiled minima may ignore NaN
     return jnp.min(jnp.where(jnp.isfinite(parts), parts, -1.0), axis=0)

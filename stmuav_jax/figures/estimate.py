@@ -2,21 +2,24 @@
 
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 from rich.text import Text
 
 from ..estimation.consistency import mean_interval
+from ..files.labelled import Labelled
 from ..files.netcdf import labelled
 from ..quadrotor.assess import CaseStudy, CaseSummary, Estimates, last_beyond, settled_from
 from ..quadrotor.filter_verdict import RunsVerdict
 from ..quadrotor.hover import Hover
 from .plot import STYLES, grid
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 FORMAT = "stmuav_jax estimate"
 FORMAT_VERSION = 1
@@ -227,11 +230,16 @@ def hover(flights: dict[str, Hover]) -> Figure:
 # --- files
 
 
-def case_dataset(study: CaseStudy) -> xr.Dataset:
+def case_dataset(study: CaseStudy) -> "xr.Dataset":
     """Labelled dataset of a case, with dimensions time, seed, tuning, component, rotor, axis.
 
     Times are the ends of the steps, over which the thrusts are constant.
     """
+    return labelled_case(study).dataset()
+
+
+def labelled_case(study: CaseStudy) -> Labelled:
+    """Content of a saved case; see `case_dataset`."""
     record, found = study.record, study.estimates
     together = lambda pick: np.stack([np.asarray(pick(e)) for e in found.values()])
     path = ("time", "component", "seed")
@@ -263,8 +271,8 @@ def case_dataset(study: CaseStudy) -> xr.Dataset:
     )
 
 
-def hover_dataset(flights: dict[str, Hover]) -> xr.Dataset:
-    """Labelled dataset of hovers, with dimensions as in `case_dataset`."""
+def labelled_hover(flights: dict[str, Hover]) -> Labelled:
+    """Content of saved hovers, with dimensions as in `case_dataset`."""
     together = lambda pick: np.stack([np.asarray(pick(h)) for h in flights.values()])
     each = ("tuning", "time", "component", "seed")
     scalar = ("tuning", "time", "seed")
@@ -288,12 +296,12 @@ def hover_dataset(flights: dict[str, Hover]) -> xr.Dataset:
     return _dataset(table, coordinates, "Hover by a controller that sees the estimate", {})
 
 
-def _times(t: Any) -> xr.Variable:
+def _times(t: Any) -> tuple[tuple[str], np.ndarray, dict[str, str]]:
     words = {"units": "s", "description": "ends of the steps"}
-    return xr.Variable(("time",), np.asarray(t)[1:], words)
+    return ("time",), np.asarray(t)[1:], words
 
 
-def _dataset(table: dict, coordinates: dict, title: str, summaries: dict) -> xr.Dataset:
+def _dataset(table: dict, coordinates: dict, title: str, summaries: dict) -> Labelled:
     used = {dim for dims, *_ in table.values() for dim in dims}
     named = {"component": list(COMPONENTS), "axis": ["x", "y", "z"]}
     return labelled(

@@ -10,11 +10,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
+from ..algebra.compiler import quick_jit
 from ..algebra.least_squares import Search, SearchReason
 from ..algebra.rotation import to_rotation_vector
+from ..checks.numbers import as_numpy
 from ..files.netcdf import FileError, write_atomically
 from ..flight.linear import Linear
 from ..flight.tuning import InputTuning
@@ -114,13 +116,19 @@ def flight_figure(
     return figure
 
 
+@quick_jit
+def _rotation_vectors(p: Float[Array, "k 4"]) -> Float[Array, "k 3"]:
+    return jax.vmap(to_rotation_vector)(p)
+
+
 def flown(
     tuning: InputTuning, values: Any, samples: int = 200
 ) -> tuple[Float[np.ndarray, " k"], dict[str, dict[str, np.ndarray]]]:
     """Times and curves of a solution of `slew`, by "quantity [unit]" and name, for figures."""
     motion = tuning.motion(values, samples)
-    path, squared, forces = motion.points, motion.inputs[:, :-2], motion.inputs[:, -2:]
-    tilt = np.asarray(jax.vmap(to_rotation_vector)(path.p))
+    path, inputs = as_numpy((motion.points, motion.inputs))
+    squared, forces = inputs[:, :-2], inputs[:, -2:]
+    tilt = np.asarray(_rotation_vectors(path.p))
     deg = lambda x: np.degrees(np.asarray(x))
     return np.asarray(motion.ts), {
         "panel [degrees]": {"phi": deg(path.angles[:, 0]), "theta": deg(path.angles[:, 1])},

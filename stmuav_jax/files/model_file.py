@@ -1,48 +1,109 @@
-"""Models of mechanisms as TOML files: loaded as scenes, and saved again to the last bit."""
+"""Models of mechanisms as TOML files, loaded as scenes; `model_text` writes them."""
 
 import contextlib
-import dataclasses
+import hashlib
 import json
 import os
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from ..algebra.rotation import rotation_matrix_in
 from ..checks.errors import ModelError, SettingError, StateError, nearest_names
-from ..checks.numbers import floats
+from ..checks.numbers import array_module, floats, stacked
 from ..checks.physical import check_unit
 from ..checks.schema import SHOWN, checked
+from ..control.instruments import Instrument
 from ..dynamics.assembly.joint_start import state_from_joints
 from ..dynamics.scene import Scene
-from ..mechanics.body import GROUND, Body
+from ..mechanics.body import Body
 from ..mechanics.joint import Joint
-from ..mechanics.load import SineMotion
 from ..mechanics.state import State
 from ..mechanics.system import System
+from ..parameters.table import Parameter, Parameters
 from .model_schema import (
     BODY,
+    DATASHEET,
     FORCES,
     IN_BODIES,
+    INSTRUMENTS,
     JOINTS,
-    MODEL_FORMAT,
     START_BODY,
     ModelFile,
-    ModelParameter,
     entries,
     kind_of,
     with_parameters,
 )
-from .netcdf import FileError, read_toml, write_atomically
+from .netcdf import FileError, read_toml
 
-Table = Mapping[str, ModelParameter]
+Table = Mapping[str, Parameter]
 
 # Largest admitted difference of a frame's axes from orthogonal unit vectors.
 _ORTHOGONAL = 1e-9
+
+
+@dataclass(frozen=True)
+class Model:
+    """Model's file that was read and checked, from whose parameters systems can be made.
+
+    Attributes:
+        place: path of the file, for messages. given: its entries.
+        scene: its scene, with the parameters' own values.
+        table: its parameters.
+    """
+
+    place: str
+    given: ModelFile
+    scene: Scene
+    table: Parameters
+
+    def system(self, table: Parameters) -> System:
+        """System with the values of a table, which JAX may trace."""
+        return _system(self.place, self.given, table)
+
+    @property
+    def digest(self) -> str:
+        """Text that tells models with other entries apart."""
+        text = json.dumps(self.given.model_dump(mode="json"), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    def of_start(self) -> frozenset[str]:
+        """Names of the parameters to which the entries of the start refer."""
+        return frozenset(_texts(self.given.start.model_dump())) & frozenset(self.table)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Model of a scene without parameters, such as a robot's; see `Model`."""
+
+    scene: Scene
+
+    @property
+    def table(self) -> Parameters:
+        """Table without parameters."""
+        return Parameters(self.scene.name, {})
+
+    @property
+    def digest(self) -> str:
+        """Text that tells systems and starts with other numbers apart."""
+        found = hashlib.sha256(repr(self.scene.system.names).encode())
+        for leaf in jax.tree.leaves((self.scene.system, self.scene.state0)):
+            found.update(np.asarray(leaf).tobytes())
+        return found.hexdigest()[:16]
+
+    def system(self, table: Parameters) -> System:
+        """The system."""
+        del table
+        return self.scene.system
+
+    def of_start(self) -> frozenset[str]:
+        """No names."""
+        return frozenset()
 
 
 def load_model(path: str | os.PathLike[str]) -> Scene:
@@ -56,10 +117,51 @@ def load_model(path: str | os.PathLike[str]) -> Scene:
             or it has no state with the coordinates and rates of the start. The message names the
             file and the table.
     """
+    return read_model(path).scene
+
+
+def read_model(path: str | os.PathLike[str]) -> Model:
+    """Model of a TOML file, see `load_model`, from whose parameters systems can be made."""
     source, content = Path(path), read_toml(path)
     with _within(f"{source}"):
         given = checked(ModelFile, content, "A model")
-        parameters = given.parameters
+    entries_of = given.parameters.items()
+    table = Parameters(
+        f"{source}", {name: Parameter(p.value, p.unit, p.source) for name, p in entries_of}
+    )
+    system = _system(f"{source}", given, table)
+    with _within(f"{source}"):
+        for name in (*given.watch, *given.links_between):
+            system.index(name)
+    sensors = {}
+    for what in ("sensors", "links_between"):
+        if getattr(given, what) and given.format < 2:
+            raise FileError(
+                f"{source}: '{what}' needs format = 2, but the file has {given.format}."
+            )
+    for name, entry in given.sensors.items():
+        with _within(f"{source}, [sensors.{name}]"):
+            sensors[name] = _instrument(name, entry, table, system)
+    with _within(f"{source}, [start]"):
+        state0 = _start(system, given, table)
+    scene = Scene(
+        name=given.name or source.stem,
+        title=given.title,
+        system=system,
+        state0=state0,
+        t0=given.t0,
+        t1=given.t1,
+        save_every=given.save_every,
+        parameters={name: each.model_dump(mode="json") for name, each in given.parameters.items()},
+        notes=given.notes,
+        watch=given.watch,
+        links_between=given.links_between,
+        sensors=sensors,
+    )
+    return Model(f"{source}", given, scene, table)
+
+
+def _system(source: str, given: ModelFile, parameters: Table) -> System:
     bodies = []
     for name, table in given.bodies.items():
         with _within(f"{source}, [bodies.{name}]"):
@@ -74,23 +176,16 @@ def load_model(path: str | os.PathLike[str]) -> Scene:
             forces.append(_force(table, parameters))
     with _within(f"{source}"):
         system = System([body for body, _ in bodies], joints, forces)
-        for name in given.watch:
-            system.index(name)
-    system = _placed(system, [place for _, place in bodies])
-    with _within(f"{source}, [start]"):
-        state0 = _start(system, given, parameters)
-    return Scene(
-        name=given.name or source.stem,
-        title=given.title,
-        system=system,
-        state0=state0,
-        t0=given.t0,
-        t1=given.t1,
-        save_every=given.save_every,
-        parameters={name: each.model_dump(mode="json") for name, each in parameters.items()},
-        notes=given.notes,
-        watch=given.watch,
-    )
+    return _placed(system, [place for _, place in bodies])
+
+
+def _texts(value: Any) -> set[str]:
+    """Texts among nested values, without the names of entries."""
+    if isinstance(value, str):
+        return {value}
+    inner = value.values() if isinstance(value, Mapping) else value
+    parts = [_texts(each) for each in inner] if isinstance(inner, Iterable) else []
+    return set().union(*parts)
 
 
 @contextlib.contextmanager
@@ -110,18 +205,26 @@ def _body(name: str, table: Mapping[str, Any], parameters: Table) -> tuple[Body,
         return Body(name, **found), None
     if "position" in found:
         raise SettingError("A body has a position or a com_position, not both.")
-    com = np.asarray(found.get("com", np.zeros(3)))
-    p = np.asarray(found.get("orientation", (1.0, 0.0, 0.0, 0.0)), dtype=float)
-    return Body(name, position=place - rotation_matrix_in(np, p) @ com, **found), place
+    com, p, place = (
+        floats(x)
+        for x in (
+            found.get("com", np.zeros(3)),
+            found.get("orientation", (1.0, 0.0, 0.0, 0.0)),
+            place,
+        )
+    )
+    module = array_module(com, p, place)
+    com, p, place = (module.asarray(x) for x in (com, p, place))
+    return Body(name, position=place - rotation_matrix_in(module, p) @ com, **found), place
 
 
 def _placed(system: System, places: list[Any]) -> System:
     """System with the given centres of mass themselves, where positions only come near them."""
-    r = np.array(system.reference.r)
-    for row, place in enumerate(places):
-        if place is not None:
-            r[row] = place
-    return eqx.tree_at(lambda s: s.reference.r, system, floats(r))
+    if all(place is None for place in places):
+        return system
+    own = system.reference.r
+    rows = [own[k] if place is None else place for k, place in enumerate(places)]
+    return eqx.tree_at(lambda s: s.reference.r, system, stacked(rows))
 
 
 def _joint(name: str, table: Mapping[str, Any], parameters: Table, before: list[Joint]) -> Joint:
@@ -176,6 +279,29 @@ def _force(table: Mapping[str, Any], parameters: Table) -> Any:
     return kind.make(*((owner,) if isinstance(owner, str) else owner), **found)
 
 
+def _instrument(
+    name: str, table: Mapping[str, Any], parameters: Table, system: System
+) -> Instrument:
+    kind = kind_of(table, INSTRUMENTS, "A sensor")
+    what = f"A sensor of kind {table['kind']}"
+    found = entries(table, kind.slots, parameters, what, owner=kind.owner, kind=True)
+    owner, own = found[kind.owner], {k: v for k, v in found.items() if k in kind.slots}
+    if kind.owner == "body":
+        system.index(owner)
+    sheet = {key: own.pop(key) for key in DATASHEET if key in own}
+    made = kind.make(owner, name=name, own=own, **sheet)
+    count = len(made.sensor.components(system))
+    for key in ("noise", "bias"):
+        value = np.asarray(sheet.get(key, 0.0))
+        if value.ndim and len(value) != count:
+            raise SettingError(
+                f"'{key}' must have one number, or {count}, but it has {len(value)}."
+            )
+        if key == "noise" and np.any(value < 0):
+            raise SettingError(f"'noise' must not be negative, but it is {value.tolist()}.")
+    return made
+
+
 def _start(system: System, given: ModelFile, parameters: Table) -> State:
     """State of the file's start; at the reference posture, at rest, if it says nothing."""
     state, start = system.reference, given.start
@@ -207,137 +333,3 @@ def _numbers(value: Any, parameters: Table, key: str) -> Any:
     if any(isinstance(x, bool) or not isinstance(x, int | float) for x in every):
         raise SettingError(f"'{key}' must be a number or a list of numbers.")
     return filled
-
-
-def save_model(scene: Scene, path: str | os.PathLike[str]) -> Path:
-    """Write a scene as a model's TOML file, see `model_to_text`; the path."""
-    return write_atomically(path, model_to_text(scene).encode())
-
-
-def model_to_text(scene: Scene) -> str:
-    """TOML text of a scene, from which `load_model` makes the same system and state to the last bit.
-
-    Numbers are written out in the bodies' reference frames: nothing refers to the parameters, which
-    are kept as a record.
-
-    Raises:
-        SettingError: the file cannot hold the system: a load or a driver's motion that is
-            another function of time, a force element of another class, or single precision.
-    """
-    system = scene.system
-    if system.allow_float32:
-        raise SettingError("Models are saved in double precision alone; this system admits others.")
-    head: dict[str, Any] = {
-        "format": MODEL_FORMAT, "name": scene.name, "title": scene.title,
-        "t0": scene.t0, "t1": scene.t1, "save_every": scene.save_every,
-        "notes": list(scene.notes), "watch": list(scene.watch),
-    }  # fmt: skip
-    tables: dict[tuple[str, ...], dict[str, Any]] = {
-        ("parameters", name): dict(each) for name, each in scene.parameters.items()
-    }
-    floating = _floating(system)
-    for k, name in enumerate(system.names):
-        tables["bodies", name] = _body_table(system, k) | ({"free": True} if k in floating else {})
-    for k, joint in enumerate(system.joints):
-        tables["joints", joint.name] = _joint_table(joint, system.joints[:k])
-    for k, force in enumerate(system.forces, start=1):
-        kind, table = _force_table(force)
-        tables["forces", f"{kind}_{k}"] = table
-    for k, name in enumerate(system.names):
-        state = scene.state0
-        tables["start", "bodies", name] = {
-            "com_position": state.r[k], "orientation": state.p[k],
-            "velocity": state.v[k], "angular_velocity": state.omega[k],
-        }  # fmt: skip
-    parts = ["\n".join(f"{key} = {_toml(value)}" for key, value in head.items())]
-    for place, table in tables.items():
-        last = place[-1] if re.fullmatch("[A-Za-z0-9_-]+", place[-1]) else _toml(place[-1])
-        title = ".".join((*place[:-1], last))
-        parts.append("\n".join([f"[{title}]", *(f"{k} = {_toml(v)}" for k, v in table.items())]))
-    return "\n\n".join(parts) + "\n"
-
-
-def _toml(value: Any) -> str:
-    """TOML form of a text, a truth value, numbers, or a table within a line."""
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + "}"
-    plain = np.asarray(value).tolist() if not isinstance(value, list | tuple) else value
-    if isinstance(plain, list | tuple):
-        return "[" + ", ".join(_toml(each) for each in plain) + "]"
-    return repr(plain)
-
-
-def _floating(system: System) -> set[int]:
-    """Rows of the bodies that no chain of joints connects to ground."""
-    reached, grown = {GROUND}, True
-    while grown:
-        ends = [{joint.body_i, joint.body_j} for joint in system.joints]
-        new = set().union(*(pair for pair in ends if pair & reached)) - reached
-        reached, grown = reached | new, bool(new)
-    return {k for k, name in enumerate(system.names) if name not in reached}
-
-
-def _body_table(system: System, k: int) -> dict[str, Any]:
-    bodies, start = system.bodies, system.reference
-    table = {
-        "mass": bodies.mass[k], "inertia": bodies.inertia[k], "com": bodies.com[k],
-        "com_position": start.r[k], "orientation": start.p[k],
-    }  # fmt: skip
-    moments = np.linalg.eigvalsh(np.asarray(bodies.inertia[k]))
-    excess = moments[2] / (moments[0] + moments[1]) - 1
-    # a rounded, printed tensor was admitted: it has to be again
-    return table | ({"triangle_tolerance": 1.01 * excess} if excess > 0 else {})
-
-
-def _joint_table(joint: Joint, before: tuple[Joint, ...]) -> dict[str, Any]:
-    if JOINTS[joint.kind].owner == "joint":
-        return _driver_table(joint, before)
-    geometry = {key: getattr(joint, key) for key in IN_BODIES}
-    ends = [joint.body_i, joint.body_j]
-    return {"kind": joint.kind, "bodies": ends, "in_bodies": geometry}
-
-
-def _driver_table(driver: Joint, before: tuple[Joint, ...]) -> dict[str, Any]:
-    if not isinstance(driver.motion, SineMotion):
-        raise SettingError(
-            f"A model's file cannot hold the motion of the driver '{driver.name}', only a "
-            "stmuav_jax.mechanics.SineMotion."
-        )
-    for joint in before:
-        other = dataclasses.replace(joint, name=driver.name, kind=driver.kind, motion=driver.motion)
-        if joint.motion is None and eqx.tree_equal(other, driver):
-            return {
-                "kind": driver.kind,
-                "joint": joint.name,
-                **{key: getattr(driver.motion, key) for key in JOINTS[driver.kind].slots},
-            }
-    raise SettingError(f"No joint before the driver '{driver.name}' is the one that it drives.")
-
-
-def _force_table(force: Any) -> tuple[str, dict[str, Any]]:
-    kinds = {each.make: (name, each) for name, each in FORCES.items()}
-    if type(force) not in kinds:
-        known = ", ".join(each.__name__ for each in kinds)
-        raise SettingError(
-            f"A model's file cannot hold a {type(force).__name__}, only these force elements: {known}."
-        )
-    name, kind = kinds[type(force)]
-    owner = [force.body_i, force.body_j] if kind.owner == "bodies" else None
-    table: dict[str, Any] = {"kind": name}
-    if kind.owner:
-        table[kind.owner] = owner or getattr(force, kind.owner)
-    for key in kind.slots:
-        value = getattr(force, key)
-        if callable(value):
-            raise SettingError(
-                f"A model's file cannot hold functions of time, such as '{key}' of the "
-                f"{type(force).__name__} on {force.acts_on()}; set it to a number by "
-                "stmuav_jax.mechanics.with_inputs."
-            )
-        if value is not None:
-            table[key] = value
-    return name, table

@@ -1,17 +1,19 @@
-"""Schema of a model's file, format 1: names, types and units of all its entries.
+"""Schema of a model's file, formats 1 and 2: names, types and units of all its entries.
 
-A kind of joint or of force element is one line of `JOINTS` or `FORCES`; its entries are the arguments
-of the function that makes it. docs/models.md lists them.
+A kind of force element is one line of `FORCES`; the kinds of joints are those of the catalogue. The
+entries of either are the arguments of the function that makes it. docs/models.md lists them.
 """
 
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 import pydantic
 from pydantic import AfterValidator, Field
 
-from ..checks.errors import SettingError, nearest_names
+from ..checks.errors import SettingError, concrete, nearest_names
 from ..checks.schema import SHOWN, Entries, Finite, Positive, Tuples, checked, named, shown
+from ..control.instruments import Instrument
 from ..mechanics import joint as joints
 from ..mechanics.body import Body
 from ..mechanics.forces import applied
@@ -19,9 +21,12 @@ from ..mechanics.forces.effort import JointEffort
 from ..mechanics.forces.joint import EndStop, JointFriction, JointServo
 from ..mechanics.load import SineMotion
 from ..montecarlo.schema import Name
+from ..parameters.table import Parameter
 from ..rotorcraft.rotor import Rotors
+from ..sensing.sensors import SENSORS
 
-MODEL_FORMAT = 1
+# Formats that are read; the second has sensors.
+MODEL_FORMATS = (1, 2)
 
 Vector = Annotated[tuple[Finite, Finite, Finite], Tuples]
 Rows = Annotated[tuple[Vector, Vector, Vector], Tuples]
@@ -31,31 +36,33 @@ Several = Annotated[tuple[Finite, ...], Tuples]
 Vectors = Annotated[tuple[Vector, ...], Tuples]
 
 
-def _inertia(value: Any) -> Any:
-    shape = pydantic.TypeAdapter(Vector | Rows)
-    try:
-        return shape.validate_python(value)
-    except pydantic.ValidationError:
-        raise ValueError(
-            f"must be three moments or three rows of three numbers, but it is {shown(value)}."
-        ) from None
+def _shaped(kinds: Any, words: str) -> AfterValidator:
+    """Check that a value is of one of some shapes; a message says what it must be."""
+    shape = pydantic.TypeAdapter(kinds)
+
+    def check(value: Any) -> Any:
+        try:
+            return shape.validate_python(value)
+        except pydantic.ValidationError:
+            raise ValueError(f"must be {words}, but it is {shown(value)}.") from None
+
+    return AfterValidator(check)
 
 
-def _value(value: Any) -> Any:
-    shape = pydantic.TypeAdapter(Finite | Several | Vectors)
-    try:
-        return shape.validate_python(value)
-    except pydantic.ValidationError:
-        raise ValueError(f"must be finite numbers, but it is {shown(value)}.") from None
+_INERTIA = _shaped(Vector | Rows, "three moments or three rows of three numbers")
+_VALUE = _shaped(Finite | Several | Vectors, "finite numbers")
+# One number, or one for each component.
+Size = Annotated[Any, _shaped(Finite | Several, "a number or a list of numbers")]
 
 
 def _format(value: int) -> int:
-    if value != MODEL_FORMAT:
-        raise ValueError(f"is {shown(value)}, but this version reads format {MODEL_FORMAT} alone.")
+    if value not in MODEL_FORMATS:
+        known = " and ".join(map(str, MODEL_FORMATS))
+        raise ValueError(f"is {shown(value)}, but this version reads the formats {known}.")
     return value
 
 
-Inertia = Annotated[Any, AfterValidator(_inertia)]
+Inertia = Annotated[Any, _INERTIA]
 
 
 class Slot(NamedTuple):
@@ -100,8 +107,6 @@ _POINT, _AXIS = Slot(Vector, "m"), Slot(Vector, "1")
 _LENGTH = Slot(Finite, "m", needed=False)
 _WHICH = Slot(Literal["angle", "displacement"], needed=False)
 _FRAME = Slot(Literal["world", "body"], needed=False)
-_ALONG = {"point": _maybe(_POINT), "axis": _AXIS}
-_ENDS = {"point_i": _POINT, "point_j": _POINT, "length": _LENGTH}
 _SWING = Slot(Finite, "m or rad", needed=False)
 _MOTION = {
     "start": _SWING,
@@ -111,20 +116,36 @@ _MOTION = {
     "phase": Slot(Finite, "rad", needed=False),
 }
 
+# Arguments of the functions that make joints: one that is not here keeps its joint out of files.
+_ARGUMENTS = {
+    **dict.fromkeys(("point", "point_i", "point_j"), _POINT),
+    **dict.fromkeys(("axis", "axis_i", "axis_j"), _AXIS),
+    "length": _LENGTH,
+    "pitch": Slot(Finite, "m/rad"),
+}
+
+
+def _joint(kind: str) -> Kind:
+    """Table of a kind of joint, from the signature of its function."""
+    own = _keywords(kind)
+    slots = {name: _ARGUMENTS[name]._replace(needed=own[name]) for name in own}
+    return Kind(getattr(joints, kind), "bodies", slots)
+
+
+def _keywords(kind: str) -> dict[str, bool]:
+    """Keyword arguments of a joint's function, and for each whether it is needed."""
+    own = inspect.signature(getattr(joints, kind)).parameters.values()
+    return {p.name: p.default is p.empty for p in own if p.kind is p.KEYWORD_ONLY}
+
+
+def _named() -> list[str]:
+    """Kinds of joints whose functions take what a file can hold; those of a user are not among them."""
+    own = [kind for kind in joints.CATALOGUE if hasattr(joints, kind)]
+    return [kind for kind in own if _keywords(kind).keys() <= _ARGUMENTS.keys()]
+
+
 JOINTS: dict[str, Kind] = {
-    "weld": Kind(joints.weld, "bodies", {"point": _maybe(_POINT)}),
-    "spherical": Kind(joints.spherical, "bodies", {"point": _POINT}),
-    "universal": Kind(
-        joints.universal, "bodies", {"point": _POINT, "axis_i": _AXIS, "axis_j": _AXIS}
-    ),
-    "revolute": Kind(joints.revolute, "bodies", {"point": _POINT, "axis": _AXIS}),
-    "translational": Kind(joints.translational, "bodies", _ALONG),
-    "cylindrical": Kind(joints.cylindrical, "bodies", _ALONG),
-    "screw": Kind(
-        joints.screw, "bodies", {"point": _POINT, "axis": _AXIS, "pitch": Slot(Finite, "m/rad")}
-    ),
-    "distance": Kind(joints.distance, "bodies", _ENDS),
-    "revolute_spherical": Kind(joints.revolute_spherical, "bodies", {"axis": _AXIS, **_ENDS}),
+    **{kind: _joint(kind) for kind in _named()},
     "drive_angle": Kind(_driver("angle"), "joint", _MOTION),
     "drive_displacement": Kind(_driver("displacement"), "joint", _MOTION),
 }
@@ -175,6 +196,30 @@ FORCES: dict[str, Kind] = {
     }),
 }  # fmt: skip
 
+
+def _sensor(name: str, unit: str, **own: Slot) -> Kind:
+    """Table of a kind of sensor with the numbers of its datasheet, noise and bias in a unit."""
+
+    def make(*owner: str, name: str, own: Mapping[str, Any], **datasheet: Any) -> Instrument:
+        return Instrument(sensor(*owner, name=name, **own), **datasheet)
+
+    sensor = SENSORS[name]
+    error = Slot(Size, unit, needed=False)
+    sheet = {"noise": error, "bias": error, "rate": Slot(Finite, "Hz", needed=False)}
+    sheet["delay"] = Slot(Finite, "s", needed=False)
+    return Kind(make, "joint" if name == "encoder" else "body", {**own, **sheet})
+
+
+_AXES = Slot(Rows, "1", needed=False)
+DATASHEET = ("noise", "bias", "rate", "delay")
+INSTRUMENTS: dict[str, Kind] = {
+    "gyroscope": _sensor("gyroscope", "rad/s", axes=_AXES),
+    "accelerometer": _sensor("accelerometer", "m/s^2", point=_maybe(_POINT), axes=_AXES),
+    "encoder": _sensor("encoder", "m or rad", coordinate=_WHICH),
+    "position": _sensor("position", "m", point=_maybe(_POINT)),
+    "attitude": _sensor("attitude", "rad"),
+}
+
 BODY = Kind(Body, "", {
     "mass": Slot(Finite, "kg"), "inertia": Slot(Inertia, "kg m^2"), "com": _maybe(_POINT),
     "position": _maybe(_POINT), "com_position": _maybe(_POINT),
@@ -192,7 +237,7 @@ START_BODY: dict[str, Slot] = {
 class ModelParameter(Entries):
     """Entry of a parameter, to which the entries of bodies, joints and forces may refer."""
 
-    value: Annotated[Any, AfterValidator(_value)]
+    value: Annotated[Any, _VALUE]
     unit: str
     source: str
 
@@ -216,10 +261,12 @@ class ModelFile(Entries):
     save_every: Positive = 0.01
     notes: Annotated[tuple[str, ...], Tuples] = ()
     watch: Annotated[tuple[str, ...], Tuples] = ()
+    links_between: Annotated[tuple[str, ...], Tuples] = ()
     parameters: dict[str, ModelParameter] = Field(default_factory=dict)
     bodies: dict[str, dict[str, Any]]
     joints: dict[str, dict[str, Any]] = Field(default_factory=dict)
     forces: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    sensors: dict[str, dict[str, Any]] = Field(default_factory=dict)
     start: StartEntry = StartEntry()
 
 
@@ -238,7 +285,7 @@ def kind_of(given: Mapping[str, Any], kinds: Mapping[str, Kind], what: str) -> K
 def entries(
     given: Mapping[str, Any],
     slots: Mapping[str, Slot],
-    parameters: Mapping[str, ModelParameter],
+    parameters: Mapping[str, Parameter],
     what: str,
     *,
     owner: str = "",
@@ -261,6 +308,9 @@ def entries(
         else with_parameters(value, parameters, key, slot.unit)
         for key, value in given.items()
     }  # fmt: skip
+    if not concrete(filled):
+        # traced numbers have been checked with the values of the file
+        return {key: filled[key] for key in every if key in filled}
     fields: Any = {key: (s.type, ... if s.needed else None) for key, s in every.items()}
     model = pydantic.create_model("Table", __base__=Entries, **fields)
     found = checked(model, filled, what)
@@ -268,7 +318,7 @@ def entries(
 
 
 def with_parameters(
-    value: Any, parameters: Mapping[str, ModelParameter], key: str, unit: str = ""
+    value: Any, parameters: Mapping[str, Parameter], key: str, unit: str = ""
 ) -> Any:
     """Value in which each text is replaced by the value of the parameter that it names."""
     if isinstance(value, list):

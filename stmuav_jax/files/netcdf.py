@@ -11,23 +11,29 @@ import tempfile
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
-import numpy as np
-import xarray as xr
 
 from ..checks.errors import ModelError, SettingError
 from ..checks.schema import checked, shown
-from ..dynamics.run import Run
 from ..mechanics.internal import internal_names
 from ..parameters.table import ParameterEntry, Parameters
+from .labelled import Labelled
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from ..dynamics.run import Run
 
 # Largest size of a TOML file in bytes.
 MOST_TOML = 4_000_000
 
 FORMAT = "stmuav_jax run"
 FORMAT_VERSION = 2
+LOOP_FORMAT, LOOP_VERSION = "stmuav_jax closed loop", 1
+# Version of each format that this package reads.
+_READ = {FORMAT: FORMAT_VERSION, LOOP_FORMAT: LOOP_VERSION}
 
 _PACKAGES = ("stmuav-jax", "jax", "jaxlib", "diffrax", "equinox", "lineax", "numpy", "xarray")
 
@@ -47,36 +53,46 @@ def labelled(
     table: Mapping[str, tuple[tuple[str, ...], Any, str, str]],
     coordinates: Mapping[str, Any],
     **attributes: Any,
-) -> xr.Dataset:
-    """Dataset with `units` and `description` of variables, and attributes with versions and date.
+) -> Labelled:
+    """Arrays with `units` and `description`, and attributes with versions and date.
 
     Args:
         table: dimensions, values, unit and description by name.
-        coordinates: coordinates of the dataset by name.
+        coordinates: labels of the dimension of that name; or dimensions, values and attributes.
         attributes: texts and integers; others are kept as JSON.
     """
     data = {
-        name: xr.Variable(dims, np.asarray(values), {"units": unit, "description": words})
+        name: (dims, values, {"units": unit, "description": words})
         for name, (dims, values, unit, words) in table.items()
     }
     about = attributes | {"versions": versions()}
     texts = {k: v if isinstance(v, str | int) else json.dumps(v) for k, v in about.items()}
     texts["date"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    return xr.Dataset(data, coordinates, texts)
+    places = {k: v if isinstance(v, tuple) else ((k,), v, {}) for k, v in coordinates.items()}
+    return Labelled(data, places, texts)
 
 
-def save_dataset(dataset: xr.Dataset, path: str | os.PathLike[str]) -> Path:
-    """Save a dataset as NetCDF (HDF5), atomically; return the path."""
-    return write_atomically(path, bytes(dataset.to_netcdf(engine="h5netcdf")))
+def save_labelled(arrays: Labelled, path: str | os.PathLike[str]) -> Path:
+    """Save labelled arrays as NetCDF (HDF5), atomically; return the path."""
+    return write_atomically(path, arrays.netcdf())
 
 
-def to_dataset(run: Run) -> xr.Dataset:
+def to_dataset(run: "Run") -> "xr.Dataset":
     """Labelled dataset of a run.
 
-    Dimensions: time, body, axis (x, y, z), component (e0 to e3), joint. Every variable has
+    Dimensions: time, body, axis (x, y, z), component (e0 to e3), joint, rotor. Every variable has
     `units` and `description`; attributes hold scene, parameters, settings, versions, date
     and certificate (the mappings as JSON). Estimated errors are NaN where there are none.
     """
+    return _labelled_run(run).dataset()
+
+
+def _labelled_run(run: "Run") -> Labelled:
+    """Content of a saved run; see `to_dataset`."""
+    # commands without a run read and write files too, and need not wait for its modules
+    from ..dynamics.run import saved
+    from .machine import machine_coordinates, machine_table, rotor_table
+
     states, system, errors = run.states, run.scene.system, run.errors
     vector = ("time", "body", "axis")
     of_body = ("time", "body")
@@ -93,6 +109,7 @@ def to_dataset(run: Run) -> xr.Dataset:
             of_body, errors.angular_velocity, "rad/s", f"{exact} angular velocity",
         ),
     }  # fmt: skip
+    table |= machine_table(system) | rotor_table(system, saved(run.trajectory))
     if run.model is not None:
         table |= _analysed(run)
     names = internal_names(system)
@@ -102,22 +119,18 @@ def to_dataset(run: Run) -> xr.Dataset:
             "states of forces, units in their names",
         )  # fmt: skip
     coordinates = {
-        "time": xr.Variable(("time",), run.ts, {"units": "s", "description": "saved times"}),
-        "body": list(system.names),
-        "axis": ["x", "y", "z"],
+        "time": (("time",), run.ts, {"units": "s", "description": "saved times"}),
         "component": ["e0", "e1", "e2", "e3"],
-        "joint": [joint.name for joint in system.joints],
-        "joint_body_i": ("joint", [joint.body_i for joint in system.joints]),
-        "joint_body_j": ("joint", [joint.body_j for joint in system.joints]),
+        **machine_coordinates(system),
     } | ({"internal_state": list(names)} if names else {})
     return labelled(
         table, coordinates, format=FORMAT, format_version=FORMAT_VERSION, scene=run.scene.name,
         title=run.scene.title, notes=run.scene.notes, parameters=run.scene.parameters,
-        settings=run.settings, certificate=run.certificate.to_dict(),
+        settings=run.settings, certificate=run.certificate.to_dict(), watch=list(run.scene.watch),
     )  # fmt: skip
 
 
-def _analysed(run: Run) -> dict[str, tuple[tuple[str, ...], Any, str, str]]:
+def _analysed(run: "Run") -> dict[str, tuple[tuple[str, ...], Any, str, str]]:
     """Dimensions, values, unit and description of the analysis's results."""
     view = run.snapshot
     vector, wrench = ("time", "body", "axis"), ("time", "joint", "axis")
@@ -164,16 +177,18 @@ _SEAL = b"\nstmuav_jax sha256 "
 _SEAL_LENGTH = len(_SEAL) + 64 + 1
 
 
-def save(run: Run, path: str | os.PathLike[str]) -> Path:
+def save(run: "Run", path: str | os.PathLike[str]) -> Path:
     """Save a run as NetCDF (HDF5), atomically; return the path.
 
     Numbers have Fletcher's checksum, which any reader of HDF5 verifies; a SHA-256 at the end of the
     file covers all content, and `load` verifies it.
     """
-    data = to_dataset(run)
-    checked = {k: {"fletcher32": True} for k, v in data.variables.items() if v.dtype.kind == "f"}
-    checked = {k: v for k, v in checked.items() if data[k].size}
-    content = bytes(data.to_netcdf(engine="h5netcdf", encoding=checked))
+    return save_sealed(_labelled_run(run), path)
+
+
+def save_sealed(arrays: Labelled, path: str | os.PathLike[str]) -> Path:
+    """Save labelled arrays as by `save`, with checksums that `load` verifies."""
+    content = arrays.netcdf(checksums=True)
     return write_atomically(path, content + _seal(content))
 
 
@@ -198,14 +213,16 @@ def _verified(source: Path) -> bytes:
     return content
 
 
-def load(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Read a saved run into memory.
+def load(path: str | os.PathLike[str]) -> "xr.Dataset":
+    """Read a saved run, of a scene or of a closed loop, into memory.
 
     Raises:
         FileError: the file is missing, truncated, damaged, or not a run of this package.
 
     Other programs read the file as NetCDF; `xarray.open_dataset(path, engine="h5netcdf")` does.
     """
+    import xarray as xr
+
     source = Path(path)
     if not source.is_file():
         raise FileError(f"There is no file {source}.")
@@ -218,17 +235,18 @@ def load(path: str | os.PathLike[str]) -> xr.Dataset:
             f"{source} cannot be read as a saved run: it is truncated, damaged or of another kind "
             f"({type(error).__name__})."
         ) from error
-    if found.attrs.get("format") != FORMAT:
+    known = _READ.get(found.attrs.get("format", ""))
+    if known is None:
         raise FileError(f"{source} is a NetCDF file, but not a run saved by stmuav_jax.")
     version = int(found.attrs.get("format_version", 0))
-    if version != FORMAT_VERSION:
+    if version != known:
         raise FileError(
-            f"{source} has format version {version}; this package reads version {FORMAT_VERSION}."
+            f"{source} has format version {version}; this package reads version {known}."
         )
     return found
 
 
-def save_certificate(run: Run, path: str | os.PathLike[str]) -> Path:
+def save_certificate(run: "Run", path: str | os.PathLike[str]) -> Path:
     """Save the certificate, settings and versions as JSON, atomically; return the path."""
     content = {
         "scene": run.scene.name,

@@ -1,4 +1,4 @@
-"""Studies from TOML files, and columns of numbers from the CSV files that they name.
+"""Studies from TOML files, with the models and the columns of numbers of the files that they name.
 
 A factor {file = "rates.csv", column = "p"} takes the numbers of that column: sampled at random, or
 in order where the design is "table". The numbers themselves become part of the study, so that a
@@ -14,17 +14,28 @@ from typing import Any
 
 from ..checks.errors import SettingError, nearest_names
 from ..checks.schema import SHOWN, named, shown
+from .model_file import Model, Robot, read_model
+from .mujoco_import import load_robot
 from .netcdf import FileError, read_toml
 
 
 def load_study(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Plain data of a study's TOML file; a study without a name is named after the file.
 
+    A model that the study names is looked for from the study's folder, and read.
+
     Raises:
         FileError: the file, or a file that it names, is missing or cannot be read.
         SettingError: a column that its file does not have.
     """
     source, content = Path(path), read_toml(path)
+    if "bodies" in content:
+        raise FileError(
+            f'{source} is a model, not a study: a study names it with model = "{source.name}", beside '
+            "its factors and quantities (docs/studies.md)."
+        )
+    if isinstance(content.get("model"), str):
+        content["model"] = _model(source.parent / content["model"])
     factors = content.get("factors", {})
     if isinstance(factors, Mapping):
         content["factors"] = {
@@ -32,6 +43,12 @@ def load_study(path: str | os.PathLike[str]) -> dict[str, Any]:
             for name, one in factors.items()
         }
     return {"name": source.stem} | content
+
+
+def _model(path: Path) -> Model | Robot:
+    if path.suffix == ".toml":
+        return read_model(path)
+    return Robot(load_robot(path))
 
 
 def _filled(given: Mapping[str, Any], folder: Path) -> dict[str, Any]:

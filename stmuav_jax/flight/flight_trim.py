@@ -167,12 +167,12 @@ def _point(tilt: Float[Array, "2"], wanted: FlightCondition) -> FlyerPoint:
 
 def _map(flyer: Flyer, at: FlyerPoint) -> Float[Array, "4 k"]:
     """Allocation matrix B about the centre of mass, base axes: thrust and moments are decoupled."""
-    com = rotation_matrix(at.p).T @ flyer.system.com(flyer.to_state(at))
+    com = flyer.system.com(flyer.level_state(at.angles, None))
     return wrench_map(flyer.propellers, com)
 
 
 def _left(at: FlyerPoint, inputs: RotorsAndForces, setting: _Setting) -> Float[Array, "8"]:
-    found = setting.flyer.accelerations(at, inputs, model=setting.model)
+    found = setting.flyer.accelerations(at, inputs, model=setting.model, resting=True)
     return jnp.concatenate([found.v - turn_acceleration(setting.wanted), found.omega, found.angles])
 
 

@@ -41,7 +41,7 @@ from ..rotorcraft.rotor import Rotors
 from ..tracker.actuator import LinearActuator
 from ..tracker.drive import SLIDER_JOINTS
 from ..tracker.geometry import TrackerGeometry
-from ..tracker.kinematics import angle_motion, panel_angles, stroke_jacobian
+from ..tracker.kinematics import angle_accelerations, panel_angles, stroke_jacobian
 from ..tracker.placement import posture
 from ..tracker.workspace import Limits
 
@@ -277,7 +277,7 @@ class Flyer(AbstractStateSpace):
         if x.internal is not None:
             system = with_internal(system, x.internal)
         time = jnp.asarray(t, x.r.dtype)
-        found = self._moving(x, replace(self.model(), system=system), time)
+        found = self._moving(x, replace(self.model(), system=system), time, x.rates)
         parts = [x.v, x.omega, x.rates, found.v, found.omega, found.angles]
         if self.size > 16:
             kin = system.kinematics(self.to_state(x))
@@ -303,33 +303,55 @@ class Flyer(AbstractStateSpace):
         t: Float[Array, ""] | float = 0.0,
         model: TreeModel | None = None,
         speeds: Float[Array, " k"] | None = None,
+        *,
+        resting: bool = False,
     ) -> FlyerAccelerations:
         """Accelerations of the independent coordinates, by the equations of the spanning tree.
 
         Args:
             model: result of `model`, if it is known already.
             speeds: speeds of rotors with lag [rad/s]; by default those commanded.
+            resting: take the rates of the panel angles as zero, which needs a smaller program.
         """
         model = self.model() if model is None else model
         model = replace(model, system=self.with_inputs(inputs, speeds))
-        return self._moving(at, model, jnp.asarray(t, at.r.dtype))
+        return self._moving(at, model, jnp.asarray(t, at.r.dtype), None if resting else at.rates)
 
-    def _moving(self, at: FlyerPoint, model: TreeModel, t: Float[Array, ""]) -> FlyerAccelerations:
+    def level_state(self, angles: Float[Array, "2"], rates: Float[Array, "2"] | None) -> State:
+        """State with the base at the origin, level and at rest; rates None for a panel at rest."""
+        inside = posture(self.geometry, angles, rates)
+        none = jnp.zeros(3)
+        r, p = inside.r + self.displacement, inside.p
+        return State(
+            _first(none, r), _first(_LEVEL, p), _first(none, inside.v), _first(none, inside.omega)
+        )
+
+    def _moving(
+        self,
+        at: FlyerPoint,
+        model: TreeModel,
+        t: Float[Array, ""],
+        rates: Float[Array, "2"] | None,
+    ) -> FlyerAccelerations:
         """Accelerations of a model whose forces are set."""
         tree, spanned = Tree(), model.parameters.tree
         # the joints' coordinates do not depend on the base's position and motion
-        still = at._replace(p=jnp.asarray(_LEVEL), v=jnp.zeros(3), omega=jnp.zeros(3))
-        inside = split(spanned, tree.to_vector(model, self.to_state(still)))
+        still = self.level_state(at.angles, rates)
+        inside = split(spanned, tree.to_vector(model, still))
         column = lambda x: x[:, None]
-        x = join(inside._replace(p=column(at.p), v=column(at.v), omega=column(at.omega)))
+        own = {name: column(getattr(at, name)) for name in ("r", "p", "v", "omega")}
+        x = join(inside._replace(**own))
         rate, _ = tree.derivative(model, t, x, Unstabilised())
         found = split(spanned, rate)
         joints = [self.system.joint_index(name) for name in SLIDER_JOINTS]
         place = {s.joint: k for k, s in enumerate(spanned.steps)}
         slides = jnp.stack([found.u[place[j]] for j in joints])
-        J = stroke_jacobian(self.geometry, at.angles)
-        moving = angle_motion(self.geometry, at.angles, J @ at.rates, slides)
-        return FlyerAccelerations(found.v[:, 0], found.omega[:, 0], moving.acceleration)
+        angles = angle_accelerations(self.geometry, at.angles, rates, slides)
+        return FlyerAccelerations(found.v[:, 0], found.omega[:, 0], angles)
+
+
+def _first(x: Any, others: Array) -> Array:
+    return jnp.concatenate([jnp.asarray(x)[None], others])
 
 
 def whole_state(
@@ -348,5 +370,4 @@ def whole_state(
     v = at.v + (inside.v + jnp.cross(at.omega, arms)) @ R.T
     p = jax.vmap(product, in_axes=(None, 0))(at.p, inside.p)
     omega = inside.omega + jnp.einsum("nji,j->ni", turning, at.omega)
-    first = lambda x, y: jnp.concatenate([x[None], y])
-    return State(first(at.r, r), first(at.p, p), first(at.v, v), first(at.omega, omega))
+    return State(_first(at.r, r), _first(at.p, p), _first(at.v, v), _first(at.omega, omega))

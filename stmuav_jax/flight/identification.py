@@ -221,7 +221,10 @@ class Misfit(eqx.Module):
     sizes: Float[Array, " p"]
 
     def __call__(self, z: Float[Array, " p"]) -> Float[Array, "k m"]:
-        return (predicted(self.predict, self.start + self.sizes * z) - self.record) / self.sigma
+        found = predicted(self.predict, self.start + self.sizes * z)
+        # known as soon as the program is made: nothing has to be traced for this check alone
+        _check_shape(self.record, found.shape)
+        return (found - self.record) / self.sigma
 
 
 def residuals_and_jacobian(
@@ -369,15 +372,21 @@ def _numbered(count: int) -> tuple[str, ...]:
     return tuple(f"q_{k}" for k in range(count))
 
 
+def _check_shape(record: Any, shape: tuple[int, ...]) -> None:
+    if np.shape(record) != shape:
+        raise ModelError(f"The record has shape {np.shape(record)}, but predictions have {shape}.")
+
+
 def _check(
     predict: Predict, record: Any, sigma: Any, q0: Array, sizes: Any, names: Sequence[str]
 ) -> None:
     for value, what in ((record, "The record"), (sigma, "The deviations of the record")):
         check_finite(value, what, "")
-    shape = eqx.filter_eval_shape(predicted, predict, q0).shape
-    if np.shape(record) != shape:
-        raise ModelError(f"The record has shape {np.shape(record)}, but predictions have {shape}.")
+    shape = np.shape(record)
     if np.shape(sigma) != shape[-1:] or not np.all(np.asarray(sigma) > 0):
+        # which of the two is wrong, only the predictions tell
+        shape = eqx.filter_eval_shape(predicted, predict, q0).shape
+        _check_shape(record, shape)
         raise SettingError(f"The record needs {shape[-1]} positive deviations, not {sigma}.")
     if np.shape(sizes) != q0.shape or not np.all(np.asarray(sizes) > 0):
         raise SettingError(f"There must be {len(q0)} positive sizes, not {sizes}.")

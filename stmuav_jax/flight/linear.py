@@ -13,7 +13,6 @@ ch. 3.7 (linearisation), 1.2 (modes, controllability).
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -23,7 +22,7 @@ from ..algebra.space import Point
 from ..checks.errors import SettingError, StateError, named_places
 from ..checks.numbers import numbers
 from ..checks.shapes import Numbers
-from ..dynamics.statespace.base import AbstractStateSpace, Time, check_regular, error_rates
+from ..dynamics.statespace.base import AbstractStateSpace, Time, check_regular, error_rate_columns
 from ..mechanics.inputs import Inputs, inputs_of
 
 
@@ -134,13 +133,8 @@ def _matrices(
     t: Float[Array, ""],
 ) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
     n = space.size
-    still = inputs.applied(space.system, values)
-
-    def both(z: Float[Array, " k"]) -> Float[Array, " n"]:
-        moved = inputs.applied(space.system, values + z[n:])
-        return error_rates(space, x, z[:n], t, moved, still)
-
-    J = jax.jacfwd(both)(jnp.zeros(n + len(inputs)))
+    system = lambda z: inputs.applied(space.system, values + z)
+    J = error_rate_columns(space, x, t, system, len(inputs))
     return J[:, :n], J[:, n:]
 
 

@@ -28,6 +28,7 @@ from jaxtyping import Array, Float, PyTree
 from ..algebra.derivative import value_and_jacobian
 from ..algebra.space import Point
 from ..checks.errors import SettingError
+from ..checks.numbers import floats, stacked
 from ..dynamics.method import Method
 from ..dynamics.statespace.base import AbstractStateSpace
 from ..dynamics.statespace.tree import TreeSpace
@@ -178,7 +179,8 @@ class Shooting(eqx.Module):
 
     def unknowns(self, values: PyTree[Any]) -> dict[str, Any]:
         """Initial unknowns of a search: the given values, and the guess at the nodes."""
-        return {"values": values, "nodes": jnp.zeros((len(self.edges) - 2, self.space.size))}
+        nodes = floats(np.zeros((len(self.edges) - 2, self.space.size)))
+        return {"values": values, "nodes": nodes}
 
     def path(self, unknowns: Any) -> tuple[Float[Array, " m"], Point, Float[Array, "n k"]]:
         """Output times, points at these times, and the defects at the nodes."""
@@ -234,9 +236,9 @@ def shooting(
     points = [guess(float(t)) for t in edges[:-1]]
     start = points[0]
     if len(points) > 1:
-        nodes = jax.tree.map(lambda *x: jnp.stack(x), *points[1:])
+        nodes = jax.tree.map(lambda *x: stacked(x), *points[1:])
     else:
-        nodes = jax.tree.map(lambda x: jnp.zeros((0, *x.shape)), start)
+        nodes = jax.tree.map(lambda x: floats(np.zeros((0, *x.shape))), start)
     return Shooting(
-        space, system, cost, start, nodes, jnp.asarray(edges), method, outputs_per_segment, weight
+        space, system, cost, start, nodes, floats(edges), method, outputs_per_segment, weight
     )

@@ -67,6 +67,9 @@ def panel_gain(design: PanelDesign, area: Numbers) -> Float[Array, "*s"]:
 def break_even(design: PanelDesign) -> BreakEven:
     """Areas at which a panel begins and ceases to pay, in closed form.
 
+    At a fixed mass of exactly zero, `needed` has no finite derivative by that mass; the one that JAX
+    returns there leaves the infinite part out. Its other derivatives are right.
+
     Raises:
         ModelError: a mass or a power that is negative, or zero where that makes no sense.
     """

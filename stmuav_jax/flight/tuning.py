@@ -24,7 +24,7 @@ from ..algebra.least_squares import Method as SearchMethod, Search, SearchReason
 from ..algebra.sampled import Sampled
 from ..algebra.space import Point
 from ..checks.errors import ModelError, SettingError, check_finite
-from ..checks.numbers import numbers
+from ..checks.numbers import array_module, as_numpy, floats, numbers
 from ..checks.shapes import Numbers
 from ..dynamics.formulations.reactions import in_joint_axes
 from ..dynamics.formulations.stabilisation import Unstabilised
@@ -107,7 +107,7 @@ def _departure(
 ) -> Departure:
     sizes = dict.fromkeys([name for name, _ in space.names], 1.0) if sizes is None else sizes
     places = places_of(space, list(sizes), "The departures")
-    return Departure(point, jnp.asarray(list(sizes.values()), dtype=float), places, at_end)
+    return Departure(point, floats(list(sizes.values())), places, at_end)
 
 
 def roughness(motion: TunedMotion) -> Float[Array, "m k"]:
@@ -243,7 +243,8 @@ class InputTuning:
 
     def motion(self, values: Any, samples: int = 200) -> TunedMotion:
         """The motion under the inputs of a search, from its start in one piece."""
-        ts = jnp.linspace(self.residuals.edges[0], self.residuals.edges[-1], samples)
+        edges = np.asarray(self.residuals.edges)
+        ts = floats(np.linspace(edges[0], edges[-1], samples))
         return _in_one_piece(self.residuals, values["values"], ts)
 
 
@@ -308,14 +309,15 @@ def tune_inputs(
         inputs = inputs_of(space.system, inputs)
     if not len(inputs):
         raise SettingError("The system has no inputs that could be tuned.")
-    given = jnp.asarray(inputs.values(space.system) if values is None else values, dtype=float)
+    given: Any = as_numpy(floats(inputs.values(space.system) if values is None else values))
     shape = (len(inputs),) if knots is None else (knots, len(inputs))
     if given.shape not in ((len(inputs),), shape):
         raise ModelError(f"The start of the inputs must have shape {shape}, not {given.shape}.")
     check_finite(given, "The start of the inputs", "")
     if sizes is None:
-        largest = jnp.max(jnp.abs(given.reshape(-1, len(inputs))), axis=0)
-        sizes = jnp.where(largest == 0, 1.0, largest)
+        xp = array_module(given)
+        largest = xp.max(xp.abs(given.reshape(-1, len(inputs))), axis=0)
+        sizes = xp.where(largest == 0, 1.0, largest)
     sizes = numbers(sizes, (len(inputs),), "The vector of the inputs' sizes", "")
     times = None if knots is None else tuple(float(t) for t in np.linspace(0.0, duration, knots))
     driven = _Driven(space, inputs, _Signals(sizes, times))
@@ -323,7 +325,8 @@ def tune_inputs(
         space, driven, _Cost(driven, tuple(residuals)), guess or (lambda _: start),
         np.linspace(0.0, duration, segments + 1), method, outputs_per_segment=outputs_per_segment, weight=weight,
     )  # fmt: skip
-    return InputTuning(name, problem, problem.unknowns(jnp.broadcast_to(given, shape) / sizes))
+    xp, own = array_module(given, sizes), as_numpy(sizes)
+    return InputTuning(name, problem, problem.unknowns(floats(xp.broadcast_to(given, shape) / own)))
 
 
 def check_span(span: float, segments: int) -> None:

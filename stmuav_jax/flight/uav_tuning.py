@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from ..algebra.compiler import quick_jit
 from ..checks.errors import ModelError, SettingError, concrete
+from ..checks.numbers import array_module, as_numpy, floats
 from ..checks.shapes import Numbers
 from ..dynamics.method import Method
 from ..dynamics.trajectory import integrate
@@ -42,9 +43,8 @@ _END = {"phi": 1e-3, "theta": 1e-3, "phi_rate": 1e-2, "theta_rate": 1e-2}
 
 def at_rest(angles: Numbers) -> FlyerPoint:
     """Level, at the origin, nothing moving, the panel at angles (2,) [rad]."""
-    none = jnp.zeros(3)
-    level = jnp.array([1.0, 0.0, 0.0, 0.0])
-    return FlyerPoint(none, level, jnp.asarray(angles, float), none, none, jnp.zeros(2))
+    none, level = floats(np.zeros(3)), floats(np.array([1.0, 0.0, 0.0, 0.0]))
+    return FlyerPoint(none, level, floats(angles), none, none, floats(np.zeros(2)))
 
 
 def hold(
@@ -70,11 +70,13 @@ def hold(
     if flyer.lagging:
         own: Any = flyer.propulsion
         start = start._replace(internal=own.speeds_of(jnp.asarray(untuned.speed_squared)))
-    scale = jnp.full_like(untuned.speed_squared, jnp.mean(untuned.speed_squared))
+    untuned = as_numpy(untuned)
+    xp = array_module(untuned)
+    scale = xp.full_like(untuned.speed_squared, xp.mean(untuned.speed_squared))
     return tune_inputs(
         flyer, [departures(flyer, start)], start=start, duration=horizon,
-        inputs=_every(flyer), values=jnp.concatenate(untuned),
-        sizes=jnp.append(scale, jnp.array([5.0, 5.0])), segments=segments, weight=10.0,
+        inputs=_every(flyer), values=xp.concatenate(untuned),
+        sizes=xp.append(scale, np.array([5.0, 5.0])), segments=segments, weight=10.0,
         method=method, name=f"hold {horizon:g} s in {segments}",
     )  # fmt: skip
 
@@ -115,8 +117,8 @@ def holding_time(
     """
     # nothing is differentiated here, so that no modes need to bound the steps
     method = Method(rtol=1e-10, atol=1e-12, steps="state") if method is None else method
-    ts = jnp.arange(0.0, max_time + 2.5e-3, 5e-3)
-    reached, turned = map(np.asarray, _departures(flyer, inputs, start, ts, method))
+    ts = np.arange(0.0, max_time + 2.5e-3, 5e-3)
+    reached, turned = map(np.asarray, _departures(flyer, inputs, start, floats(ts), method))
     out = ~(turned < limit) | (np.diff(reached, prepend=-1.0) <= 0)
     return float(ts[np.argmax(out)]) if np.any(out) else max_time
 
@@ -207,9 +209,10 @@ def slew(
     ends = [trim_flight(flyer, hover(angles)) for angles in (before, after)]
     for end, when in zip(ends, ("before", "after"), strict=True):
         _check_inside(flyer, end, limits, when)
-    first, last = (jnp.asarray(angles, float) for angles in (before, after))
-    force = jnp.max(jnp.abs(jnp.stack([end.inputs.forces for end in ends])))
-    straight = [jnp.concatenate(end.inputs) for end in ends]
+    first, last = (np.asarray(angles, float) for angles in (before, after))
+    given = [as_numpy(end.inputs) for end in ends]
+    force = np.max(np.abs(np.stack([each.forces for each in given])))
+    straight = [np.concatenate(each) for each in given]
     share = np.linspace(0.0, 1.0, knots)[:, None]
     start = ends[0].coordinates
 
@@ -217,22 +220,22 @@ def slew(
         s = t / duration
         smooth = 10 * s**3 - 15 * s**4 + 6 * s**5
         rate = (30 * s**2 - 60 * s**3 + 30 * s**4) / duration
-        now = start._replace(angles=first + smooth * (last - first))
-        return now._replace(rates=rate * (last - first))
+        now = start._replace(angles=floats(first + smooth * (last - first)))
+        return now._replace(rates=floats(rate * (last - first)))
 
     base = {f"{name}_{k}": size for name, size in _DISTURBED.items() for k in "xyz"}
     return tune_inputs(
         flyer,
         [
             departures(flyer, start, base),
-            end_at(flyer, start._replace(angles=last), _END),
+            end_at(flyer, start._replace(angles=floats(last)), _END),
             # a second difference of a tenth of the scale counts as one
             roughness,
             Limit(_Within(flyer, limits)),
         ],
         start=start, duration=duration, inputs=_every(flyer),
         values=(1 - share) * straight[0] + share * straight[1],
-        sizes=jnp.append(ends[0].inputs.speed_squared, jnp.stack([force, force])), knots=knots,
+        sizes=np.append(given[0].speed_squared, [force, force]), knots=knots,
         segments=segments, outputs_per_segment=outputs_per_segment, guess=guess, method=method,
         name=f"slew {_words(before)} to {_words(after)} in {duration:g} s, {knots} knots, {segments}",
     )  # fmt: skip

@@ -31,6 +31,7 @@ from .internal import (
     with_internal as with_internal,
 )
 from .joint import (
+    CATALOGUE as CATALOGUE,
     Joint as Joint,
     cylindrical as cylindrical,
     distance as distance,
@@ -43,6 +44,11 @@ from .joint import (
     universal as universal,
     weld as weld,
 )
+from .joint_kind import (
+    Freedom as Freedom,
+    JointKind as JointKind,
+    Term as Term,
+)
 from .joint_states import (
     JointMotion as JointMotion,
     joint_motion as joint_motion,
@@ -53,6 +59,18 @@ from .load import (
     Load as Load,
     Sine as Sine,
     SineMotion as SineMotion,
+    push as push,
+)
+from .motions.axial import (
+    PRISMATIC as PRISMATIC,
+    REVOLUTE as REVOLUTE,
+    Axial as Axial,
+)
+from .motions.base import (
+    AbstractRelativeMotion as AbstractRelativeMotion,
+)
+from .motions.spherical import (
+    SPHERICAL as SPHERICAL,
 )
 from .parts import (
     Part as Part,

@@ -136,6 +136,10 @@ class Inputs(eqx.Module):
         places = named_places(names, known, "The chosen inputs", "input")
         return Inputs(tuple(self.entries[k] for k in places))
 
+    def constant(self, system: System) -> "Inputs":
+        """These inputs without those that are functions of time."""
+        return Inputs(tuple(e for e in self.entries if not callable(_field(system, e))))
+
     def _numbered(self, stem: str) -> tuple[str, ...]:
         """The names of the numbers of a vector."""
         return tuple(e.name for e in self.entries if e.place and e.name == stem + _number(e.place))

@@ -11,7 +11,7 @@ Source: report Part I, section 3.4 (Eq. 3.11 to 3.14).
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
@@ -23,67 +23,14 @@ from ..checks.numbers import array_module, as_numpy, floats, scalar, vector
 from ..checks.shapes import Numbers
 from .body import Body
 from .constraint import ROWS, Data
+from .joint_kind import Freedom, JointKind, Term, Which, X, Y, Z
 from .motions.axial import PRISMATIC, REVOLUTE, SCREW
-from .motions.base import AbstractRelativeMotion, MotionColumn
 from .motions.spherical import SPHERICAL
 
 Motion = Callable[[Float[Array, ""]], Float[Array, ""]]
 
-X, Y, Z = 0, 1, 2
-
-
-class Term(NamedTuple):
-    """One primitive of a joint: the columns of frame i and frame j that are its axes and side."""
-
-    kind: str
-    axis_i: int = Z
-    axis_j: int = Z
-    side_i: int = Y
-
-
 _PARALLEL = (Term("n1", X, Z), Term("n1", Y, Z))
 _ON_AXIS = (Term("n2", X), Term("n2", Y))
-
-
-class Freedom(NamedTuple):
-    """One relative motion that a joint leaves free.
-
-    Attributes:
-        motion: kind of relative motion. axis: axis of the joint's frame that is its z axis.
-        place: words that distinguish its coordinates from those of the joint's other motions.
-    """
-
-    motion: AbstractRelativeMotion
-    axis: int = Z
-    place: str = ""
-
-
-class JointKind(NamedTuple):
-    """Constraints of a kind of joint, and the relative motion that it leaves free.
-
-    Attributes:
-        terms: primitives of the joint.
-        motion: relative motions that lead from frame i to frame j, in sequence; None for a
-            joint without such coordinates, which can only close a loop.
-        report: primitives of the report's own rows, if they differ.
-    """
-
-    terms: tuple[Term, ...]
-    motion: tuple[Freedom, ...] | None = None
-    report: tuple[Term, ...] | None = None
-
-    @property
-    def columns(self) -> tuple[MotionColumn, ...]:
-        """Columns of the motion subspaces about or along the joint's z axis."""
-        own = (f for f in self.motion or () if f.axis == Z and len(f.motion.columns) == 1)
-        return tuple(column for freedom in own for column in freedom.motion.columns)
-
-    @property
-    def pitched(self) -> bool:
-        """True if the `length` of such a joint is a pitch [m/rad]."""
-        return any(column.linear is None for column in self.columns)
-
-
 _POINT = Term("point")
 _REVOLUTE, _PRISMATIC = Freedom(REVOLUTE), Freedom(PRISMATIC)
 
@@ -114,16 +61,10 @@ CATALOGUE: dict[str, JointKind] = {
     "drive_displacement": JointKind((Term("displacement", Z),)),
 }
 
-# Name of a coordinate that a joint may leave free.
-Which = Literal["angle", "displacement"]
 
-# Kinds of joints that leave free the angle about their z axis, or the displacement along it.
-LEAVES_FREE: dict[str, tuple[str, ...]] = {
-    "angle": tuple(k for k, entry in CATALOGUE.items() if any(c.angular for c in entry.columns)),
-    "displacement": tuple(
-        k for k, entry in CATALOGUE.items() if any(c.linear != 0 for c in entry.columns)
-    ),
-}
+def kinds_that_leave(which: Which) -> str:
+    """Kinds of joints that leave a coordinate free, for messages."""
+    return ", ".join(kind for kind, entry in CATALOGUE.items() if which in entry.leaves_free)
 
 
 class Joint(eqx.Module):
@@ -131,8 +72,8 @@ class Joint(eqx.Module):
 
     The functions below make joints. In a `System` points and frames are in the bodies' reference
     frames: `point_i`, `point_j` (3,) [m], `frame_i`, `frame_j` (3, 3) with the joint's x, y, z
-    axes as columns; before that they are in the world at the reference posture. `length` is that
-    of a rod [m], or the pitch of a screw [m/rad].
+    axes as columns; before, in the world at the reference posture. `length`: of a rod [m], or the
+    pitch of a screw [m/rad].
     """
 
     name: str = eqx.field(static=True)
@@ -377,9 +318,7 @@ def revolute_spherical(
     return _joint("revolute_spherical", name, body_i, body_j, point_i, point_j, frame, value)
 
 
-def drive(
-    name: str, joint: Joint, motion: Motion, *, coordinate: Literal["angle", "displacement"]
-) -> Joint:
+def drive(name: str, joint: Joint, motion: Motion, *, coordinate: Which) -> Joint:
     """Prescribe a relative coordinate of a joint as a function of time; 1 row, rheonomic.
 
     Args:
@@ -391,10 +330,9 @@ def drive(
     Raises:
         ModelError: the joint does not leave this coordinate free.
     """
-    if joint.kind not in LEAVES_FREE[coordinate]:
+    if coordinate not in CATALOGUE[joint.kind].leaves_free:
         raise ModelError(
             f"Driver '{name}' prescribes the {coordinate} of joint '{joint.name}', but a "
-            f"{joint.kind} joint does not leave it free; {coordinate} needs one of: "
-            f"{', '.join(LEAVES_FREE[coordinate])}."
+            f"{joint.kind} joint does not leave it free; {coordinate} needs one of: {kinds_that_leave(coordinate)}."
         )
     return dataclasses.replace(joint, name=name, kind=f"drive_{coordinate}", motion=motion)

@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 from ..algebra.rotation import cross
 from ..algebra.stacked import apply, dot, multiply
 from ..checks.errors import ModelError
-from .joint import LEAVES_FREE, Joint, Which
+from .joint import CATALOGUE, Joint, kinds_that_leave
+from .joint_kind import Which
 from .load import Load, couple, push
 from .motions.axial import whole_turns
 from .state import Kinematics
@@ -67,7 +68,7 @@ def coordinate(kin: Kinematics, joint: Joint, which: Which) -> JointCoordinate:
 
 def free_coordinates(joint: Joint) -> list[Which]:
     """Coordinates that a joint leaves free: "angle" about its z axis, "displacement" along it."""
-    return [which for which in ("angle", "displacement") if joint.kind in LEAVES_FREE[which]]
+    return list(CATALOGUE[joint.kind].leaves_free)
 
 
 def choose(joint: Joint, which: Which | None, what: str) -> Which:
@@ -89,8 +90,8 @@ def choose(joint: Joint, which: Which | None, what: str) -> Which:
             f"{what}: a {joint.kind} joint leaves both an angle and a displacement free; say which by "
             "coordinate='angle' or coordinate='displacement'."
         )
-    names = LEAVES_FREE if which is None else (which,)
-    needed = "; ".join(f"{name} needs one of: {', '.join(LEAVES_FREE[name])}" for name in names)
+    names: tuple[Which, ...] = ("angle", "displacement") if which is None else (which,)
+    needed = "; ".join(f"{name} needs one of: {kinds_that_leave(name)}" for name in names)
     wanted = "an angle or a displacement" if which is None else f"the {which}"
     raise ModelError(
         f"{what} acts on {wanted}, but a {joint.kind} joint does not leave that free about or "

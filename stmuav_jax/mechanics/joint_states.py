@@ -20,26 +20,33 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import from_matrix, to_rotation_vector
-from ..algebra.stacked import apply_transposed, dot, multiply
+from ..algebra.rotation import (
+    cross,
+    from_matrix,
+    from_rotation_vector,
+    product,
+    rotation_matrix,
+)
+from ..algebra.stacked import apply_transposed, multiply
 from ..checks.errors import ModelError, SettingError
 from ..checks.shapes import Numbers
 from .joint import CATALOGUE, Joint
 from .joint_coordinate import coordinate
+from .joint_kind import Freedom, Z
 from .motions.axial import PRISMATIC, REVOLUTE
+from .motions.base import AbstractRelativeMotion, ColumnParts, RelativeFrames, RelativePose
+from .motions.sequence import frame_columns, references
 from .state import Kinematics, State
 from .system import System, check_state
 
-# Coordinates that each kind of joint leaves free, in their order, with units.
-COORDINATES: dict[str, tuple[tuple[str, str], ...]] = {
-    kind: tuple(
-        (name + freedom.place, unit)
-        for freedom in entry.motion
-        for name, unit in freedom.motion.coordinates
-    )
-    for kind, entry in CATALOGUE.items()
-    if entry.motion
-} | {"drive_angle": REVOLUTE.coordinates, "drive_displacement": PRISMATIC.coordinates}
+_DRIVERS = {"drive_angle": REVOLUTE.coordinates, "drive_displacement": PRISMATIC.coordinates}
+
+
+def coordinates_of(kind: str) -> tuple[tuple[str, str], ...]:
+    """Names and units of the coordinates that a kind of joint leaves free, in their order."""
+    motions = CATALOGUE[kind].motion or ()
+    own = ((name + f.place, unit) for f in motions for name, unit in f.motion.coordinates)
+    return _DRIVERS[kind] if kind in _DRIVERS else tuple(own)
 
 
 class JointMotion(eqx.Module):
@@ -78,7 +85,7 @@ class JointMotion(eqx.Module):
         return self.rates[..., self._place("displacement")]
 
     def _place(self, name: str) -> int:
-        names = [found for found, _ in COORDINATES[self.kind]]
+        names = [found for found, _ in coordinates_of(self.kind)]
         if name not in names:
             raise ModelError(
                 f"Joint '{self.name}' is {self.kind} and has no {name} of its own; its coordinates "
@@ -126,31 +133,97 @@ def joint_motion(
 
 def coordinate_count(joint: Joint) -> int:
     """Number of coordinates of a joint; raises `ModelError` for a joint without any."""
-    if joint.kind not in COORDINATES:
+    count = len(coordinates_of(joint.kind))
+    if not count:
+        have = (kind for kind in CATALOGUE if coordinates_of(kind))
         raise ModelError(
             f"Joint '{joint.name}' is a {joint.kind} joint, which has no joint coordinates; these "
-            f"have: {', '.join(COORDINATES)}."
+            f"have: {', '.join(have)}."
         )
-    return len(COORDINATES[joint.kind])
+    return count
 
 
 def relative(kin: Kinematics, joint: Joint) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
     """Coordinates and rates of a joint at one state; angles in (-pi, pi] except those of screws."""
-    if joint.kind in ("universal", "spherical"):
-        return _of_axes(kin, joint)
-    found = [coordinate(kin, joint, which) for which, _ in COORDINATES[joint.kind]]  # pyright: ignore[reportArgumentType]
+    motions = CATALOGUE[joint.kind].motion or ()
+    if any(axis != Z or len(motion.columns) > 1 for motion, axis, _ in motions):
+        return _of_motions(kin, joint, motions)
+    names = [motion.coordinates[0][0] for motion, *_ in motions] or [
+        coordinates_of(joint.kind)[0][0]
+    ]
+    found = [coordinate(kin, joint, which) for which in names]  # pyright: ignore[reportArgumentType]
     return jnp.stack([c.value for c in found]), jnp.stack([c.rate for c in found])
 
 
-def _of_axes(kin: Kinematics, joint: Joint) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+def _of_motions(
+    kin: Kinematics, joint: Joint, motions: tuple[Freedom, ...]
+) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """Coordinates and rates of any sequence of motions, read one after the other."""
     i, j = kin.index(joint.body_i), kin.index(joint.body_j)
     F_i, F_j = multiply(kin.R_wb[i], joint.frame_i), multiply(kin.R_wb[j], joint.frame_j)
-    turning = kin.omega_w[j] - kin.omega_w[i]
-    R = multiply(F_i.T, F_j)
-    if joint.kind == "spherical":
-        return to_rotation_vector(from_matrix(R)), apply_transposed(F_i, turning)
-    angles = jnp.stack([jnp.arctan2(R[2, 1], R[1, 1]), jnp.arctan2(R[0, 2], R[0, 0])])
-    return angles, jnp.stack([dot(F_i[:, 0], turning), dot(F_j[:, 1], turning)])
+    (a, a_rate), (b, b_rate) = (
+        kin.point(joint.body_i, joint.point_i),
+        kin.point(joint.body_j, joint.point_j),
+    )
+    R, d = multiply(F_i.T, F_j), apply_transposed(F_i, b - a)
+    behind, zero = references([f[:2] for f in motions], f"Joint '{joint.name}'")
+    last = frame_columns(motions[-1].axis)
+    E, o, found = jnp.eye(3, dtype=R.dtype), jnp.zeros_like(d), []
+    for n, (motion, axis, _) in enumerate(motions):
+        own = frame_columns(axis)
+        G = E @ own
+        seen = RelativeFrames(
+            (G.T @ R @ last)[..., None],
+            behind[:, [n]],
+            zero[:, [n]],
+            (G.T @ (d - o))[:, None],
+            lambda G=G, own=own: from_matrix(G.T @ R @ own)[:, None],
+        )
+        q, X, along = motion.read(seen, _parts(joint, motion))
+        at_zero = jnp.zeros_like(q).at[0].set(1.0) if motion.unit_norm else jnp.zeros_like(q)
+        found.append(motion.difference(q, at_zero).reshape(-1))
+        E, o = G @ X[..., 0] @ own.T, o + G @ along[:, 0]
+    x = jnp.concatenate(found)
+    twist = [kin.omega_w[j] - kin.omega_w[i], b_rate - a_rate - cross(kin.omega_w[i], b - a)]
+    motion_of = lambda rate: jnp.concatenate(relative_pose(joint, x, rate)[2:])
+    S = jax.vmap(motion_of, out_axes=1)(jnp.eye(len(x), dtype=x.dtype))
+    seen_twist = jnp.concatenate([apply_transposed(F_i, part) for part in twist])
+    return x, jnp.linalg.solve(S.T @ S, S.T @ seen_twist)
+
+
+def _parts(joint: Joint, motion: AbstractRelativeMotion) -> ColumnParts:
+    """Columns of one motion of a joint, as `AbstractRelativeMotion.read` takes them."""
+    shape = (*motion.velocities, 1)
+    angular = np.array([c.angular for c in motion.columns]).reshape(shape)
+    pitched = np.array([float(c.linear is None) for c in motion.columns]).reshape(shape)
+    linear = np.array([c.linear or 0.0 for c in motion.columns]).reshape(shape)
+    return ColumnParts(
+        angular, linear + pitched * joint.length if joint.pitched else linear, pitched
+    )
+
+
+def relative_pose(joint: Joint, q: Float[Array, " c"], u: Float[Array, " c"]) -> RelativePose:
+    """Pose of frame j in frame i from a joint's coordinates and rates; a weld has no motion."""
+    zero = jnp.zeros(3, q.dtype)
+    found = RelativePose(from_rotation_vector(zero), zero, zero, zero)
+    start = 0
+    for number, freedom in enumerate(CATALOGUE[joint.kind].motion or ()):
+        own = slice(start, start + len(freedom.motion.coordinates))
+        step = freedom.motion.pose(q[own], u[own], freedom.axis, joint.length)
+        found, start = step if number == 0 else _after(found, step), own.stop
+    return found
+
+
+def _after(first: RelativePose, then: RelativePose) -> RelativePose:
+    """Pose of the child frame of two successive motions in the parent frame of the first."""
+    R = rotation_matrix(first.p)
+    d = R @ then.d
+    return RelativePose(
+        product(first.p, then.p),
+        first.d + d,
+        first.w + R @ then.w,
+        first.v + R @ then.v + cross(first.w, d),
+    )
 
 
 @eqx.filter_jit
@@ -165,9 +238,12 @@ def _along(
     system: System, states: State, joint: Joint, ts: Float[Array, " k"] | None
 ) -> tuple[Float[Array, "k c"], Float[Array, "k c"]]:
     values, rates = jax.vmap(lambda state: relative(system.kinematics(state), joint))(states)
-    if joint.kind == "spherical" or joint.pitched:
+    if joint.pitched:
         return values, rates
-    turns = np.array([unit == "rad" for _, unit in COORDINATES[joint.kind]])
+    # a rotation vector is the shortest one
+    vectors = sum(3 * f.motion.unit_norm for f in CATALOGUE[joint.kind].motion or ())
+    turns = np.array([unit == "rad" for _, unit in coordinates_of(joint.kind)])
+    turns[len(turns) - vectors :] = False
     return jnp.where(turns, _unwrapped(values, rates, ts), values), rates
 
 

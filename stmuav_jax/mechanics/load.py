@@ -21,7 +21,7 @@ from ..algebra.stacked import apply_transposed, dot
 from ..checks.errors import ModelError, check_finite, check_shape
 from ..checks.numbers import floats, scalar
 from ..checks.shapes import Numbers
-from .joint import Which
+from .joint_kind import Which
 from .state import Kinematics
 
 Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Array, "..."]]

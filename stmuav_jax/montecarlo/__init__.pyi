@@ -20,6 +20,9 @@ from .examples import (
     make_work as make_work,
     ready as ready,
 )
+from .model_flights import (
+    ModelFlights as ModelFlights,
+)
 from .sampling import (
     Sampling as Sampling,
     sampling_from_plain as sampling_from_plain,

@@ -253,8 +253,10 @@ class FlightWork(AbstractWork):
     def plan(self) -> Plan:
         """Plan of the batch integration, for programs that need its bare results."""
         study, direction = self.study, self.direction
+        # asked here, where nothing is traced
+        tree = Tree().allowing_dependent_rows() if study.flights.dependent_rows else Tree()
         method = Method(
-            formulation=Tree(), solver=solver_named(study.solver), rtol=study.rtol, atol=study.atol,
+            formulation=tree, solver=solver_named(study.solver), rtol=study.rtol, atol=study.atol,
             max_steps=study.max_steps, adjoint=diffrax.ForwardMode(), steps="state",
         )  # fmt: skip
         names = study.sampling.names

@@ -12,22 +12,18 @@ Factors are the names of a scene's parameter table, such as "mass.panel_7" or
 A relative factor multiplies the table's value.
 """
 
-import difflib
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..algebra.rotation import rotation_matrix
 from ..checks.errors import SettingError, StateError
 from ..checks.quantity import quantities
-from ..checks.schema import SHOWN, named, shown
+from ..checks.schema import SHOWN, shown
 from ..dynamics.scene import Scene
 from ..dynamics.statespace.tree import TreeSpace
 from ..dynamics.tree.topology import spanning_tree
@@ -35,7 +31,7 @@ from ..environment.wind import dryden, low_altitude
 from ..flight.equilibrium import trim
 from ..flight.flight_trim import TrimReason, hover, trim_flight
 from ..flight.steady import trim_condition
-from ..mechanics.inputs import inputs_of
+from ..mechanics.inputs import Inputs, inputs_of
 from ..mechanics.state import State
 from ..mechanics.system import System
 from ..parameters.table import Parameters
@@ -45,9 +41,7 @@ from ..scenes.registry import SCENES, entry_of, make_scene, options_from_plain
 from ..scenes.uav_tracker import uav_flyer
 from ..tracker.actuator import LinearActuator
 from ..tracker.geometry import initial_angles
-
-# Relative tolerance for round-off in the check of sampled inertia tensors.
-ROUND_OFF = 1e-12
+from .factors import FactorTarget, alike, drawn_table, faced, possible_tables, table_entry
 
 _WIND = {"wind.x": "m/s", "wind.y": "m/s", "wind.z": "m/s"}
 
@@ -57,14 +51,6 @@ class Drawn(NamedTuple):
 
     values: Float[Array, " d"]
     seed: Array
-
-
-class FactorTarget(NamedTuple):
-    """Target of a factor: a parameter and places in its value, or a number not in the table."""
-
-    name: str
-    places: tuple[tuple[int, ...], ...]
-    unit: str
 
 
 class _Shift(eqx.Module):
@@ -110,6 +96,11 @@ class Flights:
     held: Float[np.ndarray, " m"] | None = None
 
     @property
+    def dependent_rows(self) -> bool:
+        """False: the constraint rows of the report's machines are independent."""
+        return False
+
+    @property
     def trimmed_case(self) -> int | None:
         """Case of the scene: with a trim's inputs that of the UAV whose inputs are constant."""
         return 2 if self.inputs == "trim" and self.scene == "uav_tracker" else self.case
@@ -126,39 +117,14 @@ class Flights:
             if factor in self.relative:
                 raise SettingError(f"'{factor}' has no value in the table that it could multiply.")
             return FactorTarget(factor, (), own[factor])
-        match = re.fullmatch(r"([\w.]+)(?:\[([\d, ]+)\])?", factor)
-        if match is None or match[1] not in set(self.table):
-            hint = _alike((match[1] if match else factor)[:SHOWN], [*own, *self.table])
-            raise SettingError(
-                f"{named(factor)} is neither a parameter of {self.scene} nor part of its start.{hint}"
-            )
-        name = match[1]
-        if name in self.given:
+        unknown = lambda: (
+            f"is neither a parameter of {self.scene} nor part of its start."
+            f"{alike(factor.partition('[')[0][:SHOWN], [*own, *self.table])}"
+        )
+        name = factor.partition("[")[0]
+        if name in self.given and name in self.table:
             raise SettingError(f"'{name}' is given by the study's options: it can be no factor.")
-        try:
-            place = tuple(int(k) for k in match[2].split(",")) if match[2] else ()
-        except ValueError:
-            raise SettingError(
-                f"{named(factor)} names no entry; one is written such as {name}[0, 1]."
-            ) from None
-        value = np.asarray(self.table.value(name), dtype=float)
-        if place and (
-            len(place) != value.ndim or any(k >= n for k, n in zip(place, value.shape, strict=True))
-        ):
-            raise SettingError(f"'{name}' has shape {value.shape}; it has no entry {list(place)}.")
-        if not place and value.ndim and factor not in self.relative:
-            raise SettingError(
-                f"'{name}' has shape {value.shape}: name one entry, such as "
-                f"{name}[{', '.join('0' * value.ndim)}], or make the factor relative."
-            )
-        places = (place,) if place else ()
-        # an inertia tensor stays symmetric, "bare.inertia" of the hexacopter too
-        tensor = self.table[name].unit == "kg m^2" and len(place) == 2
-        across = place[::-1]
-        if tensor and place != across:
-            places = (place, across)
-        unit = "1" if factor in self.relative else self.table[name].unit
-        return FactorTarget(name, places, unit)
+        return table_entry(self.table, factor, factor in self.relative, unknown)
 
     def build(self, names: tuple[str, ...], drawn: Drawn) -> tuple[System, State]:
         """System and initial state of one run, NaN for an impossible start; may be traced."""
@@ -176,49 +142,22 @@ class Flights:
         return self._driven(scene.system, values), scene.state0
 
     def _table(self, values: Mapping[str, Array]) -> Parameters:
-        own, new = self.own, {}
-        for factor, value in values.items():
-            if factor in own:
-                continue
-            name, places, _ = self.entry(factor)
-            now = new.get(name, self.table.value(name))
-            if factor in self.relative:
-                share = lambda x, value=value: jnp.asarray(x, dtype=float) * value
-                if not places:
-                    new[name] = share(now)
-                    continue
-                value = share(np.asarray(self.table.value(name))[places[0]])
-            now = jnp.asarray(now, dtype=float)
-            for place in places or ((),):
-                now = now.at[place].set(value)
-            new[name] = now
-        return self.table.replaced(new, source="drawn") if new else self.table
+        own = {factor: value for factor, value in values.items() if factor not in self.own}
+        return drawn_table(self.table, own, self.relative)
 
     def possible(
         self, names: tuple[str, ...], drawn: Float[np.ndarray, "n d"]
     ) -> Bool[np.ndarray, " n"]:
-        """True for samples with masses and inertia tensors that bodies can have (n,).
+        """True for samples with masses and inertia tensors that bodies can have (n,)."""
+        places = [k for k, name in enumerate(names) if name not in self.own]
+        factors = tuple(names[k] for k in places)
+        return possible_tables(self.table, factors, drawn[:, places], self.relative)
 
-        The checks are those of `Body`, which does not check traced numbers: masses are positive,
-        tensors positive definite, and no principal moment exceeds the sum of the other two.
-        """
-        fine = np.ones(len(drawn), bool)
-        own = self.own
-        places = [k for k, name in enumerate(names) if name not in own]
-        chosen = {self.entry(names[k]).name: self.table[self.entry(names[k]).name] for k in places}
-        if not {p.unit for p in chosen.values()} & {"kg", "kg m^2"}:
-            return fine
-        factors = [names[k] for k in places]
-        table = lambda row: self._table(dict(zip(factors, row, strict=True)))
-        sampled = lambda row: {name: jnp.asarray(table(row).value(name)) for name in chosen}
-        values = jax.vmap(sampled)(jnp.asarray(drawn[:, places]))
-        for name, parameter in chosen.items():
-            value = np.asarray(values[name], dtype=float)
-            if parameter.unit == "kg":
-                fine &= (np.isfinite(value) & (value > 0)).reshape(len(drawn), -1).all(axis=1)
-            elif parameter.unit == "kg m^2" and value.shape[1:] == (3, 3):
-                fine &= _tensors(value, parameter.tolerance)
-        return fine
+    def plain(self) -> dict[str, Any]:
+        """Plain data of what tells the scene from others, without its table."""
+        names = ("scene", "case", "inputs", "drag", "gusts")
+        options = {"options": self.options} if self.options else {}
+        return {name: getattr(self, name) for name in names} | options
 
     def _air(self, table: Parameters, values: Mapping[str, Array], seed: Array) -> Any:
         mean = jnp.asarray(table.value("wind.mean"), dtype=float)
@@ -252,7 +191,12 @@ class Flights:
                 if more is not None:
                     push = _Shift(push, more) if callable(push) else push + more
                     forces[k] = eqx.tree_at(lambda f: f.force, force, push)
-        return eqx.tree_at(lambda s: s.forces, system, tuple(forces))
+        system = eqx.tree_at(lambda s: s.forces, system, tuple(forces))
+        own = _other_inputs(system)
+        more = [values.get(f"input.{name}", 0.0) for name, _ in own.names]
+        if not any(f"input.{name}" in values for name, _ in own.names):
+            return system
+        return own.applied(system, own.values(system) + jnp.stack([jnp.asarray(x) for x in more]))
 
     def nominal(self) -> tuple[System, State]:
         """System and initial state without any disturbance."""
@@ -260,8 +204,7 @@ class Flights:
 
     def facing(self) -> np.ndarray:
         """The world direction of the last body's z axis at the start (3,); a panel faces it."""
-        _, start = self.nominal()
-        return np.asarray(rotation_matrix(start.p[-1])[:, 2])
+        return faced(self.nominal()[1])
 
 
 def _rotor_inputs(rotors: Rotors) -> list[str]:
@@ -272,22 +215,11 @@ def _actuator_input(actuator: LinearActuator) -> str:
     return f"input.actuator_{actuator.slider.rpartition('_')[2]}"
 
 
-def _alike(name: str, known: list[str]) -> str:
-    """Hint with the nearest of very many names, and some similar ones."""
-    some = difflib.get_close_matches(name, known, n=8, cutoff=0.3)
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f" Did you mean '{close[0]}'?" if close else ""
-    like = f" Names like it: {', '.join(some)}." if some else ""
-    return f"{hint}{like} docs/studies.md says which there are."
-
-
-def _tensors(inertia: Float[np.ndarray, "n 3 3"], tolerance: float) -> Bool[np.ndarray, " n"]:
-    """True for inertia tensors that a body can have, with a relative tolerance of the moments."""
-    finite = np.all(np.isfinite(inertia), axis=(1, 2))
-    moments = np.linalg.eigvalsh(np.where(finite[:, None, None], inertia, np.eye(3)))
-    with np.errstate(over="ignore"):
-        most = (moments[:, 0] + moments[:, 1]) * (1 + max(tolerance, ROUND_OFF))
-    return finite & (moments[:, 0] > 0) & (moments[:, 2] <= most)
+def _other_inputs(system: System) -> Inputs:
+    """Constant inputs of forces other than rotors and actuators, to which factors are added."""
+    named_apart = [isinstance(f, (Rotors, LinearActuator)) for f in system.forces]
+    every = inputs_of(system).entries
+    return Inputs(tuple(e for e in every if not named_apart[e.force])).constant(system)
 
 
 def _uav_hover(table: Parameters) -> Float[np.ndarray, " m"]:
@@ -300,7 +232,7 @@ def _uav_hover(table: Parameters) -> Float[np.ndarray, " m"]:
     return np.concatenate([np.asarray(x) for x in found.inputs])
 
 
-def _trim_inputs(scene: str, built: Scene) -> Float[np.ndarray, " m"]:
+def trim_inputs(scene: str, built: Scene) -> Float[np.ndarray, " m"]:
     """Inputs of a scene at which it hovers, or stands still at its start if its base is fixed (m,)."""
     if not len(inputs_of(built.system)):
         raise SettingError(
@@ -349,7 +281,7 @@ def flights(
     if made.inputs == "case":
         return made
     of_uav = scene == "uav_tracker"
-    return replace(made, held=_uav_hover(table) if of_uav else _trim_inputs(scene, built))
+    return replace(made, held=_uav_hover(table) if of_uav else trim_inputs(scene, built))
 
 
 def _own(of: Flights, system: System) -> dict[str, str]:
@@ -363,4 +295,5 @@ def _own(of: Flights, system: System) -> dict[str, str]:
             found |= dict.fromkeys(_rotor_inputs(force), "1")
         elif isinstance(force, LinearActuator):
             found[_actuator_input(force)] = "N"
+    found |= {f"input.{name}": unit for name, unit in _other_inputs(system).names}
     return found | _WIND if of.drag else found

@@ -42,35 +42,29 @@ def _start(spread: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-_UAV = {
-    "collapse": {"signal": "pointing", "take": "when_above", "level": 0.5},
-    "tilt": {"signal": "tilt", "take": "largest"},
-    "distance": {"signal": "distance", "take": "final"},
-    "pointing": {"signal": "pointing", "take": "largest"},
-    "panel_spin": {"signal": "panel_spin", "take": "largest"},
-    "reaction_top": {"signal": "force.U47", "take": "largest"},
-    "energy": {"signal": "energy", "take": "final"},
-    "phi": {"signal": "phi", "take": "path"},
-    "theta": {"signal": "theta", "take": "path"},
-}
+def _seen(signal: str, take: str, **more: Any) -> dict[str, Any]:
+    return {"signal": signal, "take": take} | more
 
-_COLLAPSE = {
-    "collapse": {"signal": "pointing", "take": "when_above", "level": 0.5},
-    "phi_end": {"signal": "phi", "take": "final"},
-    "theta_end": {"signal": "theta", "take": "final"},
-    "spin": {"signal": "panel_spin", "take": "largest"},
-    "tilt": {"signal": "tilt", "take": "largest"},
-    "phi": {"signal": "phi", "take": "path"},
-    "theta": {"signal": "theta", "take": "path"},
-}
+
+_COLLAPSED = {"collapse": _seen("pointing", "when_above", level=0.5)}
+_TILT, _DISTANCE = {"tilt": _seen("tilt", "largest")}, {"distance": _seen("distance", "final")}
+_POINTING = {"pointing": _seen("pointing", "largest")}
+_PATHS = {name: _seen(name, "path") for name in ("phi", "theta")}
+
+_UAV = _COLLAPSED | _TILT | _DISTANCE | _POINTING | {
+    "panel_spin": _seen("panel_spin", "largest"),
+    "reaction_top": _seen("force.U47", "largest"),
+    "energy": _seen("energy", "final"),
+} | _PATHS  # fmt: skip
+
+_COLLAPSE = _COLLAPSED | {
+    "phi_end": _seen("phi", "final"), "theta_end": _seen("theta", "final"),
+    "spin": _seen("panel_spin", "largest"),
+} | _TILT | _PATHS  # fmt: skip
 
 _HOVER = {
-    "lost": {"signal": "tilt", "take": "when_above", "level": 0.0873},
-    "tilt": {"signal": "tilt", "take": "final"},
-    "distance": {"signal": "distance", "take": "final"},
-    "pointing": {"signal": "pointing", "take": "largest"},
-    "tilt_path": {"signal": "tilt", "take": "path"},
-}
+    "lost": _seen("tilt", "when_above", level=0.0873), "tilt": _seen("tilt", "final"),
+} | _DISTANCE | _POINTING | {"tilt_path": _seen("tilt", "path")}  # fmt: skip
 
 _TOLERANCES = {
     "mass.hexacopter_1": _share(0.005),

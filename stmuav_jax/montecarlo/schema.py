@@ -81,6 +81,15 @@ def _scene(name: str) -> str:
     return name
 
 
+def _model(given: Any) -> Any:
+    if given is None or not hasattr(given, "system"):
+        raise ValueError(
+            f"must be a model that stmuav_jax.files.read_model has read, but it is {shown(given)}; "
+            "stmuav_jax.files.load_study reads the one that a study's file names."
+        )
+    return given
+
+
 Name = Annotated[str, AfterValidator(_name)]
 SceneName = Annotated[str, AfterValidator(_scene)]
 Factor = Annotated[Any, BeforeValidator(_factor)]
@@ -135,7 +144,8 @@ class Flying(Entries):
 class FlightsFile(Drawing, Flying):
     """Entries of a study of simulated motions."""
 
-    scene: SceneName
+    scene: SceneName | None = None
+    model: Annotated[Any, BeforeValidator(_model)] = None
     factors: Annotated[dict[str, Factor], Field(min_length=1, max_length=1000)]
     quantities: Annotated[
         dict[Annotated[str, AfterValidator(_column)], QuantityEntry], Field(max_length=1000)

@@ -76,7 +76,8 @@ def sobol(
 
     with V the variance over A and B together, values taken from their mean. Intervals are
     percentiles of a bootstrap over base points, as if these were random; from about 1000 points on
-    the errors of a Sobol sequence are smaller than that.
+    the errors of a Sobol sequence are smaller than that. `scipy.stats.sobol_indices` has the same
+    estimates, but only for 2^k base points, of which none may be lost, and resamples without a seed.
 
     Args:
         values: values of samples 0, 1, ..., n - 1 (n,).

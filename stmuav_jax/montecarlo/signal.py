@@ -17,6 +17,7 @@ from ..dynamics.formulations.base import Reactions
 from ..dynamics.integration.problem import Problem, at_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
+from ..sensing.outputs import Output, joint_outputs
 from ..tracker.kinematics import panel_angles
 
 PANEL, SLIDERS = "panel_7", ("slider_2", "slider_3")
@@ -147,9 +148,14 @@ def _at_joint(kind: str, k: int) -> Callable[[View], Array]:
     return lambda v: safe_norm(getattr(v.reactions, kind)[k])
 
 
+def _joint_signal(output: Output) -> Signal:
+    return Signal(lambda v: output.of(v.system, v.state), output.unit, output.words)
+
+
 def signals(system: System) -> dict[str, Signal]:
     """Signals of a system, by name."""
     found = dict(_ANY)
+    found |= {name: _joint_signal(output) for name, output in joint_outputs(system).items()}
     if system.floating:
         found |= _BASE
     if PANEL in system.names:

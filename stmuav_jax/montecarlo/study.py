@@ -16,8 +16,9 @@ from ..checks.schema import SHOWN, checked, named
 from ..dynamics.choices import STEP_TOLERANCE, ExplicitSolverName
 from ..parameters.table import Parameters
 from .disturbed_flights import Flights, flights
+from .model_flights import ModelFlights, started
 from .sampling import Sampling
-from .schema import Drawing, FailureEntry, Flying, QuantityEntry, flights_file
+from .schema import Drawing, FailureEntry, FlightsFile, Flying, QuantityEntry, flights_file
 from .signal import Signal, signal
 
 # Largest number of kept times of a run, all of which are held in memory.
@@ -119,7 +120,7 @@ class Study:
     """
 
     name: str
-    flights: Flights
+    flights: Flights | ModelFlights
     sampling: Sampling
     quantities: Mapping[str, Quantity]
     t1: float = 1.0
@@ -164,13 +165,11 @@ class Study:
         numbers = {name: np.asarray(table.value(name)).tolist() for name in table}
         text = json.dumps(numbers, sort_keys=True)
         failure = {} if self.failure is None else {"failure": self.failure.plain()}
-        of_flights = ("scene", "case", "inputs", "drag", "gusts")
         own = ("name", "t1", "rtol", "atol", "solver", "max_steps")
         return (
-            {name: getattr(self.flights, name) for name in of_flights}
+            self.flights.plain()
             | {name: getattr(self, name) for name in own}
             | failure
-            | ({"options": self.flights.options} if self.flights.options else {})
             | {
                 "kind": "flights",
                 "parameters": hashlib.sha256(text.encode()).hexdigest()[:16],
@@ -264,10 +263,7 @@ def study_from_plain(
     """
     given = flights_file(plain)
     factors, relative = _factors(given.factors)
-    of = flights(
-        given.scene, given.case, table, relative=relative, inputs=given.inputs, drag=given.drag,
-        gusts=given.gusts, options=given.options, duration=given.t1,
-    )  # fmt: skip
+    of = _flights(given, table, relative)
     drawing = given.model_dump(include=set(Drawing.model_fields))
     sampling = Sampling(factors, **drawing)
     quantities = {k: Quantity(**dict(q)) for k, q in given.quantities.items()}
@@ -276,6 +272,25 @@ def study_from_plain(
     if "name" not in plain:
         flying["name"] = name
     return Study(flights=of, sampling=sampling, quantities=quantities, failure=failure, **flying)
+
+
+def _flights(
+    given: FlightsFile, table: Parameters | None, relative: frozenset[str]
+) -> Flights | ModelFlights:
+    """Settings of the runs: of a scene by name, or of a model."""
+    if (given.scene is None) == (given.model is None):
+        raise SettingError("A study needs a scene or a model's file, and not both.")
+    if given.scene is not None:
+        return flights(
+            given.scene, given.case, table, relative=relative, inputs=given.inputs, drag=given.drag,
+            gusts=given.gusts, options=given.options, duration=given.t1,
+        )  # fmt: skip
+    for name in ("case", "drag", "gusts", "options"):
+        if getattr(given, name):
+            raise SettingError(f"'{name}' is for scenes; a model's file has its own numbers.")
+    if table is not None:
+        raise SettingError("A table of parameters is for scenes; a model's file has its own.")
+    return ModelFlights(given.model, relative, given.inputs, started(given.factors))
 
 
 def _factors(given: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[str]]:

@@ -56,6 +56,9 @@ class Parameters(Mapping[str, Parameter]):
             raise ModelError(f"{self.name} has no parameter {named(key)}.{self._hint(key)}")
         return self._entries[key]
 
+    def __contains__(self, key: object) -> bool:
+        return key in self._entries
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)
 

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import outer_jit
 from ..algebra.rotation import cross, from_rotation_vector, product
 from ..algebra.small import inverse
 from ..algebra.stacked import apply
@@ -149,7 +150,7 @@ def simulate_case(
 _USED = ("arm", "drag", "inertia", "mass", "true.start", "true.Q", "true.R")
 
 
-@eqx.filter_jit
+@outer_jit
 def _flown(moves: bool, t: Array, u: Array, keys: Array, table: dict, world: World) -> Any:
     """Attitude, rates and centre of mass at all times, and measurements at all but the first."""
     count, s = t.shape[0] - 1, keys.shape[0]

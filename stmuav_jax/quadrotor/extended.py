@@ -38,7 +38,15 @@ from ..checks.errors import SettingError, concrete
 from ..estimation.model import Sensor, StateSpaceModel
 from ..estimation.propagate import rk4
 from ..parameters.table import Parameters
-from .model import NAMES, OBSERVABLE, PART_III, matrix, specific_force, torque
+from .model import (
+    NAMES,
+    OBSERVABLE,
+    PART_III,
+    BodyRates,
+    matrix,
+    specific_force,
+    torque,
+)
 
 # Standard deviations per step of the random walks by which the filter models constants [ln J, P,
 # N m s, m]: estimates made at a wrong inertia are inexact and must not be kept for ever.
@@ -215,6 +223,10 @@ class Extended(eqx.Module):
         moving = path.rate, path.acceleration
         return specific_force(x[:3], self.turning(x, u), path.c, lift, moving)
 
+    def inertial(self, x: Float[Array, "n *s"], u: Float[Array, "4 *#s"]) -> Float[Array, "6 *s"]:
+        """Readings of a gyroscope [rad/s] and of the accelerometer at the epicentre [m/s^2]."""
+        return jnp.concatenate([x[:3], self.specific_force(x, u)])
+
 
 def inertia_matrix(states: Float[Array, "6 *s"]) -> Float[Array, "3 3 *s"]:
     """Inertia J_0 from its six states [kg m^2]."""
@@ -297,11 +309,7 @@ def extended_model(
     if accelerometer:
         names += tuple(f"accelerometer {axis}" for axis in "xyz")
 
-    def seen(x: Array, u: Array) -> Array:
-        if not accelerometer:
-            return x[:3]
-        return jnp.concatenate([x[:3], equations.specific_force(x, u)])
-
+    seen = equations.inertial if accelerometer else BodyRates(0)
     sensor = Sensor(seen, matrix(R), names=names, stacked=True)
     step = rk4(equations.rates)
     return StateSpaceModel(

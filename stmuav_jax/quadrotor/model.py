@@ -19,6 +19,7 @@ Source: AFRL-AFOSR-JP-TR-2019-0058, Part III, Eq. 2.2.5 to 2.4.1, Tables 2.4.1, 
 
 from typing import Any, Literal
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -150,22 +151,47 @@ def specific_force(
     return jnp.stack([-out[0], -out[1], jnp.broadcast_to(lift, out[2].shape) - out[2]])
 
 
+class RigidBodyRates(eqx.Module):
+    """Rates q'(q, u) of the 8 states, or of the last 5, under thrusts u (4,) [N]; see `rates`.
+
+    Attributes:
+        J, J_inverse: inertia [kg m^2] and its inverse.
+        arm, drag: arm [m] and drag moments (4,) [N m] of the rotors.
+        kinematics: equations of the angles; None if they are no states.
+    """
+
+    J: Float[Array, "3 3"]
+    J_inverse: Float[Array, "3 3"]
+    arm: Any
+    drag: Any
+    kinematics: Kinematics | None = eqx.field(static=True)
+
+    def __call__(self, q: Array, u: Array) -> Array:
+        start = 0 if self.kinematics is None else 3
+        omega, offset = q[start : start + 3], q[start + 3 :]
+        moment = torque(offset, u, self.arm, self.drag)
+        turning = body_rates(omega, moment, self.J, self.J_inverse)
+        parts = [turning, jnp.zeros_like(offset)]
+        if self.kinematics is not None:
+            parts.insert(0, euler_angle_rates(q[:3], omega, self.kinematics))
+        return jnp.concatenate(parts)
+
+
+class BodyRates(eqx.Module):
+    """Measurement of the body rates, which begin at a place among the states."""
+
+    first: int = eqx.field(static=True)
+
+    def __call__(self, x: Float[Array, "n *s"], u: Any) -> Float[Array, "3 *s"]:
+        return x[self.first : self.first + 3]
+
+
 def rates(parameters: Parameters = PART_III, kinematics: Kinematics | None = "corrected") -> Rates:
     """Function q'(q, u) of the 8 states, or the last 5 if kinematics=None, and thrusts (4,) [N]."""
     J = jnp.asarray(parameters.value("inertia"))
-    J_inverse = jnp.linalg.inv(J)
+    # plain numbers leave single precision as it is
     arm, drag = parameters.value("arm"), parameters.value("drag")
-    start = 0 if kinematics is None else 3
-
-    def rate(q: Array, u: Array) -> Array:
-        omega, offset = q[start : start + 3], q[start + 3 :]
-        turning = body_rates(omega, torque(offset, u, arm, drag), J, J_inverse)
-        parts = [turning, jnp.zeros_like(offset)]
-        if kinematics is not None:
-            parts.insert(0, euler_angle_rates(q[:3], omega, kinematics))
-        return jnp.concatenate(parts)
-
-    return rate
+    return RigidBodyRates(J, jnp.linalg.inv(J), arm, drag, kinematics)
 
 
 def report_model(
@@ -225,7 +251,7 @@ def _model(
     Q = np.asarray(parameters.value("filter.Q"))[states] if Q is None else Q
     R = parameters.value("filter.R") if R is None else R
     seen = ("gyroscope x", "gyroscope y", "gyroscope z")
-    sensor = Sensor(lambda x, u: x[first : first + 3], matrix(R), names=seen, stacked=True)
+    sensor = Sensor(BodyRates(first), matrix(R), names=seen, stacked=True)
     return StateSpaceModel(step, matrix(Q), sensor, names=names, stacked=True)
 
 

@@ -9,6 +9,7 @@ from .flight_options import (
 )
 from .registry import (
     SCENES as SCENES,
+    RegisteredScene as RegisteredScene,
     make_scene as make_scene,
 )
 from .spin import (

@@ -5,8 +5,10 @@ It holds where the ball joint lies on the body's zeta axis and there is no gravi
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from ..checks.numbers import as_numpy, floats
 from ..dynamics.scene import Scene
 from ..mechanics.body import GROUND, Body
 from ..mechanics.forces.applied import AppliedMoment
@@ -18,11 +20,11 @@ from ..parameters.table import Parameters
 
 def spin(parameters: Parameters = PART_I) -> Scene:
     """Scene of the report's verification problem, 5 s long."""
-    ball = jnp.asarray(parameters.value("spin.joint"), dtype=float)
+    ball = as_numpy(floats(parameters.value("spin.joint")))
     body = Body(
         "top", parameters.value("spin.mass"), parameters.value("spin.inertia"), position=-ball
     )
-    moment = jnp.array([0.0, 0.0, 1.0]) * jnp.asarray(parameters.value("spin.moment"), dtype=float)
+    moment = np.array([0.0, 0.0, 1.0]) * as_numpy(floats(parameters.value("spin.moment")))
     system = System(
         [body],
         [spherical("ball", GROUND, "top", point=(0.0, 0.0, 0.0))],

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.space import AbstractSpace, Composite, CyclicVector, Point, Vector
+from ..algebra.space import AbstractSpace, Composite, Concatenated, CyclicVector, Point, Vector
 from ..checks.errors import SettingError
 from ..checks.shapes import Numbers
 from ..dynamics.statespace.base import AbstractStateSpace, motion_rates
@@ -50,13 +50,12 @@ def _matrix(variances: Numbers) -> Numbers:
     return jnp.diag(jnp.asarray(variances)) if np.ndim(variances) == 1 else variances
 
 
-def _together(spaces: dict[str, AbstractSpace]) -> AbstractSpace:
+def _together(spaces: list[AbstractSpace]) -> AbstractSpace:
     """The space of all readings: one vector where each sensor's are vectors or angles."""
-    if not all(isinstance(part, Vector | CyclicVector) for part in spaces.values()):
-        return Composite(**spaces)
+    if not all(isinstance(part, Vector | CyclicVector) for part in spaces):
+        return Concatenated(*spaces)
     parts = (
-        part.angular if isinstance(part, CyclicVector) else (False,) * part.size
-        for part in spaces.values()
+        part.angular if isinstance(part, CyclicVector) else (False,) * part.size for part in spaces
     )
     return CyclicVector(tuple(turning for part in parts for turning in part))
 
@@ -78,8 +77,8 @@ def system_model(
     Args:
         space: state space of the mechanism, whose points are the states of the filter; with
             parameters the states are {"motion": point, "parameters": (p,)}.
-        sensors: sensors, whose readings are one vector in this order, or a dictionary by sensor
-            if one of them reads an attitude.
+        sensors: sensors, whose readings are one array in this order; an attitude's are Euler
+            parameters (4,) with errors (3,).
         Q: covariance of the process noise (n, n) or (n,), for the errors of the space, then the
             parameters.
         R: covariance of the readings' noise.
@@ -114,12 +113,10 @@ def system_model(
     def read(x: Point, u: Any) -> Point:
         own, point, system = at(x, u)
         seen = sensed_motion_at(own, point, 0.0, system, accelerations=felt)
-        found = {sensor.name: sensor.read(seen) for sensor in sensors}
-        return found if composite else jnp.concatenate(list(found.values()))
+        return jnp.concatenate([sensor.read(seen) for sensor in sensors])
 
     felt = any(sensor.needs_accelerations for sensor in sensors)
-    seen_in = _together({sensor.name: sensor.space(space.system) for sensor in sensors})
-    composite = isinstance(seen_in, Composite)
+    seen_in = _together([sensor.space(space.system) for sensor in sensors])
     names = tuple(name for sensor in sensors for name, _ in sensor.components(space.system))
     states = space if adapt is None else Composite(motion=space, parameters=Vector(len(parameters)))
     return StateSpaceModel(

@@ -8,6 +8,7 @@ Source: P. D. Groves, Principles of GNSS, Inertial, and Multisensor Integrated N
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -22,8 +23,9 @@ from ..checks.shapes import Numbers
 from ..dynamics.run import Run
 from ..dynamics.statespace.base import AbstractStateSpace, Time
 from ..mechanics.forces.applied import Gravity
-from ..mechanics.joint import Joint, Which
+from ..mechanics.joint import Joint
 from ..mechanics.joint_coordinate import choose, coordinate
+from ..mechanics.joint_kind import Which
 from ..mechanics.state import Kinematics
 from ..mechanics.system import System
 
@@ -81,6 +83,7 @@ class Gyroscope(AbstractSensor):
     Args:
         body: name of the body.
         axes: axes of the sensor in those of the body, in rows (3, 3); by default the body's.
+        name: name of the sensor; by default "gyroscope" and the body's.
     """
 
     needs_accelerations: ClassVar[bool] = False
@@ -88,8 +91,8 @@ class Gyroscope(AbstractSensor):
     body: str = eqx.field(static=True)
     axes: Float[Array, "3 3"]
 
-    def __init__(self, body: str, axes: Numbers | None = None) -> None:
-        self.name, self.body, self.axes = f"gyroscope {body}", body, _axes(axes)
+    def __init__(self, body: str, axes: Numbers | None = None, *, name: str | None = None) -> None:
+        self.name, self.body, self.axes = name or f"gyroscope {body}", body, _axes(axes)
 
     def space(self, system: System) -> AbstractSpace:
         del system
@@ -110,6 +113,7 @@ class Accelerometer(AbstractSensor):
         body: name of the body.
         point: point in the body's reference frame (3,) [m]; by default the centre of mass.
         axes: axes of the sensor in those of the body, in rows (3, 3); by default the body's.
+        name: name of the sensor; by default "accelerometer" and the body's.
     """
 
     name: str = eqx.field(static=True)
@@ -118,9 +122,14 @@ class Accelerometer(AbstractSensor):
     axes: Float[Array, "3 3"]
 
     def __init__(
-        self, body: str, point: Numbers | None = None, axes: Numbers | None = None
+        self,
+        body: str,
+        point: Numbers | None = None,
+        axes: Numbers | None = None,
+        *,
+        name: str | None = None,
     ) -> None:
-        self.name, self.body, self.axes = f"accelerometer {body}", body, _axes(axes)
+        self.name, self.body, self.axes = name or f"accelerometer {body}", body, _axes(axes)
         self.point = None
         if point is not None:
             self.point = numbers(point, (3,), f"The point of the accelerometer on '{body}'", "m")
@@ -151,6 +160,7 @@ class Encoder(AbstractSensor):
     Args:
         joint: name of the joint.
         coordinate: "angle" or "displacement", needed if the joint leaves both free.
+        name: name of the sensor; by default "encoder" and the joint's.
     """
 
     needs_accelerations: ClassVar[bool] = False
@@ -158,8 +168,10 @@ class Encoder(AbstractSensor):
     joint: str = eqx.field(static=True)
     coordinate: Which | None = eqx.field(static=True)
 
-    def __init__(self, joint: str, coordinate: Which | None = None) -> None:
-        self.name, self.joint, self.coordinate = f"encoder {joint}", joint, coordinate
+    def __init__(
+        self, joint: str, coordinate: Which | None = None, *, name: str | None = None
+    ) -> None:
+        self.name, self.joint, self.coordinate = name or f"encoder {joint}", joint, coordinate
 
     def space(self, system: System) -> AbstractSpace:
         joint = system.joints[system.joint_index(self.joint)]
@@ -186,8 +198,8 @@ class PositionFix(AbstractSensor):
     body: str = eqx.field(static=True)
     point: Float[Array, "3"] | None
 
-    def __init__(self, body: str, point: Numbers | None = None) -> None:
-        self.name, self.body, self.point = f"position {body}", body, None
+    def __init__(self, body: str, point: Numbers | None = None, *, name: str | None = None) -> None:
+        self.name, self.body, self.point = name or f"position {body}", body, None
         if point is not None:
             self.point = numbers(point, (3,), f"The point of the position fix on '{body}'", "m")
 
@@ -214,8 +226,8 @@ class AttitudeFix(AbstractSensor):
     name: str = eqx.field(static=True)
     body: str = eqx.field(static=True)
 
-    def __init__(self, body: str) -> None:
-        self.name, self.body = f"attitude {body}", body
+    def __init__(self, body: str, *, name: str | None = None) -> None:
+        self.name, self.body = name or f"attitude {body}", body
 
     def space(self, system: System) -> AbstractSpace:
         del system
@@ -227,6 +239,16 @@ class AttitudeFix(AbstractSensor):
 
     def read(self, seen: SensedMotion) -> Point:
         return seen.p[seen.kin.index(self.body)]
+
+
+# Classes of sensors by the names that models' and missions' files have for them.
+SENSORS: dict[str, Callable[..., AbstractSensor]] = {
+    "gyroscope": Gyroscope,
+    "accelerometer": Accelerometer,
+    "encoder": Encoder,
+    "position": PositionFix,
+    "attitude": AttitudeFix,
+}
 
 
 def gravity_of(system: System) -> Float[Array, "3"]:

@@ -26,8 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..algebra.compiler import quick_jit
 from ..algebra.rotation import from_rotation_vector, rotation_matrix
 from ..checks.errors import SettingError, StateError, check_finite, nearest_names
+from ..checks.numbers import as_jax, floats
 from ..checks.shapes import Numbers
 from ..environment.ephemeris import Air, Place
 from ..environment.irradiance import (
@@ -45,7 +47,7 @@ from .forward import angles_from_strokes
 from .geometry import TrackerGeometry, tracker_geometry
 from .kinematics import Reason, panel_angles, panel_normal, strokes
 from .pointing import aim
-from .reach import nearest_reachable
+from .reach import ReachableGrid, nearest_reachable
 from .workspace import Limits, tracker_limits
 
 # Years in which the series is within 0.005 degrees of the SPA (docs/sun.md).
@@ -258,11 +260,15 @@ def _aim(
     s_w: Float[Array, "3 n"],
     R_wb: Float[Array, "3 3 n"],
     flaws: Imperfections,
+    up: np.ndarray,
+    grid: ReachableGrid | None,
 ) -> _Aim:
-    """Panel angles and strokes for directions to the sun, as the controller computes them."""
-    s_b, angles, reason = _wish(geometry, limits, s_w, R_wb, jnp.asarray(flaws.attitude_error))
-    nearest = nearest_reachable(geometry, np.asarray(s_b), limits)
-    angles = jnp.where(reason == Reason.VALID, angles, nearest)
+    """Panel angles and strokes, as the controller computes them: within reach where the sun is up."""
+    s_b, angles, reason = _wish(geometry, limits, s_w, R_wb, floats(flaws.attitude_error))
+    out = up & (np.asarray(reason) != Reason.VALID)
+    wanted = np.array(angles)
+    wanted[:, out] = nearest_reachable(geometry, np.asarray(s_b)[:, out], limits, grid)
+    angles = floats(wanted)
     if flaws.stroke_step > 0:
         q = jnp.round(strokes(geometry, angles) / flaws.stroke_step) * flaws.stroke_step
         angles = jax.jit(angles_from_strokes)(geometry, q, angles).angles
@@ -270,7 +276,7 @@ def _aim(
     return _Aim(angles, q, normals, reason)
 
 
-@jax.jit
+@quick_jit
 def _wish(
     geometry: TrackerGeometry, limits: Limits, s_w: Array, R_wb: Array, error: Array
 ) -> tuple[Array, Array, Array]:
@@ -280,17 +286,22 @@ def _wish(
     return s_b, panel_angles(s_b), aim(geometry, s_b, limits, throw=False).reason
 
 
-@jax.jit
+@quick_jit
 def _hold(geometry: TrackerGeometry, angles: Array, R_wb: Array) -> tuple[Array, Array]:
     """Strokes that hold panel angles, and the panel's normals in the world."""
     return strokes(geometry, angles), in_world(panel_normal(angles), R_wb)
+
+
+@quick_jit
+def _sun(times: Array, place: Place, air: Air) -> Sun:
+    return sun_position(times, place, air=air)
 
 
 def _daylight(unix: Samples, place: Place, air: Air) -> list[tuple[float, float]]:
     """Intervals in which the sun is up [h] since the first time, by its elevation every minute."""
     # refraction sets in with a jump, so that interpolation needs short steps
     times = np.linspace(unix[0], unix[-1], 1 + round((unix[-1] - unix[0]) / 60.0))
-    height = np.asarray(jax.jit(sun_position)(times, place, air=air).elevation)
+    height = np.asarray(_sun(times, place, air).elevation)
     hours = (times - times[0]) / 3600.0
     k = np.flatnonzero((height[1:] > 0) != (height[:-1] > 0))
     edges = list(hours[k] + height[k] / (height[k] - height[k + 1]) * (hours[k + 1] - hours[k]))
@@ -320,6 +331,7 @@ def track_day(
     parameters: Parameters = PART_II,
     turbidity: float | None = None,
     albedo: float = 0.2,
+    grid: ReachableGrid | None = None,
 ) -> Day:
     """Point the panel at the sun from local midnight to local midnight.
 
@@ -334,6 +346,8 @@ def track_day(
         parameters: table with the tracker's lengths and strokes.
         turbidity: Linke's turbidity [1]; by default the month's mean there.
         albedo: reflectivity of the ground [1].
+        grid: `reachable_grid` of the table's tracker; by default it is computed where the sun is
+            out of reach.
 
     Raises:
         SettingError: a step, turbidity or flaw that makes no sense.
@@ -345,7 +359,7 @@ def track_day(
     check_year(day)
     start, unix = day_times(day, zone, step)
     air = Air.standard(place.altitude)
-    sun = jax.jit(sun_position)(unix, place, air=air)
+    sun = _sun(unix, place, air)
     up = np.asarray(sun.is_up)
     if not np.any(up):
         raise StateError(
@@ -356,7 +370,7 @@ def track_day(
     sky = clear_sky(unix, place, sun, air, turbidity=turbidity)
     R_wb = attitudes(attitude, unix - unix[0])
     geometry, limits = tracker_geometry(parameters), tracker_limits(parameters)
-    aimed = _aim(geometry, limits, sun.s_w, jnp.asarray(R_wb), flaws)
+    aimed = _aim(geometry, limits, sun.s_w, as_jax(R_wb), flaws, up, grid)
     reason = np.where(up, aimed.reason, np.int8(Reason.BELOW_HORIZON))
     angles, q, normals = (np.where(up, np.asarray(part), np.nan) for part in aimed[:3])
     faces = {

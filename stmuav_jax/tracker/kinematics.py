@@ -204,6 +204,24 @@ def stroke_motion(geometry: TrackerGeometry, angles: PairMotion, rods: Rods = RI
     )
 
 
+def angle_accelerations(
+    geometry: TrackerGeometry,
+    angles: Float[Array, "2 *s"],
+    rates: Float[Array, "2 *s"] | None,
+    stroke_accelerations: Float[Array, "2 *s"],
+    rods: Rods = RISING,
+) -> Float[Array, "2 *s"]:
+    """Accelerations of the panel angles [rad/s^2], x'' = J^-1 (q'' - J' x').
+
+    Args:
+        rates: rates of the angles x' [rad/s]; None for a panel at rest.
+    """
+    if rates is None:
+        return solve_2x2(stroke_jacobian(geometry, angles, rods), stroke_accelerations)
+    J, J_rate = _jacobian_and_rate(geometry, angles, rates, rods)
+    return solve_2x2(J, stroke_accelerations - _times(J_rate, rates))
+
+
 def angle_motion(
     geometry: TrackerGeometry,
     angles: Float[Array, "2 *s"],
@@ -216,7 +234,6 @@ def angle_motion(
     x' = J^-1 q', x'' = J^-1 (q'' - J' x'); both grow without bound near a singularity, where
     `parallel_margin` goes to zero.
     """
-    J = stroke_jacobian(geometry, angles, rods)
-    rates = solve_2x2(J, stroke_rates)
-    _, J_rate = _jacobian_and_rate(geometry, angles, rates, rods)
-    return PairMotion(angles, rates, solve_2x2(J, stroke_accelerations - _times(J_rate, rates)))
+    rates = solve_2x2(stroke_jacobian(geometry, angles, rods), stroke_rates)
+    found = angle_accelerations(geometry, angles, rates, stroke_accelerations, rods)
+    return PairMotion(angles, rates, found)

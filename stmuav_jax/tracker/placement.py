@@ -37,15 +37,19 @@ def turn_about(angle: Float[Array, ""], axis: int) -> Float[Array, "4"]:
     return e.at[axis + 1].set(jnp.sin(angle / 2))
 
 
-def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RISING) -> Placement:
-    """Place every body and joint at panel angles (phi, theta) (2,) [rad]; NaN out of reach.
+class _Placed(NamedTuple):
+    """Bodies of a `Placement`, and what its joints' points and axes are made of."""
 
-    Body axes: z along the post and the rods, upward from the lower joint; post R_x, rod 6
-    R_y, rod 5 R_y R_x (the y axis of universal joint 3-5 is in the slider, its x axis in the
-    rod), panel R_x R_y.
+    r: Float[Array, "6 3"]
+    p: Float[Array, "6 4"]
+    hinge: Float[Array, "3"]
+    top: Float[Array, "3"]
+    low: tuple[Float[Array, "3"], Float[Array, "3"]]
+    balls: tuple[Float[Array, "3"], Float[Array, "3"]]
+    R_panel: Float[Array, "3 3"]
 
-    Source: report Part II, section 3.1 and Eq. 3.10; docs/geometry.md.
-    """
+
+def _bodies(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods) -> _Placed:
     loops = close_loops(geometry, turn_by_angles(angles))
     q2, q3 = strokes_of(geometry, loops, rods)
     x, y, z = jnp.eye(3)
@@ -63,6 +67,7 @@ def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RIS
     rod_5 = product(turn_about(aside, 1), turn_about(forth, 0))
     rod_6 = turn_about(jnp.arctan2(along_2[0], along_2[2]), 1)
     panel = product(turn_about(angles[0], 0), turn_about(angles[1], 1))
+    R_panel = rotation_matrix(panel)
     out, up = geometry.slider_out, geometry.slider_up
     r = jnp.stack(
         [
@@ -71,19 +76,34 @@ def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RIS
             hinge + rotation_matrix(post) @ geometry.post_com,
             low_3 + geometry.rod_com[1] * along_3,
             low_2 + geometry.rod_com[0] * along_2,
-            top + rotation_matrix(panel) @ geometry.panel_com,
+            top + R_panel @ geometry.panel_com,
         ]
     )
+    p = jnp.stack([level, level, post, rod_5, rod_6, panel])
+    return _Placed(r, p, hinge, top, (low_2, low_3), (ball_2, ball_3), R_panel)
+
+
+def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RISING) -> Placement:
+    """Place every body and joint at panel angles (phi, theta) (2,) [rad]; NaN out of reach.
+
+    Body axes: z along the post and the rods, upward from the lower joint; post R_x, rod 6
+    R_y, rod 5 R_y R_x (the y axis of universal joint 3-5 is in the slider, its x axis in the
+    rod), panel R_x R_y.
+
+    Source: report Part II, section 3.1 and Eq. 3.10; docs/geometry.md.
+    """
+    at = _bodies(geometry, angles, rods)
+    x, y, z = jnp.eye(3)
     points = {
-        "T12": r[0], "T13": r[1], "R14": hinge, "R26": low_2,
-        "U35": low_3, "U47": top, "S57": ball_3, "S67": ball_2,
+        "T12": at.r[0], "T13": at.r[1], "R14": at.hinge, "R26": at.low[0],
+        "U35": at.low[1], "U47": at.top, "S57": at.balls[1], "S67": at.balls[0],
     }  # fmt: skip
     axes = {
         "T12": z, "T13": z, "R14": x, "R26": y,
-        "U35.i": y, "U35.j": rotation_matrix(rod_5)[:, 0],
-        "U47.i": x, "U47.j": rotation_matrix(panel)[:, 1],
+        "U35.i": y, "U35.j": rotation_matrix(at.p[3])[:, 0],
+        "U47.i": x, "U47.j": at.R_panel[:, 1],
     }  # fmt: skip
-    return Placement(r, jnp.stack([level, level, post, rod_5, rod_6, panel]), points, axes)
+    return Placement(at.r, at.p, points, axes)
 
 
 def posture(
@@ -100,9 +120,11 @@ def posture(
     """
 
     def poses(x: Array) -> tuple[Array, Array]:
-        at = place(geometry, x, rods)
+        at = _bodies(geometry, x, rods)
         return at.r, at.p
 
-    rates = jnp.zeros_like(angles) if rates is None else rates
+    if rates is None:
+        r, p = poses(angles)
+        return State(r, p, jnp.zeros_like(r), jnp.zeros_like(r))
     (r, p), (v, p_rate) = jax.jvp(poses, (angles,), (rates,))
     return State(r, p, v, jax.vmap(angular_velocity)(p, p_rate))

@@ -28,6 +28,10 @@ def dot(a, b):
     return jnp.dot(a, b)
 
 
+def squares(x):
+    return x**2 - 2.0
+
+
 def pair(layer, x):
     return {"twice": layer(2 * x), "name": ("words", 3)}
 
@@ -151,13 +155,14 @@ def test_numbers_that_become_part_of_the_program_change_its_name(folder):
         assert key(one) != key(other)
 
 
-def test_quick_programs_are_kept_too(folder, monkeypatch):
+@pytest.mark.parametrize("jit", [compiler.quick_jit, compiler.outer_jit])
+def test_quick_and_outer_programs_are_kept_too(folder, monkeypatch, jit):
     monkeypatch.setattr(compiler, "_programs", OrderedDict())
-    np.testing.assert_array_equal(compiler.quick_jit(cross)(np.asarray(A), B), EXPECTED)
+    np.testing.assert_array_equal(jit(cross)(np.asarray(A), B), EXPECTED)
     assert len(files(folder)) == 1
     compiler._programs.clear()
     monkeypatch.setattr(compiler, "_compiled_now", None)
-    np.testing.assert_array_equal(compiler.quick_jit(cross)(np.asarray(B), A), -EXPECTED)
+    np.testing.assert_array_equal(jit(cross)(np.asarray(B), A), -EXPECTED)
 
 
 def test_programs_that_call_python_are_not_kept(folder):
@@ -166,7 +171,7 @@ def test_programs_that_call_python_are_not_kept(folder):
     assert not files(folder)
 
 
-def test_programs_that_call_lapack_work_in_a_new_process(tmp_path):
+def test_programs_that_call_lapack_and_searches_work_in_a_new_process(tmp_path):
     # without its initialisation LAPACK would end the process
     words = f"""
 import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
@@ -178,13 +183,23 @@ kept.keep_programs({str(tmp_path / "programs")!r})
 a = jax.numpy.asarray(np.diag([3.0, 2.0, 1.0]), dtype=float)
 loaded = kept.load(kept.key_of(test_kept.factors, (a,), compiler._NO_LIBRARY | compiler._QUICK))
 print(compiler._compiled(test_kept.factors, (a,))(a).tolist(), loaded is not None)
+import optimistix as optx
+from stmuav_jax.algebra.least_squares import search
+made, compiled_now = [], compiler._compiled_now
+compiler._compiled_now = lambda *args: made.append(args) or compiled_now(*args)
+found = search(test_kept.squares, a, optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8))
+print(len(made), found.history)
 """
     said = [
         subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True)
         for _ in range(2)
     ]
-    assert [x.stdout.split("] ")[1].strip() for x in said] == ["False", "True"]
-    assert all(x.stdout.startswith("[3.0") for x in said)
+    factored, searched = zip(*(x.stdout.splitlines() for x in said), strict=True)
+    assert [x.split("] ")[1] for x in factored] == ["False", "True"]
+    assert all(x.startswith("[3.0") for x in factored)
+    made, histories = zip(*(x.split(" ", 1) for x in searched), strict=True)
+    assert made == ("3", "0")
+    assert histories[0] == histories[1]
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dense.report import Report
 from dense.steps import Limits, Scheme, integrate
+from dense.system import Dense
 from dense.tables import Variant, g_and_l
 
 import stmuav_jax as stm
@@ -39,7 +39,7 @@ def moving():
 
 
 def accelerations(scene, variant, t=0.1):
-    model = Report(scene, variant)
+    model = Dense(scene, variant)
     q = model.accelerations(t, model.start(scene))
     L = g_and_l(np.asarray(scene.state0.p))[1]
     return q[:, :3], 2 * (L @ q[:, 3:, None])[..., 0]
@@ -63,7 +63,7 @@ def test_misprints_change_the_accelerations(moving, variant):
 
 
 def test_residuals_of_the_start(moving):
-    model = Report(moving)
+    model = Dense(moving)
     assert model.violation(model.start(moving)) < 1e-10
     assert model.norm_error(model.start(moving)) < 1e-15
 

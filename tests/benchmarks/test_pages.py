@@ -80,8 +80,11 @@ def test_state_of_the_results_names_every_result(page):
 def test_state_of_a_result_that_left_the_history(monkeypatch):
     about = {"commit": "f" * 40, "date": "2026-11-21T18:26:22+00:00"}
     monkeypatch.setattr(state, "git", lambda *call: "12" if "--count" in call else "x")
-    monkeypatch.setattr(state, "in_history", lambda _: False)
+    monkeypatch.setattr(state, "traced", lambda _: None)
     assert state.age(about) == ("no", "12, by date")
+    monkeypatch.setattr(state, "traced", lambda _: "a" * 40)
+    monkeypatch.setattr(state, "moved", lambda *_: 3)
+    assert state.age(about) == ("as aaaaaaaaaa, the same files", "3")
     monkeypatch.setattr(state, "git", lambda *_: None)
     assert state.age(about) == ("no history here", "-")
 

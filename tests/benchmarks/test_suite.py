@@ -21,8 +21,6 @@ WANTED = {
     "published": ({"curves"}, {"problem", "rows", "references", "cheapest", "failure"}),
     "stiff": ({"curves"}, {"problem", "rows", "references", "cheapest", "failure"}),
 }
-# compiled in seconds; the others in minutes
-QUICK = ("acceleration", "hexacopter")
 
 
 def run(folder: Path, sections: tuple[str, ...]) -> Path:
@@ -54,11 +52,6 @@ def check(folder: Path, sections: tuple[str, ...], page: Path) -> None:
     assert "smallest size" in text
     shown = [line.split("(")[1].rstrip(")") for line in text.splitlines() if line.startswith("![")]
     assert all((page.parent / place).stat().st_size > 0 for place in shown)
-
-
-@pytest.mark.slow
-def test_quick_sections(tmp_path):
-    check(tmp_path, QUICK, run(tmp_path, QUICK))
 
 
 @pytest.mark.slow

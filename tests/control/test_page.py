@@ -12,8 +12,11 @@ PAGE = Path(__file__).parents[2] / "docs" / "control.md"
 @pytest.mark.slow
 def test_the_page_on_closed_loops_runs():
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 7
+    # a user's cart-pole, and a plain hexacopter
     assert len(blocks[0].splitlines()) < 40
+    assert "FlightController" in blocks[2]
+    assert len(blocks[2].splitlines()) < 40
     names: dict = {}
     exec("\n".join(blocks), names)
     assert np.max(np.abs(names["run"].states.r[-1, :, 0])) < 2e-3
@@ -21,3 +24,9 @@ def test_the_page_on_closed_loops_runs():
     np.testing.assert_allclose(end, [np.cos(4.0) - 1, np.sin(4.0), 0.8], atol=5e-3)
     assert names["sensed"].reset().estimate.state.r.shape == (1, 3)
     assert names["climbs"][1] > names["climbs"][0]
+    # the arm's end, 0.5 m from its hinge
+    bob = names["raised"].states.r[-1, 0]
+    np.testing.assert_allclose(bob, 0.5 * np.array([-np.sin(2.2), 0, -np.cos(2.2)]), atol=5e-3)
+    assert names["tuned"].improvement > 0.2
+    assert names["scores"].shape == (4,)
+    assert np.all(names["scores"] < 0)

@@ -29,6 +29,16 @@ def test_triangularise(r, k):
         assert np.all(np.diag(L) >= 0)
 
 
+def test_no_library_is_called_in_native_loops(monkeypatch):
+    """LAPACK's call would keep a filter's loop from becoming one function."""
+    rows = jnp.asarray(RNG.normal(size=(25, 8)))
+    plain = triangularise(rows)
+    monkeypatch.setattr(factor, "native_loops", lambda: True)
+    program = jax.jit(lambda rows: factor.triangularise(rows))
+    assert "custom_call" not in program.lower(rows).as_text()
+    np.testing.assert_allclose(program(rows), plain, rtol=1e-12, atol=1e-14)
+
+
 def test_small_parts_keep_their_digits():
     """A direction 1e-12 of the other: its square is lost beside 1, its root is not."""
     rows = jnp.array([[1.0, 1.0], [0.0, 1e-12]])

@@ -1,9 +1,13 @@
 """Figures show what the run holds, in units, with a legend."""
 
+import sys
+
 import numpy as np
 import pytest
 
-from stmuav_jax.figures.plot import FIGURES, euler_parameters, positions, save_figures
+from stmuav_jax.figures import drawing
+from stmuav_jax.figures.numbers import numbers_of
+from stmuav_jax.figures.plot import FIGURES, content, euler_parameters, positions, save_figures
 from stmuav_jax.figures.report import certificate_rows
 
 
@@ -44,3 +48,25 @@ def test_certificate_rows_name_quantity_and_unit(short_run):
     assert " m, at the end " in rows["Estimated position error"]
     assert not any("residual" in name for name in rows)
     assert rows["Result"] == "successful at t = 0.05 s"
+
+
+@pytest.mark.parametrize("ends_early", [False, True])
+def test_another_process_draws_the_same_figures(short_run, monkeypatch, ends_early):
+    monkeypatch.setattr(drawing, "_processors", lambda: 2)
+    monkeypatch.delitem(sys.modules, "matplotlib")
+    numbers = {"positions": numbers_of(short_run)["positions"]}
+    with drawing.drawing(True) as drawer:
+        if ends_early:
+            assert drawer.process is not None
+            drawer.process.kill()
+        drawer.ask(numbers, "png")
+        assert drawer.files() == {"positions": content(positions(short_run), "png")}
+    assert drawer.process is None or drawer.process.returncode is not None
+
+
+def test_no_process_is_started_without_need(monkeypatch):
+    for wanted, processors in ((False, 2), (True, 1), (True, 2)):
+        # the last time matplotlib is here already
+        monkeypatch.setattr(drawing, "_processors", lambda count=processors: count)
+        with drawing.drawing(wanted) as drawer:
+            assert drawer.process is None

@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import io
 import json
 
 import numpy as np
@@ -10,6 +11,7 @@ import xarray as xr
 
 from stmuav_jax import PART_II, ModelError
 from stmuav_jax.dynamics.error_estimate import without
+from stmuav_jax.files.labelled import Labelled
 from stmuav_jax.files.netcdf import (
     FileError,
     _seal,
@@ -24,7 +26,15 @@ from stmuav_jax.files.netcdf import (
 
 def test_dataset_is_labelled(short_run):
     data = to_dataset(short_run)
-    assert dict(data.sizes) == {"time": 6, "body": 7, "axis": 3, "component": 4, "joint": 8}
+    assert dict(data.sizes) == {
+        "time": 6,
+        "body": 7,
+        "axis": 3,
+        "axis_2": 3,
+        "component": 4,
+        "joint": 8,
+        "rotor": 6,
+    }
     for name in ("position", "euler_parameters", "velocity", "angular_velocity"):
         assert data[name].dims[:2] == ("time", "body")
     for name in ("reaction_force", "reaction_moment"):
@@ -50,6 +60,28 @@ def test_saved_and_loaded_runs_are_equal(short_run, tmp_path):
     assert "jax" in json.loads(found.attrs["versions"])
     assert json.loads(found.attrs["certificate"])["result"] == "successful"
     assert [p.name for p in path.parent.iterdir()] == ["run.nc"]
+
+
+@pytest.mark.parametrize("checksums", [False, True])
+def test_xarray_reads_what_labelled_arrays_hold(checksums):
+    variables = {
+        "x": (("t", "name"), np.arange(6.0).reshape(3, 2), {"units": "m"}),
+        "ok": (("t",), np.array([True, False, True]), {}),
+        "none": (("joint", "t"), np.zeros((0, 3)), {}),
+        "alone": ((), np.float64(3.0), {}),
+        "small": (("t",), np.arange(3, dtype=np.int8), {"description": "m²"}),
+    }
+    coordinates = {
+        "t": (("t",), np.arange(3.0), {"units": "s"}),
+        "name": (("name",), ["p", "qü"], {}),
+        "joint": (("joint",), [], {}),
+        "who": (("name",), ["1", "2"], {}),
+    }
+    arrays = Labelled(variables, coordinates, {"format": "ä", "version": 2})
+    with xr.open_dataset(
+        io.BytesIO(arrays.netcdf(checksums=checksums)), engine="h5netcdf"
+    ) as found:
+        xr.testing.assert_identical(found.load(), arrays.dataset())
 
 
 def test_truncated_files_are_refused(short_run, tmp_path):

@@ -14,10 +14,26 @@ from scipy.special import ellipk
 
 import stmuav_jax as stm
 from stmuav_jax.cli import main
-from stmuav_jax.dynamics import evaluate
+from stmuav_jax.dynamics import evaluate, rank
 from stmuav_jax.files import FileError, load_model, model_to_text, save_model
-from stmuav_jax.files.model_schema import BODY, FORCES, IN_BODIES, JOINTS, START_BODY
-from stmuav_jax.mechanics import EndStop, JointFriction, JointServo, SineMotion, joint_motion
+from stmuav_jax.files.model_schema import (
+    BODY,
+    DATASHEET,
+    FORCES,
+    IN_BODIES,
+    INSTRUMENTS,
+    JOINTS,
+    START_BODY,
+    _named,
+)
+from stmuav_jax.mechanics import (
+    EndStop,
+    JointFriction,
+    JointServo,
+    SineMotion,
+    joint as joint_functions,
+    joint_motion,
+)
 from stmuav_jax.mechanics.joint import CATALOGUE
 from stmuav_jax.rotorcraft import Rotors
 
@@ -119,6 +135,51 @@ def test_the_legs_of_the_stewart_platform_share_its_weight(gallery):
     assert found.accelerations.v_rate == pytest.approx(np.zeros((1, 3)), abs=1e-9)
 
 
+def test_the_arms_of_the_delta_robot_fall_together(gallery):
+    scene = gallery["delta_robot"]
+    found = evaluate(scene.system, scene.state0, formulation=stm.Tree()).accelerations
+    arm, platform, length = 0.5, 0.8, 0.3
+    moment = 0.00375 + arm * (length / 2) ** 2
+    turning = (platform + 1.5 * arm) * length * 9.81 / (platform * length**2 + 3 * moment)
+    assert found.omega_rate[:3, 1] == pytest.approx(np.full(3, turning), rel=1e-12)
+    assert found.v_rate[3] == pytest.approx([0, 0, -length * turning], rel=1e-12, abs=1e-12)
+    assert found.omega_rate[3] == pytest.approx(np.zeros(3), abs=1e-10)
+    assert turning == pytest.approx(38.9884615, abs=1e-7)
+
+
+def test_the_linkage_of_bricard_moves_although_it_should_not(gallery):
+    scene = gallery["bricard"]
+    found = rank(scene.system, scene.state0)
+    assert (found.rows, found.rank, found.dof) == (30, 29, 1)
+    how = stm.Tree(redundant=True)
+    spin = evaluate(scene.system, scene.state0, formulation=how).accelerations.omega_rate
+    # all hinges turn alike: by the rods' velocities per rate, 4.5 + 0.5 + 3e-4 kg m^2 and 1 m of fall
+    wanted = 9.81 / 5.0003
+    pattern = [[0, -1, 0], [0, -1, -1], [1, -1, -1], [1, 0, -1], [1, 0, 0]]
+    assert spin == pytest.approx(wanted * np.array(pattern), abs=1e-10)
+    assert wanted == pytest.approx(1.9618823, abs=1e-7)
+
+
+def test_the_slung_load_swings_below_a_quadrotor_that_gives_way(gallery):
+    scene = gallery["quadrotor_slung_load"]
+    found = evaluate(scene.system, scene.state0, formulation=stm.Tree()).accelerations
+    M, m, length, J = 1.2, 0.4, 0.8, 2.56e-4
+    swing = m * length**2 + J - (m * length) ** 2 / (M + m)
+    wanted = -m * 9.81 * length * math.sin(0.2) / swing
+    assert found.omega_rate[1] == pytest.approx([0, wanted, 0], rel=1e-10, abs=1e-12)
+    assert found.omega_rate[0] == pytest.approx(np.zeros(3), abs=1e-12)
+    assert wanted == pytest.approx(-3.2439183, abs=1e-7)
+
+
+def test_the_tracker_of_the_file_is_that_of_the_report(gallery):
+    scene, own = gallery["tracker"], stm.make_scene("tracker", 2)
+    found = evaluate(scene.system, scene.state0, formulation=stm.Tree()).accelerations
+    wanted = evaluate(own.system, own.state0, formulation=stm.Tree()).accelerations
+    assert found.v_rate == pytest.approx(np.asarray(wanted.v_rate), rel=1e-9, abs=1e-9)
+    assert found.omega_rate == pytest.approx(np.asarray(wanted.omega_rate), rel=1e-9, abs=1e-9)
+    assert found.v_rate[5, 2] == pytest.approx(-0.7907645, abs=1e-7)
+
+
 # --- round trips
 
 
@@ -207,6 +268,13 @@ def test_every_kind_comes_back_to_the_last_bit(tmp_path):
     assert model_to_text(again) == path.read_text(encoding="utf-8")
 
 
+def test_a_joint_with_an_argument_that_files_do_not_know_is_left_out(monkeypatch):
+    slope = lambda name, body_i, body_j, *, slope: None
+    monkeypatch.setitem(CATALOGUE, "slope", CATALOGUE["revolute"])
+    monkeypatch.setattr(joint_functions, "slope", slope, raising=False)
+    assert _named() == [kind for kind in CATALOGUE if kind in JOINTS and "drive" not in kind]
+
+
 def test_what_a_file_cannot_hold_is_refused(gallery):
     system = gallery["pendulum"].system
     pin = system.joints[0]
@@ -245,7 +313,7 @@ pin = 0.1
 """
 
 BAD = [
-    ("format = 1", "format = 2", "'format' is 2, but this version reads format 1"),
+    ("format = 1", "format = 3", "'format' is 3, but this version reads the formats 1 and 2"),
     ("format = 1", "", "A model needs 'format'"),
     ("format = 1", "format = 1\ntitel = 'x'", "no entry 'titel'. Did you mean 'title'?"),
     ("format = 1", "format = 1\nt1 = 'x'", "'t1' must be a number, but it is 'x'"),
@@ -354,13 +422,89 @@ def test_the_command_line_refuses_what_a_model_has_not(tmp_path, capsys):
 
 def test_the_page_lists_every_entry_with_its_unit():
     page = (DOCS / "models.md").read_text(encoding="utf-8")
-    for kinds in (JOINTS, FORCES):
+    for kinds in (JOINTS, FORCES, INSTRUMENTS):
         for name, kind in kinds.items():
             row = next(line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
             for key, slot in kind.slots.items():
+                if kinds is INSTRUMENTS and key in DATASHEET:
+                    continue
                 shown = f"`{key}`" if slot.needed else f"*`{key}`*"
                 assert (f"{shown} [{slot.unit}]" if slot.unit else shown) in row, (name, key)
-    for key in (*BODY.slots, *IN_BODIES, *START_BODY):
+    for key in (*BODY.slots, *IN_BODIES, *START_BODY, *DATASHEET):
         assert f"`{key}`" in page, key
     for path in GALLERY:
         assert f"(models/{path.name})" in page
+
+
+# --- sensors
+
+SENSED = """format = 2
+t1 = 1.0
+parameters.grass = {value = 0.02, unit = "rad/s", source = "datasheet"}
+[bodies.rod]
+mass = 1.0
+inertia = [0.1, 0.1, 0.1]
+com = [0.0, 0.0, -0.5]
+[joints.pin]
+kind = "revolute"
+bodies = ["ground", "rod"]
+point = [0, 0, 0]
+axis = [0, 1, 0]
+[sensors]
+spin = {kind = "gyroscope", body = "rod", noise = "grass", bias = [0.01, 0, -0.01], rate = 200.0}
+tip = {kind = "accelerometer", body = "rod", point = [0, 0, -1], axes = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]}
+foot = {kind = "accelerometer", body = "rod", noise = [0.1, 0.1, 0.2]}
+angle = {kind = "encoder", joint = "pin", noise = 1e-3, delay = 0.01}
+place = {kind = "position", body = "rod", point = [0, 0, -1]}
+facing = {kind = "attitude", body = "rod", rate = 10}
+"""
+
+
+def test_sensors_of_a_file_come_back(tmp_path):
+    path = tmp_path / "sensed.toml"
+    path.write_text(SENSED)
+    scene = load_model(path)
+    assert list(scene.sensors) == ["spin", "tip", "foot", "angle", "place", "facing"]
+    spin, tip = scene.sensors["spin"], scene.sensors["tip"]
+    assert (spin.name, spin.noise, spin.rate, spin.delay) == ("spin", 0.02, 200.0, 0.0)
+    assert np.array_equal(spin.bias, [0.01, 0.0, -0.01])
+    assert scene.sensors["angle"].delay == 0.01
+    # what they read is what the sensors of the library read
+    run = stm.simulate(scene, t1=0.1, error_estimate=False)
+    axes = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+    exact = stm.sensing.Accelerometer("rod", [0, 0, -1], axes)
+    own, other = (stm.sensing.readings((one,), run) for one in (tip.sensor, exact))
+    np.testing.assert_array_equal(own["tip"], other["accelerometer rod"])
+    text = model_to_text(scene)
+    assert text.startswith("format = 2\n")
+    again = tmp_path / "again.toml"
+    again.write_text(text)
+    back = load_model(again)
+    assert model_to_text(back).partition("title")[2] == text.partition("title")[2]
+    assert list(back.sensors) == list(scene.sensors)
+    assert [leaf.tobytes() for leaf in map(np.asarray, jax.tree.leaves(back.sensors))] == [
+        leaf.tobytes() for leaf in map(np.asarray, jax.tree.leaves(scene.sensors))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("format = 2", "format = 1", "'sensors' needs format = 2, but the file has 1"),
+        ("format = 2", "format = 3", "reads the formats 1 and 2"),
+        ('kind = "attitude"', 'kind = "attitud"', "[sensors.facing]: A sensor has the kind 'attitud'. Did you mean"),
+        ('joint = "pin"', 'joint = "pi"', "[sensors.angle]: There is no joint 'pi'"),
+        ('body = "rod", rate', 'body = "rot", rate', "[sensors.facing]: There is no body 'rot'"),
+        ("[0.01, 0, -0.01]", "[0.01, 0]", "'bias' must have one number, or 3, but it has 2"),
+        ("noise = 1e-3", "noise = -1e-3", "'noise' must not be negative, but it is -0.001"),
+        ("rate = 10}", "rate = 0}", "'facing' must be positive and finite, but it is 0.0 Hz"),
+        ('unit = "rad/s"', 'unit = "m/s"', "'noise' is a quantity in rad/s"),
+        ('joint = "pin", noise', 'joint = "pin", axes = 1, noise', "has no entry 'axes'"),
+    ],
+)  # fmt: skip
+def test_errors_of_sensors_name_the_place(old, new, words, tmp_path):
+    assert SENSED.count(old) == 1
+    path = tmp_path / "bad.toml"
+    path.write_text(SENSED.replace(old, new))
+    with pytest.raises(FileError, match=re.escape(words)):
+        load_model(path)

@@ -70,14 +70,15 @@ def four_bar(angle=1.0, torque=0.0, masses=MASSES, damping=None):
     return stm.System(bodies, joints, forces)
 
 
-def stewart():
+def stewart(mass: Any = 20.0, com: Any = (0.0, 0.0, 0.0)):
     """A platform on six legs of universal, translational and spherical joints, each pushed."""
     turn = lambda k, r, z, off: np.array(
         [r * np.cos(k * np.pi / 3 + off), r * np.sin(k * np.pi / 3 + off), z]
     )
     feet = [turn(k, 1.0, 0.0, 0.15 * (-1) ** k) for k in range(6)]
     heads = [turn(k, 0.6, 1.2, -0.25 * (-1) ** k) for k in range(6)]
-    bodies = [stm.Body("platform", 20.0, np.diag([1.0, 1.2, 1.8]), position=[0.0, 0.0, 1.25])]
+    inertia = np.diag([1.0, 1.2, 1.8])
+    bodies = [stm.Body("platform", mass, inertia, com=com, position=[0.0, 0.0, 1.25])]
     joints, efforts = [], []
     for k, (foot, head) in enumerate(zip(feet, heads, strict=True)):
         axis = (head - foot) / np.linalg.norm(head - foot)

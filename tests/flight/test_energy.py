@@ -1,6 +1,8 @@
 """Endurance over a day, and break-even of a panel: closed form, root finding, derivatives."""
 
+import re
 from datetime import date, timedelta, timezone
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -129,3 +131,17 @@ def test_bad_input(day):
     lossy = stm.parameters.ENERGY.replaced({"rotor.efficiency": 0.0})
     with pytest.raises(stm.ModelError, match="efficiency of the motors"):
         hover_demand(7.0, energy=lossy)
+
+
+def test_the_pages_python_gives_its_numbers(capsys):
+    """docs/energy.md: the endurance that it prints, and the reason for which its discharge ends."""
+    page = Path(__file__).parents[2] / "docs" / "energy.md"
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    names: dict = {}
+    exec(code, names)
+    printed = capsys.readouterr().out.splitlines()
+    (said,) = re.findall(r"# ([\d.]+) s$", code, re.MULTILINE)
+    assert float(printed[0]) == pytest.approx(float(said), abs=0.05)
+    assert printed[1].endswith("empty")
+    assert float(printed[2]) == pytest.approx(float(names["slope"](names["mass"])))
+    assert float(printed[2]) < 0

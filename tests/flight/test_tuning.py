@@ -25,6 +25,9 @@ from stmuav_jax.scenes.uav_tracker import uav_flyer
 from stmuav_jax.tracker.tracker_options import Friction
 from stmuav_jax.tracker.workspace import tracker_limits
 
+# searches fly many times: they compute for longer than they compile
+pytestmark = pytest.mark.usefixtures("optimised")
+
 START = stm.tracker.initial_angles(stm.PART_II)
 LM = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
 
@@ -170,10 +173,10 @@ def test_identification(case):
 
 
 @pytest.mark.slow
-def test_a_hundred_records(case):
-    """Of a hundred noise seeds and starts, 95 or more leave all ten parameters within 3 sigma."""
+def test_ten_records(case):
+    """Of ten noise seeds and starts, 9 or more leave all ten parameters within 3 sigma."""
     records, starts = [], []
-    for seed in range(100):
+    for seed in range(10):
         rng = np.random.default_rng(seed)
         records.append(case.clean + case.sigma * rng.normal(size=case.clean.shape))
         starts.append(case.truth + 0.5 * case.sizes * rng.uniform(-1.0, 1.0, len(case.truth)))
@@ -183,11 +186,11 @@ def test_a_hundred_records(case):
             labels=case.labels, min_singular_value=0.5,
         )
     )  # fmt: skip
-    assert sum(one.within(case.truth) for one in found) >= 95
-    # deviations are honest both ways: normal errors are within one of them in 68 of 100
+    assert sum(one.within(case.truth) for one in found) >= 9
+    # deviations are honest both ways: normal errors are within one of them in 68 % of 100
     inside = np.mean([np.abs(one.values - case.truth) < one.standard_deviations for one in found])
-    assert 0.62 < inside < 0.74
-    assert 0.97 < np.mean([one.reduced_chi_square for one in found]) < 1.03
+    assert 0.53 < inside < 0.83
+    assert 0.93 < np.mean([one.reduced_chi_square for one in found]) < 1.07
 
 
 def test_what_cannot_be_told_is_named():

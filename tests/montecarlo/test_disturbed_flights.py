@@ -11,7 +11,7 @@ import pytest
 from stmuav_jax import PART_II, Body, SettingError, System, make_scene
 from stmuav_jax.dynamics import energy
 from stmuav_jax.dynamics.formulations.augmented import Augmented
-from stmuav_jax.montecarlo.disturbed_flights import Drawn, _trim_inputs, flights
+from stmuav_jax.montecarlo.disturbed_flights import Drawn, flights, trim_inputs
 from stmuav_jax.rotorcraft import Rotors
 from stmuav_jax.tracker import PanelStart, Servo
 
@@ -140,7 +140,7 @@ def test_refusals():
         flights("tracker", drag=True)
     bare = System([Body("a", 1.0, np.eye(3), free=True)])
     with pytest.raises(SettingError, match="bare has no inputs that a trim could find"):
-        _trim_inputs("bare", replace(make_scene("spin"), system=bare))
+        trim_inputs("bare", replace(make_scene("spin"), system=bare))
     with pytest.raises(SettingError, match="that it could multiply"):
         flights("hexacopter", relative=frozenset({"start.p"})).entry("start.p")
 

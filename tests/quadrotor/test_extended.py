@@ -199,7 +199,7 @@ WRONG = np.array([*np.log([1.4, 0.65, 1.35]), 0.02, -0.02, 0.02, -0.35 * DRAG])
 def estimated(case, accelerometer, t1):
     """Parameters at the end, their deviations, and the truth; starts 30 to 40 % wrong."""
     noise = 0.1 if accelerometer else None
-    record = simulate_case(case, seeds=100, t1=t1, world=World(damping=DRAG, accelerometer=noise))
+    record = simulate_case(case, seeds=40, t1=t1, world=World(damping=DRAG, accelerometer=noise))
     R = [1e-4, 2e-4, 1e-4] + [1e-2] * 3 * accelerometer
     model = extended_model(inertia=True, drag=True, accelerometer=accelerometer, R=R)
     start = np.array([0.1, 0.2, 0.3, 0.05 * 1.35, 0.1 * 0.65, *(start_of()[5:] + WRONG)])
@@ -219,11 +219,11 @@ def estimated(case, accelerometer, t1):
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "accelerometer"), [(4, False), (1, True)])
 def test_inertia_and_drag(case, accelerometer):
-    """Within 3 sigma in at least 95 of 100 seeds, and nearer than where it started."""
+    """Within 3 sigma in at least 38 of 40 seeds, and nearer than where it started."""
     mean, deviation, truth = estimated(case, accelerometer, 2.0)
     error = np.abs(mean - truth[:, None])
     inside = np.sum(error <= 3 * deviation, axis=1)
-    assert np.all(inside >= 95), (inside, error.mean(1), deviation.mean(1))
+    assert np.all(inside >= 38), (inside, error.mean(1), deviation.mean(1))
     # diagonal: from 35 % to 2 % (gyroscope), 1 % (with accelerometer)
     assert np.all(np.sqrt(np.mean(error[:3] ** 2, axis=1)) < (0.01 if accelerometer else 0.02))
 

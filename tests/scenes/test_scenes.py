@@ -78,7 +78,10 @@ def test_energy_balance(name, case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "case"), CASES)
+@pytest.mark.usefixtures("optimised")
+@pytest.mark.parametrize(
+    ("name", "case"), [("uav_tracker", 1), ("uav_tracker", 2), ("uav_tracker", 3)]
+)
 def test_sixty_seconds_with_default_settings(name, case):
     c = simulate(make_scene(name, case), t1=60.0, save_every=0.1).certificate
     assert c.result == "successful"

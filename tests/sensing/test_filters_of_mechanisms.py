@@ -15,8 +15,8 @@ from stmuav_jax.algebra.compiler import quick_jit
 from stmuav_jax.sensing.process import moved_over
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "flight"))
-from mechanisms import cart_pole, ground_tracker  # pyright: ignore[reportMissingImports]
-from test_any_mechanism import four_bar, twin_rate  # pyright: ignore[reportMissingImports]
+from mechanisms import cart_pole, ground_tracker, stewart  # pyright: ignore[reportMissingImports]
+from test_any_mechanism import four_bar, static_forces, twin_rate  # pyright: ignore[reportMissingImports]
 
 estimation, sensing = stm.estimation, stm.sensing
 
@@ -166,7 +166,7 @@ def uav():
     return model, fine, prior, jnp.asarray(balance(flyer, x, inputs) + shake * wave)
 
 
-def motions(fine, prior, start, wander, u, dt):
+def motions(fine, prior, start, wander, u, dt, seeds=SEEDS):
     """Motions of the simulator from random starts, with noise, and what its sensors read there.
 
     Args:
@@ -174,7 +174,7 @@ def motions(fine, prior, start, wander, u, dt):
     """
     rng = np.random.default_rng(7)
     drawn = lambda sizes, *count: jnp.asarray(
-        sizes[:, None] * rng.standard_normal((*count, len(sizes), SEEDS))
+        sizes[:, None] * rng.standard_normal((*count, len(sizes), seeds))
     )
     first = fine.space.retract(jax.tree.map(lambda a: a[:, None], prior.mean), drawn(start))
 
@@ -186,20 +186,20 @@ def motions(fine, prior, start, wander, u, dt):
     fly = quick_jit(lambda start, u, w: jax.lax.scan(onwards, start, (u, w))[1])
     truth, seen = fly(first, u, drawn(wander, len(u)))
     noise = np.sqrt(np.diagonal(fine.sensor.noise @ fine.sensor.noise.T))
-    return truth, seen + drawn(noise, len(u))
+    return truth, jax.vmap(fine.sensor.space.retract)(seen, drawn(noise, len(u)))
 
 
-def consistent(model, fine, prior, start, wander, u, dt, parts, level=0.95):
+def consistent(model, fine, prior, start, wander, u, dt, parts, level=0.95, seeds=SEEDS):
     """The filter's record, whose NEES of all parts is within its 95 % interval, and NIS at a level."""
-    truth, y = motions(fine, prior, start, wander, u, dt)
+    truth, y = motions(fine, prior, start, wander, u, dt, seeds)
     out = estimation.filter_bank(model, prior, y, u=u, dt=dt)
     assert bool(out.ok.all())
     last = jax.tree.map(lambda a: a[-1], (out.mean, out.factor, truth))
     for part, only in parts.items():
         found = float(jnp.mean(estimation.nees(*last, model.space, only=only)))
-        low, high = estimation.mean_interval(only.stop - only.start, SEEDS, 0.95)
+        low, high = estimation.mean_interval(only.stop - only.start, seeds, 0.95)
         assert low < found < high, f"{part}: {low:.3f} < {found:.3f} < {high:.3f}"
-    low, high = estimation.mean_interval(y.shape[1], SEEDS * len(u), level)
+    low, high = estimation.mean_interval(model.sensor.space.size, seeds * len(u), level)
     assert low < np.asarray(out.nis).mean() < high
     return out
 
@@ -227,7 +227,7 @@ def test_the_uav_from_its_own_sensors_over_a_hundred_seeds(uav):
     assert np.all(UAV_STEPS * UAV_DT * UAV_START[11:14] > 1.5 * UAV_START[3:6])
 
 
-# --- a cart-pole, the tracker on the ground
+# --- a cart-pole, the tracker on the ground, the hexacopter, a Stewart platform
 
 
 def cart_pole_case():
@@ -250,9 +250,35 @@ def tracker_case():
     return space, sensors, start, wander, np.array([5e-4, *[0.01] * 3]), held + shake
 
 
+def hexacopter_case():
+    """Gyroscope, and fixes of position and attitude: readings of ten numbers with errors of nine."""
+    space = stm.TreeSpace(stm.make_scene("hexacopter").system)
+    name = space.system.names[0]
+    sensors = [sensing.Gyroscope(name), sensing.PositionFix(name), sensing.AttitudeFix(name)]
+    start, wander = np.repeat([0.1, 0.05, 0.2, 0.2], 3), np.repeat([0.0, 0.0, 0.02, 0.02], 3)
+    x = space.from_state(space.system.reference)
+    held = stm.flight.trim_condition(space, stm.flight.hover(), at=x).values
+    shake = 0.05 * np.sin(np.arange(10.0)[:, None] * np.linspace(0.5, 2.0, 6))
+    return space, sensors, start, wander, np.repeat([0.01, 0.05, 0.02], 3), held * (1 + shake)
+
+
+def platform_case():
+    """Encoders of three of six legs, and the platform's gyroscope."""
+    system, feet, heads = stewart()
+    space = stm.TreeSpace(system, independent=[f"T{k}.displacement" for k in range(6)])
+    sensors = [*(sensing.Encoder(f"T{k}") for k in (0, 2, 4)), sensing.Gyroscope("platform")]
+    start, wander = np.repeat([0.01, 0.05], 6), np.repeat([0.0, 0.02], 6)
+    shake = 0.05 * np.sin(np.arange(10.0)[:, None] * np.linspace(0.5, 2.0, 6))
+    held = static_forces(feet, heads)
+    return space, sensors, start, wander, np.repeat([5e-4, 0.01], 3), held * (1 + shake)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [cart_pole_case, tracker_case])
-def test_other_mechanisms_over_a_hundred_seeds(case):
+@pytest.mark.parametrize(
+    ("case", "seeds"),
+    [(cart_pole_case, 100), (tracker_case, 40), (hexacopter_case, 40), (platform_case, 25)],
+)
+def test_other_mechanisms_over_many_seeds(case, seeds):
     """NEES within its 95 % interval; NIS within 99.9 %, as it is looked at for each of them too."""
     space, sensors, start, wander, noise, u = case()
     inputs = stm.inputs_of(space.system)
@@ -264,7 +290,7 @@ def test_other_mechanisms_over_a_hundred_seeds(case):
     )
     prior = estimation.gaussian(space.from_state(space.system.reference), np.diag(start**2))
     parts = {"all": slice(0, space.size)}
-    out = consistent(model, fine, prior, start, wander, jnp.asarray(u), 0.02, parts, level=0.999)
+    out = consistent(model, fine, prior, start, wander, jnp.asarray(u), 0.02, parts, 0.999, seeds)
     # what is known at the end is more than what was known at the start
     after = np.sum(np.log(np.asarray(jnp.mean(out.standard_deviation[-1], axis=-1)) / start))
     assert after < -1.0

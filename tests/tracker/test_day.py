@@ -17,8 +17,15 @@ import stmuav_jax as stm
 from stmuav_jax.environment.ephemeris import Place
 from stmuav_jax.environment.irradiance import single_axis_normals
 from stmuav_jax.environment.sun import attitude
-from stmuav_jax.figures.day import DAY_FIGURES, day_dataset, day_rows, day_tables, load_attitude
-from stmuav_jax.files.netcdf import FileError, save_dataset
+from stmuav_jax.figures.day import (
+    DAY_FIGURES,
+    day_dataset,
+    day_rows,
+    day_tables,
+    labelled_day,
+    load_attitude,
+)
+from stmuav_jax.files.netcdf import FileError, save_labelled
 from stmuav_jax.tracker.day import (
     PANELS,
     Imperfections,
@@ -294,7 +301,7 @@ def test_dates_and_zones():
 def test_day_as_a_file(day, tmp_path):
     """Everything comes back, with units; angles of the file give its normals."""
     with xr.open_dataset(
-        save_dataset(day_dataset(day), tmp_path / "day.nc"), engine="h5netcdf"
+        save_labelled(labelled_day(day), tmp_path / "day.nc"), engine="h5netcdf"
     ) as file:
         data = file.load()
     assert all(v.attrs["units"] for v in data.data_vars.values())

@@ -18,7 +18,8 @@ def test_the_best_multiple_of_fifteen_degrees(best, found, monkeypatch):
     """Of an energy with one maximum, in ten days or fewer."""
     tried = []
 
-    def day(place, day, zone, R_wb, *, step):
+    def day(place, day, zone, R_wb, **options):
+        assert options["step"] > 0
         tried.append(R_wb)
         return SimpleNamespace(energy={"tracker": math.cos(R_wb - math.radians(best))})
 

@@ -1,7 +1,7 @@
 """Consistent initial conditions: assembly of positions, projection of velocities, rank of rows."""
 
-from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,14 +12,17 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from ...algebra.compiler import kept_jit
-from ...algebra.rotation import normalise
+from ...algebra.rotation import conjugate, normalise, product, to_rotation_vector
 from ...checks.errors import ModelError, StateError, concrete
 from ...checks.shapes import Numbers
-from ...mechanics.joint import CATALOGUE, Which, drive
+from ...mechanics.joint import CATALOGUE, drive
 from ...mechanics.joint_coordinate import coordinate, free_coordinates
+from ...mechanics.joint_kind import Which
 from ...mechanics.state import State
 from ...mechanics.system import System, check_state
 from ..formulations.augmented import Augmented, Model, displace
+from ..formulations.constraints import Equations
+from .joint_drivers import UniformMotion
 
 # A run ended in a singular posture if the smallest singular value is below this fraction of that at
 # its start.
@@ -52,6 +55,7 @@ def assemble(
     hold: Mapping[str, Held] | None = None,
     hold_joints: tuple[str, ...] = (),
     tolerance: float = 1e-11,
+    near: State | None = None,
     max_steps: int = 64,
     throw: bool = True,
 ) -> Assembly:
@@ -71,6 +75,7 @@ def assemble(
         hold: fixed coordinates by body: its "position", its "orientation" or "all".
         hold_joints: joints whose angle or displacement keeps its value; both of a cylindrical one.
         tolerance: bound of the position residuals [m].
+        near: posture at which the method starts, if several close; by default the guess.
         throw: raise an error without convergence, if values are concrete (not inside `jit`).
 
     Raises:
@@ -84,7 +89,8 @@ def assemble(
     normal = State(guess.r, jax.vmap(normalise)(guess.p), guess.v, guess.omega)
     locked = _lock(system, normal, hold_joints)
     time = jnp.asarray(t, dtype=guess.r.dtype)
-    state, residuals = _assembled(locked, time, normal, jnp.asarray(free), max_steps)
+    near = normal if near is None else near
+    state, residuals = _assembled(locked, time, normal, near, jnp.asarray(free), max_steps)
     worst = jnp.max(residuals, initial=0.0)
     converged = jnp.isfinite(worst) & (worst <= tolerance)
     moved = jnp.max(jnp.sqrt(jnp.sum((jax.lax.stop_gradient(state.r) - guess.r) ** 2, axis=1)))
@@ -103,11 +109,16 @@ def assemble(
 
 @kept_jit
 def _assembled(
-    system: System, t: Float[Array, ""], guess: State, free: Bool[Array, " k"], max_steps: int
+    system: System,
+    t: Float[Array, ""],
+    guess: State,
+    near: State,
+    free: Bool[Array, " k"],
+    max_steps: int,
 ) -> tuple[State, Float[Array, " joints"]]:
     """Assembled state and the largest position residual of each joint."""
     model = Augmented().prepare(system)
-    state = velocities(model, t, _positions(model, t, guess, free, max_steps), free)
+    state = velocities(model, t, _positions(model, t, guess, near, free, max_steps), free)
     kin = system.kinematics(state)
     value = jnp.abs(model.constraints.scales() * model.constraints.equations(t, kin).value)
     owner = np.array(model.constraints.owner, dtype=int)
@@ -143,29 +154,34 @@ def _lock(system: System, state: State, names: tuple[str, ...]) -> System:
     """System with the coordinates of the named joints locked at their present values."""
     if not names:
         return system
-    kin = system.kinematics(state)
+    kin, zero = system.kinematics(state), jnp.zeros(())
     locks = []
     for name in names:
         joint = system.joints[system.joint_index(name)]
         free = free_coordinates(joint) or ["angle"]
         # a screw's angle and displacement are one freedom; the driver refuses a joint that
         # leaves none free
-        for which in free[-max(len(CATALOGUE[joint.kind].motion or ()), 1) :]:
+        motions = CATALOGUE[joint.kind].motion or ()
+        if len(motions) > len(free):
+            raise ModelError(
+                f"Joint '{name}' cannot be held: no drivers prescribe all coordinates of a {joint.kind} "
+                "joint. Hold its bodies, or other joints."
+            )
+        for which in free[-max(len(motions), 1) :]:
             value = coordinate(kin, joint, which).value
-            locks.append(drive(f"hold {name}", joint, _Constant(value), coordinate=which))
+            locks.append(
+                drive(f"hold {name}", joint, UniformMotion(value, zero, zero), coordinate=which)
+            )
     return eqx.tree_at(lambda s: s.joints, system, (*system.joints, *locks))
 
 
-class _Constant(eqx.Module):
-    value: Float[Array, ""]
-
-    def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
-        del t
-        return self.value
-
-
 def _positions(
-    model: Model, t: Float[Array, ""], guess: State, free: Bool[Array, " k"], max_steps: int
+    model: Model,
+    t: Float[Array, ""],
+    guess: State,
+    near: State,
+    free: Bool[Array, " k"],
+    max_steps: int,
 ) -> State:
     """Newton's method on M step - J^T multipliers = 0, Phi = 0 for the step from the guess."""
     m = model.constraints.n_rows
@@ -198,18 +214,13 @@ def _positions(
 
     # one scale for the gradient rows gives both parts the unit of a length
     size = jnp.sum(bodies.mass)
-    start = (jnp.zeros(6 * model.system.n_bodies, guess.r.dtype), jnp.zeros(m, guess.r.dtype))
+    turned = jax.vmap(lambda a, b: to_rotation_vector(product(conjugate(b), a)))
+    away = lambda a, b: jnp.concatenate([a.r - b.r, turned(a.p, b.p)], axis=1).reshape(-1)
+    start = (away(*jax.lax.stop_gradient((near, guess))), jnp.zeros(m, guess.r.dtype))
     solver = optx.Newton(rtol=1e-12, atol=1e-13, linear_solver=lx.SVD(rcond=1e-11))
     adjoint = optx.ImplicitAdjoint(linear_solver=lx.SVD(rcond=1e-11))
-    solution = optx.root_find(
-        residual,
-        solver,
-        start,
-        args=(model, guess),
-        adjoint=adjoint,
-        max_steps=max_steps,
-        throw=False,
-    )
+    how: Any = {"adjoint": adjoint, "max_steps": max_steps, "throw": False}
+    solution = optx.root_find(residual, solver, start, args=(model, guess), **how)
     return moved(solution.value[0], guess)
 
 
@@ -218,15 +229,22 @@ def velocities(model: Model, t: Float[Array, ""], state: State, free: Bool[Array
     if not model.constraints.n_rows:
         return state
     eq = model.constraints.equations(t, model.system.kinematics(state))
-    weighed = model.weigh(eq.J * free.reshape(-1, 6)).reshape(eq.matrix.shape) * free
     u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
-    S = lx.MatrixLinearOperator(weighed @ (eq.matrix * free).T)
+    step = nearest_step(model, eq, free)
     # the second pass removes the round-off of the first
     for _ in range(2):
-        off = eq.matrix @ u - eq.target
-        u = u - weighed.T @ lx.linear_solve(S, off, lx.SVD(rcond=1e-11), throw=False).value
+        u = u + step(eq.target - eq.matrix @ u)
     u = u.reshape(-1, 6)
     return State(state.r, state.p, u[:, :3], u[:, 3:])
+
+
+def nearest_step(
+    model: Model, eq: Equations, free: Bool[Array, " k"]
+) -> Callable[[Float[Array, " m"]], Float[Array, " k"]]:
+    """Function of numbers b (m,) that returns the smallest x in the mass metric with J x = b."""
+    weighed = model.weigh(eq.J * free.reshape(-1, 6)).reshape(eq.matrix.shape) * free
+    S = lx.MatrixLinearOperator(weighed @ (eq.matrix * free).T)
+    return lambda b: weighed.T @ lx.linear_solve(S, b, lx.SVD(rcond=1e-11), throw=False).value
 
 
 class Rank(NamedTuple):

@@ -1,33 +1,33 @@
 """Consistent state from joint coordinates and rates, along the tree and with closed loops."""
 
-import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ...algebra.rotation import (
     conjugate,
     cross,
     from_matrix,
-    from_rotation_vector,
     product,
     rotation_matrix,
 )
 from ...checks.errors import ModelError, StateError, check_finite, concrete, nearest_names, shape_of
 from ...checks.shapes import Numbers
-from ...mechanics.joint import CATALOGUE, Joint
-from ...mechanics.joint_states import COORDINATES, coordinate_count, relative
+from ...mechanics.joint import Joint
+from ...mechanics.joint_states import coordinate_count, coordinates_of, relative, relative_pose
 from ...mechanics.motions.base import RelativePose
 from ...mechanics.state import State
 from ...mechanics.system import System, check_state
 from ..formulations.augmented import Augmented
 from ..tree.topology import Link, SpanningTree, spanning_tree
-from .initial import assemble, velocities
+from .following import followed
+from .initial import assemble, rank, velocities
+from .joint_drivers import with_drivers
 
 Given = Mapping[str, Numbers]
 
@@ -46,9 +46,10 @@ def state_from_joints(
     """State on the constraints with the given joint coordinates and rates.
 
     Joints that are not named, and floating bases, keep their values of `start`. In a mechanism with
-    loops, the resulting posture is the guess from which the loops are assembled, and undetermined
-    velocities are the nearest to those of the tree in the mass metric. The state is differentiable
-    with respect to all numbers.
+    loops, this posture of the tree is not closed yet: the result is nearest to it in the mass metric, on the
+    branch that is continuous with `start` as the coordinates move there from their values (angles
+    the shorter way round). Undetermined velocities are the nearest to those of the tree. The state is
+    differentiable with respect to all numbers.
 
     Args:
         coordinates: values by joint, see `stmuav_jax.mechanics.joint_states`: an angle [rad] or a
@@ -62,8 +63,8 @@ def state_from_joints(
     Raises:
         ModelError: a joint is unknown, a driver or without coordinates; or the values have a wrong
             number or are not finite.
-        StateError: no state of the mechanism has all coordinates or rates together; raised only
-            for concrete values, not inside `jit`.
+        StateError: no state of the mechanism has all coordinates or rates together, or none on the way
+            there from the start, but one beyond; raised only for concrete values, not inside `jit`.
     """
     start = system.reference if start is None else start
     check_state(system, start)
@@ -73,7 +74,9 @@ def state_from_joints(
     state = _placed(system, tree, q, u, start)
     if not tree.cut:
         return state
-    return _closed(system, state, q, u, jnp.asarray(t, state.r.dtype))
+    time = jnp.asarray(t, state.r.dtype)
+    near, on_the_way = followed(system, start, q, time) if q else (state, None)
+    return _closed(system, state, near, on_the_way, q, u, time)
 
 
 def _checked(system: System, given: Given, what: str) -> dict[str, Float[Array, " c"]]:
@@ -88,7 +91,7 @@ def _checked(system: System, given: Given, what: str) -> dict[str, Float[Array, 
             raise ModelError(
                 f"Joint '{name}' is a driver, whose {what} is prescribed as a function of time."
             )
-        words = ", ".join(f"{word} [{unit}]" for word, unit in COORDINATES[joint.kind])
+        words = ", ".join(f"{word} [{unit}]" for word, unit in coordinates_of(joint.kind))
         shape = shape_of(value)
         if shape != (count,) and not (count == 1 and shape == ()):
             raise ModelError(
@@ -169,9 +172,9 @@ def _placed(
             continue
         joint = system.joints[link.joint]
         x, x_rate = (jnp.zeros(0), jnp.zeros(0))
-        if joint.kind in COORDINATES:
+        if coordinates_of(joint.kind):
             x, x_rate = relative(kin, joint)
-        step = _relative_pose(joint, q.get(joint.name, x), u.get(joint.name, x_rate))
+        step = relative_pose(joint, q.get(joint.name, x), u.get(joint.name, x_rate))
         body = _behind if link.forward else _in_front
         com = lambda b: system.bodies.com[b] if b < ground else zero
         placed = body(found[link.parent], joint, step, com(link.parent), com(link.child))
@@ -183,30 +186,6 @@ def _placed(
     p = jnp.stack([sign(body.p, start.p[b]) for b, body in enumerate(bodies)])
     own = jnp.stack([rotation_matrix(body.p).T @ body.omega_w for body in bodies])
     return State(jnp.stack([b.r for b in bodies]), p, jnp.stack([b.v for b in bodies]), own)
-
-
-def _relative_pose(joint: Joint, q: Float[Array, " c"], u: Float[Array, " c"]) -> RelativePose:
-    """Pose of frame j in frame i from a joint's coordinates and rates; a weld has no motion."""
-    zero = jnp.zeros(3, q.dtype)
-    found = RelativePose(from_rotation_vector(zero), zero, zero, zero)
-    start = 0
-    for number, freedom in enumerate(CATALOGUE[joint.kind].motion or ()):
-        own = slice(start, start + len(freedom.motion.coordinates))
-        step = freedom.motion.pose(q[own], u[own], freedom.axis, joint.length)
-        found, start = step if number == 0 else _after(found, step), own.stop
-    return found
-
-
-def _after(first: RelativePose, then: RelativePose) -> RelativePose:
-    """Pose of the child frame of two successive motions in the parent frame of the first."""
-    R = rotation_matrix(first.p)
-    d = R @ then.d
-    return RelativePose(
-        product(first.p, then.p),
-        first.d + d,
-        first.w + R @ then.w,
-        first.v + R @ then.v + cross(first.w, d),
-    )
 
 
 def _behind(i: _Placed, joint: Joint, step: RelativePose, com_i: Array, com_j: Array) -> _Placed:
@@ -236,28 +215,21 @@ def _in_front(j: _Placed, joint: Joint, step: RelativePose, com_j: Array, com_i:
 # --- closing the loops
 
 
-class _Line(eqx.Module):
-    """Linear motion of a driver: value + rate (t - t0)."""
-
-    value: Float[Array, ""]
-    rate: Float[Array, ""]
-    t0: Float[Array, ""]
-
-    def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
-        return self.value + self.rate * (t - self.t0)
-
-
 def _closed(
     system: System,
     guess: State,
+    near: State,
+    on_the_way: Bool[Array, ""] | None,
     q: dict[str, Array],
     u: dict[str, Array],
     t: Float[Array, ""],
 ) -> State:
     """State with closed loops and the given joints locked, and velocities with the given rates."""
     zero = {name: jnp.zeros_like(value) for name, value in q.items()}
-    locked = _driven(system, q, zero, t)
-    found = assemble(locked, guess, t, throw=False)
+    locked = with_drivers(system, q, zero, t)
+    if on_the_way is not None:
+        near = jax.tree.map(lambda a, b: jnp.where(on_the_way, a, b), near, guess)
+    found = assemble(locked, guess, t, near=near, throw=False)
     if concrete(found) and not bool(found.converged):
         open_by = np.asarray(found.residuals)
         k = int(np.argmax(np.where(np.isfinite(open_by), open_by, np.inf)))
@@ -266,10 +238,12 @@ def _closed(
             f"start: joint '{locked.joints[k].name}' stays off by {open_by[k]:.3g}. Name fewer "
             "coordinates, choose values that fit together, or give a start nearer to the posture."
         )
+    if on_the_way is not None and concrete(found, on_the_way) and not bool(on_the_way):
+        _check_branch(system, locked, found.state, q, float(t))
     there = State(found.state.r, found.state.p, guess.v, guess.omega)
     kin = system.kinematics(there)
     now = {name: relative(kin, system.joints[system.joint_index(name)])[0] for name in u}
-    state, off = _moving(_driven(system, now, u, t), there, t)
+    state, off = _moving(with_drivers(system, now, u, t), there, t)
     if concrete(off) and not bool(off <= _RATE_TOLERANCE):
         raise StateError(
             f"No velocities of the mechanism have the joint rates {_listed(u)} in this "
@@ -277,6 +251,23 @@ def _closed(
             "rates, or values that fit together."
         )
     return state
+
+
+def _check_branch(
+    system: System, locked: System, state: State, q: dict[str, Array], t: float
+) -> None:
+    """Raise `StateError` where the loops closed at the end, but not on the way from the start.
+
+    More coordinates than there are freedoms fit together along curves only, not on a straight way;
+    they say the branch themselves.
+    """
+    held, before = rank(locked, state, t), rank(system, state, t)
+    if held.rank - before.rank == held.rows - before.rows:
+        raise StateError(
+            f"The loops do not stay closed on the way from the start to {_listed(q)}, so that it is not "
+            "known which of the postures with these values is meant. Give a start on its branch, "
+            "from which the values can be reached with closed loops."
+        )
 
 
 @eqx.filter_jit
@@ -287,64 +278,6 @@ def _moving(system: System, state: State, t: Float[Array, ""]) -> tuple[State, F
     eq = model.constraints.equations(t, system.kinematics(found))
     now = jnp.concatenate([found.v, found.omega], axis=1).reshape(-1)
     return found, jnp.max(jnp.abs(eq.matrix @ now - eq.target), initial=0.0)
-
-
-def _driven(
-    system: System, q: dict[str, Array], u: dict[str, Array], t: Float[Array, ""]
-) -> System:
-    """System with drivers for every coordinate of the given joints."""
-    drivers: list[Joint] = []
-    for name, value in q.items():
-        joint = system.joints[system.joint_index(name)]
-        for word, kind, frames, x, x_rate in _drivers(joint, value, u[name]):
-            (i, frame_i), (j, frame_j) = frames
-            sides = {"i": (joint.body_i, joint.point_i), "j": (joint.body_j, joint.point_j)}
-            drivers.append(
-                dataclasses.replace(
-                    joint,
-                    name=f"{name}, given {word}",
-                    kind=f"drive_{kind}",
-                    body_i=sides[i][0],
-                    body_j=sides[j][0],
-                    point_i=sides[i][1],
-                    point_j=sides[j][1],
-                    frame_i=frame_i,
-                    frame_j=frame_j,
-                    motion=_Line(x, x_rate, t),
-                )
-            )
-    return eqx.tree_at(lambda s: s.joints, system, (*system.joints, *drivers))
-
-
-def _drivers(joint: Joint, q: Array, u: Array) -> list[Any]:
-    """Drivers of a joint's coordinates: name, kind, two frames with their sides, value and rate.
-
-    The row of an angle measures it from the x axis of the first frame to that of the second,
-    positive towards the first frame's y axis.
-    """
-    F_i, F_j = joint.frame_i, joint.frame_j
-    words = [word for word, _ in COORDINATES[joint.kind]]
-    same = (("i", F_i), ("j", F_j))
-    if joint.kind == "universal":
-        about_i = (("i", F_i[:, [1, 2, 0]]), ("j", F_j[:, [1, 2, 0]]))
-        back = jnp.stack([F_j[:, 0], F_j[:, 2], -F_j[:, 1]], axis=1)
-        about_j = (("j", back), ("i", F_i))
-        return [
-            (words[0], "angle", about_i, q[0], u[0]),
-            (words[1], "angle", about_j, q[1], u[1]),
-        ]
-    if joint.kind == "spherical":
-        # frame i turned to the given orientation: there the rates are those of three angles
-        turn = rotation_matrix(from_rotation_vector(q))
-        at, w = F_i @ turn, turn.T @ u
-        zero = jnp.zeros_like(q[0])
-        order = {axis: [(axis + 1) % 3, (axis + 2) % 3, axis] for axis in range(3)}
-        return [
-            (words[a], "angle", (("i", at[:, order[a]]), ("j", F_j[:, order[a]])), zero, w[a])
-            for a in range(3)
-        ]
-    kinds = [word.removeprefix("drive_") for word in words]
-    return [(w, k, same, x, x_rate) for w, k, x, x_rate in zip(words, kinds, q, u, strict=True)]
 
 
 def _listed(given: Mapping[str, Array]) -> str:

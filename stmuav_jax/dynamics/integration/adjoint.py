@@ -249,7 +249,8 @@ def _backward(
     kept: int,
 ) -> _Start:
     del memory
-    arrays, rest = eqx.partition(start.model, eqx.is_inexact_array)
+    # of all numbers of the model only those that depend on what is differentiated by
+    arrays, rest = eqx.partition(start.model, perturbed.model)
     field = lambda t, y, args: problem.field(t, y, eqx.combine(args, rest))
     end = windows.last.end
     last = jnp.zeros_like(end) if wanted.y is None else wanted.y
@@ -259,7 +260,9 @@ def _backward(
     def back_window(at: tuple[Any, ...]) -> tuple[Any, ...]:
         number, by_end, by_model = at
         final = number == windows.number - 1
-        steps = jax.lax.cond(final, lambda: windows.last, lambda: _again(whole, windows, number))
+        steps = windows.last
+        if len(windows.starts) > 1:
+            steps = jax.lax.cond(final, lambda: steps, lambda: _again(whole, windows, number))
 
         def back(at: tuple[Any, ...]) -> tuple[Any, ...]:
             i, by_end, by_model = at
@@ -297,7 +300,12 @@ def _step_back(
     h = t1 - t
     by_model = jax.tree.map(jnp.zeros_like, arrays)
     # choices made at the start of the step have no derivative and are no parameters of the model
-    rest = eqx.partition(problem.at_step(t, y, eqx.combine(arrays, rest)), eqx.is_inexact_array)[1]
+    numbers, others = eqx.partition(
+        problem.at_step(t, y, eqx.combine(arrays, rest)), eqx.is_inexact_array
+    )
+    is_none = lambda x: x is None
+    fixed = jax.tree.map(lambda x, a: a if x is None else None, arrays, numbers, is_leaf=is_none)
+    rest = eqx.combine(fixed, others)
     if solver.project is not None:
         y1 = y + h * jnp.sum(b[:, None] * slopes, axis=0)
         project = lambda y, args: solver.project(t1, y, eqx.combine(args, rest))[0]  # pyright: ignore

@@ -4,7 +4,7 @@ The stages of a method with an explicit first stage and the same diagonal entry 
 
     k_i = f(t + c_i h, y + h sum_j a_ij k_j + h g k_i),
 
-are solved by simplified Newton iterations with one factorisation of I - h g df/dy a step. The Jacobian,
+are solved by simplified Newton iterations with one inverse of I - h g df/dy a step. The Jacobian,
 by differences, stays the same until convergence slows down; it changes the number of iterations, not
 the solution. One loop over all iterations of all stages holds the only copy of the right-hand side.
 With the rate of convergence theta = |d_m| / |d_(m-1)| an iteration ends where theta / (1 - theta) |d_m|
@@ -27,8 +27,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ...algebra.derivative import directional
-from ...algebra.linalg import lu
-from .explicit import RecordedStep
+from ...algebra.linalg import inverted
+from ...algebra.native import native_loops
+from .explicit import AbstractNonDense
 
 Vector = Float[Array, " k"]
 
@@ -79,7 +80,7 @@ def stages(method: diffrax.AbstractESDIRK) -> _Stages:
     return _Stages(A, predictor, c, np.asarray(table.b_sol), np.asarray(table.b_error))
 
 
-class NonDenseESDIRK(diffrax.AbstractAdaptiveSolver):
+class NonDenseESDIRK(AbstractNonDense):
     """Method of diffrax with an explicit first stage and equal diagonal entries, as in the module.
 
     The interpolation within steps is linear, so steps must end at the output times.
@@ -95,25 +96,8 @@ class NonDenseESDIRK(diffrax.AbstractAdaptiveSolver):
     atol: Any
     n_state: int = eqx.field(static=True)
 
-    @property
-    def term_structure(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return diffrax.AbstractTerm
-
-    @property
-    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return RecordedStep
-
-    def order(self, terms: Any) -> int | None:
-        return self.method.order(terms)
-
-    def error_order(self, terms: Any) -> Any:
-        return self.method.error_order(terms)
-
     def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> Memory:
         return Memory(jnp.zeros((*y0.shape, *y0.shape), y0.dtype), jnp.asarray(True))
-
-    def func(self, terms: Any, t0: Any, y0: Vector, args: Any) -> Any:
-        return terms.vf(t0, y0, args)
 
     def step(
         self,
@@ -156,8 +140,8 @@ def _solved(
 
     def attempt(now: tuple[Any, Memory, Any]) -> tuple[Any, Memory, Any]:
         _, (J, due), _ = now
-        J = jax.lax.cond(due, lambda: _differences(field, t, y), lambda: J)
-        factor = lu(jnp.eye(y.shape[0], dtype=y.dtype) - h * gamma * J)
+        J = jax.lax.cond(due, lambda: _differences(field, t, y, solver.n_state), lambda: J)
+        factor = inverted(jnp.eye(y.shape[0], dtype=y.dtype) - h * gamma * J)
         found = _iterate(solver, field, start, factor, tolerances)
         # what fails with the Jacobian of an earlier step is tried again with that of this one
         return found, Memory(J, ~found.fine), due | found.fine
@@ -171,11 +155,15 @@ def _solved(
     return found.slopes, found.fine, Memory(memory.jacobian, due)
 
 
-def _differences(field: Any, t: Any, y: Vector) -> Float[Array, "k k"]:
-    """Jacobian df/dy by differences."""
-    base, away = field(t, y), jnp.sqrt(jnp.finfo(y.dtype).eps) * (1 + jnp.abs(y))
-    there = jax.vmap(lambda move: field(t, y + move))(jnp.diag(away))
-    return ((there - base) / away[:, None]).T
+def _differences(field: Any, t: Any, y: Vector, n: int) -> Float[Array, "k k"]:
+    """Jacobian df/dy by differences, where f depends on the first n entries of y only."""
+    away = jnp.sqrt(jnp.finfo(y.dtype).eps) * (1 + jnp.abs(y))
+    # a single copy of the field to compile, for all columns and for y itself
+    moves = jnp.concatenate([jnp.zeros((1, y.shape[0]), y.dtype), jnp.diag(away)[:n]])
+    slope = lambda move: field(t, y + move)
+    there = jax.lax.map(slope, moves) if native_loops() else jax.vmap(slope)(moves)
+    columns = ((there[1:] - there[0]) / away[:n, None]).T
+    return jnp.pad(columns, ((0, 0), (0, y.shape[0] - n)))
 
 
 def _iterate(
@@ -235,7 +223,7 @@ def _solved_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
         push = lambda v: jax.jvp(lambda y: terms.vf(t + weight * h, y, args), (y,), (v,))[1]
         one = jnp.eye(y.shape[0], dtype=y.dtype)
         matrix = one - h * implicit * jax.vmap(push, out_axes=1)(one)
-        found = lu(matrix).solve(change)
+        found = inverted(matrix).solve(change)
         return jax.lax.dynamic_update_index_in_dim(moved, found, number, 0), None
 
     rows = (table.A, table.c, np.arange(len(table.c)), np.diag(table.A))

@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,18 +39,16 @@ class RungeKutta4(diffrax.AbstractERK):
         return 4
 
 
-class NonDenseRungeKutta(diffrax.AbstractAdaptiveSolver):
-    """Explicit Runge-Kutta method of diffrax without its dense output.
+class AbstractNonDense(diffrax.AbstractAdaptiveSolver):
+    """Base of methods that take a method's coefficients from diffrax, without its dense output.
 
-    The tableau and, up to round-off, the steps are those of the method: one loop over the
-    stages, their slopes in one array, without the stages that only serve interpolation. The
-    interpolation within steps is linear, so steps must end at the output times.
+    The interpolation within steps is linear, so steps must end at the output times.
 
-    Args:
-        method: explicit Runge-Kutta method of diffrax, such as `diffrax.Dopri8()`.
+    Attributes:
+        method: Runge-Kutta method of diffrax, which has the orders.
     """
 
-    method: diffrax.AbstractERK
+    method: eqx.AbstractVar[Any]
 
     @property
     def term_structure(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -68,11 +67,25 @@ class NonDenseRungeKutta(diffrax.AbstractAdaptiveSolver):
     def error_order(self, terms: Any) -> Any:
         return self.method.error_order(terms)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> None:
-        return None
-
     def func(self, terms: Any, t0: Any, y0: Vector, args: Any) -> Any:
         return terms.vf(t0, y0, args)
+
+
+class NonDenseRungeKutta(AbstractNonDense):
+    """Explicit Runge-Kutta method of diffrax without its dense output.
+
+    The tableau and, up to round-off, the steps are those of the method: one loop over the
+    stages, their slopes in one array, without the stages that only serve interpolation. The
+    interpolation within steps is linear, so steps must end at the output times.
+
+    Args:
+        method: explicit Runge-Kutta method of diffrax, such as `diffrax.Dopri8()`.
+    """
+
+    method: diffrax.AbstractERK
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> None:
+        return None
 
     def step(
         self,

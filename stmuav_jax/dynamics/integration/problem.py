@@ -23,6 +23,7 @@ from ..formulations.stabilisation import AbstractStabilisation
 from .closed_over import opened
 from .esdirk import NonDenseESDIRK
 from .explicit import NonDenseRungeKutta
+from .rosenbrock import Rodas5P
 from .step_bound import Guard, guard
 from .stepping import (
     ProjectedSolver,
@@ -201,6 +202,8 @@ class Problem(eqx.Module):
             size = n + self.n_internal
             own: Any = inner
             inner = NonDenseESDIRK(own, self.method.rtol, self.method.atol, size)
+        if isinstance(inner, Rodas5P):
+            inner = Rodas5P(n + self.n_internal)
         inner = stage_loop(inner, self.method.adjoint)
         held = project if iterations else None
         far = ProjectionLimit(self.method.rtol, self.method.atol, n) if held is not None else None

@@ -11,6 +11,7 @@ velocity in these axes. Trim, linearisation, shooting and filters use mechanisms
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ...algebra.derivative import value_and_jacobian
 from ...algebra.space import AbstractSpace, Point
 from ...checks.errors import StateError, concrete, named_places
 from ...mechanics.state import State
@@ -87,6 +89,30 @@ def error_rates(
     return _departure(space, x, v, space.rates(x, t, still), t, system)
 
 
+def error_rate_columns(
+    space: AbstractStateSpace,
+    x: Point,
+    t: Time,
+    system: Callable[[Float[Array, " m"]], System],
+    count: int,
+) -> Float[Array, "size k"]:
+    """Derivatives of `error_rates` at v = 0 by v and by m more numbers z at zero, k = size + m.
+
+    Both motions have the same rates there, which are therefore evaluated once.
+
+    Args:
+        system: system with the forces of the first motion, of z; `system(0)` is that of the other.
+        count: number of z.
+    """
+    size = space.size
+    origin = jnp.zeros(size + count)
+    rates = lambda z: space.rates(space.retract(x, z[:size]), t, system(z[size:]))
+    rate, columns = value_and_jacobian(rates, origin)
+    apart = lambda z, rate_y: _apart(space, x, z[:size], rate_y, rate)
+    push = lambda e, column: jax.jvp(apart, (origin, rate), (e, column))[1]
+    return jax.vmap(push, in_axes=(0, -1), out_axes=-1)(jnp.eye(size + count), columns)
+
+
 def motion_rates(
     space: AbstractStateSpace,
     x: Point,
@@ -111,8 +137,18 @@ def _departure(
     system: System | None,
 ) -> Float[Array, " size"]:
     """Rate dv/dt of the error v relative to a reference point x that moves at rate_x."""
+    return _apart(space, x, v, space.rates(space.retract(x, v), t, system), rate_x)
+
+
+def _apart(
+    space: AbstractStateSpace,
+    x: Point,
+    v: Float[Array, " size"],
+    rate_y: Float[Array, " size"],
+    rate_x: Float[Array, " size"],
+) -> Float[Array, " size"]:
+    """Rate dv/dt of the error v between points that move at rate_y and rate_x."""
     y = space.retract(x, v)
-    rate_y = space.rates(y, t, system)
 
     def apart(s: Float[Array, ""]) -> Float[Array, " size"]:
         return space.difference(space.retract(y, s * rate_y), space.retract(x, s * rate_x))

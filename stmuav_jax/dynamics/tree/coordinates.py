@@ -19,9 +19,10 @@ from ...algebra.rotation import (
     rotation_matrix,
 )
 from ...algebra.stacked import apply, apply_transposed, dot, multiply
-from ...mechanics.motions.base import CYCLIC, RelativeFrames
+from ...mechanics.motions.base import RelativeFrames
+from ...mechanics.motions.sequence import references
 from ...mechanics.state import State
-from .frames import columns, levels, motion_groups, pick
+from .frames import columns, levels, motion_groups, padded, pick
 from .parameters import TreeParameters, shares
 from .poses import Pose, by_group
 from .topology import SpanningTree
@@ -165,21 +166,27 @@ def _ends(parameters: TreeParameters, state: State) -> _Ends:
 
 
 def _references(tree: SpanningTree) -> tuple[np.ndarray, np.ndarray]:
-    """Reference directions (3, f) of all steps, which later steps of the joint leave alone.
+    """Reference directions (3, f) of all steps, see `references`."""
+    behind, zero = np.zeros((2, 3, len(tree.steps)))
+    for own in {steps[-1]: steps for steps in _in_joint(tree, whole=True)}.values():
+        steps = [tree.steps[f] for f in own]
+        joint = steps[0].joint
+        what = "A free body" if joint is None else f"Joint '{tree.joints[joint]}'"
+        found = references([(step.motion, step.axis) for step in steps], what)
+        behind[:, own], zero[:, own] = found
+    return behind, zero
 
-    They are in the axes of the joint's last frame, and at zero of the step in its own frame.
-    """
-    behind = np.tile([[1.0], [0.0], [0.0]], (1, len(tree.steps)))
-    own = behind.copy()
-    for step in tree.steps:
-        turning = [c.axis for c in step.motion.columns if c.angular]
-        if not step.first and turning == [2]:
-            # a reference for the preceding step: the axis of this step, which this step leaves
-            # alone, in the axes of the preceding frame
-            behind[:, step.parent - 1] = [0.0, 0.0, 1.0]
-            assert step.before is not None
-            own[:, step.parent - 1] = np.eye(3)[list(CYCLIC[step.before])] @ np.eye(3)[step.axis]
-    return behind, own
+
+def _in_joint(tree: SpanningTree, *, whole: bool = False) -> list[list[int]]:
+    """Steps of the joint of every step, up to the step itself or all of them."""
+    by_body: dict[int, list[int]] = {}
+    up_to = []
+    # the steps of a joint are sorted by their level
+    for f, step in enumerate(tree.steps):
+        own = by_body.setdefault(step.body, [])
+        own.append(f)
+        up_to.append(own if whole else list(own))
+    return up_to
 
 
 def _positions(
@@ -235,6 +242,7 @@ def _relative_parameters(
 ) -> Callable[[np.ndarray], Float[Array, "4 k"]]:
     """Function of steps that gives their motions' Euler parameters, with the bodies' signs."""
     front, behind = _neighbours(parameters.tree)
+    up_to, whole = _in_joint(parameters.tree), _in_joint(parameters.tree, whole=True)
 
     @functools.cache
     def of_bodies() -> Float[Array, "4 N"]:
@@ -243,11 +251,25 @@ def _relative_parameters(
         return product(jnp.concatenate([state.p, unit]).T, conjugate(parameters.B_p))
 
     def between(steps: np.ndarray) -> Float[Array, "4 k"]:
-        before = pick(of_bodies(), front[steps], 1)
-        before = product(before, pick(parameters.K_p, steps, 1))
-        return product(conjugate(before), pick(of_bodies(), behind[steps], 1))
+        # other motions of the joint do not turn, but their frames may have other axes
+        now, then = [up_to[f] for f in steps], [whole[f][: len(up_to[f]) - 1 : -1] for f in steps]
+        before, after = (pick(of_bodies(), ends[steps], 1) for ends in (front, behind))
+        before = _product_of(before, parameters.K_p, now)
+        return product(conjugate(before), _product_of(after, conjugate(parameters.K_p), then))
 
     return between
+
+
+def _product_of(
+    first: Float[Array, "4 k"], table: Float[Array, "4 f"], lists: list[list[int]]
+) -> Float[Array, "4 k"]:
+    """Products of quaternions with the listed ones of a table, in sequence."""
+    unit = jnp.zeros_like(table[:, :1]).at[0].set(1.0)
+    count = table.shape[1]
+    for own in padded(lists, count).T:
+        rows = table if np.all(own < count) else jnp.concatenate([table, unit], axis=1)
+        first = product(first, pick(rows, own, 1))
+    return first
 
 
 def _velocities(parameters: TreeParameters, pose: Pose, ends: _Ends) -> Array:

@@ -17,7 +17,8 @@ from typing import NamedTuple
 
 from ...checks.errors import ModelError, nearest_names
 from ...mechanics.body import GROUND
-from ...mechanics.joint import CATALOGUE, Freedom
+from ...mechanics.joint import CATALOGUE
+from ...mechanics.joint_kind import Freedom
 from ...mechanics.motions.base import AbstractRelativeMotion
 from ...mechanics.motions.spherical import SPHERICAL
 from ...mechanics.motions.translation import TRANSLATION

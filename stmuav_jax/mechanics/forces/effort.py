@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...checks.shapes import Numbers
-from ..joint import Motion, Which
+from ..joint import Motion
+from ..joint_kind import Which
 from .joint import AbstractJointForce, time_signal, which_coordinate
 
 

@@ -18,8 +18,9 @@ from jaxtyping import Array, Float
 from ...checks.errors import ModelError, concrete
 from ...checks.numbers import nonnegative, positive, scalar
 from ...checks.shapes import Numbers
-from ..joint import Motion, Which
+from ..joint import Motion
 from ..joint_coordinate import JointCoordinate, choose, coordinate
+from ..joint_kind import Which
 from ..load import AbstractForce, ActsOn, Load
 from ..state import Kinematics
 

@@ -15,7 +15,14 @@ from ...algebra.rotation import (
     to_rotation_vector,
 )
 from ...algebra.stacked import multiply
-from .base import AbstractRelativeMotion, ColumnParts, MotionColumn, RelativeFrames, RelativePose
+from .base import (
+    CYCLIC,
+    AbstractRelativeMotion,
+    ColumnParts,
+    MotionColumn,
+    RelativeFrames,
+    RelativePose,
+)
 
 
 @dataclass(frozen=True)
@@ -61,7 +68,9 @@ class Spherical(AbstractRelativeMotion):
         self, seen: RelativeFrames, shares: ColumnParts
     ) -> tuple[Float[Array, "4 k"], Float[Array, "3 3 k"], Float[Array, "3 k"]]:
         del shares
-        return seen.parameters(), seen.rotation, jnp.zeros_like(seen.offset)
+        q = seen.parameters()
+        # frames behind may have other axes than this motion's
+        return q, rotation_matrix(q), jnp.zeros_like(seen.offset)
 
     def rates(self, q: Float[Array, "4 k *s"], u: Float[Array, "3 k *s"]) -> Float[Array, "4 k *s"]:
         return euler_parameter_rate(q, u)
@@ -79,9 +88,10 @@ class Spherical(AbstractRelativeMotion):
     def pose(
         self, x: Float[Array, " c"], x_rate: Float[Array, " c"], axis: int, pitch: Float[Array, ""]
     ) -> RelativePose:
-        del axis, pitch
+        del pitch
+        own = jnp.eye(3, dtype=x.dtype)[:, CYCLIC[axis]]
         zero = jnp.zeros_like(x)
-        return RelativePose(from_rotation_vector(x), zero, x_rate, zero)
+        return RelativePose(from_rotation_vector(own @ x), zero, own @ x_rate, zero)
 
 
 SPHERICAL = Spherical()

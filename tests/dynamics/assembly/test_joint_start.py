@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.assembly.joint_start import _driven, _tree_through
+from stmuav_jax.dynamics.assembly.joint_drivers import with_drivers
+from stmuav_jax.dynamics.assembly.joint_start import _tree_through
 
 X, Y, Z = np.eye(3)
 
@@ -63,7 +64,7 @@ def test_the_rows_that_hold_coordinates_of_closed_loops_say_the_same(chain):
     state = stm.state_from_joints(chain, Q, U)
     given = {name: jnp.atleast_1d(jnp.asarray(x)) for name, x in Q.items()}
     rates = {name: jnp.atleast_1d(jnp.asarray(x)) for name, x in U.items()}
-    assert max(misfit(_driven(chain, given, rates, jnp.zeros(())), state)) < 1e-14
+    assert max(misfit(with_drivers(chain, given, rates, jnp.zeros(())), state)) < 1e-14
 
 
 @pytest.mark.slow
@@ -93,21 +94,21 @@ def test_what_is_not_named_stays_as_at_the_start(chain):
 # --- a four-bar linkage: a parallelogram, whose angles are known
 
 
-def four_bar():
-    """Crank and rocker of 1 m, upright at reference, coupler of 2 m; angles about y."""
-    bar = lambda name, at: stm.Body(name, 1.0, [0.1, 0.1, 0.01], position=at)
+PIN_D = np.array([2.0, 0, 0])
+
+
+def four_bar(b=(0.0, 0, 1), c=(2.0, 0, 1)):
+    """Four-bar of given pins B and C, by default a parallelogram upright at reference; angles about y."""
+    b, c = np.array(b), np.array(c)
+    bar = lambda name, one, two: stm.Body(name, 1.0, [0.1, 0.1, 0.01], position=(one + two) / 2)
     joints = [
-        stm.revolute("A", "ground", "crank", point=[0.0, 0, 0], axis=Y),
-        stm.revolute("B", "crank", "coupler", point=[0.0, 0, 1], axis=Y),
-        stm.revolute("C", "coupler", "rocker", point=[2.0, 0, 1], axis=Y),
+        stm.revolute("A", "ground", "crank", point=np.zeros(3), axis=Y),
+        stm.revolute("B", "crank", "coupler", point=b, axis=Y),
+        stm.revolute("C", "coupler", "rocker", point=c, axis=Y),
         # a ball, so that no row of the plane loop is dependent
-        stm.spherical("D", "ground", "rocker", point=[2.0, 0, 0]),
+        stm.spherical("D", "ground", "rocker", point=PIN_D),
     ]
-    bodies = [
-        bar("crank", [0.0, 0, 0.5]),
-        bar("coupler", [1.0, 0, 1]),
-        bar("rocker", [2.0, 0, 0.5]),
-    ]
+    bodies = [bar("crank", np.zeros(3), b), bar("coupler", b, c), bar("rocker", PIN_D, c)]
     return stm.System(bodies, joints)
 
 
@@ -135,6 +136,39 @@ def test_contradictions_are_refused_in_words(linkage):
         stm.state_from_joints(linkage, {"A": 0.5, "B": 0.2})
     with pytest.raises(stm.StateError, match=r"have the joint rates A = 1, B = 1 in this posture"):
         stm.state_from_joints(linkage, {"A": 0.5}, {"A": 1.0, "B": 1.0})
+
+
+def crank_rocker_pins(turn):
+    """Pins B and C of a crank-rocker (0.75, 2.25, 1.75, base 2 m), C above the line from B to D."""
+    b = 0.75 * np.array([np.sin(turn), 0, np.cos(turn)])
+    apart = PIN_D - b
+    length = np.linalg.norm(apart)
+    along = (2.25**2 - 1.75**2 + length**2) / (2 * length)
+    up = np.array([-apart[2], 0, apart[0]]) / length
+    return b, b + along * apart / length + np.sqrt(2.25**2 - along**2) * up
+
+
+@pytest.mark.slow
+def test_a_closed_loop_keeps_its_branch():
+    """A crank-rocker, one branch of which is out of reach of the other, against its geometry."""
+    bars = four_bar(*crank_rocker_pins(0.0))
+    for turn in (-2.5, -1.2, 0.6, 1.8, 3.0):
+        state = stm.state_from_joints(bars, {"A": turn})
+        middles = [(PIN_D + crank_rocker_pins(turn)[1]) / 2, crank_rocker_pins(turn)[0] / 2]
+        np.testing.assert_allclose(state.r[np.array([2, 0])], middles, atol=1e-9)
+        # from there on, the shorter way round
+        back = stm.state_from_joints(bars, {"A": turn + 4.0}, start=state)
+        pins = crank_rocker_pins(turn + 4.0)
+        np.testing.assert_allclose(back.r[2], (PIN_D + pins[1]) / 2, atol=1e-9)
+    # coordinates that say more than the freedoms are no way, but a place
+    turned = lambda name: stm.mechanics.joint_motion(bars, state, name).angle
+    both = stm.state_from_joints(bars, {"A": turned("A"), "B": turned("B")})
+    np.testing.assert_allclose(both.r, state.r, atol=1e-9)
+    # on the other branch alone, behind postures where coupler and rocker are in line
+    with pytest.raises(
+        stm.StateError, match="do not stay closed on the way from the start to C = 2"
+    ):
+        stm.state_from_joints(bars, {"C": 2.0})
 
 
 @pytest.mark.slow

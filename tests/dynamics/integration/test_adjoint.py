@@ -52,6 +52,20 @@ def test_three_routes():
     np.testing.assert_allclose(gradient, expected, rtol=1e-7)
 
 
+@pytest.mark.slow
+def test_three_routes_through_an_implicit_solver():
+    """Its stages are solved to its tolerance, which both modes feel apart."""
+    tight = replace(KEEPING, solver=stm.dynamics.kvaerno5())
+    ahead = replace(tight, adjoint=diffrax.ForwardMode())
+    reverse = jax.jit(jax.grad(lambda x: swing(x, tight, Q[4:])))(Q[:4])
+    run = jax.jit(jax.vmap(lambda x, d: jax.jvp(lambda q: swing(q, ahead, Q[4:]), (x,), (d,))))
+    at = lambda k: run(Q[:4] + k * 1e-3 * jnp.eye(4), jnp.eye(4))
+    np.testing.assert_allclose(reverse, at(0)[1], rtol=1e-8)
+    values = {k: np.asarray(at(k)[0]) for k in (-2, -1, 1, 2)}
+    expected = (8 * (values[1] - values[-1]) - (values[2] - values[-2])) / 12e-3
+    np.testing.assert_allclose(reverse, expected, rtol=1e-5)
+
+
 def test_many_at_once():
     """Flights of different lengths: vmap of grad is a loop of grads."""
     several = Q + jnp.linspace(0.0, 0.4, 3)[:, None]

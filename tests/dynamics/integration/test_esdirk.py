@@ -12,6 +12,7 @@ from jax.test_util import check_grads
 
 import stmuav_jax as stm
 from stmuav_jax.algebra import linalg, loops
+from stmuav_jax.dynamics.integration import esdirk
 from stmuav_jax.dynamics.integration.esdirk import NonDenseESDIRK
 from stmuav_jax.dynamics.integration.stepping import own_iterations
 
@@ -53,6 +54,18 @@ def final(solution: diffrax.Solution) -> np.ndarray:
     """State at the end."""
     assert solution.ys is not None
     return np.asarray(solution.ys[-1])
+
+
+@pytest.mark.parametrize("native", [False, True])
+def test_differences_give_the_jacobian(native, monkeypatch):
+    """Columns side by side, or one by one in a native loop; integrals beside the state have none."""
+    monkeypatch.setattr(esdirk, "native_loops", lambda: native)
+    wider = lambda t, y: jnp.append(field(t, y, 2.0), y[0] ** 2)
+    y = jnp.array([0.7, -0.4, 3.0])
+    found = esdirk._differences(wider, 0.2, y, 2)
+    exact = jax.jacfwd(lambda y: wider(0.2, y))(y)
+    # the step of a difference is the root of the round-off
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-7)
 
 
 def test_observed_order_is_five():
@@ -115,7 +128,7 @@ def test_factorisations_against_scipy(native):
         S = A @ A.T + np.eye(k)
         expected = scipy.linalg.lu_solve(scipy.linalg.lu_factor(A), b)
         np.testing.assert_allclose(
-            linalg.lu(jnp.asarray(A)).solve(jnp.asarray(b)), expected, rtol=1e-10
+            linalg.inverted(jnp.asarray(A)).solve(jnp.asarray(b)), expected, rtol=1e-10
         )
         L = np.asarray(linalg.cholesky(jnp.asarray(S)))
         np.testing.assert_allclose(L, scipy.linalg.cholesky(S, lower=True), atol=1e-13)
@@ -129,7 +142,7 @@ def test_factorisations_against_scipy(native):
 
 def test_singular_matrices_give_no_finite_solution(native):
     ones = jnp.ones((3, 3))
-    assert not np.any(np.isfinite(linalg.lu(ones).solve(jnp.arange(3.0))))
+    assert not np.any(np.isfinite(linalg.inverted(ones).solve(jnp.arange(3.0))))
     assert np.all(np.isnan(linalg.factorise(-ones, redundant=False, rcond=0.0).solve(ones[0])))
 
 
@@ -140,7 +153,7 @@ def test_derivatives_of_the_factorisations(native):
     def solutions(A, b):
         S = linalg.product_transposed(A, A) + jnp.eye(4)
         found = linalg.factorise(S, redundant=False, rcond=0.0).solve(b)
-        return linalg.lu(A).solve(b), found, linalg.cholesky(S)
+        return linalg.inverted(A).solve(b), found, linalg.cholesky(S)
 
     check_grads(jax.jit(solutions), (A, b), order=1, rtol=1e-5, atol=1e-5)
 

@@ -1,5 +1,6 @@
 """Rodas5P, the lean explicit steps, and what tells stiff scenes from others."""
 
+from functools import partial
 from typing import Any
 
 import diffrax
@@ -11,6 +12,7 @@ import pytest
 from helpers import pendulum, relative_error, swung
 
 import stmuav_jax as stm
+from stmuav_jax.dynamics.integration import rosenbrock
 from stmuav_jax.dynamics.integration.explicit import NonDenseRungeKutta, coefficients
 
 
@@ -29,13 +31,13 @@ def stiff(t, y, args):
 START = jnp.array([1.0, 0.5])
 
 
-@jax.jit
-def fixed(count):
+@partial(jax.jit, static_argnums=0)
+def fixed(terms, count, start, args=None):
     """Two seconds in `count` equal steps of Rodas5P."""
     h = 2.0 / count
-    term, solver = diffrax.ODETerm(field), stm.Rodas5P()
-    step = lambda k, y: solver.step(term, k * h, (k + 1) * h, y, None, None, False)[0]
-    return jax.lax.fori_loop(0, count, step, START)
+    term, solver = diffrax.ODETerm(terms), stm.Rodas5P()
+    step = lambda k, y: solver.step(term, k * h, (k + 1) * h, y, args, None, False)[0]
+    return jax.lax.fori_loop(0, count, step, start)
 
 
 def adaptive(solver, terms, y0, t1, tolerance, args=None) -> Any:
@@ -46,11 +48,65 @@ def adaptive(solver, terms, y0, t1, tolerance, args=None) -> Any:
     )  # fmt: skip
 
 
+def slopes(terms, counts, start, exact, args=None):
+    """Observed orders between numbers of steps, each twice the one before, and the last error."""
+    found = [fixed(terms, n, start, args) for n in counts]
+    errors = np.array([np.max(np.abs(np.asarray(y) - exact)) for y in found])
+    return np.log2(errors[:-1] / errors[1:]), errors[-1]
+
+
 def test_observed_order_is_five():
     exact = np.asarray(adaptive(diffrax.Dopri8(), field, START, 2.0, 1e-13).ys[-1])
-    errors = [np.max(np.abs(np.asarray(fixed(n)) - exact)) for n in (16, 32, 64)]
-    slopes = np.log2(np.array(errors[:-1]) / errors[1:])
-    np.testing.assert_allclose(slopes, 5, atol=0.3)
+    np.testing.assert_allclose(slopes(field, (32, 64, 128), START, exact)[0], 5, atol=0.2)
+
+
+def test_order_on_a_stiff_problem_is_three_with_an_error_that_falls_with_stiffness():
+    """The stages are of low order; what they lack is divided by the rate (Prothero and Robinson)."""
+    last = {}
+    for rate in (1e5, 1e6):
+        found, last[rate] = slopes(stiff, (16, 32, 64), jnp.array([1.0]), np.cos(2.0), rate)
+        np.testing.assert_allclose(found, 3, atol=0.2)
+    assert last[1e5] / last[1e6] == pytest.approx(10, rel=0.3)
+
+
+def test_the_coefficients_fulfil_the_conditions_of_order_five():
+    """Hairer and Wanner II, Table IV.7.1, in alpha and beta = alpha + gamma; the error's are of order four."""
+    A, one = rosenbrock._weights(), np.ones(8)
+    gamma = np.linalg.inv(np.eye(8) / rosenbrock._GAMMA - rosenbrock._table(rosenbrock._C))
+    alpha = A @ gamma
+    beta, a = alpha + gamma, alpha @ one
+    B = beta @ one
+    np.testing.assert_allclose(
+        a, [0.0, 3 * gamma[0, 0], *rosenbrock._POINTS[1:], 1, 1, 1], atol=1e-13
+    )
+    up_to_four = [
+        (one, 1), (B, 2), (a**2, 3), (beta @ B, 6), (a**3, 4), (a * (alpha @ B), 8),
+        (beta @ a**2, 12), (beta @ beta @ B, 24),
+    ]  # fmt: skip
+    five = [
+        (a**4, 5), (a**2 * (alpha @ B), 10), ((alpha @ B) ** 2, 20), (a * (alpha @ a**2), 15),
+        (a * (alpha @ beta @ B), 30), (beta @ a**3, 20), (beta @ (a * (alpha @ B)), 40),
+        (beta @ beta @ a**2, 60), (beta @ beta @ beta @ B, 120),
+    ]  # fmt: skip
+    embedded = A[7] @ gamma
+    step = embedded + gamma[7]
+    for weights, count in up_to_four:
+        np.testing.assert_allclose((step @ weights, embedded @ weights), 1 / count, atol=3e-14)
+    for weights, count in five:
+        assert step @ weights == pytest.approx(1 / count, abs=3e-14)
+    assert max(abs(embedded @ weights - 1 / count) for weights, count in five) > 1e-3
+
+
+def test_integrals_beside_the_state_need_no_columns_of_the_jacobian():
+    """Energy and distance of `field`, integrated with it: the same step, with a smaller matrix."""
+
+    def wider(t, y, args):
+        return jnp.concatenate([field(t, y, args), jnp.stack([y[1] ** 2, y[0] * t])])
+
+    start, term = jnp.concatenate([START, jnp.zeros(2)]), diffrax.ODETerm(wider)
+    step = lambda solver: solver.step(term, 0.1, 0.4, start, None, None, False)[:2]
+    for one, two in zip(step(stm.Rodas5P()), step(stm.Rodas5P(size=2)), strict=True):
+        np.testing.assert_allclose(one, two, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("rate", [1e3, 1e8])

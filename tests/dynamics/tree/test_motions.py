@@ -12,7 +12,8 @@ from helpers import inertia_of, random_quaternion, relative_error
 import stmuav_jax as stm
 from stmuav_jax.algebra.stacked import apply, apply_transposed, multiply
 from stmuav_jax.dynamics.formulations.stabilisation import Unstabilised
-from stmuav_jax.mechanics.joint import CATALOGUE, Freedom, JointKind, Term, X, Y, Z
+from stmuav_jax.mechanics.joint import CATALOGUE
+from stmuav_jax.mechanics.joint_kind import Freedom, JointKind, Term, X, Y, Z
 from stmuav_jax.mechanics.motions.axial import PRISMATIC, REVOLUTE, SCREW
 from stmuav_jax.mechanics.motions.base import AbstractRelativeMotion, MotionColumn, RelativePose
 

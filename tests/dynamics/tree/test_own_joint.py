@@ -1,58 +1,88 @@
-"""A joint of a user's own, put together from primitives and motions that there are."""
+"""Joints of a user's own, put together from primitives and motions that there are."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from helpers import inertia_of, random_quaternion
 
 import stmuav_jax as stm
-from stmuav_jax.mechanics.joint import CATALOGUE, Freedom, JointKind, Term, X, Y, Z
+from stmuav_jax.mechanics.joint import CATALOGUE
+from stmuav_jax.mechanics.joint_kind import Freedom, JointKind, Term, X, Y, Z
+from stmuav_jax.mechanics.joint_states import coordinates_of
 from stmuav_jax.mechanics.motions.axial import PRISMATIC, REVOLUTE
+from stmuav_jax.mechanics.motions.sequence import references
+from stmuav_jax.mechanics.motions.spherical import SPHERICAL
 
-PLANAR = JointKind(
-    (Term("n1", X, Z), Term("n1", Y, Z), Term("n2", Z)),
-    (Freedom(PRISMATIC, X, " along x"), Freedom(PRISMATIC, Y, " along y"), Freedom(REVOLUTE)),
-)
+ALONG_X, ALONG_Y = Freedom(PRISMATIC, X, " along x"), Freedom(PRISMATIC, Y, " along y")
+PLANE = (Term("n1", X, Z), Term("n1", Y, Z), Term("n2", Z))
+OWN = {
+    "planar": JointKind(PLANE, (ALONG_X, ALONG_Y, Freedom(REVOLUTE))),
+    "ball_in_slot": JointKind((Term("n2", Y), Term("n2", Z)), (ALONG_X, Freedom(SPHERICAL))),
+}
 
 
-def test_a_planar_joint_is_one_entry_of_the_catalogue(monkeypatch):
-    """Coordinates and rates come back from a state; accelerations are those of all bodies' rows."""
-    monkeypatch.setitem(CATALOGUE, "planar", PLANAR)
-    rng = np.random.default_rng(4)
-    own = lambda name: stm.Body(
-        name,
-        1.5,
-        np.diag([0.1, 0.2, 0.25]),
-        position=rng.normal(size=3),
-        com=0.1 * rng.normal(size=3),
-    )
-    bodies = [own(name) for name in "ab"]
-    like = stm.cylindrical("plane", "a", "b", axis=[0.3, 0.2, 1.0], point=[0.4, 0.2, 0.1])
-    hinge = stm.revolute("hinge", "ground", "a", point=[0.0, 0.0, 0.0], axis=[1.0, 0.2, 0.0])
-    joints = [hinge, dataclasses.replace(like, kind="planar")]
-    system = stm.System(bodies, joints, [stm.Gravity([0.0, 0.0, -9.81])])
-    space = stm.TreeSpace(system)
-    assert [name for name, _ in space.names[1:4]] == [
-        "plane.displacement_1",
-        "plane.displacement_2",
-        "plane.angle",
-    ]
-    x, v = space.from_state(system.reference), jnp.asarray(rng.normal(size=8))
+@pytest.fixture
+def star(monkeypatch):
+    """Bodies on ground by joints of each kind, which lead once from ground and once to it."""
+    rng, bodies, joints = np.random.default_rng(4), [], []
+    for kind, entry in OWN.items():
+        monkeypatch.setitem(CATALOGUE, kind, entry)
+        for ends in (("ground", f"{kind}, i"), (f"{kind}, j", "ground")):
+            name = next(end for end in ends if end != "ground")
+            place, com = rng.normal(size=3), 0.1 * rng.normal(size=3)
+            turn = random_quaternion(rng)
+            bodies.append(
+                stm.Body(name, 1.5, inertia_of(rng), position=place, com=com, orientation=turn)
+            )
+            like = stm.cylindrical(name, *ends, axis=rng.normal(size=3), point=rng.normal(size=3))
+            joints.append(dataclasses.replace(like, kind=kind))
+    return stm.System(bodies, joints, [stm.Gravity([0.0, 0.0, -9.81])])
+
+
+def test_coordinates_come_back_in_both_directions(star):
+    """From joint coordinates to a state and back, by the joints and by the tree's coordinates."""
+    rng = np.random.default_rng(5)
+    count = {joint.name: len(coordinates_of(joint.kind)) for joint in star.joints}
+    x, u = ({name: 0.8 * rng.normal(size=n) for name, n in count.items()} for _ in range(2))
+    state = stm.state_from_joints(star, x, u)
+    for name in count:
+        found = stm.mechanics.joint_motion(star, state, name)
+        np.testing.assert_allclose(found.coordinates, x[name], atol=1e-12)
+        np.testing.assert_allclose(found.rates, u[name], atol=1e-12)
+    tree, rows = stm.Tree(), stm.Augmented()
+    model, other, t = tree.prepare(star), rows.prepare(star), jnp.zeros(())
 
     @jax.jit
-    def routes(x):
-        state = space.to_state(space.retract(x, v))
-        back = space.difference(space.from_state(state), x)
-        formulations: list[Any] = [stm.Tree(), stm.Augmented()]
-        rates = [
-            how.accelerations(how.prepare(system), jnp.zeros(()), state, stm.Unstabilised())
-            for how in formulations
-        ]
-        return back, rates
+    def routes(state):
+        back = tree.to_state(model, tree.to_vector(model, state))
+        one = tree.accelerations(model, t, state, stm.Unstabilised())
+        return back, one, rows.accelerations(other, t, state, stm.Unstabilised())
 
-    back, (tree, augmented) = routes(x)
-    np.testing.assert_allclose(back, v, atol=1e-13)
-    np.testing.assert_allclose(tree.v_rate, augmented.v_rate, atol=1e-12)
-    np.testing.assert_allclose(tree.omega_rate, augmented.omega_rate, atol=1e-12)
+    back, one, two = routes(state)
+    for name in ("r", "p", "v", "omega"):
+        np.testing.assert_allclose(getattr(back, name), getattr(state, name), atol=1e-12)
+    np.testing.assert_allclose(one.v_rate, two.v_rate, atol=1e-11)
+    np.testing.assert_allclose(one.omega_rate, two.omega_rate, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("motions", "words"),
+    [
+        ([(REVOLUTE, X), (REVOLUTE, Y), (REVOLUTE, Z)], "more than two rotations in sequence"),
+        ([(REVOLUTE, X), (SPHERICAL, Z)], "more than two rotations in sequence"),
+        ([(PRISMATIC, X), (REVOLUTE, Y), (PRISMATIC, Z)], "put it behind the rotation"),
+    ],
+)
+def test_sequences_that_cannot_be_read_are_refused(motions, words):
+    with pytest.raises(stm.ModelError, match=f"Joint 'own' has .*{words}"):
+        references(motions, "Joint 'own'")
+
+
+def test_a_joint_that_would_be_held_in_part_is_refused(star):
+    with pytest.raises(
+        stm.ModelError, match=r"'planar, i' cannot be held: no drivers prescribe all"
+    ):
+        stm.assemble(star, star.reference, hold_joints=("planar, i",))

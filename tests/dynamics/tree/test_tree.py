@@ -81,8 +81,6 @@ def swarm():
 
 SYSTEMS = {
     "zoo": zoo,
-    "zoo backwards": lambda: zoo(backwards=True),
-    "floating zoo": lambda: zoo(grounded=False),
     "floating zoo backwards": lambda: zoo(grounded=False, backwards=True),
     "swarm": swarm,
     "uav_tracker": lambda: stm.make_scene("uav_tracker", 2).system,

@@ -1,0 +1,1 @@
+"""Commands on any mechanism: a scene by name, or a file with a model."""

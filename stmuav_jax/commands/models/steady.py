@@ -1,0 +1,222 @@
+"""Commands `stmuav trim SCENE` and `stmuav linearize SCENE`, on any mechanism."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ...checks.errors import SettingError
+from ...figures.terminal import line, row, table
+from ..options import ANGLE, SPEED, Number, default
+from ..output import written
+from ..simulate import chosen_scene, scene_command
+from .point import PointSettings, inputs_named, scalars_by_name, starting_point
+
+if TYPE_CHECKING:
+    from ...dynamics.statespace.tree import TreeSpace
+    from ...flight.equilibrium import Trim
+
+
+@dataclasses.dataclass
+class SteadySettings(PointSettings):
+    """Options of a steady motion of any mechanism."""
+
+    inputs: Annotated[tuple[str, ...], default("all")] = ()
+    """Inputs that may be chosen, such as effort; others stay as they are."""
+    free: Annotated[tuple[str, ...], default("none")] = ()
+    """States that may differ from the start, such as hinge.angle."""
+    accelerations: Annotated[tuple[str, ...], default("zero")] = ()
+    """Wanted rates of velocities, such as rail.displacement_rate=2 [m/s^2, rad/s^2]."""
+    climb: Annotated[float, SPEED] = 0.0
+    """Speed upwards of a floating base [m/s]."""
+    speed: Annotated[float, SPEED] = 0.0
+    """Its level speed [m/s]."""
+    course: Annotated[float, ANGLE] = 0.0
+    """Direction of the level speed, from x towards y [degrees]."""
+    turn: Annotated[float, Number("rate of turn", "degrees/s", -3600.0, 3600.0)] = 0.0
+    """Its rate of turn, from x towards y [degrees/s]."""
+    yaw: Annotated[float, ANGLE] = 0.0
+    """Heading of its x axis, from x towards y [degrees]."""
+
+
+@dataclasses.dataclass
+class TrimSettings(SteadySettings):
+    """Options of a trim."""
+
+    out: Annotated[Path | None, default("runs/trim_SCENE")] = None
+    """Folder for the results."""
+
+
+@dataclasses.dataclass
+class LinearSettings(SteadySettings):
+    """Options of a linearisation."""
+
+    about: Literal["start", "trim"] = "start"
+    """The start, with the options' coordinates and rates, or the trim that is found from there."""
+    outputs: Annotated[tuple[str, ...], default("all states")] = ()
+    """States that are measured, such as hinge.angle."""
+    out: Annotated[Path | None, default("runs/linearize_SCENE")] = None
+    """Folder for the results."""
+
+
+TRIM = """Find the inputs, and states if wanted, of a steady motion of any mechanism; write trim.json.
+
+Example: stmuav trim model.toml --coordinates hinge=0 --free rail.displacement. Without a scene or a model's
+file the command trims the UAV with its tracker: stmuav trim --help. A mechanism with a floating base hovers,
+climbs or turns: its attitude is found too.
+"""
+LINEAR = """Linearise any mechanism about its start, or about a trim; write A, B, C, D to linear.npz.
+
+Example: stmuav linearize model.toml --about trim --outputs hinge.angle. Without a scene or a model's file the
+command linearises the flight of the UAV with its tracker: stmuav linearize --help.
+"""
+
+
+def trim_class(words: Sequence[str]) -> type:
+    """The command for tyro, see `scene_command`."""
+    return scene_command("TrimScene", TrimSettings, TRIM, words)
+
+
+def linear_class(words: Sequence[str]) -> type:
+    """The command for tyro, see `scene_command`."""
+    return scene_command("LinearizeScene", LinearSettings, LINEAR, words)
+
+
+def trimmed(space: "TreeSpace", x: Any, settings: SteadySettings, t: float) -> "Trim":
+    """Trim from a point, of a floating base as a steady flight.
+
+    Raises:
+        SettingError: nothing may be chosen, an unknown name, or a flight of what does not float.
+        StateError: there is no trim.
+    """
+    from ...dynamics.tree.topology import spanning_tree
+    from ...flight.equilibrium import trim
+    from ...flight.steady import climb, cruise, steady_turn, trim_condition
+
+    inputs = inputs_named(space, settings.inputs)
+    if not len(inputs) and not settings.free:
+        states = ", ".join(name for name, _ in space.names[: space.dof])
+        raise SettingError(
+            "This mechanism has no inputs that a trim could choose: name states that it may change "
+            f"with --free, among {states}."
+        )
+    flying = (settings.climb, settings.speed, settings.turn, settings.yaw)
+    if not spanning_tree(space.system).floating:
+        if any(flying):
+            raise SettingError("--climb, --speed, --turn and --yaw are for a floating base.")
+        wanted = _wanted(space, settings)
+        return trim(
+            space, at=x, free=settings.free, inputs=inputs, accelerations=wanted, t=t,
+        )  # fmt: skip
+    if settings.accelerations:
+        raise SettingError("--accelerations are for mechanisms on the ground; others fly steadily.")
+    course, yaw = math.radians(settings.course), math.radians(settings.yaw)
+    if settings.turn:
+        flight = steady_turn(settings.speed, math.radians(settings.turn), None, course, yaw)
+    else:
+        flight = cruise(settings.speed, course, None, yaw)
+    flight = flight._replace(v=flight.v + climb(settings.climb).v)
+    return trim_condition(space, flight, at=x, free=settings.free, inputs=inputs)
+
+
+def _wanted(space: "TreeSpace", settings: SteadySettings) -> np.ndarray:
+    from ...checks.errors import named_places
+
+    given = scalars_by_name(settings.accelerations, "--accelerations")
+    names = [name for name, _ in space.names[space.dof : 2 * space.dof]]
+    wanted = np.zeros(space.dof)
+    places = named_places(list(given), names, "The wanted accelerations", "velocity")
+    wanted[list(places)] = list(given.values())
+    return wanted
+
+
+def _changed(space: "TreeSpace", x: Any, found: "Trim") -> dict[str, tuple[float, str]]:
+    """States that differ from the start, by how much, with their units."""
+    moved = np.asarray(space.difference(found.point, x))
+    named = zip(space.names, moved, strict=True)
+    return {name: (float(v), unit) for (name, unit), v in named if abs(v) > 1e-12}
+
+
+def modes_table(modes: Sequence[Any]) -> Table:
+    """Table of the modes other than those of a free rigid body, which have eigenvalue zero."""
+    shown = table("s [1/s]", "doubles or halves in [s]", "states that take part", title="Modes")
+    for mode in modes:
+        if abs(mode.eigenvalue) < 1e-3:
+            continue
+        s = f"{mode.eigenvalue.real:.4g}"
+        if abs(mode.eigenvalue.imag) > 1e-9 * abs(mode.eigenvalue):
+            s += f" {'+' if mode.eigenvalue.imag > 0 else '-'} {abs(mode.eigenvalue.imag):.4g} i"
+        time = "neither"
+        if math.isfinite(mode.doubling_time):
+            time = f"{'doubles' if mode.doubling_time > 0 else 'halves'} in {abs(mode.doubling_time):.4g}"
+        parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in mode.states[:3])
+        row(shown, s, time, parts)
+    return shown
+
+
+def run_trim_scene(command: Any) -> int:
+    """Find the trim, print it and write trim.json; return the exit code."""
+    from ...files.netcdf import versions, write_atomically
+
+    scene, settings = chosen_scene(command), command.settings
+    space, x = starting_point(scene, settings)
+    found = trimmed(space, x, settings, scene.t0)
+    moved = _changed(space, x, found)
+    values = [float(v) for v in np.asarray(found.values)]
+    shown = table("unknown", "value", "unit", title=f"Trim: {scene.title or scene.name}")
+    for (name, unit), value in zip(found.inputs.names, values, strict=True):
+        row(shown, f"input {name}", f"{value:.6g}", unit)
+    for name, (value, unit) in moved.items():
+        row(shown, f"change of {name}", f"{value:.6g}", unit)
+    out = Console()
+    out.print(shown)
+    line(out, f"Accelerations left: {float(found.residual):.1e}.")
+    content = {
+        "inputs": {name: v for (name, _), v in zip(found.inputs.names, values, strict=True)},
+        "changes": {name: value for name, (value, _) in moved.items()},
+        "units": dict(found.inputs.names) | {name: unit for name, (_, unit) in moved.items()},
+        "residual": float(found.residual),
+        "conditioning": float(found.conditioning),
+        "versions": versions(),
+    }
+    folder = settings.out if settings.out is not None else Path("runs") / f"trim_{scene.name}"
+    written(out, [write_atomically(folder / "trim.json", json.dumps(content, indent=2).encode())])
+    return 0
+
+
+def run_linearize_scene(command: Any) -> int:
+    """Linearise, print the modes and write linear.npz; return the exit code."""
+    from ...figures.tuning import save_linear
+    from ...flight.linear import linearize
+
+    scene, settings = chosen_scene(command), command.settings
+    space, x = starting_point(scene, settings)
+    out, inputs, values = Console(), inputs_named(space, settings.inputs), None
+    if settings.about == "trim":
+        found = trimmed(space, x, settings, scene.t0)
+        x, inputs, values = found.point, found.inputs, found.values
+    outputs = list(settings.outputs) or None
+    linear = linearize(space, x, inputs, values, outputs=outputs, t=scene.t0)
+    out.print(modes_table(linear.modes()))
+    states = ", ".join(f"{name} [{unit}]" for name, unit in linear.states)
+    line(out, f"States: {states}.")
+    line(out, _measures(linear))
+    if settings.about == "start":
+        line(out, "About the start: departures from the motion that begins there.")
+    folder = settings.out if settings.out is not None else Path("runs") / f"linearize_{scene.name}"
+    written(out, [save_linear(linear, folder / "linear.npz")])
+    return 0
+
+
+def _measures(linear: Any) -> str:
+    """Sentence on the modes that inputs move and outputs show."""
+    seen = f"of observability {np.min(linear.observability()):.2g}"
+    if not linear.B.shape[1]:
+        return f"There are no inputs. Least measure {seen}."
+    return f"Least measure of controllability {np.min(linear.controllability()):.2g}, {seen}."

@@ -1,0 +1,236 @@
+"""Command `stmuav tune WHAT SCENE`: tuned inputs, and identified parameters, of any mechanism."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from ...checks.errors import SettingError
+from ...figures.terminal import line, row, table
+from ..options import END, Number, count, default
+from ..output import written
+from ..simulate import chosen_scene, scene_command
+from .point import PointSettings, inputs_named, scalars_by_name, starting_point
+
+if TYPE_CHECKING:
+    from ...algebra.least_squares import Search
+    from ...dynamics.scene import Scene
+
+
+@dataclasses.dataclass
+class TuneSettings(PointSettings):
+    """Options of a search on any mechanism."""
+
+    to: Annotated[tuple[str, ...], default("none")] = ()
+    """slew: states at the end, as changes from the start, such as rail.displacement=0.5; others return."""
+    t1: Annotated[float | None, END, default("the scene's own")] = None
+    """Time over which departures count, or for the slew [s]."""
+    inputs: Annotated[tuple[str, ...], default("all")] = ()
+    """Inputs that are tuned, such as effort."""
+    limit: Annotated[tuple[str, ...], default("none")] = ()
+    """Largest magnitudes of inputs, such as effort=20."""
+    knots: Annotated[int, Number("number of knots", "", 4, 200)] = 8
+    """slew: knots of the cubic splines."""
+    segments: Annotated[int, count("segments", 1000)] = 1
+    """Segments of multiple shooting."""
+    record: Annotated[Path | None, default("none")] = None
+    """identify: CSV file with the column t [s], columns of joints such as A.angle or A.angle_rate, and of inputs."""
+    parameters: Annotated[tuple[str, ...], default("none")] = ()
+    """identify: parameters of the model's file with a start for the search, such as mass=0.3."""
+    sigma: Annotated[tuple[str, ...], default("none")] = ()
+    """identify: standard deviation of each column of the record, such as A.angle=0.001."""
+    steps: Annotated[int, count("steps", 1e6)] = 60
+    """Steps allowed."""
+    resume: bool = False
+    """Go on with search.npz in the folder of the results."""
+    out: Annotated[Path | None, default("runs/tune_WHAT_SCENE")] = None
+    """Folder for the results."""
+    figures: Literal["png", "pdf", "svg", "none"] = "png"
+    """Format of the figures."""
+
+
+ABOUT = """Tune the inputs of any mechanism by gradients through its motion, or identify its parameters.
+
+Examples: stmuav tune slew model.toml --to rail.displacement=0.5 --t1 1.5; stmuav tune identify model.toml
+--record flight.csv --parameters mass=0.3 --sigma A.angle=0.001. hold finds constant inputs that keep the start.
+Without a scene or a model's file the command tunes the UAV with its tracker: stmuav tune --help.
+"""
+What = Literal["hold", "slew", "identify"]
+# Loss below which inputs count as holding: departures of a millimetre or a milliradian.
+_HOLDS = 1e-6
+# Weight of a departure or of an end that is missed.
+_WEIGHT = 10.0
+
+
+def tune_class(words: Sequence[str]) -> type:
+    """The command for tyro, see `scene_command`."""
+    before = [("what", tyro.conf.Positional[What])]
+    return scene_command("TuneScene", TuneSettings, ABOUT, words, before)
+
+
+def run_tune_scene(command: Any, watched: Any) -> int:
+    """Run the command; return the exit code.
+
+    Args:
+        watched: function (command, folder, problem, start, run) -> search, with progress and checkpoints.
+    """
+    from ...algebra.least_squares import SearchReason
+
+    scene, settings = chosen_scene(command), command.settings
+    folder = settings.out
+    if folder is None:
+        folder = Path("runs") / f"tune_{command.what}_{scene.name}"
+    _check(command.what, settings)
+    work = _identified if command.what == "identify" else _tuned
+    found, shown, done = work(command, scene, folder, watched)
+    out = Console()
+    out.print(shown)
+    line(out, found.words())
+    paths = [folder / "search.npz"]
+    if settings.figures != "none":
+        from ...figures.plot import save_figures
+        from ...figures.tuning import loss_history
+
+        paths += save_figures({"loss": loss_history(found.history)}, folder, settings.figures)
+    written(out, paths)
+    if found.reason is SearchReason.INTERRUPTED:
+        return 130
+    if not done:
+        line(
+            Console(stderr=True),
+            f"stmuav: the search has not converged; {folder} has what it reached.",
+        )
+    return 0 if done else 1
+
+
+def _check(what: str, settings: TuneSettings) -> None:
+    """Raise `SettingError` for options that belong to another kind of search, or are missing."""
+    own = {"to": "slew", "record": "identify", "parameters": "identify", "sigma": "identify"}
+    for name, kind in own.items():
+        if getattr(settings, name) and what != kind:
+            raise SettingError(f"--{name} is for tune {kind}.")
+        if kind == what and not getattr(settings, name):
+            raise SettingError(f"tune {what} needs --{name}.")
+
+
+def _tuned(command: Any, scene: "Scene", folder: Path, watched: Any) -> tuple["Search", Any, bool]:
+    from ...algebra.least_squares import SearchReason
+    from ...checks.numbers import floats
+    from ...dynamics.statespace.base import places_of
+    from ...flight.tuning import departures, end_at, tune_inputs
+
+    settings = command.settings
+    space, x = starting_point(scene, settings)
+    slews = command.what == "slew"
+    t1 = scene.t1 - scene.t0 if settings.t1 is None else settings.t1
+    inputs = inputs_named(space, settings.inputs)
+    to = scalars_by_name(settings.to, "--to")
+    v = np.zeros(space.size)
+    v[list(places_of(space, list(to), "The states at the end"))] = list(to.values())
+    target = space.retract(x, floats(v))
+    residuals: list[Any] = [end_at(space, target) if slews else departures(space, x)]
+    residuals += _limits(inputs, scalars_by_name(settings.limit, "--limit"))
+    tuning = tune_inputs(
+        space, residuals, start=x, duration=t1, inputs=inputs, weight=_WEIGHT,
+        knots=settings.knots if slews else None, segments=settings.segments,
+        name=f"{command.what} {scene.name}",
+    )  # fmt: skip
+    run = lambda **options: tuning.search(patience=15, **options)
+    found = watched(settings, folder, tuning.name, tuning.start, run)
+    done = found.reason is SearchReason.CONVERGED and (slews or found.loss < _HOLDS)
+    every = np.asarray(tuning.motion(found.values).inputs)
+    shown = table("input", "at the start", "at the end", "smallest", "largest", "unit")
+    for k, (name, unit) in enumerate(inputs.names):
+        numbers = (every[0, k], every[-1, k], every[:, k].min(), every[:, k].max())
+        row(shown, name, *(f"{value:.6g}" for value in numbers), unit)
+    return found, shown, done
+
+
+class _Over:
+    """Excess of an input over its limit, as a share of the limit."""
+
+    def __init__(self, place: int, limit: float) -> None:
+        self.place, self.limit = place, limit
+
+    def __call__(self, motion: Any) -> Any:
+        value = motion.extremes[:, self.place]
+        return abs(value) / self.limit - 1.0
+
+
+def _limits(inputs: Any, given: dict[str, float]) -> list[Any]:
+    from ...flight.tuning import Limit
+
+    known, found = [entry.name for entry in inputs.entries], []
+    for name, value in given.items():
+        chosen = inputs.chosen([name]).entries
+        if not value > 0:
+            raise SettingError(f"The limit of {name} must be positive, but it is {value:g}.")
+        found += [Limit(_Over(known.index(entry.name), value)) for entry in chosen]
+    return found
+
+
+def _identified(
+    command: Any, scene: "Scene", folder: Path, watched: Any
+) -> tuple["Search", Any, bool]:
+    import jax.numpy as jnp
+
+    from ...algebra.least_squares import SearchReason
+    from ...files.model_file import read_model
+    from ...files.study_file import column
+    from ...flight.identification import Unknown, from_table, identify, motion_model
+    from ...mechanics.inputs import inputs_of
+    from ...sensing.outputs import joint_output
+
+    settings = command.settings
+    if not str(command.scene).endswith(".toml"):
+        raise SettingError("tune identify takes a model's TOML file, whose parameters have names.")
+    model = read_model(command.scene)
+    start = scalars_by_name(settings.parameters, "--parameters")
+    for name in start:
+        if name in model.of_start():
+            raise SettingError(
+                f"The parameter '{name}' sets the start, which the record must know."
+            )
+    sigma = scalars_by_name(settings.sigma, "--sigma")
+    space, x = starting_point(scene, settings)
+    read = [joint_output(scene.system, name).of for name in sigma]
+    ts = np.array(column(settings.record, "t"))
+    record = np.array([column(settings.record, name) for name in sigma]).T
+    given = _recorded_inputs(settings.record, inputs_of(scene.system), ts)
+    unknowns = [Unknown(name, max(abs(value), 1e-12)) for name, value in start.items()]
+
+    def outputs(own: Any, now: Any) -> Any:
+        state = own.to_state(now)
+        return jnp.stack([of(own.system, state) for of in read])
+
+    predict = motion_model(
+        from_table(model.system, model.table, unknowns), x, ts, outputs, inputs=given, space=space
+    )
+    sizes = np.array([unknown.size for unknown in unknowns])
+    deviations = np.array(list(sigma.values()))
+    run = lambda **options: identify(predict, record, deviations, start, sizes, **options)
+    problem = f"identify {scene.name} {','.join(start)}"
+    found = watched(settings, folder, problem, jnp.zeros(len(start)), run)
+    shown = table("parameter", "start", "found", "deviation", "unit")
+    for k, name in enumerate(start):
+        numbers = (start[name], found.values[k], found.standard_deviations[k])
+        row(shown, name, *(f"{value:.6g}" for value in numbers), model.table[name].unit)
+    shown.caption = f"chi-squared per degree of freedom {found.reduced_chi_square:.3g}"
+    return found.search, shown, found.search.reason is SearchReason.CONVERGED
+
+
+def _recorded_inputs(record: Path, inputs: Any, ts: np.ndarray) -> dict[str, Any]:
+    """Histories of the inputs that a record has as columns, as cubic splines."""
+    import csv
+
+    from ...algebra.sampled import Sampled
+    from ...files.study_file import column
+
+    with record.open(newline="", encoding="utf-8") as file:
+        head = next(csv.reader(file), [])
+    names = [name for name, _ in inputs.names if name in head]
+    return {name: Sampled(ts, np.array(column(record, name)), 3) for name in names}

@@ -1,0 +1,159 @@
+"""Outcome of a mission's flight: its data set, largest errors, margins, energy, and the verdict."""
+
+import json
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..files.labelled import Labelled
+from ..files.loop_file import Label, labelled_loop
+from .flight import MissionFlight
+from .gauges import GAUGES
+from .schema import TolerancesEntry
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_BATTERY: dict[str, Label] = {
+    "state_of_charge": (("time",), "1", "of the battery"),
+    "battery_current": (("time",), "A", "current of the battery"),
+    "battery_voltage": (("time",), "V", "at the poles of the battery"),
+}
+# Round-off of speeds that are held at a limit, as a share of the range.
+_AT_LIMIT = 1e-9
+_DEGREE = math.pi / 180
+# Round-off of times [s].
+_AT_ONCE = 1e-9
+
+
+def to_data(flight: MissionFlight) -> "xr.Dataset":
+    """Labelled dataset of a flight: the loop's run, the signals of `GAUGES`, and the limits."""
+    return labelled_flight(flight).dataset()
+
+
+def labelled_flight(flight: MissionFlight) -> Labelled:
+    """Labelled arrays with the content of `to_data`."""
+    machine, given = flight.mission.machine, flight.mission.file
+    count = machine.rotors.spin.shape[0]
+    loop = labelled_loop(
+        flight.run, GAUGES | _BATTERY, title=given.title, ending=flight.ending,
+        mission=json.loads(given.model_dump_json()), scene=machine.scene.name,
+        watch=list(machine.scene.watch),
+    )  # fmt: skip
+    limits: dict[str, tuple[str, Any, str]] = {}
+    names: dict[str, Any] = {"rotor": (("rotor",), np.arange(1, count + 1), {})}
+    if machine.speeds is not None:
+        low, high = (np.sqrt(np.asarray(x)) for x in machine.speeds.squared(count))
+        limits |= {
+            "lowest_speed": ("rotor", low, "rad/s"),
+            "highest_speed": ("rotor", high, "rad/s"),
+        }
+    if machine.limits is not None:
+        limits |= {
+            "lowest_displacement": ("slider", np.asarray(machine.limits.lower), "m"),
+            "highest_displacement": ("slider", np.asarray(machine.limits.upper), "m"),
+        }
+        names["slider"] = (("slider",), np.array([2, 3]), {})
+        names["panel_angle"] = (("panel_angle",), ["phi", "theta"], {})
+    own = {
+        name: ((dim,), values, {"units": unit, "description": f"limit of {dim}s"})
+        for name, (dim, values, unit) in limits.items()
+    }
+    return Labelled({**loop.variables, **own}, {**loop.coordinates, **names}, loop.attributes)
+
+
+class Measure(NamedTuple):
+    """Number in the table of a flight: name, value, unit, allowed value or None, and whether kept."""
+
+    name: str
+    value: float
+    unit: str
+    allowed: float | None = None
+    kept: bool = True
+
+
+def measures(data: "xr.Dataset") -> list[Measure]:
+    """Largest errors, smallest margins of the limits, and the energy used, of a flight's dataset."""
+    wanted = _tolerances(data)
+    if not _checked(data):
+        # nothing is as late as the tolerances: these numbers are of the whole flight
+        wanted = TolerancesEntry()
+    late = data.sel(time=data.time >= wanted.after - _AT_ONCE)
+    since = f" from {wanted.after:g} s on" if wanted.after else ""
+    off = np.linalg.norm(late.position_error.values, axis=1)
+    found = [
+        _largest(f"Largest position error{since}", off, "m", wanted.position),
+        _largest(
+            f"Largest tilt error{since}", late.tilt_error.values / _DEGREE, "degrees", wanted.tilt
+        ),
+    ]
+    if "panel_error" in data:
+        panel = late.panel_error.values / _DEGREE
+        found.append(_largest(f"Largest panel error{since}", panel, "degrees", wanted.panel))
+    for name, what, limit in (
+        ("rotor_speed", "rotor speeds", "speed"), ("displacement", "strokes", "displacement"),
+    ):  # fmt: skip
+        if f"lowest_{limit}" in data:
+            found.append(_margin(data, name, what, limit))
+    energy = _energy(data)
+    return [*found, *energy]
+
+
+def _tolerances(data: "xr.Dataset") -> TolerancesEntry:
+    return TolerancesEntry(**json.loads(data.attrs["mission"])["tolerances"])
+
+
+def _checked(data: "xr.Dataset") -> bool:
+    """True if the flight came to the time from which its tolerances hold."""
+    return bool(data.time.values[-1] >= _tolerances(data).after - _AT_ONCE)
+
+
+def _largest(name: str, values: np.ndarray, unit: str, allowed: float | None) -> Measure:
+    value = float(np.max(values))
+    return Measure(name, value, unit, allowed, allowed is None or value <= allowed)
+
+
+def _margin(data: "xr.Dataset", name: str, what: str, limit: str) -> Measure:
+    """Smallest distance from the limits as a share of the range."""
+    low, high = data[f"lowest_{limit}"].values, data[f"highest_{limit}"].values
+    values = np.array(data[name].values)
+    if name == "rotor_speed":
+        # a rotor that has failed is within no limits
+        for fault in json.loads(data.attrs["mission"])["faults"]:
+            if fault["rotor"] is not None:
+                values[data.time.values >= fault["at"], fault["rotor"] - 1] = np.nan
+    least = float(np.nanmin(np.minimum(values - low, high - values) / (high - low)))
+    name, kept = f"Smallest margin of the {what}", least >= -_AT_LIMIT
+    return Measure(name, 100 * least, "% of the range", 0.0, kept)
+
+
+def _energy(data: "xr.Dataset") -> list[Measure]:
+    """Energies used, the powers held from sample to sample."""
+    ts = data.time.values
+    spent = lambda name: float(np.sum(np.diff(ts) * data[name].values[:-1])) / 3600
+    found = [
+        Measure("Energy of the rotors, mechanical", spent("rotor_power"), "Wh"),
+        Measure("Energy used, electrical", spent("electric_power"), "Wh"),
+    ]
+    if "actuator_power" in data:
+        found.append(Measure("Work of the actuators", 3600 * spent("actuator_power"), "J"))
+    if "state_of_charge" in data:
+        left = float(data.state_of_charge.values[-1])
+        found.append(Measure("Charge left", 100 * left, "%"))
+    return found
+
+
+def verdict(data: "xr.Dataset") -> tuple[bool, str]:
+    """True if a flight did all that its mission asks for, and a sentence about it."""
+    end, t1 = float(data.time.values[-1]), json.loads(data.attrs["mission"])["t1"]
+    ending = data.attrs["ending"]
+    broken = [one.name.lower() for one in measures(data) if not one.kept]
+    words = f"It flew to t = {end:g} s of {t1:g} s"
+    words += f", and ended there: {ending}" if ending else ""
+    if broken:
+        return False, f"{words}. Not kept: {', '.join(broken)}."
+    if not _checked(data):
+        after = _tolerances(data).after
+        return not ending, f"{words}. Limits were kept; tolerances hold from {after:g} s on."
+    return not ending, f"{words}. All tolerances and limits were kept."

@@ -1,0 +1,309 @@
+"""Missions on a hexacopter: flown, interrupted and resumed, saved, and refused before the flight."""
+
+import copy
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.integrate
+import xarray as xr
+
+import stmuav_jax as stm
+from stmuav_jax.checks.schema import checked
+from stmuav_jax.cli import main
+from stmuav_jax.commands.fly import NOT_KEPT, UNFINISHED, Fly
+from stmuav_jax.missions.keep import load_reached, save_reached
+from stmuav_jax.missions.mission import LIBRARY
+from stmuav_jax.missions.schema import MissionFile
+
+missions = stm.missions
+ROOT = Path(__file__).parents[2]
+
+TEXT = """
+format = 1
+name = "square"
+t1 = 2.2
+
+[machine]
+scene = "hexacopter"
+options = { drag = {} }
+
+[rates]
+control = 200.0
+
+[path]
+waypoints = [
+    { t = 0.2, position = [0.0, 0.0, 0.0] },
+    { t = 1.2, position = [0.3, 0.0, 0.1], heading = 10.0 },
+    { t = 2.1, position = [0.3, 0.3, 0.1] },
+]
+
+[wind]
+steady = [1.0, 0.0, 0.0]
+gusts = { seed = 3 }
+change = { to = [2.0, 1.0, 0.0], at = 1.0 }
+
+[battery]
+state_of_charge = 0.9
+
+[tolerances]
+position = 0.1
+tilt = 15.0
+"""
+
+
+def plain(**changes):
+    """Mission with some entries replaced, by names with double underscores; None removes."""
+    content = copy.deepcopy(tomllib.loads(TEXT))
+    for name, value in changes.items():
+        *tables, last = name.split("__")
+        at = content
+        for table in tables:
+            at = at.setdefault(table, {})
+        if value is None:
+            at.pop(last)
+        else:
+            at[last] = value
+    return content
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return missions.fly(missions.make_mission(plain()))
+
+
+@pytest.fixture(scope="module")
+def data(flight):
+    return missions.to_data(flight)
+
+
+def test_a_hexacopter_flies_along_its_waypoints(flight, data):
+    assert flight.ending == ""
+    assert data.sizes["time"] == 441
+    place = data.position.sel(time=[1.2, 2.1], method="nearest").values[:, 0]
+    np.testing.assert_allclose(place, [[0.3, 0.0, 0.1], [0.3, 0.3, 0.1]], atol=0.1)
+    kept, words = missions.verdict(data)
+    assert kept
+    assert "t = 2.2 s of 2.2 s" in words
+    # tolerances that hold from later on were not checked
+    content = json.loads(data.attrs["mission"])
+    content["tolerances"] |= {"after": 5.0, "position": 1e-9}
+    later = data.assign_attrs(mission=json.dumps(content))
+    kept, words = missions.verdict(later)
+    assert kept
+    assert "tolerances hold from 5 s on" in words
+    # by hand: the error, and the thrust that the weight needs on the average
+    off = np.linalg.norm(data.position.values[:, 0] - data.wanted_position.values, axis=1)
+    assert missions.measures(data)[0].value == pytest.approx(np.max(off), rel=1e-12)
+    assert np.max(off) > 1e-4
+    squared = data.rotor_speed.values**2
+    lift = stm.PART_II.value("rotor.k_f") * np.sum(squared, axis=1)
+    assert np.mean(lift) == pytest.approx(9.81 * stm.PART_II.value("bare.mass"), rel=0.1)
+
+
+def test_powers_and_the_battery_by_hand(data):
+    """Power by the drag torque; the charge by SciPy's integration of dQ/dt = -I."""
+    speeds = data.rotor_speed.values
+    power = stm.PART_II.value("rotor.k_tau") * np.sum(speeds**3, axis=1)
+    np.testing.assert_allclose(data.rotor_power, power, rtol=1e-12)
+    np.testing.assert_allclose(data.electric_power, power / 0.8 + 10.0, rtol=1e-12)
+    table = {name: stm.parameters.ENERGY.value(f"battery.{name}") for name in (
+        "capacity", "resistance", "state_of_charge", "open_circuit_voltage")}  # fmt: skip
+    ts = data.time.values
+
+    def rate(t, soc):
+        U = np.interp(soc[0], table["state_of_charge"], table["open_circuit_voltage"])
+        P = data.electric_power.values[min(int(t * 200 + 1e-9), len(ts) - 1)]
+        R = table["resistance"]
+        return [-(U - np.sqrt(U**2 - 4 * R * P)) / (2 * R) / table["capacity"]]
+
+    found = scipy.integrate.solve_ivp(rate, (0.0, ts[-1]), [0.9], max_step=0.0025, rtol=1e-10)
+    used = 0.9 - found.y[0, -1]
+    assert 0.9 - data.state_of_charge.values[-1] == pytest.approx(used, rel=1e-4)
+
+
+def test_an_interrupted_flight_goes_on_to_the_last_bit(flight, data, tmp_path):
+    mission = missions.make_mission(plain())
+
+    def stop(done):
+        if done > 0.3:
+            raise KeyboardInterrupt
+
+    part = missions.fly(mission, progress=stop)
+    assert part.ending == "interrupted"
+    assert part.reached.samples == 200
+    data_so_far = missions.to_data(part)
+    kept, words = missions.verdict(data_so_far)
+    assert not kept
+    assert "interrupted" in words
+    path = save_reached(mission, part.reached, tmp_path / "part.npz")
+    again = missions.to_data(missions.fly(mission, reached=load_reached(mission, path)))
+    assert again.drop_attrs().identical(data.drop_attrs())
+    other = missions.make_mission(plain(wind__gusts__seed=4))
+    with pytest.raises(stm.files.FileError, match="of another mission"):
+        load_reached(other, path)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(stm.files.FileError, match="damaged"):
+        load_reached(mission, path)
+
+
+def test_an_empty_battery_ends_the_flight_with_its_results():
+    mission = missions.make_mission(plain(battery__state_of_charge=0.2004))
+    found = missions.fly(mission)
+    assert found.ending == "battery empty"
+    data = missions.to_data(found)
+    charge = data.state_of_charge.values
+    assert 10 < len(charge) < 400
+    assert charge[-1] <= 0.2 < charge[-2]
+    assert np.all(np.isfinite(data.position))
+
+
+def test_a_rotor_that_fails_is_not_known_to_the_controller(data):
+    faults = [{"rotor": 2, "share": 0.5, "at": 1.0}]
+    found = missions.to_data(missions.fly(missions.make_mission(plain(faults=faults))))
+    before = data.time.values < 1.0 - 1e-9
+    np.testing.assert_array_equal(found.command.values[before], data.command.values[before])
+    k = int(np.sum(before))
+    np.testing.assert_allclose(found.command[k, 1], 0.5 * data.command[k, 1], rtol=1e-12)
+    kept, words = missions.verdict(found)
+    assert not kept
+    assert "largest position error" in words
+
+
+def test_a_rotor_that_is_known_to_be_lost_is_flown_without(data):
+    """The same path in the same gusts, with yaw given up from the fault on."""
+    faults = [{"rotor": 2, "at": 1.0, "known": True}]
+    found = missions.to_data(missions.fly(missions.make_mission(plain(faults=faults))))
+    before = data.time.values < 1.0 - 1e-9
+    # another program: round-off, and what a second of flight makes of it
+    np.testing.assert_allclose(found.command.values[before], data.command.values[before], rtol=1e-9)
+    assert np.all(found.rotor_speed.values[~before, 1] == 0.0)
+    kept, words = missions.verdict(found)
+    assert kept, words
+
+
+def test_a_flight_is_saved_and_loaded_with_equality(flight, data, tmp_path):
+    path = stm.files.save_loop(flight.run, tmp_path / "loop.nc")
+    loaded = stm.files.load(path)
+    np.testing.assert_array_equal(loaded.position, flight.run.states.r)
+    np.testing.assert_array_equal(loaded.command, flight.run.rollout.inputs)
+    assert list(loaded.input_unit.values) == ["rad^2/s^2"] * 6
+    np.testing.assert_array_equal(loaded.tilt_error, data.tilt_error)
+    assert loaded.tilt_error.units == "see description"
+    assert data.tilt_error.units == "rad"
+    # thrusts are found from the rotors of the plant, speeds by the signals of the mission
+    k_f = float(flight.mission.machine.rotors.k_f)
+    np.testing.assert_allclose(data.rotor_thrust, k_f * data.rotor_speed**2, rtol=1e-12)
+    shown = re.findall(r'"title":"([^"]*)"', stm.view(data).html)
+    assert {"thrust of rotors [N]", "tilt error [rad]", "position error [m]"} <= set(shown)
+
+
+def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(TEXT)
+    assert main(["fly", "mine.toml", "--figures", "svg"]) == 0
+    out = capsys.readouterr().out
+    assert "Largest position error" in out
+    folder = tmp_path / "runs" / "square"
+    assert {path.name for path in folder.iterdir()} == {
+        "flight.nc", "errors.svg", "rotors.svg", "power.svg"
+    }  # fmt: skip
+    assert isinstance(stm.files.load(folder / "flight.nc"), xr.Dataset)
+    (tmp_path / "mine.toml").write_text(TEXT.replace("tilt = 15.0", "tilt = 0.1"))
+    assert main(["fly", "mine.toml", "--figures", "none"]) == NOT_KEPT
+    (folder / UNFINISHED).write_bytes(b"")
+    assert main(["fly", "mine.toml"]) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert main(["fly", "mine.toml", "--resume"]) == 2
+    assert "damaged" in capsys.readouterr().err
+    assert main(["fly", "hoover"]) == 2
+    assert "Did you mean 'hover'?" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"speed": 3.0}, "A mission has no entry 'speed'"),
+        ({"rates__contrl": 3.0}, "Did you mean 'control'"),
+        ({"format": 2}, "reads format 1 alone"),
+        ({"t1": 0.0}, "'t1' must be finite and positive"),
+        ({"t1": 2.2013}, "whole number of control periods"),
+        ({"machine__scene": "tracker"}, "must be hexacopter or uav_tracker"),
+        ({"machine__model": "x.toml"}, "a scene or a model's file, and not both"),
+        ({"machine__options": {}}, "options.drag"),
+        ({"machine__options": {"drga": {}}}, "no drga"),
+        ({"path__position": [0.0, 0.0, 0.0]}, "neither position nor heading"),
+        ({"path__waypoints": [{"t": 0.0, "position": [0.0] * 3}]}, "two or more, with times"),
+        (
+            {"path__waypoints": [
+                {"t": 0.0, "position": [0.0] * 3}, {"t": 0.3, "position": [3.0, 0.0, 0.0]}
+            ]},
+            "The path needs a thrust of",
+        ),
+        ({"controller__highest": 800.0}, "cannot carry the weight"),
+        ({"controller__servo": {"frequency": 9.0}}, "needs the tracker"),
+        ({"panel": [{"angles": [1.0, 2.0]}]}, "needs the tracker"),
+        ({"faults": [{"rotor": 7, "at": 1.0}]}, "no rotor 7"),
+        ({"faults": [{"at": 1.0}]}, "needs a rotor or a slider"),
+        ({"faults": [{"rotor": 2, "share": 0.5, "at": 1.0, "known": True}]}, "must be the loss of a"),
+        (
+            {"faults": [{"rotor": 1, "at": 1.0, "known": True}], "controller__highest": 1300.0},
+            "cannot be held without rotor 1",
+        ),
+        ({"wind__steady": [0.0, 0.0, 0.0]}, "must not be zero"),
+        ({"sensors": {"position": {"rate": 33.0}}}, "not a whole part"),
+        ({"battery__state_of_charge": 0.2, "battery__reserve": 0.3}, "above its reserve"),
+    ],
+    ids=lambda x: "" if isinstance(x, str) else None,
+)  # fmt: skip
+def test_missions_that_cannot_be_flown_are_refused(changes, words):
+    with pytest.raises((stm.SettingError, stm.ModelError), match=words):
+        missions.make_mission(plain(**changes))
+
+
+def test_the_ready_missions_and_the_pages_example_fit_the_schema():
+    page = (ROOT / "docs" / "missions.md").read_text(encoding="utf-8")
+    texts = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert len(texts) == 1
+    names = missions.mission_names()
+    assert {"hover", "case-1", "case-2", "case-3", "sun-slew", "waypoints", "gusts"} <= set(names)
+    texts += [(LIBRARY / f"{name}.toml").read_text(encoding="utf-8") for name in names]
+    for text in texts:
+        checked(MissionFile, {"name": "a"} | tomllib.loads(text), "A mission")
+    assert set(names) <= set(re.findall(r"`([a-z0-9-]+)`", page.split("## In Python")[0]))
+    listed = str(Fly.__doc__).replace("case-1 to case-3", "case-1 case-2 case-3")
+    assert all(name in listed for name in names)
+
+
+@pytest.mark.slow
+def test_the_page_on_missions_runs(capsys):
+    page = (ROOT / "docs" / "missions.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names: dict = {}
+    exec(code, names)
+    assert float(names["data"].position[-1, 0, 2]) == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.slow
+def test_case_1_is_flown_by_the_command(tmp_path, capsys):
+    """The panel's limits and errors too; and references out of the tracker's reach are refused."""
+    assert main(["fly", "case-1", "--t1", "0.5", "--true-states", "--out", str(tmp_path)]) == 0
+    assert "Largest panel error" in capsys.readouterr().out
+    data = stm.files.load(tmp_path / "flight.nc")
+    assert float(data.panel_error.max()) < np.radians(0.4)
+    assert (tmp_path / "panel.png").exists()
+    uav = {"format": 1, "name": "a", "t1": 3.0, "machine": {"scene": "uav_tracker"}}
+    sun = {"lat": 11.55, "lon": 104.92, "date": "2024-03-21", "hour": 22.0}
+    for panel, words in (
+        ([{"angles": [70.0, 0.0]}], "slider 3 would have to stand at"),
+        ([{"direction": [1.0, 0.0, 0.2]}], "The panel cannot follow its reference"),
+        ([{"sun": sun}], "degrees below the horizon"),
+        ([{"sun": sun | {"timezone": "Asia/Phnom_Pen"}}], "Did you mean 'Asia/Phnom_Penh'"),
+        ([{"angles": [0.0, 0.0]}, {"direction": [0.0, 0.0, 1.0]}], "must all be to angles"),
+        ([{"at": 1.0}], "one of angles, direction and sun"),
+    ):
+        with pytest.raises(stm.SettingError, match=words):
+            missions.make_mission(uav | {"panel": panel})
