@@ -77,8 +77,8 @@ def stubbed(monkeypatch):
 def test_odd_lines(stubbed, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rng = random.Random(4)
-    codes = {0: 0, 1: 0, 2: 0}
-    for _ in range(250):
+    codes, lines = {0: 0, 1: 0, 2: 0}, 250
+    for _ in range(lines):
         words = odd_line(rng)
         code = cli.main(words)
         printed = capsys.readouterr()
