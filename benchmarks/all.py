@@ -24,7 +24,7 @@ from shared.record import ALLOW, MEASURED, RESULTS, ROOT, commit, moved, traced
 
 FOLDER = Path(__file__).parent
 ALONE = (
-    "stiff", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "waiting",
+    "stiff", "hard", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "waiting",
     "failure", "compile_times", "montecarlo",
 )  # fmt: skip
 # Result -> the script that measures it, with its arguments, in the order of running.

@@ -15,7 +15,8 @@ from ..mechanics.forces.applied import Gravity
 from ..mechanics.internal import internal_states
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .assembly.initial import Rank, rank_of, weakest_rows
+from .assembly.initial import Rank, rank_of
+from .assembly.singular import weakest_rows
 from .certify import allow_dependent
 from .checks import (
     POSITION_TOLERANCE,

@@ -16,7 +16,7 @@ from ..checks.errors import SettingError, SimulationError
 from ..mechanics.internal import with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .assembly.initial import singular_posture
+from .assembly.singular import singular_posture
 from .certify import Checked, certify, check_saved, inspect_start, violations
 from .checks import check_method, check_start, output_times, scene_of
 from .error_estimate import LOOSER, ErrorEstimate, SecondRun, estimated, without

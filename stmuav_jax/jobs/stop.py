@@ -14,6 +14,9 @@ from typing import Any
 
 # Seconds after which an unacknowledged signal is raised again.
 AGAIN = 0.5
+# A call of Dask that has just begun cannot be cancelled yet and says so with a traceback; the
+# signal is raised there at its repetition.
+_BEGINNING = ("sync", "distributed")
 
 
 class Stop:
@@ -33,16 +36,27 @@ class Stop:
         self._heard.set()
 
     def _come(self, number: int, frame: FrameType | None) -> None:
-        del frame
-        if not self.asked:
+        first = not self.asked
+        if first:
             self.asked = True
             threading.Thread(target=self._insist, args=(number,), daemon=True).start()
-        raise KeyboardInterrupt
+        if not _is_deaf(frame, first=first):
+            raise KeyboardInterrupt
 
     def _insist(self, number: int) -> None:
         while not self._over.is_set() and not self._heard.wait(AGAIN):
             if not self._over.is_set() and not self._heard.is_set():
                 signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+
+def _is_deaf(frame: FrameType | None, *, first: bool) -> bool:
+    """True if an exception raised in a frame is printed and lost, or, the first time, mishandled."""
+    while frame is not None:
+        name, module = frame.f_code.co_name, str(frame.f_globals.get("__name__", ""))
+        if name == "__del__" or (first and (name, module.partition(".")[0]) == _BEGINNING):
+            return True
+        frame = frame.f_back
+    return False
 
 
 _now: list[Stop] = []

@@ -17,16 +17,11 @@ from ...checks.errors import ModelError, StateError, concrete
 from ...checks.shapes import Numbers
 from ...mechanics.joint import CATALOGUE, drive
 from ...mechanics.joint_coordinate import coordinate, free_coordinates
-from ...mechanics.joint_kind import Which
 from ...mechanics.state import State
 from ...mechanics.system import System, check_state
 from ..formulations.augmented import Augmented, Model, displace
 from ..formulations.constraints import Equations
 from .joint_drivers import UniformMotion
-
-# A run ended in a singular posture if the smallest singular value is below this fraction of that at
-# its start.
-_SINGULAR = 1e-3
 
 Held = Literal["position", "orientation", "all"]
 
@@ -307,13 +302,14 @@ def ranks(
         Integers (k,) and values (k,), for the unscaled Jacobian in (v, omega').
     """
     model = Augmented().prepare(system)
-    values = np.asarray(_singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
+    values = np.asarray(singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
     count = np.sum(values > tolerance * values[:, :1], axis=1)
     return count, np.take_along_axis(values, count[:, None] - 1, axis=1)[:, 0]
 
 
 @kept_jit
-def _singular_values(model: Model, states: State, t: Float[Array, ""]) -> Float[Array, "k m"]:
+def singular_values(model: Model, states: State, t: Float[Array, ""]) -> Float[Array, "k m"]:
+    """Singular values of the unscaled constraint Jacobian at states (k, n, .), the largest first."""
     matrices = jax.vmap(lambda state: _jacobian(model, state, t))(states)
     return jnp.linalg.svd(matrices, compute_uv=False)
 
@@ -329,60 +325,6 @@ def _dependent_rows(J: np.ndarray, count: int) -> list[int]:
         direction = rest[order[k]] / np.linalg.norm(rest[order[k]])
         rest = rest - np.outer(rest @ direction, direction)
     return sorted(order[count:])
-
-
-def weakest_rows(
-    system: System, model: Model, state: State, t: float, rank: int
-) -> tuple[float, tuple[str, ...]]:
-    """Singular value number `rank` of the constraint Jacobian, and the joints of its rows.
-
-    Returns:
-        The value, and the names of joints: drivers first, then those that own at least a tenth
-        of the corresponding combination of rows, the largest share first.
-    """
-    vectors, values, _ = np.linalg.svd(jacobian(model, state, t), full_matrices=False)
-    share = np.zeros(len(system.joints))
-    np.add.at(share, np.array(model.constraints.owner), vectors[:, rank - 1] ** 2)
-    driver = np.array([joint.kind.startswith("drive") for joint in system.joints])
-    order = np.lexsort((-share, ~driver))
-    named = [k for k in order if share[k] >= (1e-6 if driver[k] else 0.1)]
-    return float(values[rank - 1]), tuple(system.joints[k].name for k in named)
-
-
-def singular_posture(system: System, states: State, t: float, rank: int) -> str:
-    """Text on a run that ended in a singular posture, with joints and drivers; else "".
-
-    Args:
-        states: first and last state of the run (2, n, .). t: time of the last [s].
-        rank: rank at the start.
-    """
-    if not rank:
-        return ""
-    model = Augmented().prepare(system)
-    values = np.asarray(_singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
-    if not values[-1, rank - 1] < _SINGULAR * values[0, rank - 1]:
-        return ""
-    state = State(*(x[-1] for x in (states.r, states.p, states.v, states.omega)))
-    smallest, names = weakest_rows(system, model, state, t, rank)
-    return (
-        f"the mechanism comes to a singular posture of {_standing(system, state, names)}: the "
-        f"smallest singular value of the constraint Jacobian is {smallest:.3g} there and "
-        f"{values[0, rank - 1]:.3g} at the start. What these joints or drivers demand takes "
-        "unbounded velocities or forces; lead the motion around that posture"
-    )
-
-
-def _standing(system: System, state: State, names: tuple[str, ...]) -> str:
-    """Names of joints with their present angles and displacements, where one is free."""
-    kin = system.kinematics(state)
-    units: dict[Which, str] = {"angle": "rad", "displacement": "m"}
-    found = []
-    for name in names:
-        joint = system.joints[system.joint_index(name)]
-        free = free_coordinates(joint)
-        at = [f"{float(coordinate(kin, joint, w).value):.6g} {units[w]}" for w in free]
-        found.append(f"{name} (at {', '.join(at)})" if at else name)
-    return ", ".join(found)
 
 
 def jacobian(model: Model, state: State, t: float = 0.0) -> np.ndarray:

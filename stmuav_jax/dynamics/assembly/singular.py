@@ -1,0 +1,78 @@
+"""Singular postures: the joints that a mechanism's constraints fail at, in words."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from ...mechanics.joint_coordinate import coordinate, free_coordinates
+from ...mechanics.joint_kind import Which
+from ...mechanics.state import State
+from ...mechanics.system import System
+from ..formulations.augmented import Augmented, Model
+from .initial import jacobian, singular_values
+
+# A run ended in a singular posture if the smallest singular value is below this fraction of that at
+# its start.
+_SINGULAR = 1e-3
+# It began in one if a singular value that was zero there has come to this fraction of the largest.
+_RISEN = 1e-10
+
+
+def weakest_rows(
+    system: System, model: Model, state: State, t: float, rank: int
+) -> tuple[float, tuple[str, ...]]:
+    """Singular value number `rank` of the constraint Jacobian, and the joints of its rows.
+
+    Returns:
+        The value, and the names of joints: drivers first, then those that own at least a tenth
+        of the corresponding combination of rows, the largest share first.
+    """
+    vectors, values, _ = np.linalg.svd(jacobian(model, state, t), full_matrices=False)
+    share = np.zeros(len(system.joints))
+    np.add.at(share, np.array(model.constraints.owner), vectors[:, rank - 1] ** 2)
+    driver = np.array([joint.kind.startswith("drive") for joint in system.joints])
+    order = np.lexsort((-share, ~driver))
+    named = [k for k in order if share[k] >= (1e-6 if driver[k] else 0.1)]
+    return float(values[rank - 1]), tuple(system.joints[k].name for k in named)
+
+
+def singular_posture(system: System, states: State, t: float, rank: int) -> str:
+    """Text on a run that ended or began in a singular posture, with joints and drivers; else "".
+
+    Args:
+        states: first and last state of the run (2, n, .). t: time of the last [s].
+        rank: rank at the start.
+    """
+    if not rank:
+        return ""
+    model = Augmented().prepare(system)
+    values = np.asarray(singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
+    state = State(*(x[-1] for x in (states.r, states.p, states.v, states.omega)))
+    if rank < values.shape[1] and values[-1, rank] > _RISEN * values[0, 0] > values[0, rank]:
+        _, names = weakest_rows(system, model, state, t, rank + 1)
+        return (
+            f"the start is a singular posture of {_standing(system, state, names)}: "
+            "branches of the motion meet there, and nothing says which one it follows. Start "
+            "beside that posture, on the branch that is meant"
+        )
+    if not values[-1, rank - 1] < _SINGULAR * values[0, rank - 1]:
+        return ""
+    smallest, names = weakest_rows(system, model, state, t, rank)
+    return (
+        f"the mechanism comes to a singular posture of {_standing(system, state, names)}: the "
+        f"smallest singular value of the constraint Jacobian is {smallest:.3g} there and "
+        f"{values[0, rank - 1]:.3g} at the start. What these joints or drivers demand takes "
+        "unbounded velocities or forces; lead the motion around that posture"
+    )
+
+
+def _standing(system: System, state: State, names: tuple[str, ...]) -> str:
+    """Names of joints with their present angles and displacements, where one is free."""
+    kin = system.kinematics(state)
+    units: dict[Which, str] = {"angle": "rad", "displacement": "m"}
+    found = []
+    for name in names:
+        joint = system.joints[system.joint_index(name)]
+        free = free_coordinates(joint)
+        at = [f"{float(coordinate(kin, joint, w).value):.6g} {units[w]}" for w in free]
+        found.append(f"{name} (at {', '.join(at)})" if at else name)
+    return ", ".join(found)
