@@ -15,6 +15,7 @@ from nbclient import NotebookClient
 LONG = (
     "01_first_flight",
     "02_what_fails_at_half_a_second",
+    "03_the_geometry_from_the_printed_tables",
     "04_a_day_of_pointing_at_the_sun",
     "05_centre_of_mass",
     "06_trim_and_small_motions",
