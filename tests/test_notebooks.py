@@ -22,6 +22,9 @@ LONG = (
     "07_inputs_by_gradients",
     "08_parameters_from_a_record",
     "09_ten_thousand_collapses",
+    "10_your_own_mechanism",
+    "11_gradients_through_a_motion",
+    "12_a_filter_for_your_own_model",
 )
 PICTURES = Path(__file__).parents[1] / "docs" / "make_pictures.py"
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
