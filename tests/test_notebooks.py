@@ -25,6 +25,8 @@ LONG = (
     "10_your_own_mechanism",
     "11_gradients_through_a_motion",
     "12_a_filter_for_your_own_model",
+    "13_it_flies",
+    "14_does_the_panel_pay",
 )
 PICTURES = Path(__file__).parents[1] / "docs" / "make_pictures.py"
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
