@@ -135,7 +135,8 @@ def validation_page() -> str:
     """Text of the page on what is tested: laws, published problems and independent programs."""
     head = (ROOT / "docs" / "validation_head.md").read_text(encoding="utf-8")
     lines = [head]
-    titles = {"published": "Published problems", "oracles": "Independent programs", "laws": "Laws"}
+    titles = {"published": "Published problems", "oracles": "Independent programs", "laws": "Laws",
+              "hard": "Hard cases"}  # fmt: skip
     for folder, title in titles.items():
         lines += [f"## {title}", ""]
         for path in sorted((ROOT / "tests" / folder).glob("test_*.py")):

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from sections.tables import compile_times
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
@@ -23,6 +24,7 @@ def test_waiting(tmp_path):
         assert own["memory"] > 10
 
 
+@pytest.mark.slow
 def test_first_result(tmp_path):
     subprocess.run(
         [sys.executable, FOLDER / "first_result.py", "--quick", "--results", tmp_path],

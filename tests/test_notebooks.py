@@ -15,12 +15,18 @@ from nbclient import NotebookClient
 LONG = (
     "01_first_flight",
     "02_what_fails_at_half_a_second",
+    "03_the_geometry_from_the_printed_tables",
     "04_a_day_of_pointing_at_the_sun",
     "05_centre_of_mass",
     "06_trim_and_small_motions",
     "07_inputs_by_gradients",
     "08_parameters_from_a_record",
     "09_ten_thousand_collapses",
+    "10_your_own_mechanism",
+    "11_gradients_through_a_motion",
+    "12_a_filter_for_your_own_model",
+    "13_it_flies",
+    "14_does_the_panel_pay",
 )
 PICTURES = Path(__file__).parents[1] / "docs" / "make_pictures.py"
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))

@@ -6,13 +6,15 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 # Seconds that all sections may take; they need some two minutes.
-PATIENCE = 900
+PATIENCE = 600
 
 # Section -> keys of its record, and keys of its first row.
 WANTED = {
@@ -28,26 +30,40 @@ WANTED = {
 }
 
 
-def run(folder: Path, sections: tuple[str, ...]) -> Path:
+def run(folder: Path, sections: tuple[str, ...], capfd: Any) -> Path:
     """Run sections and build the page in a folder; returns the page."""
     page, said = folder / "docs" / "benchmarks.md", folder / "said.txt"
+    arguments = ["--size", "one", "--no-peers", "--results", folder, "--page", page]
+    for _ in range(2):
+        code = ended([FOLDER / "suite.py", *arguments, "--only", *sections], said)
+        if code is not None:
+            break
+        # It hung once in some fifteen runs, and nobody knows where: the log of the tests has to
+        # show it, whether or not the second run ends.
+        with capfd.disabled():
+            print(f"The suite hung:\n{said.read_text()}", file=sys.stderr, flush=True)
+    assert code == 0, said.read_text()[-3000:]
+    return page
+
+
+def ended(command: list[Any], said: Path) -> int | None:
+    """Exit status of a script, or None if it hung; then `said` has the stacks of all threads."""
     with said.open("w") as out:
         process = subprocess.Popen(
-            [sys.executable, FOLDER / "suite.py", "--size", "one", "--no-peers", "--only",
-             *sections, "--results", folder, "--page", page],
+            [sys.executable, "-X", "faulthandler", *map(str, command)],
             stdout=out, stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
     try:
-        code = process.wait(PATIENCE)
+        return process.wait(PATIENCE)
     except subprocess.TimeoutExpired:
-        code = None
+        os.killpg(process.pid, signal.SIGABRT)
+        time.sleep(5)
+        return None
     finally:
         # also the process with native loops that the suite has started
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-    assert code == 0, said.read_text()[-3000:]
-    return page
 
 
 def check(folder: Path, sections: tuple[str, ...], page: Path) -> None:
@@ -71,9 +87,9 @@ def check(folder: Path, sections: tuple[str, ...], page: Path) -> None:
 
 
 @pytest.mark.slow
-def test_all_sections(tmp_path):
+def test_all_sections(tmp_path, capfd):
     sections = tuple(WANTED)
-    check(tmp_path, sections, run(tmp_path, sections))
+    check(tmp_path, sections, run(tmp_path, sections, capfd))
     gradient = json.loads((tmp_path / "suite_gradient.json").read_text())
     errors = [row["error"] for row in gradient["rows"] if row["error"] is not None]
     assert len(errors) == 3

@@ -40,6 +40,7 @@ def test_trim_of_a_cart_that_accelerates(tmp_path, capsys):
     assert "input effort" in said(capsys)
 
 
+@pytest.mark.slow
 def test_linearisation_of_a_four_bar_is_that_of_the_library(tmp_path, capsys):
     path = str(MODELS / "four_bar.toml")
     words = ["linearize", path, "--independent", "A.angle", "--outputs", "A.angle"]

@@ -144,6 +144,7 @@ def cost(plant, feedback, samples=101):
     return jnp.mean(found.states.r[:, 0, 0] ** 2) + 1e-4 * jnp.mean(found.inputs**2)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_closed_loop(cart):
     """By gains and by a mass, through 1 s: against converged differences, 1e-5 relative."""
     _, space, _, feedback, start = cart

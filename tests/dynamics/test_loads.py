@@ -177,6 +177,7 @@ def test_smooth_peaks_are_between_the_peak_and_its_bound():
         stm.dynamics.smooth_peaks(loads, 0.5)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_peak_and_a_batch_of_runs():
     """A pendulum let go at a = 1.2 rad: peak m g + m l w^2, w^2 = 2 m g l (1 - cos a) / J.
 

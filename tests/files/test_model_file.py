@@ -135,6 +135,7 @@ def test_the_legs_of_the_stewart_platform_share_its_weight(gallery):
     assert found.accelerations.v_rate == pytest.approx(np.zeros((1, 3)), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_arms_of_the_delta_robot_fall_together(gallery):
     scene = gallery["delta_robot"]
     found = evaluate(scene.system, scene.state0, formulation=stm.Tree()).accelerations

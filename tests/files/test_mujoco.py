@@ -205,7 +205,9 @@ def test_a_urdf_without_its_meshes_is_checked_by_the_command_line(mujoco, tmp_pa
     assert "degrees of freedom" in shown
 
 
-@pytest.mark.parametrize("what", ["tree", "loops", "cart_pole"])
+@pytest.mark.parametrize(
+    "what", ["tree", pytest.param("loops", marks=pytest.mark.slow), "cart_pole"]
+)
 def test_what_is_saved_moves_alike_when_it_is_loaded(mujoco, tmp_path, what):
     if what == "cart_pole":
         scene = load_model(MODELS / "cart_pole.toml")

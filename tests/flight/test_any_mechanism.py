@@ -144,6 +144,7 @@ def bars():
     return space, space.from_state(space.system.reference)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.4, 1.0, 2.5])
 def test_four_bar_against_its_twin(bars, angle):
     """Acceleration, A and B at a moving point, and the torque that holds it: to 1e-9."""

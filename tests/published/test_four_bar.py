@@ -219,6 +219,7 @@ def test_a_posture_that_cannot_be_passed_is_named() -> None:
     assert np.all(np.isfinite(r))
 
 
+@pytest.mark.slow
 def test_gradient_is_the_closed_forms() -> None:
     """Solver class: d Bx / d (g, v0) for N = 2 at 1 s, 4 s and 10 s to 1e-6 relative.
 

@@ -131,6 +131,7 @@ def test_forward_gradient_is_the_closed_forms() -> None:
     np.testing.assert_allclose(got, [GRADIENT[t] for t in times], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_reverse_gradient_is_the_closed_forms() -> None:
     """Solver class: the same by reverse mode at 1 s, through the checkpointed adjoint."""
     adjoint = stm.dynamics.DiscreteAdjoint()

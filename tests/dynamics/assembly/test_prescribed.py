@@ -152,6 +152,7 @@ def fed_back(make, count, span):
     return off, moved, efforts
 
 
+@pytest.mark.slow
 def test_efforts_fed_back_on_the_ground():
     off, moved, efforts = fed_back(lambda **kw: stm.make_scene("tracker", 2, **kw), 201, 1.0)
     assert off < 1e-9

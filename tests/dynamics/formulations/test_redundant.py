@@ -106,6 +106,7 @@ def test_accelerations_equal_those_without_dependent_rows(bars, solved):
     assert relative_error(now.omega_rate, free.omega_rate) < 1e-9
 
 
+@pytest.mark.slow
 def test_simulate_finds_and_allows_for_dependent_rows(bars):
     system, _, state = bars
     run = stm.simulate(scene_of(system, state), ts=[0.0, 0.05, 0.1])

@@ -77,6 +77,7 @@ def test_many_at_once():
         np.testing.assert_allclose(gradient, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_second_derivatives():
     """Forward over reverse is symmetric and as differences have it."""
     first = jax.grad(lambda x: swing(x, KEEPING, Q[4:]))
@@ -87,6 +88,7 @@ def test_second_derivatives():
     np.testing.assert_allclose(H, rows, atol=1e-5 * np.max(np.abs(H)))
 
 
+@pytest.mark.slow
 def test_more_steps_than_are_kept():
     """Windows done again on the way back: the same derivatives as those of all steps kept."""
     fine = stm.Method(rtol=1e-12, atol=1e-12, solver=diffrax.Tsit5())

@@ -74,6 +74,7 @@ def test_differentiated(make):
     assert (float(value), float(slope)) == (6.0, 3.0)
 
 
+@pytest.mark.slow
 def test_a_force_written_as_a_lambda():
     """x(t) of 2 kg on a rail under a sin 3 t, and its derivative by a; as a user writes it."""
     body = stm.Body("m", 2.0, (1e-3,) * 3)

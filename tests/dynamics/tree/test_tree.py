@@ -215,6 +215,7 @@ def test_an_unknown_joint_cannot_be_cut():
         stm.Tree(cut=("S75",)).prepare(system)
 
 
+@pytest.mark.slow
 def test_gradients_of_lengths_and_masses_agree():
     """Forward, reverse and by maximal coordinates: through joint places and inertia."""
     state = at_random(zoo(), 3)

@@ -1,0 +1,217 @@
+"""Laws that hold for every mechanism, tried on random ones: trees and loops of all joints.
+
+Hypothesis draws the structure (bodies, joints, loops), so that a failure is reduced to the smallest
+mechanism that shows it; the numbers of each structure are drawn by NumPy, several sets for one
+compilation. What is compared shares no code: the minimal coordinates of the spanning tree, the
+maximal coordinates with a multiplier for every row, and sums over the bodies in NumPy.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import inertia_of, np_rotation, random_quaternion, unit
+from hypothesis import HealthCheck, given, settings, strategies as st
+
+import stmuav_jax as stm
+
+SETS = 25  # of numbers, for each structure
+SAME = 1e-9
+# Rows that depend on each other to this are a singular posture, of which there may be few.
+SINGULAR, FEW = 1e-5, 0.1
+# Degrees of freedom that a joint takes.
+TREE = {
+    "spherical": 3,
+    "universal": 4,
+    "revolute": 5,
+    "translational": 5,
+    "cylindrical": 4,
+    "screw": 5,
+}
+LOOPS = {"distance": 1, "revolute_spherical": 2, "spherical": 3, "universal": 4}
+
+
+class Link(NamedTuple):
+    """A joint between a body and an earlier one, or ground (-1)."""
+
+    kind: str
+    i: int
+    j: int
+
+
+class Structure(NamedTuple):
+    """Number of bodies, and the joints between them, those that close loops last."""
+
+    bodies: int
+    links: tuple[Link, ...]
+
+
+@st.composite
+def structures(draw: Any) -> Structure:
+    """Two to five bodies, each hung on an earlier one or on ground, and up to two loops."""
+    count = draw(st.integers(2, 5))
+    links = [
+        Link(draw(st.sampled_from(sorted(TREE))), draw(st.integers(-1, k - 1)), k)
+        for k in range(count)
+    ]
+    free = sum(6 - TREE[link.kind] for link in links)
+    for _ in range(draw(st.integers(0, 2))):
+        kind, j = draw(st.sampled_from(sorted(LOOPS))), draw(st.integers(1, count - 1))
+        i = draw(st.integers(-1, j - 1))
+        # one degree of freedom is left, and no two bodies are joined twice
+        if free - LOOPS[kind] >= 1 and not any({i, j} == {link.i, link.j} for link in links):
+            links.append(Link(kind, i, j))
+            free -= LOOPS[kind]
+    return Structure(count, tuple(links))
+
+
+def joint(
+    name: str, kind: str, ends: tuple[str, str], at: dict[str, np.ndarray], swap: bool
+) -> Any:
+    """One joint; with `swap` its bodies change places."""
+    i, j = ends[::-1] if swap else ends
+    a, b = ("q", "p") if swap else ("p", "q")
+    if kind == "spherical":
+        return stm.spherical(name, i, j, point=at["p"])
+    if kind == "universal":
+        axes = (at["across"], at["axis"]) if swap else (at["axis"], at["across"])
+        return stm.universal(name, i, j, point=at["p"], axis_i=axes[0], axis_j=axes[1])
+    if kind == "distance":
+        return stm.distance(name, i, j, point_i=at[a], point_j=at[b])
+    if kind == "revolute_spherical":
+        # it has no other direction: its axis is fixed in body i
+        return stm.revolute_spherical(
+            name, *ends, point_i=at["p"], axis=at["axis"], point_j=at["p"] + 0.3 * at["across"]
+        )
+    if kind == "screw":
+        return stm.screw(name, i, j, point=at["p"], axis=at["axis"], pitch=0.1)
+    make = {"revolute": stm.revolute, "translational": stm.translational,
+            "cylindrical": stm.cylindrical}[kind]  # fmt: skip
+    return make(name, i, j, point=at["p"], axis=at["axis"])
+
+
+def built(
+    structure: Structure, seed: int, *, turn: Any = None, shift: Any = 0.0, backwards: bool = False
+) -> tuple[stm.System, np.ndarray]:
+    """The system with one set of numbers, and random velocities (n, 6) of its bodies.
+
+    Args:
+        turn: Euler parameters of a rotation of the whole world. shift: of its origin [m].
+        backwards: bodies and joints in the opposite order, joints in the other direction.
+    """
+    rng = np.random.default_rng(seed)
+    p_world = np.array([1.0, 0, 0, 0]) if turn is None else turn
+    R = np_rotation(p_world)
+    bodies, joints = [], []
+    for k in range(structure.bodies):
+        p = np.asarray(
+            stm.rotation.product(jnp.asarray(p_world), jnp.asarray(random_quaternion(rng)))
+        )
+        where = R @ rng.normal(size=3) + shift
+        bodies.append(
+            stm.Body(f"b{k}", 0.5 + rng.random(), inertia_of(rng), position=where, orientation=p)
+        )
+    name = lambda k: "ground" if k < 0 else f"b{k}"
+    for number, link in enumerate(structure.links):
+        axis = unit(rng.normal(size=3))
+        across = unit(np.cross(axis, rng.normal(size=3)))
+        at = {
+            "p": R @ rng.normal(size=3) + shift, "q": R @ rng.normal(size=3) + shift,
+            "axis": R @ axis, "across": R @ across,
+        }  # fmt: skip
+        joints.append(joint(f"j{number}", link.kind, (name(link.i), name(link.j)), at, backwards))
+    forces = [
+        stm.Gravity(R @ rng.normal(size=3) * 9.81),
+        stm.AppliedForce("b0", R @ rng.normal(size=3), frame="world"),
+    ]
+    velocity = rng.normal(size=(structure.bodies, 6))
+    velocity[:, :3] = velocity[:, :3] @ R.T
+    if backwards:
+        bodies, joints, velocity = bodies[::-1], joints[::-1], velocity[::-1]
+    return stm.System(bodies, joints, forces), velocity
+
+
+class Found(NamedTuple):
+    """Velocities, accelerations by both formulations, and the ratio of extreme singular values."""
+
+    v: Any
+    omega: Any
+    tree: Any
+    augmented: Any
+    ratio: Any
+
+
+@eqx.filter_jit
+def looked(system: stm.System, velocity: Any, both: bool = True) -> Found:
+    """Everything at the reference posture, with the velocity nearest to the given one."""
+    model = stm.Augmented().prepare(system)
+    rest = system.reference
+    J = model.constraints.equations(jnp.zeros(()), system.kinematics(rest)).matrix
+    u = velocity.reshape(-1)
+    left, sizes, right = jnp.linalg.svd(J, full_matrices=False)
+    u = u - right.T @ ((left.T @ (J @ u)) / sizes)
+    v, omega = jnp.split(u.reshape(velocity.shape), 2, axis=1)
+    state = stm.State(rest.r, rest.p, v, omega)
+
+    def rates(formulation: Any) -> Any:
+        found = stm.dynamics.evaluate(system, state, formulation=formulation).accelerations
+        return found.v_rate, found.omega_rate
+
+    one = rates(stm.Tree())
+    return Found(v, omega, one, rates(stm.Augmented()) if both else one, sizes[-1] / sizes[0])
+
+
+def apart(one: Any, other: Any) -> float:
+    """Largest difference of two sets of accelerations, relative to the largest acceleration."""
+    size = max(float(np.max(np.abs(x))) for x in one)
+    pairs = zip(one, other, strict=True)
+    return max(float(np.max(np.abs(np.asarray(a) - np.asarray(b)))) for a, b in pairs) / size
+
+
+def power_missing(system: stm.System, found: Found) -> float:
+    """Rate of the kinetic energy less the power of gravity and force, relative to their size."""
+    v, omega, (v_rate, omega_rate) = np.asarray(found.v), np.asarray(found.omega), found.tree
+    mass, inertia = np.asarray(system.bodies.mass), np.asarray(system.bodies.inertia)
+    gained = mass[:, None] * v * np.asarray(v_rate)
+    turned = omega * np.einsum("nij,nj->ni", inertia, np.asarray(omega_rate))
+    gravity, push = system.forces
+    given = mass[:, None] * v * np.asarray(gravity.acceleration)
+    first = system.names.index("b0")
+    force = v[first] @ np.asarray(push.force)
+    sizes = np.sum(np.abs(gained)) + np.sum(np.abs(turned)) + np.sum(np.abs(given)) + abs(force)
+    return abs(np.sum(gained) + np.sum(turned) - np.sum(given) - force) / sizes
+
+
+@pytest.mark.slow
+@settings(
+    max_examples=20, derandomize=True, deadline=None, database=None,
+    suppress_health_check=list(HealthCheck),
+)  # fmt: skip
+@given(structures())
+def test_laws_of_random_mechanisms(structure: Structure):
+    """Both formulations agree, constraint forces do no work, and neither frame nor order matters."""
+    singular = 0
+    for seed in range(SETS):
+        system, velocity = built(structure, seed)
+        found = looked(system, jnp.asarray(velocity))
+        if found.ratio < SINGULAR:
+            singular += 1
+            continue
+        assert apart(found.tree, found.augmented) < SAME
+        assert power_missing(system, found) < SAME
+        turn, shift = random_quaternion(np.random.default_rng(seed)), np.array([3.0, -2.0, 1.0])
+        R = np_rotation(turn)
+        moved = looked(*_traced(built(structure, seed, turn=turn, shift=shift)))
+        assert apart((np.asarray(found.tree[0]) @ R.T, found.tree[1]), moved.tree) < SAME
+        if seed < SETS // 5:
+            other = looked(*_traced(built(structure, seed, backwards=True)), both=False)
+            back = jax.tree.map(lambda x: np.asarray(x)[::-1], other.tree)
+            assert apart(found.tree, back) < SAME
+    assert singular <= FEW * SETS
+
+
+def _traced(built: tuple[stm.System, np.ndarray]) -> tuple[stm.System, Any]:
+    return built[0], jnp.asarray(built[1])
