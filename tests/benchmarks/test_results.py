@@ -15,26 +15,10 @@ FOLDER = Path(__file__).parents[2] / "benchmarks"
 RESULTS = sorted(record.RESULTS.glob("*.json"))
 
 # Results whose commit is not in the history, each with the reason. No other may come.
-_LOST = (
-    "Measured on 2026-11-23 on a commit that is not in the history, because the commits of that day "
-    "were put together into one. Results measured since then also name their sources."
-)
-KNOWN_STALE: dict[str, str] = {
-    name: _LOST
-    for name in (
-        "estimation",
-        "failure",
-        "first_result",
-        "montecarlo",
-        "stiff",
-        *("suite_acceleration", "suite_batch", "suite_gradient", "suite_hexacopter"),
-        *("suite_published", "suite_scaling", "suite_scenes", "suite_stiff"),
-        "suite_work_precision",
-    )
-}
+KNOWN_STALE: dict[str, str] = {}
 
 # Benchmarks that have not been run on a quiet machine yet. A name leaves with its first result.
-NOT_RUN_YET = {"compile_times", "hard", "waiting"}
+NOT_RUN_YET: set[str] = set()
 
 
 def lost(path: Path) -> set[str]:
