@@ -1,8 +1,7 @@
 """Laws that hold for every mechanism, tried on random ones: trees and loops of all joints.
 
-Hypothesis draws the structure (bodies, joints, loops), so that a failure is reduced to the smallest
-mechanism that shows it; the numbers of each structure are drawn by NumPy, several sets for one
-compilation. What is compared shares no code: the minimal coordinates of the spanning tree, the
+Hypothesis draws the structure (bodies, joints, loops) and prints the one that fails; the numbers of
+each structure are drawn by NumPy, several sets for one compilation. What is compared shares no code: the minimal coordinates of the spanning tree, the
 maximal coordinates with a multiplier for every row, and sums over the bodies in NumPy.
 """
 
@@ -14,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import inertia_of, np_rotation, random_quaternion, unit
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 
 import stmuav_jax as stm
 
 SETS = 25  # of numbers, for each structure
-SAME = 1e-9
+SAME, ROUND_OFF = 1e-9, 1e-15
 # Rows that depend on each other to this are a singular posture, of which there may be few.
 SINGULAR, FEW = 1e-5, 0.1
 # Degrees of freedom that a joint takes.
@@ -61,11 +60,22 @@ def structures(draw: Any) -> Structure:
     for _ in range(draw(st.integers(0, 2))):
         kind, j = draw(st.sampled_from(sorted(LOOPS))), draw(st.integers(1, count - 1))
         i = draw(st.integers(-1, j - 1))
-        # one degree of freedom is left, and no two bodies are joined twice
-        if free - LOOPS[kind] >= 1 and not any({i, j} == {link.i, link.j} for link in links):
+        # what the loop may move, also if all loops so far lie on its way
+        within = sum(6 - TREE[link.kind] for link in links[:count] if link.j in around(links, i, j))
+        closed = sum(LOOPS[link.kind] for link in links[count:]) + LOOPS[kind]
+        twice = any({i, j} == {link.i, link.j} for link in links)
+        if min(free, within) > closed and not twice:
             links.append(Link(kind, i, j))
-            free -= LOOPS[kind]
     return Structure(count, tuple(links))
+
+
+def around(links: list[Link], i: int, j: int) -> set[int]:
+    """Bodies whose tree joints lie between two bodies."""
+
+    def up(k: int) -> set[int]:
+        return {k, *up(links[k].i)} if k >= 0 else set()
+
+    return up(i) ^ up(j)
 
 
 def joint(
@@ -188,7 +198,7 @@ def power_missing(system: stm.System, found: Found) -> float:
 @pytest.mark.slow
 @settings(
     max_examples=20, derandomize=True, deadline=None, database=None,
-    suppress_health_check=list(HealthCheck),
+    suppress_health_check=list(HealthCheck), phases=[Phase.generate],
 )  # fmt: skip
 @given(structures())
 def test_laws_of_random_mechanisms(structure: Structure):
@@ -200,16 +210,18 @@ def test_laws_of_random_mechanisms(structure: Structure):
         if found.ratio < SINGULAR:
             singular += 1
             continue
-        assert apart(found.tree, found.augmented) < SAME
-        assert power_missing(system, found) < SAME
+        # multipliers follow from a matrix whose condition is the square of that of the rows
+        same = SAME + ROUND_OFF / float(found.ratio) ** 2
+        assert apart(found.tree, found.augmented) < same
+        assert power_missing(system, found) < same
         turn, shift = random_quaternion(np.random.default_rng(seed)), np.array([3.0, -2.0, 1.0])
         R = np_rotation(turn)
         moved = looked(*_traced(built(structure, seed, turn=turn, shift=shift)))
-        assert apart((np.asarray(found.tree[0]) @ R.T, found.tree[1]), moved.tree) < SAME
+        assert apart((np.asarray(found.tree[0]) @ R.T, found.tree[1]), moved.tree) < same
         if seed < SETS // 5:
             other = looked(*_traced(built(structure, seed, backwards=True)), both=False)
             back = jax.tree.map(lambda x: np.asarray(x)[::-1], other.tree)
-            assert apart(found.tree, back) < SAME
+            assert apart(found.tree, back) < same
     assert singular <= FEW * SETS
 
 
