@@ -1,8 +1,9 @@
 """Laws that hold for every mechanism, tried on random ones: trees and loops of all joints.
 
 Hypothesis draws the structure (bodies, joints, loops) and prints the one that fails; the numbers of
-each structure are drawn by NumPy, several sets for one compilation. What is compared shares no code: the minimal coordinates of the spanning tree, the
-maximal coordinates with a multiplier for every row, and sums over the bodies in NumPy.
+each structure are drawn by NumPy, several sets for one compilation. What is compared shares no
+code: the minimal coordinates of the spanning tree, the maximal coordinates with a multiplier for
+every row, and sums over the bodies in NumPy.
 """
 
 from typing import Any, NamedTuple
