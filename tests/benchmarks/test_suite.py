@@ -34,6 +34,7 @@ def run(folder: Path, sections: tuple[str, ...], capfd: Any) -> Path:
     """Run sections and build the page in a folder; returns the page."""
     page, said = folder / "docs" / "benchmarks.md", folder / "said.txt"
     arguments = ["--size", "one", "--no-peers", "--results", folder, "--page", page]
+    code = None
     for _ in range(2):
         code = ended([FOLDER / "suite.py", *arguments, "--only", *sections], said)
         if code is not None:
