@@ -106,7 +106,7 @@ def joint(
 
 def built(
     structure: Structure, seed: int, *, turn: Any = None, shift: Any = 0.0, backwards: bool = False
-) -> tuple[stm.System, np.ndarray]:
+) -> tuple[stm.System, jax.Array]:
     """The system with one set of numbers, and random velocities (n, 6) of its bodies.
 
     Args:
@@ -142,7 +142,7 @@ def built(
     velocity[:, :3] = velocity[:, :3] @ R.T
     if backwards:
         bodies, joints, velocity = bodies[::-1], joints[::-1], velocity[::-1]
-    return stm.System(bodies, joints, forces), velocity
+    return stm.System(bodies, joints, forces), jnp.asarray(velocity)
 
 
 class Found(NamedTuple):
@@ -209,7 +209,7 @@ def test_laws_of_random_mechanisms(structure: Structure):
     singular = 0
     for seed in range(SETS):
         system, velocity = built(structure, seed)
-        found = looked(system, jnp.asarray(velocity))
+        found = looked(system, velocity)
         if found.ratio < SINGULAR:
             singular += 1
             continue
@@ -219,14 +219,10 @@ def test_laws_of_random_mechanisms(structure: Structure):
         assert power_missing(system, found) < same
         turn, shift = random_quaternion(np.random.default_rng(seed)), np.array([3.0, -2.0, 1.0])
         R = np_rotation(turn)
-        moved = looked(*_traced(built(structure, seed, turn=turn, shift=shift)))
+        moved = looked(*built(structure, seed, turn=turn, shift=shift))
         assert apart((np.asarray(found.tree[0]) @ R.T, found.tree[1]), moved.tree) < same
         if seed < SETS // 5:
-            other = looked(*_traced(built(structure, seed, backwards=True)), both=False)
+            other = looked(*built(structure, seed, backwards=True), both=False)
             back = jax.tree.map(lambda x: np.asarray(x)[::-1], other.tree)
             assert apart(found.tree, back) < same
     assert singular <= FEW * SETS
-
-
-def _traced(built: tuple[stm.System, np.ndarray]) -> tuple[stm.System, Any]:
-    return built[0], jnp.asarray(built[1])

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_forms import scene
-from scipy.special import ellipj
+from problems.hard import horizontal_release
 
 import stmuav_jax as stm
 
@@ -57,9 +57,8 @@ def pendulum(gravity: Any, length: Any) -> stm.System:
 
 def angle(t: np.ndarray) -> np.ndarray:
     """theta [rad] at times t [s], by the closed form."""
-    k = np.sin(np.pi / 4)
-    _, cn, dn, _ = ellipj(np.sqrt(GRAVITY / LENGTH) * t, k * k)
-    return 2 * np.arcsin(k * cn / dn)
+    x, y = horizontal_release(t, LENGTH).T
+    return np.arctan2(-x, -y)
 
 
 @pytest.fixture(scope="module")
