@@ -5,11 +5,10 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 from jaxtyping import Array, Bool, Float
 
 from ..checks.shapes import Matrix, Vector
-from . import loops
+from . import lapack, loops
 from .native import native_loops
 from .stacked import transposed_multiply
 
@@ -42,18 +41,16 @@ class Factor(eqx.Module):
 
 
 class MinimumNorm(eqx.Module):
-    """Singular value decomposition of a symmetric matrix S, singular or not.
+    """Pseudoinverse of a symmetric matrix S, singular or not.
 
     S is not scaled: that would change which solution has minimum norm.
     """
 
-    operator: lx.MatrixLinearOperator
-    solver: lx.SVD
-    state: object
+    inverse: Matrix
 
     def solve(self, b: Vector) -> Vector:
         """Minimum-norm solution x of S x = b, shape (m,)."""
-        return lx.linear_solve(self.operator, b, self.solver, state=self.state, throw=False).value
+        return self.inverse @ b
 
 
 class Proximal(eqx.Module):
@@ -88,20 +85,16 @@ def _in_loops(A: Matrix) -> bool:
     return native_loops() and A.ndim == 2 and 0 < A.shape[0] <= loops.LARGEST
 
 
+@jax.custom_jvp
 def cholesky(S: Matrix) -> Matrix:
     """Lower Cholesky factor of a symmetric positive definite matrix; NaN for any other."""
-    return _cholesky(S) if _in_loops(S) else jax.lax.linalg.cholesky(S, symmetrize_input=False)
+    return loops.cholesky(S) if _in_loops(S) else lapack.cholesky(S)
 
 
-@jax.custom_jvp
-def _cholesky(S: Matrix) -> Matrix:
-    return loops.cholesky(S)
-
-
-@_cholesky.defjvp
+@cholesky.defjvp
 def _cholesky_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matrix, Matrix]:
     """Derivative L' = L F, with F the lower half of L^-1 S' L^-T and half its diagonal."""
-    L = _cholesky(*primals)
+    L = cholesky(*primals)
     middle = solve_lower(L, solve_lower(L, tangents[0]).T)
     return L, L @ (jnp.tril(middle) - 0.5 * jnp.diag(jnp.diagonal(middle)))
 
@@ -143,7 +136,7 @@ class Inverse(eqx.Module):
 
 def inverted(A: Matrix) -> Inverse:
     """Invert a general square matrix, shape (k, k), by LU factorisation with partial pivoting."""
-    return Inverse(A, jnp.linalg.inv(jax.lax.stop_gradient(A)))
+    return Inverse(A, lapack.inverse(jax.lax.stop_gradient(A)))
 
 
 def _scaled(S: Matrix) -> tuple[Matrix, Vector]:
@@ -161,8 +154,7 @@ def factorise(S: Matrix, *, redundant: bool, rcond: float) -> Factor | MinimumNo
     largest count as zero.
     """
     if redundant:
-        operator, solver = lx.MatrixLinearOperator(S), lx.SVD(rcond=rcond)
-        return MinimumNorm(operator, solver, solver.init(operator, {}))
+        return MinimumNorm(lapack.pseudoinverse(S, rcond))
     return Factor(cholesky(S))
 
 
@@ -264,6 +256,4 @@ def right_inverse(
 
 def solve_general(K: Matrix, b: Vector, *, redundant: bool, rcond: float) -> Vector:
     """Solution x (k,) of K x = b for a general square K: LU, or minimum norm if `redundant`."""
-    operator = lx.MatrixLinearOperator(K)
-    solver = lx.SVD(rcond=rcond) if redundant else lx.LU()
-    return lx.linear_solve(operator, b, solver, throw=False).value
+    return lapack.pseudoinverse(K, rcond) @ b if redundant else lapack.solve(K, b)

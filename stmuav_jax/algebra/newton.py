@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from . import lapack
 from .derivative import directional, value_and_jacobian
 
 # Residuals below this that no longer halve are taken for round-off.
@@ -88,7 +89,7 @@ class Newton(AbstractNewton):
         now = NewtonState(y, r, J, size, done)
         kept = jax.tree.map(lambda a, b: jnp.where(worse, a, b), state, now)
         kept = eqx.tree_at(lambda s: s.done, kept, done)
-        moved = kept.y - jnp.linalg.solve(kept.J, kept.r)
+        moved = kept.y - lapack.solve(kept.J, kept.r)
         return jnp.where(done, kept.y, moved), kept, aux
 
 
@@ -126,14 +127,14 @@ class NearestNewton(AbstractNewton):
         del fn, options, tags
         z = y[: self.count]
         r, J = value_and_jacobian(lambda z: self.equations(z, args), z)
-        Q, R = jnp.linalg.qr(J.T)
+        Q, R = lapack.qr(J.T)
         size = jnp.maximum(self.norm(r), self.norm(z - Q @ (Q.T @ z)))
         stalled = (state.size < _ROUND_OFF) & ~(size < 0.9 * state.size)
         done = (size <= self.atol) | stalled | ~jnp.isfinite(size)
-        along = jnp.linalg.solve(R.T, J @ z - r)
+        along = lapack.solve(R.T, J @ z - r)
         # where it ends, z stays; the multipliers are those of its own J
         along = jnp.where(done, Q.T @ z, along)
-        moved = jnp.concatenate([jnp.where(done, z, Q @ along), jnp.linalg.solve(R, along)])
+        moved = jnp.concatenate([jnp.where(done, z, Q @ along), lapack.solve(R, along)])
         return moved, NewtonState(y, r, J, size, done), None
 
 
@@ -172,7 +173,7 @@ def _rooted_jvp(primals: Any, tangents: Any) -> Any:
     zeros = jax.tree.map(
         lambda x: jax.custom_derivatives.zero_from_primal(x, symbolic_zeros=True), rest
     )
-    return (root, rest), (-jnp.linalg.solve(J, rate), zeros)
+    return (root, rest), (-lapack.solve(J, rate), zeros)
 
 
 def _still(tree: Any) -> Any:

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..algebra import lapack
 from ..checks.errors import ModelError
 from ..flight.sensed import centre_of_mass, inertia_about_centre, inner_momentum
 from ..mechanics.state import State
@@ -102,7 +103,7 @@ class FlightController(eqx.Module):
         self.wrenches = wrench_map(rotors, system.bodies.com[0])
         self.working = working_rotors(lost, rotors.spin.shape[0])
         if self.working is None:
-            self.inverse = jnp.linalg.pinv(self.wrenches)
+            self.inverse = lapack.pseudoinverse(self.wrenches, 1e-14)
             if not bool(jnp.all(self.inverse[:, 0] > 0)):
                 raise ModelError(
                     "Not every rotor adds to the thrust where its moments balance: the base's centre "

@@ -17,7 +17,7 @@ of Numerical Algorithms (2002), theorem 19.13.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra import linalg
+from ..algebra import lapack, linalg
 from ..algebra.native import native_loops
 from ..algebra.stacked import multiply
 
@@ -40,7 +40,7 @@ def triangularise(rows: Float[Array, "r k *s"]) -> Root:
     if rows.ndim == 2 and k > (_FEW_NATIVE if native_loops() else _FEW):
         if r < k:
             rows = jnp.concatenate([rows, jnp.zeros((k - r, k), rows.dtype)])
-        R = jnp.linalg.qr(rows, mode="r")
+        R = lapack.upper(rows)
         return (jnp.where(jnp.diagonal(R) < 0, -1.0, 1.0)[:, None].astype(R.dtype) * R).T
     return _assemble(_gram_schmidt(rows))
 

@@ -25,6 +25,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from ..algebra import lapack
 from ..algebra.compiler import kept_jit
 from ..algebra.newton import Implicit, NearestNewton, Newton
 from ..algebra.space import Point
@@ -134,7 +135,7 @@ def _found(problem: _Problem) -> tuple[Any, ...]:
         throw=False,
     )
     last = jax.lax.stop_gradient(solution.state)
-    values = jnp.linalg.svd(last.J, compute_uv=False)
+    values = lapack.singular_values(last.J)
     left = jnp.max(jnp.abs(last.r))
     return solution.value[:count], left, values[-1] / values[0], solution.stats["num_steps"]
 

@@ -22,6 +22,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
+from ..algebra import lapack
 from ..algebra.compiler import kept_jit
 from ..algebra.derivative import safe_sqrt
 from ..algebra.newton import Implicit, Newton
@@ -291,7 +292,7 @@ def _found(setting: _Setting, limits: TrimLimits) -> FlightTrim:
     z, last = solution.value, jax.lax.stop_gradient(solution.state)
     # the Jacobian is scaled in units of a radian, the weight, and the weight times a metre
     sizes = jnp.where(jnp.arange(8) < 2, 1.0, jax.lax.stop_gradient(weight))
-    values = jnp.linalg.svd(last.J * sizes, compute_uv=False)
+    values = lapack.singular_values(last.J * sizes)
     at = _point(z[:2], setting.wanted)
     B = _map(flyer, at)
     squared = minimum_norm(B, z[2:6])

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra import lapack
 from ..algebra.compiler import kept_jit
 from ..algebra.rotation import (
     conjugate,
@@ -118,7 +119,7 @@ class FlyerAccelerations(NamedTuple):
 
 @kept_jit
 def _conditioning(geometry: TrackerGeometry, angles: Float[Array, "2"]) -> Float[Array, ""]:
-    values = jnp.linalg.svd(stroke_jacobian(geometry, angles), compute_uv=False)
+    values = lapack.singular_values(stroke_jacobian(geometry, angles))
     return values[-1] / values[0]
 
 

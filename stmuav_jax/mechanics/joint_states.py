@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra import lapack
 from ..algebra.rotation import (
     cross,
     from_matrix,
@@ -188,7 +189,7 @@ def _of_motions(
     motion_of = lambda rate: jnp.concatenate(relative_pose(joint, x, rate)[2:])
     S = jax.vmap(motion_of, out_axes=1)(jnp.eye(len(x), dtype=x.dtype))
     seen_twist = jnp.concatenate([apply_transposed(F_i, part) for part in twist])
-    return x, jnp.linalg.solve(S.T @ S, S.T @ seen_twist)
+    return x, lapack.solve(S.T @ S, S.T @ seen_twist)
 
 
 def _parts(joint: Joint, motion: AbstractRelativeMotion) -> ColumnParts:

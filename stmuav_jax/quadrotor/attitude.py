@@ -22,6 +22,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..algebra import lapack
 from ..algebra.rotation import cross, from_rotation_vector, product
 from ..algebra.space import Composite, Rotation, Vector
 from ..estimation.model import Sensor, StateSpaceModel
@@ -74,7 +75,7 @@ def attitude_model(
         mass: mass [kg], needed for the accelerometer; None for a gyroscope alone.
     """
     J = jnp.asarray(parameters.value("inertia"))
-    J_inverse = jnp.linalg.inv(J)
+    J_inverse = lapack.inverse(J)
     arm, drag = parameters.value("arm"), parameters.value("drag")
 
     def turning(omega: Array, offset: Array, u: Array) -> Array:

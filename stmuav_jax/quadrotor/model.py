@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra import lapack
 from ..algebra.rotation import cross
 from ..algebra.stacked import apply
 from ..checks.errors import ModelError, SettingError
@@ -191,7 +192,7 @@ def rates(parameters: Parameters = PART_III, kinematics: Kinematics | None = "co
     J = jnp.asarray(parameters.value("inertia"))
     # plain numbers leave single precision as it is
     arm, drag = parameters.value("arm"), parameters.value("drag")
-    return RigidBodyRates(J, jnp.linalg.inv(J), arm, drag, kinematics)
+    return RigidBodyRates(J, lapack.inverse(J), arm, drag, kinematics)
 
 
 def report_model(

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..algebra import lapack
 from ..algebra.rotation import cross
 from ..algebra.small import inverse
 from ..algebra.stacked import apply
@@ -81,7 +82,7 @@ def rotorcraft_model(
             with the accelerometer [m^2/s^4].
     """
     J = jnp.asarray(J)
-    J_inverse = jnp.linalg.inv(J)
+    J_inverse = lapack.inverse(J)
     noise = matrix(R)
     accelerometer = np.shape(noise)[0] == 6
 

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..algebra import lapack, linalg
 from ..algebra.derivative import safe_sqrt
 from ..checks.errors import ModelError, check_finite, concrete
 from ..checks.numbers import numbers
@@ -55,8 +56,8 @@ def minimum_norm(B: Float[Array, "4 k"], wrench: Float[Array, "4"]) -> Float[Arr
     """Minimum-norm u with B u = wrench; NaN where the rotors cannot give every wrench."""
     gram = B @ B.T
     scale = 1 / jnp.sqrt(jnp.diagonal(gram))
-    factor = jax.scipy.linalg.cho_factor(scale[:, None] * gram * scale)
-    return B.T @ (scale * jax.scipy.linalg.cho_solve(factor, scale * wrench))
+    factor = linalg.Factor(linalg.cholesky(scale[:, None] * gram * scale))
+    return B.T @ (scale * factor.solve(scale * wrench))
 
 
 class RotorLimits(NamedTuple):
@@ -300,15 +301,14 @@ def _least_slope(missed: Float[Array, ""]) -> Float[Array, ""]:
 def _settled(box: _Box, held: Int[Array, " k"], start: Float[Array, " k"]) -> Float[Array, " k"]:
     """Point nearest to `start` that minimises |A x - b| with some entries held at their limits."""
     fixed = jnp.where(held > 0, box.r, jnp.where(held < 0, 0.0, start))
-    inverse = jnp.linalg.pinv(box.A * (held == 0), rtol=_RANK)
+    inverse = lapack.pseudoinverse(box.A * (held == 0), _RANK)
     return fixed + inverse @ (box.b - box.A @ fixed)
 
 
 def _inverse(box: _Box, held: Int[Array, " k"]) -> tuple[Float[Array, "k 4"], Float[Array, ""]]:
     """Pseudoinverse of the free columns of A, and the round-off of a solution by it."""
-    U, values, V = jnp.linalg.svd(box.A * (held == 0), full_matrices=False)
-    counts = values > _RANK * values[0]
-    kept = jnp.where(counts, values, jnp.inf)
+    U, values, V = lapack.svd(box.A * (held == 0))
+    kept = jnp.where(values > _RANK * values[0], values, jnp.inf)
     smallest = jnp.min(kept) / jnp.where(values[0] > 0, values[0], 1.0)
     return (V.T / kept) @ U.T, _ROUND_OFF + 1e-15 / smallest
 

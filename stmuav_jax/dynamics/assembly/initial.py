@@ -6,11 +6,11 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from ...algebra import lapack
 from ...algebra.compiler import kept_jit
 from ...algebra.rotation import conjugate, normalise, product, to_rotation_vector
 from ...checks.errors import ModelError, StateError, concrete
@@ -188,8 +188,8 @@ def _positions(
         r, p = displace(base.r, base.p, step.reshape(-1, 6))
         return State(r, p, guess.v, guess.omega)
 
-    def residual(unknown: tuple[Array, Array], args: tuple[Model, State]) -> tuple[Array, Array]:
-        step, multipliers = unknown
+    def residual(unknown: Array, args: tuple[Model, State]) -> Array:
+        step, multipliers = unknown[:-m], unknown[-m:]
         within, base = args
         phi = lambda s: (
             within.constraints.equations(t, within.system.kinematics(moved(s, base))).value
@@ -205,18 +205,20 @@ def _positions(
             axis=1,
         ).reshape(-1)
         gradient = (weighed - pull(multipliers)[0]) / size
-        return jnp.where(free, gradient, step), value
+        return jnp.concatenate([jnp.where(free, gradient, step), value])
 
     # one scale for the gradient rows gives both parts the unit of a length
     size = jnp.sum(bodies.mass)
     turned = jax.vmap(lambda a, b: to_rotation_vector(product(conjugate(b), a)))
     away = lambda a, b: jnp.concatenate([a.r - b.r, turned(a.p, b.p)], axis=1).reshape(-1)
-    start = (away(*jax.lax.stop_gradient((near, guess))), jnp.zeros(m, guess.r.dtype))
-    solver = optx.Newton(rtol=1e-12, atol=1e-13, linear_solver=lx.SVD(rcond=1e-11))
-    adjoint = optx.ImplicitAdjoint(linear_solver=lx.SVD(rcond=1e-11))
+    start = jnp.concatenate(
+        [away(*jax.lax.stop_gradient((near, guess))), jnp.zeros(m, guess.r.dtype)]
+    )
+    solver = optx.Newton(rtol=1e-12, atol=1e-13, linear_solver=lapack.PseudoinverseSolver(1e-11))
+    adjoint = optx.ImplicitAdjoint(linear_solver=lapack.PseudoinverseSolver(1e-11))
     how: Any = {"adjoint": adjoint, "max_steps": max_steps, "throw": False}
     solution = optx.root_find(residual, solver, start, args=(model, guess), **how)
-    return moved(solution.value[0], guess)
+    return moved(solution.value[:-m], guess)
 
 
 def velocities(model: Model, t: Float[Array, ""], state: State, free: Bool[Array, " k"]) -> State:
@@ -238,8 +240,8 @@ def nearest_step(
 ) -> Callable[[Float[Array, " m"]], Float[Array, " k"]]:
     """Function of numbers b (m,) that returns the smallest x in the mass metric with J x = b."""
     weighed = model.weigh(eq.J * free.reshape(-1, 6)).reshape(eq.matrix.shape) * free
-    S = lx.MatrixLinearOperator(weighed @ (eq.matrix * free).T)
-    return lambda b: weighed.T @ lx.linear_solve(S, b, lx.SVD(rcond=1e-11), throw=False).value
+    inverse = lapack.pseudoinverse(weighed @ (eq.matrix * free).T, 1e-11)
+    return lambda b: weighed.T @ (inverse @ b)
 
 
 class Rank(NamedTuple):
@@ -311,7 +313,7 @@ def ranks(
 def singular_values(model: Model, states: State, t: Float[Array, ""]) -> Float[Array, "k m"]:
     """Singular values of the unscaled constraint Jacobian at states (k, n, .), the largest first."""
     matrices = jax.vmap(lambda state: _jacobian(model, state, t))(states)
-    return jnp.linalg.svd(matrices, compute_uv=False)
+    return jax.vmap(lapack.singular_values)(matrices)
 
 
 def _dependent_rows(J: np.ndarray, count: int) -> list[int]:

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ...algebra import lapack
 from ...algebra.compiler import kept_jit
 from ...checks.errors import ModelError, StateError, concrete
 from ...checks.reason import AbstractReason, first_reason
@@ -249,7 +249,7 @@ def _closed(
 
 def _solve(J: Float[Array, "m k"], b: Float[Array, " m"]) -> Float[Array, " k"]:
     """Least-squares solution of J x = b, of minimum norm if J does not determine it."""
-    return lx.linear_solve(lx.MatrixLinearOperator(J), b, lx.SVD(rcond=1e-12), throw=False).value
+    return lapack.pseudoinverse(J, 1e-12) @ b
 
 
 def _rates(
@@ -265,11 +265,11 @@ def _rates(
     u = spread(_solve(J, eq.target))
     moving = State(state.r, state.p, u[:, :3], u[:, 3:])
     a = spread(_solve(J, level(moving)[0].gamma))
-    values = jnp.linalg.svd(jax.lax.stop_gradient(J), compute_uv=False)
+    values = lapack.singular_values(jax.lax.stop_gradient(J))
     enough = J.shape[0] >= J.shape[1]
     smallest = values[-1] / values[0] if enough else jnp.zeros(())
     square = J.shape[0] == J.shape[1]
-    sign = jnp.linalg.slogdet(jax.lax.stop_gradient(J))[0] if square else jnp.zeros(())
+    sign = lapack.sign_of_determinant(J) if square else jnp.zeros(())
     return (moving, u, a), smallest, sign
 
 

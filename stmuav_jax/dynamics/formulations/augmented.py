@@ -19,8 +19,10 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from ...algebra import lapack
 from ...algebra.linalg import Factor, MinimumNorm, factorise, product_transposed, solve_general
 from ...algebra.rotation import (
     euler_parameter_rate,
@@ -29,7 +31,7 @@ from ...algebra.rotation import (
     normalise,
     product,
 )
-from ...checks.numbers import array_module, as_jax, as_numpy
+from ...checks.numbers import as_jax, as_numpy
 from ...mechanics.load import Load, total_load
 from ...mechanics.state import Kinematics, State
 from ...mechanics.system import System
@@ -89,9 +91,9 @@ class Augmented(AbstractFormulation):
 
     def prepare(self, system: System) -> Model:
         inertia = as_numpy(system.bodies.inertia)
-        # one batched inversion either way; NumPy's compiles nothing
-        inverse = array_module(inertia).linalg.inv(inertia)
-        return Model(system, constraints(system, self.rows), as_jax(inverse))
+        # NumPy's compiles nothing
+        invert = np.linalg.inv if isinstance(inertia, np.ndarray) else lapack.inverse
+        return Model(system, constraints(system, self.rows), as_jax(invert(inertia)))
 
     def to_vector(self, model: Model, state: State) -> Float[Array, " k"]:
         return jnp.concatenate([x.reshape(-1) for x in (state.r, state.p, state.v, state.omega)])

@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ...algebra import lapack
 from .rosenbrock import Rodas5P, stability
 
 Vector = Float[Array, " k"]
@@ -123,7 +124,7 @@ class Guard(eqx.Module):
         """Memory with the longest step that the modes allow at t [s]."""
         H = krylov.matrix[:-1]
         if self.implicit:
-            values = jnp.linalg.eigvals(jnp.where(jnp.all(jnp.isfinite(H)), H, 0.0))
+            values = lapack.eigenvalues(jnp.where(jnp.all(jnp.isfinite(H)), H, 0.0))
             left = jnp.maximum(-values.real, 0.0) * (t - modes.start) / self.order
             fastest = jnp.max(jnp.abs(values) * jnp.exp(-left))
         else:

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...algebra import lapack
 from ...algebra.rotation import (
     conjugate,
     from_rotation_vector,
@@ -236,8 +237,8 @@ class TreeSpace(AbstractStateSpace):
         if not self.selection.rows:
             return jnp.ones_like(x.u, shape=())
         _, J = self._rows(self._closed(x, t), t)
-        values = jnp.linalg.svd(J[:, self._places()[1]], compute_uv=False)
-        return values[-1] / jnp.linalg.norm(J, 2)
+        values = lapack.singular_values(J[:, self._places()[1]])
+        return values[-1] / lapack.singular_values(J)[0]
 
     def rates(
         self, x: TreePoint, t: Time = 0.0, system: System | None = None
@@ -279,10 +280,10 @@ class TreeSpace(AbstractStateSpace):
             rows = closure_rows(parameters, self.model.constraints, t, moving)
             J, gamma = rows.J[kept], rows.gamma[kept, None]
             known = jnp.concatenate([J[:, independent], gamma], axis=1)
-            by = jnp.linalg.solve(J[:, dependent], known)
+            by = lapack.solve(J[:, dependent], known)
             N = N.at[b + dependent, b:].set(-by[:, :-1])
             c = c.at[b + dependent].set(by[:, -1])
-        own = jnp.linalg.solve(N.T @ M @ N, -N.T @ (h + M @ c))
+        own = lapack.solve(N.T @ M @ N, -N.T @ (h + M @ c))
         return N @ own + c
 
     def _places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -296,7 +297,7 @@ class TreeSpace(AbstractStateSpace):
         at = self._closed(x, t)
         target, J = self._rows(at, t, target=True)
         J_d = J[:, self._places()[1]]
-        by = jnp.linalg.solve(J_d, target - J @ at.u)
+        by = lapack.solve(J_d, target - J @ at.u)
         return at._replace(u=at.u.at[self._places()[1]].add(by))
 
     def _opened(self, x: TreePoint) -> TreeCoordinates:
@@ -312,7 +313,7 @@ class TreeSpace(AbstractStateSpace):
 
         def step(now: TreeCoordinates) -> tuple[TreeCoordinates, Array]:
             value, J = self._rows(now, t)
-            by = jnp.linalg.solve(J[:, dependent], value)
+            by = lapack.solve(J[:, dependent], value)
             full = jnp.zeros(J.shape[1], J.dtype).at[dependent].set(-by)
             return moved(tree, now, full), jnp.max(jnp.abs(by))
 

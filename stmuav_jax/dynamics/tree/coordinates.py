@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...algebra import lapack
 from ...algebra.rotation import (
     conjugate,
     cross,
@@ -292,7 +293,7 @@ def _velocities(parameters: TreeParameters, pose: Pose, ends: _Ends) -> Array:
         along = table.linear[own] + table.pitched[own] * pitch
         S = jnp.concatenate([turn, along * axis[:, own] + cross(turn, pivot - at[:, own])])
         twist = jnp.concatenate([omega_b - omega_f, v_b - v_f])[:, own[-1]]
-        found = found.at[own].set(jnp.linalg.solve(S.T @ S, S.T @ twist))
+        found = found.at[own].set(lapack.solve(S.T @ S, S.T @ twist))
     return found
 
 

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ...algebra import lapack
 from ...algebra.compiler import kept_jit
 from ...algebra.linalg import solve_saddle
 from ...algebra.rotation import conjugate, cross, product, rotation_matrix
@@ -298,7 +299,7 @@ def _inverse_of_base(parameters: TreeParameters) -> Float[Array, "6 6"]:
     at = filled(tree, jnp.zeros)
     moving = motion(parameters, at._replace(p=at.p.at[0].set(1.0)))
     total = inertia(parameters, moving, jnp.zeros_like(moving.V))
-    return jnp.linalg.inv(mass_matrix(tree, moving.S, total))
+    return lapack.inverse(mass_matrix(tree, moving.S, total))
 
 
 def _closure_reactions(
