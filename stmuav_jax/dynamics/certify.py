@@ -4,12 +4,14 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from ..checks.errors import ModelError
 from ..mechanics.internal import internal_states
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .assembly.initial import Rank, rank_of
+from .assembly.singular import singular_start
 from .checks import check_consistent, check_loads
 from .error_estimate import ErrorEstimate
 from .evaluation import Balances, RowsAt, Saved, accelerations, balances, rows_at, singular_values
@@ -83,6 +85,10 @@ def allow_dependent(
     return allowing
 
 
+# The start was a singular posture if a singular value that is zero there comes to this fraction of the
+# largest, and to this multiple of the constraints' residuals.
+_RISEN, _DRIFT = 1e-5, 100.0
+
 # Largest number of saved states at which the standard certificate looks at the rank.
 SEEN = 256
 
@@ -95,12 +101,14 @@ class Checked(NamedTuple):
         smallest: smallest singular value number `rank` of the constraint Jacobian, or None.
         difference: that of two formulations, see `Certificate.formulation_difference`, or None.
         worst: largest constraint residuals by name in a certificate.
+        branches: text on a start in a singular posture that the motion has left; else "".
     """
 
     balances: Balances | None
     smallest: float | None
     difference: float | None
     worst: dict[str, float]
+    branches: str = ""
 
 
 def check_saved(
@@ -118,14 +126,35 @@ def check_saved(
     if not full and len(pick) > SEEN:
         pick = np.linspace(0, len(pick) - 1, SEEN).round().astype(int)
     there = rows_at(rows, jax.tree.map(lambda x: np.asarray(x)[pick], at))
-    smallest = difference = None
+    smallest, difference, branches = None, None, ""
+    worst = violations(rows.constraints, first, there if full else start.rows, start.norm)
     if start.rank.rank:
-        smallest = float(np.min(singular_values(there)[:, start.rank.rank - 1]))
-    looked = there if full else start.rows
+        values = singular_values(there)
+        smallest = float(np.min(values[:, start.rank.rank - 1]))
+        drifted = max(worst["position_violation"], worst["angle_violation"])
+        later = _independent_later(values, start.rank.rank, drifted)
+        if later is not None:
+            one = lambda k: jax.tree.map(lambda x: np.asarray(x)[k], at.states)
+            k = pick[later]
+            time = float(at.ts[k])
+            branches = singular_start(system, rows, one(0), one(k), time, start.rank.rank)
     if full:
         difference = _formulation_difference(problem, rows, at, bool(start.rank.redundant))
-    worst = violations(rows.constraints, first, looked, start.norm)
-    return Checked(balances(system, at), smallest, difference, worst)
+    return Checked(balances(system, at), smallest, difference, worst, branches)
+
+
+def _independent_later(values: Float[np.ndarray, "k s"], rank: int, drifted: float) -> int | None:
+    """Saved state whose rows are independent where those of the start are not; None if there is none.
+
+    Args:
+        values: singular values of the rows. rank: rank at the start.
+        drifted: largest residual of the constraints, which makes dependent rows a little different.
+    """
+    if rank >= values.shape[1]:
+        return None
+    least = max(_RISEN, _DRIFT * drifted) * values[0, 0]
+    later = int(np.argmax(values[:, rank]))
+    return later if values[later, rank] > least > values[0, rank] else None
 
 
 def _formulation_difference(problem: Problem, rows: Model, at: Saved, dependent: bool) -> float:
@@ -171,7 +200,7 @@ def certify(
         angular_velocity_error=angular_velocity,
         error_e_folding_time=errors.e_folding_time,
         predictability_horizon=errors.predictability_horizon,
-        error_words=errors.words(np.asarray(trajectory.ts)),
+        error_words=_with(errors.words(np.asarray(trajectory.ts)), checked.branches),
         **checked.worst,
         energy_error=drift,
         relative_energy_error=relative_drift,
@@ -190,6 +219,14 @@ def certify(
         estimate_seconds=seconds.estimate,
         analysis_seconds=seconds.analysis,
     )
+
+
+def _with(words: str, branches: str) -> str:
+    """Words about the errors, with those on a singular start as a sentence of their own."""
+    if not branches:
+        return words
+    also = f"T{branches[1:]}. The errors are those of the branch that this run follows."
+    return f"{words.rstrip('.')}. {also}" if words else also
 
 
 def _balances(

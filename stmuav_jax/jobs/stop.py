@@ -40,7 +40,7 @@ class Stop:
         if first:
             self.asked = True
             threading.Thread(target=self._insist, args=(number,), daemon=True).start()
-        if not _is_deaf(frame, first=first):
+        if not _loses_exceptions(frame, first=first):
             raise KeyboardInterrupt
 
     def _insist(self, number: int) -> None:
@@ -49,7 +49,7 @@ class Stop:
                 signal.pthread_kill(threading.main_thread().ident or 0, number)
 
 
-def _is_deaf(frame: FrameType | None, *, first: bool) -> bool:
+def _loses_exceptions(frame: FrameType | None, *, first: bool) -> bool:
     """True if an exception raised in a frame is printed and lost, or, the first time, mishandled."""
     while frame is not None:
         name, module = frame.f_code.co_name, str(frame.f_globals.get("__name__", ""))

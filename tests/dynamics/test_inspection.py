@@ -123,3 +123,15 @@ def test_the_command_says_by_its_exit_code_what_is_wrong(tmp_path, capsys):
     odd.write_text(text.replace("0.16666666666666666, 0.16666666666666666", "1.0, -1.0"))
     assert main(["check", str(odd), "--no-cache"]) == 2
     assert main(["check", "hexacopter", "--no-cache"]) in (0, 1)
+
+
+def test_a_run_from_a_singular_posture_says_so():
+    """The flat parallelogram falls along one of its branches: the certificate names the joints."""
+    flat, sound = parallelogram(0.0), parallelogram(0.3)
+    words = lambda system: (
+        stm.simulate(system, system.reference, t1=0.2, save_every=0.05).certificate.error_words
+    )
+    assert words(flat).startswith("The start is a singular posture of ")
+    assert "A (at 0 rad)" in words(flat)
+    assert "branch that this run follows" in words(flat)
+    assert words(sound) == ""

@@ -46,14 +46,9 @@ def singular_posture(system: System, states: State, t: float, rank: int) -> str:
         return ""
     model = Augmented().prepare(system)
     values = np.asarray(singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
-    state = State(*(x[-1] for x in (states.r, states.p, states.v, states.omega)))
+    state = _one(states, -1)
     if rank < values.shape[1] and values[-1, rank] > _RISEN * values[0, 0] > values[0, rank]:
-        _, names = weakest_rows(system, model, state, t, rank + 1)
-        return (
-            f"the start is a singular posture of {_standing(system, state, names)}: "
-            "branches of the motion meet there, and nothing says which one it follows. Start "
-            "beside that posture, on the branch that is meant"
-        )
+        return singular_start(system, model, _one(states, 0), state, t, rank)
     if not values[-1, rank - 1] < _SINGULAR * values[0, rank - 1]:
         return ""
     smallest, names = weakest_rows(system, model, state, t, rank)
@@ -63,6 +58,26 @@ def singular_posture(system: System, states: State, t: float, rank: int) -> str:
         f"{values[0, rank - 1]:.3g} at the start. What these joints or drivers demand takes "
         "unbounded velocities or forces; lead the motion around that posture"
     )
+
+
+def singular_start(
+    system: System, model: Model, start: State, later: State, t: float, rank: int
+) -> str:
+    """Text on a start in a singular posture, whose dependent rows are independent at a later state.
+
+    Args:
+        t: time of the later state [s]. rank: rank at the start.
+    """
+    _, names = weakest_rows(system, model, later, t, rank + 1)
+    return (
+        f"the start is a singular posture of {_standing(system, start, names)}: "
+        "branches of the motion meet there, and nothing says which one it follows. Start "
+        "beside that posture, on the branch that is meant"
+    )
+
+
+def _one(states: State, k: int) -> State:
+    return State(*(x[k] for x in (states.r, states.p, states.v, states.omega)))
 
 
 def _standing(system: System, state: State, names: tuple[str, ...]) -> str:
