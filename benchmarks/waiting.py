@@ -78,10 +78,11 @@ def measured(name: str, repeats: int) -> dict[str, Any]:
     runs: dict[str, list[dict[str, Any]]] = {"cold": [], "warm": []}
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder) / "out"
-            if name in BEFORE:
-                one(COMMANDS[BEFORE[name]], Path(folder) / "other", out)
             for kind in runs:
+                # a study does not write over another
+                out = Path(folder) / kind
+                if name in BEFORE:
+                    one(COMMANDS[BEFORE[name]], Path(folder) / "other", out)
                 runs[kind].append(one(words, Path(folder) / "cache", out))
     return {"words": words, **{kind: {**least(own), "runs": own} for kind, own in runs.items()}}
 

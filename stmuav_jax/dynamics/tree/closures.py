@@ -36,7 +36,7 @@ def in_world(parameters: TreeParameters, at: TreeCoordinates, moving: TreeMotion
     R, r, v, w = moving.R, moving.c, moving.v, moving.w
     omega = apply_transposed(R, w)
     if not tree.floating:
-        return Placed(r, v, omega, R, w)
+        return Placed(r - r[:, -1:], v, omega, R, w)
     R_w0 = rotation_matrix(at.p)
     moves = aligned(np.arange(r.shape[1]) < r.shape[1] - 1, r.ndim - 1)
     R = jnp.where(moves, multiply(R_w0, R), aligned(np.eye(3), R.ndim))

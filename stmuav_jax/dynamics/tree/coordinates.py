@@ -143,7 +143,7 @@ def read(parameters: TreeParameters, state: State) -> TreeCoordinates:
 class _Ends(NamedTuple):
     """Bodies and ground in the axes of frame 0: axes of their frames, positions, velocities.
 
-    The positions are those of the centres of mass from the root's; the velocities are absolute.
+    The positions are those of the centres of mass from frame 0's origin; the velocities are absolute.
     """
 
     E: Float[Array, "3 3 N"]
@@ -163,7 +163,8 @@ def _ends(parameters: TreeParameters, state: State) -> _Ends:
     R_w0 = R_wb[:, :, at]
     E = multiply(jnp.swapaxes(R_w0, 0, 1), multiply(R_wb, jnp.swapaxes(parameters.B, 0, 1)))
     seen = lambda x: apply_transposed(R_w0, x)
-    return _Ends(E, seen(r - r[:, at]), seen(v), seen(omega))
+    # in the world the root is ground, whose position in frame 0 is not zero
+    return _Ends(E, seen(r - r[:, at]) + parameters.com[:, at], seen(v), seen(omega))
 
 
 def _references(tree: SpanningTree) -> tuple[np.ndarray, np.ndarray]:

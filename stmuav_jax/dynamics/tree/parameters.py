@@ -1,7 +1,10 @@
 """Parameters of a spanning tree: its constant rotations, positions, masses and inertias.
 
-Spatial vectors are (angular, linear), in the axes of frame 0 and about its origin. Frame 0 is
-the world or, if the system floats, the base, with its origin at the base's centre of mass.
+Spatial vectors are (angular, linear), in the axes of frame 0 and about its origin. Frame 0 has the
+axes of the world and its origin at a joint with ground or, if the system floats, the axes of the
+base and its origin at the base's centre of mass. Both are near the bodies, wherever in the world
+these are: moments of inertia about a point at a distance c would lose c^2 over their square size
+of their digits.
 Velocities then add from the root outwards, and inertias and wrenches from the tips inwards,
 without any transformation. Frames of equal depth are evaluated together.
 
@@ -39,7 +42,8 @@ class TreeParameters(eqx.Module):
         K, k: rotation (3, 3, f) and position (3, f) [m] of every frame in its parent, where
             the coordinates of the frame's own step are zero.
         B: axes of the bodies and of ground in those of their frames (3, 3, n + 1).
-        com: centres of mass in the axes and about the origins of their frames (3, n + 1) [m].
+        com: centres of mass in the axes and about the origins of their frames (3, n + 1) [m]; that
+            of ground is the world's origin.
         mass: mass of all bodies fixed to a frame, taken as one (f + 1,) [kg].
         centre: their centre of mass in the frame (3, f + 1) [m].
         inertia: their inertia about it in the frame's axes (3, 3, f + 1) [kg m^2].
@@ -72,7 +76,7 @@ def tree_parameters(system: System, tree: SpanningTree) -> TreeParameters:
     K: list[Any] = []
     k: list[Any] = []
     B: dict[int, Any] = {tree.root: _EYE}
-    com: dict[int, Any] = {tree.root: np.zeros(3)}
+    com: dict[int, Any] = {tree.root: np.zeros(3) if tree.floating else -_origin(system, tree)}
     by_link = {link.child: link for link in tree.links}
     for link in tree.links:
         frame_i, point_i, frame_j, point_j = _sides(system, link)
@@ -116,6 +120,16 @@ def tree_parameters(system: System, tree: SpanningTree) -> TreeParameters:
         B_p,
         _pitches(system, tree),
     )
+
+
+def _origin(system: System, tree: SpanningTree) -> Any:
+    """Point of the world (3,) [m] where a tree that stands on ground has the origin of frame 0."""
+    for link in tree.links:
+        if link.parent == tree.root and link.joint is not None:
+            point = _sides(system, link)[1]
+            # the motion does not depend on it, and neither do derivatives
+            return point if isinstance(point, np.ndarray) else jax.lax.stop_gradient(point)
+    return np.zeros(3)
 
 
 def _pitches(system: System, tree: SpanningTree) -> Float[Array, "f"] | None:

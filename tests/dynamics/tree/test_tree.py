@@ -243,3 +243,27 @@ def test_gradients_of_lengths_and_masses_agree():
     maximal = jax.jit(jax.jacfwd(lambda q: bent(q, stm.Augmented())))(zero)
     np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(forward[1], maximal[1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("distance", [1e4, 1e7])
+def test_a_mechanism_on_ground_far_from_the_origin(distance):
+    """A double pendulum moves as at the origin, in as many steps, to the round-off of its positions."""
+
+    def run_at(foot):
+        size = (0.05, 0.1, 0.1)
+        bodies = [
+            stm.Body("upper", 1.0, size, position=foot + np.array([-0.5, 0.0, 0.0])),
+            stm.Body("lower", 1.0, size, position=foot + np.array([-1.5, 0.0, 0.0])),
+        ]
+        joints = [
+            stm.revolute("foot", "ground", "upper", point=foot, axis=(0.0, 0.0, 1.0)),
+            stm.revolute("knee", "upper", "lower", point=foot - np.eye(3)[0], axis=(0.0, 0.0, 1.0)),
+        ]
+        system = stm.System(bodies, joints, [stm.Gravity((0.0, -9.81, 0.0))])
+        return stm.simulate(system, system.reference, t1=1.0, save_every=0.1)
+
+    foot = distance * np.array([1.0, -2.0, 1.0])
+    near, far = run_at(np.zeros(3)), run_at(foot)
+    off = np.max(np.abs(far.states.r - foot - near.states.r))
+    assert off < 1e-10 + 4 * np.spacing(2 * distance)
+    assert far.certificate.accepted_steps == near.certificate.accepted_steps
