@@ -73,7 +73,8 @@ def _one_by_one(factorise: Callable[[Array], Any], most: int, A: Array) -> Any:
 
 @_in_blocks(operations=1)
 def _lu(A: Array) -> tuple[Array, Array, Array]:
-    return tuple(jax.lax.linalg.lu(A))
+    lu, pivots, order = jax.lax.linalg.lu(A)
+    return lu, pivots, order
 
 
 @_in_blocks(operations=1)
@@ -85,7 +86,8 @@ def cholesky(S: Array) -> Array:
 @_in_blocks(operations=4)
 def qr(A: Array) -> tuple[Array, Array]:
     """Factors Q (m, k), R (k, n) of A = Q R, with k = min(m, n) orthonormal columns; no derivative."""
-    return tuple(jnp.linalg.qr(A))
+    Q, R = jnp.linalg.qr(A)
+    return Q, R
 
 
 @_in_blocks(operations=4)
@@ -96,7 +98,8 @@ def _upper(A: Array) -> Array:
 @_in_blocks(operations=10)
 def svd(A: Array) -> tuple[Array, Array, Array]:
     """Factors U (m, k), s (k,), V^T (k, n) of A = U diag(s) V^T, k = min(m, n); no derivative."""
-    return tuple(jnp.linalg.svd(A, full_matrices=False))
+    U, values, V_t = jnp.linalg.svd(A, full_matrices=False)
+    return U, values, V_t
 
 
 @_in_blocks(operations=10)
