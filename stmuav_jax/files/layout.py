@@ -221,7 +221,9 @@ def read_node(folder: Path) -> dict[str, Any]:
         raise FileError(f"{file} is nested too deeply; it was altered.") from None
     except (OSError, ValueError) as error:
         raise FileError(f"{file} is truncated, damaged or of another kind: {error}.") from None
-    if not isinstance(found, dict) or not isinstance(found.get("attributes"), dict):
+    fine = isinstance(found, dict) and isinstance(found.get("attributes"), dict)
+    kind = (found.get("zarr_format"), found.get("node_type")) if fine else None
+    if kind not in ((3, "group"), (3, "array")):
         raise FileError(f"{file} is not the description of a Zarr array or group.")
     return found
 
@@ -308,7 +310,9 @@ def _plain_array(path: Path, name: str) -> dict[str, Any]:
     node = read_node(path / name)
     codecs = node.get("codecs")
     simple = (
-        isinstance(codecs, list)
+        node["node_type"] == "array"
+        and "fill_value" in node
+        and isinstance(codecs, list)
         and [codec.get("name") for codec in codecs] == ["bytes", "crc32c"]
         and codecs[0].get("configuration", {}).get("endian", "little") == "little"
         and isinstance(node.get("shape"), list)
@@ -329,7 +333,7 @@ def _read_column(
     about, dims = node["attributes"], tuple(node["dimension_names"][1:])
     column = Column(node["data_type"], about["units"], about["long_name"], about["role"], dims)
     row = [len(axes[dim].values) for dim in dims]
-    fine = node["shape"][1:] == row
+    fine = node["shape"][1:] == row and node["dimension_names"][0] == SAMPLE
     if not fine or node["chunk_grid"]["configuration"]["chunk_shape"] != [chunk, *row]:
         raise FileError(f"{path / name / 'zarr.json'} does not fit {path / 'zarr.json'}.")
     return column, int(node["shape"][0])
@@ -344,9 +348,10 @@ def _read_axis(path: Path, name: str, node: Mapping[str, Any]) -> Axis:
         raise FileError(f"There is no file {file}; the store was altered.")
     item = np.dtype(node["data_type"]).itemsize
     # one chunk holds the whole axis, so that an altered shape is detected before anything is read
-    if len(shape) != 1 or node["chunk_grid"]["configuration"]["chunk_shape"] != shape or (
-        file.stat().st_size != shape[0] * item + 4
-    ):  # fmt: skip
+    chunks, dims = node["chunk_grid"]["configuration"]["chunk_shape"], node["dimension_names"]
+    if (len(shape), chunks, dims) != (1, shape, [name]) or file.stat().st_size != shape[
+        0
+    ] * item + 4:
         raise FileError(f"{path / name / 'zarr.json'} does not fit {file}; the store was altered.")
     try:
         values = np.asarray(zarr.open_array(str(path / name), mode="r")[:])

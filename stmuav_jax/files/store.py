@@ -21,6 +21,7 @@ import numpy as np
 import xarray as xr
 
 from ..checks.errors import SettingError, nearest_names
+from ..checks.schema import shown
 from ..montecarlo.schema import check_count
 from ..montecarlo.work import AbstractWork
 from .chunks import (
@@ -225,17 +226,20 @@ class Store:
         """
         chosen = self._known(columns)
         others = [name for name in self.layout.columns if name not in chosen]
-        whole = xr.open_zarr(
-            self.path, consolidated=False, chunks=None, decode_cf=False, drop_variables=others
-        )
+        # columns are in the study's order, not in that of the folder
+        order = [name for name in self.layout.columns if name in chosen]
+        how: Any = {"consolidated": False, "chunks": None, "decode_cf": False}
+        try:
+            whole = xr.open_zarr(self.path, drop_variables=others, **how)[order]
+        except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
+            why = shown(str(error))
+            raise FileError(f"A description in {self.path} is damaged: {why}.") from error
         begins = [self.layout.chunk * chunk for chunk in sorted(self._stored)]
         spans = [np.arange(k, k + self._stored[k // self.layout.chunk]) for k in begins]
         numbers = np.concatenate([np.zeros(0, np.int64), *spans])
         gapless = not numbers.size or numbers[-1] + 1 == numbers.size
         # a slice reads whole chunks, and is equivalent while no sample is missing in between
         kept = whole.isel({SAMPLE: slice(0, numbers.size) if gapless else numbers})
-        # columns are in the study's order, not in that of the folder
-        kept = kept[[name for name in self.layout.columns if name in chosen]]
         words = {"long_name": "number of the sample", "units": "1"}
         return kept.assign_coords({SAMPLE: (SAMPLE, numbers, words)}).assign_attrs(
             total=self.total, finished=int(numbers.size)
