@@ -5,6 +5,12 @@ from .compiler import (
     compiler_options as compiler_options,
     outer_jit as outer_jit,
 )
+from .lapack import (
+    inverse as inverse,
+    pseudoinverse as pseudoinverse,
+    singular_values as singular_values,
+    solve as solve,
+)
 from .least_squares import (
     Search as Search,
     SearchReason as SearchReason,
