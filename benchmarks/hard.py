@@ -35,8 +35,10 @@ tolerances that users may give. The error that is demanded is 1,000 tolerances, 
 """
 LIMITS = """## Where it ends
 
-- Positions are saved in the axes of the world, with 16 digits: at 10,000 km from the origin they are
-  rounded to 2e-9 m. The motion itself is computed in coordinates of the joints and loses nothing.
+- A mechanism that only rods or cut loops tie to ground, 1,000 km or more from the origin, stops with
+  "step size collapsed": its positions are numbers that are 1e6 times as large as its motion. Put the
+  origin near the mechanism, or use `formulation=stm.Augmented()`. Trees that stand on ground by a joint
+  compute about that joint: a double pendulum at 10,000 km moves as at the origin.
 - Tolerances are lengths in metres as well as numbers. For a mechanism much smaller than a
   millimetre the default of 1e-8 m is a large part of it, as the estimated error then tells.
 """
