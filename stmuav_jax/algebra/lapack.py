@@ -114,9 +114,16 @@ def eigenvalues(A: Array) -> Complex[Array, "*s n"]:
 
 
 def solve(A: Matrix, b: Float[Array, "n *r"]) -> Float[Array, "n *r"]:
-    """Solution x of A x = b for a general square matrix; not finite if A is singular.
+    """Solution x of A x = b for a general square matrix, by LU factorisation with pivots.
 
-    Derivatives of any order, in both modes, follow from A x = b.
+    Derivatives of any order, in both modes, follow from A x = b. A singular matrix gives numbers that
+    are not finite, and raises no error.
+
+    Args:
+        A: matrix (n, n). b: right-hand side (n,), or several of them as columns (n, r).
+
+    Returns:
+        Solution of the shape of b.
     """
     lu, _, order = _lu(jax.lax.stop_gradient(A))
     ahead = lambda _, b: _ahead(lu, order, b)
@@ -144,7 +151,10 @@ def _back(lu: Matrix, order: Array, b: Matrix) -> Matrix:
 
 
 def inverse(A: Float[Array, "*s n n"]) -> Float[Array, "*s n n"]:
-    """Inverses of general square matrices, with derivatives; not finite for singular ones."""
+    """Inverses (*s, n, n) of general square matrices (*s, n, n), with the derivatives of `solve`.
+
+    A singular matrix gives numbers that are not finite, and raises no error.
+    """
     one = lambda A: solve(A, jnp.eye(A.shape[-1], dtype=A.dtype))
     return jnp.vectorize(one, signature="(n,n)->(n,n)")(A)
 
@@ -177,7 +187,10 @@ def _upper_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matrix,
 
 @jax.custom_jvp
 def singular_values(A: Matrix) -> Vector:
-    """Singular values of a matrix, the largest first; derivatives exist where they are distinct."""
+    """Singular values (k,) of a matrix (m, n), k = min(m, n), the largest first.
+
+    Derivatives exist where the values are distinct.
+    """
     return _values(A)
 
 
@@ -189,7 +202,9 @@ def _values_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Vector
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def pseudoinverse(A: Matrix, rcond: float) -> Matrix:
-    """Moore-Penrose inverse (n, m), where values up to `rcond` times the largest count as zero.
+    """Moore-Penrose inverse (n, m) of a matrix (m, n).
+
+    Singular values up to `rcond` times the largest count as zero.
 
     Derivatives exist where the rank stays the same. Source: G. H. Golub, V. Pereyra, The
     differentiation of pseudo-inverses, SIAM Journal on Numerical Analysis 10 (1973), eq. 4.12.

@@ -3,8 +3,8 @@
 Spatial vectors are (angular, linear), in the axes of frame 0 and about its origin. Frame 0 has the
 axes of the world and its origin at a joint with ground or, if the system floats, the axes of the
 base and its origin at the base's centre of mass. Both are near the bodies, wherever in the world
-these are: moments of inertia about a point at a distance c would lose c^2 over their square size
-of their digits.
+these are: a moment of inertia J about a point at a distance c from a mass m is rounded to 1e-16 m c^2,
+which may be more than J.
 Velocities then add from the root outwards, and inertias and wrenches from the tips inwards,
 without any transformation. Frames of equal depth are evaluated together.
 
