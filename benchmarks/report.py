@@ -32,6 +32,12 @@ PARTS: dict[str, tuple[str, Callable[[dict[str, Any]], Lines]]] = {
     "stiff": ("Time against error, stiff variants", tables.curves),
 }
 
+# What is waited for: the file of the result, the title, and what writes it.
+WAITING = (
+    ("compile_times", "Compile times", tables.compile_times),
+    ("waiting", "Commands", tables.commands),
+)
+
 HEAD = """# Benchmarks
 
 Made by `python benchmarks/suite.py` from the files `suite_*.json` in `benchmarks/results/`; do not
@@ -102,14 +108,9 @@ def build(results: Path, page: Path) -> Path:
             place = os.path.relpath(figure, page.parent)
             lines += [f"![{figure.stem.replace('_', ' ')}]({place})", ""]
         lines += write(result)
-    programs = results / "compile_times.json"
-    if programs.exists():
-        lines += [
-            "",
-            "## Compile times",
-            "",
-            *tables.compile_times(json.loads(programs.read_text())),
-        ]
+    for name, title, write in WAITING:
+        if (file := results / f"{name}.json").exists():
+            lines += ["", f"## {title}", "", *write(json.loads(file.read_text()))]
     text = "\n".join(lines).rstrip() + "\n"
     return write_atomically(page, text.encode())
 

@@ -186,6 +186,35 @@ def compile_times(result: Row) -> Lines:
     ]  # fmt: skip
 
 
+def commands(result: Row) -> Lines:
+    """What each command of the command line takes, cold and with what the first run has kept."""
+    rows = []
+    for name, found in result["commands"].items():
+        words = found["words"].replace("{out}", "OUT")
+        row = [name, f"`{words}`"]
+        for kind in ("cold", "warm"):
+            own = found[kind]
+            ended = sorted({run["exit"] for run in own["runs"]} - {0})
+            row += [number(own["cpu"]), number(own["wall"]), f"{own['memory']:.0f}"]
+            if kind == "warm":
+                row.append(", ".join(str(code) for code in ended))
+        rows.append(row)
+    measures = ("CPU [s]", "wall [s]", "peak [MB]")
+    head = [
+        "command",
+        "words after `stmuav`",
+        *(f"{k}, {m}" for k in ("cold", "warm") for m in measures),
+    ]
+    repeats = max(len(found["cold"]["runs"]) for found in result["commands"].values())
+    return [
+        f"Whole processes on {result['environment']['cores']} cores, {repeats} of each: least processor time, "
+        "medians of wall time and peak memory. Cold is with an empty cache folder, warm the same command "
+        "again. Exit code 3 says that a filter is not consistent, which is the report's.",
+        "",
+        *table([*head, "exit code, if not 0"], rows),
+    ]
+
+
 def hexacopter(result: Row) -> Lines:
     """One free body, ours and by hand."""
     lines = listed(
