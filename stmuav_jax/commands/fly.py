@@ -93,7 +93,7 @@ def _flown(command: Fly, mission: "Mission", unfinished: Path) -> "MissionFlight
 
     if unfinished.exists() and not command.resume:
         raise SettingError(
-            f"There is an unfinished flight in {unfinished.parent}: go on with it (--resume), give "
+            f"There is an unfinished flight in {unfinished.parent}: continue it (--resume), give "
             f"another folder (--out), or remove {unfinished}."
         )
     reached = load_reached(mission, unfinished) if command.resume else None

@@ -59,7 +59,7 @@ class Settings:
     """Method that keeps the constraints from drifting."""
     save_every: Annotated[float | None, SPACING, default("the scene's own")] = None
     """Spacing of the saved times [s]."""
-    max_steps: Annotated[int, count("steps allowed", 1e8)] = STEPS_ALLOWED
+    max_steps: Annotated[int, count("steps between two saved times", 1e8)] = STEPS_ALLOWED
     """Largest number of steps between two saved times."""
     error_estimate: bool = True
     """Estimate the run's error by a second run beside it."""
