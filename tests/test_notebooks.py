@@ -18,7 +18,7 @@ LONG = (
     "03_the_geometry_from_the_printed_tables",
     "04_a_day_of_pointing_at_the_sun",
     "05_centre_of_mass",
-    "06_trim_and_small_motions",
+    "06_trim_and_linearisation",
     "07_inputs_by_gradients",
     "08_parameters_from_a_record",
     "09_ten_thousand_collapses",

@@ -9,10 +9,10 @@ from shared.record import commit, git, moved, traced
 
 WORDS = """Every result names the commit that it was measured on. This table was made at {now} and
 says of each result whether that commit, or another one with the same files of the package and the
-benchmarks, is in the history of this repository, whether the tree had
+benchmarks, is in the history of this repository. It says whether the tree had
 changes beside the commit, how many commits have changed the package since, and how many processes
-were running when it began (all cores; what runs on one core has that core for itself, but shares cache
-and memory with the others: above some 2, times and ratios of short runs scatter). Numbers of a result
+were running when it began. All cores count: what runs on one core has that core for itself, but shares
+cache and memory with the others, so that above some 2 times and ratios of short runs scatter. Numbers of a result
 that is not of the present package are those of an earlier one; times and errors may have changed.
 `python benchmarks/all.py` measures again whatever is not of the present code."""
 

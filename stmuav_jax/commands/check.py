@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from rich.console import Console
 
 from ..figures.terminal import line, row, table
-from .options import default
+from .options import Cache, default, shared
 from .simulate import chosen_scene, scene_command
 
 EXIT_CODES = {"note": 0, "warning": 1, "fault": 2}
@@ -18,12 +18,9 @@ EXIT_CODES = {"note": 0, "warning": 1, "fault": 2}
 class CheckSettings:
     """Options of an inspection, which all scenes share."""
 
-    case: Annotated[int | None, default("the scene's first choice")] = None
-    """Case of the report."""
-    params: Annotated[Path | None, default("the report's values")] = None
-    """TOML file with values that replace the table's."""
-    cache: bool = True
-    """Keep compiled code in the user's cache folder for the next run."""
+    case: Annotated[int | None, shared("case"), default("the scene's first choice")] = None
+    params: Annotated[Path | None, shared("params"), default("the report's values")] = None
+    cache: Cache = True
 
 
 ABOUT = """Inspect a scene, or a model's file, at its start: what is wrong, and what a run will demand.

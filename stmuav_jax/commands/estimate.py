@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from .models.estimation import EstimateSettings, estimate_class, run_estimate_model
-from .options import END, SEED, Number, count, default
+from .options import END, Cache, Figures, Number, Seed, count, default, shared
 from .output import written
 from .simulate import named_scene
 
@@ -18,37 +18,32 @@ from .simulate import named_scene
 class Estimate:
     """Estimate the centre of mass in the report's cases; write NetCDF files and figures.
 
-    Of a model's file with sensors: `stmuav estimate model.toml`, which `--help` after it describes.
+    Example: stmuav estimate --case 4 --seeds 20; stmuav estimate --hover. The motion of a mechanism with sensors is
+    estimated by `stmuav estimate model.toml`; `stmuav estimate model.toml --help` describes that.
 
     Exit code: 0 all filters are consistent with their innovations; 1 a filter lost its covariance;
     2 wrong input; 3 done, but a filter's own account of its errors cannot be trusted. The report's
     tuning is of this kind in all eight cases."""
 
-    case: Annotated[int | None, Number("number of the case", "", 1, 8), default("all")] = None
-    """Case of the report, 1 to 8."""
+    case: Annotated[
+        int | None, Number("number of the case", "", 1, 8), shared("case"), default("all 8")
+    ] = None
     tuning: Literal["both", "report", "consistent"] = "both"
-    """Table 2.4.2, or one whose covariances say what is known."""
+    """Covariances of Table 2.4.2 of the report, consistent ones, or both for comparison."""
     model: Literal["default", "observable", "report", "printed", "attitude"] = "default"
-    """5 observable states; the report's 8 as corrected or as printed; 8 with SO(3).
-    Default: the report's tuning on the report's, the consistent one on the observable states."""
+    """States of the filter: 5 observable ones; the report's 8, corrected or as printed; 8 with an attitude in SO(3).
+    By default the report's tuning has the report's states and the consistent tuning the observable ones."""
     hover: bool = False
-    """Instead fly a hover whose controller sees only the estimate."""
-    seeds: Annotated[int, count("runs", 100_000)] = 50
-    """How many runs with other noise."""
-    seed: Annotated[int, SEED] = 0
-    """The first of them."""
-    t1: Annotated[float, END] = 2.0
-    """End [s]."""
-    params: Annotated[Path | None, default("the report's values")] = None
-    """TOML file with values that replace the table's, for truth and filters alike."""
+    """Fly a hover, whose controller sees only the estimate, in place of the cases."""
+    seeds: Annotated[int, count("runs", 100_000), shared("seeds")] = 50
+    seed: Seed = 0
+    t1: Annotated[float, END, shared("t1")] = 2.0
+    params: Annotated[Path | None, shared("params"), default("the report's values")] = None
     filter_params: Annotated[Path | None, default("the values of --params")] = None
-    """TOML file with values that the filters alone believe: a mismatch to try."""
-    out: Annotated[Path | None, default("runs/estimate_CASE or runs/hover")] = None
-    """Folder for the results."""
-    figures: Literal["png", "pdf", "svg", "none"] = "png"
-    """Format of the figures."""
-    cache: bool = True
-    """Keep compiled code in the user's cache folder for the next run."""
+    """TOML file with values for the filters alone, to try a wrong model; --params is for truth and filters alike."""
+    out: Annotated[Path | None, shared("out"), default("runs/estimate_CASE or runs/hover")] = None
+    figures: Figures = "png"
+    cache: Cache = True
 
 
 # Exit code of a completed run with a filter that cannot be trusted.

@@ -22,7 +22,7 @@ from .models.steady import (
     run_trim_scene,
     trim_class,
 )
-from .options import ANGLE, FORCE, SPEED, Number, default
+from .options import ANGLE, FORCE, SPEED, TURN, Cache, Number, default, shared
 from .output import written
 from .simulate import named_scene
 
@@ -40,18 +40,14 @@ class SteadyFlight:
     """First angle of the panel [degrees]."""
     theta: Annotated[float | None, ANGLE, default("the initial one")] = None
     """Second angle of the panel [degrees]."""
-    sun: Annotated[tuple[float, float] | None, ANGLE, default("at --phi and --theta")] = None
-    """Point the panel at the sun instead: azimuth from north (y) to east (x), elevation [degrees]."""
-    climb: Annotated[float, SPEED] = 0.0
-    """Speed upwards [m/s]."""
-    speed: Annotated[float, SPEED] = 0.0
-    """Level speed [m/s]."""
-    course: Annotated[float, ANGLE] = 0.0
-    """Direction of the level speed, from x (east) towards y (north) [degrees]."""
-    turn: Annotated[float, Number("rate of turn", "degrees/s", -3600.0, 3600.0)] = 0.0
-    """Rate of turn, from x towards y [degrees/s]."""
-    yaw: Annotated[float, ANGLE] = 0.0
-    """Heading of the UAV's x axis, from x towards y [degrees]."""
+    sun: Annotated[
+        tuple[float, float] | None, ANGLE, shared("sun"), default("panel at --phi and --theta")
+    ] = None
+    climb: Annotated[float, SPEED, shared("climb")] = 0.0
+    speed: Annotated[float, SPEED, shared("speed")] = 0.0
+    course: Annotated[float, ANGLE, shared("course")] = 0.0
+    turn: Annotated[float, TURN, shared("turn")] = 0.0
+    yaw: Annotated[float, ANGLE, shared("yaw")] = 0.0
 
 
 # Its options stand beside the command's own, without a prefix.
@@ -62,44 +58,38 @@ _Flight = Annotated[SteadyFlight, tyro.conf.arg(name="")]
 class TrimCommand:
     """Find attitude, rotor speeds and actuator forces of a steady flight; write trim.json.
 
-    Example: stmuav trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods. Of another mechanism: `stmuav trim
-    model.toml`, or a scene's name; `stmuav trim model.toml --help` describes that.
+    Example: stmuav trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods. Another mechanism is trimmed by `stmuav
+    trim model.toml`, or by a scene's name; `stmuav trim model.toml --help` describes that.
     """
 
     flight: _Flight = dataclasses.field(default_factory=SteadyFlight)
     highest: Annotated[float | None, _ROTOR, default("none")] = None
-    """Limit of the rotors' speeds [rad/s]."""
+    """Largest speed of the rotors [rad/s]."""
     lowest: Annotated[float, _ROTOR] = 0.0
-    """Least speed of the rotors [rad/s], with --highest."""
+    """Smallest speed of the rotors [rad/s], with --highest."""
     force: Annotated[float | None, FORCE, default("none")] = None
-    """Limit of the actuators' forces either way [N]."""
+    """Largest force of the actuators, either way [N]."""
     by: tuple[str, ...] = ()
-    """Parameters to which the trim's sensitivity is wanted, such as mass.panel_7."""
-    params: Annotated[Path | None, default("the report's values")] = None
-    """TOML file with values that replace the table's."""
-    out: Annotated[Path | None, default("runs/trim")] = None
-    """Folder for the results."""
-    cache: bool = True
-    """Keep compiled code in the user's cache folder for the next run."""
+    """Parameters by which the trim is differentiated, such as mass.panel_7."""
+    params: Annotated[Path | None, shared("params"), default("the report's values")] = None
+    out: Annotated[Path | None, shared("out"), default("runs/trim")] = None
+    cache: Cache = True
 
 
 @dataclasses.dataclass
 class Linearize:
     """Linearise about a steady flight; write A, B, C, D with names to linear.npz.
 
-    Example: stmuav linearize --sun 150 60 --outputs phi theta. Of another mechanism: `stmuav linearize
-    model.toml`, or a scene's name; `stmuav linearize model.toml --help` describes that.
+    Example: stmuav linearize --sun 150 60 --outputs phi theta. Another mechanism is linearised by `stmuav linearize
+    model.toml`, or by a scene's name; `stmuav linearize model.toml --help` describes that.
     """
 
     flight: _Flight = dataclasses.field(default_factory=SteadyFlight)
     outputs: Annotated[tuple[str, ...], default("all")] = ()
     """States that are measured, such as omega_x."""
-    params: Annotated[Path | None, default("the report's values")] = None
-    """TOML file with values that replace the table's."""
-    out: Annotated[Path | None, default("runs/linearize")] = None
-    """Folder for the results."""
-    cache: bool = True
-    """Keep compiled code in the user's cache folder for the next run."""
+    params: Annotated[Path | None, shared("params"), default("the report's values")] = None
+    out: Annotated[Path | None, shared("out"), default("runs/linearize")] = None
+    cache: Cache = True
 
 
 def trim_options(words: Sequence[str]) -> type:

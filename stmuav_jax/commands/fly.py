@@ -2,14 +2,14 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
 
 from ..checks.errors import SettingError, SimulationError
 from ..figures.terminal import line, row, table
-from .options import END, default
+from .options import END, Cache, Figures, Resume, default, shared
 from .output import written
 
 if TYPE_CHECKING:
@@ -21,28 +21,23 @@ if TYPE_CHECKING:
 class Fly:
     """Fly a mission under control; write flight.nc and figures.
 
-    A mission is a TOML file (docs/missions.md) or one that is ready: hover, case-1 to case-3,
+    A mission is a TOML file (docs/missions.md) or a ready one: hover, case-1 to case-3,
     sun-slew, sun-day, waypoints, wind-step, gusts, rotor-weak, rotor-lost, rotor-lost-known,
     slider-jammed, battery.
     Example: stmuav fly case-1 --t1 5. Exit code: 0 all tolerances and limits were kept; 1 the flight
     failed; 2 wrong input; 3 flown, but not as the mission asks."""
 
     mission: tyro.conf.Positional[str]
-    """TOML file, or a mission that is ready."""
-    t1: Annotated[float | None, END, default("the mission's")] = None
-    """End [s]."""
+    """TOML file, or the name of a ready mission."""
+    t1: Annotated[float | None, END, shared("t1"), default("the mission's")] = None
     true_states: bool = False
-    """Leave the mission's sensors out: the controller knows the true states."""
+    """Give the controller the true states in place of estimates from the mission's sensors."""
     native_loops: bool = False
-    """Compile into one native function: takes longer to compile, flies faster."""
-    resume: bool = False
-    """Go on with an interrupted flight in the folder of the results."""
-    out: Annotated[Path | None, default("runs/MISSION")] = None
-    """Folder for the results."""
-    figures: Literal["png", "pdf", "svg", "none"] = "png"
-    """Format of the figures."""
-    cache: bool = True
-    """Keep compiled code in the user's cache folder for the next run."""
+    """Compile the flight into one native function, which takes longer to compile and flies faster."""
+    resume: Resume = False
+    out: Annotated[Path | None, shared("out"), default("runs/MISSION")] = None
+    figures: Figures = "png"
+    cache: Cache = True
 
 
 # Exit code of a flight that was flown, but not as the mission asks.
@@ -98,7 +93,7 @@ def _flown(command: Fly, mission: "Mission", unfinished: Path) -> "MissionFlight
 
     if unfinished.exists() and not command.resume:
         raise SettingError(
-            f"There is an unfinished flight in {unfinished.parent}: go on with it (--resume), give "
+            f"There is an unfinished flight in {unfinished.parent}: continue it (--resume), give "
             f"another folder (--out), or remove {unfinished}."
         )
     reached = load_reached(mission, unfinished) if command.resume else None

@@ -10,7 +10,10 @@ from ..scenes.registry import SCENES
 
 @dataclasses.dataclass
 class List:
-    """List the scenes, their cases and where the report describes them."""
+    """List the scenes, their cases and where the report describes them.
+
+    Example: stmuav list
+    """
 
 
 def run_list(_: List) -> int:

@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from ..checks.errors import SettingError
-from .options import SEED, count, default
+from .options import SEED, Cache, Figures, Resume, count, default, shared
 from .output import written
 
 if TYPE_CHECKING:
@@ -21,49 +21,45 @@ if TYPE_CHECKING:
 class Montecarlo:
     """Fly a study: a TOML file, or the name of a ready one; write a store and a report.
 
-    Ready studies: collapse, hover, case_1 to case_3, estimate_1 to estimate_8.
+    Example: stmuav montecarlo collapse --samples 256; stmuav montecarlo study.toml --resume --figures none. The ready
+    studies are collapse, hover, case_1 to case_3 and estimate_1 to estimate_8. With --figures none there is no report.
     """
 
     study: tyro.conf.Positional[str]
-    """TOML file (see docs/studies.md), or a ready study."""
+    """TOML file (docs/studies.md), or the name of a ready study."""
     samples: Annotated[int | None, count("samples", 1e9), default("the study's")] = None
-    """How many. More than a finished store has extend it."""
-    seed: Annotated[int | None, SEED, default("the study's")] = None
-    """Seed of the draws."""
-    resume: bool = False
-    """Go on with the store in the folder of the results."""
+    """Number of samples. A larger number extends a finished store."""
+    seed: Annotated[int | None, SEED, shared("seed"), default("the study's")] = None
+    resume: Resume = False
     chunk: Annotated[
         int | None, count("samples written together", 1e9), default("some seconds' worth")
     ] = None
-    """Samples written together."""
+    """Number of samples that are written together."""
     devices: Annotated[int | None, count("devices", 256), default("all")] = None
-    """Cores (or GPUs) to use; no number depends on it."""
+    """Number of cores or GPUs to use; no result depends on it."""
     lanes: Annotated[int | None, count("lanes", 1e6), default("16")] = None
-    """Flights that go on together on a device, a multiple of 8; part of the study."""
-    scheduler: str | None = None
+    """Number of flights that a device computes together, a multiple of 8; part of the study."""
+    scheduler: Annotated[str | None, default("none")] = None
     """Address of a Dask scheduler, such as tcp://10.0.0.1:8786."""
     workers: Annotated[int | None, count("workers", 256), default("none")] = None
-    """Instead start a Dask cluster of so many processes here."""
-    params: Annotated[Path | None, default("the scene's table")] = None
-    """TOML file with values that replace the scene's table's."""
-    out: Annotated[Path | None, default("runs/STUDY")] = None
-    """Folder for the results."""
-    figures: Literal["png", "pdf", "svg", "none"] = "png"
-    """Format of the report's figures; none leaves the report out."""
-    cache: bool = True
-    """Keep compiled code in the user's cache folder for the next run."""
+    """Number of processes of a Dask cluster that is started here."""
+    params: Annotated[Path | None, shared("params"), default("the scene's table")] = None
+    out: Annotated[Path | None, shared("out"), default("runs/STUDY")] = None
+    figures: Figures = "png"
+    cache: Cache = True
 
 
 @dataclasses.dataclass
 class Report:
-    """Make figures, tables and a page from the store of a study."""
+    """Make figures, tables and a page from the store of a study.
+
+    Example: stmuav report runs/collapse/study.zarr --figures svg
+    """
 
     store: tyro.conf.Positional[Path]
     """Folder of the store."""
-    out: Annotated[Path | None, default("beside the store")] = None
-    """Folder for the report."""
-    figures: Literal["png", "pdf", "svg"] = "png"
-    """Format of the figures."""
+    out: Annotated[Path | None, shared("out"), default("beside the store")] = None
+    figures: Annotated[Literal["png", "pdf", "svg"], shared("figures")] = "png"
 
 
 def cores() -> int:
@@ -143,7 +139,7 @@ def run_montecarlo(command: Montecarlo) -> int:
     out = Console()
     out.print(outcome.words(), highlight=False, markup=False, emoji=False)
     paths = [folder / "study.zarr"]
-    if command.figures != "none":
+    if command.figures != "none" or not outcome.interrupted:
         paths += _report(folder / "study.zarr", folder, command.figures, out)
     written(out, paths)
     return 130 if outcome.interrupted else 0
@@ -168,10 +164,9 @@ def _carried_out(
 
 
 def _report(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]:
-    """Verify the store, write its report and print a summary."""
+    """Verify the store, write its report unless there are to be no figures, and print a summary."""
     from ..figures.study_analysis import analyse
     from ..figures.study_data import study_data
-    from ..figures.study_report import write_report
     from ..figures.study_table import summary_lines, summary_table
     from ..files.store import open_store
 
@@ -179,7 +174,11 @@ def _report(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]
         opened.verify()
         dataset = opened.dataset()
         analysis = analyse(study_data(dataset))
-        paths = write_report(dataset, folder, figures, analysis=analysis)
+        paths = []
+        if figures != "none":
+            from ..figures.study_report import write_report
+
+            paths = write_report(dataset, folder, figures, analysis=analysis)
     out.print(summary_table(analysis), markup=False, emoji=False)
     for line in summary_lines(analysis):
         out.print(line, highlight=False, markup=False, emoji=False)

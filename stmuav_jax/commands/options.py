@@ -4,7 +4,7 @@ import dataclasses
 import math
 import sys
 from collections.abc import Sequence
-from typing import Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
@@ -67,13 +67,52 @@ def default(words: str) -> Any:
     return tyro.conf.arg(help_behavior_hint=f"(default: {words})")
 
 
+# Texts of the options that several commands have: one word, one text.
+TEXTS = {
+    "case": "Case of the report.",
+    "params": "TOML file with values that replace those of the parameter table.",
+    "out": "Folder for the results.",
+    "figures": "Format of the figures.",
+    "cache": "Keep compiled code in the user's cache folder for the next run.",
+    "resume": "Continue an interrupted run from the folder of its results.",
+    "t1": "End of the time span [s].",
+    "seed": "Seed of the random numbers.",
+    "seeds": "Number of runs, each with noise of its own.",
+    "sun": "Direction of the sun: azimuth clockwise from north (y), and elevation [degrees].",
+    "climb": "Speed upwards [m/s].",
+    "speed": "Level speed [m/s].",
+    "course": "Direction of the level speed, from x (east) towards y (north) [degrees].",
+    "turn": "Rate of turn, from x towards y [degrees/s].",
+    "yaw": "Heading of the x axis, from x (east) towards y (north) [degrees].",
+    "inputs": "Inputs that may be chosen, such as effort; the others stay as they are.",
+    "what": "hold: constant inputs that keep the start. slew: histories of inputs that lead to another "
+    "posture. identify: parameters, with their uncertainty, from a record.",
+    "duration": "Time that a slew takes, or over which hold counts departures from the start [s].",
+    "knots": "slew: number of knots of the cubic splines.",
+    "segments": "Number of segments of multiple shooting.",
+    "steps": "Largest number of steps of the search.",
+}
+
+
+def shared(name: str) -> Any:
+    """Annotation with the text of an option that several commands have, by its name in `TEXTS`."""
+    return tyro.conf.arg(help=TEXTS[name])
+
+
 # Options that several commands have.
 ANGLE = Number("angle", "degrees", -360.0, 360.0)
 SPEED = Number("speed", "m/s", -1000.0, 1000.0)
 END = Number("end of the time span", "s", above=0.0, high=1e5)
 SEED = Number("seed", "", 0, 2**32 - 1)
+TURN = Number("rate of turn", "degrees/s", -3600.0, 3600.0)
 FORCE = Number("limit of the force", "N", above=0.0, high=1e6)
 TOLERANCE = Number("tolerance", "", above=0.0, high=1.0)
+
+# Options that all or most commands have; the words of a default stand beside them.
+Cache = Annotated[bool, shared("cache")]
+Figures = Annotated[Literal["png", "pdf", "svg", "none"], shared("figures")]
+Resume = Annotated[bool, shared("resume")]
+Seed = Annotated[int, SEED, shared("seed")]
 
 
 def count(what: str, high: float | int = 1e9) -> Number:

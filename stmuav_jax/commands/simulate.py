@@ -4,7 +4,7 @@ import dataclasses
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 from rich.console import Console
@@ -24,7 +24,7 @@ from ..figures.drawing import Drawer, drawing
 from ..figures.numbers import numbers_of
 from ..figures.terminal import line
 from ..scenes.registry import SCENES
-from .options import END, TOLERANCE, Number, count, default
+from .options import END, TOLERANCE, Cache, Figures, Number, count, default, shared
 from .output import written
 from .scene_options import check_known, options_class, plain_of, scene_among
 
@@ -40,10 +40,8 @@ SPACING = Number("spacing of the saved times", "s", above=1e-7, high=1e5)
 class Settings:
     """Options of a run and of its files, which all scenes share."""
 
-    case: Annotated[int | None, default("the scene's first choice")] = None
-    """Case of the report."""
-    t1: Annotated[float | None, END, default("the scene's own")] = None
-    """End [s]."""
+    case: Annotated[int | None, shared("case"), default("the scene's first choice")] = None
+    t1: Annotated[float | None, END, shared("t1"), default("the scene's own")] = None
     rtol: Annotated[float, dataclasses.replace(TOLERANCE, what="relative tolerance")] = (
         STEP_TOLERANCE
     )
@@ -53,36 +51,33 @@ class Settings:
     )
     """Absolute tolerance of a step [m, m/s, rad/s]."""
     solver: SolverName = "dopri8"
-    """Explicit, or implicit for stiff scenes (kvaerno, rodas5p); auto looks at the start."""
+    """Solver: explicit, implicit for stiff scenes (kvaerno, rodas5p), or chosen at the start (auto)."""
     formulation: FormulationName = "tree"
-    """Relative coordinates; or all bodies' by structure, densely, in the report's rows."""
+    """Relative coordinates of a spanning tree (tree), or coordinates of all bodies: by the structure of the joints
+    (augmented), with dense matrices (augmented-dense), with the rows of the report (report)."""
     stabilisation: StabilisationName = "projection"
-    """What keeps the constraints from drifting."""
+    """Method that keeps the constraints from drifting."""
     save_every: Annotated[float | None, SPACING, default("the scene's own")] = None
     """Spacing of the saved times [s]."""
-    max_steps: Annotated[int, count("steps allowed", 1e8)] = STEPS_ALLOWED
-    """Steps allowed between two saved times."""
+    max_steps: Annotated[int, count("steps between two saved times", 1e8)] = STEPS_ALLOWED
+    """Largest number of steps between two saved times."""
     error_estimate: bool = True
     """Estimate the run's error by a second run beside it."""
     certificate: Literal["standard", "full"] = "standard"
-    """Full: also compare the accelerations with those by another formulation; compiles longer."""
-    params: Annotated[Path | None, default("the report's values")] = None
-    """TOML file with values that replace the table's."""
-    out: Annotated[Path | None, default("runs/SCENE")] = None
-    """Folder for the results."""
-    figures: Literal["png", "pdf", "svg", "none"] = "png"
-    """Format of the figures."""
+    """With full, the accelerations are also compared with those of another formulation, which compiles longer."""
+    params: Annotated[Path | None, shared("params"), default("the report's values")] = None
+    out: Annotated[Path | None, shared("out"), default("runs/SCENE")] = None
+    figures: Figures = "png"
     loads: bool = False
-    """Also find the joints' reaction loads, peaks between saved times too; loads.csv, figure."""
-    cache: bool = True
-    """Keep compiled code in the user's cache folder for the next run."""
+    """Also write the reaction loads of the joints, with their peaks between saved times, to loads.csv and a figure."""
+    cache: Cache = True
 
 
 ABOUT = """Simulate a scene, or a model's file; write run.nc, certificate.json and figures.
 
-Example: stmuav simulate uav_tracker --case 2 --t1 1 --loads. A scene has options of its own, such as
---drag or --servo.stiffness 1e6: `stmuav simulate SCENE --help` lists them with these. A model's file
-has none: stmuav simulate model.toml --t1 1 (docs/models.md). Robots in URDF or MJCF need MuJoCo.
+Example: stmuav simulate uav_tracker --case 2 --t1 1 --loads; stmuav simulate model.toml --t1 1. A scene has
+options of its own, such as --drag or --servo.stiffness 1e6: `stmuav simulate SCENE --help` lists them with these.
+A model's file has none (docs/models.md). Robots in URDF or MJCF need MuJoCo.
 """
 
 
@@ -93,7 +88,8 @@ def simulate_class(words: Sequence[str]) -> type:
 
 def _flags(settings: type) -> list[str]:
     """Options of a dataclass that no value follows."""
-    switches = [field.name for field in dataclasses.fields(settings) if field.type is bool]
+    kinds = get_type_hints(settings)
+    switches = [field.name for field in dataclasses.fields(settings) if kinds[field.name] is bool]
     return [f"--{no}{each}".replace("_", "-") for each in switches for no in ("", "no-")]
 
 
@@ -119,7 +115,7 @@ def scene_command(
     shared, flags = dataclasses.fields(settings), _flags(settings)
     scene = named_scene(settings, words)
     which = tyro.conf.arg(
-        help="Which scene, see `stmuav list`; or a model's file: .toml, .xml, .urdf."
+        help="Name of a scene, as `stmuav list` has it, or a model's file: .toml, .xml, .urdf."
     )
     flat = tyro.conf.arg(name="")
     model = () if scene is None or scene in SCENES else (scene,)

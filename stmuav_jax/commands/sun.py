@@ -3,13 +3,13 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from rich.console import Console
 
 from ..checks.errors import SettingError
 from ..figures.terminal import line
-from .options import ANGLE, Number, default
+from .options import ANGLE, Cache, Figures, Number, default, shared
 from .output import written
 
 
@@ -25,19 +25,20 @@ class SunDay:
     lon: Annotated[float, Number("longitude", "degrees", -360, 360)]
     """Longitude, east positive [degrees]."""
     date: str
-    """Date at the place, as 2024-03-21."""
+    """Date at the place, such as 2024-03-21."""
     timezone: Annotated[str | None, default("whole hours by the longitude")] = None
     """Time zone such as Asia/Phnom_Penh or +07:00."""
     altitude: Annotated[float, Number("altitude", "m", -500, 11000)] = 0.0
-    """Above sea level [m]."""
+    """Altitude of the place above sea level [m]."""
     roll: Annotated[float, ANGLE] = 0.0
-    """Attitude of the UAV [degrees]: turn about its x axis."""
+    """Angle of the UAV about its x axis [degrees]."""
     pitch: Annotated[float, ANGLE] = 0.0
-    """Turn about its y axis [degrees]; positive lowers its x axis."""
-    yaw: Annotated[float | None, ANGLE, default("the heading of the most energy")] = None
-    """Its x axis from east towards north [degrees]."""
+    """Angle of the UAV about its y axis [degrees]; a positive one lowers the x axis."""
+    yaw: Annotated[
+        float | None, ANGLE, shared("yaw"), default("the heading of the most energy")
+    ] = None
     attitude: Annotated[Path | None, default("a constant attitude")] = None
-    """CSV file with a history of the attitude instead: columns t [s], roll, pitch, yaw."""
+    """CSV file with a history of the attitude: columns t [s], roll, pitch, yaw [degrees]."""
     step: Annotated[float, Number("time step", "s", 1, 7200)] = 300.0
     """Time between samples [s]."""
     stroke_step: Annotated[float, Number("step of the actuators", "m", 0, 0.1)] = 0.0
@@ -45,19 +46,15 @@ class SunDay:
     attitude_error: Annotated[
         tuple[float, float, float], dataclasses.replace(ANGLE, what="error of the attitude")
     ] = (0.0, 0.0, 0.0)
-    """Rotation vector from the true attitude to the one believed, body axes [degrees]."""
+    """Rotation vector from the true attitude to the estimated one, body axes [degrees]."""
     turbidity: Annotated[
         float | None, Number("turbidity", "", 1, 20), default("the month's mean at the place")
     ] = None
-    """Linke's turbidity of the air."""
-    params: Annotated[Path | None, default("the report's values")] = None
-    """TOML file with values that replace the table's."""
-    out: Annotated[Path | None, default("runs/sun_DATE")] = None
-    """Folder for the results."""
-    figures: Literal["png", "pdf", "svg", "none"] = "png"
-    """Format of the figures."""
-    cache: bool = True
-    """Keep compiled code in the user's cache folder for the next run."""
+    """Linke turbidity of the air."""
+    params: Annotated[Path | None, shared("params"), default("the report's values")] = None
+    out: Annotated[Path | None, shared("out"), default("runs/sun_DATE")] = None
+    figures: Figures = "png"
+    cache: Cache = True
 
 
 def run_sun(command: SunDay) -> int:

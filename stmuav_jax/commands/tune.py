@@ -16,7 +16,7 @@ from ..checks.errors import SettingError
 from ..figures.terminal import line, row, table
 from .flight import table_of
 from .models.tuning import TuneSettings, run_tune_scene, tune_class
-from .options import ANGLE, END, FORCE, SEED, Number, count, default
+from .options import ANGLE, END, FORCE, Cache, Figures, Number, Resume, Seed, count, default, shared
 from .output import written
 from .simulate import named_scene
 
@@ -39,40 +39,31 @@ _LONGEST = {"hold": 0.05, "slew": 0.2}
 class Tune:
     """Tune by gradients through the flight; write inputs or parameters, history and figures.
 
-    Example: stmuav tune hold --t1 0.4. Of another mechanism: `stmuav tune hold model.toml`, or a scene's name;
-    `stmuav tune hold model.toml --help` describes that. A search that does not converge ends with exit code 1.
+    Example: stmuav tune hold --t1 0.4; stmuav tune slew --to 8 0. The UAV begins with equal rotor speeds and idle
+    actuators; identify simulates its own record, with noise. The inputs of another mechanism are tuned by `stmuav
+    tune hold model.toml`, or by a scene's name; `stmuav tune hold model.toml --help` describes that. A search that
+    does not converge ends with exit code 1.
     """
 
-    what: tyro.conf.Positional[Literal["hold", "slew", "identify"]]
-    """hold: constant inputs that keep the UAV level and its panel standing, from equal rotor speeds and idle
-    actuators. slew: histories of inputs that turn the panel. identify: parameters and their uncertainty from a
-    noisy record of a simulated flight."""
+    what: Annotated[tyro.conf.Positional[Literal["hold", "slew", "identify"]], shared("what")]
     to: Annotated[tuple[float, float], ANGLE] = (8.0, 0.0)
     """slew: panel angles at the end [degrees]; at the start they are the initial ones."""
-    t1: Annotated[float | None, END, default("hold 0.4, slew 1")] = None
-    """slew: time for the turn [s]. hold: time over which departures count [s]."""
+    t1: Annotated[float | None, END, shared("duration"), default("hold 0.4, slew 1")] = None
     force: Annotated[float | None, FORCE, default("none")] = None
-    """slew: limit of the actuators' forces [N]."""
+    """slew: largest force of the actuators, either way [N]."""
     reaction: Annotated[float | None, FORCE, default("none")] = None
-    """slew: limit of the force in any joint [N]."""
-    segments: Annotated[int | None, count("segments", 1000), default(SEGMENTS)] = None
-    """Segments of multiple shooting."""
-    knots: Annotated[int, Number("number of knots", "", 4, 200)] = 8
-    """slew: knots of the cubic splines."""
-    seed: Annotated[int, SEED] = 0
-    """identify: of the record's noise and of the start."""
-    steps: Annotated[int, count("steps", 1e6)] = 60
-    """Steps allowed."""
-    resume: bool = False
-    """Go on with search.npz in the folder of the results."""
-    params: Annotated[Path | None, default("the report's values")] = None
-    """TOML file with values that replace the table's."""
-    out: Annotated[Path | None, default("runs/tune_WHAT")] = None
-    """Folder for the results."""
-    figures: Literal["png", "pdf", "svg", "none"] = "png"
-    """Format of the figures."""
-    cache: bool = True
-    """Keep compiled code in the user's cache folder for the next run."""
+    """slew: largest reaction force in any joint [N]."""
+    segments: Annotated[
+        int | None, count("segments", 1000), shared("segments"), default(SEGMENTS)
+    ] = None
+    knots: Annotated[int, Number("number of knots", "", 4, 200), shared("knots")] = 8
+    seed: Seed = 0
+    steps: Annotated[int, count("steps", 1e6), shared("steps")] = 60
+    resume: Resume = False
+    params: Annotated[Path | None, shared("params"), default("the report's values")] = None
+    out: Annotated[Path | None, shared("out"), default("runs/tune_WHAT")] = None
+    figures: Figures = "png"
+    cache: Cache = True
 
 
 class _Watch:
@@ -138,7 +129,7 @@ def run_tune(command: Any) -> int:
     more = found.steps + 60
     line(
         Console(stderr=True),
-        f"stmuav: the search has not converged; what it has reached is in {folder}. Go on with "
+        f"stmuav: the search has not converged; what it has reached is in {folder}. Continue with "
         f"--resume --steps {more}, or try other --segments.",
     )
     return 1

@@ -9,8 +9,8 @@ import tyro
 from rich.console import Console
 
 from ..checks.errors import SettingError
-from ..figures.terminal import line
-from .options import Number, default
+from ..figures.terminal import line, row, table
+from .options import Number, default, shared
 from .output import written
 
 
@@ -23,24 +23,30 @@ class View:
 
     run: tyro.conf.Positional[Path]
     """The file run.nc of `stmuav simulate` or flight.nc of `stmuav fly`, or its folder."""
-    beside: Path | None = None
+    beside: Annotated[Path | None, default("none")] = None
     """A second run, shown beside the first."""
     html: Annotated[Path | None, default("a temporary file, which the browser opens")] = None
-    """Write the page to this file instead of opening the browser; it works without network."""
+    """File for the page, which works without network; the browser is then not opened."""
     sun: Annotated[
         tuple[float, float] | None, Number("direction of the sun", "degrees", -360, 360),
-        default("no sun"),
+        shared("sun"), default("no sun"),
     ] = None  # fmt: skip
-    """Azimuth clockwise from north (y) and elevation of the sun [degrees]."""
 
 
 def run_view(command: View) -> int:
-    """Write the page, or open it; return the exit code."""
-    from ..viewer.page import view
+    """Write the page, or open it, and print what it shows; return the exit code."""
+    from ..viewer.page import saved_run, view
 
-    runs = [command.run] if command.beside is None else [command.run, command.beside]
+    paths = [command.run] if command.beside is None else [command.run, command.beside]
+    runs = [saved_run(path) for path in paths]
     page = view(*runs, sun=None if command.sun is None else towards_sun(*command.sun))
     out = Console()
+    shown = table("run", "bodies", "joints", "saved times", "from [s]", "to [s]")
+    for path, run in zip(paths, runs, strict=True):
+        ts = run["time"].values
+        sizes = (run.sizes["body"], run.sizes.get("joint", 0), len(ts))
+        row(shown, path, *sizes, f"{ts[0]:g}", f"{ts[-1]:g}")
+    out.print(shown)
     if command.html is not None:
         written(out, [page.save(command.html)])
         return 0

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from ...checks.errors import SettingError, named_places
 from ...figures.terminal import line, row, table
-from ..options import SEED, Number, count, default
+from ..options import Number, Seed, count, default, shared
 from ..output import written
 from ..simulate import chosen_scene, scene_command
 from .point import PointSettings, scalars_by_name, starting_point
@@ -29,25 +29,21 @@ class EstimateSettings(PointSettings):
     """Options of a filter on a model's sensors."""
 
     sensors: Annotated[tuple[str, ...], default("all of the file")] = ()
-    """Sensors that the filter has."""
-    t1: Annotated[float | None, Number("end", "s", above=0.0, high=1e4), default("the file's")] = (
-        None
-    )
-    """End [s]."""
+    """Sensors whose readings the filter has."""
+    t1: Annotated[
+        float | None, Number("end", "s", above=0.0, high=1e4), shared("t1"), default("the file's")
+    ] = None
     rate: Annotated[float | None, _RATE, default("the sensors' highest, else 100")] = None
     """Rate of the filter [Hz]; sensors' own rates are whole parts of it."""
     spread: Annotated[float, _SIZE] = 0.05
     """Standard deviation of every state at the start, in its unit."""
     spreads: Annotated[tuple[str, ...], default("none")] = ()
-    """That of single states, such as hinge.angle=0.2."""
+    """Standard deviations of single states at the start, such as hinge.angle=0.2."""
     process: Annotated[float, _SIZE] = 0.01
-    """Random change of every velocity over a second, standard deviation in its unit."""
-    seeds: Annotated[int, count("runs", 100_000)] = 50
-    """How many runs with other noise."""
-    seed: Annotated[int, SEED] = 0
-    """Of their noise."""
-    out: Annotated[Path | None, default("runs/estimate_MODEL")] = None
-    """Folder for the results."""
+    """Standard deviation of the random change of every velocity in one second, in its unit."""
+    seeds: Annotated[int, count("runs", 100_000), shared("seeds")] = 50
+    seed: Seed = 0
+    out: Annotated[Path | None, shared("out"), default("runs/estimate_MODEL")] = None
 
 
 ABOUT = """Estimate the motion of a model from the sensors of its file, over many seeds; write estimate.npz.

@@ -21,7 +21,7 @@ class PointSettings(CheckSettings):
     coordinates: Annotated[tuple[str, ...], default("those of the start")] = ()
     """Coordinates of joints instead of those of the start, such as hinge=0.3 [rad, m]."""
     rates: Annotated[tuple[str, ...], default("those of the start")] = ()
-    """Their rates, such as hinge=1.5 [rad/s, m/s]; zero where only coordinates are given."""
+    """Rates of these coordinates, such as hinge=1.5 [rad/s, m/s]; zero where only coordinates are given."""
     independent: Annotated[tuple[str, ...], default("those that the loops determine best")] = ()
     """States that must be independent coordinates where loops are closed, such as A.angle."""
 

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from ...checks.errors import SettingError
 from ...figures.terminal import line, row, table
-from ..options import ANGLE, SPEED, Number, default
+from ..options import ANGLE, SPEED, TURN, default, shared
 from ..output import written
 from ..simulate import chosen_scene, scene_command
 from .point import PointSettings, inputs_named, scalars_by_name, starting_point
@@ -27,30 +27,23 @@ if TYPE_CHECKING:
 class SteadySettings(PointSettings):
     """Options of a steady motion of any mechanism."""
 
-    inputs: Annotated[tuple[str, ...], default("all")] = ()
-    """Inputs that may be chosen, such as effort; others stay as they are."""
+    inputs: Annotated[tuple[str, ...], shared("inputs"), default("all")] = ()
     free: Annotated[tuple[str, ...], default("none")] = ()
     """States that may differ from the start, such as hinge.angle."""
     accelerations: Annotated[tuple[str, ...], default("zero")] = ()
     """Wanted rates of velocities, such as rail.displacement_rate=2 [m/s^2, rad/s^2]."""
-    climb: Annotated[float, SPEED] = 0.0
-    """Speed upwards of a floating base [m/s]."""
-    speed: Annotated[float, SPEED] = 0.0
-    """Its level speed [m/s]."""
-    course: Annotated[float, ANGLE] = 0.0
-    """Direction of the level speed, from x towards y [degrees]."""
-    turn: Annotated[float, Number("rate of turn", "degrees/s", -3600.0, 3600.0)] = 0.0
-    """Its rate of turn, from x towards y [degrees/s]."""
-    yaw: Annotated[float, ANGLE] = 0.0
-    """Heading of its x axis, from x towards y [degrees]."""
+    climb: Annotated[float, SPEED, shared("climb")] = 0.0
+    speed: Annotated[float, SPEED, shared("speed")] = 0.0
+    course: Annotated[float, ANGLE, shared("course")] = 0.0
+    turn: Annotated[float, TURN, shared("turn")] = 0.0
+    yaw: Annotated[float, ANGLE, shared("yaw")] = 0.0
 
 
 @dataclasses.dataclass
 class TrimSettings(SteadySettings):
     """Options of a trim."""
 
-    out: Annotated[Path | None, default("runs/trim_SCENE")] = None
-    """Folder for the results."""
+    out: Annotated[Path | None, shared("out"), default("runs/trim_SCENE")] = None
 
 
 @dataclasses.dataclass
@@ -61,8 +54,7 @@ class LinearSettings(SteadySettings):
     """The start, with the options' coordinates and rates, or the trim that is found from there."""
     outputs: Annotated[tuple[str, ...], default("all states")] = ()
     """States that are measured, such as hinge.angle."""
-    out: Annotated[Path | None, default("runs/linearize_SCENE")] = None
-    """Folder for the results."""
+    out: Annotated[Path | None, shared("out"), default("runs/linearize_SCENE")] = None
 
 
 TRIM = """Find the inputs, and states if wanted, of a steady motion of any mechanism; write trim.json.

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from ...checks.errors import SettingError
 from ...figures.terminal import line, row, table
-from ..options import END, Number, count, default
+from ..options import END, Figures, Number, Resume, count, default, shared
 from ..output import written
 from ..simulate import chosen_scene, scene_command
 from .point import PointSettings, inputs_named, scalars_by_name, starting_point
@@ -26,31 +26,23 @@ class TuneSettings(PointSettings):
     """Options of a search on any mechanism."""
 
     to: Annotated[tuple[str, ...], default("none")] = ()
-    """slew: states at the end, as changes from the start, such as rail.displacement=0.5; others return."""
-    t1: Annotated[float | None, END, default("the scene's own")] = None
-    """Time over which departures count, or for the slew [s]."""
-    inputs: Annotated[tuple[str, ...], default("all")] = ()
-    """Inputs that are tuned, such as effort."""
+    """slew: states at the end, as changes from the start, such as rail.displacement=0.5; the others return to it."""
+    t1: Annotated[float | None, END, shared("duration"), default("the scene's own")] = None
+    inputs: Annotated[tuple[str, ...], shared("inputs"), default("all")] = ()
     limit: Annotated[tuple[str, ...], default("none")] = ()
     """Largest magnitudes of inputs, such as effort=20."""
-    knots: Annotated[int, Number("number of knots", "", 4, 200)] = 8
-    """slew: knots of the cubic splines."""
-    segments: Annotated[int, count("segments", 1000)] = 1
-    """Segments of multiple shooting."""
+    knots: Annotated[int, Number("number of knots", "", 4, 200), shared("knots")] = 8
+    segments: Annotated[int, count("segments", 1000), shared("segments")] = 1
     record: Annotated[Path | None, default("none")] = None
     """identify: CSV file with the column t [s], columns of joints such as A.angle or A.angle_rate, and of inputs."""
     parameters: Annotated[tuple[str, ...], default("none")] = ()
     """identify: parameters of the model's file with a start for the search, such as mass=0.3."""
     sigma: Annotated[tuple[str, ...], default("none")] = ()
     """identify: standard deviation of each column of the record, such as A.angle=0.001."""
-    steps: Annotated[int, count("steps", 1e6)] = 60
-    """Steps allowed."""
-    resume: bool = False
-    """Go on with search.npz in the folder of the results."""
-    out: Annotated[Path | None, default("runs/tune_WHAT_SCENE")] = None
-    """Folder for the results."""
-    figures: Literal["png", "pdf", "svg", "none"] = "png"
-    """Format of the figures."""
+    steps: Annotated[int, count("steps", 1e6), shared("steps")] = 60
+    resume: Resume = False
+    out: Annotated[Path | None, shared("out"), default("runs/tune_WHAT_SCENE")] = None
+    figures: Figures = "png"
 
 
 ABOUT = """Tune the inputs of any mechanism by gradients through its motion, or identify its parameters.
@@ -68,7 +60,7 @@ _WEIGHT = 10.0
 
 def tune_class(words: Sequence[str]) -> type:
     """The command for tyro, see `scene_command`."""
-    before = [("what", tyro.conf.Positional[What])]
+    before = [("what", Annotated[tyro.conf.Positional[What], shared("what")])]
     return scene_command("TuneScene", TuneSettings, ABOUT, words, before)
 
 
