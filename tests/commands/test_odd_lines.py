@@ -29,11 +29,16 @@ OPTIONS = {
     "estimate": ("--case", "--tuning", "--model", "--seeds", "--seed", "--t1", "--hover"),
     "fly": ("--t1", "--resume", "--true-states", "--native-loops", "--figures", "--out"),
     "montecarlo": ("--samples", "--seed", "--chunk", "--devices", "--lanes", "--workers"),
+    "view": ("--beside", "--html", "--sun"),
+    "show": ("--case", "--params", "--out", "--figures", "--servo.stiffness", "--start.phi", "--nope"),
+    "check": ("--case", "--params", "--stops.lower", "--start.phi-rate", "--wind.mean", "--figures"),
 }  # fmt: skip
 FIRST = {
     "simulate": ("spin", "tracker", "uav", "", "[b]"), "tune": ("hold", "slew", "fly", "0"),
     "fly": ("hover", "case-9", "", "a/[/b].toml"),
     "montecarlo": ("collapse", "nope", "", "a/[/b].toml"), "report": ("nope", "", "[/b]"),
+    "view": ("nope", "", "[/b]", "run.nc"), "show": ("spin", "tracker", "uav", "none.toml", "[b]"),
+    "check": ("spin", "tracker", "", "none.toml", "a/[/b].toml"),
 }  # fmt: skip
 
 
@@ -68,16 +73,20 @@ def stubbed(monkeypatch):
         monkeypatch.setattr(module, name, stop)
     for name in ("montecarlo", "estimate", "report", "fly"):
         monkeypatch.setitem(cli.COMMANDS, name, cli.COMMANDS[name]._replace(run=stop))
-    monkeypatch.setattr("stmuav_jax.tracker.heading.best_heading", stop)
-    monkeypatch.setattr("stmuav_jax.tracker.day.track_day", stop)
+    for place in (
+        "tracker.heading.best_heading", "tracker.day.track_day", "dynamics.inspection.check",
+        "viewer.sketch.draw",
+    ):  # fmt: skip
+        monkeypatch.setattr(f"stmuav_jax.{place}", stop)
     monkeypatch.setattr(cli, "_configure", lambda _: None)
     return reached
 
 
-def test_odd_lines(stubbed, capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize("lines", [250, pytest.param(1000, marks=pytest.mark.slow)])
+def test_odd_lines(lines, stubbed, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    rng = random.Random(4)
-    codes, lines = {0: 0, 1: 0, 2: 0}, 250
+    rng = random.Random(lines)
+    codes = {0: 0, 1: 0, 2: 0}
     for _ in range(lines):
         words = odd_line(rng)
         code = cli.main(words)
