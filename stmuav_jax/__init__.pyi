@@ -127,6 +127,9 @@ from .scenes.registry import (
     SCENES as SCENES,
     make_scene as make_scene,
 )
+from .viewer.filming import (
+    film as film,
+)
 from .viewer.page import (
     view as view,
 )

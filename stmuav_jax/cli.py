@@ -31,7 +31,7 @@ ABOUT = """Simulate, trim, tune and estimate a UAV that carries a parallel-mecha
 from the command line. Results go to files in runs/; `stmuav COMMAND --help` describes a command.
 
 Examples: stmuav simulate uav_tracker --case 2; stmuav sun --lat 11.55 --lon 104.92 --date 2024-03-21;
-stmuav trim --phi 10 --theta -5; stmuav view runs/uav_tracker_2.
+stmuav trim --phi 10 --theta -5; stmuav view runs/uav_tracker_2 --gif flight.gif.
 Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted.
 `--version` prints the version; `--debug` with a command prints the traceback of an error.
 """
@@ -57,7 +57,7 @@ COMMANDS = {
     "simulate": Command(simulate_class, run_simulate),
     "fly": Command(Fly, run_fly),
     "check": Command(check_class, run_check, "Compiling and inspecting"),
-    "view": Command(View, run_view, "Reading the run and writing the page"),
+    "view": Command(View, run_view),
     "sun": Command(SunDay, run_sun, "Following the sun through the day"),
     "trim": Command(trim_options, run_trim, "Compiling and solving the trim"),
     "linearize": Command(

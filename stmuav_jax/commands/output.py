@@ -5,7 +5,7 @@ import os
 import sys
 import tempfile
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -33,6 +33,33 @@ def working(words: str) -> Iterator[None]:
         return
     with console.status(Text(words)):
         yield
+
+
+@contextlib.contextmanager
+def progressing(words: str) -> Iterator[Callable[[float], None]]:
+    """Show a progress bar on stderr, if that is a terminal; the context gives a function that moves it.
+
+    The function takes the share that is done, from 0 to 1.
+    """
+    # slow to import, and most commands show no bar
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
+    console = Console(stderr=True)
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(words, total=1.0)
+        yield lambda done: bar.update(task, completed=done)
 
 
 # --- errors

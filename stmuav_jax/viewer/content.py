@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from ..checks.errors import SettingError, nearest_names
@@ -76,13 +76,13 @@ def content_of(
             }
             for name in names
         ],
-        "joints": [_joint(run, k) for k in range(run.sizes.get("joint", 0))],
+        "joints": [joint_of(run, k) for k in range(run.sizes.get("joint", 0))],
         "reactions": encoded(run["reaction_force"].values) if "reaction_force" in run else None,
         "wanted": encoded(run["wanted_position"].values) if "wanted_position" in run else None,
         "rotors": _rotors(run),
         "sun": None if towards is None else towards.tolist(),
         "watch": watched(run),
-        "size": _size(run),
+        "size": machine_size(run),
         "curves": curves(run, towards),
     }
 
@@ -104,8 +104,8 @@ def encoded(values: Any, kind: str = "<f4") -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii")
 
 
-def _shown_times(run: xr.Dataset) -> tuple[np.ndarray, str]:
-    """Indices of the saved times that are shown, and a sentence about the others."""
+def finite_times(run: xr.Dataset) -> Int[np.ndarray, " k"]:
+    """Indices of the saved times at which all poses are finite; `FileError` if there is none."""
     finite = np.all(np.isfinite(run["position"].values), axis=(1, 2))
     finite &= np.all(np.isfinite(run["euler_parameters"].values), axis=(1, 2))
     kept = np.flatnonzero(finite)
@@ -114,11 +114,15 @@ def _shown_times(run: xr.Dataset) -> tuple[np.ndarray, str]:
             f"The run of scene '{run.attrs.get('scene', '')}' has no saved time at which all poses are "
             "finite numbers, so that there is nothing to draw."
         )
+    return kept
+
+
+def _shown_times(run: xr.Dataset) -> tuple[np.ndarray, str]:
+    """Indices of the saved times that are shown, and a sentence about the others."""
+    kept, count = finite_times(run), run.sizes["time"]
     note = ""
-    if len(kept) < len(finite):
-        note = (
-            f"{len(finite) - len(kept)} of {len(finite)} saved times are not finite and left out. "
-        )
+    if len(kept) < count:
+        note = f"{count - len(kept)} of {count} saved times are not finite and left out. "
     if len(kept) > MOST_TIMES:
         some = np.unique(np.round(np.linspace(0, len(kept) - 1, MOST_TIMES)).astype(int))
         note += f"{MOST_TIMES} of {len(kept)} saved times are shown."
@@ -162,7 +166,7 @@ def _poses(run: xr.Dataset, body: str) -> tuple[Any, Any]:
     return run["position"].values[:, k], turned
 
 
-def _joint(run: xr.Dataset, k: int) -> dict[str, Any]:
+def joint_of(run: xr.Dataset, k: int) -> dict[str, Any]:
     """Plain data of a joint, with points from the bodies' centres of mass."""
     i, j = (str(run[f"joint_body_{side}"].values[k]) for side in ("i", "j"))
     point_i = run["joint_point_i"].values[k] - centre(run, i)
@@ -203,7 +207,7 @@ def _rotors(run: xr.Dataset) -> dict[str, Any] | None:
     }  # fmt: skip
 
 
-def _size(run: xr.Dataset) -> float:
+def machine_size(run: xr.Dataset) -> float:
     """Diagonal [m] of the box around all joints, rotors and centres of mass at the start."""
     found = [run["position"].values[0]]
     for body in (str(name) for name in run["body"].values):

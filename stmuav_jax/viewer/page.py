@@ -78,7 +78,7 @@ def view(
     """
     if len(runs) not in (1, 2):
         raise SettingError(f"The viewer shows one run or two side by side, not {len(runs)}.")
-    content = {"runs": [content_of(saved_run(run), sun, shapes) for run in runs]}
+    content = {"runs": [content_of(dataset_of(run), sun, shapes) for run in runs]}
     titles = dict.fromkeys(each["title"] for each in content["runs"])
     # "<" within the numbers and names would end the script element
     data = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
@@ -88,8 +88,8 @@ def view(
     return RunPage(page)
 
 
-def saved_run(run: Run | LoopRun | xr.Dataset | str | os.PathLike[str]) -> xr.Dataset:
-    """Data set of a run, of a closed loop's run, or of a saved one by its file or folder."""
+def dataset_of(run: Run | LoopRun | xr.Dataset | str | os.PathLike[str]) -> xr.Dataset:
+    """Labelled dataset of a run: of one in memory, or of a saved one by its file or folder."""
     if isinstance(run, xr.Dataset):
         return run
     if isinstance(run, Run):

@@ -71,7 +71,7 @@ def body_shapes(run: xr.Dataset, body: str) -> tuple[Shape, ...]:
         length = float(np.linalg.norm(apart[1] - apart[0]))
         thin = float(np.sqrt(2 * np.linalg.eigvalsh(inertia)[0] / mass))
         least, most = (length * part for part in _SLENDER)
-        return (_rod(apart[0], apart[1], min(max(thin, least), most)),)
+        return (rod(apart[0], apart[1], min(max(thin, least), most)),)
     solid = inertia_solid(mass, inertia, kind="panel" if "panel" in body.lower() else None)
     round_part = solid.kind in ("sphere", "cylinder")
     halves = (
@@ -80,7 +80,7 @@ def body_shapes(run: xr.Dataset, body: str) -> tuple[Shape, ...]:
         else [0.5 * x for x in solid.size]
     )
     far = [point for point in apart if np.linalg.norm(point) > 1.05 * max(halves)]
-    struts = (_rod(np.zeros(3), point, 0.02 * float(np.linalg.norm(point))) for point in far)
+    struts = (rod(np.zeros(3), point, 0.02 * float(np.linalg.norm(point))) for point in far)
     return (solid, *struts)
 
 
@@ -139,7 +139,7 @@ def inertia_solid(mass: float, inertia: Float[np.ndarray, "3 3"], kind: str | No
     edges = np.sqrt(np.maximum(squares, 1e-4 * np.max(squares)))
     if kind is None and any(equal):
         along = equal.index(True)
-        turn = _towards(R[:, along])
+        turn = towards(R[:, along])
         radius, length = np.sqrt(2 * moments[along] / mass), edges[along]
         return Shape("cylinder", (float(radius), float(length)), orientation=turn)
     size = tuple(float(edge) for edge in edges)
@@ -159,17 +159,18 @@ def _rotorcraft(rotors: Points) -> tuple[Shape, ...]:
             Shape("cylinder", (1.6 * thick, 3 * thick), tuple(rotor - [0, 0, 1.7 * thick]))
         )
         if reach:
-            shapes.append(_rod(hub, under, thick))
+            shapes.append(rod(hub, under, thick))
     return tuple(shapes)
 
 
-def _rod(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float) -> Shape:
+def rod(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float) -> Shape:
+    """Cylinder from one point to another, with a radius [m]; points (3,) in body axes [m]."""
     along = end - start
     middle = tuple(float(x) for x in 0.5 * (start + end))
-    return Shape("cylinder", (radius, float(np.linalg.norm(along))), middle, _towards(along))
+    return Shape("cylinder", (radius, float(np.linalg.norm(along))), middle, towards(along))
 
 
-def _towards(axis: Float[np.ndarray, "3"]) -> tuple[float, ...]:
+def towards(axis: Float[np.ndarray, "3"]) -> tuple[float, ...]:
     """Euler parameters of a rotation that turns z towards an axis."""
     z = axis / np.linalg.norm(axis)
     half = np.array([-z[1], z[0], 0.0])
