@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .errors import ModelError, check_finite, check_shape, concrete
+from .errors import ModelError, SettingError, check_finite, check_shape, concrete
 from .shapes import Numbers
 
 Tree = TypeVar("Tree")
@@ -118,3 +118,23 @@ def positive(value: Numbers, what: str, unit: str) -> Float[Array, ""]:
     if concrete(number) and float(number) <= 0:
         raise ModelError(f"{what} must be positive, but it is {float(number):g} {unit}.")
     return number
+
+
+def increasing_times(ts: Any, what: str) -> np.ndarray:
+    """Convert a user's times (k,) [s] to a NumPy array of finite, increasing numbers.
+
+    Args:
+        what: subject of the error's sentence, such as "The times of the record".
+
+    Raises:
+        SettingError: there is none, one is not finite, or one does not follow the one before.
+    """
+    times = np.asarray(ts, dtype=float)
+    if times.ndim != 1 or times.size < 1 or not np.all(np.isfinite(times)):
+        raise SettingError(f"{what} must be a list of finite numbers.")
+    if np.any(times[1:] <= times[:-1]):
+        k = int(np.argmax(times[1:] <= times[:-1]))
+        raise SettingError(
+            f"{what} must increase, but ts[{k + 1}] = {times[k + 1]} s follows ts[{k}] = {times[k]} s."
+        )
+    return times

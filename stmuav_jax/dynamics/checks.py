@@ -7,7 +7,7 @@ import diffrax
 import numpy as np
 
 from ..checks.errors import ModelError, SettingError, StateError, concrete
-from ..checks.numbers import as_numpy
+from ..checks.numbers import as_numpy, increasing_times
 from ..checks.physical import check_unit
 from ..mechanics.constraint import ROWS
 from ..mechanics.state import State
@@ -45,7 +45,7 @@ def scene_of(
         )
     title = "System of " + ", ".join(what.names)
     if ts is not None:
-        times = _times(ts)
+        times = increasing_times(ts, "The output times ts")
         return Scene("system", title, what, state, times[0], times[-1])
     if t1 is None:
         raise SettingError("To simulate a system give the end t1 [s], or the saved times ts [s].")
@@ -53,24 +53,12 @@ def scene_of(
     return Scene("system", title, what, state, 0.0, float(t1), every or 1.0)
 
 
-def _times(ts: Any) -> np.ndarray:
-    times = np.asarray(ts, dtype=float)
-    if times.ndim != 1 or times.size < 1 or not np.all(np.isfinite(times)):
-        raise SettingError("The output times ts must be a list of finite numbers.")
-    if np.any(np.diff(times) <= 0):
-        k = int(np.argmax(np.diff(times) <= 0))
-        raise SettingError(
-            f"Output times must increase, but ts[{k + 1}] = {times[k + 1]} s follows ts[{k}] = {times[k]} s."
-        )
-    return times
-
-
 def output_times(
     scene: Scene, t1: float | None, save_every: float | None, ts: Sequence[float] | Any
 ) -> np.ndarray:
     """Saved times (k,) [s], beginning with the scene's t0."""
     if ts is not None:
-        times = _times(ts)
+        times = increasing_times(ts, "The output times ts")
         if times[0] != scene.t0:
             raise SettingError(
                 f"The first output time must be the scene's t0 = {scene.t0} s, not {times[0]} s."

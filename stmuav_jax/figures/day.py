@@ -171,6 +171,10 @@ def labelled_day(day: Day) -> Labelled:
     )  # fmt: skip
 
 
+# Largest angle of an attitude history [degrees]; beyond, a double no longer tells directions.
+_MOST_TURNED = 1e9
+
+
 def load_attitude(path: str | os.PathLike[str]) -> Callable[[Array], Float[Array, "3 3"]]:
     """Attitude history from a CSV file with columns t, roll, pitch, yaw.
 
@@ -194,11 +198,15 @@ def load_attitude(path: str | os.PathLike[str]) -> Callable[[Array], Float[Array
     if not rows or [cell.strip() for cell in rows[0]] != names:
         raise FileError(f"{source} must begin with the line t,roll,pitch,yaw.")
     try:
-        t, *degrees = np.array(rows[1:], dtype=float).reshape(-1, 4).T
+        # rows of another length are refused, also where all numbers would fill rows of four
+        numbers = np.array(rows[1:], dtype=float)
+        t, *degrees = numbers.reshape(len(rows) - 1, 4).T
     except ValueError:
         raise FileError(f"{source} must have four numbers in each line after the first.") from None
-    if len(t) == 0 or not np.all(np.isfinite([t, *degrees])) or np.any(np.diff(t) <= 0):
+    if len(t) == 0 or not np.all(np.isfinite([t, *degrees])) or np.any(t[1:] <= t[:-1]):
         raise FileError(f"{source} must have finite numbers and times that rise from line to line.")
+    if np.max(np.abs(degrees)) > _MOST_TURNED:
+        raise FileError(f"{source} has angles beyond {_MOST_TURNED:g} degrees.")
     angles = np.unwrap(np.radians(degrees), axis=1)
 
     def history(time: Array) -> Float[Array, "3 3"]:

@@ -1,28 +1,30 @@
 """Files and figures of parameter searches, tuned inputs and linear models."""
 
 import io
-import json
 import os
-import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
+from pydantic import Field
 
 from ..algebra.compiler import quick_jit
 from ..algebra.least_squares import Search, SearchReason
 from ..algebra.rotation import to_rotation_vector
+from ..checks.errors import SettingError
 from ..checks.numbers import as_numpy
-from ..files.netcdf import FileError, write_atomically
+from ..checks.schema import Entries, Tuples, checked, named, shown
+from ..files.netcdf import FileError, load_checkpoint, save_checkpoint, write_atomically
 from ..flight.linear import Linear
 from ..flight.tuning import InputTuning
 from .plot import grid
 
-_FORMAT = "stmuav_jax search"
+_FORMAT = "stmuav_jax search 2"
+_Loss = Annotated[float, Field(strict=True, allow_inf_nan=True)]
 
 
 def save_linear(linear: Linear, path: str | os.PathLike[str]) -> Path:
@@ -37,6 +39,17 @@ def save_linear(linear: Linear, path: str | os.PathLike[str]) -> Path:
     return write_atomically(path, content.getvalue())
 
 
+class _Head(Entries):
+    """Everything of a search but its values; a loss may be NaN or infinite."""
+
+    format: Literal["stmuav_jax search 2"]
+    problem: str
+    loss: _Loss
+    history: Annotated[tuple[_Loss, ...], Tuples, Field(min_length=1)]
+    best: Annotated[int, Field(ge=0)]
+    reason: Annotated[int, Field(ge=min(SearchReason), le=max(SearchReason))]
+
+
 def save_search(search: Search, problem: str, path: str | os.PathLike[str]) -> Path:
     """Write the state of a search, from which `load_search` resumes it.
 
@@ -45,50 +58,43 @@ def save_search(search: Search, problem: str, path: str | os.PathLike[str]) -> P
         problem: name of the problem; searches of another problem are refused on loading.
         path: path of the npz file.
     """
-    leaves = jax.tree.leaves(search.values)
-    head = {
-        "format": _FORMAT,
-        "problem": problem,
-        "loss": search.loss,
-        "history": list(search.history),
-        "best": search.best,
-        "reason": int(search.reason),
-    }
-    content = io.BytesIO()
-    arrays = {f"leaf_{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
-    np.savez(content, head=np.array(json.dumps(head)), **arrays)  # pyright: ignore[reportArgumentType]
-    return write_atomically(path, content.getvalue())
+    head = _Head(
+        format=_FORMAT,
+        problem=problem,
+        loss=float(search.loss),
+        history=tuple(map(float, search.history)),
+        best=int(search.best),
+        reason=int(search.reason),
+    )
+    return save_checkpoint(path, dict(head), jax.tree.leaves(search.values))
 
 
 def load_search(path: str | os.PathLike[str], problem: str, like: Any) -> Search:
     """Read a search of a problem whose values have the tree structure and shapes of `like`.
 
     Raises:
-        FileError: no such file, not a search, or one of another problem.
+        FileError: no such file, not a search, a damaged one, or one of another problem.
     """
+    given, arrays = load_checkpoint(path, "a search")
     try:
-        with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as content:
-            head = json.loads(str(content["head"]))
-            arrays = [content[f"leaf_{k}"] for k in range(len(content.files) - 1)]
-    except FileNotFoundError:
-        raise FileError(f"There is no file {path} to go on from.") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        head = checked(_Head, given, "A search")
+    except SettingError as error:
         raise FileError(f"{path} is not a search, or it is damaged: {error}") from None
-    if head.get("format") != _FORMAT:
-        raise FileError(f"{path} is not a search.")
-    if head["problem"] != problem:
+    if head.problem != problem:
         raise FileError(
-            f"{path} holds a search of another problem: '{head['problem']}', not '{problem}'."
+            f"{path} holds a search of another problem: {named(head.problem)}, not {named(problem)}."
         )
     leaves, form = jax.tree.flatten(like)
-    if [np.shape(leaf) for leaf in leaves] != [a.shape for a in arrays]:
+    forms = lambda every: [(np.shape(one), np.asarray(one).dtype.kind) for one in every]
+    if forms(leaves) != forms(arrays):
         raise FileError(
-            f"{path} holds values of shapes {[a.shape for a in arrays]}, where "
-            f"{[np.shape(leaf) for leaf in leaves]} are wanted."
+            f"{path} holds values of shapes {shown([a.shape for a in arrays])}, where "
+            f"{shown([np.shape(leaf) for leaf in leaves])} of numbers are wanted."
         )
+    if not all(np.all(np.isfinite(a)) for a in arrays) or head.best >= len(head.history):
+        raise FileError(f"{path} holds values that are not finite, or a best step beyond its last.")
     values = jax.tree.unflatten(form, [jnp.asarray(a) for a in arrays])
-    history = tuple(float(x) for x in head["history"])
-    return Search(values, head["loss"], history, head["best"], SearchReason(head["reason"]))
+    return Search(values, head.loss, head.history, head.best, SearchReason(head.reason))
 
 
 def loss_history(history: tuple[float, ...]) -> Figure:

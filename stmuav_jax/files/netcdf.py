@@ -9,11 +9,12 @@ import os
 import platform
 import tempfile
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import numpy as np
 
 from ..checks.errors import ModelError, SettingError
 from ..checks.schema import checked, shown
@@ -196,21 +197,56 @@ def _seal(content: bytes) -> bytes:
     return _SEAL + hashlib.sha256(content).hexdigest().encode() + b"\n"
 
 
-def _verified(source: Path) -> bytes:
-    """Content of a saved run without its seal, verified, as HDF5 is not safe on damaged files."""
+def _verified(source: Path, kind: str = "a run") -> bytes:
+    """Content of a file without its seal, verified, as HDF5 and zip are not safe on damaged files."""
     whole = source.read_bytes()
     content, seal = whole[:-_SEAL_LENGTH], whole[-_SEAL_LENGTH:]
     if not seal.startswith(_SEAL):
         raise FileError(
-            f"{source} cannot be read: it is truncated, was changed since it was saved, or is not a run "
-            "saved by stmuav_jax."
+            f"{source} cannot be read: it is truncated, damaged or was changed since it was saved, or is "
+            f"not {kind} saved by stmuav_jax."
         )
     if seal != _seal(content):
         raise FileError(
-            f"{source} cannot be read as a saved run: it is damaged, its SHA-256 is not the one that it "
+            f"{source} cannot be read as {kind}: it is damaged, its SHA-256 is not the one that it "
             "was saved with."
         )
     return content
+
+
+def save_checkpoint(
+    path: str | os.PathLike[str], head: Mapping[str, Any], arrays: Iterable[Any]
+) -> Path:
+    """Save plain data and arrays as a sealed npz file, atomically; return the path."""
+    content = io.BytesIO()
+    numbered: dict[str, Any] = {f"{k}": np.asarray(array) for k, array in enumerate(arrays)}
+    np.savez(content, allow_pickle=False, head=np.array(json.dumps(dict(head))), **numbered)
+    return write_atomically(path, content.getvalue() + _seal(content.getvalue()))
+
+
+def load_checkpoint(
+    path: str | os.PathLike[str], kind: str
+) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """Plain data and arrays of a file of `save_checkpoint`.
+
+    Args:
+        kind: what the file should be, such as "a search", for the errors.
+
+    Raises:
+        FileError: the file is missing, damaged, or of another kind.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise FileError(f"There is no file {source} to go on from.")
+    content = _verified(source, kind)
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as found:
+            head = json.loads(str(found["head"]))
+            arrays = [found[f"{k}"] for k in range(len(found.files) - 1)]
+        return dict(head), arrays
+    # a sealed file of another program may hold anything
+    except Exception as error:
+        raise FileError(f"{source} is not {kind} ({type(error).__name__}).") from error
 
 
 def load(path: str | os.PathLike[str]) -> "xr.Dataset":

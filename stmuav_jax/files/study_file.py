@@ -71,14 +71,15 @@ def column(path: str | os.PathLike[str], name: str) -> list[float]:
 
     Raises:
         FileError: the file is missing or not a text file.
-        SettingError: the column is missing, or an entry in it is not a finite number.
+        SettingError: the column is missing or there are two, or an entry in it is not a finite number.
     """
     source = Path(path)
     if source.exists() and not source.is_file():
         raise FileError(f"{source} is no file but a folder or a pipe.")
     try:
         with source.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+            reader = csv.DictReader(file)
+            rows, header = list(reader), list(reader.fieldnames or [])
     except FileNotFoundError:
         raise FileError(f"There is no file {source}.") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -89,6 +90,8 @@ def column(path: str | os.PathLike[str], name: str) -> list[float]:
         known = [key for key in rows[0] if key]
         near = nearest_names(name[:SHOWN], [key[:SHOWN] for key in known])
         raise SettingError(f"{source} has no column {named(name)}.{near}")
+    if header.count(name) > 1:
+        raise SettingError(f"{source} has {header.count(name)} columns {named(name)}.")
     values = []
     for line, row in enumerate(rows, start=2):
         try:

@@ -25,7 +25,8 @@ from jaxtyping import Array, Float
 
 from ..algebra.least_squares import Search, search, value_and_columns
 from ..algebra.space import CyclicVector, Point, Vector
-from ..checks.errors import ModelError, SettingError, check_finite
+from ..checks.errors import ModelError, SettingError, check_finite, concrete
+from ..checks.numbers import increasing_times
 from ..checks.shapes import Numbers
 from ..dynamics.method import Method
 from ..dynamics.statespace.base import AbstractStateSpace, places_of
@@ -154,9 +155,11 @@ def motion_model(
         inputs: known inputs by name, numbers or histories; see `stmuav_jax.mechanics.with_inputs`.
 
     Raises:
-        SettingError: an unknown name, a sensor whose readings are no vector, or a system without
-            `space`.
+        SettingError: times that do not increase, an unknown name, a sensor whose readings are no
+            vector, or a system without `space`.
     """
+    if concrete(ts):
+        increasing_times(ts, "The times of the record")
     times = jnp.asarray(ts, dtype=float)
     if method is None:
         method = Method(rtol=1e-9, atol=1e-9, adjoint=diffrax.ForwardMode())

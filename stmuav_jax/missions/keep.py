@@ -2,12 +2,11 @@
 
 import dataclasses
 import hashlib
-import io
-import json
 import os
 import time
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax
@@ -15,12 +14,25 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..algebra.native import native_loops
+from ..checks.errors import SettingError
+from ..checks.schema import Entries, Tuples, checked
 from ..control.rolling import Rollout
-from ..files.netcdf import FileError, versions, write_atomically
+from ..files.netcdf import FileError, load_checkpoint, save_checkpoint, versions
 from .flight import MissionFlight, Reached
 from .mission import Mission
 
-_FORMAT = "stmuav_jax unfinished flight 1"
+_FORMAT = "stmuav_jax unfinished flight 2"
+
+
+class _About(Entries):
+    """Everything of an unfinished flight but its arrays."""
+
+    format: Literal["stmuav_jax unfinished flight 2"]
+    mission: str
+    versions: dict[str, str]
+    soc: float
+    seconds: Annotated[tuple[float, float], Tuples]
+    signals: Annotated[tuple[str, ...], Tuples]
 
 
 def save_reached(mission: Mission, reached: Reached, path: str | os.PathLike[str]) -> Path:
@@ -32,14 +44,8 @@ def save_reached(mission: Mission, reached: Reached, path: str | os.PathLike[str
     }  # fmt: skip
     names = [field.name for field in dataclasses.fields(Rollout)]
     leaves = jax.tree.leaves({name: getattr(reached.rows, name) for name in names})
-    arrays = {
-        f"{k}": np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-        for k, leaf in enumerate(leaves)
-    }
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
-    content = buffer.getvalue()
-    return write_atomically(path, content + hashlib.sha256(content).digest())
+    arrays = [jax.random.key_data(leaf) if _is_key(leaf) else leaf for leaf in leaves]
+    return save_checkpoint(path, about, arrays)
 
 
 def load_reached(mission: Mission, path: str | os.PathLike[str]) -> Reached:
@@ -50,29 +56,34 @@ def load_reached(mission: Mission, path: str | os.PathLike[str]) -> Reached:
             the end.
     """
     source = Path(path)
-    if not source.is_file():
-        raise FileError(f"There is no unfinished flight {source} to go on with.")
-    whole = source.read_bytes()
-    if hashlib.sha256(whole[:-32]).digest() != whole[-32:]:
-        raise FileError(f"{source} is damaged, or no unfinished flight.")
-    with np.load(io.BytesIO(whole[:-32]), allow_pickle=False) as found:
-        about = json.loads(str(found["about"]))
-        arrays = [found[f"{k}"] for k in range(len(found.files) - 1)]
-    if about["mission"] != _identity(mission):
+    about, arrays = _content(source)
+    if about.mission != _identity(mission):
         raise FileError(
             f"{source} is of another mission than this one, or of its file before a change."
         )
-    if about["versions"] != _computing():
+    if about.versions != _computing():
         raise FileError(
             f"{source} was flown by other versions of the package or its libraries, or with or without "
             "native loops: begin anew, or go on as it was begun."
         )
-    rows = _like(mission, about["signals"], arrays)
+    try:
+        rows = _like(mission, about.signals, arrays)
+    except (TypeError, ValueError):
+        raise FileError(f"{source} has not the arrays of a flight of this mission.") from None
     if len(rows.ts) > mission.samples:
         raise FileError(
             f"{source} has come to t = {rows.ts[-1]:g} s already, beyond the end at {mission.file.t1:g} s."
         )
-    return Reached(rows, about["soc"], tuple(about["seconds"]))
+    return Reached(rows, about.soc, about.seconds)
+
+
+def _content(source: Path) -> tuple[_About, list[np.ndarray]]:
+    """Head and arrays of a file of `save_reached`; `FileError` for any other."""
+    given, arrays = load_checkpoint(source, "an unfinished flight")
+    try:
+        return checked(_About, given, "An unfinished flight"), arrays
+    except SettingError as error:
+        raise FileError(f"{source} is not an unfinished flight: {error}") from None
 
 
 def _identity(mission: Mission) -> str:
@@ -92,7 +103,7 @@ def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(getattr(leaf, "dtype", float), jax.dtypes.prng_key)
 
 
-def _like(mission: Mission, signals: list[str], arrays: list[np.ndarray]) -> Rollout:
+def _like(mission: Mission, signals: Iterable[str], arrays: list[np.ndarray]) -> Rollout:
     """Rollout of a mission with the arrays of a file."""
     key = jax.random.key(0)
     start: Any = eqx.filter_eval_shape(mission.plant.reset, key)

@@ -15,6 +15,7 @@ import stmuav_jax as stm
 from stmuav_jax.checks.schema import checked
 from stmuav_jax.cli import main
 from stmuav_jax.commands.fly import NOT_KEPT, UNFINISHED, Fly
+from stmuav_jax.files.netcdf import load_checkpoint, save_checkpoint
 from stmuav_jax.missions.keep import load_reached, save_reached
 from stmuav_jax.missions.mission import LIBRARY
 from stmuav_jax.missions.schema import MissionFile
@@ -145,6 +146,13 @@ def test_an_interrupted_flight_goes_on_to_the_last_bit(flight, data, tmp_path):
     other = missions.make_mission(plain(wind__gusts__seed=4))
     with pytest.raises(stm.files.FileError, match="of another mission"):
         load_reached(other, path)
+    head, arrays = load_checkpoint(path, "a flight")
+    save_checkpoint(path, head, arrays[:-1])
+    with pytest.raises(stm.files.FileError, match="has not the arrays of a flight"):
+        load_reached(mission, path)
+    save_checkpoint(path, {**head, "signals": 3}, arrays)
+    with pytest.raises(stm.files.FileError, match="'signals' must be a list"):
+        load_reached(mission, path)
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(stm.files.FileError, match="damaged"):
         load_reached(mission, path)

@@ -172,7 +172,6 @@ def _identified(
 
     from ...algebra.least_squares import SearchReason
     from ...files.model_file import read_model
-    from ...files.study_file import column
     from ...flight.identification import Unknown, from_table, identify, motion_model
     from ...mechanics.inputs import inputs_of
     from ...sensing.outputs import joint_output
@@ -190,9 +189,7 @@ def _identified(
     sigma = scalars_by_name(settings.sigma, "--sigma")
     space, x = starting_point(scene, settings)
     read = [joint_output(scene.system, name).of for name in sigma]
-    ts = np.array(column(settings.record, "t"))
-    record = np.array([column(settings.record, name) for name in sigma]).T
-    given = _recorded_inputs(settings.record, inputs_of(scene.system), ts)
+    ts, record, given = read_record(settings.record, list(sigma), inputs_of(scene.system))
     unknowns = [Unknown(name, max(abs(value), 1e-12)) for name, value in start.items()]
 
     def outputs(own: Any, now: Any) -> Any:
@@ -215,14 +212,26 @@ def _identified(
     return found.search, shown, found.search.reason is SearchReason.CONVERGED
 
 
-def _recorded_inputs(record: Path, inputs: Any, ts: np.ndarray) -> dict[str, Any]:
-    """Histories of the inputs that a record has as columns, as cubic splines."""
+def read_record(
+    path: Path, names: Sequence[str], inputs: Any
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """Times (k,) [s] and columns (k, m) of a record, and its columns of inputs as cubic splines.
+
+    Raises:
+        FileError: the file is missing or not a text file.
+        SettingError: a column is missing, an entry is not a finite number, or the times do not
+            increase.
+        ModelError: too few samples for the splines of the inputs.
+    """
     import csv
 
     from ...algebra.sampled import Sampled
+    from ...checks.numbers import increasing_times
     from ...files.study_file import column
 
-    with record.open(newline="", encoding="utf-8") as file:
+    ts = increasing_times(column(path, "t"), f"The times of {path}")
+    record = np.array([column(path, name) for name in names]).T
+    with path.open(newline="", encoding="utf-8") as file:
         head = next(csv.reader(file), [])
-    names = [name for name, _ in inputs.names if name in head]
-    return {name: Sampled(ts, np.array(column(record, name)), 3) for name in names}
+    known = [name for name, _ in inputs.names if name in head]
+    return ts, record, {name: Sampled(ts, np.array(column(path, name)), 3) for name in known}
