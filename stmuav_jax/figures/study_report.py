@@ -19,7 +19,7 @@ from ..montecarlo.sensitivity import IndexIntervals
 from ..montecarlo.statistics import LEVEL, IntervalEstimate, SampleSummary
 from ..montecarlo.study import column_name
 from . import study_plot, study_region
-from .study_analysis import Analysis, Finding, analyse, number, plain
+from .study_analysis import Analysis, QuantityAnalysis, analyse, number, plain
 from .study_data import StudyData, label, study_data
 from .study_plot import strength
 
@@ -257,7 +257,7 @@ def _decide(data: StudyData, analysis: Analysis) -> str:
     return f'<h2>Which inputs decide</h2><p>{said}</p><div class="side">{"".join(tables)}</div>'
 
 
-def _influences(one: Finding, words: Mapping[str, str]) -> str:
+def _influences(one: QuantityAnalysis, words: Mapping[str, str]) -> str:
     found = one.influence
     title = _text(one.quantity.words)
     remark = f"<p><small>{_text(found.note)}</small></p>" if found.note else ""

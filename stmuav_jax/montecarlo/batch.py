@@ -27,7 +27,7 @@ from ..dynamics.method import Method
 from ..dynamics.tree.formulation import Tree
 from ..mechanics.state import State
 from .disturbed_flights import Drawn
-from .signal import Signal, View
+from .signal import RunPoint, Signal
 from .study import Quantity, Study, column_name
 from .work import AbstractWork, Axis, Column
 
@@ -271,8 +271,8 @@ class FlightWork(AbstractWork):
             chosen = [(of[k].of, q) for k, q in watched.items() if of[k].smooth == smooth]
 
             def signals(problem: Problem, t: Any, y: Any) -> Any:
-                view = View(problem, t, y, jnp.asarray(direction, y.dtype))
-                found = [_turned(quantity, signal(view)) for signal, quantity in chosen]
+                point = RunPoint(problem, t, y, jnp.asarray(direction, y.dtype))
+                found = [_turned(quantity, signal(point)) for signal, quantity in chosen]
                 return jnp.stack(found) if found else jnp.zeros(0, y.dtype)
 
             return signals
@@ -295,7 +295,7 @@ class FlightWork(AbstractWork):
         direction = jnp.asarray(self.direction, real)
         watched = list(self._watched)
         fine = flown.ending == Ending.FINE
-        value = lambda name, t, y: self._signals[name].of(View(problem, t, y, direction))
+        value = lambda name, t, y: self._signals[name].of(RunPoint(problem, t, y, direction))
         found: dict[str, Any] = {}
         for name, quantity in study.quantities.items():
             if name in watched:

@@ -37,7 +37,7 @@ def turn_about(angle: Float[Array, ""], axis: int) -> Float[Array, "4"]:
     return e.at[axis + 1].set(jnp.sin(angle / 2))
 
 
-class _Placed(NamedTuple):
+class _PlacedBodies(NamedTuple):
     """Bodies of a `Placement`, and what its joints' points and axes are made of."""
 
     r: Float[Array, "6 3"]
@@ -49,7 +49,7 @@ class _Placed(NamedTuple):
     R_panel: Float[Array, "3 3"]
 
 
-def _bodies(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods) -> _Placed:
+def _bodies(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods) -> _PlacedBodies:
     loops = close_loops(geometry, turn_by_angles(angles))
     q2, q3 = strokes_of(geometry, loops, rods)
     x, y, z = jnp.eye(3)
@@ -80,7 +80,7 @@ def _bodies(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods) ->
         ]
     )
     p = jnp.stack([level, level, post, rod_5, rod_6, panel])
-    return _Placed(r, p, hinge, top, (low_2, low_3), (ball_2, ball_3), R_panel)
+    return _PlacedBodies(r, p, hinge, top, (low_2, low_3), (ball_2, ball_3), R_panel)
 
 
 def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RISING) -> Placement:
