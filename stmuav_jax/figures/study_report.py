@@ -14,6 +14,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from ..checks.errors import SettingError, nearest_names
+from ..files.layout import flattened
 from ..files.netcdf import write_atomically
 from ..montecarlo.sensitivity import IndexIntervals
 from ..montecarlo.statistics import LEVEL, IntervalEstimate, SampleSummary
@@ -311,24 +312,14 @@ def _law(one: Mapping[str, Any]) -> str:
 
 
 def _identity(data: StudyData) -> str:
-    rows = [[_text(name), _text(value)] for name, value in _flat(data.identity, data.sampling)]
+    entries = flattened(data.identity, left_out=data.sampling)
+    rows = [[_text(name), _text(_short(value))] for name, value in entries if value != {}]
     rows += [
         [_text(name), _text(_short(value))]
         for name, value in data.dataset.attrs.items()
         if name not in ("identity", "reasons", "title")
     ]
     return _table(["", ""], rows, text=(1,)) if rows else "<p>Nothing is known of it.</p>"
-
-
-def _flat(value: Any, skipped: Any, name: str = "") -> Iterator[tuple[str, str]]:
-    """Entries of nested tables by dotted names."""
-    if value is skipped and value:
-        return
-    if isinstance(value, Mapping):
-        for key, inner in value.items():
-            yield from _flat(inner, skipped, f"{name}.{key}" if name else str(key))
-    else:
-        yield name, _short(value)
 
 
 # --- small pieces of text

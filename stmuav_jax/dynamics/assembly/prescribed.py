@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...algebra import lapack
 from ...algebra.compiler import kept_jit
+from ...algebra.derivative import held_constant
 from ...checks.errors import ModelError, StateError, concrete
 from ...checks.reason import AbstractReason, first_reason
 from ...mechanics.joint import Motion, drive
@@ -221,8 +222,7 @@ def _closed(
     def size(model: AugmentedModel, value: Array) -> Array:
         return jnp.max(jnp.abs(model.constraints.scales() * value), initial=0.0)
 
-    arrays, rest = eqx.partition((model, t, start), eqx.is_array)
-    fixed, t_fixed, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
+    fixed, t_fixed, begin = held_constant((model, t, start))
     # stopped once more on the results: a driver's function may hold traced numbers of its own
     still = lambda state: jax.lax.stop_gradient(look(fixed, t_fixed, state))
 
