@@ -6,6 +6,7 @@ have a copy each. The last digits depend only on the number of batch slots ("lan
 of the study's identity.
 """
 
+import dataclasses
 import itertools
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -20,11 +21,9 @@ import numpy as np
 
 from ..algebra.compiler import compiler_options
 from ..checks.errors import SettingError, SimulationError
-from ..dynamics.choices import solver_named
+from ..dynamics.formulations.base import AbstractFormulation
 from ..dynamics.integration.lanes import REASONS, Ending, Plan, RunResult, fly
 from ..dynamics.integration.problem import Problem, prepare
-from ..dynamics.method import Method
-from ..dynamics.tree.formulation import Tree
 from ..mechanics.state import State
 from .disturbed_flights import Drawn
 from .signal import RunPoint, Signal
@@ -249,16 +248,29 @@ class FlightWork(AbstractWork):
     def _signals(self) -> dict[str, Signal]:
         return self.study.signals()
 
+    @property
+    def _formulation(self) -> AbstractFormulation:
+        """Formulation of the runs, asked for where nothing is traced."""
+        chosen = self.study.method.formulation
+        if not self.study.flights.dependent_rows:
+            return chosen
+        allowing = chosen.allowing_dependent_rows()
+        if allowing is None:
+            raise SettingError(
+                f"Some constraint rows depend on others, for which {chosen} has no equations."
+            )
+        return allowing
+
     @cached_property
     def plan(self) -> Plan:
         """Plan of the batch integration, for programs that need its bare results."""
         study, direction = self.study, self.direction
-        # asked here, where nothing is traced
-        tree = Tree().allowing_dependent_rows() if study.flights.dependent_rows else Tree()
-        method = Method(
-            formulation=tree, solver=solver_named(study.solver), rtol=study.rtol, atol=study.atol,
-            max_steps=study.max_steps, adjoint=diffrax.ForwardMode(), steps="state",
-        )  # fmt: skip
+        method = dataclasses.replace(
+            study.method,
+            formulation=self._formulation,
+            adjoint=diffrax.ForwardMode(),
+            steps="state",
+        )
         names = study.sampling.names
 
         def make(drawn: Drawn) -> tuple[Problem, State]:
