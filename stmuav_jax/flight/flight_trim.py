@@ -26,7 +26,7 @@ from ..algebra import lapack
 from ..algebra.compiler import kept_jit
 from ..algebra.derivative import safe_sqrt
 from ..algebra.newton import Implicit, Newton
-from ..algebra.rotation import product, rotation_matrix, to_rotation_vector
+from ..algebra.rotation import product, rotation_matrix, to_rotation_vector, turn_about
 from ..checks.errors import ModelError, StateError, concrete
 from ..checks.numbers import floats
 from ..checks.reason import first_reason
@@ -43,7 +43,6 @@ from ..rotorcraft.allocation import (
 from ..rotorcraft.motor import MotorRotors
 from ..tracker.geometry import turn_by_angles
 from ..tracker.kinematics import RISING, Reason, panel_angles
-from ..tracker.placement import turn_about
 from ..tracker.pointing import why_outside
 from ..tracker.workspace import Limits, measure, reasons, survey
 from .flyer import Flyer, FlyerPoint, RotorsAndForces

@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import angular_velocity, product, rotation_matrix
+from ..algebra.rotation import angular_velocity, product, rotation_matrix, turn_about
 from ..mechanics.state import State
 from .geometry import TrackerGeometry, close_loops, turn_by_angles
 from .kinematics import RISING, Rods, strokes_of
 
+# Bodies of the tracker, in the order of its arrays.
 TRACKER_BODIES = ("slider_2", "slider_3", "post_4", "rod_5", "rod_6", "panel_7")
 
 
@@ -29,12 +30,6 @@ class Placement(NamedTuple):
     p: Float[Array, "6 4"]
     points: dict[str, Float[Array, "3"]]
     axes: dict[str, Float[Array, "3"]]
-
-
-def turn_about(angle: Float[Array, ""], axis: int) -> Float[Array, "4"]:
-    """Euler parameters of a rotation [rad] about a coordinate axis (0, 1 or 2)."""
-    e = jnp.zeros(4).at[0].set(jnp.cos(angle / 2))
-    return e.at[axis + 1].set(jnp.sin(angle / 2))
 
 
 class _PlacedBodies(NamedTuple):
