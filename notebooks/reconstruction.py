@@ -28,11 +28,9 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Bool, Float
 
-from stmuav_jax.algebra.rotation import product, rotation_matrix
-from stmuav_jax.checks.errors import SettingError
-from stmuav_jax.parameters.airframe import PRINTED_CENTRES, PRINTED_ORIENTATIONS
-from stmuav_jax.tracker.geometry import TrackerGeometry
-from stmuav_jax.tracker.placement import TRACKER_BODIES, place, turn_about
+from stmuav_jax import SettingError, rotation
+from stmuav_jax.parameters import PRINTED_CENTRES, PRINTED_ORIENTATIONS
+from stmuav_jax.tracker import TRACKER_BODIES, TrackerGeometry, place
 
 POSITION_DEVIATION = 5e-4  # [m]
 EULER_DEVIATION = {"post_4": 0.002, "rod_5": 0.004, "rod_6": 0.002, "panel_7": 0.004}
@@ -149,9 +147,10 @@ def predicted(
 ) -> tuple[Float[Array, "6 3"], Float[Array, "4 4"]]:
     """Centres of mass of bodies 2 to 7 [m] and Euler parameters of 4 to 7."""
     at = place(geometry, angles)
-    along = rotation_matrix(at.p[3])[:, 2]
+    along = rotation.rotation_matrix(at.p[3])[:, 2]
     aside = jnp.arctan2(along[0], jnp.sqrt(along[1] ** 2 + along[2] ** 2))
-    other = product(turn_about(jnp.arctan2(-along[1], along[2]), 0), turn_about(aside, 1))
+    turn = rotation.turn_about
+    other = rotation.product(turn(jnp.arctan2(-along[1], along[2]), 0), turn(aside, 1))
     return at.r, at.p[2:].at[1].set(jnp.where(other_cross, other, at.p[3]))
 
 

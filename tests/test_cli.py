@@ -96,6 +96,8 @@ def test_parameters_and_solver_reach_the_run(tmp_path, capsys):
         (("tracker", "--actuators", "printed"), "tracker has no actuators"),
         (("tracker", "--params", "/none.toml"), "There is no file '/none.toml'"),
         (("hexacopter", "--loads"), "hexacopter has none"),
+        (("hexacopter", "--jump-times", "99"), "must lie within the run, between 0 and"),
+        (("hexacopter", "--baumgarte-gains", "1", "1", "1"), "but it is projection"),
     ],
 )
 def test_bad_input_is_one_paragraph_and_exit_code_two(arguments, words, capsys, tmp_path):

@@ -191,14 +191,21 @@ def test_every_module_says_what_it_is(path):
 
 
 def classes() -> dict[str, tuple[Path, ast.ClassDef]]:
-    """All classes of the package by name (a second of one name by its module too)."""
-    found: dict[str, tuple[Path, ast.ClassDef]] = {}
+    """All classes of the package by name, which `test_class_names_are_unique` makes a key."""
+    nodes = [(path, node) for path in MODULES for node in ast.walk(tree(path))]
+    return {node.name: (path, node) for path, node in nodes if isinstance(node, ast.ClassDef)}
+
+
+def test_class_names_are_unique():
+    """One word, one meaning: a second class of a name has to be called something else."""
+    places: dict[str, list[str]] = {}
     for path in MODULES:
         for node in ast.walk(tree(path)):
             if isinstance(node, ast.ClassDef):
-                key = node.name if node.name not in found else f"{node.name} of {dotted(path)}"
-                found[key] = path, node
-    return found
+                places.setdefault(node.name, []).append(f"{dotted(path)}:{node.lineno}")
+    twice = {name: found for name, found in places.items() if len(found) > 1}
+    assert not twice, twice
+    assert len(places) > 300
 
 
 def base_names(node: ast.ClassDef) -> list[str]:

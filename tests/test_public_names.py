@@ -17,6 +17,7 @@ ROOT = Path(stm.__file__).parent
 ROOMS = sorted(stub.parent.name for stub in ROOT.glob("*/__init__.pyi"))
 PAGES = [
     *(REPOSITORY / "notebooks").glob("*.ipynb"),
+    *(REPOSITORY / "notebooks").glob("*.py"),
     *(REPOSITORY / "docs").rglob("*.md"),
     *(REPOSITORY / "docs").rglob("*.py"),
     REPOSITORY / "README.md",
@@ -62,6 +63,11 @@ def test_pages_use_public_names(page):
         assert room not in ROOMS or name in dir(getattr(stm, room)), f"stm.{room}.{name}"
     for name in re.findall(r"(?<![\w.])stm\.([A-Za-z]\w*)", found):
         assert name in dir(stm), f"{page.name} uses stm.{name}."
+    for place in re.findall(r"(?<![\w./])stmuav_jax\.([A-Za-z]\w*(?:\.\w+)*)", found):
+        room, *names = place.split(".")
+        assert room in dir(stm), f"{page.name} speaks of stmuav_jax.{place}."
+        known = set() if room not in ROOMS else set(dir(getattr(stm, room)))
+        assert not names or names[0] in known, f"{page.name} speaks of stmuav_jax.{place}."
 
 
 def test_one_alias_is_used_everywhere():

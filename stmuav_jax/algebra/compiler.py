@@ -214,7 +214,7 @@ def _compiled(
     def call(*args: Any) -> Any:
         arrays = [leaf for leaf in jax.tree.leaves(args) if eqx.is_array(leaf)]
         found = jax.block_until_ready(compiled(arrays))
-        return jax.tree.map(lambda x: found[x] if isinstance(x, kept.Slot) else x, result)
+        return jax.tree.map(lambda x: found[x] if isinstance(x, kept.ArrayIndex) else x, result)
 
     return call
 
@@ -222,7 +222,7 @@ def _compiled(
 def _compiled_now(
     function: Callable[..., Any], args: tuple[Any, ...], key: str | None, quick: bool
 ) -> tuple[Callable[[list[Any]], list[Any]], Any]:
-    """Program of lists of arrays, and the result's pytree with a `Slot` for each of them."""
+    """Program of lists of arrays, and the result's pytree with an `ArrayIndex` for each of them."""
     leaves, structure = jax.tree.flatten(args)
     places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
     arrays, result = [leaves[k] for k in places], []
@@ -234,7 +234,7 @@ def _compiled_now(
         found, tree = jax.tree.flatten(function(*jax.tree.unflatten(structure, given)))
         numbers = [x for x in found if eqx.is_array(x)]
         count = iter(range(len(numbers)))
-        marked = [kept.Slot(next(count)) if eqx.is_array(x) else x for x in found]
+        marked = [kept.ArrayIndex(next(count)) if eqx.is_array(x) else x for x in found]
         result[:] = [jax.tree.unflatten(tree, marked)]
         return numbers
 

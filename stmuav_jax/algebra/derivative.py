@@ -1,7 +1,7 @@
 """Derivatives along some of the arguments, and safe derivatives at singular points."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .stacked import dot
+
+T = TypeVar("T")
 
 
 def directional(
@@ -32,6 +34,12 @@ def value_and_jacobian(
     value, columns = jax.vmap(push, out_axes=(0, -1))(jnp.eye(x.shape[0], dtype=x.dtype))
     # the value is the same along every direction
     return jax.tree.map(lambda v: v[0], value), columns
+
+
+def held_constant(tree: T) -> T:
+    """Pytree with the same leaves, of which no floating-point array has a derivative."""
+    still = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x
+    return jax.tree.map(still, tree)
 
 
 @jax.custom_jvp

@@ -56,11 +56,11 @@ class _NoTextError(Exception):
     """Error of an object that no text describes in a way that other processes share."""
 
 
-class Slot(int):
+class ArrayIndex(int):
     """Place of an array in a list, which stands for it in a pytree without arrays."""
 
 
-class _Setting:
+class _Keeping:
     folder: Path | None = None
 
 
@@ -70,14 +70,14 @@ def keep_programs(folder: Path | str | None) -> None:
     The folder is made if it is missing. One that others may write to, or that is not the user's
     own, is not used; nor is one that cannot be written. None ends the keeping.
     """
-    _Setting.folder = None
+    _Keeping.folder = None
     if folder is None:
         return
     path = Path(folder)
     with contextlib.suppress(OSError):
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         if _is_own(path):
-            _Setting.folder = path
+            _Keeping.folder = path
 
 
 def _is_own(path: Path) -> bool:
@@ -95,7 +95,7 @@ def key_of(function: Callable[..., Any], args: tuple[Any, ...], options: Any) ->
         function: function that is compiled. args: its arguments; of arrays only shapes and data
             types count. options: of the compiler.
     """
-    if _Setting.folder is None:
+    if _Keeping.folder is None:
         return None
     try:
         text = _text((function, args, options))
@@ -113,12 +113,12 @@ def load(key: str | None) -> tuple[Call, Any] | None:
     """Kept program and the structure of its result; None if there is no sound one.
 
     Returns:
-        function from a list of arrays to a list of arrays, and the pytree of the result with a
-        `Slot` in the place of each array.
+        function from a list of arrays to a list of arrays, and the pytree of the result with an
+        `ArrayIndex` in the place of each array.
     """
-    if key is None or _Setting.folder is None:
+    if key is None or _Keeping.folder is None:
         return None
-    path = _Setting.folder / (key + _SUFFIX)
+    path = _Keeping.folder / (key + _SUFFIX)
     try:
         if not _is_own(path):
             return None
@@ -132,7 +132,7 @@ def load(key: str | None) -> tuple[Call, Any] | None:
         if calls:
             # lowering does this otherwise; without it a call of LAPACK ends the process
             lapack.prepare_lapack_call("getrf_ffi", np.dtype(float))
-        slots = [x for x in jax.tree.leaves(result) if isinstance(x, Slot)]
+        slots = [x for x in jax.tree.leaves(result) if isinstance(x, ArrayIndex)]
         trees = (jax.tree.structure((([0] * count,), {})), jax.tree.structure([0] * len(slots)))
         call = serialize_executable.deserialize_and_load(program, *trees)
     except Exception:
@@ -161,7 +161,7 @@ def store(key: str | None, lowered: Any, compiled: Any, count: int, result: Any)
         lowered, compiled: the program, as `jax.jit(...).lower(...)` and its `compile()` return it.
         count: number of its arguments' arrays. result: as `load` returns it.
     """
-    folder = _Setting.folder
+    folder = _Keeping.folder
     if key is None or folder is None:
         return
     calls = set(re.findall(r"custom_call @(\w+)", lowered.as_text()))

@@ -15,7 +15,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from . import lapack
-from .derivative import directional, value_and_jacobian
+from .derivative import directional, held_constant, value_and_jacobian
 
 # Residuals below this that no longer halve are taken for round-off.
 _ROUND_OFF = 1e-6
@@ -169,15 +169,11 @@ def _rooted_jvp(primals: Any, tangents: Any) -> Any:
     root, rest = _rooted(primal_fn, rewrite_fn, inputs)
     of = lambda y, given: rewrite_fn(y, rest, eqx.combine(given, still))
     rate = jax.jvp(lambda given: of(root, given), (varied,), (moved,))[1]
-    J = _jacobian(root, _still(rest), inputs, rewrite_fn)
+    J = _jacobian(root, held_constant(rest), inputs, rewrite_fn)
     zeros = jax.tree.map(
         lambda x: jax.custom_derivatives.zero_from_primal(x, symbolic_zeros=True), rest
     )
     return (root, rest), (-lapack.solve(J, rate), zeros)
-
-
-def _still(tree: Any) -> Any:
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 @eqx.filter_custom_jvp

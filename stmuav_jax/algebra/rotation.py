@@ -138,6 +138,12 @@ def normalise(p: Quats) -> Float[Array, "4 ..."]:
     return q / jnp.sqrt(dot(q, q))
 
 
+def turn_about(angle: Float[Array, ""], axis: int) -> Float[Array, "4"]:
+    """Euler parameters of a rotation [rad] about a coordinate axis (0, 1 or 2)."""
+    e = jnp.zeros(4).at[0].set(jnp.cos(angle / 2))
+    return e.at[axis + 1].set(jnp.sin(angle / 2))
+
+
 def from_rotation_vector(v: Vec3s) -> Float[Array, "4 ..."]:
     """Euler parameters of the rotation by the angle |v| [rad] about v / |v|, shape (4,).
 

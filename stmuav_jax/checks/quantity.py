@@ -21,7 +21,7 @@ Option = TypeVar("Option")
 _KEY = "quantity"
 
 
-class Quantity(NamedTuple):
+class OptionField(NamedTuple):
     """Description of one field of an option.
 
     Attributes:
@@ -40,11 +40,11 @@ def quantity(
     what: str, unit: str = "", *counts: int, kind: type = float, default: Any = None
 ) -> Any:
     """Field of an option's dataclass; None by default, which leaves the number to the scene."""
-    described = Quantity(what, unit, counts or (1,), kind)
+    described = OptionField(what, unit, counts or (1,), kind)
     return dataclasses.field(default=default, metadata={_KEY: described})
 
 
-def quantities(option: Any) -> dict[str, Quantity]:
+def quantities(option: Any) -> dict[str, OptionField]:
     """Descriptions of an option's fields by name; empty for any other class."""
     if not dataclasses.is_dataclass(option):
         return {}
@@ -83,7 +83,7 @@ def _value(value: Any, counts: tuple[int, ...]) -> Any:
     return value[0] if len(value) == 1 and 1 in counts else tuple(value)
 
 
-def _check(quantity: Quantity, value: Any, where: str) -> None:
+def _check(quantity: OptionField, value: Any, where: str) -> None:
     entries = value if isinstance(value, list | tuple) else (value,)
     words = {float: "number", int: "whole number", bool: "true or false"}[quantity.kind]
     admitted = (int, float) if quantity.kind is float else (quantity.kind,)

@@ -10,6 +10,8 @@ Scalar = Float[Array, ""]
 Vec3 = Float[Array, "3"]
 Quat = Float[Array, "4"]
 Vector = Float[Array, " _"]
+# Vectors that an integrator advances: all of one call have the same length k.
+StateVector = Float[Array, " k"]
 Matrix = Float[Array, "_ _"]
 
 # Shapes of arguments, for which NumPy arrays are valid too; the axes of a stack come last.

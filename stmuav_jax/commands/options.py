@@ -139,7 +139,7 @@ def check_options(command: Any, words: Sequence[str]) -> None:
         if dataclasses.is_dataclass(value):
             check_options(value, words)
         if value == () and option in words:
-            raise SettingError(f"{option} needs at least one name after it.")
+            raise SettingError(f"{option} needs at least one value after it.")
         for note in getattr(hints[field.name], "__metadata__", ()):
             if isinstance(note, Number):
                 note.check(value, option)

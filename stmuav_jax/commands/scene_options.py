@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from ..checks.errors import SettingError
-from ..checks.quantity import Quantity, quantities
+from ..checks.quantity import OptionField, quantities
 from ..scenes.registry import SCENES
 from ..scenes.signature import SceneOption
 
@@ -76,7 +76,7 @@ def _fields(option: SceneOption) -> list[Any]:
     return found
 
 
-def _number(name: str, word: str, number: Quantity, usual: Any) -> Any:
+def _number(name: str, word: str, number: OptionField, usual: Any) -> Any:
     unit = f" [{number.unit}]" if number.unit else ""
     words = f"{number.what[0].upper()}{number.what[1:]}{unit}."
     if number.kind is bool:

@@ -1,6 +1,7 @@
 """`stmuav simulate`: one run of a scene, with its certificate, figures and loads."""
 
 import dataclasses
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from rich.console import Console
 
 from ..checks.errors import SettingError, SimulationError
 from ..dynamics.choices import (
+    FIRST_STEP,
     STEP_TOLERANCE,
     STEPS_ALLOWED,
     FormulationName,
@@ -29,11 +31,17 @@ from .output import written
 from .scene_options import check_known, options_class, plain_of, scene_among
 
 if TYPE_CHECKING:
+    from ..dynamics.method import Method
     from ..dynamics.run import Run
     from ..dynamics.scene import Scene
 
 # Saved times are kept in memory: a spacing far below a step's would ask for too many.
 SPACING = Number("spacing of the saved times", "s", above=1e-7, high=1e5)
+# Steps of the size of round-off would not reach an end.
+FIRST = Number("first step", "s", above=1e-12, high=1e5)
+LARGEST = Number("largest step", "s", above=1e-12, high=1e5)
+JUMP = Number("time of a jump", "s", above=0.0, high=1e5)
+GAIN = Number("gain of Baumgarte's feedback", "1/s", 0.0, 1e6)
 
 
 @dataclasses.dataclass
@@ -57,10 +65,18 @@ class Settings:
     (augmented), with dense matrices (augmented-dense), with the rows of the report (report)."""
     stabilisation: StabilisationName = "projection"
     """Method that keeps the constraints from drifting."""
+    baumgarte_gains: Annotated[tuple[float, float, float] | None, GAIN, default("10 10 10")] = None
+    """Gains of baumgarte [1/s]: alpha of the rates, beta of the positions, that of |p| = 1."""
     save_every: Annotated[float | None, SPACING, default("the scene's own")] = None
     """Spacing of the saved times [s]."""
     max_steps: Annotated[int, count("steps between two saved times", 1e8)] = STEPS_ALLOWED
     """Largest number of steps between two saved times."""
+    first_step: Annotated[float, FIRST] = FIRST_STEP
+    """Length of the first step that is tried [s]."""
+    max_step: Annotated[float | None, LARGEST, default("none")] = None
+    """Largest step [s]; no step goes beyond a saved time either."""
+    jump_times: Annotated[tuple[float, ...], JUMP, default("none")] = ()
+    """Times at which forces jump [s]: a step ends before each, the next begins behind it."""
     error_estimate: bool = True
     """Estimate the run's error by a second run beside it."""
     certificate: Literal["standard", "full"] = "standard"
@@ -170,6 +186,48 @@ def _loaded(command: Any) -> "Scene":
     return load(command.scene)
 
 
+def _stabilisation(settings: Settings) -> Any:
+    """Stabilisation of the settings; raises `SettingError` for gains of one that has none."""
+    if settings.baumgarte_gains is None:
+        return stabilisation_named(settings.stabilisation)
+    if settings.stabilisation != "baumgarte":
+        raise SettingError(
+            "--baumgarte-gains is for --stabilisation baumgarte, but it is "
+            f"{settings.stabilisation}."
+        )
+    from ..dynamics.formulations.stabilisation import Baumgarte
+
+    return Baumgarte(*settings.baumgarte_gains)
+
+
+def method_of(settings: Settings, scene: "Scene") -> "Method":
+    """Method of integration that the settings describe.
+
+    Raises:
+        SettingError: gains without their stabilisation, or a jump outside the run.
+    """
+    from ..dynamics.method import Method
+
+    end = scene.t1 if settings.t1 is None else settings.t1
+    for jump in settings.jump_times:
+        if not scene.t0 < jump < end:
+            raise SettingError(
+                f"The times of jumps must lie within the run, between {scene.t0:g} and {end:g} s, but "
+                f"one is {jump:g} s (--jump-times)."
+            )
+    return Method(
+        formulation=formulation_named(settings.formulation),
+        solver=solver_named(settings.solver),
+        stabilisation=_stabilisation(settings),
+        rtol=settings.rtol,
+        atol=settings.atol,
+        first_step=settings.first_step,
+        max_steps=settings.max_steps,
+        jump_ts=settings.jump_times or None,
+        max_step=math.inf if settings.max_step is None else settings.max_step,
+    )
+
+
 def run_scene(scene: "Scene", settings: Settings, console: Console) -> "Run":
     """Simulate the scene with a progress bar on stderr."""
     from rich.progress import (
@@ -180,9 +238,9 @@ def run_scene(scene: "Scene", settings: Settings, console: Console) -> "Run":
         TimeRemainingColumn,
     )
 
-    from ..dynamics.method import Method
     from ..dynamics.simulation import simulate
 
+    method = method_of(settings, scene)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -195,14 +253,6 @@ def run_scene(scene: "Scene", settings: Settings, console: Console) -> "Run":
         def report(done: float) -> None:
             bar.update(task, completed=done, description=f"{scene.name}: {100 * done:.0f} %")
 
-        method = Method(
-            formulation=formulation_named(settings.formulation),
-            solver=solver_named(settings.solver),
-            stabilisation=stabilisation_named(settings.stabilisation),
-            rtol=settings.rtol,
-            atol=settings.atol,
-            max_steps=settings.max_steps,
-        )
         return simulate(
             scene,
             method=method,

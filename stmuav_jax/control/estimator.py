@@ -31,6 +31,7 @@ from ..algebra.rotation import (
     normalise,
     product,
     rotation_matrix,
+    skew,
     to_rotation_vector,
 )
 from ..algebra.space import Composite, Point, Rotation, Vector
@@ -43,7 +44,6 @@ from ..mechanics.system import System
 from ..sensing.sensors import SENSORS, gravity_of
 from ..tracker.drive import SLIDER_JOINTS
 from ..tracker.kinematics import stroke_jacobian, strokes
-from .geometric import hat
 from .instruments import Instrument, Reading
 from .panel import PanelBodies, panel_motion
 
@@ -124,7 +124,7 @@ def strapdown(
     moved = {"p": normalise(product(middle, half)), "v": x["v"] + h * a}
     moved = {**x, **moved, "r": x["r"] + h * x["v"] + h**2 / 2 * a}
     back = rotation_matrix(half).T
-    by_attitude = -R @ hat(felt) @ back
+    by_attitude = -R @ skew(felt) @ back
     one, none = jnp.eye(3), jnp.zeros((3, 3))
     errors = jnp.block(
         [
@@ -327,7 +327,7 @@ class MotionEstimator(eqx.Module):
         one, none = jnp.eye(3), jnp.zeros((3, 3))
         H = jnp.block(
             [
-                [-R @ hat(self.arm) @ _turn(late[0] * omega), one, -late[0] * one, none, none],
+                [-R @ skew(self.arm) @ _turn(late[0] * omega), one, -late[0] * one, none, none],
                 [_turn(late[1] * omega), none, none, late[1] * one, none],
             ]
         )

@@ -163,18 +163,6 @@ class WantedWrench(NamedTuple):
     rate_error: Float[Array, "3"]
 
 
-def hat(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Matrix of the cross product with x."""
-    zero = jnp.zeros_like(x[0])
-    return jnp.stack(
-        [
-            jnp.stack([zero, -x[2], x[1]]),
-            jnp.stack([x[2], zero, -x[0]]),
-            jnp.stack([-x[1], x[0], zero]),
-        ]
-    )
-
-
 def vee(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Vector of the antisymmetric part of a matrix."""
     return 0.5 * jnp.stack([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]])

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.rotation import skew
 from ..checks.errors import ModelError
 from ..rotorcraft.allocation import RotorLimits
-from .geometric import BaseMotion, Waypoint, hat
+from .geometric import BaseMotion, Waypoint
 
 # Part of the turning moments of the rotors, below which no change of speeds turns without tilting.
 _TURNS = 1e-9
@@ -79,7 +80,7 @@ def inverse_without_yaw(
 
 def as_it_turns(wanted: Waypoint, base: BaseMotion) -> Waypoint:
     """Waypoint whose heading is that of the base, and goes on turning as it does."""
-    x, rate = base.R[:, 0], (base.R @ hat(base.omega))[:, 0]
+    x, rate = base.R[:, 0], (base.R @ skew(base.omega))[:, 0]
     turning = (x[0] * rate[1] - x[1] * rate[0]) / (x[0] ** 2 + x[1] ** 2)
     return wanted._replace(
         heading=jnp.arctan2(x[1], x[0]), turning=turning, turning_rate=jnp.zeros_like(turning)

@@ -15,7 +15,7 @@ from .assembly.singular import singular_start
 from .checks import check_consistent, check_loads
 from .error_estimate import ErrorEstimate
 from .evaluation import Balances, RowsAt, Saved, accelerations, balances, rows_at, singular_values
-from .formulations.augmented import Augmented, Model
+from .formulations.augmented import Augmented, AugmentedModel
 from .formulations.base import AbstractFormulation
 from .formulations.constraints import Constraints
 from .integration.advance import Trajectory
@@ -34,7 +34,7 @@ class Start(NamedTuple):
 
 def inspect_start(
     system: System, state: State, t: float, formulation: AbstractFormulation
-) -> tuple[AbstractFormulation, Model, Start]:
+) -> tuple[AbstractFormulation, AugmentedModel, Start]:
     """Check an initial state and its loads, determine the rank, and allow for dependent rows.
 
     Returns:
@@ -112,7 +112,7 @@ class Checked(NamedTuple):
 
 
 def check_saved(
-    problem: Problem, rows: Model, start: Start, first: Trajectory, full: bool
+    problem: Problem, rows: AugmentedModel, start: Start, first: Trajectory, full: bool
 ) -> Checked:
     """Checks of the saved states of a run, by the rows of all joints and by another formulation.
 
@@ -157,7 +157,9 @@ def _independent_later(values: Float[np.ndarray, "k s"], rank: int, drifted: flo
     return later if values[later, rank] > least > values[0, rank] else None
 
 
-def _formulation_difference(problem: Problem, rows: Model, at: Saved, dependent: bool) -> float:
+def _formulation_difference(
+    problem: Problem, rows: AugmentedModel, at: Saved, dependent: bool
+) -> float:
     """Largest relative difference of the accelerations by two formulations."""
     own = problem.method.formulation
     other, model = Augmented(), rows

@@ -12,7 +12,7 @@ from ..checks.physical import check_unit
 from ..mechanics.constraint import ROWS
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
-from .formulations.augmented import Model
+from .formulations.augmented import AugmentedModel
 from .method import Method
 from .scene import Scene
 
@@ -124,7 +124,7 @@ def check_loads(system: System, finite: np.ndarray, t: float) -> None:
 
 
 def check_consistent(
-    system: System, model: Model, residuals: np.ndarray, rates: np.ndarray
+    system: System, model: AugmentedModel, residuals: np.ndarray, rates: np.ndarray
 ) -> None:
     """Raise `StateError` unless positions and velocities satisfy the joints.
 
@@ -148,7 +148,7 @@ def check_consistent(
         )
 
 
-def _off(model: Model, k: int, value: float) -> str:
+def _off(model: AugmentedModel, k: int, value: float) -> str:
     """Text of the residual of row k: a length, a cosine or an angle."""
     kinds = [g.kind for g in model.constraints.groups for _ in range(len(g.i) * ROWS[g.kind])]
     if kinds[k] == "distance":
@@ -162,6 +162,6 @@ def _off(model: Model, k: int, value: float) -> str:
     return f"{abs(value):.3g} m"
 
 
-def _off_rate(model: Model, k: int, value: float) -> str:
+def _off_rate(model: AugmentedModel, k: int, value: float) -> str:
     unit = "rad/s" if model.constraints.angular[k] else "m/s"
     return f"{abs(value):.3g} {unit}"

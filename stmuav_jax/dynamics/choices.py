@@ -14,6 +14,8 @@ StabilisationName = Literal["projection", "baumgarte", "none"]
 
 # Default of rtol and atol, on positions [m], Euler parameters, velocities [m/s], [rad/s] alike.
 STEP_TOLERANCE = 1e-8
+# Length of the first step that is tried [s].
+FIRST_STEP = 1e-4
 # Largest number of accepted and rejected steps between two output times.
 STEPS_ALLOWED = 100_000
 

@@ -17,7 +17,7 @@ from ..mechanics.load import Load
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .conserved import energy, momentum
-from .formulations.augmented import Augmented, Model
+from .formulations.augmented import Augmented, AugmentedModel
 from .formulations.base import AbstractFormulation, Accelerations, Reactions
 from .formulations.reactions import Frame, in_joint_axes
 from .formulations.stabilisation import Unstabilised
@@ -98,7 +98,7 @@ def _balances(system: System, saved: Saved) -> Balances:
 
 
 @kept_jit
-def _rows(model: Model, saved: Saved) -> RowsAt:
+def _rows(model: AugmentedModel, saved: Saved) -> RowsAt:
     def one(at: Saved) -> RowsAt:
         system, state = with_internal(model.system, at.internal), at.states
         kin = system.kinematics(state)
@@ -150,7 +150,7 @@ def balances(system: System, saved: Saved) -> Balances:
     return _in_blocks(lambda at: _balances(system, at), saved)
 
 
-def rows_at(model: Model, saved: Saved) -> RowsAt:
+def rows_at(model: AugmentedModel, saved: Saved) -> RowsAt:
     """`RowsAt` of saved states, as NumPy arrays stacked along the first axis.
 
     Args:

@@ -26,7 +26,7 @@ from .checks import (
     check_start,
 )
 from .evaluation import RowsAt, Saved, rows_at
-from .formulations.augmented import Augmented, Model, displace
+from .formulations.augmented import Augmented, AugmentedModel, displace
 from .scene import Scene
 from .stiffness import EXPLICIT_LIMIT, spectrum
 from .tree.formulation import Tree
@@ -235,7 +235,7 @@ def _posture(system: System, state: State, t: float) -> list[Finding]:
     return found
 
 
-def _rows(system: System, model: Model, states: list[State], t: float) -> RowsAt:
+def _rows(system: System, model: AugmentedModel, states: list[State], t: float) -> RowsAt:
     """Constraint rows and loads at several states, stacked along the first axis."""
     stack: Any = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *states)
     internal = np.stack([np.asarray(internal_states(system))] * len(states))
@@ -292,7 +292,7 @@ def _conditions(
 
 
 def _nearness(
-    system: System, model: Model, state: State, t: float, rank: Rank, free: np.ndarray
+    system: System, model: AugmentedModel, state: State, t: float, rank: Rank, free: np.ndarray
 ) -> Iterator[Finding]:
     """Findings on dependent rows and singular postures, from postures beside this one."""
     names, at, change = ", ".join(rank.redundant), rank.smallest_singular_value, 0.0
@@ -324,7 +324,9 @@ def _nearness(
         )  # fmt: skip
 
 
-def _beside(system: System, model: Model, state: State, t: float, free: np.ndarray) -> RowsAt:
+def _beside(
+    system: System, model: AugmentedModel, state: State, t: float, free: np.ndarray
+) -> RowsAt:
     """Rows at postures one step to either side along each free motion, put on the constraints.
 
     The largest movement of a body is `_STEP` [m or rad].

@@ -1,5 +1,6 @@
 """Integration method: formulation, solver, tolerances and further settings."""
 
+import dataclasses
 from functools import partial
 from typing import Any, Literal
 
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ..checks.errors import SettingError, concrete, nearest_names
 from ..checks.shapes import Numbers
-from .choices import STEP_TOLERANCE, STEPS_ALLOWED
+from .choices import FIRST_STEP, STEP_TOLERANCE, STEPS_ALLOWED
 from .formulations.augmented import Augmented
 from .formulations.base import AbstractFormulation
 from .formulations.stabilisation import AbstractStabilisation, Baumgarte, Projection, Unstabilised
@@ -49,6 +50,14 @@ def _part(name: str, given: Any) -> Any:
     else:
         what = f"of type {type(given).__name__}."
     raise SettingError(f"{name} must be an object such as {valid}, but it is {what}")
+
+
+def described(part: Any) -> dict[str, Any]:
+    """Name of the class of a method's part, and those of its fields that are numbers or texts."""
+    fields = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+    plain = {k: v for k, v in fields.items() if isinstance(v, str | None)}
+    numbers = {k: np.asarray(v).tolist() for k, v in fields.items() if eqx.is_array_like(v)}
+    return {"kind": type(part).__name__} | plain | numbers
 
 
 def _times(given: Any) -> Any:
@@ -109,7 +118,7 @@ class Method(AbstractMethod):
     stabilisation: AbstractStabilisation = eqx.field(
         converter=partial(_part, "stabilisation"), default=Projection()
     )
-    first_step: float | Float[Array, ""] = 1e-4
+    first_step: float | Float[Array, ""] = FIRST_STEP
     max_steps: int = eqx.field(static=True, default=STEPS_ALLOWED)
     adjoint: diffrax.AbstractAdjoint = DiscreteAdjoint()
     event: Event | None = None

@@ -24,7 +24,7 @@ from .evaluation import accelerations
 from .integration.advance import Trajectory
 from .integration.march import CHUNK, March, same_result
 from .integration.problem import Problem, prepare
-from .method import Method
+from .method import Method, described
 from .run import Run, Seconds, saved
 from .scene import Scene
 from .stiffness import choose_solver
@@ -246,7 +246,7 @@ def _words(trajectory: Trajectory) -> str:
 
 def _settings(method: Method) -> dict[str, Any]:
     """Description of the method in words and numbers, as results keep it."""
-    return {
+    found = {
         "formulation": str(method.formulation),
         "solver": type(method.solver).__name__,
         "rtol": float(method.rtol),
@@ -254,6 +254,16 @@ def _settings(method: Method) -> dict[str, Any]:
         "stabilisation": type(method.stabilisation).__name__,
         "max_steps_between_saved_times": method.max_steps,
     }
+    usual = Method()
+    if float(method.first_step) != float(usual.first_step):
+        found["first_step"] = float(method.first_step)
+    if np.isfinite(float(method.max_step)):
+        found["max_step"] = float(method.max_step)
+    if method.jump_ts is not None:
+        found["jump_times"] = np.asarray(method.jump_ts).tolist()
+    if not eqx.tree_equal(method.stabilisation, usual.stabilisation):
+        found["stabilisation_settings"] = described(method.stabilisation)
+    return found
 
 
 def _failure(run: Run, end: float) -> str:

@@ -7,9 +7,12 @@ from .ephemeris import (
     unix_time as unix_time,
 )
 from .sun import (
+    SensedDirection as SensedDirection,
     Sun as Sun,
     SunReason as SunReason,
     attitude as attitude,
+    in_body as in_body,
+    sensed_direction as sensed_direction,
     sensed_sun as sensed_sun,
     sun_at as sun_at,
     sun_in_body as sun_in_body,

@@ -2,7 +2,6 @@
 
 from .day import (
     DAY_FIGURES as DAY_FIGURES,
-    day_dataset as day_dataset,
     day_rows as day_rows,
     light as light,
     load_attitude as load_attitude,
@@ -11,7 +10,6 @@ from .day import (
 )
 from .estimate import (
     CASE_FIGURES as CASE_FIGURES,
-    case_dataset as case_dataset,
     consistency as consistency,
     errors as errors,
     hover as hover,

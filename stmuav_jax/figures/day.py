@@ -5,7 +5,7 @@ import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,9 +25,6 @@ from ..tracker.kinematics import Reason, panel_angles
 from ..tracker.workspace import Limits, direction_grid, survey
 from .plot import STYLES, grid
 from .terminal import row, table
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 FORMAT = "stmuav_jax day"
 FORMAT_VERSION = 1
@@ -121,18 +118,13 @@ def day_tables(day: Day) -> tuple[Table, Table]:
 # --- files
 
 
-def day_dataset(day: Day) -> "xr.Dataset":
-    """Labelled dataset of the day, with times in seconds since local midnight.
+def labelled_day(day: Day) -> Labelled:
+    """Content of a saved day, with times in seconds since local midnight.
 
     Dimensions: time, axis (x, y, z; the world is east, north, up), axis_b (of the UAV), angle,
     leg, panel. Every variable has `units` and `description`; attributes hold place, date and
     settings.
     """
-    return labelled_day(day).dataset()
-
-
-def labelled_day(day: Day) -> Labelled:
-    """Content of a saved day; see `day_dataset`."""
     s = "time"
     table = {
         "unix_time": ((s,), day.unix, "s", "UTC since 1970-01-01, without leap seconds"),

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,9 +17,6 @@ from ..quadrotor.assess import CaseStudy, CaseSummary, Estimates, last_beyond, s
 from ..quadrotor.filter_verdict import RunsVerdict
 from ..quadrotor.hover import Hover
 from .plot import STYLES, grid
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 FORMAT = "stmuav_jax estimate"
 FORMAT_VERSION = 1
@@ -230,16 +227,11 @@ def hover(flights: dict[str, Hover]) -> Figure:
 # --- files
 
 
-def case_dataset(study: CaseStudy) -> "xr.Dataset":
-    """Labelled dataset of a case, with dimensions time, seed, tuning, component, rotor, axis.
+def labelled_case(study: CaseStudy) -> Labelled:
+    """Content of a saved case, with dimensions time, seed, tuning, component, rotor, axis.
 
     Times are the ends of the steps, over which the thrusts are constant.
     """
-    return labelled_case(study).dataset()
-
-
-def labelled_case(study: CaseStudy) -> Labelled:
-    """Content of a saved case; see `case_dataset`."""
     record, found = study.record, study.estimates
     together = lambda pick: np.stack([np.asarray(pick(e)) for e in found.values()])
     path = ("time", "component", "seed")
@@ -272,7 +264,7 @@ def labelled_case(study: CaseStudy) -> Labelled:
 
 
 def labelled_hover(flights: dict[str, Hover]) -> Labelled:
-    """Content of saved hovers, with dimensions as in `case_dataset`."""
+    """Content of saved hovers, with dimensions as in `labelled_case`."""
     together = lambda pick: np.stack([np.asarray(pick(h)) for h in flights.values()])
     each = ("tuning", "time", "component", "seed")
     scalar = ("tuning", "time", "seed")

@@ -57,7 +57,7 @@ class Influence(NamedTuple):
     note: str
 
 
-class Finding(NamedTuple):
+class QuantityAnalysis(NamedTuple):
     """Results for one quantity: statistics, its probability if it is an event, sensitivities."""
 
     quantity: StudyQuantity
@@ -101,7 +101,7 @@ class Analysis(NamedTuple):
     level: float
     inputs: dict[str, SampleSummary]
     varying: tuple[StudyQuantity, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[QuantityAnalysis, ...]
     failing: np.ndarray | None
     notes: tuple[str, ...]
     failure: Failing | None = None
@@ -161,14 +161,14 @@ def is_event(one: StudyQuantity, values: np.ndarray) -> bool:
 
 def _finding(
     data: StudyData, one: StudyQuantity, names: tuple[str, ...], table: np.ndarray, level: float
-) -> Finding:
+) -> QuantityAnalysis:
     values = data.values(one)
     event = probability(int(np.sum(values)), len(values), level) if is_event(one, values) else None
     if data.design == "saltelli":
         influence = _sobol(data, one, names, level)
     else:
         influence = _from_samples(names, table, values[:ROWS], level)
-    return Finding(one, summarise(values, SHARES, level), event, influence)
+    return QuantityAnalysis(one, summarise(values, SHARES, level), event, influence)
 
 
 def _sobol(data: StudyData, one: StudyQuantity, names: tuple[str, ...], level: float) -> Influence:

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..montecarlo.statistics import SampleSummary, bands
 from .plot import STYLES, grid
-from .study_analysis import Analysis, Finding, is_event
+from .study_analysis import Analysis, QuantityAnalysis, is_event
 from .study_data import Curve, StudyData, StudyQuantity, label
 
 BLUE, ORANGE, GREEN, BLACK = (colour for colour, _ in STYLES)
@@ -214,7 +214,7 @@ def scatter(data: StudyData, analysis: Analysis) -> Figure | None:
     return figure
 
 
-def strength(one: Finding) -> np.ndarray:
+def strength(one: QuantityAnalysis) -> np.ndarray:
     """Influence of each named input on a quantity: total or first-order indices."""
     found = one.influence
     if found.indices:
@@ -226,7 +226,7 @@ def strength(one: Finding) -> np.ndarray:
     return np.zeros(len(found.names))
 
 
-def ordered(findings: list[Finding]) -> list[str]:
+def ordered(findings: list[QuantityAnalysis]) -> list[str]:
     """Keys of the inputs, sorted by their largest influence on one of the quantities."""
     names = findings[0].influence.names
     most = np.max([strength(one) for one in findings], axis=0, initial=0.0)
@@ -243,7 +243,7 @@ def two(value: float) -> str:
     return f"{round(float(value), 2) + 0.0:.2f}".replace("-", "\N{MINUS SIGN}")
 
 
-def _strength_words(one: Finding, name: str) -> str:
+def _strength_words(one: QuantityAnalysis, name: str) -> str:
     found = one.influence
     if name not in found.names:
         return ""
@@ -269,7 +269,7 @@ def _points(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
 
 
 def _scatter_notes(
-    data: StudyData, analysis: Analysis, points: int, rows: list[Finding], names: list[str]
+    data: StudyData, analysis: Analysis, points: int, rows: list[QuantityAnalysis], names: list[str]
 ) -> list[str]:
     there = len([f for f in analysis.findings if f.event is None and f.summary.values > 1])
     notes = []

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from ..montecarlo.sensitivity import separation
 from ..montecarlo.statistics import convergence, probability
 from .plot import grid
-from .study_analysis import ROWS, Analysis, Finding, is_event
+from .study_analysis import ROWS, Analysis, QuantityAnalysis, is_event
 from .study_data import StudyData, StudyQuantity
 from .study_plot import (
     BLACK,
@@ -217,7 +217,7 @@ def sensitivities(data: StudyData, analysis: Analysis) -> Figure | None:
     return figure
 
 
-def _sobol_bars(ax: Axes, one: Finding, names: list[str]) -> None:
+def _sobol_bars(ax: Axes, one: QuantityAnalysis, names: list[str]) -> None:
     found = one.influence.indices
     assert found is not None
     picked = [one.influence.names.index(name) for name in names]
@@ -236,7 +236,7 @@ def _sobol_bars(ax: Axes, one: Finding, names: list[str]) -> None:
     ax.set_xlabel("share of the variance", fontsize=8)
 
 
-def _share_bars(ax: Axes, one: Finding, names: list[str]) -> None:
+def _share_bars(ax: Axes, one: QuantityAnalysis, names: list[str]) -> None:
     found = one.influence
     assert found.first is not None
     picked = [found.names.index(name) for name in names]

@@ -14,12 +14,13 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from ..checks.errors import SettingError, nearest_names
+from ..files.layout import flattened
 from ..files.netcdf import write_atomically
 from ..montecarlo.sensitivity import IndexIntervals
 from ..montecarlo.statistics import LEVEL, IntervalEstimate, SampleSummary
 from ..montecarlo.study import column_name
 from . import study_plot, study_region
-from .study_analysis import Analysis, Finding, analyse, number, plain
+from .study_analysis import Analysis, QuantityAnalysis, analyse, number, plain
 from .study_data import StudyData, label, study_data
 from .study_plot import strength
 
@@ -257,7 +258,7 @@ def _decide(data: StudyData, analysis: Analysis) -> str:
     return f'<h2>Which inputs decide</h2><p>{said}</p><div class="side">{"".join(tables)}</div>'
 
 
-def _influences(one: Finding, words: Mapping[str, str]) -> str:
+def _influences(one: QuantityAnalysis, words: Mapping[str, str]) -> str:
     found = one.influence
     title = _text(one.quantity.words)
     remark = f"<p><small>{_text(found.note)}</small></p>" if found.note else ""
@@ -311,24 +312,14 @@ def _law(one: Mapping[str, Any]) -> str:
 
 
 def _identity(data: StudyData) -> str:
-    rows = [[_text(name), _text(value)] for name, value in _flat(data.identity, data.sampling)]
+    entries = flattened(data.identity, left_out=data.sampling)
+    rows = [[_text(name), _text(_short(value))] for name, value in entries if value != {}]
     rows += [
         [_text(name), _text(_short(value))]
         for name, value in data.dataset.attrs.items()
         if name not in ("identity", "reasons", "title")
     ]
     return _table(["", ""], rows, text=(1,)) if rows else "<p>Nothing is known of it.</p>"
-
-
-def _flat(value: Any, skipped: Any, name: str = "") -> Iterator[tuple[str, str]]:
-    """Entries of nested tables by dotted names."""
-    if value is skipped and value:
-        return
-    if isinstance(value, Mapping):
-        for key, inner in value.items():
-            yield from _flat(inner, skipped, f"{name}.{key}" if name else str(key))
-    else:
-        yield name, _short(value)
 
 
 # --- small pieces of text

@@ -5,7 +5,7 @@ from .loop_file import (
     save_loop as save_loop,
 )
 from .model_file import (
-    Model as Model,
+    ParametricModel as ParametricModel,
     load_model as load_model,
     read_model as read_model,
 )

@@ -359,12 +359,13 @@ def _read_axis(path: Path, name: str, node: Mapping[str, Any]) -> Axis:
     return Axis(values, node["attributes"]["units"])
 
 
-def _flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+def flattened(value: Any, name: str = "", left_out: Any = None) -> Iterator[tuple[str, Any]]:
+    """Entries of nested tables, but of the one left out, by dotted names; {} is an entry."""
     if isinstance(value, Mapping) and value:
-        for key, inner in value.items():
-            yield from _flat(inner, f"{prefix}.{key}" if prefix else str(key))
+        for key, inner in value.items() if value is not left_out else ():
+            yield from flattened(inner, f"{name}.{key}" if name else str(key), left_out)
     else:
-        yield prefix, value
+        yield name, value
 
 
 def _deciding(layout: Layout) -> dict[str, Any]:
@@ -378,7 +379,7 @@ def _deciding(layout: Layout) -> dict[str, Any]:
         for name, axis in layout.axes.items()
     }
     more = {"column": columns, "axis": axes, "reason": layout.reasons, "version": layout.versions}
-    return dict(_flat(layout.identity, "")) | dict(_flat(more, ""))
+    return dict(flattened(layout.identity)) | dict(flattened(more))
 
 
 def differences(there: Layout, here: Layout) -> list[str]:

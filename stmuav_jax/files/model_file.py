@@ -48,7 +48,7 @@ _ORTHOGONAL = 1e-9
 
 
 @dataclass(frozen=True)
-class Model:
+class ParametricModel:
     """Model's file that was read and checked, from whose parameters systems can be made.
 
     Attributes:
@@ -79,7 +79,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Robot:
-    """Model of a scene without parameters, such as a robot's; see `Model`."""
+    """Model of a scene without parameters, such as a robot's; see `ParametricModel`."""
 
     scene: Scene
 
@@ -120,7 +120,7 @@ def load_model(path: str | os.PathLike[str]) -> Scene:
     return read_model(path).scene
 
 
-def read_model(path: str | os.PathLike[str]) -> Model:
+def read_model(path: str | os.PathLike[str]) -> ParametricModel:
     """Model of a TOML file, see `load_model`, from whose parameters systems can be made."""
     source, content = Path(path), read_toml(path)
     with _within(f"{source}"):
@@ -158,7 +158,7 @@ def read_model(path: str | os.PathLike[str]) -> Model:
         links_between=given.links_between,
         sensors=sensors,
     )
-    return Model(f"{source}", given, scene, table)
+    return ParametricModel(f"{source}", given, scene, table)
 
 
 def _system(source: str, given: ModelFile, parameters: Table) -> System:

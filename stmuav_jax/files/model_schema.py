@@ -28,12 +28,12 @@ from ..sensing.sensors import SENSORS
 # Formats that are read; the second has sensors.
 MODEL_FORMATS = (1, 2)
 
-Vector = Annotated[tuple[Finite, Finite, Finite], Tuples]
-Rows = Annotated[tuple[Vector, Vector, Vector], Tuples]
+Triple = Annotated[tuple[Finite, Finite, Finite], Tuples]
+Rows = Annotated[tuple[Triple, Triple, Triple], Tuples]
 Quaternion = Annotated[tuple[Finite, Finite, Finite, Finite], Tuples]
 Pair = Annotated[tuple[str, str], Tuples]
 Several = Annotated[tuple[Finite, ...], Tuples]
-Vectors = Annotated[tuple[Vector, ...], Tuples]
+Triples = Annotated[tuple[Triple, ...], Tuples]
 
 
 def _shaped(kinds: Any, words: str) -> AfterValidator:
@@ -49,8 +49,8 @@ def _shaped(kinds: Any, words: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-_INERTIA = _shaped(Vector | Rows, "three moments or three rows of three numbers")
-_VALUE = _shaped(Finite | Several | Vectors, "finite numbers")
+_INERTIA = _shaped(Triple | Rows, "three moments or three rows of three numbers")
+_VALUE = _shaped(Finite | Several | Triples, "finite numbers")
 # One number, or one for each component.
 Size = Annotated[Any, _shaped(Finite | Several, "a number or a list of numbers")]
 
@@ -65,7 +65,7 @@ def _format(value: int) -> int:
 Inertia = Annotated[Any, _INERTIA]
 
 
-class Slot(NamedTuple):
+class Entry(NamedTuple):
     """One entry of a table of the file.
 
     Attributes:
@@ -89,10 +89,10 @@ class Kind(NamedTuple):
 
     make: Callable[..., Any]
     owner: str
-    slots: Mapping[str, Slot]
+    slots: Mapping[str, Entry]
 
 
-def _maybe(slot: Slot) -> Slot:
+def _maybe(slot: Entry) -> Entry:
     return slot._replace(needed=False)
 
 
@@ -103,17 +103,17 @@ def _driver(coordinate: Any) -> Callable[..., joints.Joint]:
     return make
 
 
-_POINT, _AXIS = Slot(Vector, "m"), Slot(Vector, "1")
-_LENGTH = Slot(Finite, "m", needed=False)
-_WHICH = Slot(Literal["angle", "displacement"], needed=False)
-_FRAME = Slot(Literal["world", "body"], needed=False)
-_SWING = Slot(Finite, "m or rad", needed=False)
+_POINT, _AXIS = Entry(Triple, "m"), Entry(Triple, "1")
+_LENGTH = Entry(Finite, "m", needed=False)
+_WHICH = Entry(Literal["angle", "displacement"], needed=False)
+_FRAME = Entry(Literal["world", "body"], needed=False)
+_SWING = Entry(Finite, "m or rad", needed=False)
 _MOTION = {
     "start": _SWING,
-    "rate": Slot(Finite, "m/s or rad/s", needed=False),
+    "rate": Entry(Finite, "m/s or rad/s", needed=False),
     "amplitude": _SWING,
-    "angular_frequency": Slot(Finite, "rad/s", needed=False),
-    "phase": Slot(Finite, "rad", needed=False),
+    "angular_frequency": Entry(Finite, "rad/s", needed=False),
+    "phase": Entry(Finite, "rad", needed=False),
 }
 
 # Arguments of the functions that make joints: one that is not here keeps its joint out of files.
@@ -121,7 +121,7 @@ _ARGUMENTS = {
     **dict.fromkeys(("point", "point_i", "point_j"), _POINT),
     **dict.fromkeys(("axis", "axis_i", "axis_j"), _AXIS),
     "length": _LENGTH,
-    "pitch": Slot(Finite, "m/rad"),
+    "pitch": Entry(Finite, "m/rad"),
 }
 
 
@@ -151,28 +151,28 @@ JOINTS: dict[str, Kind] = {
 }
 
 # Geometry of a joint in the reference frames of its bodies, by which saved models give it.
-IN_BODIES: dict[str, Slot] = {
+IN_BODIES: dict[str, Entry] = {
     "point_i": _POINT, "point_j": _POINT,
-    "frame_i": Slot(Rows, "1"), "frame_j": Slot(Rows, "1"),
-    "length": Slot(Finite, "m or m/rad"),
+    "frame_i": Entry(Rows, "1"), "frame_j": Entry(Rows, "1"),
+    "length": Entry(Finite, "m or m/rad"),
 }  # fmt: skip
 
-_STIFFNESS, _DAMPING = Slot(Finite, "N/m or N m/rad"), Slot(Finite, "N s/m or N m s/rad")
-_COORDINATE, _EFFORT = Slot(Finite, "m or rad"), Slot(Finite, "N or N m")
+_STIFFNESS, _DAMPING = Entry(Finite, "N/m or N m/rad"), Entry(Finite, "N s/m or N m s/rad")
+_COORDINATE, _EFFORT = Entry(Finite, "m or rad"), Entry(Finite, "N or N m")
 
 FORCES: dict[str, Kind] = {
-    "gravity": Kind(applied.Gravity, "", {"acceleration": Slot(Vector, "m/s^2", needed=False)}),
+    "gravity": Kind(applied.Gravity, "", {"acceleration": Entry(Triple, "m/s^2", needed=False)}),
     "spring": Kind(applied.LinearSpringDamper, "bodies", {
-        "point_i": _maybe(_POINT), "point_j": _maybe(_POINT), "stiffness": Slot(Finite, "N/m"),
-        "damping": Slot(Finite, "N s/m", needed=False), "length": _LENGTH,
+        "point_i": _maybe(_POINT), "point_j": _maybe(_POINT), "stiffness": Entry(Finite, "N/m"),
+        "damping": Entry(Finite, "N s/m", needed=False), "length": _LENGTH,
     }),
     "torsional_spring": Kind(applied.TorsionalSpringDamper, "joint", {
-        "stiffness": Slot(Finite, "N m/rad"), "damping": Slot(Finite, "N m s/rad", needed=False),
-        "angle": Slot(Finite, "rad", needed=False),
+        "stiffness": Entry(Finite, "N m/rad"), "damping": Entry(Finite, "N m s/rad", needed=False),
+        "angle": Entry(Finite, "rad", needed=False),
     }),
     "damping": Kind(applied.JointDamping, "joint", {
-        "turning": Slot(Finite, "N m s/rad", needed=False),
-        "sliding": Slot(Finite, "N s/m", needed=False),
+        "turning": Entry(Finite, "N m s/rad", needed=False),
+        "sliding": Entry(Finite, "N s/m", needed=False),
     }),
     "servo": Kind(JointServo, "joint", {
         "stiffness": _STIFFNESS, "damping": _DAMPING, "target": _COORDINATE, "coordinate": _WHICH,
@@ -182,35 +182,35 @@ FORCES: dict[str, Kind] = {
         "damping": _DAMPING, "width": _COORDINATE, "coordinate": _WHICH,
     }),
     "friction": Kind(JointFriction, "joint", {
-        "coulomb": _EFFORT, "viscous": _maybe(_DAMPING), "speed": Slot(Finite, "m/s or rad/s"),
+        "coulomb": _EFFORT, "viscous": _maybe(_DAMPING), "speed": Entry(Finite, "m/s or rad/s"),
         "coordinate": _WHICH,
     }),
     "effort": Kind(JointEffort, "joint", {"effort": _EFFORT, "coordinate": _WHICH}),
     "force": Kind(applied.AppliedForce, "body", {
-        "force": Slot(Vector, "N"), "frame": _FRAME, "point": _maybe(_POINT),
+        "force": Entry(Triple, "N"), "frame": _FRAME, "point": _maybe(_POINT),
     }),
-    "moment": Kind(applied.AppliedMoment, "body", {"moment": Slot(Vector, "N m"), "frame": _FRAME}),
+    "moment": Kind(applied.AppliedMoment, "body", {"moment": Entry(Triple, "N m"), "frame": _FRAME}),
     "rotors": Kind(Rotors, "body", {
-        "arms": Slot(Vectors, "m"), "spin": Slot(Several, "1"), "k_f": Slot(Finite, "N s^2/rad^2"),
-        "k_tau": Slot(Finite, "N m s^2/rad^2"), "speed_squared": Slot(Several, "rad^2/s^2"),
+        "arms": Entry(Triples, "m"), "spin": Entry(Several, "1"), "k_f": Entry(Finite, "N s^2/rad^2"),
+        "k_tau": Entry(Finite, "N m s^2/rad^2"), "speed_squared": Entry(Several, "rad^2/s^2"),
     }),
 }  # fmt: skip
 
 
-def _sensor(name: str, unit: str, **own: Slot) -> Kind:
+def _sensor(name: str, unit: str, **own: Entry) -> Kind:
     """Table of a kind of sensor with the numbers of its datasheet, noise and bias in a unit."""
 
     def make(*owner: str, name: str, own: Mapping[str, Any], **datasheet: Any) -> Instrument:
         return Instrument(sensor(*owner, name=name, **own), **datasheet)
 
     sensor = SENSORS[name]
-    error = Slot(Size, unit, needed=False)
-    sheet = {"noise": error, "bias": error, "rate": Slot(Finite, "Hz", needed=False)}
-    sheet["delay"] = Slot(Finite, "s", needed=False)
+    error = Entry(Size, unit, needed=False)
+    sheet = {"noise": error, "bias": error, "rate": Entry(Finite, "Hz", needed=False)}
+    sheet["delay"] = Entry(Finite, "s", needed=False)
     return Kind(make, "joint" if name == "encoder" else "body", {**own, **sheet})
 
 
-_AXES = Slot(Rows, "1", needed=False)
+_AXES = Entry(Rows, "1", needed=False)
 DATASHEET = ("noise", "bias", "rate", "delay")
 INSTRUMENTS: dict[str, Kind] = {
     "gyroscope": _sensor("gyroscope", "rad/s", axes=_AXES),
@@ -221,16 +221,16 @@ INSTRUMENTS: dict[str, Kind] = {
 }
 
 BODY = Kind(Body, "", {
-    "mass": Slot(Finite, "kg"), "inertia": Slot(Inertia, "kg m^2"), "com": _maybe(_POINT),
+    "mass": Entry(Finite, "kg"), "inertia": Entry(Inertia, "kg m^2"), "com": _maybe(_POINT),
     "position": _maybe(_POINT), "com_position": _maybe(_POINT),
-    "orientation": Slot(Quaternion, "1", needed=False), "free": Slot(bool, needed=False),
-    "triangle_tolerance": Slot(Finite, "1", needed=False),
+    "orientation": Entry(Quaternion, "1", needed=False), "free": Entry(bool, needed=False),
+    "triangle_tolerance": Entry(Finite, "1", needed=False),
 })  # fmt: skip
 
-START_BODY: dict[str, Slot] = {
-    "com_position": _maybe(_POINT), "orientation": Slot(Quaternion, "1", needed=False),
-    "velocity": Slot(Vector, "m/s", needed=False),
-    "angular_velocity": Slot(Vector, "rad/s", needed=False),
+START_BODY: dict[str, Entry] = {
+    "com_position": _maybe(_POINT), "orientation": Entry(Quaternion, "1", needed=False),
+    "velocity": Entry(Triple, "m/s", needed=False),
+    "angular_velocity": Entry(Triple, "rad/s", needed=False),
 }  # fmt: skip
 
 
@@ -270,7 +270,7 @@ class ModelFile(Entries):
     start: StartEntry = StartEntry()
 
 
-_OWNERS = {"bodies": Slot(Pair), "body": Slot(str), "joint": Slot(str), "": None}
+_OWNERS = {"bodies": Entry(Pair), "body": Entry(str), "joint": Entry(str), "": None}
 
 
 def kind_of(given: Mapping[str, Any], kinds: Mapping[str, Kind], what: str) -> Kind:
@@ -284,7 +284,7 @@ def kind_of(given: Mapping[str, Any], kinds: Mapping[str, Kind], what: str) -> K
 
 def entries(
     given: Mapping[str, Any],
-    slots: Mapping[str, Slot],
+    slots: Mapping[str, Entry],
     parameters: Mapping[str, Parameter],
     what: str,
     *,
@@ -302,7 +302,7 @@ def entries(
             parameter or to one of another unit.
     """
     own = _OWNERS[owner]
-    every = {**({"kind": Slot(str)} if kind else {}), **({owner: own} if own else {}), **slots}
+    every = {**({"kind": Entry(str)} if kind else {}), **({owner: own} if own else {}), **slots}
     filled = {
         key: value if (slot := every.get(key)) is None or slot.unit is None
         else with_parameters(value, parameters, key, slot.unit)

@@ -57,9 +57,9 @@ class _Draft(NamedTuple):
 
     def site(self, body: str, name: str, pos: Any, frame: Any = None) -> str:
         """Name of a new site at a point of a body, with the axes of a frame."""
-        site = ElementTree.SubElement(self.bodies[body], "site", name=name, pos=_text(pos))
+        site = ElementTree.SubElement(self.bodies[body], "site", name=name, pos=xml_numbers(pos))
         if frame is not None:
-            site.set("quat", _text(from_matrix(frame)))
+            site.set("quat", xml_numbers(from_matrix(frame)))
         return name
 
 
@@ -93,7 +93,7 @@ def _document(scene: Scene) -> tuple[str, tuple[str, ...]]:
     root = Element("mujoco", model=scene.name)
     ElementTree.SubElement(root, "compiler", angle="radian")
     gravity = sum((f.acceleration for f in system.forces if isinstance(f, Gravity)), np.zeros(3))
-    ElementTree.SubElement(root, "option", gravity=_text(gravity))
+    ElementTree.SubElement(root, "option", gravity=xml_numbers(gravity))
     world = ElementTree.SubElement(root, "worldbody")
     tendons, equalities, actuators = (
         ElementTree.SubElement(root, name) for name in ("tendon", "equality", "actuator")
@@ -118,17 +118,22 @@ def _document(scene: Scene) -> tuple[str, tuple[str, ...]]:
     return ElementTree.tostring(root, encoding="unicode") + "\n", draft.left_out.sentences()
 
 
-def _text(numbers: Any) -> str:
+def xml_numbers(numbers: Any) -> str:
+    """Text of numbers in an attribute, each with all its digits."""
     return " ".join(repr(x) for x in np.atleast_1d(np.asarray(numbers, float)).tolist())
 
 
 def _body(draft: _Draft, k: int, parent: str, pos: Any, quat: Any) -> Element:
     name, bodies = draft.system.names[k], draft.system.bodies
-    place = {"name": name, "pos": _text(pos), "quat": _text(quat)}
+    place = {"name": name, "pos": xml_numbers(pos), "quat": xml_numbers(quat)}
     body = ElementTree.SubElement(draft.bodies[parent], "body", place)
     J = np.asarray(bodies.inertia[k])
-    full = _text([J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]])
-    inertial = {"pos": _text(bodies.com[k]), "mass": _text(bodies.mass[k]), "fullinertia": full}
+    full = xml_numbers([J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]])
+    inertial = {
+        "pos": xml_numbers(bodies.com[k]),
+        "mass": xml_numbers(bodies.mass[k]),
+        "fullinertia": full,
+    }
     ElementTree.SubElement(body, "inertial", inertial)
     draft.bodies[name] = body
     return body
@@ -155,7 +160,7 @@ def _linked(draft: _Draft, link: Link) -> None:
     turn = frame @ axes.T
     body = _body(draft, link.child, names[link.parent], point - turn @ own, from_matrix(turn))
     if joint.kind == "spherical":
-        ball = {"name": joint.name, "type": "ball", "pos": _text(own)}
+        ball = {"name": joint.name, "type": "ball", "pos": xml_numbers(own)}
         draft.axes[joint.name] = ElementTree.SubElement(body, "joint", ball)
         return
     freedoms = CATALOGUE[joint.kind].motion or ()
@@ -165,8 +170,8 @@ def _linked(draft: _Draft, link: Link) -> None:
         mine = ElementTree.SubElement(body, "joint", {
             "name": joint.name if len(freedoms) == 1 else f"{joint.name}_{number + 1}",
             "type": "hinge" if turns else "slide",
-            "pos": _text(own),
-            "axis": _text(sign * axes[:, freedom.axis]),
+            "pos": xml_numbers(own),
+            "axis": xml_numbers(sign * axes[:, freedom.axis]),
         })  # fmt: skip
         which = "" if len(freedoms) == 1 else " angle" if turns else " displacement"
         draft.axes.setdefault(joint.name + which, mine)
@@ -205,7 +210,9 @@ def _keyframe(root: Element, scene: Scene) -> None:
             place.append(float(found.coordinates[number]))
             speed.append(float(found.rates[number]))
     frame = ElementTree.SubElement(root, "keyframe")
-    ElementTree.SubElement(frame, "key", name="start", qpos=_text(place), qvel=_text(speed))
+    ElementTree.SubElement(
+        frame, "key", name="start", qpos=xml_numbers(place), qvel=xml_numbers(speed)
+    )
 
 
 def _turned(system: System, state: State, name: str, child: str) -> tuple[list[float], list[float]]:
@@ -250,15 +257,15 @@ def _axis(draft: _Draft, name: str, which: str | None) -> Element | None:
 
 
 def _add_damping(axis: Element, damping: Any) -> None:
-    axis.set("damping", _text(float(axis.get("damping", "0")) + float(damping)))
+    axis.set("damping", xml_numbers(float(axis.get("damping", "0")) + float(damping)))
 
 
 def _spring(draft: _Draft, force: TorsionalSpringDamper) -> bool:
     axis = _axis(draft, force.joint, "angle")
     if axis is None or axis.get("stiffness"):
         return False
-    axis.set("stiffness", _text(force.stiffness))
-    axis.set("springref", _text(force.angle))
+    axis.set("stiffness", xml_numbers(force.stiffness))
+    axis.set("springref", xml_numbers(force.angle))
     _add_damping(axis, force.damping)
     return True
 
@@ -276,8 +283,8 @@ def _line(draft: _Draft, force: LinearSpringDamper) -> bool:
     name = f"spring_{len(draft.tendons) + 1}"
     ends = ((force.body_i, force.point_i, "i"), (force.body_j, force.point_j, "j"))
     tendon = ElementTree.SubElement(draft.tendons, "spatial", {
-        "name": name, "stiffness": _text(force.stiffness), "damping": _text(force.damping),
-        "springlength": _text(force.length),
+        "name": name, "stiffness": xml_numbers(force.stiffness), "damping": xml_numbers(force.damping),
+        "springlength": xml_numbers(force.length),
     })  # fmt: skip
     for body, point, side in ends:
         site = draft.site(body, f"{name}_{side}", point)
@@ -290,7 +297,7 @@ def _effort(draft: _Draft, force: JointEffort) -> bool:
 
 
 def _servo(draft: _Draft, force: JointServo) -> bool:
-    numbers = {"kp": _text(force.stiffness), "kv": _text(force.damping)}
+    numbers = {"kp": xml_numbers(force.stiffness), "kv": xml_numbers(force.damping)}
     return _actuator(draft, force, "position", "target", force.target, numbers)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from ..checks.errors import SettingError, nearest_names
 from ..checks.schema import SHOWN, named, shown
-from .model_file import Model, Robot, read_model
+from .model_file import ParametricModel, Robot, read_model
 from .mujoco_import import load_robot
 from .netcdf import FileError, read_toml
 
@@ -45,7 +45,7 @@ def load_study(path: str | os.PathLike[str]) -> dict[str, Any]:
     return {"name": source.stem} | content
 
 
-def _model(path: Path) -> Model | Robot:
+def _model(path: Path) -> ParametricModel | Robot:
     if path.suffix == ".toml":
         return read_model(path)
     return Robot(load_robot(path))

@@ -19,6 +19,7 @@ from ..mechanics.body import GROUND
 from ..mechanics.forces.applied import Gravity, JointDamping
 from ..mechanics.joint import Joint
 from ..mechanics.system import System
+from .mujoco_export import xml_numbers
 from .mujoco_left_out import LeftOut
 from .netcdf import write_atomically
 
@@ -71,10 +72,6 @@ def save_urdf(scene: Scene, path: str | os.PathLike[str]) -> tuple[str, ...]:
     return left_out.sentences()
 
 
-def _text(numbers: Any) -> str:
-    return " ".join(repr(x) for x in np.atleast_1d(np.asarray(numbers, float)).tolist())
-
-
 def _angles(R: np.ndarray) -> np.ndarray:
     """Roll, pitch and yaw about fixed axes (3,) [rad] of a rotation matrix."""
     flat = np.hypot(R[0, 0], R[1, 0])
@@ -91,11 +88,11 @@ def _link(root: Element, system: System, k: int, shift: np.ndarray) -> None:
     inertial = ElementTree.SubElement(
         ElementTree.SubElement(root, "link", name=system.names[k]), "inertial"
     )
-    place = {"xyz": _text(np.asarray(bodies.com[k]) - shift), "rpy": "0 0 0"}
+    place = {"xyz": xml_numbers(np.asarray(bodies.com[k]) - shift), "rpy": "0 0 0"}
     ElementTree.SubElement(inertial, "origin", place)
-    ElementTree.SubElement(inertial, "mass", value=_text(bodies.mass[k]))
+    ElementTree.SubElement(inertial, "mass", value=xml_numbers(bodies.mass[k]))
     J = np.asarray(bodies.inertia[k])
-    parts = {f"i{a}{b}": _text(J["xyz".index(a), "xyz".index(b)]) for a, b in _PAIRS}
+    parts = {f"i{a}{b}": xml_numbers(J["xyz".index(a), "xyz".index(b)]) for a, b in _PAIRS}
     ElementTree.SubElement(inertial, "inertia", parts)
 
 
@@ -108,7 +105,7 @@ def _joint(
     joint = ElementTree.SubElement(root, "joint", name=name, type=kind)
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=child)
-    place = {"xyz": _text(pose[0]), "rpy": _text(_angles(np.asarray(pose[1])))}
+    place = {"xyz": xml_numbers(pose[0]), "rpy": xml_numbers(_angles(np.asarray(pose[1])))}
     ElementTree.SubElement(joint, "origin", place)
     return joint
 
@@ -145,9 +142,14 @@ def _linked(
     if joint.kind == "weld":
         return
     sign = 1.0 if link.forward else -1.0
-    ElementTree.SubElement(made, "axis", xyz=_text(sign * mine[:, 2]))
+    ElementTree.SubElement(made, "axis", xyz=xml_numbers(sign * mine[:, 2]))
     if joint.kind == "translational":
-        ends = {"lower": _text(-_FAR), "upper": _text(_FAR), "effort": "0", "velocity": "0"}
+        ends = {
+            "lower": xml_numbers(-_FAR),
+            "upper": xml_numbers(_FAR),
+            "effort": "0",
+            "velocity": "0",
+        }
         ElementTree.SubElement(made, "limit", ends)
     axes[joint.name] = made
 
@@ -165,10 +167,10 @@ def _left_out(scene: Scene, axes: dict[str, Element]) -> LeftOut:
             what = f"{type(force).__name__} on {force.acts_on()}"
             left_out.add("force elements", what)
     for name, value in damping.items():
-        ElementTree.SubElement(axes[name], "dynamics", damping=_text(value), friction="0")
+        ElementTree.SubElement(axes[name], "dynamics", damping=xml_numbers(value), friction="0")
     gravity = sum((f.acceleration for f in system.forces if isinstance(f, Gravity)), np.zeros(3))
     if not np.array_equal(gravity, _USUAL):
-        left_out.add("gravity, which readers take as 9.81 m/s^2 down", _text(gravity))
+        left_out.add("gravity, which readers take as 9.81 m/s^2 down", xml_numbers(gravity))
     apart = lambda a, b: bool(np.any(np.abs(a - b) > _SAME))
     if any(jax.tree.leaves(jax.tree.map(apart, scene.state0, system.reference))):
         left_out.add("the start, which is not the reference posture at rest", "")

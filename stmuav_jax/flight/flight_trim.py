@@ -26,7 +26,7 @@ from ..algebra import lapack
 from ..algebra.compiler import kept_jit
 from ..algebra.derivative import safe_sqrt
 from ..algebra.newton import Implicit, Newton
-from ..algebra.rotation import product, rotation_matrix, to_rotation_vector
+from ..algebra.rotation import product, rotation_matrix, to_rotation_vector, turn_about
 from ..checks.errors import ModelError, StateError, concrete
 from ..checks.numbers import floats
 from ..checks.reason import first_reason
@@ -43,7 +43,6 @@ from ..rotorcraft.allocation import (
 from ..rotorcraft.motor import MotorRotors
 from ..tracker.geometry import turn_by_angles
 from ..tracker.kinematics import RISING, Reason, panel_angles
-from ..tracker.placement import turn_about
 from ..tracker.pointing import why_outside
 from ..tracker.workspace import Limits, measure, reasons, survey
 from .flyer import Flyer, FlyerPoint, RotorsAndForces
@@ -149,7 +148,7 @@ def _attitude(tilt: Float[Array, "2"], yaw: Float[Array, ""]) -> Float[Array, "4
     return product(turn_about(yaw, 2), product(turn_about(tilt[1], 1), turn_about(tilt[0], 0)))
 
 
-class _Setting(NamedTuple):
+class _TrimProblem(NamedTuple):
     flyer: Flyer
     model: TreeModel
     wanted: FlightCondition
@@ -172,12 +171,12 @@ def _map(flyer: Flyer, at: FlyerPoint) -> Float[Array, "4 k"]:
     return wrench_map(flyer.propellers, com)
 
 
-def _left(at: FlyerPoint, inputs: RotorsAndForces, setting: _Setting) -> Float[Array, "8"]:
+def _left(at: FlyerPoint, inputs: RotorsAndForces, setting: _TrimProblem) -> Float[Array, "8"]:
     found = setting.flyer.accelerations(at, inputs, model=setting.model, resting=True)
     return jnp.concatenate([found.v - turn_acceleration(setting.wanted), found.omega, found.angles])
 
 
-def _residual(z: Float[Array, "8"], setting: _Setting) -> Float[Array, "8"]:
+def _residual(z: Float[Array, "8"], setting: _TrimProblem) -> Float[Array, "8"]:
     at = _point(z[:2], setting.wanted)
     squared = minimum_norm(_map(setting.flyer, at), z[2:6])
     return _left(at, RotorsAndForces(squared, z[6:]), setting)
@@ -185,7 +184,7 @@ def _residual(z: Float[Array, "8"], setting: _Setting) -> Float[Array, "8"]:
 
 def residual(flyer: Flyer, wanted: FlightCondition, z: Float[Array, "8"]) -> Float[Array, "8"]:
     """Residual of `trim_flight`: accelerations less those wanted, at unknowns z (8,)."""
-    return _residual(z, _Setting(flyer, flyer.model(), wanted))
+    return _residual(z, _TrimProblem(flyer, flyer.model(), wanted))
 
 
 def trim_flight(
@@ -219,7 +218,7 @@ def trim_flight(
             check_lift(flyer.propellers, limits.rotors, _weight(flyer))
     # limits are arrays, so that other values do not need another compilation
     bounds: Any = jax.tree.map(floats, limits)
-    found = _found(_Setting(flyer, flyer.model(), wanted), bounds)
+    found = _found(_TrimProblem(flyer, flyer.model(), wanted), bounds)
     if throw and concrete(found.reason):
         _raise(TrimReason(int(found.reason)), found, flyer, limits)
     balanced = (TrimReason.VALID, TrimReason.ACTUATOR_LIMIT, *_OUTSIDE)
@@ -275,7 +274,7 @@ def _weight(flyer: Flyer) -> Float[Array, ""]:
 
 
 @kept_jit
-def _found(setting: _Setting, limits: TrimLimits) -> FlightTrim:
+def _found(setting: _TrimProblem, limits: TrimLimits) -> FlightTrim:
     """Result of Newton's method, converged or not, with the reason code."""
     flyer = setting.flyer
     weight = _weight(flyer)

@@ -49,19 +49,9 @@ VISCOUS = 10.0  # viscous friction of the sliders in this experiment [N s/m]; th
 SIGMA = np.array([1e-3] * 3 + [2e-3] * 3 + [5e-3] * 3 + [2e-4] * 2)
 
 
-# What the record has in each row, with units: position and attitude (rotation vector from level) of
-# the base, its angular velocity in its own axes, strokes of both sliders.
-OUTPUTS = (
-    *((f"r_{k}", "m") for k in "xyz"),
-    *((f"theta_{k}", "rad") for k in "xyz"),
-    *((f"omega_{k}", "rad/s") for k in "xyz"),
-    ("stroke_2", "m"),
-    ("stroke_3", "m"),
-)
-
-
 def outputs(flyer: Flyer, at: FlyerPoint) -> Float[Array, "11"]:
-    """A row of the record, see `OUTPUTS`."""
+    """Row of the record (11,): position [m] and attitude of the base, as a rotation vector from level
+    [rad], its angular velocity in its own axes [rad/s], strokes of both sliders [m]."""
     turned = to_rotation_vector(at.p)
     return jnp.concatenate([at.r, turned, at.omega, strokes(flyer.geometry, at.angles)])
 

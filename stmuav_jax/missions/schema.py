@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from ..checks.schema import Count, Entries, Finite, Positive, Tuples, shown
-from ..files.model_schema import Size, Vector
+from ..files.model_schema import Size, Triple
 from ..montecarlo.schema import Name, Seed
 
 MISSION_FORMAT = 1
@@ -98,17 +98,17 @@ class PointEntry(Entries):
     """Entry for a waypoint: time [s], position [m], heading [degrees]."""
 
     t: Finite
-    position: Vector
+    position: Triple
     heading: Finite = 0.0
 
 
 class PathEntry(Entries):
     """Entry for the path: a place to hold, waypoints, or a constant acceleration [m/s^2]."""
 
-    position: Vector | None = None
+    position: Triple | None = None
     heading: Finite | None = None
     waypoints: Annotated[tuple[PointEntry, ...], Tuples] | None = None
-    acceleration: Vector | None = None
+    acceleration: Triple | None = None
 
 
 class SunEntry(Entries):
@@ -131,7 +131,7 @@ class MoveEntry(Entries):
     world, or to the sun; begun at a time [s], done after a duration [s]."""
 
     angles: PanelAngles | None = None
-    direction: Vector | None = None
+    direction: Triple | None = None
     sun: SunEntry | None = None
     at: NotNegative = 0.0
     duration: Positive = 1.0
@@ -140,7 +140,7 @@ class MoveEntry(Entries):
 class ChangeEntry(Entries):
     """Entry for a change of the wind to another velocity [m/s], over a time [s]."""
 
-    to: Vector
+    to: Triple
     at: NotNegative
     rise: Positive = 0.2
 
@@ -156,7 +156,7 @@ class GustsEntry(Entries):
 class WindEntry(Entries):
     """Entry for the wind: steady velocity, world [m/s], a change of it, gusts about it."""
 
-    steady: Vector = (0.0, 0.0, 0.0)
+    steady: Triple = (0.0, 0.0, 0.0)
     change: ChangeEntry | None = None
     gusts: GustsEntry | None = None
 

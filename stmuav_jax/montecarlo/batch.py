@@ -6,6 +6,7 @@ have a copy each. The last digits depend only on the number of batch slots ("lan
 of the study's identity.
 """
 
+import dataclasses
 import itertools
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -20,14 +21,12 @@ import numpy as np
 
 from ..algebra.compiler import compiler_options
 from ..checks.errors import SettingError, SimulationError
-from ..dynamics.choices import solver_named
+from ..dynamics.formulations.base import AbstractFormulation
 from ..dynamics.integration.lanes import REASONS, Ending, Plan, RunResult, fly
 from ..dynamics.integration.problem import Problem, prepare
-from ..dynamics.method import Method
-from ..dynamics.tree.formulation import Tree
 from ..mechanics.state import State
 from .disturbed_flights import Drawn
-from .signal import Signal, View
+from .signal import RunPoint, Signal
 from .study import Quantity, Study, column_name
 from .work import AbstractWork, Axis, Column
 
@@ -249,16 +248,29 @@ class FlightWork(AbstractWork):
     def _signals(self) -> dict[str, Signal]:
         return self.study.signals()
 
+    @property
+    def _formulation(self) -> AbstractFormulation:
+        """Formulation of the runs, asked for where nothing is traced."""
+        chosen = self.study.method.formulation
+        if not self.study.flights.dependent_rows:
+            return chosen
+        allowing = chosen.allowing_dependent_rows()
+        if allowing is None:
+            raise SettingError(
+                f"Some constraint rows depend on others, for which {chosen} has no equations."
+            )
+        return allowing
+
     @cached_property
     def plan(self) -> Plan:
         """Plan of the batch integration, for programs that need its bare results."""
         study, direction = self.study, self.direction
-        # asked here, where nothing is traced
-        tree = Tree().allowing_dependent_rows() if study.flights.dependent_rows else Tree()
-        method = Method(
-            formulation=tree, solver=solver_named(study.solver), rtol=study.rtol, atol=study.atol,
-            max_steps=study.max_steps, adjoint=diffrax.ForwardMode(), steps="state",
-        )  # fmt: skip
+        method = dataclasses.replace(
+            study.method,
+            formulation=self._formulation,
+            adjoint=diffrax.ForwardMode(),
+            steps="state",
+        )
         names = study.sampling.names
 
         def make(drawn: Drawn) -> tuple[Problem, State]:
@@ -271,8 +283,8 @@ class FlightWork(AbstractWork):
             chosen = [(of[k].of, q) for k, q in watched.items() if of[k].smooth == smooth]
 
             def signals(problem: Problem, t: Any, y: Any) -> Any:
-                view = View(problem, t, y, jnp.asarray(direction, y.dtype))
-                found = [_turned(quantity, signal(view)) for signal, quantity in chosen]
+                point = RunPoint(problem, t, y, jnp.asarray(direction, y.dtype))
+                found = [_turned(quantity, signal(point)) for signal, quantity in chosen]
                 return jnp.stack(found) if found else jnp.zeros(0, y.dtype)
 
             return signals
@@ -295,7 +307,7 @@ class FlightWork(AbstractWork):
         direction = jnp.asarray(self.direction, real)
         watched = list(self._watched)
         fine = flown.ending == Ending.FINE
-        value = lambda name, t, y: self._signals[name].of(View(problem, t, y, direction))
+        value = lambda name, t, y: self._signals[name].of(RunPoint(problem, t, y, direction))
         found: dict[str, Any] = {}
         for name, quantity in study.quantities.items():
             if name in watched:

@@ -28,6 +28,8 @@ from ..scenes.registry import SCENES
 
 # Longest permitted run [s]; a longer one is taken for a mistake.
 LONGEST = 1e6
+# Number of steps after which a run has failed, where a study does not say.
+STEPS_OF_A_RUN = 20_000
 # Largest numbers that the store's column types can hold.
 MOST_STEPS = 2**31 - 1
 MOST_SEED = 2**63 - 1
@@ -129,19 +131,24 @@ class Drawing(Entries):
 
 
 class Flying(Entries):
-    """Entries of a study for the integration and recording of each run."""
+    """Entries of a study for the length and the recording of each run."""
 
     name: Name = "study"
     t1: Seconds = 1.0
     every: Positive | None = None
-    rtol: Tolerance = STEP_TOLERANCE
-    atol: Annotated[float, Field(ge=1e-15)] = STEP_TOLERANCE
-    solver: ExplicitSolverName = "dopri8"
-    max_steps: Annotated[int, Field(ge=1, le=MOST_STEPS)] = 20_000
     direction: Annotated[tuple[Finite, Finite, Finite], Tuples] | None = None
 
 
-class FlightsFile(Drawing, Flying):
+class Integrating(Entries):
+    """Entries of a study for the method of its runs, see `stmuav_jax.Method`."""
+
+    rtol: Tolerance = STEP_TOLERANCE
+    atol: Annotated[float, Field(ge=1e-15)] = STEP_TOLERANCE
+    solver: ExplicitSolverName = "dopri8"
+    max_steps: Annotated[int, Field(ge=1, le=MOST_STEPS)] = STEPS_OF_A_RUN
+
+
+class FlightsFile(Drawing, Flying, Integrating):
     """Entries of a study of simulated motions."""
 
     scene: SceneName | None = None

@@ -23,7 +23,7 @@ from ..tracker.kinematics import panel_angles
 PANEL, SLIDERS = "panel_7", ("slider_2", "slider_3")
 
 
-class View:
+class RunPoint:
     """State of a run at one time, with values that several signals need, each computed once.
 
     Args:
@@ -91,13 +91,13 @@ class Signal:
     """Scalar signal of a run.
 
     Attributes:
-        of: function from a view to the signal's value.
+        of: function from a point of a run to the signal's value.
         unit: SI unit.
         words: description for tables and figures.
         smooth: true if its rate is computed too; reactions are evaluated within steps instead.
     """
 
-    of: Callable[[View], Array]
+    of: Callable[[RunPoint], Array]
     unit: str
     words: str
     smooth: bool = True
@@ -144,7 +144,7 @@ _ANY = {
 }
 
 
-def _at_joint(kind: str, k: int) -> Callable[[View], Array]:
+def _at_joint(kind: str, k: int) -> Callable[[RunPoint], Array]:
     return lambda v: safe_norm(getattr(v.reactions, kind)[k])
 
 

@@ -5,24 +5,36 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields
+from typing import Any, get_args
 
 import equinox as eqx
 import numpy as np
 
 from ..checks.errors import SettingError, nearest_names
 from ..checks.schema import SHOWN, checked, named
-from ..dynamics.choices import STEP_TOLERANCE, ExplicitSolverName
+from ..dynamics.choices import ExplicitSolverName, solver_named
+from ..dynamics.method import Method, described
 from ..parameters.table import Parameters
 from .disturbed_flights import Flights, flights
 from .model_flights import ModelFlights, started
 from .sampling import Sampling
-from .schema import Drawing, FailureEntry, FlightsFile, Flying, QuantityEntry, flights_file
+from .schema import (
+    STEPS_OF_A_RUN,
+    Drawing,
+    FailureEntry,
+    FlightsFile,
+    Flying,
+    Integrating,
+    QuantityEntry,
+    flights_file,
+)
 from .signal import Signal, signal
 
 # Largest number of kept times of a run, all of which are held in memory.
 MOST_TIMES = 100_000
+# Method of the runs where a study does not say.
+USUAL_METHOD = Method(max_steps=STEPS_OF_A_RUN)
 # Columns that every study has.
 OWN = {"status", "sample", "time", "end", "steps", "rejected", "residual", "records"}
 
@@ -107,16 +119,16 @@ class Study:
         quantities: quantities by the names of their columns.
         t1: final time [s].
         every: spacing of the kept times of paths [s]; default one thirtieth of t1.
-        rtol, atol: relative and absolute tolerances of a step.
-        solver: "dopri8" or "tsit5".
-        max_steps: number of steps after which a run has failed.
+        method: how the runs are integrated: by `diffrax.Dopri8()` or `diffrax.Tsit5()`, with at most
+            `max_steps` steps, after which a run has failed. Nothing differentiates the runs: its
+            `adjoint` and `steps` are not used.
         direction: unit vector that the panel should face, world; default its direction at the
             start.
         failure: condition under which completed runs count as failures; default none.
 
     Raises:
         SettingError: no quantities, names that clash or are no names, impossible numbers, a failure
-            of an unknown quantity.
+            of an unknown quantity, a method that many runs at once cannot have.
     """
 
     name: str
@@ -125,10 +137,7 @@ class Study:
     quantities: Mapping[str, Quantity]
     t1: float = 1.0
     every: float | None = None
-    rtol: float = STEP_TOLERANCE
-    atol: float = STEP_TOLERANCE
-    solver: ExplicitSolverName = "dopri8"
-    max_steps: int = 20_000
+    method: Method = USUAL_METHOD
     direction: tuple[float, float, float] | None = field(default=None)
     failure: Failure | None = None
 
@@ -136,6 +145,8 @@ class Study:
         object.__setattr__(self, "quantities", dict(self.quantities))
         flying = {name: getattr(self, name) for name in Flying.model_fields}
         checked(Flying, flying, "A study")
+        settings = method_plain(self.method)
+        checked(Integrating, {k: settings[k] for k in Integrating.model_fields}, "A study")
         if not self.quantities:
             raise SettingError(f"Study '{self.name}' keeps nothing: give it quantities.")
         _check_factors(self)
@@ -165,10 +176,11 @@ class Study:
         numbers = {name: np.asarray(table.value(name)).tolist() for name in table}
         text = json.dumps(numbers, sort_keys=True)
         failure = {} if self.failure is None else {"failure": self.failure.plain()}
-        own = ("name", "t1", "rtol", "atol", "solver", "max_steps")
+        own = {"name": self.name, "t1": self.t1}
         return (
             self.flights.plain()
-            | {name: getattr(self, name) for name in own}
+            | own
+            | method_plain(self.method)
             | failure
             | {
                 "kind": "flights",
@@ -192,6 +204,55 @@ def _plain(quantity: Quantity) -> dict[str, Any]:
     found: dict[str, Any] = {"signal": quantity.signal, "take": quantity.take}
     if quantity.level is not None:
         found |= {"level": quantity.level, "stop": quantity.stop}
+    return found
+
+
+# Parts of a method that a study cannot have, and why.
+_NOT_OF_STUDIES = {
+    "event": "a quantity with stop = true ends its runs",
+    "jump_ts": "its runs do not end their steps at given times",
+    "balances": 'it keeps no balances; the signal "energy" is one of its quantities',
+}
+
+
+def _integration(method: Method) -> dict[str, Any]:
+    """Entries of a study's file for its method; raises `SettingError` for one that it cannot have."""
+    if not isinstance(method, Method):
+        raise SettingError(
+            f"The method of a study must be a stmuav_jax.Method, not of type {type(method).__name__}."
+        )
+    for name, why in _NOT_OF_STUDIES.items():
+        if getattr(method, name) is not None and getattr(method, name) is not False:
+            raise SettingError(f"The method of a study cannot have '{name}': {why}.")
+    known = {name: solver_named(name) for name in get_args(ExplicitSolverName)}
+    found = [name for name, solver in known.items() if eqx.tree_equal(method.solver, solver)]
+    if not found:
+        asked = method.solver if isinstance(method.solver, str) else type(method.solver).__name__
+        valid = " or ".join(f"{type(solver).__name__}()" for solver in known.values())
+        raise SettingError(f"The solver of a study must be diffrax's {valid}, not {asked}.")
+    tolerances = {"rtol": float(method.rtol), "atol": float(method.atol)}
+    return tolerances | {"solver": found[0], "max_steps": method.max_steps}
+
+
+def method_plain(method: Method) -> dict[str, Any]:
+    """Plain data of a study's method: the file's entries, and other parts where they are not usual.
+
+    Raises:
+        SettingError: a part that a study cannot have, or that plain data cannot describe.
+    """
+    usual, found = Method(), _integration(method)
+    for name in ("first_step", "max_step"):
+        if (value := float(getattr(method, name))) != float(getattr(usual, name)):
+            found[name] = value
+    for name in ("formulation", "stabilisation"):
+        part = getattr(method, name)
+        if not eqx.tree_equal(part, getattr(usual, name)):
+            found[name] = described(part)
+            if odd := {field.name for field in fields(part)} - found[name].keys():
+                raise SettingError(
+                    f"The {name} of a study must consist of numbers and texts, but {type(part).__name__} "
+                    f"has '{min(odd)}'."
+                )
     return found
 
 
@@ -271,7 +332,10 @@ def study_from_plain(
     flying = given.model_dump(include=set(Flying.model_fields))
     if "name" not in plain:
         flying["name"] = name
-    return Study(flights=of, sampling=sampling, quantities=quantities, failure=failure, **flying)
+    settings = given.model_dump(include=set(Integrating.model_fields))
+    method = Method(**settings | {"solver": solver_named(given.solver)})
+    more: Any = {"failure": failure, "method": method, **flying}
+    return Study(flights=of, sampling=sampling, quantities=quantities, **more)
 
 
 def _flights(

@@ -14,14 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import product
+from ..algebra.rotation import product, turn_about
 from ..checks.errors import SettingError
 from ..estimation.gaussians import Gaussian, gaussian
 from ..estimation.model import StateSpaceModel
 from ..estimation.sigma import Unscented
 from ..estimation.update import DEFAULT, AbstractFilter, GaussianFilter
 from ..parameters.table import Parameters
-from ..tracker.placement import turn_about
 from .attitude import attitude_model
 from .extended import extended_model
 from .model import (

@@ -273,7 +273,7 @@ def _check_power(battery: Battery, power: Numbers, soc: Numbers) -> None:
     if not np.any(excess > 0):
         return
     k = np.unravel_index(np.argmax(excess), excess.shape)
-    largest = voltage[k] ** 2 / (4.0 * battery.resistance)
+    largest = float(battery.largest_power(at[k]))
     raise StateError(
         f"The battery cannot deliver {asked[k]:g} W at a state of charge of {at[k]:g}: with "
         f"{voltage[k]:.4g} V behind {float(battery.resistance):g} ohm no current gives more than "

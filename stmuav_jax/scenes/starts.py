@@ -3,13 +3,13 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import product
+from ..algebra.rotation import product, turn_about
 from ..checks.errors import StateError, check_finite, concrete
 from ..flight.flyer import FlyerPoint, whole_state
 from ..mechanics.state import State
 from ..parameters.table import Parameters
 from ..tracker.geometry import initial_angles, tracker_geometry
-from ..tracker.placement import posture, turn_about
+from ..tracker.placement import posture
 from ..tracker.tracker_options import PanelStart
 from .flight_options import AbstractStart, BaseStart, FlightStart
 

@@ -32,6 +32,9 @@ from .kinematics import (
     strokes as strokes,
 )
 from .placement import (
+    TRACKER_BODIES as TRACKER_BODIES,
+    Placement as Placement,
+    place as place,
     posture as posture,
 )
 from .pointing import (

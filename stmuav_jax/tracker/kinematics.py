@@ -220,20 +220,3 @@ def angle_accelerations(
         return solve_2x2(stroke_jacobian(geometry, angles, rods), stroke_accelerations)
     J, J_rate = _jacobian_and_rate(geometry, angles, rates, rods)
     return solve_2x2(J, stroke_accelerations - _times(J_rate, rates))
-
-
-def angle_motion(
-    geometry: TrackerGeometry,
-    angles: Float[Array, "2 *s"],
-    stroke_rates: Float[Array, "2 *s"],
-    stroke_accelerations: Float[Array, "2 *s"],
-    rods: Rods = RISING,
-) -> PairMotion:
-    """Panel motion [rad], [rad/s], [rad/s^2] at known angles under moving strokes.
-
-    x' = J^-1 q', x'' = J^-1 (q'' - J' x'); both grow without bound near a singularity, where
-    `parallel_margin` goes to zero.
-    """
-    rates = solve_2x2(stroke_jacobian(geometry, angles, rods), stroke_rates)
-    found = angle_accelerations(geometry, angles, rates, stroke_accelerations, rods)
-    return PairMotion(angles, rates, found)

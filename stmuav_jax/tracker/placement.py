@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import angular_velocity, product, rotation_matrix
+from ..algebra.rotation import angular_velocity, product, rotation_matrix, turn_about
 from ..mechanics.state import State
 from .geometry import TrackerGeometry, close_loops, turn_by_angles
 from .kinematics import RISING, Rods, strokes_of
 
+# Bodies of the tracker, in the order of its arrays.
 TRACKER_BODIES = ("slider_2", "slider_3", "post_4", "rod_5", "rod_6", "panel_7")
 
 
@@ -31,13 +32,7 @@ class Placement(NamedTuple):
     axes: dict[str, Float[Array, "3"]]
 
 
-def turn_about(angle: Float[Array, ""], axis: int) -> Float[Array, "4"]:
-    """Euler parameters of a rotation [rad] about a coordinate axis (0, 1 or 2)."""
-    e = jnp.zeros(4).at[0].set(jnp.cos(angle / 2))
-    return e.at[axis + 1].set(jnp.sin(angle / 2))
-
-
-class _Placed(NamedTuple):
+class _PlacedBodies(NamedTuple):
     """Bodies of a `Placement`, and what its joints' points and axes are made of."""
 
     r: Float[Array, "6 3"]
@@ -49,7 +44,7 @@ class _Placed(NamedTuple):
     R_panel: Float[Array, "3 3"]
 
 
-def _bodies(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods) -> _Placed:
+def _bodies(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods) -> _PlacedBodies:
     loops = close_loops(geometry, turn_by_angles(angles))
     q2, q3 = strokes_of(geometry, loops, rods)
     x, y, z = jnp.eye(3)
@@ -80,7 +75,7 @@ def _bodies(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods) ->
         ]
     )
     p = jnp.stack([level, level, post, rod_5, rod_6, panel])
-    return _Placed(r, p, hinge, top, (low_2, low_3), (ball_2, ball_3), R_panel)
+    return _PlacedBodies(r, p, hinge, top, (low_2, low_3), (ball_2, ball_3), R_panel)
 
 
 def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RISING) -> Placement:

@@ -65,14 +65,38 @@ def test_the_scene_of_the_words_is_that_of_the_options(words):
     assert found.notes == wanted.notes
 
 
+def test_the_words_of_the_method_are_that_of_the_library():
+    words = (
+        "spin --solver kvaerno5 --formulation augmented --rtol 1e-9 --atol 1e-7 --max-steps 77 "
+        "--first-step 1e-3 --max-step 0.02 --jump-times 0.2 0.1 --stabilisation baumgarte "
+        "--baumgarte-gains 5 6 7"
+    )
+    _, command = cli._read(["simulate", *words.split()])
+    found = simulate.method_of(command.settings, scene_of(command))
+    wanted = stm.Method(
+        solver=stm.dynamics.kvaerno5(), formulation=stm.Augmented(), rtol=1e-9, atol=1e-7,
+        max_steps=77, first_step=1e-3, max_step=0.02, jump_ts=[0.2, 0.1],
+        stabilisation=stm.Baumgarte(5.0, 6.0, 7.0),
+    )  # fmt: skip
+    assert eqx.tree_equal(found, wanted)
+    _, command = cli._read(["simulate", "spin"])
+    assert eqx.tree_equal(simulate.method_of(command.settings, scene_of(command)), stm.Method())
+
+
 def test_a_run_with_options_is_that_of_the_library(tmp_path):
-    words = "simulate hexacopter --drag --wind.mean 6 0 0 --motor.time-constant 0.04 --t1 0.05"
+    words = (
+        "simulate hexacopter --drag --wind.mean 6 0 0 --motor.time-constant 0.04 --t1 0.05 "
+        "--first-step 1e-3 --max-step 2e-3"
+    )
     plain = "--figures none --no-error-estimate --no-cache --out"
     assert cli.main([*words.split(), *plain.split(), str(tmp_path)]) == 0
     scene = stm.make_scene(
         "hexacopter", drag=Drag(), wind=Wind((6.0, 0.0, 0.0)), motor=Motor(time_constant=0.04)
     )
-    run = stm.simulate(scene, t1=0.05, error_estimate=False)
+    method = stm.Method(first_step=1e-3, max_step=2e-3)
+    run = stm.simulate(scene, method=method, t1=0.05, error_estimate=False)
+    assert run.certificate.accepted_steps >= 25
+    assert (run.settings["first_step"], run.settings["max_step"]) == (1e-3, 2e-3)
     kept = load(tmp_path / "run.nc")
     for name, values in (("position", run.states.r), ("velocity", run.states.v)):
         assert (kept[name].values == values).all()

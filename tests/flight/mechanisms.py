@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 import stmuav_jax as stm
@@ -26,6 +27,15 @@ def cart_pole(mass: Any = 2.0, bob: Any = 0.5, length: Any = 0.8, inertia=0.02, 
     if damping is not None:
         forces.append(stm.mechanics.JointDamping("hinge", turning=damping))
     return stm.System([cart, pole], joints, forces)
+
+
+def pendulum(mass: Any = 1.2, com: Any = 0.3, inertia: Any = 0.02):
+    """A body on a hinge with its centre of mass at a distance below it, turned by a torque."""
+    body = stm.Body(
+        "rod", mass, jnp.eye(3) * jnp.asarray(inertia), com=-jnp.asarray(com) * jnp.eye(3)[2]
+    )
+    hinge = stm.revolute("hinge", "ground", "rod", point=[0.0, 0.0, 0.0], axis=[0.0, 1.0, 0.0])
+    return stm.System([body], [hinge], [stm.Gravity([0.0, 0.0, -G]), stm.JointEffort("hinge", 0.0)])
 
 
 CRANK, COUPLER, ROCKER, BASE = 0.3, 0.9, 0.7, 0.8

@@ -19,6 +19,7 @@ from mechanisms import (
     ground_tracker,
     stewart,
 )
+from scipy.integrate import solve_ivp
 
 import stmuav_jax as stm
 
@@ -92,6 +93,39 @@ def test_trim_of_an_accelerating_cart(cart):
     exact = 1 / G / (1 + (a / G) ** 2)
     assert float(jax.jacfwd(of)(jnp.asarray(a))) == pytest.approx(exact, rel=1e-10)
     assert float(jax.grad(of)(jnp.asarray(a))) == pytest.approx(exact, rel=1e-10)
+
+
+@pytest.mark.slow
+def test_growth_along_a_falling_pole(cart):
+    """Transition matrices against the variational equations of the cart-pole, by SciPy.
+
+    (M + m) x'' + m l (a'' cos a - a'^2 sin a) = 0,  m l x'' cos a + (J + m l^2) a'' = m g l sin a.
+    """
+    space, x = cart
+    M, m, length, J = 2.0, 0.5, 0.8, 0.02
+
+    def rate(z):
+        _, a, speed, w = z
+        across = m * length * jnp.cos(a)
+        mass = jnp.array([[M + m, across], [across, J + m * length**2]])
+        load = m * length * jnp.sin(a) * jnp.stack([w * w, G])
+        return jnp.concatenate([jnp.stack([speed, w]), jnp.linalg.solve(mass, load)])
+
+    @jax.jit
+    def both(_, y):
+        z, Phi = y[:4], y[4:].reshape(4, 4)
+        return jnp.concatenate([rate(z), (jax.jacfwd(rate)(z) @ Phi).ravel()])
+
+    ts, start = np.linspace(0.0, 0.9, 7), np.array([0.1, 0.2, -0.3, 0.8])
+    y0 = np.concatenate([start, np.eye(4).ravel()])
+    end = solve_ivp(both, (0, ts[-1]), y0, "DOP853", ts, rtol=1e-12, atol=1e-13).y.T
+    factor = [np.linalg.svd(Phi.reshape(4, 4), compute_uv=False)[0] for Phi in end[:, 4:]]
+    seen = stm.flight.growth(space, space.system, space.retract(x, jnp.asarray(start)), ts)
+    # the tolerance of a step, 1e-8, some twenty steps and the growth of their errors
+    np.testing.assert_allclose(seen.factor, factor, rtol=1e-7)
+    assert seen.rate == pytest.approx(np.polyfit(ts[3:], np.log(factor[3:]), 1)[0], rel=1e-7)
+    assert factor[-1] > 3 * factor[1]
+    assert seen.useful_until == 0.9
 
 
 def test_what_a_trim_refuses(cart):

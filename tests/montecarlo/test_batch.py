@@ -1,15 +1,18 @@
 """Flights through lanes: against flights one by one, whatever the block, lane and device."""
 
 import itertools
+import json
 import pickle
+from dataclasses import replace
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from stmuav_jax import Method, SettingError, integrate
+from stmuav_jax import Augmented, Baumgarte, Method, SettingError, integrate
 from stmuav_jax.algebra.rotation import rotation_matrix
+from stmuav_jax.dynamics.formulations.stabilisation import AbstractStabilisation
 from stmuav_jax.montecarlo.batch import FlightWork, _parts
 from stmuav_jax.montecarlo.disturbed_flights import Drawn
 from stmuav_jax.montecarlo.study import study_from_plain
@@ -107,6 +110,97 @@ def test_any_number_of_devices_gives_the_same_numbers(turning, devices):
         assert np.array_equal(found[name], values, equal_nan=True), name
     assert shared.identity == work.identity
     assert len(work._compiled) == 1
+
+
+# Identity of the study below, but its parameters' digest, in a store that commit c3864ae made.
+MADE_BEFORE = (
+    '{"scene": "hexacopter", "case": null, "inputs": "case", "drag": false, "gusts": false, '
+    '"name": "turning", "t1": 0.04, "rtol": 1e-10, "atol": 1e-08, "solver": "tsit5", '
+    '"max_steps": 20000, "kind": "flights", "relative": [], "sampling": {"design": "random", '
+    '"seed": 4, "factors": [{"name": "start.p", "distribution": "normal", "mean": 0.0, '
+    '"standard_deviation": 0.3}]}, "quantities": {"tilt": {"signal": "tilt", "take": "largest"}, '
+    '"path": {"signal": "z", "take": "path"}}, "times": [0.0, 0.02, 0.04], "direction": null, '
+    '"lanes": 8}'
+)
+SHORT = {
+    "name": "turning", "scene": "hexacopter", "t1": 0.04, "every": 0.02, "rtol": 1e-10, "seed": 4,
+    "solver": "tsit5", "factors": {"start.p": NORMAL},
+    "quantities": {name: TURNING["quantities"][name] for name in ("tilt", "path")},
+}  # fmt: skip
+
+
+def test_a_study_goes_on_with_stores_made_before():
+    """Its identity is the same text, whether the method comes from a file or from Python."""
+    study = study_from_plain(SHORT)
+    method = Method(solver=diffrax.Tsit5(), rtol=1e-10, max_steps=20_000)
+    for one in (study, replace(study, method=method)):
+        found = dict(FlightWork(one, lanes=8).identity)
+        assert len(found.pop("parameters")) == 16
+        assert json.dumps(found) == MADE_BEFORE
+    unused = replace(method, adjoint=diffrax.DirectAdjoint(), steps="state")
+    assert replace(study, method=unused).plain() == study.plain()
+
+
+def test_other_parts_of_a_method_are_of_the_identity_too():
+    usual = study_from_plain(SHORT)
+    method = replace(
+        usual.method, first_step=1e-3, max_step=0.01, formulation=Augmented(redundant=True),
+        stabilisation=Baumgarte(5.0, 6.0, 7.0),
+    )  # fmt: skip
+    found = replace(usual, method=method).plain()
+    assert {k: v for k, v in found.items() if k not in usual.plain()} == {
+        "first_step": 1e-3,
+        "max_step": 0.01,
+        "formulation": {
+            "kind": "Augmented", "solve": "structured", "rows": "body", "redundant": True,
+            "rcond": 1e-11,
+        },
+        "stabilisation": {"kind": "Baumgarte", "alpha": 5.0, "beta": 6.0, "norm": 7.0},
+    }  # fmt: skip
+    assert json.loads(json.dumps(found)) == found
+
+
+class Doubled(AbstractStabilisation):
+    """A stabilisation that plain data cannot describe: one of its fields is a stabilisation."""
+
+    inner: AbstractStabilisation = Baumgarte()
+
+    def held_rows(self, gamma, value, rate):
+        return self.inner.held_rows(gamma, 2 * value, 2 * rate)
+
+    def held_norms(self, rate, p):
+        return self.inner.held_norms(rate, p)
+
+    def iterations_after_step(self):
+        return 0
+
+
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [
+        (Method(solver=diffrax.Kvaerno5()), r"Dopri8\(\) or Tsit5\(\), not Kvaerno5"),
+        (Method(solver="auto"), r"Dopri8\(\) or Tsit5\(\), not auto"),
+        (Method(event=lambda t, state: t - 1.0), "cannot have 'event'"),
+        (Method(jump_ts=[0.1]), "cannot have 'jump_ts'"),
+        (Method(balances=True), "cannot have 'balances'"),
+        (Method(rtol=2.0), "'rtol' must be at most 1"),
+        (Method(max_steps=2**40), "'max_steps' must be at most"),
+        (Method(stabilisation=Doubled()), "numbers and texts, but Doubled has 'inner'"),
+    ],
+)
+def test_methods_that_a_study_cannot_have(method, words):
+    study = study_from_plain(SHORT)
+    with pytest.raises(SettingError, match=words):
+        replace(study, method=method)
+
+
+@pytest.mark.slow
+def test_another_formulation_gives_the_same_flights(turning):
+    work, found = turning
+    method = replace(work.study.method, formulation=Augmented(), stabilisation=Baumgarte())
+    other = FlightWork(replace(work.study, method=method), block=32, lanes=8).run(0, 32)
+    for name in ("path", "end_x", "tilt"):
+        np.testing.assert_allclose(other[name], found[name], atol=1e-8)
 
 
 def test_parts_keep_devices_busy_and_lanes_full():

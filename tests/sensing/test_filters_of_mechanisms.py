@@ -15,7 +15,7 @@ from stmuav_jax.algebra.compiler import quick_jit
 from stmuav_jax.sensing.process import moved_over
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "flight"))
-from mechanisms import cart_pole, ground_tracker, stewart  # pyright: ignore[reportMissingImports]
+from mechanisms import G, cart_pole, ground_tracker, pendulum, stewart  # pyright: ignore[reportMissingImports]
 from test_any_mechanism import four_bar, static_forces, twin_rate  # pyright: ignore[reportMissingImports]
 
 estimation, sensing = stm.estimation, stm.sensing
@@ -108,6 +108,54 @@ def test_a_four_bar_from_one_encoder_over_a_hundred_seeds(bars):
     # a filter that believes in a third of the encoder's noise is found out
     sure = eqx.tree_at(lambda m: m.sensor.noise, model, model.sensor.noise / 3)
     assert judged(sure)[0][-1].mean() > estimation.mean_interval(2, SEEDS, 0.999)[1]
+
+
+# --- a pendulum whose centre of mass and inertia are states too, against its equation by hand
+
+
+def test_centre_of_mass_and_inertia_of_a_pendulum():
+    """States beside the motion: the filter is that of (J + m c^2) a'' = torque - m g c sin(a)."""
+    mass, true = 1.2, np.array([0.35, 0.03])
+    # angle [rad], rate [rad/s], centre of mass [m], inertia [kg m^2]
+    prior, noise, encoder = np.array([0.05, 0.2, 0.04, 0.01]), np.array([0, 1e-3, 0, 0]), 2e-3
+    space = stm.TreeSpace(pendulum(mass))
+    model = sensing.system_model(
+        space, [sensing.Encoder("hinge")], Q=noise**2, R=[encoder**2],
+        inputs=stm.inputs_of(space.system), parameters=("com", "inertia"),
+        adapt=lambda space, own: space.with_system(pendulum(mass, own[0], own[1])),
+    )  # fmt: skip
+
+    def rate(z, u):
+        angle, speed, com, inertia = z
+        moment = u[0] - mass * G * com * jnp.sin(angle)
+        none = jnp.zeros_like(angle)
+        return jnp.stack([speed, moment / (inertia + mass * com**2), none, none])
+
+    step = estimation.rk4(rate)
+    torque = 1.5 * np.sin(0.45 * np.arange(60))[:, None]
+    onwards = lambda z, u: (step(z, u, DT),) * 2
+    begun = jnp.array([0.04, -0.1, *true])
+    path = jax.jit(lambda z: jax.lax.scan(onwards, z, torque)[1])(begun)
+    y = path[:, :1] + encoder * np.random.default_rng(5).standard_normal((len(torque), 1))
+
+    filtered = quick_jit(lambda m, p: estimation.kalman_filter(m, p, y, u=torque, dt=DT))
+    guess, x = np.array([0.3, 0.02]), space.from_state(space.system.reference)
+    start = {"motion": x, "parameters": jnp.asarray(guess)}
+    found = filtered(model, estimation.gaussian(start, np.diag(prior**2)))
+    hand = estimation.StateSpaceModel(
+        step, np.diag(noise**2), estimation.Sensor(lambda z, u: z[:1], [[encoder**2]])
+    )
+    exact = filtered(hand, estimation.gaussian(np.array([0, 0, *guess]), np.diag(prior**2)))
+    moved = jax.vmap(lambda mean: space.difference(mean["motion"], x))(found.mean)
+    np.testing.assert_allclose(moved, exact.mean[:, :2], atol=1e-9)
+    own = found.mean["parameters"]
+    np.testing.assert_allclose(own, exact.mean[:, 2:], atol=1e-9)
+    np.testing.assert_allclose(found.covariance, exact.covariance, rtol=1e-7, atol=1e-12)
+    # both are found: within three of their deviations, which are less than half of those at the start
+    deviation = np.sqrt(np.diagonal(found.covariance[-1]))[2:]
+    assert np.all(np.abs(own[-1] - true) < 3 * deviation)
+    assert np.all(deviation < prior[2:] / 2)
+    assert model.names == ("hinge.angle", "hinge.angle_rate", "com", "inertia")
 
 
 # --- the UAV with its tracker: gyroscope, accelerometer, encoders of both sliders

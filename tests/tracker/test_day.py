@@ -19,7 +19,6 @@ from stmuav_jax.environment.irradiance import single_axis_normals
 from stmuav_jax.environment.sun import attitude
 from stmuav_jax.figures.day import (
     DAY_FIGURES,
-    day_dataset,
     day_rows,
     day_tables,
     labelled_day,
@@ -314,7 +313,7 @@ def test_day_as_a_file(day, tmp_path):
     assert reasons["3"] == "tilt"
     shift = data["displacements"] - data["strokes"]
     assert np.ptp(shift.sel(leg=2).to_numpy()[day.is_up]) < 1e-15
-    assert day_dataset(day).attrs["start"] == "2024-03-21T00:00:00+07:00"
+    assert labelled_day(day).dataset().attrs["start"] == "2024-03-21T00:00:00+07:00"
 
 
 def test_table_and_figures(day):

@@ -4,13 +4,13 @@ Most loops close in more than one way: a four-bar's coupler lies on either side 
 that are led from the start in small parts, with the loops closed after each, say which is meant.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ...algebra.compiler import kept_jit
+from ...algebra.derivative import held_constant
 from ...mechanics.joint import Joint
 from ...mechanics.joint_states import coordinates_of, relative
 from ...mechanics.state import State
@@ -34,8 +34,7 @@ def followed(
     Angles go the shorter way round. The steps are the smallest in the mass metric. The state is closed to
     some 1e-8 and has no derivatives.
     """
-    still = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x
-    system, start, q, t = jax.tree.map(still, (system, start, q, t))
+    system, start, q, t = held_constant((system, start, q, t))
     kin = system.kinematics(start)
     joints = {name: system.joints[system.joint_index(name)] for name in q}
     first = {name: relative(kin, joint)[0] for name, joint in joints.items()}

@@ -19,7 +19,7 @@ from ...mechanics.joint import CATALOGUE, drive
 from ...mechanics.joint_coordinate import coordinate, free_coordinates
 from ...mechanics.state import State
 from ...mechanics.system import System, check_state
-from ..formulations.augmented import Augmented, Model, displace
+from ..formulations.augmented import Augmented, AugmentedModel, displace
 from ..formulations.constraints import Equations
 from .joint_drivers import UniformMotion
 
@@ -171,7 +171,7 @@ def _lock(system: System, state: State, names: tuple[str, ...]) -> System:
 
 
 def _positions(
-    model: Model,
+    model: AugmentedModel,
     t: Float[Array, ""],
     guess: State,
     near: State,
@@ -188,7 +188,7 @@ def _positions(
         r, p = displace(base.r, base.p, step.reshape(-1, 6))
         return State(r, p, guess.v, guess.omega)
 
-    def residual(unknown: Array, args: tuple[Model, State]) -> Array:
+    def residual(unknown: Array, args: tuple[AugmentedModel, State]) -> Array:
         step, multipliers = unknown[:-m], unknown[-m:]
         within, base = args
         phi = lambda s: (
@@ -221,7 +221,9 @@ def _positions(
     return moved(solution.value[:-m], guess)
 
 
-def velocities(model: Model, t: Float[Array, ""], state: State, free: Bool[Array, " k"]) -> State:
+def velocities(
+    model: AugmentedModel, t: Float[Array, ""], state: State, free: Bool[Array, " k"]
+) -> State:
     """Velocities with J qdot = target that are nearest in the mass metric."""
     if not model.constraints.n_rows:
         return state
@@ -236,7 +238,7 @@ def velocities(model: Model, t: Float[Array, ""], state: State, free: Bool[Array
 
 
 def nearest_step(
-    model: Model, eq: Equations, free: Bool[Array, " k"]
+    model: AugmentedModel, eq: Equations, free: Bool[Array, " k"]
 ) -> Callable[[Float[Array, " m"]], Float[Array, " k"]]:
     """Function of numbers b (m,) that returns the smallest x in the mass metric with J x = b."""
     weighed = model.weigh(eq.J * free.reshape(-1, 6)).reshape(eq.matrix.shape) * free
@@ -268,7 +270,7 @@ def rank(system: System, state: State, t: float = 0.0) -> Rank:
 
 def rank_of(
     system: System,
-    model: Model,
+    model: AugmentedModel,
     state: State,
     t: float = 0.0,
     matrix: np.ndarray | None = None,
@@ -310,7 +312,9 @@ def ranks(
 
 
 @kept_jit
-def singular_values(model: Model, states: State, t: Float[Array, ""]) -> Float[Array, "k m"]:
+def singular_values(
+    model: AugmentedModel, states: State, t: Float[Array, ""]
+) -> Float[Array, "k m"]:
     """Singular values of the unscaled constraint Jacobian at states (k, n, .), the largest first."""
     matrices = jax.vmap(lambda state: _jacobian(model, state, t))(states)
     return jax.vmap(lapack.singular_values)(matrices)
@@ -329,11 +333,11 @@ def _dependent_rows(J: np.ndarray, count: int) -> list[int]:
     return sorted(order[count:])
 
 
-def jacobian(model: Model, state: State, t: float = 0.0) -> np.ndarray:
+def jacobian(model: AugmentedModel, state: State, t: float = 0.0) -> np.ndarray:
     """Constraint Jacobian in (v, omega') as a NumPy matrix (m, 6 n)."""
     return np.asarray(_jacobian(model, state, jnp.asarray(t, dtype=state.r.dtype)))
 
 
 @kept_jit
-def _jacobian(model: Model, state: State, t: Float[Array, ""]) -> Float[Array, "m k"]:
+def _jacobian(model: AugmentedModel, state: State, t: Float[Array, ""]) -> Float[Array, "m k"]:
     return model.constraints.equations(t, model.system.kinematics(state)).matrix

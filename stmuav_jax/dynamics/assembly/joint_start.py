@@ -145,7 +145,7 @@ def _path(links: list[Link], a: int, b: int) -> list[int]:
     return [k for k in (*one, *two) if (k in one) != (k in two)]
 
 
-class _Placed(NamedTuple):
+class _BodyMotion(NamedTuple):
     """Pose and velocity of one body: Euler parameters, centre of mass, world omega, velocity."""
 
     p: Array
@@ -162,8 +162,8 @@ def _placed(
     kin = system.kinematics(start)
     ground = system.n_bodies
     zero, unit = jnp.zeros(3, start.r.dtype), jnp.array([1.0, 0, 0, 0], start.r.dtype)
-    at = lambda b: _Placed(start.p[b], start.r[b], kin.omega_w[b], start.v[b])
-    found = {ground: _Placed(unit, zero, zero, zero)}
+    at = lambda b: _BodyMotion(start.p[b], start.r[b], kin.omega_w[b], start.v[b])
+    found = {ground: _BodyMotion(unit, zero, zero, zero)}
     if tree.floating:
         found[tree.root] = at(tree.root)
     for link in tree.links:
@@ -188,7 +188,9 @@ def _placed(
     return State(jnp.stack([b.r for b in bodies]), p, jnp.stack([b.v for b in bodies]), own)
 
 
-def _behind(i: _Placed, joint: Joint, step: RelativePose, com_i: Array, com_j: Array) -> _Placed:
+def _behind(
+    i: _BodyMotion, joint: Joint, step: RelativePose, com_i: Array, com_j: Array
+) -> _BodyMotion:
     """Pose and velocity of body j from those of body i."""
     front = product(i.p, from_matrix(joint.frame_i))
     p = product(product(front, step.p), conjugate(from_matrix(joint.frame_j)))
@@ -197,10 +199,12 @@ def _behind(i: _Placed, joint: Joint, step: RelativePose, com_i: Array, com_j: A
     omega = i.omega_w + F_i @ step.w
     arm = R_j @ (com_j - joint.point_j)
     at_point = i.v + cross(i.omega_w, point - i.r) + F_i @ step.v
-    return _Placed(p, point + arm, omega, at_point + cross(omega, arm))
+    return _BodyMotion(p, point + arm, omega, at_point + cross(omega, arm))
 
 
-def _in_front(j: _Placed, joint: Joint, step: RelativePose, com_j: Array, com_i: Array) -> _Placed:
+def _in_front(
+    j: _BodyMotion, joint: Joint, step: RelativePose, com_j: Array, com_i: Array
+) -> _BodyMotion:
     """Pose and velocity of body i from those of body j."""
     back = product(product(j.p, from_matrix(joint.frame_j)), conjugate(step.p))
     p = product(back, conjugate(from_matrix(joint.frame_i)))
@@ -209,7 +213,7 @@ def _in_front(j: _Placed, joint: Joint, step: RelativePose, com_j: Array, com_i:
     omega = j.omega_w - F_i @ step.w
     at_point = j.v + cross(j.omega_w, point - j.r) - F_i @ step.v
     arm = R_i @ (com_i - joint.point_i) - F_i @ step.d
-    return _Placed(p, point + arm, omega, at_point + cross(omega, arm))
+    return _BodyMotion(p, point + arm, omega, at_point + cross(omega, arm))
 
 
 # --- closing the loops

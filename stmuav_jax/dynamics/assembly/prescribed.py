@@ -19,13 +19,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...algebra import lapack
 from ...algebra.compiler import kept_jit
+from ...algebra.derivative import held_constant
 from ...checks.errors import ModelError, StateError, concrete
 from ...checks.reason import AbstractReason, first_reason
 from ...mechanics.joint import Motion, drive
 from ...mechanics.joint_coordinate import choose
 from ...mechanics.state import State
 from ...mechanics.system import System, check_state
-from ..formulations.augmented import Augmented, Model, displace
+from ..formulations.augmented import Augmented, AugmentedModel, displace
 from ..formulations.stabilisation import Unstabilised
 
 _MOST_STEPS = 30
@@ -202,12 +203,12 @@ def _path(
 
 
 def _closed(
-    model: Model, t: Array, start: State, columns: np.ndarray, tolerance: Any
+    model: AugmentedModel, t: Array, start: State, columns: np.ndarray, tolerance: Any
 ) -> tuple[State, Array, Array]:
     """Nearest posture that satisfies all rows, the largest displacement, the largest residual."""
     n = start.r.shape[0]
 
-    def look(model: Model, t: Array, state: State) -> tuple[Array, Array]:
+    def look(model: AugmentedModel, t: Array, state: State) -> tuple[Array, Array]:
         eq = model.constraints.equations(t, model.system.kinematics(state))
         return eq.value, eq.matrix[:, columns]
 
@@ -218,11 +219,10 @@ def _closed(
         r, p = displace(state.r, state.p, by)
         return State(r, p, state.v, state.omega)
 
-    def size(model: Model, value: Array) -> Array:
+    def size(model: AugmentedModel, value: Array) -> Array:
         return jnp.max(jnp.abs(model.constraints.scales() * value), initial=0.0)
 
-    arrays, rest = eqx.partition((model, t, start), eqx.is_array)
-    fixed, t_fixed, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
+    fixed, t_fixed, begin = held_constant((model, t, start))
     # stopped once more on the results: a driver's function may hold traced numbers of its own
     still = lambda state: jax.lax.stop_gradient(look(fixed, t_fixed, state))
 
@@ -253,7 +253,7 @@ def _solve(J: Float[Array, "m k"], b: Float[Array, " m"]) -> Float[Array, " k"]:
 
 
 def _rates(
-    model: Model, t: Array, state: State, columns: np.ndarray, spread: Any
+    model: AugmentedModel, t: Array, state: State, columns: np.ndarray, spread: Any
 ) -> tuple[tuple[State, Array, Array], Array, Array]:
     """State with velocities, rates and accelerations; smallest singular value; sign of det J."""
 

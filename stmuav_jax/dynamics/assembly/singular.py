@@ -7,7 +7,7 @@ from ...mechanics.joint_coordinate import coordinate, free_coordinates
 from ...mechanics.joint_kind import Which
 from ...mechanics.state import State
 from ...mechanics.system import System
-from ..formulations.augmented import Augmented, Model
+from ..formulations.augmented import Augmented, AugmentedModel
 from .initial import jacobian, singular_values
 
 # A run ended in a singular posture if the smallest singular value is below this fraction of that at
@@ -18,7 +18,7 @@ _RISEN = 1e-10
 
 
 def weakest_rows(
-    system: System, model: Model, state: State, t: float, rank: int
+    system: System, model: AugmentedModel, state: State, t: float, rank: int
 ) -> tuple[float, tuple[str, ...]]:
     """Singular value number `rank` of the constraint Jacobian, and the joints of its rows.
 
@@ -61,7 +61,7 @@ def singular_posture(system: System, states: State, t: float, rank: int) -> str:
 
 
 def singular_start(
-    system: System, model: Model, start: State, later: State, t: float, rank: int
+    system: System, model: AugmentedModel, start: State, later: State, t: float, rank: int
 ) -> str:
     """Text on a start in a singular posture, whose dependent rows are independent at a later state.
 

@@ -49,7 +49,7 @@ from .reactions import joint_reactions
 from .stabilisation import AbstractStabilisation
 
 
-class Model(AbstractModel):
+class AugmentedModel(AbstractModel):
     """System prepared for maximal coordinates."""
 
     system: System
@@ -89,16 +89,16 @@ class Augmented(AbstractFormulation):
     def allowing_dependent_rows(self) -> "Augmented":
         return self if self.redundant else dataclasses.replace(self, redundant=True)
 
-    def prepare(self, system: System) -> Model:
+    def prepare(self, system: System) -> AugmentedModel:
         inertia = as_numpy(system.bodies.inertia)
         # NumPy's compiles nothing
         invert = np.linalg.inv if isinstance(inertia, np.ndarray) else lapack.inverse
-        return Model(system, constraints(system, self.rows), as_jax(invert(inertia)))
+        return AugmentedModel(system, constraints(system, self.rows), as_jax(invert(inertia)))
 
-    def to_vector(self, model: Model, state: State) -> Float[Array, " k"]:
+    def to_vector(self, model: AugmentedModel, state: State) -> Float[Array, " k"]:
         return jnp.concatenate([x.reshape(-1) for x in (state.r, state.p, state.v, state.omega)])
 
-    def to_state(self, model: Model, x: Float[Array, " k"]) -> State:
+    def to_state(self, model: AugmentedModel, x: Float[Array, " k"]) -> State:
         n = model.system.n_bodies
         r, p, v, omega = (
             x[a * n : b * n].reshape(n, -1) for a, b in ((0, 3), (3, 7), (7, 10), (10, 13))
@@ -106,20 +106,24 @@ class Augmented(AbstractFormulation):
         return State(r, p, v, omega)
 
     def accelerations(
-        self, model: Model, t: Float[Array, ""], state: State, stabilisation: AbstractStabilisation
+        self,
+        model: AugmentedModel,
+        t: Float[Array, ""],
+        state: State,
+        stabilisation: AbstractStabilisation,
     ) -> Accelerations:
         kin = model.system.kinematics(state)
         load = model.load(t, kin)
         return self._accelerate(model, t, state.p, kin, load, stabilisation)[0]
 
     def reactions(
-        self, model: Model, t: Float[Array, ""], state: State, result: Accelerations
+        self, model: AugmentedModel, t: Float[Array, ""], state: State, result: Accelerations
     ) -> Reactions:
         return joint_reactions(model.system, model.constraints, t, state, result.multipliers)
 
     def derivative(
         self,
-        model: Model,
+        model: AugmentedModel,
         t: Float[Array, ""],
         x: Float[Array, " k"],
         stabilisation: AbstractStabilisation,
@@ -141,7 +145,7 @@ class Augmented(AbstractFormulation):
 
     def _accelerate(
         self,
-        model: Model,
+        model: AugmentedModel,
         t: Float[Array, ""],
         p: Float[Array, "n 4"],
         kin: Kinematics,
@@ -174,7 +178,7 @@ class Augmented(AbstractFormulation):
 
     def _dense(
         self,
-        model: Model,
+        model: AugmentedModel,
         t: Float[Array, ""],
         p: Float[Array, "n 4"],
         kin: Kinematics,
@@ -211,12 +215,14 @@ class Augmented(AbstractFormulation):
         omega_rate = 2 * jnp.einsum("nap,np->na", L, q[:, 3:])
         return Accelerations(q[:, :3], omega_rate, -x[7 * n :]), eq.target
 
-    def at_step(self, model: Model, t: Float[Array, ""], x: Float[Array, " k"]) -> Model:
+    def at_step(
+        self, model: AugmentedModel, t: Float[Array, ""], x: Float[Array, " k"]
+    ) -> AugmentedModel:
         del t, x
         return model
 
     def project(
-        self, model: Model, t: Float[Array, ""], x: Float[Array, " k"], iterations: int
+        self, model: AugmentedModel, t: Float[Array, ""], x: Float[Array, " k"], iterations: int
     ) -> tuple[Float[Array, " k"], Residuals]:
         state = self.to_state(model, x)
         p = jax.vmap(normalise)(state.p)
@@ -244,14 +250,18 @@ class Augmented(AbstractFormulation):
         u = u.reshape(-1, 6)
         return self.to_vector(model, State(r, p, u[:, :3], u[:, 3:])), left
 
-    def residuals(self, model: Model, t: Float[Array, ""], x: Float[Array, " k"]) -> Residuals:
+    def residuals(
+        self, model: AugmentedModel, t: Float[Array, ""], x: Float[Array, " k"]
+    ) -> Residuals:
         state = self.to_state(model, x)
         u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
         eq = model.constraints.equations(t, model.system.kinematics(state))
         return _left(model, eq, state.p, u)
 
 
-def _left(model: Model, eq: Equations, p: Float[Array, "n 4"], u: Float[Array, " k"]) -> Residuals:
+def _left(
+    model: AugmentedModel, eq: Equations, p: Float[Array, "n 4"], u: Float[Array, " k"]
+) -> Residuals:
     norm = jnp.max(jnp.abs(jnp.sum(p**2, axis=1) - 1))
     return residuals_of(model.constraints, eq.value, eq.matrix @ u - eq.target, norm)
 

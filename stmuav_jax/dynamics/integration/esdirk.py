@@ -29,9 +29,8 @@ from jaxtyping import Array, Bool, Float
 from ...algebra.derivative import directional
 from ...algebra.linalg import inverted
 from ...algebra.native import native_loops
+from ...checks.shapes import StateVector
 from .explicit import AbstractNonDense
-
-Vector = Float[Array, " k"]
 
 # Error of an iteration over the tolerance of the step, and iterations of a stage at most.
 SHARE, ITERATIONS = 0.01, 10
@@ -96,7 +95,7 @@ class NonDenseESDIRK(AbstractNonDense):
     atol: Any
     n_state: int = eqx.field(static=True)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> Memory:
+    def init(self, terms: Any, t0: Any, t1: Any, y0: StateVector, args: Any) -> Memory:
         return Memory(jnp.zeros((*y0.shape, *y0.shape), y0.dtype), jnp.asarray(True))
 
     def step(
@@ -104,11 +103,11 @@ class NonDenseESDIRK(AbstractNonDense):
         terms: Any,
         t0: Any,
         t1: Any,
-        y0: Vector,
+        y0: StateVector,
         args: Any,
         solver_state: Memory,
         made_jump: Any,
-    ) -> tuple[Vector, Vector, Any, Memory, diffrax.RESULTS]:
+    ) -> tuple[StateVector, StateVector, Any, Memory, diffrax.RESULTS]:
         del made_jump
         table = stages(self.method)
         t0, h = jnp.asarray(t0, y0.dtype), jnp.asarray(t1 - t0, y0.dtype)
@@ -122,7 +121,7 @@ class NonDenseESDIRK(AbstractNonDense):
         info = {"y0": y0, "y1": y1, "slopes": slopes}
         return y1, error, info, memory, diffrax.RESULTS.successful
 
-    def norm(self, change: Vector, y: Vector, tolerances: Any) -> Float[Array, ""]:
+    def norm(self, change: StateVector, y: StateVector, tolerances: Any) -> Float[Array, ""]:
         """Root mean square of a change of y over the tolerance."""
         rtol, atol = tolerances
         part = (change / (atol + rtol * jnp.abs(y)))[: self.n_state]
@@ -155,7 +154,7 @@ def _solved(
     return found.slopes, found.fine, Memory(memory.jacobian, due)
 
 
-def _differences(field: Any, t: Any, y: Vector, n: int) -> Float[Array, "k k"]:
+def _differences(field: Any, t: Any, y: StateVector, n: int) -> Float[Array, "k k"]:
     """Jacobian df/dy by differences, where f depends on the first n entries of y only."""
     away = jnp.sqrt(jnp.finfo(y.dtype).eps) * (1 + jnp.abs(y))
     # a single copy of the field to compile, for all columns and for y itself
@@ -212,7 +211,7 @@ def _solved_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     def stage(moved: Float[Array, "s k"], at: tuple[Any, ...]) -> tuple[Any, None]:
         row, weight, number, implicit = at
 
-        def f(terms: Any, args: Any, start: Any, slopes: Any) -> Vector:
+        def f(terms: Any, args: Any, start: Any, slopes: Any) -> StateVector:
             t, h, y = start
             y = y + h * jnp.sum(row[:, None] * slopes, axis=0)
             return terms.vf(t + weight * h, y, args)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-Vector = Float[Array, " k"]
+from ...checks.shapes import StateVector
 
 
 class RecordedStep(diffrax.LocalLinearInterpolation):
@@ -67,7 +67,7 @@ class AbstractNonDense(diffrax.AbstractAdaptiveSolver):
     def error_order(self, terms: Any) -> Any:
         return self.method.error_order(terms)
 
-    def func(self, terms: Any, t0: Any, y0: Vector, args: Any) -> Any:
+    def func(self, terms: Any, t0: Any, y0: StateVector, args: Any) -> Any:
         return terms.vf(t0, y0, args)
 
 
@@ -84,7 +84,7 @@ class NonDenseRungeKutta(AbstractNonDense):
 
     method: diffrax.AbstractERK
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> None:
+    def init(self, terms: Any, t0: Any, t1: Any, y0: StateVector, args: Any) -> None:
         return None
 
     def step(
@@ -92,11 +92,11 @@ class NonDenseRungeKutta(AbstractNonDense):
         terms: Any,
         t0: Any,
         t1: Any,
-        y0: Vector,
+        y0: StateVector,
         args: Any,
         solver_state: None,
         made_jump: Any,
-    ) -> tuple[Vector, Vector, Any, None, diffrax.RESULTS]:
+    ) -> tuple[StateVector, StateVector, Any, None, diffrax.RESULTS]:
         del solver_state, made_jump
         A, b, b_error, c = coefficients(self.method)
         h = terms.contr(t0, t1)

@@ -69,7 +69,7 @@ class Plan(NamedTuple):
     stops: tuple[bool, ...]
 
 
-class Slot(eqx.Module):
+class BatchSlot(eqx.Module):
     """Run in a batch slot.
 
     Attributes:
@@ -151,7 +151,7 @@ def _seen(plan: Plan, problem: Problem, t: Array, y: Array, *, all_signals: bool
     return found._replace(smooth=value, rate=rate)
 
 
-def launch(plan: Plan, numbers: Any) -> Slot:
+def launch(plan: Plan, numbers: Any) -> BatchSlot:
     """Run before its first step."""
     problem, state0 = plan.make(numbers)
     t0 = jnp.asarray(plan.t0, state0.r.dtype)
@@ -166,13 +166,13 @@ def launch(plan: Plan, numbers: Any) -> Slot:
     rate = jnp.concatenate([seen.rate, jnp.zeros_like(seen.sharp)])
     monitor = start(t0, jnp.concatenate([seen.smooth, seen.sharp]), rate)
     ending = jnp.where(fine, Ending.RUNNING, Ending.NO_START).astype(int)
-    return Slot(
+    return BatchSlot(
         carry.t, carry.y, seen.slope, carry.t + carry.step, carry.solver_state, carry.controller_state,
         zero + reached, kept, monitor, zero, zero, ending,
     )  # fmt: skip
 
 
-def attempt(plan: Plan, problem: Problem, lane: Slot) -> Slot:
+def attempt(plan: Plan, problem: Problem, lane: BatchSlot) -> BatchSlot:
     """Try one step; a run that has ended keeps its values."""
     solver, terms = problem.solver(), diffrax.ODETerm(problem.field)
     running = lane.ending == Ending.RUNNING
@@ -209,7 +209,7 @@ def attempt(plan: Plan, problem: Problem, lane: Slot) -> Slot:
         (collapsed, Ending.COLLAPSED),
         (most, Ending.MAX_STEPS),
     ).astype(int)
-    return Slot(
+    return BatchSlot(
         t, y, slope, jnp.where(running, t + step, lane.next),
         _select(taken, solver_state, lane.solver_state),
         _select(running, controller_state, lane.controller_state),
@@ -219,7 +219,7 @@ def attempt(plan: Plan, problem: Problem, lane: Slot) -> Slot:
 
 
 def _watched(
-    plan: Plan, problem: Problem, lane: Slot, taken: Array, t: Array, y: Array
+    plan: Plan, problem: Problem, lane: BatchSlot, taken: Array, t: Array, y: Array
 ) -> tuple[Monitor, Array]:
     """Monitor and slope after the step to t, y if it was accepted, otherwise before it."""
     if not plan.stops:
@@ -237,7 +237,7 @@ def _watched(
     return _select(taken, (after, seen.slope), (before, lane.slope))
 
 
-def _left(lane: Slot) -> RunResult:
+def _left(lane: BatchSlot) -> RunResult:
     worst = lane.solver_state[1]
     monitor = lane.monitor
     failed = lane.ending != Ending.FINE
@@ -258,7 +258,7 @@ class _Queue(NamedTuple):
         results: results of all runs (n, .).
     """
 
-    lanes: Slot
+    lanes: BatchSlot
     numbers: Any
     flight: Int[Array, " b"]
     next: Int[Array, ""]
@@ -276,7 +276,7 @@ def fly(plan: Plan, numbers: Any, count: Int[Array, ""], lanes: int) -> RunResul
     take = lambda places: jax.tree.map(lambda x: x[jnp.clip(places, 0, size - 1)], numbers)
     launched = jax.vmap(lambda each: launch(plan, each))
 
-    def whole(each: Any, lane: Slot) -> Slot:
+    def whole(each: Any, lane: BatchSlot) -> BatchSlot:
         problem, _ = plan.make(each)
         return jax.lax.fori_loop(0, ROUND, lambda _, now: attempt(plan, problem, now), lane)
 

@@ -24,8 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...algebra.linalg import inverted
-
-Vector = Float[Array, " k"]
+from ...checks.shapes import StateVector
 
 _GAMMA = 0.21193756319429014
 _A = (
@@ -124,10 +123,10 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
     def error_order(self, terms: Any) -> int:
         return 5
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> None:
+    def init(self, terms: Any, t0: Any, t1: Any, y0: StateVector, args: Any) -> None:
         return None
 
-    def func(self, terms: Any, t0: Any, y0: Vector, args: Any) -> Any:
+    def func(self, terms: Any, t0: Any, y0: StateVector, args: Any) -> Any:
         return terms.vf(t0, y0, args)
 
     def step(
@@ -135,11 +134,11 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         terms: Any,
         t0: Any,
         t1: Any,
-        y0: Vector,
+        y0: StateVector,
         args: Any,
         solver_state: None,
         made_jump: Any,
-    ) -> tuple[Vector, Vector, Any, None, diffrax.RESULTS]:
+    ) -> tuple[StateVector, StateVector, Any, None, diffrax.RESULTS]:
         del solver_state, made_jump
         h = t1 - t0
         field = lambda t, y: terms.vf(t, y, args)
@@ -176,13 +175,13 @@ def stability(z: complex) -> complex:
 
 
 def _linear_solver(
-    field: Any, t: Float[Array, ""], y: Vector, h: Any, n: int
-) -> tuple[Callable[[Vector], Vector], Vector]:
+    field: Any, t: Float[Array, ""], y: StateVector, h: Any, n: int
+) -> tuple[Callable[[StateVector], StateVector], StateVector]:
     """Function b -> W^-1 b for a step of length h, and df/dt (k,); f depends on y_1, ..., y_n only."""
     J, by_time = _derivatives(field, t, y, n)
     W = inverted(jnp.eye(n, dtype=y.dtype) / (h * _GAMMA) - J[:n])
 
-    def solve(b: Vector) -> Vector:
+    def solve(b: StateVector) -> StateVector:
         k = W.solve(b[:n])
         # all other entries are integrals of functions of the first ones
         return jnp.concatenate([k, h * _GAMMA * (b[n:] + J[n:] @ k)]) if n < b.shape[0] else k
@@ -191,8 +190,8 @@ def _linear_solver(
 
 
 def _derivatives(
-    field: Any, t: Float[Array, ""], y: Vector, n: int
-) -> tuple[Float[Array, "k n"], Vector]:
+    field: Any, t: Float[Array, ""], y: StateVector, n: int
+) -> tuple[Float[Array, "k n"], StateVector]:
     """Derivatives df/dy by the first n entries (k, n), and df/dt (k,), by one batch of directions."""
     directions = jnp.eye(n + 1, dtype=y.dtype)
     push = lambda v: jax.jvp(field, (t, y), (v[n], jnp.zeros_like(y).at[:n].set(v[:n])))[1]

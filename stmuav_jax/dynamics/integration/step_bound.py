@@ -31,9 +31,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ...algebra import lapack
+from ...checks.shapes import StateVector
 from .rosenbrock import Rodas5P, stability
-
-Vector = Float[Array, " k"]
 
 # Relative error of derivatives allowed per radian of the fastest mode, over the tolerance: at the
 # default of 1e-8 a period of a pendulum at rest then costs derivatives 1.3e-10 of their size.
@@ -82,7 +81,7 @@ class Guard(eqx.Module):
         """Number of directions of Arnoldi's method."""
         return self.size if self.implicit else min(self.size, DIRECTIONS)
 
-    def begin(self, t0: Any, y0: Vector) -> Modes:
+    def begin(self, t0: Any, y0: StateVector) -> Modes:
         """Initial memory, without any bound yet."""
         return Modes(jnp.asarray(jnp.inf, y0.dtype), jnp.asarray(EVERY), jnp.asarray(t0, y0.dtype))
 
@@ -91,7 +90,7 @@ class Guard(eqx.Module):
         often = h > 0.75 * modes.longest
         return modes.age >= jnp.where(often, EVERY_BOUND, EVERY)
 
-    def first(self, y0: Vector) -> Krylov:
+    def first(self, y0: StateVector) -> Krylov:
         """Krylov space of a first direction: pseudo-random, always the same, with all modes."""
         m, k = self.directions, y0.shape[0]
         start = np.zeros(k)
@@ -100,12 +99,12 @@ class Guard(eqx.Module):
         basis[0] = start / np.linalg.norm(start)
         return Krylov(jnp.asarray(basis, y0.dtype), jnp.zeros((m + 1, m), y0.dtype))
 
-    def away(self, y0: Vector) -> Float[Array, ""]:
+    def away(self, y0: StateVector) -> Float[Array, ""]:
         """Length of the difference along a direction."""
         small = jnp.finfo(y0.dtype).eps ** 0.4
         return small * (1 + jnp.max(jnp.abs(y0[: self.size])))
 
-    def with_slope(self, krylov: Krylov, j: Any, change: Vector) -> Krylov:
+    def with_slope(self, krylov: Krylov, j: Any, change: StateVector) -> Krylov:
         """Krylov space with one more direction: the part of J v_j (`change`) outside of it."""
         change = jnp.where(np.arange(change.shape[0]) < self.size, change, 0.0)
         along = krylov.basis @ change
@@ -136,7 +135,12 @@ class Guard(eqx.Module):
         return Modes(longest, jnp.zeros_like(modes.age), modes.start)
 
     def looked(
-        self, field: Callable[[Any, Vector], Vector], t0: Any, y0: Vector, h: Any, modes: Modes
+        self,
+        field: Callable[[Any, StateVector], StateVector],
+        t0: Any,
+        y0: StateVector,
+        h: Any,
+        modes: Modes,
     ) -> Modes:
         """Memory after a step of length h from y0 at t0, where the modes are computed if due."""
         t0, y0, h = jax.lax.stop_gradient((jnp.asarray(t0, y0.dtype), y0, h))
@@ -146,7 +150,9 @@ class Guard(eqx.Module):
             away = self.away(y0)
 
             # the slope at y0 itself comes first, in the same loop: one copy of the field to compile
-            def one(now: tuple[Krylov, Vector], j: Any) -> tuple[tuple[Krylov, Vector], None]:
+            def one(
+                now: tuple[Krylov, StateVector], j: Any
+            ) -> tuple[tuple[Krylov, StateVector], None]:
                 krylov, base = now
                 first, j = j < 0, jnp.maximum(j, 0)
                 slope = field(t0, y0 + jnp.where(first, 0.0, away) * krylov.basis[j])

@@ -12,10 +12,9 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ...algebra.derivative import safe_sqrt
+from ...checks.shapes import StateVector
 from ..formulations.base import Residuals
 from .step_bound import Guard
-
-Vector = Float[Array, " k"]
 
 # The integration fails at a rejected step shorter than this times 1 s plus the time.
 _SHORTEST = 1e-14
@@ -29,10 +28,10 @@ def _landed(inner: Callable[..., Any]) -> type:
         t0: Any
         t1: Any
         inner: Any
-        end: Vector
-        shift: Vector
+        end: StateVector
+        shift: StateVector
 
-        def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Vector:
+        def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> StateVector:
             del left
             if t1 is not None:
                 return self.evaluate(t1) - self.evaluate(t0)
@@ -61,7 +60,9 @@ class ProjectionLimit(eqx.Module):
     atol: Any
     n_state: int = eqx.field(static=True)
 
-    def error(self, y0: Vector, y1: Vector, end: Vector, error: Vector) -> Vector:
+    def error(
+        self, y0: StateVector, y1: StateVector, end: StateVector, error: StateVector
+    ) -> StateVector:
         """Error estimate of the step; one above the tolerance if its end was moved too far."""
         scale = lambda y: self.atol + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y))
         n = self.n_state
@@ -90,9 +91,9 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     """
 
     solver: diffrax.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
-    project: Callable[[Any, Vector, Any], tuple[Vector, Residuals]] | None
-    residuals: Callable[[Any, Vector, Any], Residuals]
-    at_step: Callable[[Any, Vector, Any], Any]
+    project: Callable[[Any, StateVector, Any], tuple[StateVector, Residuals]] | None
+    residuals: Callable[[Any, StateVector, Any], Residuals]
+    at_step: Callable[[Any, StateVector, Any], Any]
     far: ProjectionLimit | None
     guard: Guard | None = None
 
@@ -130,7 +131,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     def error_order(self, terms: Any) -> Any:
         return self.solver.error_order(terms)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Vector, args: Any) -> Any:
+    def init(self, terms: Any, t0: Any, t1: Any, y0: StateVector, args: Any) -> Any:
         none = jnp.zeros((), y0.dtype)
         start = (self.solver.init(terms, t0, t1, y0, args), Residuals(*(none,) * 5))
         return start if self.guard is None else (*start, self.guard.begin(t0, y0))
@@ -140,11 +141,11 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         terms: Any,
         t0: Any,
         t1: Any,
-        y0: Vector,
+        y0: StateVector,
         args: Any,
         solver_state: Any,
         made_jump: Any,
-    ) -> tuple[Vector, Any, Any, Any, diffrax.RESULTS]:
+    ) -> tuple[StateVector, Any, Any, Any, diffrax.RESULTS]:
         inner, worst, *modes = solver_state
         jump = made_jump if self.project is None else True
         args = self.at_step(t0, y0, args)
@@ -168,7 +169,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         y_error = (y_error, modes[0].longest) if modes else y_error
         return end, y_error, info, (inner, worst, *modes), result
 
-    def func(self, terms: Any, t0: Any, y0: Vector, args: Any) -> Any:
+    def func(self, terms: Any, t0: Any, y0: StateVector, args: Any) -> Any:
         return self.solver.func(terms, t0, y0, args)
 
 
@@ -297,10 +298,10 @@ def own_iterations(solver: Any) -> bool:
     return known and isinstance(solver.root_finder, optx.Chord)
 
 
-def error_norm(n_state: int) -> Callable[[Vector], Float[Array, ""]]:
+def error_norm(n_state: int) -> Callable[[StateVector], Float[Array, ""]]:
     """Root-mean-square norm of the first `n_state` entries, which leaves out quadratures."""
 
-    def norm(error: Vector) -> Float[Array, ""]:
+    def norm(error: StateVector) -> Float[Array, ""]:
         part = error[:n_state]
         return safe_sqrt(jnp.mean(part * part))
 

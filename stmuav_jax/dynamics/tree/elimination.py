@@ -141,18 +141,6 @@ def _padded(rows: Float[Array, "r k *s"], flat: np.ndarray) -> Float[Array, "r l
     return pick(rows, flat, 1)
 
 
-def solve_branches(
-    tree: SpanningTree,
-    S: Float[Array, "6 k *s"],
-    at: Inertia,
-    h: Float[Array, "l *s"],
-    J: Float[Array, "m k *s"],
-    gamma: Float[Array, "m *s"],
-) -> tuple[Float[Array, "l *s"], Float[Array, "m *s"]]:
-    """Accelerations x and multipliers y of M x - J^T y = -h, J x = gamma."""
-    return first_solution(tree, eliminate_branches(tree, S, at, J, gamma, h))
-
-
 def first_solution(
     tree: SpanningTree, found: BranchElimination
 ) -> tuple[Float[Array, "l *s"], Float[Array, "m *s"]]:

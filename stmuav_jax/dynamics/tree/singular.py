@@ -14,12 +14,12 @@ from collections.abc import Callable
 from math import factorial
 from typing import Any, NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ...algebra.derivative import held_constant
 from ...algebra.linalg import cholesky, independent_rows, solve_lower
 from ...mechanics.constraint import ROWS
 from ..formulations.constraints import Constraints
@@ -172,7 +172,7 @@ def nearness(model: TreeModel, t: Float[Array, ""], at: TreeCoordinates) -> Near
     """Nearness of this posture to a singular one, in comparison with those before and after."""
     kept = model.kept
     assert kept is not None
-    model, at = _still(model), _still(at)
+    model, at = held_constant((model, at))
     step = _APART * _along(at.u)
 
     def clearance(place: Float[Array, ""]) -> Float[Array, ""]:
@@ -189,8 +189,3 @@ def nearness(model: TreeModel, t: Float[Array, ""], at: TreeCoordinates) -> Near
     others = lambda: less_near(_PLACES[np.abs(_PLACES) > 1])
     around = lambda: jax.lax.cond(less_near(_PLACES[np.abs(_PLACES) == 1]), others, no)
     return Nearness(jax.lax.cond(here < _CLEAR, around, no), here)
-
-
-def _still(tree: T) -> T:
-    still = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x
-    return jax.tree.map(still, tree)
