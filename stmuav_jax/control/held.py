@@ -129,7 +129,7 @@ def check_steps(steps: int | None) -> None:
 
 
 def usable_method(method: Method | None, steps: int | None) -> Method:
-    """Method for the steps of a plant."""
+    """Method for the steps of a plant; nothing bounds steps of a fixed length for derivatives."""
     if method is None:
         solver: Any = diffrax.Dopri8() if steps is None else RungeKutta4()
         return usable_method(Method(solver=solver), steps)
@@ -138,4 +138,5 @@ def usable_method(method: Method | None, steps: int | None) -> Method:
     adjoint = method.adjoint
     if isinstance(adjoint, DiscreteAdjoint):
         adjoint = diffrax.RecursiveCheckpointAdjoint()
-    return dataclasses.replace(method, adjoint=adjoint, steps="state")
+    how = "state" if steps is not None else method.steps
+    return dataclasses.replace(method, adjoint=adjoint, steps=how)

@@ -85,7 +85,7 @@ class Plant(eqx.Module):
         memory: first memory of the estimator, any pytree of arrays.
         observe: function (t, state, internal states) -> estimate; by default the `State`.
         method: method of integration; by default the classical Runge-Kutta method of order 4 for
-            fixed steps, Dopri8 for others. Its `steps` are always "state".
+            fixed steps, Dopri8 for others. Its `steps` count where their length is not fixed.
         steps: steps in a period; None for steps whose length the method's tolerances choose.
 
     Raises:

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,6 +73,31 @@ def test_a_loop_is_the_exact_sampled_system(late, steps):
     assert run.successful
     assert run.certificate.energy_error < 1e-6
     np.testing.assert_allclose(run.ts, np.arange(101) / RATE, atol=1e-14)
+
+
+def test_adaptive_steps_are_safe_for_derivatives_unless_told_otherwise():
+    """At rest, where the state has no error: by the held input, as the matrix exponential has it."""
+    system, _ = spring_mass()
+
+    def plant(number, **how):
+        method = stm.Method(**how) if how else None
+        return control.Plant(system, rate=0.5, inputs=["effort"], method=method, steps=number)
+
+    ahead = plant(None, adjoint=diffrax.ForwardMode())
+
+    def moved(u):
+        step = lambda now, _: (ahead.step(now, u), None)
+        return jax.lax.scan(step, ahead.reset(), None, 2)[0].state.r[0, 0]
+
+    _, slope = jax.jit(lambda u: jax.jvp(moved, (u,), (jnp.ones(1),)))(jnp.zeros(1))
+    A = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]])
+    _, exact = control.held_matrices(A, np.array([[0.0], [1 / MASS]]), 4.0)
+    np.testing.assert_allclose(slope, exact[0, 0], rtol=1e-6)
+    chosen = lambda of: of.motion.problem.method.steps
+    assert [chosen(ahead), chosen(plant(None))] == ["sensitivities"] * 2
+    assert chosen(plant(None, steps="state")) == "state"
+    # nothing could bound steps of a fixed length
+    assert chosen(plant(2)) == "state"
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """`integrate`: under jit, vmap and differentiation, and its events; on a pendulum."""
 
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -23,10 +25,13 @@ def run(parameters, ts=TS, **more):
     return stm.integrate(system, swung(system, 0.7, rate), ts, method)
 
 
-def loss(parameters, **more):
-    found = run(parameters, **more)
+def loss_of(found):
     weights = jnp.asarray([1.0, 0.0, 2.0])
     return jnp.sum(found.states.r @ weights) + jnp.sum(found.states.omega[-1] ** 2)
+
+
+def loss(parameters, **more):
+    return loss_of(run(parameters, **more))
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +40,14 @@ def graded():
     return jax.jit(jax.value_and_grad(loss))
 
 
+# what the flights of the batch need is some 20 step attempts for an output time
+FEW: dict[str, Any] = {"max_steps": 60}
+
+
 @pytest.fixture(scope="module")
 def of_batch():
     """Values and gradients of a batch, compiled."""
-    return jax.jit(jax.vmap(jax.value_and_grad(loss)))
+    return jax.jit(jax.vmap(jax.value_and_grad(lambda x: loss(x, **FEW))))
 
 
 @pytest.fixture(scope="module")
@@ -87,15 +96,41 @@ def test_gradients_equal_finite_differences(graded):
         assert gradient[k] == pytest.approx(float(expected), rel=1e-6)
 
 
-def test_forward_and_reverse_mode_agree(graded):
-    forward = jax.jit(
-        lambda x, d: jax.jvp(lambda y: loss(y, adjoint=diffrax.ForwardMode()), (x,), (d,))
-    )
+@pytest.fixture(scope="module")
+def forward():
+    """Value, derivative along a direction, and the trajectory, compiled."""
+
+    def along(x):
+        found = run(x, adjoint=diffrax.ForwardMode(), **FEW)
+        return loss_of(found), found
+
+    return jax.jit(lambda x, d: jax.jvp(along, (x,), (d,), has_aux=True))
+
+
+def test_forward_and_reverse_mode_agree(graded, forward):
     value, gradient = graded(BATCH[0])
     for k, direction in enumerate(np.eye(3)):
-        same, rate = forward(BATCH[0], jnp.asarray(direction))
+        same, rate, _ = forward(BATCH[0], jnp.asarray(direction))
         assert float(same) == pytest.approx(float(value), rel=1e-12)
         assert float(rate) == pytest.approx(float(gradient[k]), rel=1e-9)
+
+
+def test_a_flight_that_stops_on_the_way_is_not_a_number(of_batch, batched, forward):
+    """In both modes; what it has reached is kept, and the other flights are as without it."""
+    fast = BATCH.at[1, 0].set(250.0)
+    value, rate, found = forward(fast[1], jnp.eye(3)[0])
+    assert found.result == diffrax.RESULTS.max_steps_reached
+    assert float(TS[1]) < float(found.ts[-1]) < float(TS[2])
+    assert np.all(np.isfinite(found.states.r[:2]))
+    assert np.all(np.isnan(found.states.r[2]))
+    assert np.isnan(value)
+    assert np.isnan(rate)
+    values, gradients = of_batch(fast)
+    assert np.isnan(values[1])
+    assert np.all(np.isnan(gradients[1]))
+    for k in (0, 2):
+        assert float(values[k]) == pytest.approx(float(batched[0][k]), rel=1e-12)
+        assert relative_error(gradients[k], batched[1][k]) < 1e-10
 
 
 def test_an_event_stops_at_its_time_on_the_constraint():

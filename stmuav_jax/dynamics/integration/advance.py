@@ -19,6 +19,7 @@ from ..formulations.base import Residuals
 from .adjoint import DiscreteAdjoint, recorded
 from .events import to_event
 from .problem import Counts, IntegrationState, Problem, SegmentEnd, landing
+from .record import Record
 from .step_bound import EVERY
 
 
@@ -52,12 +53,11 @@ def _to(
     problem: Problem,
     carry: IntegrationState,
     t1: Float[Array, ""],
-    adjoint: diffrax.AbstractAdjoint,
+    adjoint: diffrax.AbstractAdjoint | Record,
 ) -> SegmentEnd:
     """Integrate from the carry to t1 [s], or to an event before it."""
-    if isinstance(adjoint, DiscreteAdjoint):
-        assert adjoint.recorded_steps is not None
-        return recorded(problem, carry, t1, adjoint.recorded_steps)
+    if isinstance(adjoint, Record):
+        return recorded(problem, carry, t1, adjoint)
     if problem.method.event is not None:
         return to_event(problem, carry, t1, adjoint)
     return landing(problem.solve(carry, t1, adjoint))
@@ -97,7 +97,7 @@ def _through(
     problem: Problem, carry: IntegrationState, ts: Any, segments: int
 ) -> tuple[IntegrationState, tuple[Any, ...]]:
     """Integrate through times [s], or pairs of a time and True if it is that of a jump."""
-    adjoint = problem.method.adjoint
+    adjoint: Any = problem.method.adjoint
     if isinstance(adjoint, DiscreteAdjoint):
         adjoint = adjoint.of(problem, segments)
     jumps = problem.method.jump_ts

@@ -1,5 +1,6 @@
 """Reverse mode by kept steps: against diffrax's own, forward mode, and differences."""
 
+import itertools
 from dataclasses import replace
 
 import diffrax
@@ -10,6 +11,8 @@ import pytest
 from helpers import pendulum, swung
 
 import stmuav_jax as stm
+from stmuav_jax.dynamics.integration import record
+from stmuav_jax.dynamics.integration.problem import prepare
 
 KEEPING = stm.Method(rtol=1e-10, atol=1e-10)
 AGAIN = replace(KEEPING, adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=500))
@@ -104,6 +107,62 @@ def test_more_steps_than_are_kept():
     assert float(counts.accepted[-1]) * 0.5 > 2 * 64
     assert value == expected
     np.testing.assert_allclose(gradient, same, rtol=1e-11)
+
+
+@pytest.mark.parametrize("flights", [pytest.param(1, marks=pytest.mark.slow), 2])
+def test_pieces_of_few_windows(monkeypatch, flights):
+    """Pieces integrated again on the way back: the same derivatives as those of all steps kept.
+
+    Pieces of two windows of two attempts; the flights of a batch have different numbers of them.
+    """
+    monkeypatch.setattr(record, "WINDOWS", 3)
+    monkeypatch.setattr(record, "ROOM", 0)
+    adjoint = stm.dynamics.DiscreteAdjoint(recorded_steps=2)
+    few = replace(KEEPING, adjoint=adjoint, max_steps=200)
+    assert adjoint.of(prepare(pendulum(), few), 3) == (2, 3, 50)
+    several = Q + jnp.linspace(0.0, 0.4, flights)[:, None]
+    graded = jax.value_and_grad(lambda q: swing(q, few))
+    found = jax.jit(
+        jax.vmap(graded) if flights > 1 else lambda q: jax.tree.map(lambda x: x[None], graded(q[0]))
+    )
+    for q, value, gradient in zip(several, *found(several), strict=True):
+        alone, expected = of_kept(q)
+        assert value == pytest.approx(float(alone), rel=1e-9)
+        np.testing.assert_allclose(gradient, expected, rtol=1e-9)
+
+
+def test_there_is_room_for_all_steps():
+    """Whatever the numbers; and for ordinary runs in windows of one piece."""
+    for kept, most, segments, size in itertools.product(
+        (1, 64, 409, 4096), (1, 12, 1000, 100_000, 10**7), (1, 10, 64, 1000), (13, 400)
+    ):
+        kept = min(kept, most)
+        room = record.Record.of(kept, most, segments, size)
+        spare = 0 if room.pieces == 1 else 1
+        assert (room.windows - spare) * room.pieces * room.steps >= most
+        numbers = segments * room.windows * (kept + size)
+        assert numbers <= max(record.ROOM, segments * record.WINDOWS * (kept + size))
+    assert record.Record.of(64, 100_000, 64, 28).pieces == 1
+
+
+@pytest.mark.slow
+def test_a_long_span_beside_many_short_ones():
+    """64 output times, and more step attempts before the last than 256 windows have: forward mode."""
+    ts = jnp.concatenate([jnp.linspace(0.0, 0.064, 64), jnp.array([10.0])])
+    method = stm.Method(solver=diffrax.Heun(), rtol=1e-6, atol=1e-6, steps="state")
+
+    def end(rate, how):
+        system = pendulum()
+        found = stm.integrate(system, swung(system, 0.7, rate), ts, how)
+        return found.states.r[-1, 0, 0], found
+
+    gradient, found = jax.jit(jax.grad(lambda rate: end(rate, method), has_aux=True))(1.0)
+    attempts = np.diff(found.counts.accepted + found.counts.rejected)
+    assert found.result == diffrax.RESULTS.successful
+    assert 16_384 < attempts[-1] < 100_000
+    ahead = replace(method, adjoint=diffrax.ForwardMode())
+    _, expected = jax.jit(lambda x: jax.jvp(lambda x: end(x, ahead)[0], (x,), (1.0,)))(1.0)
+    assert gradient == pytest.approx(float(expected), rel=1e-9)
 
 
 def test_in_diffrax_itself():
