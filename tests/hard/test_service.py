@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -69,6 +70,32 @@ def test_threads_do_not_disturb_each_other():
     with ThreadPoolExecutor(4) as pool:
         together = [bits(run) for run in pool.map(flown, masses)]
     assert together == alone
+
+
+def chained(count: int) -> stm.Run:
+    """A chain of so many links, each number of them a program of its own."""
+    bodies = [
+        stm.Body(f"link{k}", 1.0, (0.02, 0.02, 0.01), position=(0.0, 0.0, -0.2 - 0.4 * k))
+        for k in range(count)
+    ]
+    names = ["ground", *(body.name for body in bodies)]
+    hinges = [
+        stm.revolute(f"hinge{k}", *pair, point=(0.0, 0.0, -0.4 * k), axis=(0.0, 1.0, 0.0))
+        for k, pair in enumerate(pairwise(names))
+    ]
+    system = stm.System(bodies, hinges, [stm.Gravity()])
+    start = stm.state_from_joints(system, {f"hinge{k}": 0.5 - 0.1 * k for k in range(count)})
+    return stm.simulate(system, start, ts=TIMES, analysis=False)
+
+
+@pytest.mark.slow
+def test_threads_compile_different_programs_at_once():
+    """Four systems of different structure, none compiled before; then one by one, compiled again."""
+    jax.clear_caches()
+    with ThreadPoolExecutor(4) as pool:
+        together = [bits(run) for run in pool.map(chained, range(1, 5))]
+    jax.clear_caches()
+    assert [bits(chained(count)) for count in range(1, 5)] == together
 
 
 def test_importing_leaves_the_settings_of_jax_alone():
