@@ -16,10 +16,10 @@ ROOMS = sorted(stub.parent.name for stub in Path(stm.__file__).parent.glob("*/__
 
 # Pages whose Python runs here, with the number of blocks; and which of them take long.
 RUN = {
-    "estimation": 5, "gpu": 1, "index": 2, "own_data": 3, "parameters_file": 1,
+    "contact": 1, "estimation": 5, "gpu": 1, "index": 2, "own_data": 3, "parameters_file": 1,
     "reading_results": 1, "viewer": 2, "which_solver": 1,
 }  # fmt: skip
-LONG = {"estimation", "index", "reading_results", "viewer", "which_solver"}
+LONG = {"contact", "estimation", "index", "reading_results", "viewer", "which_solver"}
 # Pages whose Python runs in tests of their own.
 ELSEWHERE = {
     "control": "tests/control/test_page.py",
@@ -63,6 +63,7 @@ def test_python_of_a_page_runs(name, tmp_path, monkeypatch):
 
 # What a page leaves behind, beyond running without an error.
 CHECKS = {
+    "contact": lambda n: abs(float(n["gear"].normal_forces(n["idle"].kinematics(n["at_end"])).sum()) / 53.04267 - 1) < 1e-3,
     "index": lambda n: n["run"].successful and Path("flight.html").stat().st_size > 100_000,
     "own_data": lambda n: abs(n["out"].mean[-1, 1] + 9.81 * 0.5) < 0.5,
     "parameters_file": lambda n: n["scene"].parameters["mass.panel_7"]["value"] == 0.95,

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from ..algebra import lapack
 from ..checks.errors import ModelError
 from ..flight.sensed import centre_of_mass, inertia_about_centre, inner_momentum
+from ..mechanics.forces.contact import GroundContact
 from ..mechanics.state import State
 from ..mechanics.system import System
 from ..rotorcraft.allocation import RotorLimits, check_lift, wrench_map
@@ -18,6 +19,7 @@ from ..rotorcraft.rotor import Rotors
 from ..sensing.sensors import gravity_of
 from .estimator import state_of
 from .geometric import (
+    BaseMotion,
     FlightGains,
     MassProperties,
     Waypoint,
@@ -37,11 +39,28 @@ class FlightMemory(NamedTuple):
     integral: Float[Array, "3"]
 
 
+class Feet(eqx.Module):
+    """Feet of the base of a machine, as its controller knows them.
+
+    Attributes:
+        places: from the base's centre of mass, its axes (k, 3) [m].
+        ground: heights of the ground under them, world (k,) [m].
+    """
+
+    places: Float[Array, "k 3"]
+    ground: Float[Array, " k"]
+
+    def touches(self, base: BaseMotion) -> Bool[Array, ""]:
+        """True if a foot is below the ground's height."""
+        return jnp.any(base.r[2] + self.places @ base.R[2] < self.ground)
+
+
 class FlightController(eqx.Module):
     """Controller of the rotors: position and heading of the machine's base follow a `Waypoint`.
 
     The estimate is a `State` of all bodies, a `MotionEstimate`, or the `BaseMotion` of the base; the
-    reference is a `Waypoint`, the memory a `FlightMemory`. While the rotors cannot give the wanted wrench, the
+    reference is a `Waypoint`, the memory a `FlightMemory`. While the rotors cannot give the wanted wrench, and
+    while a foot of the base's landing gear (`GroundContact`) is below the ground's height by the estimate, the
     integral of the position error stands still.
 
     Args:
@@ -67,6 +86,7 @@ class FlightController(eqx.Module):
     inverse: Float[Array, "k 4"]
     limits: RotorLimits | None
     period: Float[Array, ""]
+    feet: Feet | None
     working: tuple[int, ...] | None = eqx.field(static=True)
 
     def __init__(
@@ -114,6 +134,7 @@ class FlightController(eqx.Module):
         self.gains = FlightGains() if gains is None else gains
         self.limits, self.period = limits, jnp.asarray(1.0 / rate)
         self.mass = mass_properties(system, system.reference) if mass is None else mass
+        self.feet = feet_of(system)
 
     def start(self) -> FlightMemory:
         """First memory."""
@@ -142,6 +163,8 @@ class FlightController(eqx.Module):
             wrench = wrench.at[3].add(-self.gains.rate * mass.J[2, 2] * base.omega[2])
             squared, given = self._allocated_to_working(wrench)
         error = base.r - reference.r
+        if self.feet is not None:
+            given = given & ~self.feet.touches(base)
         integral = memory.integral + jnp.where(given, self.period, 0.0) * error
         return squared, FlightMemory(integral)
 
@@ -212,6 +235,16 @@ def _share(rise: Float[Array, "*s"], room: Float[Array, "*s"]) -> Float[Array, "
     limited = rise > jnp.maximum(room, 0.0)
     shares = jnp.where(limited, jnp.maximum(room, 0.0) / jnp.where(limited, rise, 1.0), 1.0)
     return jnp.min(shares) + 0.0 * jnp.sum(rise)
+
+
+def feet_of(system: System) -> Feet | None:
+    """Feet of the ground contacts of a system's first body; None without any."""
+    own = [f for f in system.forces if isinstance(f, GroundContact) and system.index(f.body) == 0]
+    if not own:
+        return None
+    heights = [jnp.full(len(f.feet), f.height) for f in own]
+    places = jnp.concatenate([f.feet - system.bodies.com[0] for f in own])
+    return Feet(places, jnp.concatenate(heights))
 
 
 def _rotors(force: Rotors | MotorRotors) -> Rotors:

@@ -17,6 +17,7 @@ from ..control.instruments import Instrument
 from ..mechanics import joint as joints
 from ..mechanics.body import Body
 from ..mechanics.forces import applied
+from ..mechanics.forces.contact import GroundContact
 from ..mechanics.forces.effort import JointEffort
 from ..mechanics.forces.joint import EndStop, JointFriction, JointServo
 from ..mechanics.load import SineMotion
@@ -186,6 +187,11 @@ FORCES: dict[str, Kind] = {
         "coordinate": _WHICH,
     }),
     "effort": Kind(JointEffort, "joint", {"effort": _EFFORT, "coordinate": _WHICH}),
+    "ground_contact": Kind(GroundContact, "body", {
+        "feet": Slot(Vectors, "m"), "height": _LENGTH, "stiffness": Slot(Finite, "N/m"),
+        "damping": Slot(Finite, "N s/m"), "width": Slot(Finite, "m"), "friction": Slot(Finite, "1"),
+        "slip_speed": Slot(Finite, "m/s"),
+    }),
     "force": Kind(applied.AppliedForce, "body", {
         "force": Entry(Triple, "N"), "frame": _FRAME, "point": _maybe(_POINT),
     }),

@@ -12,6 +12,9 @@ from .forces.applied import (
     LinearSpringDamper as LinearSpringDamper,
     TorsionalSpringDamper as TorsionalSpringDamper,
 )
+from .forces.contact import (
+    GroundContact as GroundContact,
+)
 from .forces.effort import (
     JointEffort as JointEffort,
 )

@@ -10,6 +10,7 @@ from ..algebra.rotation import rotation_matrix
 from ..control.estimator import MotionEstimate
 from ..control.panel import PanelBodies, panel_motion
 from ..control.rolling import Sample
+from ..mechanics.forces.contact import GroundContact
 from ..mechanics.internal import internal_names
 from ..mechanics.state import State
 from ..mechanics.system import System
@@ -39,6 +40,8 @@ GAUGES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "panel_error": (_TIME, "rad", "angle of the panel's normal from its reference"),
     "displacement": (_SLIDERS, "m", "of the sliders from the initial posture"),
     "actuator_power": (_TIME, "W", "mechanical power of both actuators"),
+    "gear_load": (_TIME, "N", "of the ground on all feet of the landing gear, upwards"),
+    "gear_depth": (_TIME, "m", "of the lowest foot below the ground's height, negative in flight"),
 }
 
 
@@ -51,6 +54,7 @@ class Gauges(eqx.Module):
         gravity: acceleration of free fall (3,) [m/s^2].
         efficiency: of the motors [1]. other: power of everything else [W].
         places: places of the rotor speeds among the states of force elements; none without lag.
+        grounded: system of a machine with a landing gear, else None.
     """
 
     k_tau: Float[Array, ""]
@@ -59,6 +63,7 @@ class Gauges(eqx.Module):
     gravity: Float[Array, "3"]
     efficiency: Float[Array, ""]
     other: Float[Array, ""]
+    grounded: System | None
     places: tuple[int, ...] = eqx.field(static=True)
     rotors: int = eqx.field(static=True)
 
@@ -71,6 +76,8 @@ class Gauges(eqx.Module):
         names = internal_names(system)
         self.places = tuple(k for k, name in enumerate(names) if ": speed of rotor " in name)
         self.rotors = machine.rotors.spin.shape[0]
+        has_gear = any(isinstance(force, GroundContact) for force in system.forces)
+        self.grounded = system if has_gear else None
 
     def __call__(self, sample: Sample) -> dict[str, Any]:
         """Signals by name."""
@@ -93,6 +100,8 @@ class Gauges(eqx.Module):
         }
         if isinstance(sample.estimate, MotionEstimate):
             found["estimated_position"] = sample.estimate.state.r[0]
+        if self.grounded is not None:
+            found |= gear_signals(self.grounded, state)
         pushing = jnp.zeros(())
         if self.bodies is not None:
             own = self._panel(state, sample.reference, sample.inputs[self.rotors :])
@@ -120,6 +129,15 @@ class Gauges(eqx.Module):
             "displacement": moved.value - self.home,
             "actuator_power": forces @ moved.rate,
         }
+
+
+def gear_signals(system: System, state: State) -> dict[str, Any]:
+    """Load on a landing gear [N] and depth of its lowest foot [m]."""
+    kin = system.kinematics(state)
+    contacts = [force for force in system.forces if isinstance(force, GroundContact)]
+    loads = [jnp.sum(force.normal_forces(kin)) for force in contacts]
+    depths = [jnp.max(force.depths(kin)) for force in contacts]
+    return {"gear_load": sum(loads), "gear_depth": jnp.max(jnp.stack(depths))}
 
 
 def _between(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:

@@ -25,6 +25,7 @@ from ..control.plant import Plant
 from ..environment.ephemeris import Place
 from ..environment.sun import sun_position
 from ..files.netcdf import FileError, read_toml
+from ..mechanics.forces.contact import GroundContact
 from ..parameters.energy import ENERGY
 from ..rotorcraft.battery import Battery
 from ..sensing.sensors import gravity_of
@@ -132,6 +133,7 @@ def make_mission(plain: Mapping[str, Any], folder: str | os.PathLike[str] = ".")
     panel = _moves(given, machine) if machine.bodies is not None else None
     if given.battery is not None and given.battery.state_of_charge <= (given.battery.reserve or 0):
         raise SettingError("'battery.state_of_charge' must be above its reserve.")
+    _check_gear(given, plant)
     mission = Mission(
         given, machine, plant, controller_of(given, machine, plant),
         References(_path(given.path, machine), panel), Gauges(machine, plant.system), _battery(given),
@@ -141,6 +143,16 @@ def make_mission(plain: Mapping[str, Any], folder: str | os.PathLike[str] = ".")
     if panel is not None:
         _check_panel(mission)
     return mission
+
+
+def _check_gear(given: MissionFile, plant: Plant) -> None:
+    """Raise `SettingError` for tolerances of a landing gear that the machine does not have."""
+    wanted = [k for k in ("touchdown", "sink") if getattr(given.tolerances, k) is not None]
+    if wanted and not any(isinstance(f, GroundContact) for f in plant.system.forces):
+        raise SettingError(
+            f"'tolerances.{wanted[0]}' needs a landing gear, which this machine does not have: add "
+            "'options.gear = {}' to [machine]."
+        )
 
 
 def _path(given: PathEntry, machine: Machine) -> HeldPath | WaypointPath:

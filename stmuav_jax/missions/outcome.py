@@ -23,6 +23,8 @@ _BATTERY: dict[str, Label] = {
 # Round-off of speeds that are held at a limit, as a share of the range.
 _AT_LIMIT = 1e-9
 _DEGREE = math.pi / 180
+# Time in flight before a touchdown [s]; what follows sooner is a rebound.
+_ALOFT = 0.1
 # Round-off of times [s].
 _AT_ONCE = 1e-9
 
@@ -81,6 +83,8 @@ def measures(data: "xr.Dataset") -> list[Measure]:
         wanted = TolerancesEntry()
     late = data.sel(time=data.time >= wanted.after - _AT_ONCE)
     since = f" from {wanted.after:g} s on" if wanted.after else ""
+    if "gear_load" in data:
+        late, since = _in_flight(late), f"{since} in flight"
     off = np.linalg.norm(late.position_error.values, axis=1)
     found = [
         _largest(f"Largest position error{since}", off, "m", wanted.position),
@@ -96,8 +100,8 @@ def measures(data: "xr.Dataset") -> list[Measure]:
     ):  # fmt: skip
         if f"lowest_{limit}" in data:
             found.append(_margin(data, name, what, limit))
-    energy = _energy(data)
-    return [*found, *energy]
+    gear = _of_gear(data, wanted) if "gear_load" in data else []
+    return [*found, *gear, *_energy(data)]
 
 
 def _tolerances(data: "xr.Dataset") -> TolerancesEntry:
@@ -110,8 +114,34 @@ def _checked(data: "xr.Dataset") -> bool:
 
 
 def _largest(name: str, values: np.ndarray, unit: str, allowed: float | None) -> Measure:
-    value = float(np.max(values))
+    value = float(np.max(values, initial=0.0))
     return Measure(name, value, unit, allowed, allowed is None or value <= allowed)
+
+
+def _in_flight(data: "xr.Dataset") -> "xr.Dataset":
+    """Samples at which the ground carries nothing; there may be none."""
+    return data.sel(time=data.gear_load == 0.0)
+
+
+def _of_gear(data: "xr.Dataset", wanted: TolerancesEntry) -> list[Measure]:
+    """Speed of the touchdowns, which follow some time in flight, and how deep the feet sank."""
+    ts, aloft = data.time.values, data.gear_load.values == 0.0
+    period = float(ts[1] - ts[0]) if len(ts) > 1 else 1.0
+    window = max(round(_ALOFT / period), 1)
+    # samples in flight among the last ones, and the samples at which all of them are
+    count = np.cumsum(aloft)
+    before = count[window - 1 : -1] - np.concatenate([[0], count[: -window - 1]])
+    down = np.flatnonzero((before == window) & ~aloft[window:]) + window
+    found = []
+    if len(down):
+        fastest = float(np.max(-data.velocity.values[down - 1, 0, 2]))
+        kept = wanted.touchdown is None or fastest <= wanted.touchdown
+        found.append(Measure("Largest touchdown speed", fastest, "m/s", wanted.touchdown, kept))
+    deepest = max(float(np.max(data.gear_depth.values)), 0.0)
+    kept = wanted.sink is None or deepest <= wanted.sink
+    found.append(Measure("Deepest sink of the landing gear", deepest, "m", wanted.sink, kept))
+    carried = float(data.gear_load.values[-1])
+    return [*found, Measure("Load of the landing gear at the end", carried, "N")]
 
 
 def _margin(data: "xr.Dataset", name: str, what: str, limit: str) -> Measure:

@@ -191,12 +191,15 @@ class BatteryEntry(Entries):
 
 
 class TolerancesEntry(Entries):
-    """Entry for the largest errors that the verdict allows, from a time [s] on."""
+    """Entry for what the verdict allows: the largest errors from a time [s] on, the largest speed at
+    which a landing gear touches down [m/s], and its deepest sink into the ground [m]."""
 
     after: NotNegative = 0.0
     position: Positive | None = None
     tilt: Positive | None = None
     panel: Positive | None = None
+    touchdown: Positive | None = None
+    sink: Positive | None = None
 
 
 class MissionFile(Entries):

@@ -148,6 +148,15 @@ _AIR = {
     "motor.inertia": Parameter(1e-4, "kg m^2", _CHOICE + ", a rotor of about 0.3 m"),
     "motor.lowest": Parameter(200.0, "rad/s", _CHOICE),
     "motor.highest": Parameter(1900.0, "rad/s", _CHOICE + ", about twice the weight"),
+    "gear.spread": Parameter(0.15, "m", _CHOICE),
+    "gear.depth": Parameter(0.2, "m", _CHOICE),
+    # a start at the origin stands on it, its feet at the depth zero
+    "gear.ground": Parameter(-0.2, "m", _CHOICE + ", at the feet of a start at the origin"),
+    "gear.stiffness": Parameter(2e4, "N/m", _CHOICE + ", 0.9 mm under the weight of the UAV"),
+    "gear.damping": Parameter(150.0, "N s/m", _CHOICE + ", some 40 % of the critical"),
+    "gear.width": Parameter(1e-3, "m", _CHOICE),
+    "gear.friction": Parameter(0.6, "1", _CHOICE),
+    "gear.slip_speed": Parameter(0.02, "m/s", _CHOICE),
 }
 
 # strokes of (slider 2, slider 3) from the initial posture; |phi|, |theta| <= 45 degrees need

@@ -4,6 +4,7 @@ from .flight_options import (
     BaseStart as BaseStart,
     Drag as Drag,
     FlightStart as FlightStart,
+    Gear as Gear,
     Motor as Motor,
     Wind as Wind,
 )

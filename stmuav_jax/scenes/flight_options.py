@@ -1,6 +1,6 @@
-"""Options of flying scenes: drag, wind, motors, and where the flight starts.
+"""Options of flying scenes: drag, wind, motors, landing gear, and where the flight starts.
 
-Numbers left out are those of the scene's parameter table ("drag.", "wind.", "gust.", "motor.");
+Numbers left out are those of the scene's parameter table ("drag.", "wind.", "gust.", "motor.", "gear.");
 numbers given go into the table that is kept with the results. `rotors_and_air.py` and `starts.py`
 build them; the command line reads this module without JAX.
 """
@@ -62,6 +62,27 @@ class Motor:
     inertia: Numbers | None = quantity("inertia of a rotor about its axis", "kg m^2")
     lowest: Numbers | None = quantity("lowest speed", "rad/s")
     highest: Numbers | None = quantity("highest speed", "rad/s")
+
+
+@dataclass(frozen=True)
+class Gear:
+    """Landing gear of the hexacopter on level ground, four feet at the corners of a square.
+
+    Attributes:
+        spread: half the side of the square [m]. depth: of the feet below the centre of mass [m].
+        ground: height of the ground, world [m].
+        stiffness: of each foot [N/m]. damping: of each foot [N s/m]. width: of the smoothing [m].
+        friction: coefficient of friction [1]. slip_speed: of its smoothing [m/s].
+    """
+
+    spread: Numbers | None = quantity("half the side of the feet's square", "m")
+    depth: Numbers | None = quantity("depth of the feet below the base's centre of mass", "m")
+    ground: Numbers | None = quantity("height of the ground", "m")
+    stiffness: Numbers | None = quantity("stiffness of each foot", "N/m")
+    damping: Numbers | None = quantity("damping of each foot", "N s/m")
+    width: Numbers | None = quantity("width of the smoothing", "m")
+    friction: Numbers | None = quantity("coefficient of friction", "1")
+    slip_speed: Numbers | None = quantity("speed of the friction's smoothing", "m/s")
 
 
 @dataclass(frozen=True)

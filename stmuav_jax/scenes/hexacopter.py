@@ -12,7 +12,7 @@ from ..mechanics.system import System
 from ..parameters.airframe import PART_II
 from ..parameters.table import Parameters
 from ..rotorcraft.rotor import Rotors, hover_speed_squared
-from .flight_options import BaseStart, Drag, Motor, Wind
+from .flight_options import BaseStart, Drag, Gear, Motor, Wind
 from .rotors_and_air import flight
 from .starts import STARTED, base_state
 
@@ -35,6 +35,7 @@ def hexacopter(
     drag: Drag | None = None,
     wind: Wind | Numbers | Callable[..., object] | None = None,
     motor: Motor | None = None,
+    gear: Gear | None = None,
     start: BaseStart | None = None,
 ) -> Scene:
     """Scene of the bare hexacopter rising with constant, equal rotor speeds; it has no joints.
@@ -47,6 +48,7 @@ def hexacopter(
         wind: a `Wind`, or the air's velocity, world (3,) [m/s], or a function of
             (t, kinematics); it needs drag.
         motor: lag, inertia and limits of the rotors; the report has none.
+        gear: landing gear on level ground; the report has none.
         start: of the flight; the report's is level and at rest at the origin.
 
     Raises:
@@ -59,13 +61,15 @@ def hexacopter(
     weight = mass * jnp.linalg.norm(jnp.asarray(gravity, dtype=float))
     air = flight(
         rotors("hexacopter", parameters, lift * hover), weight, parameters,
-        drag=drag, wind=wind, motor=motor,
+        drag=drag, wind=wind, motor=motor, gear=gear,
     )  # fmt: skip
     system = System(
         [Body("hexacopter", mass, parameters.value("bare.inertia"), free=True)],
         forces=[Gravity(gravity), *air.forces],
     )
-    options = tuple(g for g in ("drag.", "wind.", "gust.", "motor.") if g not in air.unused)
+    options = tuple(
+        g for g in ("drag.", "wind.", "gust.", "motor.", "gear.") if g not in air.unused
+    )
     keep = ("bare.", "rotor.", "gravity", *options)
     return Scene(
         name="hexacopter",

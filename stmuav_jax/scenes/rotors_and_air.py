@@ -1,24 +1,27 @@
-"""Rotors and air of a flying scene: what its options of drag, wind and motors build."""
+"""Rotors, air and gear of a flying scene: what its options of drag, wind, motors and gear build."""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from ..checks.errors import ModelError, concrete
+from ..checks.numbers import array_module, as_numpy, floats
 from ..checks.shapes import Numbers
 from ..environment.wind import Gusts, dryden, low_altitude
+from ..mechanics.forces.contact import GroundContact
 from ..mechanics.load import AbstractForce
 from ..parameters.table import Parameters
 from ..rotorcraft.allocation import RotorLimits, check_lift
 from ..rotorcraft.drag import AirframeDrag
 from ..rotorcraft.motor import MotorRotors
 from ..rotorcraft.rotor import Rotors
-from .flight_options import Drag, Motor, Wind
+from .flight_options import Drag, Gear, Motor, Wind
 
 
 class RotorsAndAir(NamedTuple):
-    """Rotors and air of a scene.
+    """Rotors, air and gear of a scene.
 
     Attributes:
         forces: the elements. parameters: the scene's table with the numbers they have.
@@ -39,6 +42,7 @@ def flight(
     drag: Drag | None = None,
     wind: Wind | Numbers | Callable[..., object] | None = None,
     motor: Motor | None = None,
+    gear: Gear | None = None,
 ) -> RotorsAndAir:
     """The rotors and what the given options add; None costs nothing.
 
@@ -55,7 +59,7 @@ def flight(
         raise ModelError(
             "Wind acts through the airframe's drag: give drag=Drag() with it (--drag)."
         )
-    groups: dict[str, object] = {"drag": drag, "motor": motor}
+    groups: dict[str, object] = {"drag": drag, "motor": motor, "gear": gear}
     for group, option in groups.items():
         if option is not None:
             given = {f"{group}.{k}": v for k, v in vars(option).items() if v is not None}
@@ -73,13 +77,16 @@ def flight(
         numbers = {k: parameters.value(f"drag.{k}") for k in ("linear", "quadratic")}
         centre = parameters.value("drag.centre")
         forces.append(AirframeDrag(rotors.body, **numbers, point=centre, wind=air))
+    if gear is not None:
+        forces.append(_gear(rotors.body, parameters))
     used = {
         "drag.": drag is not None,
         "wind.": isinstance(wind, Wind),
         "gust.": isinstance(wind, Wind) and wind.gusts,
         "motor.": motor is not None,
+        "gear.": gear is not None,
     }
-    words = {"drag": drag, "wind": wind, "motors": motor}
+    words = {"drag": drag, "wind": wind, "motors": motor, "landing gear": gear}
     names = ", ".join(name for name, option in words.items() if option is not None)
     notes = (f"Not in the report: {names}.",) if names else ()
     unused = tuple(group for group, is_used in used.items() if not is_used)
@@ -91,6 +98,17 @@ def _motors(rotors: Rotors, weight: Numbers, parameters: Parameters) -> MotorRot
     check_lift(rotors, limits, weight)
     numbers = {k: parameters.value(f"motor.{k}") for k in ("time_constant", "inertia")}
     return MotorRotors(rotors, **numbers, limits=limits)
+
+
+def _gear(body: str, parameters: Parameters) -> GroundContact:
+    lengths = [floats(parameters.value(f"gear.{k}")) for k in ("spread", "depth")]
+    spread, depth = as_numpy(lengths)
+    module = array_module(spread, depth)
+    corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    feet = module.concatenate([spread * corners, -depth * np.ones((4, 1))], axis=1)
+    keys = ("stiffness", "damping", "width", "friction", "slip_speed")
+    numbers = {k: parameters.value(f"gear.{k}") for k in keys}
+    return GroundContact(body, feet=feet, height=parameters.value("gear.ground"), **numbers)
 
 
 def _wind(parameters: Parameters, wind: Wind) -> Numbers | Gusts:

@@ -22,7 +22,7 @@ from ..tracker.drive import slider_drive, stroke_drivers
 from ..tracker.geometry import tracker_geometry
 from ..tracker.tracker_options import Friction, Servo, Stops, Strokes
 from ..tracker.workspace import tracker_limits
-from .flight_options import Drag, FlightStart, Motor, Wind
+from .flight_options import Drag, FlightStart, Gear, Motor, Wind
 from .hexacopter import rotors
 from .rotors_and_air import RotorsAndAir, flight
 from .starts import STARTED, flight_state
@@ -48,6 +48,7 @@ def uav_tracker(
     drag: Drag | None = None,
     wind: Wind | Numbers | Callable[..., object] | None = None,
     motor: Motor | None = None,
+    gear: Gear | None = None,
     start: FlightStart | None = None,
 ) -> Scene:
     """Scene of the report's seven-body UAV.
@@ -65,6 +66,7 @@ def uav_tracker(
         drag: of the hexacopter's airframe; the report has none. wind: a `Wind`, or the air's
             velocity, world (3,) [m/s], or a function of (t, kinematics); needs drag.
         motor: lag, inertia and limits of the rotors; the report has none.
+        gear: landing gear on level ground; the report has none.
         start: of base and panel; the report's is level and at rest in the initial posture.
 
     Raises:
@@ -78,7 +80,7 @@ def uav_tracker(
         BASE, parameters.value(f"mass.{BASE}"), parameters.value(f"inertia.{BASE}"), free=True
     )
     drive = slider_drive(parameters, servo=servo, stops=stops, friction=friction)
-    air = _flight(case, drive.parameters, drag=drag, wind=wind, motor=motor)
+    air = _flight(case, drive.parameters, drag=drag, wind=wind, motor=motor, gear=gear)
     unused = ("bare.", "workspace.", *drive.unused, *air.unused)
     joints = tracker_joints(parameters, BASE, shift)
     system = System(

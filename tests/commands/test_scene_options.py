@@ -14,7 +14,7 @@ from stmuav_jax.commands.scene_options import scene_among
 from stmuav_jax.commands.simulate import scene_of
 from stmuav_jax.files.netcdf import load
 from stmuav_jax.montecarlo.study import study_from_plain
-from stmuav_jax.scenes import BaseStart, Drag, FlightStart, Motor, Wind
+from stmuav_jax.scenes import BaseStart, Drag, FlightStart, Gear, Motor, Wind
 from stmuav_jax.scenes.registry import SCENES, RegisteredScene
 from stmuav_jax.tracker import Friction, PanelStart, Servo, Stops, Strokes
 
@@ -49,6 +49,10 @@ LINES = {
     "uav_tracker --case 1 --drag.linear 0.1 0.1 0.2 --start.phi -0.2 --start.q 0.1": (
         1, {"drag": Drag(linear=(0.1, 0.1, 0.2)), "start": FlightStart(phi=-0.2, q=0.1)},
     ),
+    "hexacopter --gear.friction 0.5 --gear.depth 0.25 --start.z 0.1": (
+        None, {"gear": Gear(friction=0.5, depth=0.25), "start": BaseStart(z=0.1)},
+    ),
+    "uav_tracker --gear": (None, {"gear": Gear()}),
     "uav_tracker --actuators printed": (None, {"actuators": "printed"}),
 }  # fmt: skip
 
@@ -115,6 +119,11 @@ def test_a_run_with_options_is_that_of_the_library(tmp_path):
         ("tracker --friction.speed 0", "speed of the friction in joint 'T12' must be positive"),
         ("tracker --start.phi 1.5", "its rods do not reach so far"),
         ("tracker --strokes.duration 0", "duration of the strokes' rise must be positive"),
+        (
+            "hexacopter --gear.width 0",
+            "width of the ground contact of body 'hexacopter' must be positive",
+        ),
+        ("hexacopter --gear.feet 4", "There is no --gear.feet; hexacopter has --gear.damping"),
         ("hexacopter --wind", "Wind acts through the airframe's drag"),
         ("hexacopter --drag --wind.gusts --wind.mean 0 0 0", "must not be zero"),
         ("hexacopter --motor.highest 300", "N are required"),

@@ -122,3 +122,22 @@ def test_machines_that_the_controller_cannot_fly_are_refused():
         control.FlightGains(position=-1.0)
     with pytest.raises(stm.ModelError, match="position of a waypoint"):
         control.at_point([0.0, 1.0])
+
+
+def test_the_integral_stands_still_on_the_ground():
+    """A foot at the ground's height counts by the attitude; without a gear nothing does."""
+    tilted = [np.cos(0.1), np.sin(0.1), 0.0, 0.0]
+    for gear, height, p, moves in (
+        (stm.scenes.Gear(), 0.001, [1.0, 0.0, 0.0, 0.0], True),
+        (stm.scenes.Gear(), -0.001, [1.0, 0.0, 0.0, 0.0], False),
+        (stm.scenes.Gear(), 0.001, tilted, False),
+        (None, -0.001, [1.0, 0.0, 0.0, 0.0], True),
+    ):
+        system = stm.make_scene("hexacopter", gear=gear).system
+        pilot = control.FlightController(system, 400.0, limits=LIMITS)
+        state = stm.State(
+            jnp.array([[0.1, 0.0, height]]), jnp.array([p]), jnp.zeros((1, 3)), jnp.zeros((1, 3))
+        )
+        _, memory = pilot(state, control.at_point([0.0, 0.0, -0.2]), pilot.start())
+        wanted = [0.1 / 400, 0.0, (height + 0.2) / 400] if moves else np.zeros(3)
+        np.testing.assert_allclose(memory.integral, wanted, rtol=1e-12)

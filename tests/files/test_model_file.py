@@ -28,6 +28,7 @@ from stmuav_jax.files.model_schema import (
 )
 from stmuav_jax.mechanics import (
     EndStop,
+    GroundContact,
     JointFriction,
     JointServo,
     SineMotion,
@@ -234,6 +235,16 @@ def everything():
         EndStop("translational", lower=-1 / 3, stiffness=1e9, damping=0, width=1e-3),
         JointFriction("revolute", coulomb=1, speed=1e-3),
         stm.JointEffort("translational", 3.0),
+        GroundContact(
+            "b1",
+            feet=[odd, [1.0, 2.0, 3.0]],
+            height=-0.1,
+            stiffness=1e4,
+            damping=1 / 3,
+            width=1e-3,
+            friction=0.6,
+            slip_speed=0.02,
+        ),
         stm.AppliedForce("b1", odd, frame="body", point=odd),
         stm.AppliedMoment("b1", odd),
         Rotors("b2", arms=np.eye(3), spin=[1, -1, 1], k_f=1e-6, k_tau=1e-8, speed_squared=odd),

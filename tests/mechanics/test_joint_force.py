@@ -11,7 +11,7 @@ import pytest
 from helpers import central, np_rotation, random_quaternion, state_of, turn
 
 import stmuav_jax as stm
-from stmuav_jax.mechanics.forces.joint import ramp, ramp_area, ramp_slope
+from stmuav_jax.mechanics.forces.ramp import ramp, ramp_area, ramp_slope
 
 COM = {"a": np.array([0.1, -0.2, 0.05]), "b": np.array([-0.3, 0.1, 0.2])}
 POINT = np.array([0.2, 0.3, -0.1])

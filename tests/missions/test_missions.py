@@ -18,7 +18,8 @@ from stmuav_jax.commands.fly import NOT_KEPT, UNFINISHED, Fly
 from stmuav_jax.files.netcdf import load_checkpoint, save_checkpoint
 from stmuav_jax.missions.keep import load_reached, save_reached
 from stmuav_jax.missions.mission import LIBRARY
-from stmuav_jax.missions.schema import MissionFile
+from stmuav_jax.missions.outcome import _in_flight, _of_gear
+from stmuav_jax.missions.schema import MissionFile, TolerancesEntry
 
 missions = stm.missions
 ROOT = Path(__file__).parents[2]
@@ -262,6 +263,8 @@ def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
             "cannot be held without rotor 1",
         ),
         ({"wind__steady": [0.0, 0.0, 0.0]}, "must not be zero"),
+        ({"tolerances__sink": 0.01}, "'tolerances.sink' needs a landing gear"),
+        ({"tolerances__touchdown": 0.0}, "'tolerances.touchdown' must be finite and positive"),
         ({"sensors": {"position": {"rate": 33.0}}}, "not a whole part"),
         ({"battery__state_of_charge": 0.2, "battery__reserve": 0.3}, "above its reserve"),
     ],
@@ -284,6 +287,31 @@ def test_the_ready_missions_and_the_pages_example_fit_the_schema():
     assert set(names) <= set(re.findall(r"`([a-z0-9-]+)`", page.split("## In Python")[0]))
     listed = str(Fly.__doc__).replace("case-1 to case-3", "case-1 case-2 case-3")
     assert all(name in listed for name in names)
+
+
+def test_a_touchdown_follows_a_time_in_flight_and_rebounds_do_not():
+    """Of a made-up record: stands, flies, touches down, rebounds, stands."""
+    ts = np.arange(100) * 0.02
+    load = np.where((ts < 0.5) | (ts > 1.01), 30.0, 0.0)
+    load[55:58] = 0.0
+    v = np.zeros((100, 1, 3))
+    v[:, 0, 2] = -0.01 * np.arange(100)
+    time = {"time": ts}
+    data = xr.Dataset(
+        {"gear_load": ("time", load), "gear_depth": ("time", load / 1e4 - 1e-3),
+         "velocity": (("time", "body", "axis"), v)}, time,
+    )  # fmt: skip
+    wanted = TolerancesEntry(touchdown=0.4, sink=0.1)
+    speed, sink, carried = _of_gear(data, wanted)
+    assert (speed.value, speed.allowed, speed.kept) == (pytest.approx(0.5), 0.4, False)
+    assert (sink.value, sink.kept) == (pytest.approx(2e-3), True)
+    assert carried.value == 30.0
+    assert _in_flight(data).time.values.tolist() == ts[load == 0.0].tolist()
+    never = data.assign(gear_load=("time", np.full(100, 30.0)))
+    assert _in_flight(never).sizes["time"] == 0
+    assert [one.name for one in _of_gear(never, wanted)] == [sink.name, carried.name]
+    # shorter than the time in flight that a touchdown takes
+    assert len(_of_gear(data.isel(time=slice(0, 3)), TolerancesEntry())) == 2
 
 
 @pytest.mark.slow
@@ -315,3 +343,34 @@ def test_case_1_is_flown_by_the_command(tmp_path, capsys):
     ):
         with pytest.raises(stm.SettingError, match=words):
             missions.make_mission(uav | {"panel": panel})
+
+
+@pytest.mark.slow
+def test_a_flight_starts_and_ends_on_the_ground(tmp_path, capsys):
+    """The ready mission: it stands, takes off, lands slowly, and stands where it stood."""
+    assert main(["fly", "takeoff-and-land", "--figures", "none", "--out", str(tmp_path)]) == 0
+    words = capsys.readouterr().out
+    assert "Largest touchdown speed" in words
+    data = stm.files.load(tmp_path / "flight.nc")
+    z, load, ts = data.position.values[:, 0, 2], data.gear_load.values, data.time.values
+    weight = 9.81 * stm.PART_II.value("bare.mass")
+    thrust = stm.PART_II.value("rotor.k_f") * np.sum(data.rotor_speed.values**2, axis=1)
+    for at in ((ts > 0.5) & (ts < 1.0), ts > 21.5):
+        # it stands: thrust and gear carry the weight, at the depth of what the gear carries
+        np.testing.assert_allclose((thrust + load)[at], weight, rtol=1e-3)
+        np.testing.assert_allclose(z[at], -load[at] / (4 * 2e4) - 0.5e-3, atol=2e-6)
+        np.testing.assert_allclose(thrust[at] / weight, 1 - 9 * 0.8 / 9.81, atol=2e-3)
+    aloft = (ts > 8.0) & (ts < 14.0)
+    assert not np.any(load[aloft])
+    assert np.max(z) == pytest.approx(1.0, abs=0.01)
+    # touchdowns by hand: no load for a tenth of a second before; the first is the fastest
+    down, *_ = [k for k in range(40, len(ts)) if load[k] and not np.any(load[k - 40 : k])]
+    (speed,) = [one for one in missions.measures(data) if one.name == "Largest touchdown speed"]
+    assert speed.value == pytest.approx(-data.velocity.values[down - 1, 0, 2], rel=1e-12)
+    assert 0.1 < speed.value < 0.5
+    # a mass on springs: the energy of the touchdown bounds the sink
+    deepest = np.max(data.gear_depth.values)
+    assert deepest < 0.5e-3 + load[-1] / 8e4 + speed.value * np.sqrt(
+        stm.PART_II.value("bare.mass") / 8e4
+    )
+    assert float(data.tilt_error.max()) < np.radians(1.0)

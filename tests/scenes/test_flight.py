@@ -61,6 +61,29 @@ def test_numbers_given_are_used_and_kept():
     assert "wind.mean" not in plain.parameters
 
 
+def test_the_gear_of_a_scene_stands_below_its_base():
+    scene = stm.make_scene("uav_tracker", 1, gear=stm.scenes.Gear(spread=0.3, ground=1.0))
+    gear = scene.system.forces[-1]
+    assert isinstance(gear, stm.mechanics.GroundContact)
+    assert gear.body == "hexacopter_1"
+    feet = [[x, y, -0.2] for x, y in ((0.3, 0.3), (-0.3, 0.3), (-0.3, -0.3), (0.3, -0.3))]
+    np.testing.assert_allclose(gear.feet, feet)
+    numbers = {
+        "height": 1.0,
+        "stiffness": 2e4,
+        "damping": 150,
+        "width": 1e-3,
+        "friction": 0.6,
+        "slip_speed": 0.02,
+    }
+    for name, value in numbers.items():
+        np.testing.assert_allclose(getattr(gear, name), value)
+    assert scene.parameters["gear.ground"]["source"] == "given by the user"
+    assert "Not in the report: landing gear." in scene.notes
+    assert "gear.ground" not in stm.make_scene("uav_tracker", 1).parameters
+    assert "gear.depth" in stm.make_scene("hexacopter", gear=stm.scenes.Gear()).parameters
+
+
 @pytest.mark.parametrize(
     "name", ["hexacopter", pytest.param("uav_tracker", marks=pytest.mark.slow)]
 )
@@ -96,6 +119,10 @@ def test_a_flight_in_gusts_keeps_its_balances(name, tmp_path):
         (
             {"drag": stm.scenes.Drag(), "wind": stm.scenes.Wind(height=1.0, gusts=True)},
             "3.048 to 304.8 m",
+        ),
+        (
+            {"gear": stm.scenes.Gear(stiffness=0.0)},
+            "stiffness of the ground contact .* must be positive",
         ),
         ({"motor": stm.scenes.Motor(time_constant=0.0)}, "must be positive"),
         ({"motor": stm.scenes.Motor(highest=1000.0)}, r"72.25 N are required.* 39.28 N"),

@@ -12,7 +12,6 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ...checks.errors import ModelError, concrete
@@ -23,6 +22,7 @@ from ..joint_coordinate import JointCoordinate, choose, coordinate
 from ..joint_kind import Which
 from ..load import AbstractForce, ActsOn, Load
 from ..state import Kinematics
+from .ramp import one_sided_push, ramp_area
 
 
 class AbstractJointForce(AbstractForce):
@@ -195,14 +195,7 @@ class EndStop(AbstractJointForce):
                 )
 
     def _push(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
-        spring = self.stiffness * ramp(depth, self.width)
-        damper = self.damping * ramp_slope(depth, self.width) * rate
-        # the division's derivatives contain 1 / spring^3, which overflows for smaller values
-        contact = spring > np.finfo(spring.dtype).tiny ** 0.25
-        span = jnp.where(contact, spring, 1.0)
-        # half of the push remains: if all of it vanished before the spring is slack, no force would
-        # show the step control that the spring's potential is still being released
-        return jnp.where(contact, 0.5 * span + ramp(span + damper, span), 0.0)
+        return one_sided_push(depth, rate, self.stiffness, self.damping, self.width)
 
     def law(
         self, x: Float[Array, ""], x_rate: Float[Array, ""], t: Float[Array, ""]
@@ -271,29 +264,6 @@ class JointFriction(AbstractJointForce):
 
     def centre(self, t: Float[Array, ""]) -> Float[Array, ""]:
         return jnp.zeros_like(t)
-
-
-# --- a ramp with a smooth start
-
-
-def ramp(d: Float[Array, ""], w: Float[Array, ""]) -> Float[Array, ""]:
-    """Smooth ramp: 0 up to d = 0, d - w/2 from d = w, three times continuously differentiable."""
-    u = jnp.clip(d / w, 0.0, 1.0)
-    inner = w * u**4 * (2.5 - 3 * u + u * u)
-    return jnp.where(d < w, inner, d - 0.5 * w)
-
-
-def ramp_slope(d: Float[Array, ""], w: Float[Array, ""]) -> Float[Array, ""]:
-    """Derivative of `ramp` with respect to d, from 0 to 1."""
-    u = jnp.clip(d / w, 0.0, 1.0)
-    return u**3 * (10 - 15 * u + 6 * u * u)
-
-
-def ramp_area(d: Float[Array, ""], w: Float[Array, ""]) -> Float[Array, ""]:
-    """Integral of `ramp` from 0 to d."""
-    u = jnp.clip(d / w, 0.0, 1.0)
-    inner = w * w * u**5 * (0.5 - 0.5 * u + u * u / 7)
-    return jnp.where(d < w, inner, 0.5 * (d - 0.5 * w) ** 2 + w * w / 56)
 
 
 # --- checks of user input
