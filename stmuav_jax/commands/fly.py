@@ -23,7 +23,7 @@ class Fly:
 
     A mission is a TOML file (docs/missions.md) or a ready one: hover, case-1 to case-3,
     sun-slew, sun-day, waypoints, wind-step, gusts, rotor-weak, rotor-lost, rotor-lost-known,
-    slider-jammed, battery, takeoff-and-land.
+    slider-jammed, slew-30, battery, takeoff-and-land.
     Example: stmuav fly case-1 --t1 5. Exit code: 0 all tolerances and limits were kept; 1 the flight
     failed; 2 wrong input; 3 flown, but not as the mission asks."""
 

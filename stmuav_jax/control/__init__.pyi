@@ -1,5 +1,16 @@
 """Public names of this folder; `__init__.py` imports each when it is first used."""
 
+from .adaptation.adaptive import (
+    AdaptiveController as AdaptiveController,
+    AdaptiveMemory as AdaptiveMemory,
+)
+from .adaptation.moments import (
+    Payload as Payload,
+)
+from .adaptation.payload_filter import (
+    PayloadFilter as PayloadFilter,
+    PayloadMemory as PayloadMemory,
+)
 from .closed_loop import (
     LoopCertificate as LoopCertificate,
     LoopRun as LoopRun,

@@ -75,6 +75,7 @@ class MotionEstimate(NamedTuple):
         panel: those of the panel angles and their rates; None without a tracker.
         nis: normalised innovation squared of the fixes that arrived now.
         components: number of their components, zero where none arrived.
+        force: accelerometer's reading less its bias, base axes (3,) [m/s^2].
     """
 
     state: State
@@ -82,6 +83,7 @@ class MotionEstimate(NamedTuple):
     panel: Belief | None
     nis: Float[Array, ""]
     components: Float[Array, ""]
+    force: Float[Array, "3"]
 
 
 class EstimatorMemory(NamedTuple):
@@ -138,7 +140,7 @@ def strapdown(
     return moved, errors
 
 
-def _corrected(
+def one_by_one(
     P: Float[Array, "n n"],
     H: Float[Array, "m n"],
     variance: Float[Array, " m"],
@@ -304,7 +306,8 @@ class MotionEstimator(eqx.Module):
         )
         panel = None if memory.panel is None else self._panel(memory.panel, h, encoders)
         state = self._state(base.mean, turning - base.mean["gyroscope_bias"], panel)
-        found = MotionEstimate(state, base, panel, nis, 3.0 * jnp.sum(fresh))
+        felt = force - base.mean["accelerometer_bias"]
+        found = MotionEstimate(state, base, panel, nis, 3.0 * jnp.sum(fresh), felt)
         return found, EstimatorMemory(base, panel, turning, jnp.ones((), bool))
 
     def _fixed(
@@ -333,7 +336,7 @@ class MotionEstimator(eqx.Module):
         )
         fresh = jnp.repeat(jnp.stack([position.fresh, attitude.fresh]), 3)
         error = jnp.concatenate([off, turned])
-        move, P, nis = _corrected(P, H, self.variance[:6], error, fresh)
+        move, P, nis = one_by_one(P, H, self.variance[:6], error, fresh)
         return Belief(_BASE.retract(x, move), P), nis
 
     def _panel(self, before: Belief, h: Float[Array, ""], encoders: list[Reading]) -> Belief:
@@ -348,7 +351,7 @@ class MotionEstimator(eqx.Module):
         error = jnp.concatenate([one.value for one in encoders]) - now + late @ x[2:]
         fresh = jnp.stack([one.fresh for one in encoders])
         H = jnp.concatenate([J, -late], axis=1)
-        move, P, _ = _corrected(0.5 * (P + P.T), H, self.variance[6:], error, fresh)
+        move, P, _ = one_by_one(0.5 * (P + P.T), H, self.variance[6:], error, fresh)
         return Belief(x + move, P)
 
     def _state(self, x: Point, omega: Float[Array, "3"], panel: Belief | None) -> State:

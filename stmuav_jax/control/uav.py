@@ -1,6 +1,6 @@
 """Controller of the UAV with its tracker: rotors and sliders together."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from ..mechanics.system import System
 from ..tracker.kinematics import PairMotion
 from .estimator import MotionEstimate, state_of
 from .flying import FlightController, FlightMemory, mass_properties
-from .geometric import Waypoint
+from .geometric import MassProperties, Waypoint
 from .panel import PanelServo, StrokeServo, facing, panel_motion
 
 
@@ -56,14 +56,26 @@ class UavController(eqx.Module):
     ) -> tuple[Float[Array, " m"], FlightMemory]:
         """Inputs (k + 2,): squared rotor speeds [rad^2/s^2] and forces [N]; and the memory."""
         state: State = state_of(estimate)
+        own = self.flight.mass
+        assert isinstance(own, MassProperties)
+        mass = mass_properties(self.system, state) if self.feedforward else own
+        return self.command(state, reference, memory, mass, self.servo)
+
+    def command(
+        self,
+        state: State,
+        reference: UavReference,
+        memory: FlightMemory,
+        mass: MassProperties,
+        servo: PanelServo | StrokeServo,
+    ) -> tuple[Float[Array, " m"], FlightMemory]:
+        """Inputs (k + 2,) and the memory, with given mass properties and a given servo."""
         flight, at = self.flight, reference.waypoint
-        assert isinstance(flight.mass, tuple)
-        mass: Any = mass_properties(self.system, state) if self.feedforward else flight.mass
         gravity_b = rotation_matrix(state.p[0]).T @ (flight.gravity - at.a)
         wanted = reference.panel
         if not isinstance(wanted, PairMotion):
             wanted = facing(jnp.asarray(wanted), state)
-        moved = self.servo.command(panel_motion(state), wanted, gravity_b, mass.centre)
+        moved = servo.command(panel_motion(state), wanted, gravity_b, mass.centre)
         if self.feedforward:
             mass = mass._replace(moment=moved.moment)
         squared, after = flight.command(state, at, memory, mass)

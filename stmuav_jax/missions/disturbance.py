@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..control.adaptation.adaptive import AdaptiveController, AdaptiveMemory
 from ..control.flying import FlightController, FlightMemory
 from ..control.panel import panel_motion
 from ..control.uav import UavController, UavReference
@@ -61,10 +62,13 @@ class Jam(eqx.Module):
         return jnp.where(jammed, pull, forces), held
 
 
+Pilot = FlightController | UavController | AdaptiveController
+
+
 class MissionMemory(NamedTuple):
     """Memory of the controller, and the strokes of jammed sliders (2,) [m], infinite for others."""
 
-    flight: FlightMemory
+    flight: FlightMemory | AdaptiveMemory
     held: Float[Array, "2"]
 
 
@@ -72,7 +76,7 @@ class Told(NamedTuple):
     """Controller that takes over at a time [s], because it is told of lost rotors."""
 
     at: Float[Array, ""]
-    pilot: FlightController | UavController
+    pilot: Pilot
 
 
 class MissionController(eqx.Module):
@@ -85,7 +89,7 @@ class MissionController(eqx.Module):
         jam: faults of the sliders, or None.
     """
 
-    pilot: FlightController | UavController
+    pilot: Pilot
     lost: Float[Array, " k"]
     share: Float[Array, " k"]
     jam: Jam | None
@@ -115,8 +119,9 @@ class MissionController(eqx.Module):
         return jnp.concatenate([rotors, forces]), MissionMemory(after, held)
 
 
-def _commanded(pilot: Any, estimate: Any, reference: MissionReference, memory: FlightMemory) -> Any:
-    if isinstance(pilot, FlightController):
+def _commanded(pilot: Any, estimate: Any, reference: MissionReference, memory: Any) -> Any:
+    own = pilot.pilot if isinstance(pilot, AdaptiveController) else pilot
+    if isinstance(own, FlightController):
         return pilot(estimate, reference.waypoint, memory)
     state = getattr(estimate, "state", estimate)
     return pilot(estimate, UavReference(reference.waypoint, wanted_panel(reference, state)), memory)

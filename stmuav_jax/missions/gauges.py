@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import rotation_matrix
+from ..control.adaptation.adaptive import AdaptiveMemory
 from ..control.estimator import MotionEstimate
 from ..control.panel import PanelBodies, panel_motion
 from ..control.rolling import Sample
@@ -42,6 +43,12 @@ GAUGES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "actuator_power": (_TIME, "W", "mechanical power of both actuators"),
     "gear_load": (_TIME, "N", "of the ground on all feet of the landing gear, upwards"),
     "gear_depth": (_TIME, "m", "of the lowest foot below the ground's height, negative in flight"),
+    "payload_mass": (_TIME, "kg", "mass of the payload, estimated"),
+    "payload_mass_deviation": (_TIME, "kg", "standard deviation of payload_mass"),
+    "payload_moment": (_AXES, "kg m", "first moment of the payload, estimated; its carrier's axes"),
+    "payload_moment_deviation": (_AXES, "kg m", "standard deviation of payload_moment"),
+    "centre_of_mass": (_AXES, "m", "of all bodies from the base's, base axes"),
+    "believed_centre_of_mass": (_AXES, "m", "centre of mass that was fed forward"),
 }
 
 
@@ -53,6 +60,7 @@ class Gauges(eqx.Module):
         bodies: of the tracker, and home: strokes at the start (2,) [m]; None without a tracker.
         gravity: acceleration of free fall (3,) [m/s^2].
         efficiency: of the motors [1]. other: power of everything else [W].
+        mass: of the bodies (n,) [kg].
         places: places of the rotor speeds among the states of force elements; none without lag.
         grounded: system of a machine with a landing gear, else None.
     """
@@ -64,13 +72,14 @@ class Gauges(eqx.Module):
     efficiency: Float[Array, ""]
     other: Float[Array, ""]
     grounded: System | None
+    mass: Float[Array, " n"]
     places: tuple[int, ...] = eqx.field(static=True)
     rotors: int = eqx.field(static=True)
 
     def __init__(self, machine: Machine, system: System) -> None:
         self.k_tau, self.bodies = machine.rotors.k_tau, machine.bodies
         self.home = None if machine.limits is None else machine.limits.home
-        self.gravity = gravity_of(system)
+        self.gravity, self.mass = gravity_of(system), system.bodies.mass
         self.efficiency = jnp.asarray(ENERGY.value("rotor.efficiency"), dtype=float)
         self.other = jnp.asarray(ENERGY.value("other.power"), dtype=float)
         names = internal_names(system)
@@ -102,12 +111,27 @@ class Gauges(eqx.Module):
             found["estimated_position"] = sample.estimate.state.r[0]
         if self.grounded is not None:
             found |= gear_signals(self.grounded, state)
+        flight = getattr(sample.memory, "flight", None)
+        if isinstance(flight, AdaptiveMemory):
+            found |= self._payload(state, flight)
         pushing = jnp.zeros(())
         if self.bodies is not None:
             own = self._panel(state, sample.reference, sample.inputs[self.rotors :])
             pushing = jnp.maximum(own["actuator_power"], 0.0)
             found |= own
         return found | {"electric_power": power / self.efficiency + pushing + self.other}
+
+    def _payload(self, state: State, memory: AdaptiveMemory) -> dict[str, Any]:
+        spread = jnp.sqrt(jnp.diagonal(memory.payload.covariance))
+        centre = self.mass @ (state.r - state.r[0]) / jnp.sum(self.mass)
+        return {
+            "payload_mass": memory.payload.mean[3],
+            "payload_mass_deviation": spread[3],
+            "payload_moment": memory.payload.mean[4:7],
+            "payload_moment_deviation": spread[4:7],
+            "centre_of_mass": rotation_matrix(state.p[0]).T @ centre,
+            "believed_centre_of_mass": memory.centre,
+        }
 
     def _panel(
         self, state: State, reference: MissionReference, forces: Float[Array, "2"]

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..checks.errors import SettingError
+from ..control.adaptation.adaptive import AdaptiveController
+from ..control.adaptation.payload_filter import PayloadFilter
 from ..control.estimator import MotionEstimator
 from ..control.flying import FlightController
 from ..control.geometric import FlightGains
@@ -21,6 +23,7 @@ from ..dynamics.scene import Scene
 from ..environment.wind import dryden, low_altitude
 from ..files.model_file import load_model
 from ..mechanics.load import Sine
+from ..mechanics.system import System
 from ..parameters.table import Parameters
 from ..rotorcraft.allocation import RotorLimits
 from ..rotorcraft.motor import MotorRotors
@@ -31,7 +34,8 @@ from ..tracker.actuator import LinearActuator
 from ..tracker.drive import SLIDER_JOINTS
 from ..tracker.geometry import tracker_geometry
 from ..tracker.workspace import Limits, tracker_limits
-from .disturbance import Jam, MissionController, MissionWind, Told
+from .disturbance import Jam, MissionController, MissionWind, Pilot, Told
+from .payload import WithoutPayload, table_carrying, tracker_carrying
 from .schema import MissionFile, SensorsEntry, ServoEntry, WindEntry
 
 FORCES = ("force_slider_2", "force_slider_3")
@@ -56,6 +60,8 @@ class Machine(NamedTuple):
         scene: its scene. rotors: the rotors or motors. table: its parameters; None for a model.
         bodies: bodies of the tracker, and limits: of its workspace; None without a tracker.
         speeds: limits of the rotor speeds, or None.
+        believed: system without the payload, of which the controller does not know; None where it is
+            that of the scene. `bodies` are those that the controller believes.
     """
 
     scene: Scene
@@ -64,6 +70,7 @@ class Machine(NamedTuple):
     bodies: PanelBodies | None
     limits: Limits | None
     speeds: RotorLimits | None
+    believed: System | None = None
 
 
 def machine_of(given: MissionFile, folder: Path) -> Machine:
@@ -98,8 +105,9 @@ def machine_of(given: MissionFile, folder: Path) -> Machine:
             )
         options["wind"] = _wind(given.wind, table, given.t1)
     # case 2 has actuators; a mission's own forces take the place of the report's
-    scene = make_scene(entry.scene, 2 if has_panel else None, table, **options)
-    scene = _pushed(scene, given) if has_panel else scene
+    name, case = entry.scene, 2 if has_panel else None
+    made = lambda table: make_scene(name, case, table, **options)
+    scene = _pushed(made(table), given) if has_panel else made(table)
     motors = next(f for f in scene.system.forces if isinstance(f, Rotors | MotorRotors))
     own = getattr(motors, "limits", None)
     usual = RotorLimits(table.value("motor.lowest"), table.value("motor.highest"))
@@ -109,7 +117,21 @@ def machine_of(given: MissionFile, folder: Path) -> Machine:
         return Machine(scene, rotors, table, None, None, speeds)
     geometry, shift = tracker_geometry(table), table.value("mount.shift")
     bodies = panel_bodies(scene.system, geometry, shift)
-    return Machine(scene, rotors, table, bodies, tracker_limits(table), speeds)
+    empty = Machine(scene, rotors, table, bodies, tracker_limits(table), speeds)
+    return empty if given.payload is None else _loaded(empty, given, made)
+
+
+def _loaded(empty: Machine, given: MissionFile, made: Callable[[Parameters], Scene]) -> Machine:
+    """Machine with the mission's payload, from the one without."""
+    assert given.payload is not None
+    assert empty.bodies is not None
+    assert empty.table is not None
+    bodies = tracker_carrying(empty.bodies, given.payload)
+    table = table_carrying(empty.table, bodies)
+    loaded = empty._replace(scene=_pushed(made(table), given), table=table)
+    if given.controller.payload == "known":
+        return loaded._replace(bodies=bodies)
+    return loaded._replace(believed=empty.scene.system)
 
 
 def _model(given: MissionFile, path: Path) -> Machine:
@@ -136,7 +158,7 @@ def _without_tracker(given: MissionFile, what: str) -> None:
         "[[panel]]": given.panel, "[push]": given.push, "'controller.servo'": given.controller.servo,
         "'controller.feedforward'": given.controller.feedforward is not None,
         "'sensors.encoders'": given.sensors and given.sensors.encoders,
-        "'tolerances.panel'": given.tolerances.panel,
+        "'tolerances.panel'": given.tolerances.panel, "[payload]": given.payload,
         "A fault of a slider": any(fault.slider for fault in given.faults),
     }  # fmt: skip
     for name, value in used.items():
@@ -204,14 +226,16 @@ def plant_of(given: MissionFile, machine: Machine) -> Plant:
         SettingError: rates or delays that do not divide, instruments that do not suffice.
     """
     system, rate = machine.scene.system, given.rates.control
+    known = system if machine.believed is None else machine.believed
     names = ["speed_squared", *(FORCES if machine.bodies is not None else ())]
-    count, mass = machine.rotors.spin.shape[0], float(jnp.sum(system.bodies.mass))
+    count, mass = machine.rotors.spin.shape[0], float(jnp.sum(known.bodies.mass))
     hover = hover_speed_squared(mass, gravity_of(system), machine.rotors.k_f, count)
     before = jnp.concatenate([jnp.full(count, hover), jnp.zeros(len(names) - 1)])
     settings: dict[str, Any] = {"inputs": names, "before": before, "rate": rate}
     settings |= {"steps": given.rates.steps, "delay": given.rates.delay}
     if given.sensors is None:
-        return Plant(machine.scene, **settings)
+        observe = None if machine.believed is None else WithoutPayload(system, known)
+        return Plant(machine.scene, observe=observe, **settings)
     instruments = _instruments(given.sensors, machine)
     estimator = MotionEstimator(system, rate, instruments, tracker=machine.bodies)
     memory = estimator.start(machine.scene.state0)
@@ -263,15 +287,31 @@ def controller_of(given: MissionFile, machine: Machine, plant: Plant) -> Mission
     return dataclasses.replace(found, told=tuple(told))
 
 
-def _pilot(given: MissionFile, machine: Machine, plant: Plant, lost: tuple[int, ...]) -> Any:
+def _pilot(given: MissionFile, machine: Machine, plant: Plant, lost: tuple[int, ...]) -> Pilot:
     """Controller of a machine that knows of lost rotors."""
-    entry, system = given.controller, plant.system
+    entry = given.controller
+    system = plant.system if machine.believed is None else machine.believed
     gains = FlightGains(**entry.gains.model_dump(exclude_none=True))
     flight = FlightController(system, plant.rate, gains=gains, limits=machine.speeds, lost=lost)
-    if machine.bodies is None:
-        return flight
-    servo = _servo(entry.servo or ServoEntry(), machine.bodies)
-    return UavController(system, flight, servo, entry.feedforward is not False)
+    pilot: FlightController | UavController = flight
+    if machine.bodies is not None:
+        servo = _servo(entry.servo or ServoEntry(), machine.bodies)
+        pilot = UavController(system, flight, servo, entry.feedforward is not False)
+    if entry.payload == "known" and given.payload is None:
+        raise SettingError("'controller.payload' is known, but the mission has no [payload].")
+    if entry.payload != "estimated":
+        return pilot
+    if given.sensors is None:
+        raise SettingError(
+            "'controller.payload' is estimated from gyroscope and accelerometer, which only a mission with "
+            "[sensors] has."
+        )
+    own = given.sensors.gyroscope.noise
+    noise = np.asarray(INSTRUMENTS["gyroscope"]["noise"] if own is None else own)
+    found = PayloadFilter(
+        system, plant.rate, delay=given.rates.delay, gyroscope=float(np.sqrt(np.mean(noise**2)))
+    )
+    return AdaptiveController(pilot, found)
 
 
 def _servo(entry: ServoEntry, bodies: PanelBodies) -> PanelServo | StrokeServo:

@@ -84,14 +84,26 @@ class ServoEntry(Entries):
     stiffness: Positive | None = None
 
 
+class PayloadEntry(Entries):
+    """Entry for a payload: a point mass [kg] on the panel, at a position from the panel's centre of mass
+    in its axes [m]."""
+
+    mass: Positive
+    position: Vector
+
+
 class ControllerEntry(Entries):
-    """Entry for the controller; the limits of the rotor speeds are in rad/s."""
+    """Entry for the controller; the limits of the rotor speeds are in rad/s.
+
+    Of the payload it knows nothing, or all, or it estimates it.
+    """
 
     gains: GainsEntry = GainsEntry()
     lowest: NotNegative | None = None
     highest: Positive | None = None
     servo: ServoEntry | None = None
     feedforward: bool | None = None
+    payload: Literal["unknown", "estimated", "known"] = "unknown"
 
 
 class PointEntry(Entries):
@@ -213,6 +225,7 @@ class MissionFile(Entries):
     rates: RatesEntry = RatesEntry()
     sensors: SensorsEntry | None = None
     controller: ControllerEntry = ControllerEntry()
+    payload: PayloadEntry | None = None
     path: PathEntry = PathEntry()
     panel: Annotated[tuple[MoveEntry, ...], Tuples] = ()
     wind: WindEntry | None = None

@@ -12,7 +12,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "control.md"
 @pytest.mark.slow
 def test_the_page_on_closed_loops_runs():
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 7
+    assert len(blocks) == 8
     # a user's cart-pole, and a plain hexacopter
     assert len(blocks[0].splitlines()) < 40
     assert "FlightController" in blocks[2]
@@ -23,6 +23,11 @@ def test_the_page_on_closed_loops_runs():
     end = names["flight"].states.r[-1, 0]
     np.testing.assert_allclose(end, [np.cos(4.0) - 1, np.sin(4.0), 0.8], atol=5e-3)
     assert names["sensed"].reset().estimate.state.r.shape == (1, 3)
+    # a load of 0.4 kg at (0.05, -0.03) m, across the thrust
+    np.testing.assert_allclose(names["lifted"].signal("payload")[-1, 0], 0.4, atol=0.1)
+    np.testing.assert_allclose(
+        names["lifted"].signal("payload")[-1, 1:3], [0.02, -0.012], atol=0.01
+    )
     assert names["climbs"][1] > names["climbs"][0]
     # the arm's end, 0.5 m from its hinge
     bob = names["raised"].states.r[-1, 0]
