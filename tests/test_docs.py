@@ -3,11 +3,16 @@
 import importlib.util
 import json
 import re
+import shlex
+import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import stmuav_jax as stm
+from stmuav_jax import cli
+from stmuav_jax.montecarlo.study import study_from_plain
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -91,6 +96,84 @@ def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
         made = target.startswith(("https:", "api/")) or target == "validation.md"
         assert made or (page.parent / target).exists(), target
+
+
+# --- other code of the pages
+
+# What reads the TOML of a page; the missions' is read in tests/missions/test_missions.py, the first block of
+# docs/models.md is a study that tests/commands/test_model_commands.py carries out.
+TOML = {"geometry": 1, "missions": 1, "models": 2, "parameters_file": 1, "studies": 1}
+
+
+def fenced(page: Path, kinds: str) -> list[str]:
+    """Blocks of code of a page in one of some languages."""
+    text = page.read_text(encoding="utf-8")
+    return re.findall(rf"^```(?:{kinds})\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def test_every_block_of_toml_is_known():
+    found = {page.stem: len(fenced(page, "toml")) for page in PAGES if fenced(page, "toml")}
+    assert found == TOML
+
+
+@pytest.mark.parametrize("name", ["geometry", "parameters_file"])
+def test_parameters_of_a_page_replace_those_of_the_table(name, tmp_path):
+    (text,) = fenced(DOCS / f"{name}.md", "toml")
+    path = tmp_path / "p.toml"
+    path.write_text(text)
+    table = stm.files.load_parameters(path, stm.PART_II)
+    for group, entries in tomllib.loads(text).items():
+        for key, given in entries.items():
+            value = given["value"] if isinstance(given, dict) else given
+            assert np.asarray(table.value(f"{group}.{key}")).tolist() == value
+            assert np.asarray(stm.PART_II.value(f"{group}.{key}")).tolist() != value
+    shown = stm.make_scene("uav_tracker", parameters=table).parameters
+    assert shown.items() <= table.to_dict().items()
+    assert {f"{group}.{key}" for group, keys in tomllib.loads(text).items() for key in keys} <= set(
+        shown
+    )
+
+
+def test_study_of_the_page_is_built(tmp_path):
+    (text,) = fenced(DOCS / "studies.md", "toml")
+    (tmp_path / "study.toml").write_text(text)
+    (tmp_path / "rates.csv").write_text("q\n0.1\n-0.2\n0.05\n")
+    plain = stm.files.load_study(tmp_path / "study.toml")
+    study = study_from_plain(plain)
+    assert list(study.plain()["quantities"]) == ["fall", "tilt", "phi", "load"]
+    drawn = json.dumps(study.plain()["sampling"])
+    assert all(json.dumps(name) in drawn for name in tomllib.loads(text)["factors"])
+
+
+def test_model_of_the_page_is_read(tmp_path):
+    _, text = fenced(DOCS / "models.md", "toml")
+    (tmp_path / "model.toml").write_text(text)
+    scene = stm.files.load_model(tmp_path / "model.toml")
+    assert scene.title == "Compound pendulum"
+    # the centre of mass hangs at the parameter's distance, turned by the start
+    height = float(np.asarray(scene.state0.r)[0, 2])
+    assert height == pytest.approx(0.5 * np.cos(1.0))
+
+
+COMMANDS = [
+    (page.name, line)
+    for page in (ROOT / "README.md", *PAGES)
+    for line in re.findall(
+        r"^(?:    |.*bin/)?(stmuav .*)$", page.read_text(encoding="utf-8"), re.MULTILINE
+    )
+]
+
+
+@pytest.mark.parametrize(("page", "line"), COMMANDS, ids=lambda words: words[:60])
+def test_commands_of_pages_are_understood(page, line):
+    _, *words = shlex.split(line, comments=True)
+    assert cli._read(words)[0] == words[0]
+
+
+def test_commands_of_pages_are_found():
+    pages = {page for page, _ in COMMANDS}
+    assert {"README.md", "index.md", "models.md", "studies.md", "sun.md", "viewer.md"} <= pages
+    assert len(COMMANDS) > 25
 
 
 # --- the site
