@@ -68,7 +68,9 @@ def test_python_of_a_page_runs(name, tmp_path, monkeypatch):
 
 # What a page leaves behind, beyond running without an error.
 CHECKS = {
-    "contact": lambda n: abs(float(n["gear"].normal_forces(n["idle"].kinematics(n["at_end"])).sum()) / 53.04267 - 1) < 1e-3,
+    "contact": lambda n: (
+        abs(np.sum(n["gear"].normal_forces(n["idle"].kinematics(n["at_end"]))) / 53.04267 - 1) < 1e-3
+    ),
     "index": lambda n: n["run"].successful and Path("flight.html").stat().st_size > 100_000,
     "own_data": lambda n: abs(n["out"].mean[-1, 1] + 9.81 * 0.5) < 0.5,
     "parameters_file": lambda n: n["scene"].parameters["mass.panel_7"]["value"] == 0.95,
