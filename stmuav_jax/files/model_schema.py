@@ -188,9 +188,9 @@ FORCES: dict[str, Kind] = {
     }),
     "effort": Kind(JointEffort, "joint", {"effort": _EFFORT, "coordinate": _WHICH}),
     "ground_contact": Kind(GroundContact, "body", {
-        "feet": Slot(Vectors, "m"), "height": _LENGTH, "stiffness": Slot(Finite, "N/m"),
-        "damping": Slot(Finite, "N s/m"), "width": Slot(Finite, "m"), "friction": Slot(Finite, "1"),
-        "slip_speed": Slot(Finite, "m/s"),
+        "feet": Entry(Vectors, "m"), "height": _LENGTH, "stiffness": Entry(Finite, "N/m"),
+        "damping": Entry(Finite, "N s/m"), "width": Entry(Finite, "m"), "friction": Entry(Finite, "1"),
+        "slip_speed": Entry(Finite, "m/s"),
     }),
     "force": Kind(applied.AppliedForce, "body", {
         "force": Entry(Triple, "N"), "frame": _FRAME, "point": _maybe(_POINT),

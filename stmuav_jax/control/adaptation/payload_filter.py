@@ -31,6 +31,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ...algebra.rotation import skew
 from ...checks.errors import ModelError
 from ...checks.numbers import nonnegative, positive
 from ...checks.shapes import Numbers
@@ -40,7 +41,6 @@ from ...rotorcraft.motor import MotorRotors
 from ...rotorcraft.rotor import Rotors, hover_speed_squared
 from ...sensing.sensors import gravity_of
 from ..estimator import MotionEstimate, one_by_one
-from ..geometric import hat
 from ..instruments import whole_periods
 from .moments import Carrier, Moments, Payload, carrying, payload_of
 
@@ -213,8 +213,8 @@ class PayloadFilter(eqx.Module):
         """
         h, p = self.period, carrying(about, on, payload_of(z[3:])).first
         L = z[:3] + h * (torque - jnp.cross(p, felt) - jnp.cross(turning, z[:3]))
-        by_payload = h * hat(felt) @ jnp.concatenate([on.r[:, None], on.R], axis=1)
-        F = jnp.eye(10).at[:3, :3].add(-h * hat(turning)).at[:3, 3:7].set(by_payload)
+        by_payload = h * skew(felt) @ jnp.concatenate([on.r[:, None], on.R], axis=1)
+        F = jnp.eye(10).at[:3, :3].add(-h * skew(turning)).at[:3, 3:7].set(by_payload)
         return L, F
 
     def expected(
