@@ -188,7 +188,7 @@ FORCES: dict[str, Kind] = {
     }),
     "effort": Kind(JointEffort, "joint", {"effort": _EFFORT, "coordinate": _WHICH}),
     "ground_contact": Kind(GroundContact, "body", {
-        "feet": Entry(Vectors, "m"), "height": _LENGTH, "stiffness": Entry(Finite, "N/m"),
+        "feet": Entry(Triples, "m"), "height": _LENGTH, "stiffness": Entry(Finite, "N/m"),
         "damping": Entry(Finite, "N s/m"), "width": Entry(Finite, "m"), "friction": Entry(Finite, "1"),
         "slip_speed": Entry(Finite, "m/s"),
     }),

@@ -89,7 +89,7 @@ class PayloadEntry(Entries):
     in its axes [m]."""
 
     mass: Positive
-    position: Vector
+    position: Triple
 
 
 class ControllerEntry(Entries):
