@@ -61,6 +61,12 @@ def safe_sqrt(square: Float[Array, "*s"]) -> Float[Array, "*s"]:
     return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, square)))
 
 
+def sharp_sqrt(square: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """Square root that is zero where `square` is < 0; NaN derivatives at zero, where there are none."""
+    zero = square == 0
+    return jnp.where(zero, without_derivative(square, zero), safe_sqrt(square))
+
+
 def safe_norm(vectors: Float[Array, "..."], axis: int = 0) -> Float[Array, "..."]:
     """Euclidean norm along an axis; its derivatives at zero are set to zero."""
     return safe_sqrt(jnp.sum(vectors * vectors, axis=axis))

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from ..algebra import lapack
 from ..algebra.compiler import kept_jit
-from ..algebra.derivative import safe_sqrt
+from ..algebra.derivative import sharp_sqrt
 from ..algebra.newton import Implicit, Newton
 from ..algebra.rotation import product, rotation_matrix, to_rotation_vector, turn_about
 from ..checks.errors import ModelError, StateError, concrete
@@ -109,7 +109,8 @@ class FlightTrim(eqx.Module):
     Attributes:
         coordinates: coordinates at the trim, with the base at the origin.
         inputs: inputs at the trim.
-        speeds: rotor speeds (k,) [rad/s].
+        speeds: rotor speeds (k,) [rad/s], zero for a negative square. A speed of zero has no derivative,
+            NaN, but within limits of the speeds it is a rotor at its limit, see `Allocation`.
         residual: largest residual acceleration [m/s^2] or [rad/s^2].
         conditioning: smallest over largest singular value of the Jacobian, in units of a
             radian, the weight, and the weight times a metre; near zero, other trims lie near.
@@ -295,11 +296,13 @@ def _found(setting: _TrimProblem, limits: TrimLimits) -> FlightTrim:
     at = _point(z[:2], setting.wanted)
     B = _map(flyer, at)
     squared = minimum_norm(B, z[2:6])
+    speeds = sharp_sqrt(squared)
     missed = jnp.zeros((), bool)
     if limits.rotors is not None:
         # the wrench is the same, and so are the accelerations
         given = allocate(B, z[2:6], limits.rotors)
-        squared, missed = given.speed_squared, given.reason != AllocationReason.VALID
+        squared, speeds = given.speed_squared, given.speeds
+        missed = given.reason != AllocationReason.VALID
     inputs, left = RotorsAndForces(squared, z[6:]), last.size
     spun = jnp.zeros((), bool)
     if limits.rotors is not None and isinstance(flyer.propulsion, MotorRotors):
@@ -322,7 +325,7 @@ def _found(setting: _TrimProblem, limits: TrimLimits) -> FlightTrim:
         *((outside == why, own) for own, why in _OUTSIDE.items()),
     )
     steps = solution.stats["num_steps"]
-    return FlightTrim(at, inputs, safe_sqrt(squared), left, values[-1] / values[0], reason, steps)
+    return FlightTrim(at, inputs, speeds, left, values[-1] / values[0], reason, steps)
 
 
 def _raise(reason: TrimReason, found: FlightTrim, flyer: Flyer, limits: TrimLimits) -> None:

@@ -108,7 +108,7 @@ class Allocation(eqx.Module):
 
     Attributes:
         speed_squared: squared speeds u (k,) [rad^2/s^2].
-        speeds: rotor speeds (k,) [rad/s].
+        speeds: rotor speeds (k,) [rad/s]; zero with the derivatives of a rotor held at that limit.
         wrench: wrench that they give (4,) [N], [N m].
         wrench_error: wanted wrench less the given one (4,) [N], [N m].
         at_limit: true for each rotor at one of its limits (k,).
@@ -165,7 +165,8 @@ def allocate(
     lower, upper = limits.squared(count)
     each = () if np.ndim(preferred) == 0 else (count,)
     u0 = numbers(preferred, each, "The preferred squares of the speeds", "rad^2/s^2")
-    return _allocate(B, wrench, lower, upper, weights, jnp.broadcast_to(u0, (count,)))
+    slowest = jnp.broadcast_to(jnp.asarray(limits.lowest, dtype=float), (count,))
+    return _allocate(B, wrench, lower, upper, weights, jnp.broadcast_to(u0, (count,)), slowest)
 
 
 class _Box(NamedTuple):
@@ -185,6 +186,7 @@ def _allocate(
     upper: Float[Array, " k"],
     priority: Float[Array, "4"],
     preferred: Float[Array, " k"],
+    slowest: Float[Array, " k"],
 ) -> Allocation:
     span = jnp.max(upper - lower)
     W = priority / (jnp.abs(B) @ (upper - lower))
@@ -214,7 +216,8 @@ def _allocate(
     )
     u = lower + span * x
     at_limit = (x < ATTAINED) | (x > box.r - ATTAINED)
-    return Allocation(u, safe_sqrt(u), wrench - missed, missed, at_limit, reason)
+    speeds = jnp.where((held < 0) & (slowest == 0), slowest, safe_sqrt(u))
+    return Allocation(u, speeds, wrench - missed, missed, at_limit, reason)
 
 
 def _size(x: Float[Array, "..."]) -> Float[Array, ""]:
@@ -365,12 +368,9 @@ def _walked(
         held = jnp.where(anew, forced, held)
         return _Walk(after, held, ends & ~anew, now.again | anew, now.steps + 1)
 
-    def unfinished(now: _Walk) -> Array:
-        return ~now.done & (now.steps < _MOST_STEPS * k)
-
+    unfinished = lambda now: ~now.done & (now.steps < _MOST_STEPS * k)
     no = jnp.zeros((), bool)
-    start = _Walk(x, held, no, no, jnp.zeros((), int))
-    return jax.lax.while_loop(unfinished, go, start)
+    return jax.lax.while_loop(unfinished, go, _Walk(x, held, no, no, jnp.zeros((), int)))
 
 
 def check_lift(

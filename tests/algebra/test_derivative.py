@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from stmuav_jax.algebra.derivative import length_and_direction, safe_norm, safe_sqrt
+from stmuav_jax.algebra.derivative import length_and_direction, safe_norm, safe_sqrt, sharp_sqrt
 
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
@@ -19,6 +19,15 @@ def test_safe_sqrt_and_norm_have_zero_derivatives_at_zero(mode):
     slope = mode(safe_norm)(jnp.array([3.0, 0.0, -4.0]))
     assert np.allclose(slope, [0.6, 0.0, -0.8], rtol=1e-15, atol=0)
     assert np.array_equal(mode(mode(safe_norm))(jnp.zeros(2)), np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_sharp_sqrt_has_no_derivative_at_zero(mode):
+    """Such as that of a rotor's speed by the wrench, at a command of zero; elsewhere it has."""
+    squares = jnp.array([-1.0, 0.0, 4.0, jnp.nan])
+    assert np.array_equal(sharp_sqrt(squares), [0.0, 0.0, 2.0, np.nan], equal_nan=True)
+    for square, slope in zip(squares, [0.0, np.nan, 0.25, np.nan], strict=True):
+        assert np.array_equal(mode(sharp_sqrt)(square), slope, equal_nan=True)
 
 
 def test_safe_norm_sums_over_the_axis_it_is_told():

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from stmuav_jax import Augmented, Baumgarte, Method, SettingError, integrate
+from stmuav_jax.algebra.compiler import quick_jit
 from stmuav_jax.algebra.rotation import rotation_matrix
 from stmuav_jax.dynamics.formulations.stabilisation import AbstractStabilisation
+from stmuav_jax.dynamics.loads import joint_loads
 from stmuav_jax.montecarlo.batch import FlightWork, _parts
 from stmuav_jax.montecarlo.disturbed_flights import Drawn
 from stmuav_jax.montecarlo.study import study_from_plain
@@ -292,6 +294,18 @@ def test_a_crossing_can_stop_a_flight():
     assert np.any(found["end"][crossed] < 0.35)
 
 
+def largest(work, k, ts):
+    """Peak of the load of U47 by another formulation, at times (n,) and then between its neighbours."""
+    force = np.zeros(1)
+    for _ in range(2):
+        system, run = one_by_one(work, k, ts, rtol=1e-12, atol=1e-12)
+        loads = quick_jit(joint_loads)(system, run.ts, run.states, Augmented())
+        force = np.linalg.norm(loads.force[:, loads.joints.index("U47")], axis=1)
+        top = int(np.argmax(force))
+        ts = np.append(0.0, np.linspace(ts[top - 1], ts[top + 1], len(ts) - 1))
+    return force.max()
+
+
 @pytest.mark.slow
 def test_the_uav_as_flights_one_by_one():
     plain = {
@@ -312,9 +326,12 @@ def test_the_uav_as_flights_one_by_one():
         normal = rotation_matrix(state.p[-1])[:, 2]
         return jnp.arctan2(jnp.linalg.norm(jnp.cross(normal, facing)), normal @ facing) - 0.5
 
+    dense = np.linspace(0.0, 0.5, 2001)
     for k in (0, 9):
-        _, run = one_by_one(work, k, [0.0, 0.5], rtol=1e-12, atol=1e-12)
+        _, run = one_by_one(work, k, dense, rtol=1e-12, atol=1e-12)
         assert found["x"][k] == pytest.approx(float(run.states.r[-1, 0, 0]), abs=1e-8)
+        # the load between steps is a quartic, and its peak is some 5 ms wide
+        assert found["load"][k] == pytest.approx(largest(work, k, dense), rel=2e-4)
         _, run = one_by_one(work, k, [0.0, 0.5], rtol=1e-12, atol=1e-12, event=fallen)
         assert found["fall"][k] == pytest.approx(float(run.ts[-1]), abs=1e-6)
 

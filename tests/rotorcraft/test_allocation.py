@@ -286,6 +286,32 @@ def test_derivatives_are_those_of_differences(derivatives):
         assert by_reverse == pytest.approx(c @ rate[0], rel=1e-10)
 
 
+def test_a_rotor_at_rest_has_the_derivatives_of_one_held_there():
+    """Limits from zero: speeds by the wrench and by the limits, against differences where it stays."""
+
+    @jax.jit
+    def speeds(w, low):
+        found = allocate(TABLE, w, RotorLimits(low, HIGH))
+        return found.speeds, found.reason
+
+    w, low = jnp.array([46.3, 1.9, -4.2, 0.6]), jnp.zeros(6)
+    found, reason = speeds(w, low)
+    rests = np.asarray(found) == 0
+    assert reason == AllocationReason.VALID
+    assert rests.sum() == 1
+    by_wrench, by_low = jax.jit(jax.jacfwd(lambda *x: speeds(*x)[0], argnums=(0, 1)))(w, low)
+    h = 1e-4 * np.eye(4)
+    differences = [(speeds(w + e, low)[0] - speeds(w - e, low)[0]) / 2e-4 for e in h]
+    np.testing.assert_allclose(by_wrench, np.stack(differences, axis=1), rtol=1e-5, atol=1e-5)
+    assert np.all(np.asarray(by_wrench)[rests] == 0)
+    # speeds cannot be below zero: from one side
+    one_sided = (speeds(w, low + 1e-3)[0] - found) / 1e-3
+    np.testing.assert_allclose(by_low @ np.ones(6), one_sided, rtol=0, atol=1e-3)
+    np.testing.assert_array_equal(np.asarray(by_low)[rests], np.eye(6)[rests])
+    pull = jax.jit(jax.grad(lambda w: speeds(w, low)[0] @ jnp.arange(1.0, 7.0)))(w)
+    np.testing.assert_allclose(pull, np.arange(1.0, 7.0) @ np.asarray(by_wrench), rtol=1e-10)
+
+
 @pytest.mark.parametrize(
     ("limits", "words"),
     [
