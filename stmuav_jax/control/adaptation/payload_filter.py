@@ -13,9 +13,10 @@ by how the machine turns. The mass itself is seen in what the thrust T along the
 
 The state is z = (L, dm, mu, inertia) (10,), an extended Kalman filter's: L moves by the first equation
 with an unknown moment of white noise, the payload by a slow random walk, and each period measures W by
-the gyroscope, W = J^-1 (L - H), and the thrust. In the derivatives of this W stand smoothed earlier
-readings of the gyroscope, and the moving parts are taken to be at rest: with the noise of the present
-rates in them, a machine that does not turn would seem to say something about its inertia and its payload.
+the gyroscope, W = J^-1 (L - H), and f_z. In the derivatives by the payload stand smoothed earlier
+readings of gyroscope and accelerometer, and the moving parts are taken to be at rest. Present ones are
+tied to the present noise: an unknown moment also accelerates O, and the noise of a rate looks like turning,
+so that a machine at rest would seem to say something about its inertia and its payload.
 
 A steady moment of the air about O cannot be told from a centre of mass, and is taken for one; a thrust
 coefficient that is wrong is taken for a mass, the one for which the believed rotors carry the machine.
@@ -46,7 +47,7 @@ from .moments import Carrier, Moments, Payload, carrying, payload_of
 
 # Standard deviation of the angular momentum before the first sample [N m s], as good as unknown.
 _UNKNOWN = 10.0
-# Bandwidth of the smoothed angular velocity [rad/s], beyond that of a flight controller's motion.
+# Bandwidth of the smoothed readings [rad/s], beyond that of a flight controller's motion.
 _SMOOTHING = 50.0
 
 
@@ -56,7 +57,7 @@ class PayloadMemory(NamedTuple):
     Attributes:
         mean: L (3,) [N m s], mass [kg], moment (3,) [kg m] and inertia (3,) [1] in one vector (10,).
         covariance: of their errors (10, 10).
-        turning: smoothed angular velocity until the last sample (3,) [rad/s].
+        turning, felt: smoothed W (3,) [rad/s] and f (3,) [m/s^2] until the last sample.
         speeds: speeds of the rotors (k,) [rad/s].
         sent: commands on their way, the next first (d, k) [rad^2/s^2].
     """
@@ -64,6 +65,7 @@ class PayloadMemory(NamedTuple):
     mean: Float[Array, "10"]
     covariance: Float[Array, "10 10"]
     turning: Float[Array, "3"]
+    felt: Float[Array, "3"]
     speeds: Float[Array, " k"]
     sent: Float[Array, "d k"]
 
@@ -157,8 +159,10 @@ class PayloadFilter(eqx.Module):
         """First memory: no payload, as the standard deviations before the flight have it."""
         spread = jnp.concatenate([jnp.full(3, _UNKNOWN), self.prior])
         sent = jnp.tile(self.before, (self.late + 1, 1))
-        zero, speeds = jnp.zeros(10), jnp.sqrt(self.before)
-        return PayloadMemory(zero, jnp.diag(spread**2), jnp.zeros(3), speeds, sent)
+        # a machine that hovers
+        felt = jnp.zeros(3).at[2].set(jnp.linalg.norm(gravity_of(self.system)))
+        still, speeds = (jnp.zeros(10), jnp.diag(spread**2), jnp.zeros(3)), jnp.sqrt(self.before)
+        return PayloadMemory(*still, felt, speeds, sent)
 
     def payload(self, memory: PayloadMemory) -> Payload:
         """Payload that is fed forward: the mean within `bound`."""
@@ -183,7 +187,7 @@ class PayloadFilter(eqx.Module):
         """
         speeds, wrench = self._acted(memory)
         turning, felt = estimate.state.omega[0], estimate.force
-        L, F = self.onwards(memory.mean, about, on, wrench[1:], turning, felt)
+        L, F = self.onwards(memory.mean, about, on, wrench[1:], turning, felt, memory.felt)
         P = F @ memory.covariance @ F.T + jnp.diag(self.walk)
         z = memory.mean.at[:3].set(L)
         expected, H = self.expected(z, about, on, memory.turning, wrench[0])
@@ -193,8 +197,9 @@ class PayloadFilter(eqx.Module):
         error = jnp.append(turning, felt[2]) - expected
         move, P, _ = one_by_one(0.5 * (P + P.T), H, noise, error, jnp.ones(4, bool))
         share = 1 - jnp.exp(-_SMOOTHING * self.period)
-        smooth = memory.turning + share * (turning - memory.turning)
-        return PayloadMemory(z + move, P, smooth, speeds, memory.sent)
+        smooth = lambda old, new: old + share * (new - old)
+        before = smooth(memory.turning, turning), smooth(memory.felt, felt)
+        return PayloadMemory(z + move, P, before[0], before[1], speeds, memory.sent)
 
     def onwards(
         self,
@@ -204,16 +209,17 @@ class PayloadFilter(eqx.Module):
         torque: Float[Array, "3"],
         turning: Float[Array, "3"],
         felt: Float[Array, "3"],
+        before: Float[Array, "3"],
     ) -> tuple[Float[Array, "3"], Float[Array, "10 10"]]:
         """Angular momentum L at the end of a period (3,), and the matrix of errors of z there.
 
         Args:
             z: state before. torque: tau (3,) [N m]. turning: W (3,) [rad/s].
-            felt: f (3,) [m/s^2].
+            felt: f (3,) [m/s^2]. before: smoothed f (3,) [m/s^2].
         """
         h, p = self.period, carrying(about, on, payload_of(z[3:])).first
         L = z[:3] + h * (torque - jnp.cross(p, felt) - jnp.cross(turning, z[:3]))
-        by_payload = h * skew(felt) @ jnp.concatenate([on.r[:, None], on.R], axis=1)
+        by_payload = h * skew(before) @ jnp.concatenate([on.r[:, None], on.R], axis=1)
         F = jnp.eye(10).at[:3, :3].add(-h * skew(turning)).at[:3, 3:7].set(by_payload)
         return L, F
 

@@ -52,6 +52,7 @@ def test_the_moments_of_a_payload_are_those_of_the_loaded_machine(machines, tumb
     assert np.linalg.norm(direct.h) > 1e-3
 
 
+@pytest.mark.slow
 def test_the_angular_momentum_obeys_the_filters_equation(machines, tumbling):
     """dL/dt = tau - p x f - W x L along the simulator's accelerations, rotors and sliders at work."""
     flyer = machines[1]
@@ -85,7 +86,7 @@ def test_the_filters_derivatives(machines, tumbling):
     torque, turning, felt = (jnp.asarray(rng.normal(size=3)) for _ in range(3))
 
     def ahead(z):
-        L, F = found.onwards(z, about, on, torque, turning, felt)
+        L, F = found.onwards(z, about, on, torque, turning, felt, felt)
         return z.at[:3].set(L), F
 
     def read(z, turning):
