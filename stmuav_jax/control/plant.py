@@ -13,9 +13,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..checks.errors import SettingError
+from ..checks.errors import SettingError, concrete
 from ..checks.numbers import numbers
 from ..checks.shapes import Numbers
 from ..dynamics.integration.problem import IntegrationState, begin, prepare
@@ -27,6 +28,9 @@ from ..mechanics.system import System, check_state
 from ..sensing.sensors import SensedMotion, gravity_of
 from .held import HeldMotion, check_steps, usable_method
 from .instruments import Bench, Reading, whole_periods
+
+# Number that is folded into a key for the noise while standing; no sample of a run has it.
+_STANDING = np.uint32(2**32 - 1)
 
 Observe = Callable[[Float[Array, ""], State, Float[Array, " m"]], Any]
 Estimator = Callable[[dict[str, Reading], Float[Array, " m"], Any], tuple[Any, Any]]
@@ -78,6 +82,9 @@ class Plant(eqx.Module):
         before: inputs that are held until the first command arrives (m,); by default the
             system's own values.
         delay: time from a sample to the effect of its command [s], whole periods.
+        standing: time [s], whole periods, for which the instruments read before the first sample, while
+            the machine is held at its start. The estimator so finds biases and pose before the
+            loop is closed.
         sensors: sensors, or `Instrument`s with rates and noise.
         estimator: function (readings by name, inputs held until now, memory) -> (estimate,
             memory). Without one the estimate is the readings by name; without sensors either, it is
@@ -90,7 +97,8 @@ class Plant(eqx.Module):
 
     Raises:
         SettingError: rates or delays that do not divide; a rate or a number of steps that is not
-            positive; fixed steps together with "auto" or an event; names of inputs that are unknown.
+            positive; fixed steps together with "auto" or an event; names of inputs that are unknown;
+            a time of standing that is negative, without sensors, or of a machine whose start moves.
         ModelError: values before the first command that do not fit the inputs.
     """
 
@@ -103,6 +111,7 @@ class Plant(eqx.Module):
     observe: Observe | None
     rate: float = eqx.field(static=True)
     late: int = eqx.field(static=True)
+    stood: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -113,6 +122,7 @@ class Plant(eqx.Module):
         inputs: Sequence[str] | None = None,
         before: Numbers | None = None,
         delay: float = 0.0,
+        standing: float = 0.0,
         sensors: Sequence[Any] = (),
         estimator: Estimator | None = None,
         memory: Any = None,
@@ -142,6 +152,13 @@ class Plant(eqx.Module):
         problem = prepare(own.applied(system, self.before), usable_method(method, steps))
         self.motion = HeldMotion(problem, own, steps)
         self.bench = Bench(tuple(sensors), system, self.rate)
+        if not 0 <= standing < float("inf"):
+            raise SettingError(
+                f"The time of standing must be finite and not negative, but it is {standing} s."
+            )
+        self.stood = whole_periods(standing, rate, "The time of standing")
+        if self.stood:
+            _check_standing(self.bench, self.state0)
         self.estimator, self.observe = estimator, observe
         self.memory = jax.tree.map(jnp.asarray, memory)
 
@@ -165,6 +182,9 @@ class Plant(eqx.Module):
         Args:
             key: random key of the sensors' noise; by default that of seed 0.
             state0: another start than the plant's own, on the joints. t0: its time [s].
+
+        Raises:
+            SettingError: a plant that stands first, and another start that moves.
         """
         key = jax.random.key(0) if key is None else key
         t = jnp.asarray(t0, dtype=float)
@@ -173,9 +193,18 @@ class Plant(eqx.Module):
         k = jnp.zeros((), int)
         pending = jnp.tile(self.before, (self.late, 1))
         seen = self._seen(t, state, internal, self.before)
-        queues = self.bench.first(seen, self.system, key) if seen is not None else ()
-        readings = self.bench.arrived(queues)
-        estimate, memory = self._estimated(t, state, internal, readings, self.before, self.memory)
+        if self.stood:
+            assert seen is not None
+            if state0 is not None:
+                _check_standing(self.bench, state0)
+            queues, estimate, memory = self._after_standing(t, state, internal, seen, key)
+            readings = self.bench.arrived(queues)
+        else:
+            queues = self.bench.first(seen, self.system, key) if seen is not None else ()
+            readings = self.bench.arrived(queues)
+            estimate, memory = self._estimated(
+                t, state, internal, readings, self.before, self.memory
+            )
         return PlantState(
             k, t, t, state, internal, estimate, self.before, readings, motion, pending, queues,
             memory, key,
@@ -201,6 +230,37 @@ class Plant(eqx.Module):
             now.key,
         )  # fmt: skip
 
+    def _after_standing(
+        self, t: Array, state: State, internal: Array, seen: SensedMotion, key: Any
+    ) -> tuple[tuple[Any, ...], Any, Any]:
+        """Queues, estimate and memory at the first sample, after the samples of standing before it.
+
+        At the first sample the machine is still held, and let go of right after it: its readings
+        tell of the period before.
+        """
+        own, zero = jax.random.fold_in(key, _STANDING), jnp.zeros_like(state.v)
+        still = seen._replace(v_rate=zero, omega_rate=zero)
+        # a reading is fresh only where it is due, and so that those of sample 0 are
+        queues = tuple(
+            Reading(queue.value, jnp.zeros_like(queue.fresh))
+            for queue in self.bench.first(still, self.system, key)
+        )
+
+        def one(carry: Any, k: Array) -> tuple[Any, None]:
+            queues, _, memory = carry
+            queues = self.bench.later(queues, still, self.system, k, own)
+            readings = self.bench.arrived(queues)
+            return (
+                queues,
+                *self._estimated(t, state, internal, readings, self.before, memory),
+            ), None
+
+        none = (queues, None, self.memory)
+        kind = jax.eval_shape(lambda: one(none, jnp.zeros((), int))[0][1])
+        blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), kind)
+        ks = jnp.arange(-self.stood, 1)
+        return jax.lax.scan(one, (queues, blank, self.memory), ks)[0]
+
     def _seen(
         self, t: Array, state: State, internal: Array, held: Float[Array, " m"]
     ) -> SensedMotion | None:
@@ -224,6 +284,26 @@ class Plant(eqx.Module):
         if readings:
             return {name: reading.value for name, reading in readings.items()}, memory
         return (state if self.observe is None else self.observe(t, state, internal)), memory
+
+
+def _check_standing(bench: Bench, start: State) -> None:
+    """Raise `SettingError` for a plant that cannot stand before its first sample.
+
+    A traced start is not checked.
+    """
+    if not bench.instruments:
+        raise SettingError(
+            "Nothing reads while the plant is standing, since it has no sensors: set 'standing' to 0."
+        )
+    if not concrete(start.v, start.omega):
+        return
+    # NumPy's, which stays concrete where something else is traced
+    fastest = max(float(np.max(np.abs(np.asarray(x)), initial=0.0)) for x in (start.v, start.omega))
+    if fastest > 0:
+        raise SettingError(
+            "The plant cannot stand before its first sample, because its start moves, with up to "
+            f"{fastest:.4g} m/s or rad/s: set 'standing' to 0."
+        )
 
 
 def same_kind(after: Any, before: Any, what: str) -> Any:

@@ -95,19 +95,8 @@ def machine_of(given: MissionFile, folder: Path) -> Machine:
             raise SettingError(
                 f"'machine.options' of a mission has no {name}: {instead} takes its place."
             )
-    options = options_from_plain(entry.scene, entry.options)
     table = entry_of(entry.scene).parameters.replaced(entry.parameters)
-    if given.wind is not None:
-        if "drag" not in options:
-            raise SettingError(
-                "Wind acts through the airframe's drag, which this machine does not have: add "
-                "'options.drag = {}' to [machine]."
-            )
-        options["wind"] = _wind(given.wind, table, given.t1)
-    # case 2 has actuators; a mission's own forces take the place of the report's
-    name, case = entry.scene, 2 if has_panel else None
-    made = lambda table: make_scene(name, case, table, **options)
-    scene = _pushed(made(table), given) if has_panel else made(table)
+    scene = scene_of(given, table)
     motors = next(f for f in scene.system.forces if isinstance(f, Rotors | MotorRotors))
     own = getattr(motors, "limits", None)
     usual = RotorLimits(table.value("motor.lowest"), table.value("motor.highest"))
@@ -118,20 +107,46 @@ def machine_of(given: MissionFile, folder: Path) -> Machine:
     geometry, shift = tracker_geometry(table), table.value("mount.shift")
     bodies = panel_bodies(scene.system, geometry, shift)
     empty = Machine(scene, rotors, table, bodies, tracker_limits(table), speeds)
-    return empty if given.payload is None else _loaded(empty, given, made)
+    return empty if given.payload is None else _loaded(empty, given)
 
 
-def _loaded(empty: Machine, given: MissionFile, made: Callable[[Parameters], Scene]) -> Machine:
+def _loaded(empty: Machine, given: MissionFile) -> Machine:
     """Machine with the mission's payload, from the one without."""
     assert given.payload is not None
     assert empty.bodies is not None
     assert empty.table is not None
     bodies = tracker_carrying(empty.bodies, given.payload)
     table = table_carrying(empty.table, bodies)
-    loaded = empty._replace(scene=_pushed(made(table), given), table=table)
+    loaded = empty._replace(scene=scene_of(given, table), table=table)
     if given.controller.payload == "known":
         return loaded._replace(bodies=bodies)
     return loaded._replace(believed=empty.scene.system)
+
+
+def scene_of(given: MissionFile, table: Parameters, gusts: Any = None) -> Scene:
+    """Scene of a mission's machine in its air, with a table of parameters, which may be traced.
+
+    Args:
+        gusts: seed of the gusts in place of the mission's.
+
+    Raises:
+        SettingError: wind without drag, gusts without wind, options that the scene does not have.
+        ModelError: numbers that the scene refuses.
+    """
+    entry = given.machine
+    assert entry.scene is not None
+    options = options_from_plain(entry.scene, entry.options)
+    if given.wind is not None:
+        if "drag" not in options:
+            raise SettingError(
+                "Wind acts through the airframe's drag, which this machine does not have: add "
+                "'options.drag = {}' to [machine]."
+            )
+        options["wind"] = _wind(given.wind, table, given.t1, gusts)
+    # case 2 has actuators; a mission's own forces take the place of the report's
+    has_panel = entry.scene == "uav_tracker"
+    scene = make_scene(entry.scene, 2 if has_panel else None, table, **options)
+    return _pushed(scene, given) if has_panel else scene
 
 
 def _model(given: MissionFile, path: Path) -> Machine:
@@ -159,6 +174,7 @@ def _without_tracker(given: MissionFile, what: str) -> None:
         "'controller.feedforward'": given.controller.feedforward is not None,
         "'sensors.encoders'": given.sensors and given.sensors.encoders,
         "'tolerances.panel'": given.tolerances.panel, "[payload]": given.payload,
+        "'tolerances.panel_after'": given.tolerances.panel_after is not None,
         "A fault of a slider": any(fault.slider for fault in given.faults),
     }  # fmt: skip
     for name, value in used.items():
@@ -178,7 +194,7 @@ def _speeds(given: MissionFile, own: RotorLimits | None) -> RotorLimits | None:
     return RotorLimits(lowest, high if high is not None else getattr(own, "highest", 0.0))
 
 
-def _wind(given: WindEntry, table: Parameters, t1: float) -> MissionWind:
+def _wind(given: WindEntry, table: Parameters, t1: float, seed: Any) -> MissionWind:
     steady = jnp.asarray(given.steady, dtype=float)
     before: Any = steady
     if given.gusts is not None:
@@ -192,7 +208,7 @@ def _wind(given: WindEntry, table: Parameters, t1: float) -> MissionWind:
                 "Gusts pass at the speed of the steady wind, which must not be zero."
             )
         before = dryden(
-            given.gusts.seed,
+            given.gusts.seed if seed is None else seed,
             low_altitude(*numbers),
             airspeed=speed,
             duration=t1 + BEYOND,
@@ -219,15 +235,21 @@ def _pushed(scene: Scene, given: MissionFile) -> Scene:
     return dataclasses.replace(scene, system=system)
 
 
+def input_names(machine: Machine) -> list[str]:
+    """Names of the inputs that a mission's controller sets."""
+    return ["speed_squared", *(FORCES if machine.bodies is not None else ())]
+
+
 def plant_of(given: MissionFile, machine: Machine) -> Plant:
     """Sampled plant of a machine, with instruments and estimator if the mission has them.
 
     Raises:
-        SettingError: rates or delays that do not divide, instruments that do not suffice.
+        SettingError: rates or delays that do not divide, instruments that do not suffice, a start that
+            moves although it is to stand first.
     """
     system, rate = machine.scene.system, given.rates.control
     known = system if machine.believed is None else machine.believed
-    names = ["speed_squared", *(FORCES if machine.bodies is not None else ())]
+    names = input_names(machine)
     count, mass = machine.rotors.spin.shape[0], float(jnp.sum(known.bodies.mass))
     hover = hover_speed_squared(mass, gravity_of(system), machine.rotors.k_f, count)
     before = jnp.concatenate([jnp.full(count, hover), jnp.zeros(len(names) - 1)])
@@ -239,7 +261,8 @@ def plant_of(given: MissionFile, machine: Machine) -> Plant:
     instruments = _instruments(given.sensors, machine)
     estimator = MotionEstimator(system, rate, instruments, tracker=machine.bodies)
     memory = estimator.start(machine.scene.state0)
-    return Plant(machine.scene, sensors=instruments, estimator=estimator, memory=memory, **settings)
+    settings |= {"sensors": instruments, "standing": given.sensors.standing}
+    return Plant(machine.scene, estimator=estimator, memory=memory, **settings)
 
 
 def _instruments(given: SensorsEntry, machine: Machine) -> list[Instrument]:

@@ -21,12 +21,12 @@ _BATTERY: dict[str, Label] = {
     "battery_voltage": (("time",), "V", "at the poles of the battery"),
 }
 # Round-off of speeds that are held at a limit, as a share of the range.
-_AT_LIMIT = 1e-9
+AT_LIMIT = 1e-9
 _DEGREE = math.pi / 180
 # Time in flight before a touchdown [s]; what follows sooner is a rebound.
 _ALOFT = 0.1
 # Round-off of times [s].
-_AT_ONCE = 1e-9
+AT_ONCE = 1e-9
 
 
 def to_data(flight: MissionFlight) -> "xr.Dataset":
@@ -77,24 +77,16 @@ class Measure(NamedTuple):
 
 def measures(data: "xr.Dataset") -> list[Measure]:
     """Largest errors, smallest margins of the limits, and the energy used, of a flight's dataset."""
-    wanted = _tolerances(data)
-    if not _checked(data):
-        # nothing is as late as the tolerances: these numbers are of the whole flight
-        wanted = TolerancesEntry()
-    late = data.sel(time=data.time >= wanted.after - _AT_ONCE)
-    since = f" from {wanted.after:g} s on" if wanted.after else ""
-    if "gear_load" in data:
-        late, since = _in_flight(late), f"{since} in flight"
-    off = np.linalg.norm(late.position_error.values, axis=1)
+    wanted, times = _tolerances(data), _times(data)
+    off = np.linalg.norm(data.position_error.values, axis=1)
+    tilt = data.tilt_error.values / _DEGREE
     found = [
-        _largest(f"Largest position error{since}", off, "m", wanted.position),
-        _largest(
-            f"Largest tilt error{since}", late.tilt_error.values / _DEGREE, "degrees", wanted.tilt
-        ),
+        _largest(data, "position", off, "m", wanted.position, times[0]),
+        _largest(data, "tilt", tilt, "degrees", wanted.tilt, times[0]),
     ]
     if "panel_error" in data:
-        panel = late.panel_error.values / _DEGREE
-        found.append(_largest(f"Largest panel error{since}", panel, "degrees", wanted.panel))
+        panel = data.panel_error.values / _DEGREE
+        found.append(_largest(data, "panel", panel, "degrees", wanted.panel, times[-1]))
     for name, what, limit in (
         ("rotor_speed", "rotor speeds", "speed"), ("displacement", "strokes", "displacement"),
     ):  # fmt: skip
@@ -108,19 +100,39 @@ def _tolerances(data: "xr.Dataset") -> TolerancesEntry:
     return TolerancesEntry(**json.loads(data.attrs["mission"])["tolerances"])
 
 
-def _checked(data: "xr.Dataset") -> bool:
-    """True if the flight came to the time from which its tolerances hold."""
-    return bool(data.time.values[-1] >= _tolerances(data).after - _AT_ONCE)
+def _times(data: "xr.Dataset") -> tuple[float, float]:
+    """Times from which the tolerances of the base and that of the panel hold [s]."""
+    wanted = _tolerances(data)
+    return wanted.after, wanted.after if wanted.panel_after is None else wanted.panel_after
 
 
-def _largest(name: str, values: np.ndarray, unit: str, allowed: float | None) -> Measure:
-    value = float(np.max(values, initial=0.0))
-    return Measure(name, value, unit, allowed, allowed is None or value <= allowed)
+def _reached(data: "xr.Dataset", after: float) -> bool:
+    """True if the flight came to the time from which a tolerance holds."""
+    return bool(data.time.values[-1] >= after - AT_ONCE)
 
 
-def _in_flight(data: "xr.Dataset") -> "xr.Dataset":
-    """Samples at which the ground carries nothing; there may be none."""
-    return data.sel(time=data.gear_load == 0.0)
+def _largest(
+    data: "xr.Dataset",
+    of: str,
+    values: np.ndarray,
+    unit: str,
+    allowed: float | None,
+    after: float,
+) -> Measure:
+    """Largest error from the time on from which its tolerance holds.
+
+    Where nothing is as late, it is that of the whole flight, and nothing is asked of it. With a landing
+    gear it is that of the samples at which the ground carries nothing; there may be none.
+    """
+    if not _reached(data, after):
+        after, allowed = 0.0, None
+    since = f" from {after:g} s on" if after else ""
+    late = data.time.values >= after - AT_ONCE
+    if "gear_load" in data:
+        late, since = late & (data.gear_load.values == 0.0), f"{since} in flight"
+    value = float(np.max(values[late], initial=0.0))
+    kept = allowed is None or value <= allowed
+    return Measure(f"Largest {of} error{since}", value, unit, allowed, kept)
 
 
 def _of_gear(data: "xr.Dataset", wanted: TolerancesEntry) -> list[Measure]:
@@ -154,7 +166,7 @@ def _margin(data: "xr.Dataset", name: str, what: str, limit: str) -> Measure:
             if fault["rotor"] is not None:
                 values[data.time.values >= fault["at"], fault["rotor"] - 1] = np.nan
     least = float(np.nanmin(np.minimum(values - low, high - values) / (high - low)))
-    name, kept = f"Smallest margin of the {what}", least >= -_AT_LIMIT
+    name, kept = f"Smallest margin of the {what}", least >= -AT_LIMIT
     return Measure(name, 100 * least, "% of the range", 0.0, kept)
 
 
@@ -183,7 +195,10 @@ def verdict(data: "xr.Dataset") -> tuple[bool, str]:
     words += f", and ended there: {ending}" if ending else ""
     if broken:
         return False, f"{words}. Not kept: {', '.join(broken)}."
-    if not _checked(data):
-        after = _tolerances(data).after
-        return not ending, f"{words}. Limits were kept; tolerances hold from {after:g} s on."
+    base, panel = _times(data)
+    if not _reached(data, base):
+        return not ending, f"{words}. Limits were kept; tolerances hold from {base:g} s on."
+    if "panel_error" in data and not _reached(data, panel):
+        words = f"{words}. Tolerances and limits were kept; the panel's holds from {panel:g} s on."
+        return not ending, words
     return not ending, f"{words}. All tolerances and limits were kept."

@@ -55,9 +55,13 @@ class InstrumentEntry(Entries):
 
 
 class SensorsEntry(Entries):
-    """Entry for the instruments, which feed an estimator; see `machine.INSTRUMENTS` for defaults."""
+    """Entry for the instruments, which feed an estimator; see `machine.INSTRUMENTS` for defaults.
+
+    They read for a time of `standing` [s] before the flight, while the machine is held at its start.
+    """
 
     seed: Seed = 0
+    standing: NotNegative = 3.0
     gyroscope: InstrumentEntry = InstrumentEntry()
     accelerometer: InstrumentEntry = InstrumentEntry()
     position: InstrumentEntry = InstrumentEntry()
@@ -204,9 +208,13 @@ class BatteryEntry(Entries):
 
 class TolerancesEntry(Entries):
     """Entry for what the verdict allows: the largest errors from a time [s] on, the largest speed at
-    which a landing gear touches down [m/s], and its deepest sink into the ground [m]."""
+    which a landing gear touches down [m/s], and its deepest sink into the ground [m].
+
+    The panel's may have a time of its own, `panel_after`; by default it is `after`.
+    """
 
     after: NotNegative = 0.0
+    panel_after: NotNegative | None = None
     position: Positive | None = None
     tilt: Positive | None = None
     panel: Positive | None = None
