@@ -116,7 +116,9 @@ def test_command_writes_the_page(short_run, tmp_path, capsys):
     folder = save(short_run, tmp_path / "run.nc").parent
     target = tmp_path / "out" / "page.html"
     assert run_view(View(folder, html=target, sun=(90.0, 0.0))) == 0
-    assert "page.html" in capsys.readouterr().out.replace("\n", "")
+    said = capsys.readouterr().out
+    assert "page.html" in said.replace("\n", "")
+    assert "saved times" in " ".join(said.split())
     assert embedded(target.read_text())[0]["sun"] == pytest.approx([1.0, 0.0, 0.0])
     with pytest.raises(stm.SettingError, match="within -90 and 90 degrees, but it is 91"):
         towards_sun(0.0, 91.0)
