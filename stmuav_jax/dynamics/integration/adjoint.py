@@ -32,7 +32,17 @@ from jaxtyping import Array, Bool, Float, Int
 from ...checks.errors import SettingError
 from .explicit import NonDenseRungeKutta, coefficients
 from .problem import Counts, IntegrationState, Problem, SegmentEnd, landing
-from .record import MORE, Now, Pieces, Record, Steps, Windows, again, in_pieces, piece_of
+from .record import (
+    MORE,
+    Now,
+    RecordedPieces,
+    RecordRoom,
+    Steps,
+    Windows,
+    again,
+    in_pieces,
+    piece_of,
+)
 
 TWICE = (
     "Second derivatives of stmuav_jax.integrate by reverse mode over reverse mode are not available: "
@@ -67,13 +77,13 @@ class DiscreteAdjoint(diffrax.AbstractAdjoint):
                 f"A DiscreteAdjoint keeps at least one step attempt, not {self.recorded_steps}."
             )
 
-    def of(self, problem: Problem, segments: int) -> "diffrax.AbstractAdjoint | Record":
+    def of(self, problem: Problem, segments: int) -> "diffrax.AbstractAdjoint | RecordRoom":
         """Adjoint for a problem with this number of output times, or the room for its record."""
         segments, most = max(segments, 1), problem.method.max_steps
         kept = max(KEPT // segments, 64) if self.recorded_steps is None else self.recorded_steps
         kept = min(most, kept)
         if isinstance(problem.solver().solver, NonDenseRungeKutta):
-            return Record.of(kept, most, segments, problem.n_state + problem.n_internal)
+            return RecordRoom.of(kept, most, segments, problem.n_state + problem.n_internal)
         return diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
 
     def loop(self, **how: Any) -> Any:
@@ -82,7 +92,7 @@ class DiscreteAdjoint(diffrax.AbstractAdjoint):
 
 
 def recorded(
-    problem: Problem, carry: IntegrationState, t1: Float[Array, ""], room: Record
+    problem: Problem, carry: IntegrationState, t1: Float[Array, ""], room: RecordRoom
 ) -> SegmentEnd:
     """Integrate to t1 [s] with the discrete adjoint, which has this room for its record."""
     bare = eqx.tree_at(lambda p: p.model, problem, None)
@@ -120,7 +130,7 @@ def _begun(start: _Start, problem: Problem, memory: Any) -> tuple[Problem, Integ
 
 
 @eqx.filter_custom_vjp
-def _recorded(start: _Start, problem: Problem, memory: Any, room: Record) -> SegmentEnd:
+def _recorded(start: _Start, problem: Problem, memory: Any, room: RecordRoom) -> SegmentEnd:
     del room
     problem, carry = _begun(start, problem, memory)
     return landing(problem.solve(carry, start.t1, diffrax.ForwardMode()))
@@ -128,15 +138,15 @@ def _recorded(start: _Start, problem: Problem, memory: Any, room: Record) -> Seg
 
 @_recorded.def_fwd
 def _forward(
-    perturbed: Any, start: _Start, problem: Problem, memory: Any, room: Record
-) -> tuple[SegmentEnd, Pieces]:
+    perturbed: Any, start: _Start, problem: Problem, memory: Any, room: RecordRoom
+) -> tuple[SegmentEnd, RecordedPieces]:
     """Integrate piece by piece, with a record of their starts and of the last one's windows."""
     del perturbed
     problem, carry = _begun(start, problem, memory)
     begin = Now(carry.t, carry.y, carry.solver_state, carry.controller_state)
     if room.pieces == 1:
         end, windows = piece_of(problem, begin, start.t1, room, room.windows)
-        found = Pieces(windows.number, None, windows)
+        found = RecordedPieces(windows.number, None, windows)
     else:
         end, found = in_pieces(problem, begin, start.t1, room)
     over = end.accepted + end.rejected > problem.method.max_steps
@@ -146,13 +156,13 @@ def _forward(
 
 @_recorded.def_bwd
 def _backward(
-    pieces: Pieces,
+    pieces: RecordedPieces,
     wanted: SegmentEnd,
     perturbed: Any,
     start: _Start,
     problem: Problem,
     memory: Any,
-    room: Record,
+    room: RecordRoom,
 ) -> _Start:
     del memory
     # of all numbers of the model only those that depend on what is differentiated by
@@ -189,7 +199,7 @@ def _backward(
 
 
 def _piece_again(
-    problem: Problem, pieces: Pieces, number: Int[Array, ""], room: Record
+    problem: Problem, pieces: RecordedPieces, number: Int[Array, ""], room: RecordRoom
 ) -> tuple[Windows, Bool[Array, ""]]:
     """Windows of a piece, integrated again if it is not the last; False if they miss its end."""
     final = number == pieces.number - 1

@@ -19,7 +19,7 @@ from ..formulations.base import Residuals
 from .adjoint import DiscreteAdjoint, recorded
 from .events import to_event
 from .problem import Counts, IntegrationState, Problem, SegmentEnd, landing
-from .record import Record
+from .record import RecordRoom
 from .step_bound import EVERY
 
 
@@ -53,10 +53,10 @@ def _to(
     problem: Problem,
     carry: IntegrationState,
     t1: Float[Array, ""],
-    adjoint: diffrax.AbstractAdjoint | Record,
+    adjoint: diffrax.AbstractAdjoint | RecordRoom,
 ) -> SegmentEnd:
     """Integrate from the carry to t1 [s], or to an event before it."""
-    if isinstance(adjoint, Record):
+    if isinstance(adjoint, RecordRoom):
         return recorded(problem, carry, t1, adjoint)
     if problem.method.event is not None:
         return to_event(problem, carry, t1, adjoint)

@@ -25,7 +25,7 @@ MORE = diffrax.RESULTS.max_steps_reached
 WINDOWS, ROOM = 256, 10_000_000
 
 
-class Record(NamedTuple):
+class RecordRoom(NamedTuple):
     """Room for the record of an integration to one output time.
 
     Attributes:
@@ -38,7 +38,7 @@ class Record(NamedTuple):
     pieces: int
 
     @classmethod
-    def of(cls, steps: int, max_steps: int, segments: int, numbers: int) -> "Record":
+    def of(cls, steps: int, max_steps: int, segments: int, numbers: int) -> "RecordRoom":
         """Room for all of max_steps attempts, in each of the segments, of a state of so many numbers."""
         needed = -(-max_steps // steps)
         windows = max(WINDOWS, ROOM // (segments * (steps + numbers)))
@@ -85,7 +85,7 @@ class Now(NamedTuple):
     controller_state: Any
 
 
-class Pieces(NamedTuple):
+class RecordedPieces(NamedTuple):
     """Record of an integration: number of pieces, their starts (if there may be many), the last one."""
 
     number: Int[Array, ""]
@@ -103,8 +103,8 @@ def _end(now: Now, counts: tuple[Array, Array], result: diffrax.RESULTS) -> Segm
 
 
 def in_pieces(
-    problem: Problem, begin: Now, t1: Float[Array, ""], room: Record
-) -> tuple[SegmentEnd, Pieces]:
+    problem: Problem, begin: Now, t1: Float[Array, ""], room: RecordRoom
+) -> tuple[SegmentEnd, RecordedPieces]:
     """Integrate to t1 [s] piece by piece, each one window shorter than there is room for."""
     most, none = room.windows - 1, jnp.zeros((), int)
     run = lambda now: piece_of(problem, now, t1, room, most)
@@ -125,14 +125,14 @@ def in_pieces(
     fine = diffrax.RESULTS.successful
     state = (none, begin, _empty(begin, room.pieces), fine, (none, none), _empty(windows))
     number, now, starts, result, counts, windows = jax.lax.while_loop(unfinished, piece, state)
-    return _end(now, counts, result), Pieces(number, starts, windows)
+    return _end(now, counts, result), RecordedPieces(number, starts, windows)
 
 
 def piece_of(
     problem: Problem,
     begin: Now,
     t1: Float[Array, ""],
-    room: Record,
+    room: RecordRoom,
     most: int,
     wanted: Bool[Array, ""] | bool = True,
 ) -> tuple[SegmentEnd, Windows]:
