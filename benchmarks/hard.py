@@ -6,17 +6,26 @@ writes `results/hard.json` and the page `docs/hard.md`.
 """
 
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+from peers import ExudynPeer, MujocoC, PinocchioCpp
+from peers.adapter import Peer
 from problems.hard import CASES, TOLERANCES, Hard, run_of, swinging
+from problems.hard_loops import LOOP_CASES, STARTS
 from shared.command import benchmark
 from shared.pages import number, titled
 from shared.record import ROOT
 
+import stmuav_jax as stm
 from stmuav_jax.files.netcdf import write_atomically
 
+EVERY = (*CASES, *LOOP_CASES)
+PEERS: tuple[type[Peer], ...] = (MujocoC, ExudynPeer, PinocchioCpp)
 PAGE = ROOT / "docs" / "hard.md"
 HEAD = """# Hard cases
 
@@ -32,6 +41,16 @@ SWEEP = """## All tolerances
 A pendulum of 1 m, released with its rod horizontal, for 15 radians of a small swing (4.8 s), at
 tolerances that users may give. The error that is demanded is 1,000 tolerances, and never less than
 1e-11 m.
+"""
+SINGULAR = """## Starts at a singular posture
+
+Nothing says which branch the motion follows: the run has to stop at once and to name the posture.
+"""
+BESIDE = """## Other programs
+
+The same cases by the programs of `benchmarks/peers` that are installed, at their finest setting whose
+steps end at the output times, one run each: error, seconds. A case stands here if its error is one of
+positions; a sentence says why a program did not run it.
 """
 LIMITS = """## Where it ends
 
@@ -59,6 +78,49 @@ def row_of(case: Hard, **method: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def beside(case: Hard, peer: Peer) -> dict[str, Any]:
+    """One case by another program: error and seconds, or the reason why there are none."""
+    system, state, ts = case.build()
+    scene = stm.Scene(case.name, case.why, system, state, t1=float(ts[-1]))
+    row: dict[str, Any] = {"peer": peer.name, "error": None, "seconds": None, "setting": None}
+    if reason := peer.missing() or peer.unsupported(scene):
+        return row | {"reason": reason}
+    reason = "No setting has steps that end at the output times."
+    for setting in reversed(peer.settings(scene)):
+        try:
+            prepared = peer.prepare(scene, ts, setting)
+        except ValueError:
+            continue
+        except Exception as error:
+            return row | {"reason": f"{type(error).__name__}: {error}"[:160]}
+        clock = time.perf_counter()
+        outcome = prepared.run()
+        spent = outcome.seconds or [time.perf_counter() - clock]
+        row["setting"] = {
+            "solver": setting.solver,
+            "tolerance": setting.tolerance,
+            "step": setting.step,
+        }
+        if outcome.failure or not np.all(np.isfinite(outcome.positions)):
+            return row | {"reason": outcome.failure or "Its positions are not finite."}
+        seen: Any = SimpleNamespace(ts=ts, states=SimpleNamespace(r=outcome.positions))
+        return row | {"error": case.error(seen), "seconds": float(np.median(spent)), "reason": ""}
+    return row | {"reason": reason}
+
+
+def singular_start(name: str, why: str, system: stm.System) -> dict[str, Any]:
+    """A run from a singular posture: how far it came, and what it says."""
+    run = stm.simulate(system, system.reference, t1=0.1, throw=False)
+    named = "the start is a singular posture" in run.failure
+    return {
+        "name": name,
+        "why": why,
+        "t_end": run.certificate.t_end,
+        "said": run.failure,
+        "named": named,
+    }
+
+
 def sweep(tolerances: tuple[float, ...]) -> Iterator[dict[str, Any]]:
     """The pendulum at every tolerance."""
     build, error = swinging(1.0, 15.0)
@@ -76,11 +138,45 @@ def holds(row: dict[str, Any]) -> bool:
 def record(size: tuple[int | None, int | None]) -> Iterator[dict[str, Any]]:
     """So many cases and tolerances."""
     content: dict[str, Any] = {"what": "hard cases against known motions", "cases": []}
-    for case in CASES[: size[0]]:
+    peers = [peer() for peer in PEERS]
+    for case in EVERY[: size[0]]:
         content["cases"].append(row_of(case))
+        if case.of_positions:
+            content["cases"][-1]["peers"] = [beside(case, peer) for peer in peers]
         print(content["cases"][-1], flush=True)
+    made = STARTS[: size[0]]
+    content["starts"] = [singular_start(name, why, build()) for name, why, build in made]
     content["tolerances"] = list(sweep(TOLERANCES[: size[1]]))
     yield content
+
+
+def more(content: dict[str, Any]) -> list[str]:
+    """Sections on singular starts and on other programs, where the record has them."""
+    parts: list[str] = []
+    if starts := content.get("starts"):
+        named = lambda x: "yes" if x else "no"
+        columns = (
+            ("start", "name"),
+            ("what makes it hard", "why"),
+            ("named", "named", named),
+            "said",
+        )
+        parts += [SINGULAR, titled("", starts, *columns).lstrip(), ""]
+    ran = [row for row in content["cases"] if row.get("peers")]
+    if ran:
+        shown = lambda one: (
+            one["reason"]
+            or f"{number(one['error'], digits=2)}, {number(one['seconds'], digits=2)} s"
+        )
+        cell = lambda k: lambda row: shown(row["peers"][k])
+        names = [(one["peer"], None, cell(k)) for k, one in enumerate(ran[0]["peers"])]
+        ours = (
+            "reached here",
+            None,
+            lambda row: f"{number(row['reached'], digits=2)} {row['unit']}",
+        )
+        parts += [BESIDE, titled("", ran, ("case", "name"), ours, *names).lstrip(), ""]
+    return parts
 
 
 def page(content: dict[str, Any]) -> str:
@@ -91,6 +187,10 @@ def page(content: dict[str, Any]) -> str:
     effort = (
         ("steps", None, lambda row: f"{row['accepted']:,} + {row['rejected']:,}"),
         ("run [s]", "seconds", lambda x: number(x, digits=2)),
+    )
+    drift = (
+        ("joints open by [m]", "position_violation", lambda x: number(x, digits=2)),
+        ("energy, relative", "relative_energy_error", lambda x: number(x, digits=2)),
     )
     reached = (
         ("demanded", None, lambda row: f"{row['demanded']:.0e} {row['unit']}"),
@@ -105,12 +205,24 @@ def page(content: dict[str, Any]) -> str:
     where = f"Commit {about['commit'][:10]}, {about['date'][:10]}, run times on one core."
     cases = titled(
         "## Cases", content["cases"], ("case", "name"), ("what makes it hard", "why"),
-        ("compared with", "truth"), *reached, *effort,
+        ("compared with", "truth"), *reached, *drift, *effort,
     )  # fmt: skip
     swept = titled(
         "", content["tolerances"], ("tolerance", "tolerance", "{:.0e}".format), *reached, *effort
     )
-    return "\n".join([HEAD, f"{where} {verdict}", "", cases, "", SWEEP, swept.lstrip(), "", LIMITS])
+    parts = [
+        HEAD,
+        f"{where} {verdict}",
+        "",
+        cases,
+        "",
+        SWEEP,
+        swept.lstrip(),
+        "",
+        *more(content),
+        LIMITS,
+    ]
+    return "\n".join(parts)
 
 
 def show(path: Path, folder: Path) -> str:

@@ -1,17 +1,20 @@
 """Hard cases: each reaches its end, with the error demanded, and knows how large its error is.
 
-The cases and what they are compared with are those of `benchmarks/problems/hard.py`.
+The cases and what they are compared with are those of `benchmarks/problems/hard.py` and `hard_loops.py`.
 """
 
 import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hard import holds, row_of, sweep
-from problems.hard import CASES, TOLERANCES, Hard
+from hard import EVERY, PEERS, beside, holds, page, row_of, singular_start, sweep
+from peers.adapter import Outcome, Prepared, Setting
+from problems.hard import TOLERANCES, Hard, apart, on_rail
+from problems.hard_loops import STARTS, in_line
 
 import stmuav_jax as stm
 
@@ -24,7 +27,7 @@ ROUND_OFF = 1e-12
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", EVERY, ids=lambda case: case.name)
 def test_a_hard_case(case: Hard):
     row = row_of(case)
     assert holds(row), row
@@ -41,25 +44,19 @@ def test_every_tolerance():
         assert holds(row), row
 
 
-def folded_four_bar() -> stm.System:
-    """A four-bar whose third rod lies back on the others, heavy beyond its foot: branches meet there."""
-    small, z = (1e-2, 1e-2, 1e-2), (0.0, 0.0, 1.0)
-    bodies = [
-        stm.Body(f"rod{k}", 1.0, small, position=(k + 0.5 - 2 * (k == 2), 0.0, 0.0))
-        for k in range(3)
-    ]
-    places, names = ((0.0,), (1.0,), (2.0,), (1.0,)), ("ground", "rod0", "rod1", "rod2", "ground")
-    joints = [
-        stm.revolute(f"R{k}", names[k], names[k + 1], point=(*places[k], 0.0, 0.0), axis=z)
-        for k in range(4)
-    ]
-    return stm.System(bodies, joints, [stm.Gravity((0.0, -9.81, 0.0))])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "why", "build"), STARTS, ids=[name for name, *_ in STARTS])
+def test_a_start_in_a_singular_posture_is_named(name, why, build):
+    """Nothing says which branch the motion follows: it stops at once, and the posture is named."""
+    row = singular_start(name, why, build())
+    assert row["named"], row
+    assert "R" in row["said"]
+    assert row["t_end"] < 1e-3
 
 
 @pytest.mark.slow
-def test_a_start_in_a_singular_posture_is_named():
-    """Nothing says which branch the motion follows: it stops at once, and the posture is named."""
-    system = folded_four_bar()
+def test_a_singular_start_raises_by_default():
+    system = in_line(0.5)
     with pytest.raises(stm.SimulationError, match=r"the start is a singular posture of .*R\d"):
         stm.simulate(system, system.reference, t1=0.1)
 
@@ -85,3 +82,62 @@ def test_the_page_is_made_of_the_record(tmp_path):
     text = (tmp_path / "hard.md").read_text()
     assert "All are reached." in text
     assert all(row["name"] in text for row in content["cases"])
+
+
+class Falling:
+    """Program that knows where a body on a rail is, for the columns of other programs."""
+
+    name, reason = "falling", ""
+
+    def missing(self) -> str:
+        return self.reason
+
+    def unsupported(self, scene: stm.Scene) -> str:
+        return "" if len(scene.system.names) == 1 else "Two bodies are not written."
+
+    def settings(self, scene: stm.Scene | None = None) -> list[Setting]:
+        return [Setting("coarse", step=0.5), Setting("fine", step=0.25), Setting("odd", step=0.3)]
+
+    def prepare(self, scene: stm.Scene, times: np.ndarray, setting: Setting) -> Prepared:
+        if setting.solver == "odd":
+            raise ValueError("Steps of 0.3 s do not end at the wanted times.")
+        x = 0.5 * times**2 + (setting.step or 0.0)
+        places = np.stack([x, 0 * x, 0 * x], axis=1)[:, None]
+        return Prepared(lambda: Outcome(places, seconds=[1.0, 3.0, 2.0]))
+
+
+def test_other_programs_run_at_their_finest_setting_that_fits():
+    """The finest one's steps do not end at the times; reasons stand for what was not run."""
+    ts = np.linspace(0.0, 1.0, 5)
+
+    def case(count: int) -> Hard:
+        bodies, joints = on_rail(count)
+        system = stm.System(bodies, joints)
+        exact = lambda run: apart(run, 0, 0.5 * run.ts[:, None] ** 2)
+        return Hard("a", "b", "c", 1.0, "m", lambda: (system, system.reference, ts), exact)
+
+    peer: Any = Falling()
+    row = beside(case(1), peer)
+    assert row["error"] == pytest.approx(0.25)
+    assert (row["seconds"], row["setting"]["solver"], row["reason"]) == (2.0, "fine", "")
+    assert beside(case(2), peer)["reason"] == "Two bodies are not written."
+    peer.reason = "It is not installed."
+    assert beside(case(1), peer) == {
+        "peer": "falling", "error": None, "seconds": None, "setting": None,
+        "reason": "It is not installed.",
+    }  # fmt: skip
+    assert len(PEERS) == 3
+    assert [one.name for one in EVERY if not one.of_positions] == [
+        "fast rotation", "intermediate axis", "ten minutes of the tracker"
+    ]  # fmt: skip
+
+
+def test_the_page_of_an_older_record_has_no_empty_sections():
+    content = json.loads((FOLDER / "results" / "hard.json").read_text())
+    for row in content["cases"]:
+        row.pop("peers", None)
+    content.pop("starts", None)
+    text = page(content)
+    assert "joints open by [m]" in text
+    assert "Other programs" not in text
+    assert "singular posture" not in text.split("## All tolerances")[1]

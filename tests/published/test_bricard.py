@@ -11,36 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_forms import attitude, scene
+from problems.bricard import CORNERS, bricard
 
 import stmuav_jax as stm
 
-CORNERS = np.array(
-    [(0, 0, 0), (1, 0, 0), (1, -1, 0), (1, -1, 1), (0, -1, 1), (0, 0, 1)], dtype=float
-)
-AXES = [(0, 1, 0), (0, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0)]
-THIN = 1e-3  # kg m^2, along a rod
 TIMES = np.linspace(0.0, 10.0, 21)
-
-
-def bricard(last=stm.revolute) -> stm.System:
-    """The linkage, with the joint of its last corner."""
-    rods = np.diff(CORNERS, axis=0)
-    bodies = [
-        stm.Body(
-            f"rod{k}",
-            1.0,
-            tuple((1 - np.abs(rod)) / 12 + THIN * np.abs(rod)),
-            position=tuple(CORNERS[k] + rod / 2),
-        )
-        for k, rod in enumerate(rods)
-    ]
-    names = ["ground", *(body.name for body in bodies), "ground"]
-    kinds = [stm.revolute] * 5 + [last]
-    joints = [
-        kind(f"R{k}", names[k], names[k + 1], point=tuple(CORNERS[k]), axis=AXES[k])
-        for k, kind in enumerate(kinds)
-    ]
-    return stm.System(bodies, joints, [stm.Gravity((0.0, -9.81, 0.0))])
 
 
 def corner(run: stm.Run) -> np.ndarray:

@@ -137,12 +137,12 @@ def test_there_is_room_for_all_steps():
         (1, 64, 409, 4096), (1, 12, 1000, 100_000, 10**7), (1, 10, 64, 1000), (13, 400)
     ):
         kept = min(kept, most)
-        room = record.Record.of(kept, most, segments, size)
+        room = record.RecordRoom.of(kept, most, segments, size)
         spare = 0 if room.pieces == 1 else 1
         assert (room.windows - spare) * room.pieces * room.steps >= most
         numbers = segments * room.windows * (kept + size)
         assert numbers <= max(record.ROOM, segments * record.WINDOWS * (kept + size))
-    assert record.Record.of(64, 100_000, 64, 28).pieces == 1
+    assert record.RecordRoom.of(64, 100_000, 64, 28).pieces == 1
 
 
 @pytest.mark.slow
