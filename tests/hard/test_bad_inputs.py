@@ -19,6 +19,7 @@ from helpers import GRAVITY, np_rotation, pendulum, state_of, swung, unit
 
 import stmuav_jax as stm
 from stmuav_jax.commands.models.tuning import read_record
+from stmuav_jax.dynamics.choices import solver_named
 from stmuav_jax.figures.day import load_attitude
 
 LENGTH, MASS, INERTIA = 0.5, 2.0, 0.02
@@ -133,7 +134,7 @@ def test_steps_for_which_newton_fails_are_taken_again(solver):
     """A first step of 1 s that has no solution near the end; then the end itself, which is none."""
     system, start = runaway()
     method = stm.Method(
-        solver=stm.dynamics.choices.solver_named(solver), first_step=1.0, rtol=1e-6, atol=1e-6,
+        solver=solver_named(solver), first_step=1.0, rtol=1e-6, atol=1e-6,
         adjoint=diffrax.ForwardMode(), max_steps=3000,
     )  # fmt: skip
     run = jax.jit(lambda ts: stm.integrate(system, start, ts, method))

@@ -16,6 +16,7 @@ import pytest
 from problems.conservative import SLOW, top
 
 import stmuav_jax as stm
+from stmuav_jax.dynamics.choices import solver_named
 from stmuav_jax.dynamics.integration.problem import begin, prepare
 
 SPAN = 1.0
@@ -31,11 +32,11 @@ SYSTEM, START = top(SLOW)
 
 
 @cache
-def by_equal_steps(solver: str, formulation: Any) -> Any:
+def by_equal_steps(solver: Any, formulation: Any) -> Any:
     """Function count -> positions at the end (1, 3), one compiled program for all counts."""
     method = stm.Method(
         formulation=formulation,
-        solver=stm.dynamics.choices.solver_named(solver),  # pyright: ignore[reportArgumentType]
+        solver=solver_named(solver),
         # to which the stages of implicit methods are solved
         rtol=1e-13,
         atol=1e-13,
@@ -59,7 +60,7 @@ def by_equal_steps(solver: str, formulation: Any) -> Any:
     return lambda count: np.asarray(end(SPAN / count * (1 + 1e-14)))
 
 
-def orders(solver: str, formulation: Any, counts: tuple[int, ...]) -> np.ndarray:
+def orders(solver: Any, formulation: Any, counts: tuple[int, ...]) -> np.ndarray:
     """Orders between the numbers of steps."""
     exact = by_equal_steps("dopri8", stm.Tree())(200)
     errors = [np.linalg.norm(by_equal_steps(solver, formulation)(n) - exact) for n in counts]
