@@ -25,7 +25,7 @@ from shared.record import ALLOW, MEASURED, RESULTS, ROOT, commit, moved, traced
 FOLDER = Path(__file__).parent
 ALONE = (
     "stiff", "hard", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "waiting",
-    "failure", "compile_times", "montecarlo",
+    "failure", "compile_times", "montecarlo", "missions",
 )  # fmt: skip
 # Result -> the script that measures it, with its arguments, in the order of running.
 BENCHMARKS: dict[str, tuple[str, ...]] = {

@@ -113,11 +113,26 @@ def _work(command: Montecarlo) -> tuple[Any, dict[str, Any]]:
 
     plain = plain_of(command)
     try:
+        if plain.get("kind") == "missions":
+            return _missions(command, plain), plain
         return make_work(plain, _table(command, plain), **_options(command, plain)), plain
     except SettingError as error:
         if command.study in READY:
             raise
         raise SettingError(f"{command.study}: {error}") from None
+
+
+def _missions(command: Montecarlo, plain: Mapping[str, Any]) -> Any:
+    """Work of a study of a mission."""
+    from ..missions.ensemble import mission_work
+
+    for name in ("lanes", "devices", "params"):
+        if getattr(command, name) is not None:
+            raise SettingError(
+                f"A study of a mission has no --{name}: its flights go side by side in sixteens, with the "
+                "parameters of the mission's file."
+            )
+    return mission_work(plain, Path(command.study).parent)
 
 
 def run_montecarlo(command: Montecarlo) -> int:

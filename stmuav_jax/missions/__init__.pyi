@@ -1,5 +1,9 @@
 """Public names of this folder; `__init__.py` imports each when it is first used."""
 
+from .ensemble import (
+    MissionWork as MissionWork,
+    mission_work as mission_work,
+)
 from .figures import (
     FLIGHT_FIGURES as FLIGHT_FIGURES,
     flight_figures as flight_figures,

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 
 from ..checks.schema import Count, Entries, Finite, Positive, Tuples, shown
 from ..files.model_schema import Size, Triple
-from ..montecarlo.schema import Name, Seed
+from ..montecarlo.schema import MOST_STEPS, Drawing, Factor, Name, Seed
 
 MISSION_FORMAT = 1
 # Longest flight [s]: its samples are kept in memory.
@@ -241,3 +241,18 @@ class MissionFile(Entries):
     faults: Annotated[tuple[FaultEntry, ...], Tuples] = ()
     battery: BatteryEntry | None = None
     tolerances: TolerancesEntry = TolerancesEntry()
+
+
+class MissionStudyFile(Drawing):
+    """Entries of a Monte Carlo study of a mission, which is a ready one or a file beside the study's.
+
+    Its end `t1` [s] takes the place of the mission's.
+    """
+
+    kind: Literal["missions"]
+    name: Name = "missions"
+    mission: str
+    t1: Annotated[float, Field(gt=0, le=LONGEST)] | None = None
+    factors: Annotated[dict[str, Factor], Field(min_length=1, max_length=1000)]
+    samples: Count | None = None
+    chunk: Annotated[int, Field(ge=1, le=MOST_STEPS)] | None = None

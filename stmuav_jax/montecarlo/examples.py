@@ -131,7 +131,9 @@ def make_work(
             options["lanes"] = plain.get("lanes")
         return FlightWork(study, **options)
     if kind != "estimation":
-        raise SettingError(f"A study's kind is flights or estimation, not {shown(kind)}.")
+        raise SettingError(
+            f"A study's kind is flights or estimation, or missions with a mission, not {shown(kind)}."
+        )
     given = estimation_file(plain)
     if table is not None:
         raise SettingError("Studies of estimation take no other parameters yet.")

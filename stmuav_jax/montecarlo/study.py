@@ -323,7 +323,7 @@ def study_from_plain(
         SettingError: an unknown entry (with the nearest known one), or numbers that do not fit.
     """
     given = flights_file(plain)
-    factors, relative = _factors(given.factors)
+    factors, relative = factors_of(given.factors)
     of = _flights(given, table, relative)
     drawing = given.model_dump(include=set(Drawing.model_fields))
     sampling = Sampling(factors, **drawing)
@@ -357,7 +357,7 @@ def _flights(
     return ModelFlights(given.model, relative, given.inputs, started(given.factors))
 
 
-def _factors(given: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[str]]:
+def factors_of(given: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[str]]:
     """Distributions of the factors in plain form, and the names of relative ones."""
     found: dict[str, Any] = {}
     relative = set()
