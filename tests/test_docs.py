@@ -12,6 +12,8 @@ import pytest
 
 import stmuav_jax as stm
 from stmuav_jax import cli
+from stmuav_jax.checks.schema import checked
+from stmuav_jax.missions.schema import MissionStudyFile
 from stmuav_jax.montecarlo.study import study_from_plain
 
 ROOT = Path(__file__).parents[1]
@@ -104,7 +106,7 @@ def test_links_lead_somewhere(page):
 
 # What reads the TOML of a page; the missions' is read in tests/missions/test_missions.py, the first block of
 # docs/models.md is a study that tests/commands/test_model_commands.py carries out.
-TOML = {"geometry": 1, "missions": 1, "models": 2, "parameters_file": 1, "studies": 1}
+TOML = {"geometry": 1, "missions": 1, "models": 2, "parameters_file": 1, "studies": 2}
 
 
 def fenced(page: Path, kinds: str) -> list[str]:
@@ -137,7 +139,8 @@ def test_parameters_of_a_page_replace_those_of_the_table(name, tmp_path):
 
 
 def test_study_of_the_page_is_built(tmp_path):
-    (text,) = fenced(DOCS / "studies.md", "toml")
+    text, of_missions = fenced(DOCS / "studies.md", "toml")
+    checked(MissionStudyFile, tomllib.loads(of_missions), "A study of a mission")
     (tmp_path / "study.toml").write_text(text)
     (tmp_path / "rates.csv").write_text("q\n0.1\n-0.2\n0.05\n")
     plain = stm.files.load_study(tmp_path / "study.toml")

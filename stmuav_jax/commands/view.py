@@ -23,7 +23,7 @@ class View:
     """Show the moving mechanism of a saved run in the browser, or write it as a page or a film.
 
     Examples: stmuav view runs/uav_tracker_2 --html flight.html --sun 135 50;
-    stmuav view runs/uav_tracker_2 --gif flight.gif --span 0 0.6 --speed 0.2
+    stmuav view runs/uav_tracker_2 --gif flight.gif --span 0 0.6 --playback 0.2
     """
 
     run: tyro.conf.Positional[Path]
@@ -54,7 +54,7 @@ class View:
         24.0, -53.0,
     )  # fmt: skip
     """Elevation, and azimuth from x towards y, from which the film is seen [degrees]."""
-    speed: Annotated[float, Number("speed of the film", "", above=0.0, high=1e6)] = 1.0
+    playback: Annotated[float, Number("speed of the film", "", above=0.0, high=1e6)] = 1.0
     """Seconds of the motion in a second of the film; 0.1 is slow motion."""
 
 
@@ -80,7 +80,7 @@ def run_view(command: View) -> int:
                 paths.append(
                     film(
                         command.run, target, fps=command.fps, size=command.size, span=command.span,
-                        view=command.eye, speed=command.speed, progress=progress,
+                        view=command.eye, speed=command.playback, progress=progress,
                     )
                 )  # fmt: skip
     written(out, paths)

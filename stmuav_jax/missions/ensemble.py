@@ -262,7 +262,7 @@ class MissionWork(AbstractWork):
         return np.stack([own(first + k) for k in range(LANES)]).astype(np.uint32)
 
     def _kept(self, worst: Any) -> np.ndarray:
-        """Whether flights kept the tolerances and limits of the mission (lanes,)."""
+        """Test whether flights kept the tolerances and limits of the mission (lanes,)."""
         wanted = self.mission.file.tolerances
         fine = (worst.rotors >= -AT_LIMIT) & (worst.strokes >= -AT_LIMIT)
         for value, most in (

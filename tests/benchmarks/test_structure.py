@@ -17,7 +17,8 @@ FLOORS = {
     "": 4,
 }
 TESTS = {path.stem for path in FOLDER.parent.joinpath("tests").rglob("*.py")} | {"tests"}
-LINES, STEPS, IN_A_FOLDER, IN_ALL = 400, 60, 15, 8_300
+# sixteen scripts are started
+LINES, STEPS, IN_A_FOLDER, IN_ALL = 400, 60, 16, 8_060
 
 each = pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(FOLDER)))
 

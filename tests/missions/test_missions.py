@@ -18,7 +18,7 @@ from stmuav_jax.commands.fly import NOT_KEPT, UNFINISHED, Fly
 from stmuav_jax.files.netcdf import load_checkpoint, save_checkpoint
 from stmuav_jax.missions.keep import load_reached, save_reached
 from stmuav_jax.missions.mission import LIBRARY
-from stmuav_jax.missions.outcome import _in_flight, _of_gear
+from stmuav_jax.missions.outcome import _largest, _of_gear
 from stmuav_jax.missions.schema import MissionFile, TolerancesEntry
 
 missions = stm.missions
@@ -309,9 +309,11 @@ def test_a_touchdown_follows_a_time_in_flight_and_rebounds_do_not():
     assert (speed.value, speed.allowed, speed.kept) == (pytest.approx(0.5), 0.4, False)
     assert (sink.value, sink.kept) == (pytest.approx(2e-3), True)
     assert carried.value == 30.0
-    assert _in_flight(data).time.values.tolist() == ts[load == 0.0].tolist()
+    late = _largest(data, "position", ts, "m", 1.0, 0.2)
+    assert late.name == "Largest position error from 0.2 s on in flight"
+    assert (late.value, late.kept) == (ts[load == 0.0][-1], False)
     never = data.assign(gear_load=("time", np.full(100, 30.0)))
-    assert _in_flight(never).sizes["time"] == 0
+    assert _largest(never, "position", ts, "m", 1.0, 0.2).value == 0.0
     assert [one.name for one in _of_gear(never, wanted)] == [sink.name, carried.name]
     # shorter than the time in flight that a touchdown takes
     assert len(_of_gear(data.isel(time=slice(0, 3)), TolerancesEntry())) == 2

@@ -292,7 +292,7 @@ def test_a_failing_ffmpeg_is_quoted(data, tmp_path, monkeypatch):
 def test_command_writes_films(short_run, tmp_path, capsys):
     save(short_run, tmp_path / "run.nc")
     words = ["view", str(tmp_path), "--gif", str(tmp_path / "a.gif"), "--size", "160", "120"]
-    assert cli.main([*words, "--speed", "0.5", "--span", "0", "0.04", "--eye", "90", "-90"]) == 0
+    assert cli.main([*words, "--playback", "0.5", "--span", "0", "0.04", "--eye", "90", "-90"]) == 0
     assert "a.gif" in capsys.readouterr().out.replace("\n", "")
     with Image.open(tmp_path / "a.gif") as picture:
         assert (picture.size, picture.n_frames) == ((160, 120), 3)  # pyright: ignore[reportAttributeAccessIssue]
