@@ -1,4 +1,4 @@
-"""Time per filter step on the report's case 2: one filter, a bank of 256, and the peers.
+"""Time per filter step on the report's case 2: one filter, online or not, a bank of 256, and the peers.
 
 The 8-state model with corrected kinematics and Euler steps, the report's tuning
 (alpha = 0.1, beta = 2, kappa = 0.1) in double precision, everything in one process on one core:
@@ -11,6 +11,7 @@ jitter of 1e-9 is taken out, and its first entry is a measurement that is all pr
 before it predicts.
 """
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -18,13 +19,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from shared.clock import Timing, measure
+from shared.clock import Timing, measure, summary
 from shared.command import benchmark
-from shared.native import with_native_loops
+from shared.native import in_process, with_native_loops
 
 from stmuav_jax.algebra.compiler import compiler_options
 from stmuav_jax.estimation.bank import filter_bank
 from stmuav_jax.estimation.filter import kalman_filter
+from stmuav_jax.estimation.online import OnlineFilter
 from stmuav_jax.estimation.sigma import Unscented
 from stmuav_jax.estimation.update import DEFAULT, AbstractFilter, GaussianFilter
 from stmuav_jax.quadrotor.model import (
@@ -119,6 +121,32 @@ def programs(method: AbstractFilter, states: int) -> tuple[Any, Any]:
     return jax.jit(single, compiler_options=options), jax.jit(bank, compiler_options=options)
 
 
+def online(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, float]:
+    """Microseconds of `OnlineFilter.step` with the default filter and 8 states, one call at a time."""
+    found = OnlineFilter(report_model(propagation="euler"), report_prior())
+    found.warm_up(u[0])
+    seconds = []
+    for k in range(size.steps):
+        start = time.perf_counter()
+        found.step(y[k], (k + 1) * DT, u[k])
+        seconds.append(time.perf_counter() - start)
+    return per_step(summary(seconds), 1)
+
+
+def synchronous() -> None:
+    """Keep every computation in the thread that asks for it; before JAX computes anything."""
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+def with_online(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
+    """The online filter as it is, in a process without asynchronous dispatch, and by native loops."""
+    return {
+        "default": online(size, u, y),
+        "without_async_dispatch": in_process(synchronous, online, size, u, y),
+        "native_loops": with_native_loops(online, size, u, y),
+    }
+
+
 def with_filterpy(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
     """FilterPy, its functions in plain NumPy."""
     from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter  # pyright: ignore[reportMissingImports]
@@ -207,6 +235,8 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
     u, y = record_of_case(2, size.steps)
     content: dict[str, Any] = {"ours": ours(size, u, y)}
     content["native_loops"] = with_native_loops(ours, size, u, y)
+    content["online"] = with_online(size, u, y)
+    print("online", content["online"], flush=True)
     for name, peer in (("filterpy", with_filterpy), ("dynamax", with_dynamax)):
         try:
             content[name] = peer(size, u, y)

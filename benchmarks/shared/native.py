@@ -1,7 +1,7 @@
-"""A process in which XLA compiles loops into native functions.
+"""A process in which JAX is set up in another way, such as XLA compiling loops into native functions.
 
-XLA reads the option once, when its backend starts; so runs with it and runs without are in two
-processes, of which only one computes at a time.
+XLA reads such options once, when its backend starts; so runs with them and runs without are in
+different processes, of which only one computes at a time.
 """
 
 from collections.abc import Callable
@@ -14,12 +14,17 @@ import stmuav_jax as stm
 
 
 @cache
-def _other() -> ProcessPoolExecutor:
-    """The process with native loops, started when it is needed first."""
-    how = {"mp_context": get_context("spawn"), "initializer": stm.algebra.use_native_loops}
+def _other(begin: Callable[[], Any]) -> ProcessPoolExecutor:
+    """The process that begins with this function, started when it is needed first."""
+    how = {"mp_context": get_context("spawn"), "initializer": begin}
     return ProcessPoolExecutor(max_workers=1, **how)
+
+
+def in_process(begin: Callable[[], Any], function: Callable[..., Any], *arguments: Any) -> Any:
+    """Value of a module's function, computed in the process that begins with a function of a module."""
+    return _other(begin).submit(function, *arguments).result()
 
 
 def with_native_loops(function: Callable[..., Any], *arguments: Any) -> Any:
     """Value of a module's function, computed in the process with native loops."""
-    return _other().submit(function, *arguments).result()
+    return in_process(stm.algebra.use_native_loops, function, *arguments)

@@ -21,6 +21,8 @@ def test_estimation(tmp_path):
     for kind in record["ours"].values():
         for how in ("single", "bank"):
             assert kind[how]["median_us"] > 0
+    assert set(record["online"]) == {"default", "without_async_dispatch", "native_loops"}
+    assert all(how["median_us"] > 0 for how in record["online"].values())
     # a peer has figures, or the reason why not
     for peer in ("filterpy", "dynamax"):
         assert "apart" in record[peer] or record[peer]["skipped"]
