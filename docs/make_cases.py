@@ -44,12 +44,11 @@ def main() -> None:
                 f"| {c.relative_energy_error:.1e} | {c.accepted_steps} |\n"
             )
             place = Path("figures") / run.scene.name
-            for path in save_figures(FIGURES, FOLDER / place, "png", run, dpi=110):
-                if path.stem == "balances":
-                    path.unlink()
+            figures = {name: FIGURES[name] for name in ("pose", "joints")}
+            save_figures(figures, FOLDER / place, "png", run, dpi=110)
             sections += f"\n## `{name}` case {case}\n\n{run.scene.title}.\n\n"
-            sections += f"![positions]({place}/positions.png)\n\n"
-            sections += f"![Euler parameters]({place}/euler_parameters.png)\n"
+            sections += f"![position, tilt and angular velocity]({place}/pose.png)\n\n"
+            sections += f"![strokes and panel angles]({place}/joints.png)\n"
             print(run.scene.name, c.result)
     (FOLDER / "cases.md").write_text(HEAD + rows + TEXT + sections)
 

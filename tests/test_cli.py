@@ -52,7 +52,7 @@ def test_version_and_help(capsys):
 def test_simulate_writes_results_and_prints_the_certificate(tmp_path, capsys):
     out = tmp_path / "results"
     assert run("simulate", "hexacopter", "--t1", "0.1", "--out", str(out)) == 0
-    names = {"run.nc", "certificate.json", "positions.png", "euler_parameters.png", "balances.png"}
+    names = {"run.nc", "certificate.json", "pose.png", "balances.png"}
     assert {p.name for p in out.iterdir()} == names
     assert load(out / "run.nc").attrs["scene"] == "hexacopter"
     assert json.loads((out / "certificate.json").read_text())["certificate"]["t_end"] == 0.1

@@ -27,9 +27,9 @@ from .plot import (
     FIGURES as FIGURES,
     STYLES as STYLES,
     balances as balances,
-    euler_parameters as euler_parameters,
     grid as grid,
-    positions as positions,
+    joints as joints,
+    pose as pose,
     save_figures as save_figures,
 )
 from .report import (

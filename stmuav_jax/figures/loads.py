@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
@@ -22,6 +23,8 @@ HEADER = (
 
 # Loads below this are round-off of joints without such a load; tables show them as 0 [N, N m].
 _NOTHING = 1e-9
+# Peaks of more than so many usual loads are drawn on a logarithmic axis.
+_SPIKE = 5.0
 
 
 def rows(system: System, found: Envelope) -> list[tuple[str | float, ...]]:
@@ -85,7 +88,8 @@ def loads_figure(scene: Scene, found: JointLoads) -> Figure:
     else:
         for ax in axes.flat:
             ax.set_axis_off()
-    figure.suptitle(f"{scene.title}\nreactions in joint axes, body i on body j", fontsize=10)
+    words = "reactions in joint axes, body i on body j; beyond the thin lines logarithmic"
+    figure.suptitle(f"{scene.title}\n{words}", fontsize=10, parse_math=False)
     return figure
 
 
@@ -95,3 +99,24 @@ def _history(found: JointLoads, k: int, axes: np.ndarray) -> None:
         curves(ax, np.asarray(found.ts), values[:, part], ("x", "y", "z", "magnitude"))
         if not np.any(np.abs(values[:, part]) > _NOTHING):
             ax.set_ylim(-1.0, 1.0)
+            ax.set_yticks([])
+            ax.text(0.5, 0.6, "none", transform=ax.transAxes, ha="center", fontsize=9)
+        else:
+            _room_for_spikes(ax, values[:, part][:, -1])
+
+
+def _room_for_spikes(ax: Axes, magnitude: np.ndarray) -> None:
+    """Make an axis logarithmic beyond the usual loads, where short peaks are far above them."""
+    sizes = magnitude[np.isfinite(magnitude)]
+    usual = float(np.quantile(sizes, 0.9))
+    if usual <= _NOTHING or np.max(sizes) < _SPIKE * usual:
+        return
+    decade = 10 ** np.floor(np.log10(usual))
+    linear = float(decade * max(k for k in (1, 2, 5) if k * decade <= usual))
+    ax.set_yscale("symlog", linthresh=linear, linscale=1.5)
+    largest = 10 ** np.ceil(np.log10(np.max(sizes)))
+    ax.set_yticks([-largest, -linear, 0.0, linear, largest])
+    ax.minorticks_off()
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    for side in (-linear, linear):
+        ax.axhline(side, color="0.55", linewidth=0.5)

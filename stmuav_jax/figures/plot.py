@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from .numbers import balances_of, euler_parameters_of, positions_of
+from .numbers import balances_of, joints_of, pose_of
 
 if TYPE_CHECKING:
     from ..dynamics.run import Run
@@ -51,79 +51,105 @@ def curves(ax: Axes, ts: np.ndarray, values: np.ndarray, labels: tuple[str, ...]
     ax.set_xlabel("time [s]", fontsize=9)
 
 
-def positions(run: "Run") -> Figure:
-    """Figure of positions of the watched bodies' centres of mass, one panel per body.
+def pose(run: "Run") -> Figure:
+    """Figure of the base's position, tilt and angular velocity.
 
-    Source: in the style of report Part II, Fig. 5.3 to 5.5.
+    The base is the body with rotors, or else the last watched body; tilt is the angle of its z axis
+    from the vertical.
     """
-    return _positions(*positions_of(run))
+    return _pose(*pose_of(run))
 
 
-def _positions(
-    title: str, names: Sequence[str], ts: np.ndarray, positions: Sequence[np.ndarray]
+def _pose(
+    title: str, name: str, ts: np.ndarray, r: np.ndarray, tilt: np.ndarray, omega: np.ndarray
 ) -> Figure:
-    columns = 1 if len(names) == 1 else 2
-    rows = -(-len(names) // columns)
-    figure, axes = grid(rows, columns, 0.6 + 2.4 * rows)
-    for ax, name, r in zip(axes.flat, names, positions, strict=False):
-        curves(ax, ts, r, ("x", "y", "z"))
-        ax.set_title(name.replace("_", " "), fontsize=10)
-        ax.set_ylabel("position [m]", fontsize=9)
-    for ax in axes.flat[len(names) :]:
-        ax.set_axis_off()
-    axes.flat[0].legend(fontsize=9)
-    figure.suptitle(title, fontsize=11)
+    figure, axes = grid(3, 1, 5.6, sharex=True)
+    _panel(axes[0, 0], ts, r, ("x", "y", "z"), "position [m]")
+    _panel(axes[1, 0], ts, tilt[:, None], ("tilt",), "tilt [degrees]")
+    axes[1, 0].set_ylim(bottom=0.0)
+    _panel(axes[2, 0], ts, omega, ("x", "y", "z"), "angular velocity,\nbody axes [rad/s]")
+    for ax in axes[:-1, 0]:
+        ax.set_xlabel("")
+    figure.align_ylabels(axes[:, 0])
+    figure.suptitle(f"{title}\n{name.replace('_', ' ')}", fontsize=10, parse_math=False)
     return figure
 
 
-def euler_parameters(run: "Run") -> Figure:
-    """Figure of the Euler parameters of the last watched body (the panel).
+def joints(run: "Run") -> Figure | None:
+    """Figure of strokes and panel angles, or else of the angles of joints that turn.
 
-    Source: in the style of report Part I, Fig. 5.1 to 5.3.
+    None for a run without such joints.
     """
-    return _euler_parameters(*euler_parameters_of(run))
+    found = joints_of(run)
+    return _joints(*found) if found[-1] else None
 
 
-def _euler_parameters(title: str, name: str, ts: np.ndarray, p: np.ndarray) -> Figure:
-    figure, axes = grid(1, 1, 3.2)
-    ax = axes[0, 0]
-    curves(ax, ts, p, ("$e_0$", "$e_1$", "$e_2$", "$e_3$"))
-    ax.set_ylim(-1.05, 1.05)
-    ax.set_ylabel("Euler parameters [1]", fontsize=9)
-    ax.legend(fontsize=9, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.18))
-    ax.set_title(f"{title}: {name.replace('_', ' ')}", fontsize=10)
+def _joints(
+    title: str, ts: np.ndarray, panels: Sequence[tuple[str, tuple[str, ...], np.ndarray]]
+) -> Figure:
+    figure, axes = grid(len(panels), 1, 0.9 + 2.1 * len(panels), sharex=True)
+    for ax, (words, labels, values) in zip(axes[:, 0], panels, strict=True):
+        _panel(ax, ts, values, labels, words)
+    for ax in axes[:-1, 0]:
+        ax.set_xlabel("")
+    figure.align_ylabels(axes[:, 0])
+    figure.suptitle(title, fontsize=10, parse_math=False)
     return figure
+
+
+def _panel(
+    ax: Axes, ts: np.ndarray, values: np.ndarray, labels: tuple[str, ...], words: str
+) -> None:
+    """Plot curves with a legend beside them."""
+    curves(ax, ts, values, labels)
+    ax.set_ylabel(words, fontsize=9)
+    if len(labels) > 1:
+        ax.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
 def balances(run: "Run") -> Figure:
-    """Figure of energies, energy drift, constraint violations, and the estimated error."""
+    """Figure of energies, and of the estimated error, energy drift and violations, a unit an axis."""
     return _balances(*balances_of(run))
 
 
 def _balances(title: str, ts: np.ndarray, energies: np.ndarray, errors: np.ndarray) -> Figure:
-    figure, axes = grid(1, 2, 3.3)
+    figure, axes = grid(2, 2, 5.2, sharex=True)
+    position, drift, lengths, rates = errors.T
     curves(axes[0, 0], ts, energies, ("kinetic", "potential", "work done"))
     axes[0, 0].set_ylabel("energy [J]", fontsize=9)
-    labels = (
-        "estimated position error [m]",
-        "energy drift so far [J]",
-        "violation of lengths so far [m]",
-        "of their rates so far [m/s]",
-    )
-    curves(axes[0, 1], ts, np.maximum(errors, 1e-18), labels)
-    axes[0, 1].set_yscale("log")
-    axes[0, 1].set_ylabel("error, violation", fontsize=9)
+    both = np.stack([position, lengths], axis=1)
+    labels = ("estimated error of positions", "violation of lengths so far")
+    _logarithmic(axes[0, 1], ts, both, labels, "length [m]")
+    _logarithmic(axes[1, 0], ts, drift[:, None], ("energy drift so far",), "energy [J]")
+    words = ("violation of the lengths' rates so far",)
+    _logarithmic(axes[1, 1], ts, rates[:, None], words, "speed [m/s]")
     for ax in axes.flat:
-        ax.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
-    figure.suptitle(title, fontsize=11)
+        ax.legend(fontsize=8, ncols=1, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    for ax in axes[0]:
+        ax.set_xlabel("")
+    figure.suptitle(title, fontsize=10, parse_math=False)
     return figure
 
 
-FIGURES = {"positions": positions, "euler_parameters": euler_parameters, "balances": balances}
+def _logarithmic(
+    ax: Axes, ts: np.ndarray, values: np.ndarray, labels: tuple[str, ...], words: str
+) -> None:
+    """Plot the positive values on a logarithmic axis; zeros have no place on it."""
+    positive = np.where(values > 0, values, np.nan)
+    curves(ax, ts, positive, labels)
+    ax.set_ylabel(words, fontsize=9)
+    if np.any(values > 0):
+        ax.set_yscale("log")
+    else:
+        ax.set_yticks([])
+        ax.text(0.5, 0.5, "zero throughout", transform=ax.transAxes, ha="center", fontsize=9)
+
+
+FIGURES = {"pose": pose, "joints": joints, "balances": balances}
 
 
 # The same by the numbers that `numbers_of` takes from a run.
-DRAWN = {"positions": _positions, "euler_parameters": _euler_parameters, "balances": _balances}
+DRAWN = {"pose": _pose, "joints": _joints, "balances": _balances}
 
 
 def content(figure: Figure, suffix: str, dpi: int = 200) -> bytes:
@@ -134,7 +160,7 @@ def content(figure: Figure, suffix: str, dpi: int = 200) -> bytes:
 
 
 def save_figures(
-    figures: Mapping[str, Figure | Callable[..., Figure]],
+    figures: Mapping[str, Figure | Callable[..., Figure | None]],
     folder: str | os.PathLike[str],
     suffix: str = "png",
     *subject: Any,
@@ -143,7 +169,8 @@ def save_figures(
     """Write figures (png, pdf or svg) into `folder`, atomically; return their paths.
 
     Args:
-        figures: figures by file name, or functions of the subject that draw them.
+        figures: figures by file name, or functions of the subject that draw them; those that return None
+            leave a file out.
         folder: folder of the files.
         suffix: "png", "pdf" or "svg".
         subject: arguments of the functions, such as a run.
@@ -154,6 +181,8 @@ def save_figures(
     paths = []
     for name, drawn in figures.items():
         figure = drawn if isinstance(drawn, Figure) else drawn(*subject)
+        if figure is None:
+            continue
         path = Path(folder) / f"{name}.{suffix}"
         paths.append(write_atomically(path, content(figure, suffix, dpi)))
     return paths

@@ -3,12 +3,13 @@
 import csv
 import io
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
 
 from stmuav_jax.dynamics import envelope, run_loads
-from stmuav_jax.dynamics.loads import COMPONENTS
+from stmuav_jax.dynamics.loads import COMPONENTS, JointLoads
 from stmuav_jax.figures.loads import HEADER, loads_figure, loads_table, save_loads
 from stmuav_jax.figures.plot import save_figures
 
@@ -59,3 +60,22 @@ def test_figure_shows_histories_with_units(short_run, loads, tmp_path):
     (path,) = save_figures({"loads": loads_figure}, tmp_path, "pdf", short_run.scene, loads)
     assert path.name == "loads.pdf"
     assert path.read_bytes().startswith(b"%PDF")
+
+
+def test_short_peaks_do_not_hide_the_usual_loads(short_run):
+    t, force = np.linspace(0, 1, 200), np.zeros((200, 8, 3))
+    force[:, 0, 0] = 3 * np.sin(6 * t)
+    names = tuple(joint.name for joint in short_run.scene.system.joints)
+    made = lambda: JointLoads(*map(jnp.asarray, (t, force, 0 * force)), names)
+    axes = np.array(loads_figure(short_run.scene, made()).axes).reshape(8, 2)
+    assert axes[0, 0].get_yscale() == "linear"
+    assert [text.get_text() for text in axes[0, 1].texts] == ["none"]
+    force[100, 0, 0] = 500.0
+    figure = loads_figure(short_run.scene, made())
+    ax = figure.axes[0]
+    assert ax.get_yscale() == "symlog"
+    assert ax.get_yticks() == pytest.approx([-1000, -2, 0, 2, 1000])
+    # the usual loads take a fifth of the axis instead of a hundredth
+    low, high = (ax.transData.transform((0, y))[1] for y in (-2, 2))
+    assert (high - low) / ax.bbox.height > 0.2
+    figure.savefig(io.BytesIO(), format="png")

@@ -1,34 +1,89 @@
 """Figures show what the run holds, in units, with a legend."""
 
 import sys
+from types import SimpleNamespace
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import stmuav_jax as stm
 from stmuav_jax.figures import drawing
-from stmuav_jax.figures.numbers import numbers_of
-from stmuav_jax.figures.plot import FIGURES, content, euler_parameters, positions, save_figures
+from stmuav_jax.figures.numbers import joints_of, numbers_of
+from stmuav_jax.figures.plot import FIGURES, balances, content, joints, pose, save_figures
 from stmuav_jax.figures.report import certificate_rows
+from stmuav_jax.mechanics.joint_states import joint_motion
+from stmuav_jax.tracker.kinematics import panel_angles
 
 
-def test_positions_has_a_panel_for_each_watched_body(short_run):
-    axes = positions(short_run).axes
-    assert [ax.get_title() for ax in axes] == ["hexacopter 1", "slider 2", "slider 3", "panel 7"]
-    line = axes[3].lines[2]
-    assert line.get_label() == "z"
-    assert np.asarray(line.get_ydata()) == pytest.approx(
-        np.asarray(short_run.body("panel_7").r[:, 2])
+def test_pose_shows_the_base(short_run):
+    position, tilt, turning = pose(short_run).axes
+    base = short_run.body("hexacopter_1")
+    for k, line in enumerate(position.lines):
+        assert np.asarray(line.get_ydata()) == pytest.approx(np.asarray(base.r[:, k]))
+    R = np.asarray(jax.vmap(stm.rotation.rotation_matrix)(base.p))
+    wanted = np.degrees(np.arctan2(np.hypot(R[:, 0, 2], R[:, 1, 2]), R[:, 2, 2]))
+    assert np.asarray(tilt.lines[0].get_ydata()) == pytest.approx(wanted, abs=1e-5)
+    assert np.asarray(turning.lines[1].get_ydata()) == pytest.approx(np.asarray(base.omega[:, 1]))
+    labels = [ax.get_ylabel() for ax in (position, tilt, turning)]
+    assert all(
+        unit in label for unit, label in zip(("[m]", "[degrees]", "[rad/s]"), labels, strict=True)
     )
-    assert all("[m]" in ax.get_ylabel() for ax in axes)
+    assert len({line.get_linestyle() for line in position.lines}) == 3
 
 
-def test_euler_parameters_shows_the_panel(short_run):
-    (ax,) = euler_parameters(short_run).axes
-    assert len(ax.lines) == 4
-    assert np.asarray(ax.lines[0].get_ydata()) == pytest.approx(
-        np.asarray(short_run.body("panel_7").p[:, 0])
+def test_joints_shows_strokes_and_panel_angles(short_run):
+    figure = joints(short_run)
+    assert figure is not None
+    strokes, angles = figure.axes
+    for line, name in zip(strokes.lines, ("T12", "T13"), strict=True):
+        moved = short_run.joint(name).displacement
+        assert np.asarray(line.get_ydata()) == pytest.approx(1e3 * (moved - moved[0]), abs=1e-9)
+        assert str(line.get_label()).startswith(name)
+    assert "[mm]" in strokes.get_ylabel()
+    R, R_base = (
+        np.asarray(jax.vmap(stm.rotation.rotation_matrix)(short_run.body(name).p))
+        for name in ("panel_7", "hexacopter_1")
     )
-    assert len({line.get_linestyle() for line in ax.lines}) == 4
+    wanted = np.degrees(panel_angles(np.einsum("kji,kj->ik", R_base, R[:, :, 2])))
+    for line, each in zip(angles.lines, wanted, strict=True):
+        assert np.asarray(line.get_ydata()) == pytest.approx(each, abs=1e-9)
+
+
+def test_angles_of_a_machine_without_a_panel_are_continuous():
+    """A pendulum that turns over: 1.75 turns, against the package's own reading of the joint."""
+    bar = stm.Body("bar", 1.0, np.eye(3), position=(0.0, 0.0, -1.0))
+    hinge = stm.revolute("hinge", "ground", "bar", point=(0, 0, 0), axis=(0, 1.0, 0))
+    system = stm.System([bar], joints=[hinge])
+    angles = np.linspace(0.1, 3.5 * np.pi, 40)
+    p = np.zeros((40, 1, 4))
+    p[:, 0, 0], p[:, 0, 2] = np.cos(angles / 2), np.sin(angles / 2)
+    r = np.stack([-np.sin(angles), 0 * angles, -np.cos(angles)], axis=1)[:, None]
+    states = stm.State(*map(jnp.asarray, (r, p, 0 * r, 0 * r)))
+    scene = SimpleNamespace(system=system, title="bar", watch=())
+    body = lambda name: jax.tree.map(lambda x: x[:, 0], states)
+    run: Any = SimpleNamespace(scene=scene, ts=np.arange(40.0), states=states, body=body)
+    ((words, labels, found),) = joints_of(run)[2]
+    assert (words, labels) == ("joint angle [degrees]", ("hinge",))
+    wanted = np.degrees(np.asarray(joint_motion(system, states, "hinge").coordinates))
+    assert found == pytest.approx(wanted)
+    assert np.ptp(found) == pytest.approx(630 - np.degrees(0.1))
+
+
+def test_balances_have_one_unit_on_each_axis(short_run):
+    figure = balances(short_run)
+    assert [ax.get_ylabel() for ax in figure.axes] == [
+        "energy [J]", "length [m]", "energy [J]", "speed [m/s]",
+    ]  # fmt: skip
+    kinetic = np.asarray(figure.axes[0].lines[0].get_ydata())
+    assert kinetic == pytest.approx(np.asarray(short_run.snapshot.kinetic))
+    violation = np.asarray(figure.axes[1].lines[1].get_ydata())
+    worst = np.asarray(short_run.trajectory.worst.position)
+    # zeros are left out and are not a floor
+    assert np.array_equal(np.isnan(violation), worst == 0)
+    assert violation[worst > 0] == pytest.approx(worst[worst > 0], abs=0)
 
 
 @pytest.mark.parametrize("suffix", ["png", "pdf"])
@@ -54,13 +109,13 @@ def test_certificate_rows_name_quantity_and_unit(short_run):
 def test_another_process_draws_the_same_figures(short_run, monkeypatch, ends_early):
     monkeypatch.setattr(drawing, "_processors", lambda: 2)
     monkeypatch.delitem(sys.modules, "matplotlib")
-    numbers = {"positions": numbers_of(short_run)["positions"]}
+    numbers = {"pose": numbers_of(short_run)["pose"]}
     with drawing.drawing(True) as drawer:
         if ends_early:
             assert drawer.process is not None
             drawer.process.kill()
         drawer.ask(numbers, "png")
-        assert drawer.files() == {"positions": content(positions(short_run), "png")}
+        assert drawer.files() == {"pose": content(pose(short_run), "png")}
     assert drawer.process is None or drawer.process.returncode is not None
 
 
