@@ -50,8 +50,10 @@ TWICE = (
     "Method(adjoint=diffrax.ForwardMode())."
 )
 
-# Step attempts recorded at a time, some hundred numbers each, divided among the output times.
-KEPT = 4096
+# Step attempts recorded at a time, some hundred numbers each, divided among the output times. Setting
+# their memory aside takes time: with 4,096 a gradient of a second of flight took two to three times as
+# long, while of a longer flight the steps of all windows but the last are taken again.
+KEPT = 1024
 
 
 class DiscreteAdjoint(diffrax.AbstractAdjoint):
@@ -62,7 +64,7 @@ class DiscreteAdjoint(diffrax.AbstractAdjoint):
     `RecursiveCheckpointAdjoint` with `recorded_steps` checkpoints, which takes adaptive steps again.
 
     Attributes:
-        recorded_steps: number of step attempts recorded at a time; None for 4,096 divided among the output
+        recorded_steps: number of step attempts recorded at a time; None for 1,024 divided among the output
             times, at least 64 for each.
 
     Raises:
