@@ -54,6 +54,8 @@ TWICE = (
 # their memory aside takes time: with 4,096 a gradient of a second of flight took two to three times as
 # long, while of a longer flight the steps of all windows but the last are taken again.
 KEPT = 1024
+# Those of diffrax are states alone; where they are fewer than the steps, the path back may differ.
+CHECKPOINTS = 4096
 
 
 class DiscreteAdjoint(diffrax.AbstractAdjoint):
@@ -64,8 +66,8 @@ class DiscreteAdjoint(diffrax.AbstractAdjoint):
     `RecursiveCheckpointAdjoint` with `recorded_steps` checkpoints, which takes adaptive steps again.
 
     Attributes:
-        recorded_steps: number of step attempts recorded at a time; None for 1,024 divided among the output
-            times, at least 64 for each.
+        recorded_steps: number of step attempts recorded at a time; None for 1,024, or 4,096 checkpoints, divided
+            among the output times, at least 64 for each.
 
     Raises:
         SettingError: `recorded_steps` is less than one.
@@ -82,9 +84,10 @@ class DiscreteAdjoint(diffrax.AbstractAdjoint):
     def of(self, problem: Problem, segments: int) -> "diffrax.AbstractAdjoint | RecordRoom":
         """Adjoint for a problem with this number of output times, or the room for its record."""
         segments, most = max(segments, 1), problem.method.max_steps
-        kept = max(KEPT // segments, 64) if self.recorded_steps is None else self.recorded_steps
-        kept = min(most, kept)
-        if isinstance(problem.solver().solver, NonDenseRungeKutta):
+        explicit = isinstance(problem.solver().solver, NonDenseRungeKutta)
+        own = max((KEPT if explicit else CHECKPOINTS) // segments, 64)
+        kept = min(most, own if self.recorded_steps is None else self.recorded_steps)
+        if explicit:
             return RecordRoom.of(kept, most, segments, problem.n_state + problem.n_internal)
         return diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
 
