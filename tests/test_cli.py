@@ -246,6 +246,7 @@ def test_trim_command(tmp_path, capsys):
     assert "no steady" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 def test_linearize_command(tmp_path, capsys):
     assert main(["linearize", "--out", str(tmp_path), "--no-cache", "--outputs", "phi"]) == 0
     with np.load(tmp_path / "linear.npz") as found:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 
+@pytest.mark.slow
 def test_its_study_draws_every_mass_and_inertia_and_its_flights_are_counted():
     work = missions.work(0.1)
     assert {"mass.panel_7", "inertia.hexacopter_1", "rotor.k_f"} <= set(work.sampling.names)

@@ -9,6 +9,7 @@ import stmuav_jax as stm
 control, tracker = stm.control, stm.tracker
 
 
+@pytest.mark.slow
 def test_the_integral_stands_still_while_the_rotors_cannot_give_the_wrench():
     """Far below its reference the machine asks for more than its rotors have; nearby it does not."""
     scene = stm.make_scene("hexacopter")
@@ -30,6 +31,7 @@ def test_the_integral_stands_still_while_the_rotors_cannot_give_the_wrench():
     assert float(after.integral[2] - begun.integral[2]) == pytest.approx(-50.0 / 400.0)
 
 
+@pytest.mark.slow
 def test_the_servo_of_strokes_is_a_spring_and_a_damper_of_each_slider():
     """Forces against differences of the strokes themselves, from two postures apart by angles."""
     table = stm.PART_II

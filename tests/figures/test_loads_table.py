@@ -66,7 +66,7 @@ def test_short_peaks_do_not_hide_the_usual_loads(short_run):
     t, force = np.linspace(0, 1, 200), np.zeros((200, 8, 3))
     force[:, 0, 0] = 3 * np.sin(6 * t)
     names = tuple(joint.name for joint in short_run.scene.system.joints)
-    made = lambda: JointLoads(*map(jnp.asarray, (t, force, 0 * force)), names)
+    made = lambda: JointLoads(jnp.asarray(t), jnp.asarray(force), jnp.asarray(0 * force), names)
     axes = np.array(loads_figure(short_run.scene, made()).axes).reshape(8, 2)
     assert axes[0, 0].get_yscale() == "linear"
     assert [text.get_text() for text in axes[0, 1].texts] == ["none"]

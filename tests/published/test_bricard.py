@@ -40,6 +40,7 @@ def twin() -> stm.Run:
     )
 
 
+@pytest.mark.slow
 def test_one_row_depends_on_the_others(run: stm.Run, twin: stm.Run) -> None:
     """Exact class."""
     assert (run.certificate.rows, run.certificate.rank) == (30, 29)
@@ -47,6 +48,7 @@ def test_one_row_depends_on_the_others(run: stm.Run, twin: stm.Run) -> None:
     assert (twin.certificate.rows, twin.certificate.rank) == (29, 29)
 
 
+@pytest.mark.slow
 def test_the_dependent_row_costs_no_steps_and_no_energy(run: stm.Run) -> None:
     """Demanded: 300 attempts and 1e-7 J; with all rows at the stages it took 9,031 and 7e-5 J."""
     assert run.successful
@@ -55,6 +57,7 @@ def test_the_dependent_row_costs_no_steps_and_no_energy(run: stm.Run) -> None:
     assert run.certificate.position_violation <= 1e-12
 
 
+@pytest.mark.slow
 def test_it_moves_as_without_the_dependent_row(run: stm.Run, twin: stm.Run) -> None:
     """Solver class: the corner to 1e-7 m through all of 10 s."""
     assert np.ptp(corner(twin)[:, 1]) > 0.5

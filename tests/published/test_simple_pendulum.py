@@ -122,6 +122,7 @@ def x_at(parameters: Any, times: tuple[float, ...], adjoint: Any) -> Any:
     return path.states.r[1:, 0, 0]
 
 
+@pytest.mark.slow
 def test_forward_gradient_is_the_closed_forms() -> None:
     """Solver class: dx/dg and dx/dL at 1 s and 5 s to 1e-6 relative, start included in dL."""
     times = tuple(GRADIENT)

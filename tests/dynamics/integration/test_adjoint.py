@@ -40,6 +40,7 @@ def swing(q, method, times=None):
 of_kept = jax.jit(jax.value_and_grad(lambda q: swing(q, KEEPING)))
 
 
+@pytest.mark.slow
 def test_three_routes():
     """By numbers of the model and of the start, and by times, which the flow's equations give."""
     value, gradient = of_kept(Q)
@@ -109,7 +110,8 @@ def test_more_steps_than_are_kept():
     np.testing.assert_allclose(gradient, same, rtol=1e-11)
 
 
-@pytest.mark.parametrize("flights", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("flights", [1, 2])
 def test_pieces_of_few_windows(monkeypatch, flights):
     """Pieces integrated again on the way back: the same derivatives as those of all steps kept.
 
