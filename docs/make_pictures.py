@@ -1,7 +1,7 @@
 """Make the pictures of the README and of docs/pictures.md, and the numbers that stand beside them.
 
 python docs/make_pictures.py             # sketches of the models, some seconds each
-python docs/make_pictures.py flight      # the flight and the printed equations, some minutes
+python docs/make_pictures.py flight      # the flight, its film, and the printed equations, some minutes
 """
 
 import json
@@ -71,6 +71,7 @@ def flight() -> dict[str, float]:
     stm.figures.save_figures(drawn, FIGURES / "flight", "png", dpi=90)
     # the page moves at 25 pictures a second
     stm.view(data.isel(time=slice(None, None, 16))).save(FIGURES / "flight" / "waypoints.html")
+    stm.film(data, FIGURES / "flight" / "waypoints.gif", fps=12.5, size=(480, 360), speed=2.5)
     degree = np.pi / 180
     return {
         "waypoints_end_s": float(data.time.values[-1]),
