@@ -151,6 +151,6 @@ def _panel_angles(run: "Run", name: str) -> np.ndarray:
         n = np.einsum("kji,kj->ki", _rotations(run.body(base).p), n)
     theta = np.arcsin(np.clip(n[:, 0], -1.0, 1.0))
     phi = np.arctan2(-n[:, 1], n[:, 2])
-    # a line across the picture from half a turn to minus half a turn would be no motion
-    phi[1:][np.abs(np.diff(phi)) > np.pi] = np.nan
+    # a line from half a turn to minus half a turn, or across the flip at theta = 90 degrees, would be no motion
+    phi[1:][np.abs(np.diff(phi)) > np.pi / 2] = np.nan
     return np.stack([phi, theta], axis=1)
