@@ -24,7 +24,7 @@ ROOMS = sorted(stub.parent.name for stub in Path(stm.__file__).parent.glob("*/__
 # Pages whose Python runs here, with the number of blocks; and which of them take long.
 RUN = {
     "contact": 1, "estimation": 5, "gpu": 1, "index": 2, "own_data": 3, "parameters_file": 1,
-    "reading_results": 1, "viewer": 2, "which_solver": 1,
+    "reading_results": 1, "viewer": 3, "which_solver": 1,
 }  # fmt: skip
 LONG = {"contact", "estimation", "index", "reading_results", "viewer", "which_solver"}
 # Pages whose Python runs in tests of their own.

@@ -65,7 +65,8 @@ def load_robot(path: str | os.PathLike[str], *, link_share: float = LINK_SHARE) 
         except ValueError:
             # files of meshes are often absent, and matter only where a body has no inertia of its own
             model = _without_meshes(mujoco.MjSpec.from_file(str(source))).compile()
-    except (ValueError, mujoco.FatalError) as error:
+    except (ValueError, mujoco.FatalError, UserWarning) as error:
+        # a warning of MuJoCo is raised where warnings are errors
         raise FileError(f"{source}: MuJoCo cannot read it: {error}") from error
     try:
         return scene_from_mujoco(model, source.stem, link_share=link_share)
@@ -133,6 +134,25 @@ class _Reader(NamedTuple):
         return self.poses[self.root(number)].inside(self.poses[number].of(r, R))
 
 
+def _check_finite(model: Any) -> None:
+    """Raise `ModelError` where MuJoCo's parser has let a place or a mass pass that is not finite."""
+    of_body = {
+        "body_pos": "position", "body_quat": "orientation", "body_ipos": "centre of mass",
+        "body_iquat": "principal axes", "body_mass": "mass", "body_inertia": "inertia",
+    }  # fmt: skip
+    of_joint = {"jnt_pos": "position", "jnt_axis": "axis"}
+    for kind, names, each in (("body", of_body, model.body), ("joint", of_joint, model.joint)):
+        for name, words in names.items():
+            rows = np.asarray(getattr(model, name))
+            bad = (~np.isfinite(rows)).any(axis=tuple(range(1, rows.ndim)))
+            if np.any(bad):
+                k = int(np.argmax(bad))
+                raise ModelError(
+                    f"The {words} of the {kind} '{each(k).name or k}' must be finite, but it is "
+                    f"{rows[k].tolist()}."
+                )
+
+
 def scene_from_mujoco(model: Any, name: str = "robot", *, link_share: float = LINK_SHARE) -> Scene:
     """Scene of a compiled `mujoco.MjModel`; what cannot be carried over is in its notes.
 
@@ -146,6 +166,7 @@ def scene_from_mujoco(model: Any, name: str = "robot", *, link_share: float = LI
         ModelError: no body moves, or the masses and inertias are not those of rigid bodies.
         StateError: the loops cannot be closed near qpos0.
     """
+    _check_finite(model)
     poses = [_Pose(np.zeros(3), np.eye(3))]
     for b in range(1, model.nbody):
         parent = poses[model.body_parentid[b]]
