@@ -96,14 +96,10 @@ def _other(joint: "Joint") -> str:
 
 
 def _rotations(p: Any) -> np.ndarray:
-    """Rotation matrices (k, 3, 3) of unit Euler parameters (k, 4); no number stays none."""
-    w, x, y, z = np.asarray(p).T
-    rows = [
-        [1 - 2 * (y**2 + z**2), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x**2 + z**2), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
+    """Rotation matrices (k, 3, 3) of Euler parameters (k, 4); no number stays none."""
+    from ..algebra.rotation import rotation_matrix_in
+
+    return np.moveaxis(np.asarray(rotation_matrix_in(np, np.asarray(p).T)), -1, 0)
 
 
 def _side(run: "Run", joint: "Joint", side: str) -> tuple[np.ndarray, np.ndarray]:

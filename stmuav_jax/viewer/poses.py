@@ -53,22 +53,11 @@ class Poses:
     def at(self, t: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
         """Positions (n, 3) [m] and rotation matrices, body to world (n, 3, 3), at t [s]."""
         k, share = self.between(t)
-        e = _shortest(self.orientations[k], self.orientations[k + 1], share)
-        return self.mixed(self.positions, t), Rotation.from_quat(e[:, [1, 2, 3, 0]]).as_matrix()
+        start, end = (_rotation(self.orientations[i]) for i in (k, k + 1))
+        turned = start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())
+        return self.mixed(self.positions, t), turned.as_matrix()
 
 
-def _shortest(
-    start: Float[np.ndarray, "n 4"], end: Float[np.ndarray, "n 4"], share: float
-) -> Float[np.ndarray, "n 4"]:
-    """Euler parameters on the way of the shortest rotation between two orientations.
-
-    p = (sin((1 - s) a) p_0 + sin(s a) p_1) / sin a,   cos a = p_0 . p_1
-    """
-    cosine = np.sum(start * end, axis=1, keepdims=True)
-    end = np.where(cosine < 0, -end, end)
-    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
-    near = angle < 1e-6
-    safe = np.where(near, 1.0, angle)
-    a = np.where(near, 1 - share, np.sin((1 - share) * safe) / np.sin(safe))
-    b = np.where(near, share, np.sin(share * safe) / np.sin(safe))
-    return a * start + b * end
+def _rotation(p: Float[np.ndarray, "n 4"]) -> Rotation:
+    """Rotations of Euler parameters, of which SciPy has the scalar last."""
+    return Rotation.from_quat(p[:, [1, 2, 3, 0]])
