@@ -92,7 +92,7 @@ def studies():
 NOTES = {1: 0.258, 2: 0.366, 3: 0.187, 4: 0.106, 5: 0.131, 6: 0.338, 7: 0.110, 8: 0.070}
 
 
-# notebook 05 asserts the same of 20 seeds by default
+# notebook 14 asserts the same of 20 seeds by default
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_target_table(studies, case):
