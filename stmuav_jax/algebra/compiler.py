@@ -10,7 +10,7 @@ import threading
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +187,29 @@ def program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
     return _by_key((function, structure, setting, tuple(map(_kind, leaves))), function, args)
 
 
+def program_of_shapes(
+    function: Callable[..., Any], *args: Any, parts: tuple[Any, ...]
+) -> Callable[..., Any]:
+    """Compiled program of a function for arrays of these shapes, optimised as by `outer_jit`.
+
+    Where programs are kept for later processes (`keep_programs`), this one is too.
+
+    Args:
+        function: function of positional arguments. args: pytrees, which may have a
+            `jax.ShapeDtypeStruct` in the place of an array; the program accepts the same pytrees
+            with arrays.
+        parts: all numbers and structure that the function takes from elsewhere. A kept program is
+            found by them and by the function's name, not by what the function holds.
+    """
+    name = f"{function.__module__}.{function.__qualname__}"
+    key = kept.key_of(partial(_described, name, parts), args, _asked(quick=False))
+    return _compiled(function, args, quick=False, key=key)
+
+
+def _described(name: str, parts: tuple[Any, ...]) -> None:
+    """Stand for a function of this name that depends on these parts."""
+
+
 def _by_key(
     key: Hashable, function: Callable[..., Any], args: tuple[Any, ...], quick: bool = True
 ) -> Any:
@@ -197,7 +220,7 @@ def _by_key(
             _programs.move_to_end(key)
             return found
     check_maps()
-    made = _compiled(function, args, quick)
+    made = _compiled(function, args, quick, kept.key_of(function, args, _asked(quick)))
     with _lock:
         _programs[key] = made
         while len(_programs) > MOST_PROGRAMS:
@@ -206,14 +229,14 @@ def _by_key(
 
 
 def _compiled(
-    function: Callable[..., Any], args: tuple[Any, ...], quick: bool = True
+    function: Callable[..., Any], args: tuple[Any, ...], quick: bool, key: str | None
 ) -> Callable[..., Any]:
-    key = kept.key_of(function, args, _asked(quick))
     compiled, result = kept.load(key) or _compiled_now(function, args, key, quick)
+    places = [k for k, leaf in enumerate(jax.tree.leaves(args)) if _is_given(leaf)]
 
     def call(*args: Any) -> Any:
-        arrays = [leaf for leaf in jax.tree.leaves(args) if eqx.is_array(leaf)]
-        found = jax.block_until_ready(compiled(arrays))
+        leaves = jax.tree.leaves(args)
+        found = jax.block_until_ready(compiled([leaves[k] for k in places]))
         return jax.tree.map(lambda x: found[x] if isinstance(x, kept.ArrayIndex) else x, result)
 
     return call
@@ -224,7 +247,7 @@ def _compiled_now(
 ) -> tuple[Callable[[list[Any]], list[Any]], Any]:
     """Program of lists of arrays, and the result's pytree with an `ArrayIndex` for each of them."""
     leaves, structure = jax.tree.flatten(args)
-    places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
+    places = [k for k, leaf in enumerate(leaves) if _is_given(leaf)]
     arrays, result = [leaves[k] for k in places], []
 
     def run(arrays: list[Any]) -> list[Any]:
@@ -244,6 +267,11 @@ def _compiled_now(
     compiled = lowered.compile()
     kept.store(key, lowered, compiled, len(arrays), result[0])
     return compiled, result[0]
+
+
+def _is_given(leaf: Any) -> bool:
+    """Test whether a leaf is an array that the program is given, or the shape of one."""
+    return eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct)
 
 
 def _kind(leaf: Any) -> Hashable:

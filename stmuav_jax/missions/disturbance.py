@@ -97,7 +97,7 @@ class MissionController(eqx.Module):
 
     def start(self) -> MissionMemory:
         """First memory."""
-        return MissionMemory(self.pilot.start(), jnp.full(2, jnp.inf))
+        return MissionMemory(self.pilot.start(), jnp.full(2, jnp.inf, dtype=float))
 
     def __call__(
         self, estimate: Any, reference: MissionReference, memory: MissionMemory

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.compiler import compiler_options
+from ..algebra.compiler import program_of_shapes
 from ..checks.errors import SettingError
 from ..checks.schema import SHOWN, checked, named
 from ..control.plant import Plant, PlantState
@@ -131,8 +131,7 @@ class MissionWork(AbstractWork):
     @property
     def identity(self) -> Mapping[str, Any]:
         """Plain data of the mission, the parameters and the sampling."""
-        numbers = {name: np.asarray(self._table.value(name)).tolist() for name in self._table}
-        text = json.dumps(numbers, sort_keys=True)
+        text = json.dumps(self._numbers, sort_keys=True)
         return {
             "kind": "missions", "name": self.name, "lanes": LANES,
             "mission": json.loads(self.mission.file.model_dump_json(exclude={"title"})),
@@ -187,6 +186,10 @@ class MissionWork(AbstractWork):
         table = self.mission.machine.table
         assert table is not None
         return table
+
+    @property
+    def _numbers(self) -> dict[str, Any]:
+        return {name: np.asarray(self._table.value(name)).tolist() for name in self._table}
 
     @property
     def _quantities(self) -> list[str]:
@@ -280,16 +283,19 @@ class MissionWork(AbstractWork):
         nominal = _Nominal(
             of.plant, of.controller, of.references, of.gauges, machine.speeds, machine.limits
         )
-        arrays, rest = eqx.partition(nominal, eqx.is_array)
 
-        def flight(arrays: Any, values: Array, seeds: Array) -> Worst:
-            return self._flown(eqx.combine(arrays, rest), values, seeds)
-
+        flights = lambda of, *each: jax.vmap(partial(self._flown, of))(*each)
         values = jax.ShapeDtypeStruct((LANES, len(self.sampling.names)), jnp.float64)
         seeds = jax.ShapeDtypeStruct((LANES, 2), jnp.uint32)
-        side_by_side = jax.vmap(flight, in_axes=(None, 0, 0))
-        made = jax.jit(side_by_side, compiler_options=compiler_options())
-        return partial(made.lower(arrays, values, seeds).compile(), arrays)
+        return partial(
+            program_of_shapes(flights, nominal, values, seeds, parts=self._parts), nominal
+        )
+
+    @property
+    def _parts(self) -> tuple[Any, ...]:
+        """All that the compiled program depends on: not how many samples are drawn, nor from what."""
+        names = tuple(self.sampling.names)
+        return self.mission.file.model_dump(), self._numbers, names, self.relative
 
     def _flown(self, of: _Nominal, values: Float[Array, " d"], seeds: Array) -> Worst:
         """Largest errors and smallest margins of one flight; traced."""

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..algebra.compiler import compiler_options
+from ..algebra.compiler import program_of_shapes
 from ..checks.errors import SettingError, SimulationError
 from ..dynamics.formulations.base import AbstractFormulation
 from ..dynamics.integration.lanes import REASONS, Ending, Plan, RunResult, fly
@@ -232,11 +232,20 @@ class FlightWork(AbstractWork):
             queue = Drawn(values, seeds)
             return jax.vmap(self._kept)(queue, fly(plan, queue, count, self.lanes))
 
-        at = jax.sharding.SingleDeviceSharding(place)
+        # where there is one device, the program is that of later processes too
+        at = None if place.platform == "cpu" else jax.sharding.SingleDeviceSharding(place)
         of = lambda dtype, *shape: jax.ShapeDtypeStruct(shape, dtype, sharding=at)
         values = of(jnp.float64, self._block, len(self.study.sampling.names))
-        program = jax.jit(block, compiler_options=compiler_options())
-        return program.lower(values, of(jnp.uint32, self._block), of(jnp.int32)).compile()
+        shapes = values, of(jnp.uint32, self._block), of(jnp.int32)
+        return program_of_shapes(block, *shapes, parts=self._parts)
+
+    @property
+    def _parts(self) -> tuple[Any, ...]:
+        """All that the compiled program depends on: not how many samples are drawn, nor from what."""
+        drawn = ("name", "sampling", "failure")
+        parts = [f.name for f in dataclasses.fields(self.study) if f.name not in drawn]
+        own = (tuple(self.study.sampling.names), self.lanes, self._block)
+        return *((name, getattr(self.study, name)) for name in parts), *own
 
     @cached_property
     def direction(self) -> np.ndarray:

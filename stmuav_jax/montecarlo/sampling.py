@@ -308,6 +308,11 @@ def _check_table(factors: Mapping[str, Distribution]) -> None:
             )
         if one.name == "empirical":
             sizes[name] = len(one.parameters["values"])
+    if not sizes:
+        raise SettingError(
+            "A table of samples needs a factor with a column of values ('empirical'), but all of its factors "
+            "are constants."
+        )
     if len(set(sizes.values())) != 1:
         raise SettingError(
             f"The columns of a table must be equally long, but they have {sizes} rows."

@@ -56,7 +56,14 @@ def folder(tmp_path, monkeypatch):
 
 def result(function=cross, *args):
     """Result of a program that is loaded or compiled as if by a new process."""
-    return compiler._compiled(function, args or (A, B))(*(args or (A, B)))
+    return compiled(function, *args)(*(args or (A, B)))
+
+
+def compiled(function=cross, *args):
+    """Program that is loaded or compiled as if by a new process."""
+    given = args or (A, B)
+    key = kept.key_of(function, given, compiler._asked(quick=True))
+    return compiler._compiled(function, given, True, key)
 
 
 def files(folder: Path) -> list[Path]:
@@ -72,7 +79,7 @@ def test_a_kept_program_is_neither_traced_nor_compiled(folder, monkeypatch):
     assert len(files(folder)) == 1
     monkeypatch.setattr(compiler, "_compiled_now", None)
     np.testing.assert_array_equal(result(), EXPECTED)
-    other = compiler._compiled(cross, (A, B))(B, A)
+    other = compiled()(B, A)
     np.testing.assert_array_equal(other, -EXPECTED)
 
 
@@ -182,7 +189,7 @@ kept._PACKAGES = (*kept._PACKAGES, "test_kept")
 kept.keep_programs({str(tmp_path / "programs")!r})
 a = jax.numpy.asarray(np.diag([3.0, 2.0, 1.0]), dtype=float)
 loaded = kept.load(kept.key_of(test_kept.factors, (a,), compiler._NO_LIBRARY | compiler._QUICK))
-print(compiler._compiled(test_kept.factors, (a,))(a).tolist(), loaded is not None)
+print(test_kept.compiled(test_kept.factors, a)(a).tolist(), loaded is not None)
 import optimistix as optx
 from stmuav_jax.algebra.least_squares import search
 made, compiled_now = [], compiler._compiled_now

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import stmuav_jax as stm
+from stmuav_jax.algebra import compiler, kept
 from stmuav_jax.cli import main
 from stmuav_jax.missions.ensemble import LANES, NOT_PHYSICAL
 
@@ -54,6 +55,25 @@ def work():
 @pytest.fixture(scope="module")
 def columns(work):
     return work.run(0, 24)
+
+
+# functions with executed annotations have no text, and only the slow tests run without
+@pytest.mark.slow
+def test_programs_kept_in_files_are_found_whatever_is_drawn(tmp_path, monkeypatch):
+    names = []
+
+    noted = lambda function, args, quick, key: names.append(key) or function
+    other = FACTORS | {"bare.mass": {"distribution": "empirical", "values": [1.0, 1.1]}}
+    kept.keep_programs(tmp_path / "programs")
+    try:
+        works = study(), study(other), study(sensors={"standing": 0.4})
+        monkeypatch.setattr(compiler, "_compiled", noted)
+        assert all(work._program for work in works)
+    finally:
+        kept.keep_programs(None)
+    first, same, longer = names
+    assert first is not None
+    assert first == same != longer
 
 
 @pytest.mark.slow

@@ -12,10 +12,12 @@ import scipy.integrate
 import xarray as xr
 
 import stmuav_jax as stm
+from stmuav_jax.algebra import compiler
 from stmuav_jax.checks.schema import checked
 from stmuav_jax.cli import main
 from stmuav_jax.commands.fly import NOT_KEPT, UNFINISHED, Fly
 from stmuav_jax.files.netcdf import load_checkpoint, save_checkpoint
+from stmuav_jax.missions.flight import _chunk
 from stmuav_jax.missions.keep import load_reached, save_reached
 from stmuav_jax.missions.mission import LIBRARY
 from stmuav_jax.missions.outcome import _largest, _of_gear
@@ -72,9 +74,18 @@ def plain(**changes):
     return content
 
 
+def chunks():
+    """Keys of the programs that fly a chunk."""
+    return {key for key in compiler._programs if key[0] is _chunk}
+
+
 @pytest.fixture(scope="module")
 def flight():
-    return missions.fly(missions.make_mission(plain()))
+    there = chunks()
+    found = missions.fly(missions.make_mission(plain()))
+    # one program flies the first second and the others
+    assert len(chunks() - there) <= 1 < len(found.run.ts) / 200
+    return found
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,13 @@ import pickle
 from dataclasses import replace
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from stmuav_jax import Augmented, Baumgarte, Method, SettingError, integrate
+from stmuav_jax.algebra import compiler, kept
 from stmuav_jax.algebra.compiler import quick_jit
 from stmuav_jax.algebra.rotation import rotation_matrix
 from stmuav_jax.dynamics.formulations.stabilisation import AbstractStabilisation
@@ -98,6 +100,24 @@ def test_any_range_gives_the_same_numbers(turning):
             same = part[name][:upto] == values[first : first + upto]
             both = np.isnan(part[name][:upto]) & np.isnan(values[first : first + upto])
             assert np.all(same | both), name
+
+
+# functions with executed annotations have no text, and only the slow tests run without
+@pytest.mark.slow
+def test_programs_kept_in_files_are_found_whatever_is_drawn(tmp_path, monkeypatch):
+    names = []
+    monkeypatch.setattr(compiler, "_compiled", lambda function, args, quick, key: names.append(key))
+    turned = TURNING["factors"] | {"start.p": NORMAL | {"standard_deviation": 0.1}}
+    changes = ({}, {"seed": 5}, {"factors": turned}, {"t1": 0.5}, {"rtol": 1e-9})
+    kept.keep_programs(tmp_path / "programs")
+    try:
+        for change in changes:
+            FlightWork(study_from_plain(TURNING | change), lanes=8)._program(jax.devices()[0])
+    finally:
+        kept.keep_programs(None)
+    first, *others = names
+    assert first is not None
+    assert [name == first for name in others] == [True, True, False, False]
 
 
 @pytest.mark.parametrize("devices", [2, 5])
