@@ -283,7 +283,6 @@ class MissionWork(AbstractWork):
         nominal = _Nominal(
             of.plant, of.controller, of.references, of.gauges, machine.speeds, machine.limits
         )
-
         flights = lambda of, *each: jax.vmap(partial(self._flown, of))(*each)
         values = jax.ShapeDtypeStruct((LANES, len(self.sampling.names)), jnp.float64)
         seeds = jax.ShapeDtypeStruct((LANES, 2), jnp.uint32)
