@@ -13,6 +13,7 @@ from nbclient import NotebookClient
 
 # What the notebook shows is tested otherwise by default; its own run takes minutes.
 LONG = (
+    "00_the_machine_in_pictures",
     "01_first_flight",
     "02_your_own_mechanism",
     "04_what_fails_at_half_a_second",
