@@ -16,6 +16,7 @@ LONG = (
     "00_the_machine_in_pictures",
     "01_first_flight",
     "02_your_own_mechanism",
+    "03_the_equations_two_formulations",
     "04_what_fails_at_half_a_second",
     "05_the_geometry_from_the_printed_tables",
     "07_a_day_of_pointing_at_the_sun",
