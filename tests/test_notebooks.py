@@ -23,6 +23,7 @@ LONG = (
     "09_trim_and_linearisation",
     "10_gradients_through_a_motion",
     "11_inputs_by_gradients",
+    "12_design_by_gradients",
     "13_parameters_from_a_record",
     "14_centre_of_mass",
     "15_a_filter_for_your_own_model",
