@@ -13,14 +13,17 @@ from nbclient import NotebookClient
 
 # What the notebook shows is tested otherwise by default; its own run takes minutes.
 LONG = (
+    "00_the_machine_in_pictures",
     "01_first_flight",
     "02_your_own_mechanism",
+    "03_the_equations_two_formulations",
     "04_what_fails_at_half_a_second",
     "05_the_geometry_from_the_printed_tables",
     "07_a_day_of_pointing_at_the_sun",
     "09_trim_and_linearisation",
     "10_gradients_through_a_motion",
     "11_inputs_by_gradients",
+    "12_design_by_gradients",
     "13_parameters_from_a_record",
     "14_centre_of_mass",
     "15_a_filter_for_your_own_model",
