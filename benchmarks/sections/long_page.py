@@ -7,16 +7,17 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from shared.pages import Row, legend_of, number, panels, power, save, shown, titled
+
+from stmuav_jax.figures import look
 
 SOLVERS = {
     "dopri8": "Dopri8", "tsit5": "Tsit5", "gauss": "Gauss order 4", "midpoint": "midpoint order 2",
 }  # fmt: skip
 HOLDS = {"projection": "projected", "none": "unstabilised", "baumgarte": "Baumgarte"}
-COLOURS = {"dopri8": "C0", "tsit5": "C1", "gauss": "C2", "midpoint": "C3"}
-LINES = {"projection": "-", "none": "--", "baumgarte": ":"}
-MARKS = {"projection": "o", "none": "s", "baumgarte": "^"}
+ERROR = "|energy error| / scale [1]"
+# Colour and marker tell the solver; dash and filling tell what holds the joints.
+LINES = {"projection": ("-", "full"), "none": ("--", "none"), "baumgarte": (":", "bottom")}
 
 
 def name_of(family: str) -> str:
@@ -35,7 +36,7 @@ def show(path: Path, folder: Path) -> str:
     parts += [at_tolerance(problems), finest(problems)]
     figures = {
         "long_horizon_work": work(record, "seconds", "run time [s]"),
-        "long_horizon_evaluations": work(record, "evaluations", "evaluations of x' = f(t, x)"),
+        "long_horizon_evaluations": work(record, "evaluations", "evaluations of x' = f(t, x) [1]"),
         "long_horizon_energy": over_time(record),
     }
     return shown(parts, save(figures, folder))
@@ -89,19 +90,18 @@ def at_tolerance(problems: list[Row]) -> str:
 
 
 def work(record: Row, cost: str, label: str) -> Figure:
-    """Largest energy error against cost, one panel per problem."""
+    """Cost against largest energy error, one panel per problem."""
 
     def draw(ax: Any, problem: Row) -> None:
         rows = [row for row in problem["runs"] if row["largest"]]
         for family in dict.fromkeys(row["family"] for row in rows):
             mine = [row for row in rows if row["family"] == family]
-            x, y = [row[cost] for row in mine], [row["largest"] for row in mine]
-            ax.loglog(x, y, marker=MARKS[mine[0]["hold"]], markersize=4, **style(mine[0]))
-        ax.set(title=problem["title"], xlabel=label, ylabel="largest energy error [scale]")
-        # within one decade the labels of minor ticks overlap
-        ax.xaxis.set_minor_formatter(NullFormatter())
+            x, y = [row["largest"] for row in mine], [row[cost] for row in mine]
+            ax.loglog(x, y, **style(mine[0]))
+        ax.set(title=problem["title"], xlabel=f"largest {ERROR}", ylabel=label)
 
-    return each(record["problems"], draw)
+    note = "Where a method has fewer points than elsewhere, its other runs did not reach the end."
+    return each(record["problems"], draw, note)
 
 
 def over_time(record: Row) -> Figure:
@@ -113,26 +113,29 @@ def over_time(record: Row) -> Figure:
             ts = record["every"] * np.arange(1, size.size + 1)
             setting = "1e-6" if row["step"] is None else f"h = {1e3 * row['step']:g} ms"
             # round-off may give exactly zero, which a logarithm cannot show
-            ax.semilogy(ts, np.maximum(size, 1e-17), linewidth=1, **style(row, f", {setting}"))
-        ax.set(title=problem["title"], xlabel="t [s]", ylabel="|energy error| [scale]")
+            ax.semilogy(ts, np.maximum(size, 1e-17), markevery=20, **style(row, f", {setting}"))
+        ax.set(title=problem["title"], xlabel="time [s]", ylabel=ERROR)
 
-    return each(record["problems"], draw)
+    return each(record["problems"], draw, "Where a curve ends early, so did the run.")
 
 
-def each(problems: list[Row], draw: Callable[[Any, Row], None]) -> Figure:
-    """One panel per problem, and one legend below all of them."""
-    columns = min(3, len(problems))
+def each(problems: list[Row], draw: Callable[[Any, Row], None], note: str) -> Figure:
+    """One panel per problem, and one legend below all of them under a note."""
+    columns = min(2, len(problems))
     rows = -(-len(problems) // columns)
-    figure, axes = panels(rows, columns, 4 * columns + 1, 3.3 * rows + 1.2)
+    figure, axes = panels(rows, columns, 2.4 * rows + 1.0)
     for ax, problem in zip(axes, problems, strict=True):
         draw(ax, problem)
-        ax.grid(alpha=0.3)
     lines = legend_of(axes)
-    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=3)
+    figure.legend(
+        lines.values(), lines.keys(), loc="outside lower center", ncols=3, fontsize=7, title=note,
+        title_fontsize=7, handlelength=3,
+    )  # fmt: skip
     return figure
 
 
 def style(row: Row, more: str = "") -> dict[str, Any]:
-    """Colour, line and label of a run."""
-    colour, line = COLOURS[row["solver"]], LINES[row["hold"]]
-    return {"color": colour, "linestyle": line, "label": name_of(row["family"]) + more}
+    """Colour, marker, line and label of a run."""
+    line, filling = LINES[row["hold"]]
+    own = {"linestyle": line, "fillstyle": filling, "markerfacecoloralt": "white"}
+    return look(list(SOLVERS).index(row["solver"])) | own | {"label": name_of(row["family"]) + more}

@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from shared.pages import Row, number, panels, power, save, shown, titled
+from shared.pages import Row, legend_of, number, panels, power, save, shown, titled
+
+from stmuav_jax.figures import look
 
 NAMES = {"dopri8": "Dopri8", "tsit5": "Tsit5", "rodas5p": "Rodas5P", "kvaerno5": "Kvaerno5"}
-STYLES = {"dopri8": "C0o-", "tsit5": "C1s-", "rodas5p": "C2^--", "kvaerno5": "C3v--"}
+STYLES = {solver: look(k) | {"label": name} for k, (solver, name) in enumerate(NAMES.items())}
 
 
 def show(path: Path, folder: Path) -> str:
@@ -80,32 +82,41 @@ def completed(scene: Row, solver: str) -> list[Row]:
     return [r for r in scene["runs"] if r["solver"] == solver and r["completed"]]
 
 
+def named(scene: Row) -> str:
+    """A scene's name, with the unit of the servo's stiffness."""
+    return scene["name"] + (" N/m" if "e+" in scene["name"] else "")
+
+
 def work(record: Row) -> Figure:
-    """Error against run time of every solver, one panel per scene."""
+    """Run time against error of every solver, one panel per scene."""
     scenes = record["scenes"]
-    columns = min(4, len(scenes))
+    columns = min(3, len(scenes))
     rows = -(-len(scenes) // columns)
-    width, height = 3.6 * columns + 1, 3.2 * rows + 0.8
-    figure, axes = panels(rows, columns, width, height, sharex=True, sharey=True)
-    lines = {}
+    figure, axes = panels(rows, columns, 2.1 * rows + 0.8, sharex=True, sharey=True)
     for ax, scene in zip(axes, scenes, strict=False):
         for solver in solvers(scenes):
             fine = completed(scene, solver)
-            seconds, errors = [r["seconds"] for r in fine], [r["error"] for r in fine]
-            (lines[NAMES[solver]],) = ax.loglog(seconds, errors, STYLES[solver], markersize=4)
-        ax.set_title(scene["name"])
-        ax.grid(alpha=0.3)
+            ax.loglog([r["error"] for r in fine], [r["seconds"] for r in fine], **STYLES[solver])
+        ax.set_title(named(scene))
     for ax in axes[len(scenes) :]:
         ax.set_axis_off()
-    figure.supxlabel(f"run time for {record['t1']:g} s [s]")
-    figure.supylabel("largest position error [m]")
-    figure.legend(lines.values(), lines.keys(), loc="outside upper center", ncols=4)
+    figure.supxlabel("largest position error [m]", fontsize=9)
+    figure.supylabel(f"run time for {record['t1']:g} s of motion [s]", fontsize=9)
+    lines = legend_of(axes)
+    figure.legend(
+        lines.values(),
+        lines.keys(),
+        loc="outside upper center",
+        ncols=4,
+        fontsize=8,
+        handlelength=3,
+    )
     return figure
 
 
 def crossover(record: Row) -> Figure:
     """Fastest run time to 1e-6 m against the largest eigenvalue at the start, by solver."""
-    figure, (ax,) = panels(1, 1, 8, 4.6)
+    figure, (ax,) = panels(1, 1, 3.8)
     start = lambda scene: scene["eigenvalue"]["start"]
     servos = sorted((s for s in record["scenes"] if s["stiffness"] > 0), key=start)
     for solver in solvers(record["scenes"]):
@@ -115,16 +126,15 @@ def crossover(record: Row) -> Figure:
             if fine := [row["seconds"] for row in runs if row["error"] <= 1e-6]:
                 points.append((start(scene), min(fine)))
         if points:
-            ax.loglog(*zip(*points, strict=True), STYLES[solver], label=NAMES[solver])
+            ax.loglog(*zip(*points, strict=True), **STYLES[solver])
     for scene in servos:
         at, place = start(scene), ax.get_xaxis_transform()
-        beside = {"rotation": 90, "ha": "right", "fontsize": 8, "color": "0.4"}
-        ax.text(at, 0.03, scene["name"] + " ", transform=place, **beside)
+        beside = {"rotation": 90, "ha": "right", "fontsize": 7, "color": "0.4"}
+        ax.text(at, 0.03, named(scene) + " ", transform=place, **beside)
         ax.axvline(at, color="0.9", zorder=0)
-    seconds = f"fastest run for {record['t1']:g} s to 1e-6 m [s]"
+    seconds = f"fastest run for {record['t1']:g} s of motion,\nerror up to 1e-6 m [s]"
     ax.set(xlabel="largest |eigenvalue| at the start [1/s]", ylabel=seconds)
     # room for the scenes' names below the curves
-    ax.set_ylim(bottom=0.2 * ax.dataLim.ymin)
-    ax.grid(alpha=0.3)
-    ax.legend()
+    ax.set_ylim(bottom=0.05 * ax.dataLim.ymin)
+    ax.legend(fontsize=8, handlelength=3, loc="upper left")
     return figure

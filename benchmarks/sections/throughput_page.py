@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from shared.pages import Row, listed, save
+from shared.pages import Row, listed, panels, save
 
+from stmuav_jax.figures import look
 from stmuav_jax.files.netcdf import write_atomically
 
 PROGRAM = ("program", "tolerance or step", "per second", "median [m]", "largest [m]", "failure")
@@ -45,19 +46,18 @@ def of_peer(row: Row) -> tuple[Any, ...]:
 
 def figure(content: Row) -> Figure:
     """Flights per second by lanes."""
-    drawn = Figure(figsize=(7.0, 3.2), layout="constrained")
-    ax = drawn.subplots()
+    drawn, (ax,) = panels(1, 1, 3.2)
     lanes = [row["lanes"] for row in content["rows"]]
-    ax.plot(lanes, [row["per_second"] for row in content["rows"]], "o-", color="#0072B2")
-    ax.axhline(content["one_lane_per_second"], color="0.5", linestyle=":", label="one by one")
-    for peer, color in zip(comparable(content), ("#D55E00", "#009E73"), strict=False):
-        ax.axhline(peer["per_second"], color=color, linestyle="--", label=peer["method"])
+    ax.plot(lanes, [row["per_second"] for row in content["rows"]], **look(0), label="stmuav-jax")
+    ax.axhline(content["one_lane_per_second"], color="0.4", linestyle=":", label="one by one")
+    for k, peer in enumerate(comparable(content), 1):
+        ax.axhline(peer["per_second"], **look(k) | {"marker": ""}, label=peer["method"])
     ax.set_xscale("log", base=2)
     ax.set_xticks(lanes, [str(k) for k in lanes])
     ax.set_ylim(bottom=0)
-    ax.set_xlabel("flights that go on together (lanes)", fontsize=9)
-    ax.set_ylabel("flights per second, one core", fontsize=9)
-    ax.grid(True, color="0.85", linewidth=0.6)
+    ax.set(
+        xlabel="flights that go on together (lanes)", ylabel="flights per second, one core [1/s]"
+    )
     ax.legend(fontsize=8)
     return drawn
 
@@ -67,7 +67,7 @@ def write_page(result: Path, page: Path) -> Path:
     content = json.loads(result.read_text())
     about, rows, cores = content["environment"], content["rows"], content["cores"]
     tried, one = content["tried"], "{:.1f}".format
-    (picture,) = save({"lanes": figure(content)}, page.parent / "figures" / "benchmarks", dpi=160)
+    (picture,) = save({"lanes": figure(content)}, page.parent / "figures" / "benchmarks")
     dirty = " with changes" if about["dirty"] else ""
     rate, error = max(row["per_second"] for row in rows), tried[-1]["largest_error"]
     spent = lambda r: f"{100 * r['per_second'] / (r['devices'] * cores[0]['per_second']):.0f} %"

@@ -1,14 +1,12 @@
 """Markdown tables and figures of the benchmarks' pages, which hold only what JSON records say."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from stmuav_jax.files.netcdf import write_atomically
+from stmuav_jax.figures import grid, save_figures
 
 Lines = list[str]
 Row = dict[str, Any]
@@ -92,12 +90,10 @@ def ours(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if row["method"].startswith("stmuav-jax")]
 
 
-def panels(
-    rows: int, columns: int, width: float, height: float, **shared: Any
-) -> tuple[Figure, list[Any]]:
-    """A figure of so many panels, row by row; sizes in inches."""
-    figure = Figure(figsize=(width, height), layout="constrained", dpi=110)
-    return figure, list(figure.subplots(rows, columns, squeeze=False, **shared).ravel())
+def panels(rows: int, columns: int, height: float, **shared: Any) -> tuple[Figure, list[Any]]:
+    """A figure of the library's style with so many panels, row by row; its height in inches."""
+    figure, axes = grid(rows, columns, height, **shared)
+    return figure, list(axes.flat)
 
 
 def legend_of(axes: Sequence[Any]) -> dict[str, Any]:
@@ -109,12 +105,9 @@ def legend_of(axes: Sequence[Any]) -> dict[str, Any]:
     return lines
 
 
-def save(figures: dict[str, Figure], folder: Path, dpi: float | None = None) -> list[Path]:
-    """Write figures as PNG under their names; returns their paths."""
-    paths = []
-    for name, figure in figures.items():
-        FigureCanvasAgg(figure)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=dpi or "figure")
-        paths.append(write_atomically(folder / f"{name}.png", buffer.getvalue()))
-    return paths
+def save(figures: dict[str, Figure], folder: Path) -> list[Path]:
+    """Write figures as PNG under their names, for print; returns their paths."""
+    for ax in (ax for figure in figures.values() for ax in figure.axes):
+        for text in (ax.title, ax.xaxis.label, ax.yaxis.label):
+            text.set_fontsize(9)
+    return save_figures(figures, folder, dpi=160)

@@ -29,6 +29,7 @@ from .plot import (
     balances as balances,
     grid as grid,
     joints as joints,
+    look as look,
     pose as pose,
     save_figures as save_figures,
 )

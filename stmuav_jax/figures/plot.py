@@ -23,6 +23,17 @@ STYLES = (
     ("#009E73", "-."),
     ("#000000", ":"),
 )
+# More of them for figures of many curves. With the markers, whose number is no multiple of that of the
+# colours, 104 curves stay apart.
+_COLORS = (*(color for color, _ in STYLES), "#CC79A7", "#E69F00", "#56B4E9", "#666666")
+_DASHES = (
+    *(dash for _, dash in STYLES),
+    (0, (5, 1)),
+    (0, (3, 1, 1, 1, 1, 1)),
+    (0, (1, 1)),
+    (0, (9, 2)),
+)
+_MARKS = "os^DvP*X<>hp8"
 WIDTH = 7.0  # text width of a page [inch]
 
 
@@ -41,6 +52,19 @@ def grid(rows: int, columns: int, height: float, **more: Any) -> tuple[Figure, n
         ax.grid(True, color="0.85", linewidth=0.6)
         ax.tick_params(labelsize=9)
     return figure, axes
+
+
+def look(k: int) -> dict[str, Any]:
+    """Colour, dash and marker of the k-th of many curves, as keyword arguments of `plot`.
+
+    The colours are Okabe and Ito's; dash or marker alone tells the curves apart in grey print.
+
+    Args:
+        k: number of the curve, from zero.
+    """
+    color, dash = (each[k % len(each)] for each in (_COLORS, _DASHES))
+    mark = _MARKS[k % len(_MARKS)]
+    return {"color": color, "linestyle": dash, "marker": mark, "markersize": 4, "linewidth": 1.2}
 
 
 def curves(ax: Axes, ts: np.ndarray, values: np.ndarray, labels: tuple[str, ...]) -> None:

@@ -12,7 +12,16 @@ import pytest
 import stmuav_jax as stm
 from stmuav_jax.figures import drawing
 from stmuav_jax.figures.numbers import joints_of, numbers_of
-from stmuav_jax.figures.plot import FIGURES, balances, content, joints, pose, save_figures
+from stmuav_jax.figures.plot import (
+    FIGURES,
+    STYLES,
+    balances,
+    content,
+    joints,
+    look,
+    pose,
+    save_figures,
+)
 from stmuav_jax.figures.report import certificate_rows
 from stmuav_jax.mechanics.joint_states import joint_motion
 from stmuav_jax.tracker.kinematics import panel_angles
@@ -32,6 +41,15 @@ def test_pose_shows_the_base(short_run):
         unit in label for unit, label in zip(("[m]", "[degrees]", "[rad/s]"), labels, strict=True)
     )
     assert len({line.get_linestyle() for line in position.lines}) == 3
+
+
+def test_many_curves_stay_apart_in_print():
+    """By colour and marker up to 104; without colours by the marker up to 13, by the dash up to 8."""
+    looks = [look(k) for k in range(104)]
+    assert [(each["color"], each["linestyle"]) for each in looks[:4]] == list(STYLES)
+    assert len({(each["color"], each["marker"]) for each in looks}) == 104
+    assert len({each["marker"] for each in looks[:13]}) == 13
+    assert len({each["linestyle"] for each in looks[:8]}) == 8
 
 
 def test_joints_shows_strokes_and_panel_angles(short_run):
