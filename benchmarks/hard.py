@@ -44,13 +44,14 @@ tolerances that users may give. The error that is demanded is 1,000 tolerances, 
 """
 SINGULAR = """## Starts at a singular posture
 
-Nothing says which branch the motion follows: the run has to stop at once and to name the posture.
+Nothing says which branch the motion follows: the start has to be refused, and the posture named.
 """
 BESIDE = """## Other programs
 
 The same cases by the programs of `benchmarks/peers` that are installed, at their finest setting whose
-steps end at the output times, one run each: error, seconds. A case stands here if its error is one of
-positions; a sentence says why a program did not run it.
+steps end at the output times, one run each: error, seconds, and that setting (fixed step, or tolerance).
+A case stands here if its error is one of positions; a sentence says why a program did not run it, or
+what became of it at that setting. Coarser settings are not tried then.
 """
 LIMITS = """## Where it ends
 
@@ -109,16 +110,14 @@ def beside(case: Hard, peer: Peer) -> dict[str, Any]:
 
 
 def singular_start(name: str, why: str, system: stm.System) -> dict[str, Any]:
-    """A run from a singular posture: how far it came, and what it says."""
-    run = stm.simulate(system, system.reference, t1=0.1, throw=False)
-    named = "the start is a singular posture" in run.failure
-    return {
-        "name": name,
-        "why": why,
-        "t_end": run.certificate.t_end,
-        "said": run.failure,
-        "named": named,
-    }
+    """A start in a singular posture: how far a run came, and what was said."""
+    try:
+        run = stm.simulate(system, system.reference, t1=0.1, throw=False)
+        reached, said = run.certificate.t_end, run.failure or run.certificate.error_words
+    except stm.StateError as error:
+        reached, said = 0.0, str(error)
+    named = "the start is a singular posture" in said.lower()
+    return {"name": name, "why": why, "t_end": reached, "said": said, "named": named}
 
 
 def sweep(tolerances: tuple[float, ...]) -> Iterator[dict[str, Any]]:
@@ -150,6 +149,17 @@ def record(size: tuple[int | None, int | None]) -> Iterator[dict[str, Any]]:
     yield content
 
 
+def result_of(one: dict[str, Any]) -> str:
+    """Error, seconds and setting of another program; or the reason why there is none, and at which setting."""
+    setting, at = one["setting"], ""
+    if setting is not None:
+        tolerance, step = setting["tolerance"], setting["step"]
+        at = f"step {step:.2g} s" if tolerance is None else f"tolerance {tolerance:.0e}"
+    if reason := one["reason"]:
+        return f"{reason.rstrip('.')} ({at})." if at else reason
+    return f"{number(one['error'], digits=2)}, {number(one['seconds'], digits=2)} s ({at})"
+
+
 def more(content: dict[str, Any]) -> list[str]:
     """Sections on singular starts and on other programs, where the record has them."""
     parts: list[str] = []
@@ -164,11 +174,7 @@ def more(content: dict[str, Any]) -> list[str]:
         parts += [SINGULAR, titled("", starts, *columns).lstrip(), ""]
     ran = [row for row in content["cases"] if row.get("peers")]
     if ran:
-        shown = lambda one: (
-            one["reason"]
-            or f"{number(one['error'], digits=2)}, {number(one['seconds'], digits=2)} s"
-        )
-        cell = lambda k: lambda row: shown(row["peers"][k])
+        cell = lambda k: lambda row: result_of(row["peers"][k])
         names = [(one["peer"], None, cell(k)) for k, one in enumerate(ran[0]["peers"])]
         ours = (
             "reached here",

@@ -232,6 +232,32 @@ _SEVEN: Mapping[str, tuple[float, list[float], list[float], list[float]]] = {
 }  # fmt: skip
 
 
+def parallelogram(
+    angle: float,
+    *,
+    size: float = 1.0,
+    gravity: Any = (0, 0, -GRAVITY),
+    forces: tuple[Any, ...] = (),
+) -> stm.System:
+    """Two cranks of 1 m and a coupler of 2 m, with the cranks at an angle; all lie flat at zero."""
+    B = size * np.array([np.cos(angle), 0.0, np.sin(angle)])
+    D = size * np.array([2.0, 0.0, 0.0])
+    p = (np.cos(angle / 2), 0.0, -np.sin(angle / 2), 0.0)
+    inertia, axis = size**2 * np.array([1e-3, 0.1, 0.1]), (0, -1, 0)
+    bodies = [
+        stm.Body("crank", 1.0, inertia, position=B / 2, orientation=p),
+        stm.Body("coupler", 2.0, inertia, position=B + D / 2),
+        stm.Body("rocker", 1.0, inertia, position=D + B / 2, orientation=p),
+    ]
+    joints = [
+        stm.revolute("A", "ground", "crank", point=(0, 0, 0), axis=axis),
+        stm.revolute("B", "crank", "coupler", point=B, axis=axis),
+        stm.revolute("C", "coupler", "rocker", point=B + D, axis=axis),
+        stm.revolute("D", "ground", "rocker", point=D, axis=axis),
+    ]
+    return stm.System(bodies, joints, [stm.Gravity(gravity), *forces])
+
+
 def seven_bodies() -> stm.System:
     """A free base, two sliders, a post, two rods and a platform: 34 rows, 8 degrees of freedom.
 

@@ -1,8 +1,8 @@
 """Hard cases of closed loops and long times, and starts at which branches of the motion meet.
 
 They go on where `hard.py` ends: loops with dependent rows, a slider-crank through its dead points,
-2,000 s of a pendulum. A start at a singular posture has no motion to compare with: the run has to
-stop at once, and to say why.
+2,000 s of a pendulum. A start at rest in a singular posture has no motion to compare with: it has to
+be refused, and its joints named.
 """
 
 from collections.abc import Callable
@@ -117,5 +117,10 @@ STARTS: tuple[tuple[str, str, Callable[[], stm.System]], ...] = (
         "folded four-bar",
         "its last rod is heavy beyond its foot: no branch balances",
         lambda: in_line(0.5),
+    ),
+    (
+        "four-bar in line",
+        "its rods fall as one parallelogram, or as crossed ones: both keep the joints together",
+        lambda: in_line(1.5),
     ),
 )

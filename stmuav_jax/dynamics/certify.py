@@ -6,12 +6,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..checks.errors import ModelError
+from ..checks.errors import ModelError, StateError
 from ..mechanics.internal import internal_states
 from ..mechanics.state import State
 from ..mechanics.system import System
+from .assembly.branching import RESTING, Branching, branching
 from .assembly.initial import Rank, rank_of
-from .assembly.singular import singular_start
+from .assembly.singular import branches_meet, singular_start
 from .checks import check_consistent, check_loads
 from .error_estimate import ErrorEstimate
 from .evaluation import Balances, RowsAt, Saved, accelerations, balances, rows_at, singular_values
@@ -25,11 +26,20 @@ from .tree.formulation import Tree
 
 
 class Start(NamedTuple):
-    """Checks of the initial state: its constraint rows, their rank, and the largest | |p|^2 - 1 |."""
+    """Checks of the initial state.
+
+    Attributes:
+        rows: its constraint rows. rank: their rank. norm: largest | |p|^2 - 1 |.
+        branches: text on a singular posture from which several motions lead; else "".
+        followed: true if the posture is singular, and the velocities say along which branch the
+            motion goes on.
+    """
 
     rows: RowsAt
     rank: Rank
     norm: float
+    branches: str = ""
+    followed: bool = False
 
 
 def inspect_start(
@@ -42,21 +52,71 @@ def inspect_start(
         maximal coordinates, with the rows of all joints; and what was found.
 
     Raises:
-        StateError: the state is not consistent with the joints. ModelError: a load is not finite,
-            the constraints contradict each other, or the formulation allows for no dependent rows.
+        StateError: the state is not consistent with the joints, or it is a singular posture at rest
+            from which loads set the system in motion. ModelError: a load is not finite, the
+            constraints contradict each other, or the formulation allows for no dependent rows.
     """
     rows = Augmented().prepare(system)
     row = lambda x: np.asarray(x)[None]
     here = Saved(np.array([t]), *jax.tree.map(row, (state, internal_states(system))))
     seen = rows_at(rows, here)
-    residuals, rates, matrix, gamma, finite_loads = (np.asarray(x)[0] for x in seen)
+    residuals, rates, matrix, gamma, finite_loads, wrenches = (np.asarray(x)[0] for x in seen)
     check_loads(system, finite_loads, t)
     check_consistent(system, rows, residuals, rates)
     rank = rank_of(system, rows, state, t, matrix)
+    off_unit = np.max(np.abs(np.sum(np.asarray(state.p) ** 2, axis=-1) - 1))
+    start = Start(seen, rank, float(off_unit))
     if rank.rank < rank.rows:
         formulation = allow_dependent(formulation, rank, matrix, gamma)
-    off_unit = np.max(np.abs(np.sum(np.asarray(state.p) ** 2, axis=-1) - 1))
-    return formulation, rows, Start(seen, rank, float(off_unit))
+        beside = branches_at(rows, state, t, matrix)
+        check_determined(system, state, beside, gamma, wrenches)
+        text = branches_meet(system, state, beside.names) if beside.undetermined else ""
+        followed = beside.gained > 0 and not beside.undetermined
+        start = start._replace(branches=text, followed=followed)
+    return formulation, rows, start
+
+
+def branches_at(rows: AugmentedModel, state: State, t: float, matrix: np.ndarray) -> Branching:
+    """`Branching` of a posture with dependent rows.
+
+    Args:
+        rows: system prepared for maximal coordinates, with the rows of all joints.
+        matrix: constraint Jacobian in (v, omega').
+    """
+    internal = np.asarray(internal_states(rows.system))
+
+    def look(states: State) -> np.ndarray:
+        count = len(states.r)
+        beside = Saved(np.full(count, t), states, np.tile(internal, (count, 1)))
+        return np.asarray(rows_at(rows, jax.tree.map(np.asarray, beside)).matrix)
+
+    return branching(rows, state, matrix, look)
+
+
+# Generalised forces below this part of their terms, and accelerations of drivers below this [m/s^2],
+# [rad/s^2], count as zero.
+_BALANCED = 1e-9
+
+
+def check_determined(
+    system: System, state: State, beside: Branching, gamma: np.ndarray, wrenches: np.ndarray
+) -> None:
+    """Raise `StateError` if a motion begins at rest in a singular posture.
+
+    Args:
+        gamma: right-hand sides of the constraint rows for accelerations (m,). wrenches: loads on the
+            bodies (n, 6), as in `RowsAt`.
+    """
+    if not (beside.undetermined and beside.resting):
+        return
+    terms = beside.free * wrenches.reshape(-1, 1)
+    pushed = np.any(np.abs(terms.sum(axis=0)) > _BALANCED * np.abs(terms).sum(axis=0))
+    if pushed or np.max(np.abs(gamma)) > _BALANCED:
+        text = branches_meet(system, state, beside.names)
+        raise StateError(
+            f"T{text[1:]}. Here it is at rest, as which velocities up to {RESTING:g} rad/s count, and "
+            "its loads or drivers set it in motion."
+        )
 
 
 def allow_dependent(
@@ -133,7 +193,7 @@ def check_saved(
         smallest = float(np.min(values[:, start.rank.rank - 1]))
         drifted = max(worst["position_violation"], worst["angle_violation"])
         later = _independent_later(values, start.rank.rank, drifted)
-        if later is not None:
+        if later is not None and not start.followed:
             one = lambda k: jax.tree.map(lambda x: np.asarray(x)[k], at.states)
             k = pick[later]
             time = float(at.ts[k])

@@ -13,7 +13,7 @@ from ..algebra.compiler import in_blocks, kept_jit
 from ..checks.numbers import as_jax
 from ..checks.shapes import Numbers
 from ..mechanics.internal import with_internal
-from ..mechanics.load import Load
+from ..mechanics.load import Load, no_load
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .conserved import energy, momentum
@@ -58,6 +58,8 @@ class RowsAt(NamedTuple):
         matrix: constraint Jacobian in (v, omega') (m, 6 n). gamma: right-hand side of its
             rows for accelerations (m,).
         finite_loads: true for each force element whose load is finite.
+        wrenches: sum of all loads on every body (n, 6), force [N] in world axes at the mass centre and
+            moment [N m] in body axes.
     """
 
     residuals: Float[Array, " m"]
@@ -65,6 +67,7 @@ class RowsAt(NamedTuple):
     matrix: Float[Array, "m k"]
     gamma: Float[Array, " m"]
     finite_loads: Bool[Array, " forces"]
+    wrenches: Float[Array, "n 6"]
 
 
 class Saved(NamedTuple):
@@ -109,7 +112,9 @@ def _rows(model: AugmentedModel, saved: Saved) -> RowsAt:
         finite = [jnp.all(jnp.isfinite(x.force)) & jnp.all(jnp.isfinite(x.moment)) for x in loads]
         fine = jnp.stack(finite) if finite else jnp.zeros((0,), bool)
         off = scale * (eq.matrix @ u - eq.target)
-        return RowsAt(scale * eq.value, off, eq.matrix, eq.gamma, fine)
+        total = sum(loads, start=no_load(kin))
+        wrenches = jnp.concatenate([total.force, total.moment], axis=1)[:-1]
+        return RowsAt(scale * eq.value, off, eq.matrix, eq.gamma, fine, wrenches)
 
     return jax.lax.map(one, saved)
 

@@ -17,7 +17,7 @@ from ..mechanics.state import State
 from ..mechanics.system import System
 from .assembly.initial import Rank, rank_of
 from .assembly.singular import weakest_rows
-from .certify import allow_dependent
+from .certify import allow_dependent, branches_at, check_determined
 from .checks import (
     POSITION_TOLERANCE,
     VELOCITY_TOLERANCE,
@@ -215,7 +215,7 @@ def _posture(system: System, state: State, t: float) -> list[Finding]:
     """Findings on loads, residuals, rank, conditions and the linearised motion at a state."""
     model = Augmented().prepare(system)
     seen = _rows(system, model, [state], t)
-    residuals, rates, matrix, gamma, loads = (np.asarray(x)[0] for x in seen)
+    residuals, rates, matrix, gamma, loads, wrenches = (np.asarray(x)[0] for x in seen)
     found = list(_faults("loads", lambda: check_loads(system, loads, t)))
     off = list(_faults("posture", lambda: check_consistent(system, model, residuals, rates)))
     if not off and system.joints:
@@ -227,7 +227,12 @@ def _posture(system: System, state: State, t: float) -> list[Finding]:
     free = _free_motions(matrix, rank, 6 * system.n_bodies)
     found += [*off, *_freedom(system, rank), *_conditions(system, rank, matrix, free)]
     if rank.redundant:
-        found += _faults("constraints", lambda: allow_dependent(Tree(), rank, matrix, gamma))
+        wrong = list(_faults("constraints", lambda: allow_dependent(Tree(), rank, matrix, gamma)))
+        if not (wrong or off):
+            beside = branches_at(model, state, t, matrix)
+            start = lambda: check_determined(system, state, beside, gamma, wrenches)
+            wrong += _faults("singular posture at rest", start)
+        found += wrong
     if rank.rank and not off:
         found += _nearness(system, model, state, t, rank, free)
     if rank.dof and not any(each.severity == "fault" for each in found):

@@ -17,7 +17,7 @@ from ..mechanics.internal import with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .assembly.singular import singular_posture
-from .certify import Checked, certify, check_saved, inspect_start, violations
+from .certify import Checked, Start, certify, check_saved, inspect_start, violations
 from .checks import check_method, check_start, output_times, scene_of
 from .error_estimate import LOOSER, ErrorEstimate, SecondRun, estimated, without
 from .evaluation import accelerations
@@ -76,7 +76,8 @@ def simulate(
     Raises:
         SettingError: tolerances, span, saved times or kinds of arguments are invalid, or a full
             certificate is wanted without the analysis.
-        StateError: the initial state is not finite, not unit or not consistent.
+        StateError: the initial state is not finite, not unit or not consistent, or a singular posture
+            at rest from which loads set the system in motion: its branch is not determined.
         ModelError: constraints are contradictory, or a load is not finite at the start.
         SimulationError: the end was not reached (with `throw`); its `run` holds the result so far.
     """
@@ -98,10 +99,10 @@ def simulate(
         balances=analysis,
     )
     wanted = _Wanted(error_estimate, analysis, certificate == "full")
-    run = _carried_out(scene, method, times, progress, wanted)
+    run, start = _carried_out(scene, method, times, progress, wanted)
     if run.successful or run.certificate.result == "interrupted":
         return run
-    run = dataclasses.replace(run, failure=_failure(run, float(times[-1])))
+    run = dataclasses.replace(run, failure=_failure(run, float(times[-1]), start))
     if throw:
         raise SimulationError(run.failure, run)
     return run
@@ -121,8 +122,8 @@ def _carried_out(
     times: np.ndarray,
     progress: Progress | None,
     wanted: _Wanted,
-) -> Run:
-    """Run with its certificate, complete or not."""
+) -> tuple[Run, Start]:
+    """Run with its certificate, complete or not, and what was found at its start."""
     clock = time.perf_counter()
     problem = prepare(scene.system, method)
     prepared = time.perf_counter() - clock
@@ -140,7 +141,7 @@ def _carried_out(
         checked = check_saved(problem, rows, start, first, wanted.full)
     else:
         worst = violations(rows.constraints, first, start.rows, start.norm)
-        checked = Checked(None, None, None, worst)
+        checked = Checked(None, None, None, worst, start.branches)
     errors = _errors(scene, problem, done, wanted.analysis)
     seconds = dataclasses.replace(
         done.seconds,
@@ -150,7 +151,8 @@ def _carried_out(
     result = done.stopped or _words(first)
     certificate = certify(scene.system, first, checked, errors, start.rank, result, seconds)
     model = problem.model if wanted.analysis else None
-    return Run(scene, method, first, model, errors, certificate, _settings(method))
+    run = Run(scene, method, first, model, errors, certificate, _settings(method))
+    return run, start
 
 
 def _solver(scene: Scene, method: Method) -> diffrax.AbstractSolver:
@@ -266,7 +268,7 @@ def _settings(method: Method) -> dict[str, Any]:
     return found
 
 
-def _failure(run: Run, end: float) -> str:
+def _failure(run: Run, end: float, start: Start) -> str:
     """Reason why a run stopped, in one paragraph."""
     t = run.certificate.t_end
     state = jax.tree.map(lambda x: jnp.asarray(x[-1]), run.states)
@@ -284,7 +286,8 @@ def _failure(run: Run, end: float) -> str:
         reason = "the value of its event is not a number there"
     system = with_internal(run.scene.system, jnp.asarray(run.trajectory.internal[-1]))
     ends = jax.tree.map(lambda x: jnp.asarray(x)[np.array([0, -1])], run.states)
-    reason = singular_posture(system, ends, t, run.certificate.rank) or reason
+    posture = singular_posture(system, ends, t, start.rank.rank, start.followed)
+    reason = start.branches or posture or reason
     kin = system.kinematics(state)
     for force in system.forces:
         # a load may cease to be finite right after the last state at which it was

@@ -6,31 +6,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import parallelogram
 
 import stmuav_jax as stm
 from stmuav_jax.cli import main
 
 MODELS = Path(__file__).parents[2] / "docs" / "models"
-
-
-def parallelogram(angle: float) -> stm.System:
-    """Two cranks of 1 m and a coupler of 2 m, with the cranks at an angle; all lie flat at zero."""
-    B = np.array([np.cos(angle), 0.0, np.sin(angle)])
-    D = np.array([2.0, 0.0, 0.0])
-    p = (np.cos(angle / 2), 0.0, -np.sin(angle / 2), 0.0)
-    inertia, axis = (1e-3, 0.1, 0.1), (0, -1, 0)
-    bodies = [
-        stm.Body("crank", 1.0, inertia, position=B / 2, orientation=p),
-        stm.Body("coupler", 2.0, inertia, position=B + D / 2),
-        stm.Body("rocker", 1.0, inertia, position=D + B / 2, orientation=p),
-    ]
-    joints = [
-        stm.revolute("A", "ground", "crank", point=(0, 0, 0), axis=axis),
-        stm.revolute("B", "crank", "coupler", point=B, axis=axis),
-        stm.revolute("C", "coupler", "rocker", point=B + D, axis=axis),
-        stm.revolute("D", "ground", "rocker", point=D, axis=axis),
-    ]
-    return stm.System(bodies, joints, [stm.Gravity()])
 
 
 def by_name(found):
@@ -49,7 +30,8 @@ def test_a_parallelogram_near_and_in_its_singular_posture():
     assert near.severity == "warning"
     assert float(near.value.split()[4]) == pytest.approx(0.01, rel=0.06)
     flat = stm.check(parallelogram(0.0))
-    assert flat.worst == "warning"
+    assert flat.worst == "fault"
+    assert "nothing says which one it follows" in by_name(flat)["singular posture at rest"].value
     assert by_name(flat)["singular posture"].value == "rank 16 here, more beside it"
     assert by_name(flat)["degrees of freedom"].value.startswith("2 ")
     # cranks that turn against each other are the other branch's motion; equal rates are this one's,
@@ -123,15 +105,3 @@ def test_the_command_says_by_its_exit_code_what_is_wrong(tmp_path, capsys):
     odd.write_text(text.replace("0.16666666666666666, 0.16666666666666666", "1.0, -1.0"))
     assert main(["check", str(odd), "--no-cache"]) == 2
     assert main(["check", "hexacopter", "--no-cache"]) in (0, 1)
-
-
-def test_a_run_from_a_singular_posture_says_so():
-    """The flat parallelogram falls along one of its branches: the certificate names the joints."""
-    flat, sound = parallelogram(0.0), parallelogram(0.3)
-    words = lambda system: (
-        stm.simulate(system, system.reference, t1=0.2, save_every=0.05).certificate.error_words
-    )
-    assert words(flat).startswith("The start is a singular posture of ")
-    assert "A (at 0 rad)" in words(flat)
-    assert "branch that this run follows" in words(flat)
-    assert words(sound) == ""

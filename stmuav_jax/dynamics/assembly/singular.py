@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ...mechanics.joint_coordinate import coordinate, free_coordinates
 from ...mechanics.joint_kind import Which
@@ -23,24 +24,37 @@ def weakest_rows(
     """Singular value number `rank` of the constraint Jacobian, and the joints of its rows.
 
     Returns:
-        The value, and the names of joints: drivers first, then those that own at least a tenth
-        of the corresponding combination of rows, the largest share first.
+        The value, and the names of the joints that own the corresponding combination of rows, see
+        `owners`.
     """
     vectors, values, _ = np.linalg.svd(jacobian(model, state, t), full_matrices=False)
-    share = np.zeros(len(system.joints))
-    np.add.at(share, np.array(model.constraints.owner), vectors[:, rank - 1] ** 2)
-    driver = np.array([joint.kind.startswith("drive") for joint in system.joints])
+    return float(values[rank - 1]), owners(model, vectors[:, rank - 1] ** 2)
+
+
+def owners(model: AugmentedModel, weights: Float[np.ndarray, " m"]) -> tuple[str, ...]:
+    """Names of joints that own rows of some weight: drivers first, then those with the largest shares.
+
+    A share counts if it is at least a tenth, or half of the largest where all are smaller.
+    """
+    joints = model.system.joints
+    share = np.zeros(len(joints))
+    np.add.at(share, np.array(model.constraints.owner), weights / np.sum(weights))
+    driver = np.array([joint.kind.startswith("drive") for joint in joints])
     order = np.lexsort((-share, ~driver))
-    named = [k for k in order if share[k] >= (1e-6 if driver[k] else 0.1)]
-    return float(values[rank - 1]), tuple(system.joints[k].name for k in named)
+    least = min(0.1, 0.5 * np.max(share))
+    named = [k for k in order if share[k] >= (1e-6 if driver[k] else least)]
+    return tuple(joints[k].name for k in named)
 
 
-def singular_posture(system: System, states: State, t: float, rank: int) -> str:
+def singular_posture(
+    system: System, states: State, t: float, rank: int, followed: bool = False
+) -> str:
     """Text on a run that ended or began in a singular posture, with joints and drivers; else "".
 
     Args:
         states: first and last state of the run (2, n, .). t: time of the last [s].
-        rank: rank at the start.
+        rank: rank at the start. followed: true if the start's velocities say along which branch of a
+            singular posture the motion goes on.
     """
     if not rank:
         return ""
@@ -48,12 +62,13 @@ def singular_posture(system: System, states: State, t: float, rank: int) -> str:
     values = np.asarray(singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
     state = _one(states, -1)
     if rank < values.shape[1] and values[-1, rank] > _RISEN * values[0, 0] > values[0, rank]:
-        return singular_start(system, model, _one(states, 0), state, t, rank)
+        where = _one(states, 0), state
+        return "" if followed else singular_start(system, model, *where, t, rank)
     if not values[-1, rank - 1] < _SINGULAR * values[0, rank - 1]:
         return ""
     smallest, names = weakest_rows(system, model, state, t, rank)
     return (
-        f"the mechanism comes to a singular posture of {_standing(system, state, names)}: the "
+        f"the mechanism comes to a singular posture of {standing(system, state, names)}: the "
         f"smallest singular value of the constraint Jacobian is {smallest:.3g} there and "
         f"{values[0, rank - 1]:.3g} at the start. What these joints or drivers demand takes "
         "unbounded velocities or forces; lead the motion around that posture"
@@ -69,10 +84,15 @@ def singular_start(
         t: time of the later state [s]. rank: rank at the start.
     """
     _, names = weakest_rows(system, model, later, t, rank + 1)
+    return branches_meet(system, start, names)
+
+
+def branches_meet(system: System, start: State, names: tuple[str, ...]) -> str:
+    """Text on a start in a singular posture of some joints, from which several motions lead."""
     return (
-        f"the start is a singular posture of {_standing(system, start, names)}: "
+        f"the start is a singular posture of {standing(system, start, names)}: "
         "branches of the motion meet there, and nothing says which one it follows. Start "
-        "beside that posture, on the branch that is meant"
+        "beside that posture, on the branch that is meant, or with velocities along it"
     )
 
 
@@ -80,7 +100,7 @@ def _one(states: State, k: int) -> State:
     return State(*(x[k] for x in (states.r, states.p, states.v, states.omega)))
 
 
-def _standing(system: System, state: State, names: tuple[str, ...]) -> str:
+def standing(system: System, state: State, names: tuple[str, ...]) -> str:
     """Names of joints with their present angles and displacements, where one is free."""
     kin = system.kinematics(state)
     units: dict[Which, str] = {"angle": "rad", "displacement": "m"}
