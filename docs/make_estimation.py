@@ -1,6 +1,6 @@
 """Figures and tables of docs/estimation.md; takes minutes.
 
-    python docs/make_estimation.py [machine] [walk] [loads] [cases] [hover]
+    python docs/make_estimation.py [walk] [loads] [cases] [hover]
 
 Writes docs/figures/estimation/*.png and numbers.json. The tables of the eight cases and of the
 hover are those of `stmuav estimate` and `stmuav estimate --hover`.
@@ -16,15 +16,12 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 from rich.console import Console
 
 import stmuav_jax as stm
 from stmuav_jax.algebra import outer_jit
 from stmuav_jax.figures import (
     CASE_FIGURES,
-    STYLES,
-    grid,
     hover,
     hover_table,
     save_figures,
@@ -115,63 +112,6 @@ def followed() -> dict:
             "gain of log-likelihood": found.log_likelihood - float(found.history[0])}  # fmt: skip
 
 
-def _machine_figure(t: np.ndarray, truth: np.ndarray, found: dict[str, np.ndarray]) -> Figure:
-    """The centre of mass (T, 2) [m] of the UAV with its moving tracker, estimates against truth."""
-    figure, axes = grid(2, 1, 4.6)
-    for row, axis in enumerate("xy"):
-        ax = axes[row, 0]
-        ax.plot(t, 1e3 * truth[:, row], color="0.6", linewidth=3.0, label="truth")
-        for (words, values), (color, dash) in zip(found.items(), STYLES[1::-1], strict=False):
-            ax.plot(t, 1e3 * values[:, row], color=color, linestyle=dash, lw=1.2, label=words)
-        middle = 1e3 * np.mean(truth[:, row])
-        ax.set_ylim(middle - 6, middle + 6)
-        ax.set_ylabel(f"centre of mass, {axis} [mm]", fontsize=9)
-    axes[0, 0].legend(fontsize=8)
-    axes[1, 0].set_xlabel("time [s]", fontsize=9)
-    figure.suptitle("UAV with its tracker moving: from gyroscope and rotor speeds", fontsize=11)
-    return figure
-
-
-def machine() -> dict:
-    """The seven-body UAV, its tracker moving; the filter with and without what that does."""
-    strokes = (
-        lambda t: 0.03 * (1 - jnp.cos(jnp.pi * t)),
-        lambda t: 0.04 * (1 - jnp.cos(1.5 * jnp.pi * t)),
-    )
-    scene = stm.make_scene("uav_tracker", 1, strokes=strokes)
-    flight = stm.flight.sensed_flight(scene.system, scene.state0)
-    rotors = next(f for f in scene.system.forces if isinstance(f, stm.rotorcraft.Rotors))
-    rng = np.random.default_rng(0)
-    y = np.asarray(flight.omega)[1:] + 1e-3 * rng.normal(size=(len(flight.speed_squared), 3))
-    model = stm.quadrotor.rotorcraft_model(
-        rotors,
-        stm.flight.inertia_about_centre(scene.system, scene.state0),
-        jnp.sum(scene.system.bodies.mass),
-        height=flight.centre_of_mass[0, 2],
-        Q=[1e-8] * 3 + [4e-9] * 2,
-        R=[1e-6] * 3,
-    )
-    prior = stm.estimation.gaussian(
-        [0.0, 0.0, 0.0, 0.05, -0.05], np.diag([0.1] * 3 + [0.05] * 2) ** 2
-    )
-    inputs = {
-        "one rigid body": flight.speed_squared,
-        "motion of the parts known": stm.quadrotor.moving_part_inputs(
-            flight.speed_squared, flight.J, flight.h, flight.centre_of_mass[:, 2], 5e-3
-        ),
-    }
-    truth = np.asarray(flight.centre_of_mass)[1:, :2]
-    found = {
-        words: np.asarray(stm.estimation.kalman_filter(model, prior, y, u=u, dt=5e-3).mean)[:, 3:]
-        for words, u in inputs.items()
-    }
-    shown = _machine_figure(np.asarray(flight.t)[1:], truth, found)
-    save_figures({"machine": shown}, FOLDER, dpi=120)
-    size = lambda e: {"rms mm": (1e3 * np.sqrt(np.mean(e[20:] ** 2, axis=0))).tolist(),
-                      "largest mm": float(1e3 * np.max(np.abs(e[20:])))}  # fmt: skip
-    return {words: size(values - truth) for words, values in found.items()}
-
-
 def tabled() -> dict:
     """The eight cases, and what smoothing leaves."""
     rows, smoothed = cases()
@@ -179,7 +119,6 @@ def tabled() -> dict:
 
 
 PARTS = {
-    "machine": lambda: {"machine": machine()},
     "walk": lambda: {"random walk": followed()},
     "loads": lambda: {"loads": loads()},
     "cases": tabled,

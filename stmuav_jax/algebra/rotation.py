@@ -64,6 +64,18 @@ def _cross_jvp(primals: Any, tangents: Any) -> Any:
 _cross.defjvp(_cross_jvp, symbolic_zeros=True)
 
 
+def relative_acceleration(omega: Vec3s, omega_rate: Vec3s, arm: Vec3s) -> Float[Array, "3 ..."]:
+    """Acceleration of a point of a rigid body relative to another one [m/s^2], shape (3,).
+
+        omega' x s + omega x (omega x s)
+
+    Args:
+        omega: angular velocity [rad/s]. omega_rate: angular acceleration [rad/s^2], same axes.
+        arm: vector s between the points [m], same axes.
+    """
+    return cross(omega_rate, arm) + cross(omega, cross(omega, arm))
+
+
 def matrix_g(p: Quats) -> Float[Array, "3 4 ..."]:
     """Matrix G = [-e, e~ + e0 I] of Euler parameters, shape (3, 4)."""
     e = p[1:]

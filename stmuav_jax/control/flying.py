@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..algebra import lapack
 from ..checks.errors import ModelError
-from ..flight.sensed import centre_of_mass, inertia_about_centre, inner_momentum
+from ..flight.mass_properties import centre_of_mass, inertia_about_centre, inner_momentum
 from ..mechanics.forces.contact import GroundContact
 from ..mechanics.state import State
 from ..mechanics.system import System

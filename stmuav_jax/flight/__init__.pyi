@@ -38,6 +38,11 @@ from .linear import (
     Linear as Linear,
     linearize as linearize,
 )
+from .mass_properties import (
+    centre_of_mass as centre_of_mass,
+    inertia_about_centre as inertia_about_centre,
+    inner_momentum as inner_momentum,
+)
 from .multiple_shooting import (
     growth as growth,
     shooting as shooting,
@@ -48,12 +53,6 @@ from .panel_design import (
     PanelDesign as PanelDesign,
     break_even as break_even,
     panel_gain as panel_gain,
-)
-from .sensed import (
-    SensedFlight as SensedFlight,
-    centre_of_mass as centre_of_mass,
-    inertia_about_centre as inertia_about_centre,
-    sensed_flight as sensed_flight,
 )
 from .slopes import (
     trim_slopes as trim_slopes,

@@ -39,11 +39,6 @@ from .model import (
     report_prior as report_prior,
     thrusts as thrusts,
 )
-from .rotorcraft import (
-    MovingPartInputs as MovingPartInputs,
-    moving_part_inputs as moving_part_inputs,
-    rotorcraft_model as rotorcraft_model,
-)
 from .tuning import (
     FilterTuning as FilterTuning,
     consistent_tuning as consistent_tuning,

@@ -156,7 +156,12 @@ def hover_model(Q: Any, R: Any, *, parameters: Parameters = PART_III) -> StateSp
 
 
 def controlled(x: dict, loop: Loop, parameters: Parameters = PART_III) -> Float[Array, "4 *s"]:
-    """Thrusts of the rotors [N] by the controller for an estimated state."""
+    """Thrusts of the rotors [N] by the controller for an estimated state.
+
+    The figures of the hover belong to this law, which is not that of `stm.control.FlightController`:
+    it only holds the place and gives no moment about the thrust, where that one follows a path with
+    a heading and knows the machine as a `System`.
+    """
     J = jnp.asarray(parameters.value("inertia"))
     mass, length = parameters.value("mass"), parameters.value("arm")
     R_wb, omega, c = rotation_matrix(x["p"]), x["omega"], x["offset"]

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra import lapack
-from ..algebra.rotation import cross
+from ..algebra.rotation import cross, relative_acceleration
 from ..algebra.stacked import apply
 from ..checks.errors import ModelError, SettingError
 from ..estimation.gaussians import Gaussian, gaussian
@@ -146,7 +146,7 @@ def specific_force(
         lift: specific thrust F / m [m/s^2].
         moving: c' [m/s] and c'' [m/s^2] in body axes for a moving load; None if c is fixed.
     """
-    out = cross(omega_rate, c) + cross(omega, cross(omega, c))
+    out = relative_acceleration(omega, omega_rate, c)
     if moving is not None:
         out = out + 2 * cross(omega, moving[0]) + moving[1]
     return jnp.stack([-out[0], -out[1], jnp.broadcast_to(lift, out[2].shape) - out[2]])

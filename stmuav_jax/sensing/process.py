@@ -19,7 +19,7 @@ from ..checks.errors import SettingError
 from ..checks.shapes import Numbers
 from ..dynamics.statespace.base import AbstractStateSpace, motion_rates
 from ..estimation.model import Sensor, StateSpaceModel
-from ..estimation.propagate import rk4_step_in_loop
+from ..estimation.propagate import rk4_step
 from ..mechanics.inputs import Inputs
 from .sensors import AbstractSensor, check_sensors, sensed_motion_at
 
@@ -38,7 +38,7 @@ def moved_over(
 
     def onwards(x: Point, _: None) -> tuple[Point, None]:
         rate = lambda v, s: motion_rates(space, x, v, 0.0, system)
-        v = rk4_step_in_loop(rate, space.difference(x, x), h)
+        v = rk4_step(rate, space.difference(x, x), h, in_loop=True)
         return space.with_closed_loops(space.retract(x, v)), None
 
     # stages and substeps are loops: a mechanism's rates are compiled once, not in each of them

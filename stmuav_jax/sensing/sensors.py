@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..algebra.rotation import relative_acceleration
 from ..algebra.space import AbstractSpace, CyclicVector, Point, Rotation, Vector
 from ..checks.errors import SettingError
 from ..checks.numbers import numbers
@@ -146,9 +147,8 @@ class Accelerometer(AbstractSensor):
         k, kin = seen.kin.index(self.body), seen.kin
         felt = kin.R_wb[k].T @ (seen.v_rate[k] - seen.gravity)
         if self.point is not None:
-            arm, omega = self.point - kin.com[k], kin.omega[k]
-            felt = felt + jnp.cross(seen.omega_rate[k], arm)
-            felt = felt + jnp.cross(omega, jnp.cross(omega, arm))
+            arm = self.point - kin.com[k]
+            felt = felt + relative_acceleration(kin.omega[k], seen.omega_rate[k], arm)
         return self.axes @ felt
 
 

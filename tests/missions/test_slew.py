@@ -14,7 +14,7 @@ import pytest
 import stmuav_jax as stm
 from stmuav_jax.algebra.compiler import quick_jit
 from stmuav_jax.algebra.rotation import conjugate, product, to_rotation_vector
-from stmuav_jax.flight.sensed import centre_of_mass
+from stmuav_jax.flight.mass_properties import centre_of_mass
 from stmuav_jax.missions.mission import LIBRARY
 from stmuav_jax.missions.reference import PanelMoves, References
 

@@ -21,6 +21,9 @@ class RecordedStep(diffrax.LocalLinearInterpolation):
 class RungeKutta4(diffrax.AbstractERK):
     """Classical Runge-Kutta method of order 4, for steps of fixed length: it estimates no error.
 
+    It takes steps with everything that a `Method` adds to a solver of diffrax, such as the projection
+    onto the constraints; the filters' `rk4_step` takes plain steps of a vector.
+
     Source: E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I (1993),
     section II.1.
     """

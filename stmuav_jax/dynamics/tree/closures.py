@@ -48,6 +48,7 @@ def in_world(parameters: TreeParameters, at: TreeCoordinates, moving: TreeMotion
 
 def kinematics(system: System, placed: Placed) -> Kinematics:
     """Kinematics of one state in the form that force elements take."""
+    # XLA makes no kernels of these transposes: docs/dynamics.md, "Array layout"
     R = jnp.moveaxis(placed.R_wb, -1, 0)
     return Kinematics(
         r=placed.r.T,
