@@ -24,6 +24,10 @@ from .filter_record import (
     record_of_file as record_of_file,
 )
 from .filter_report import write_filter_report as write_filter_report
+from .linear import (
+    pole_map as pole_map,
+    step_response as step_response,
+)
 from .loads import (
     loads_figure as loads_figure,
     loads_table as loads_table,
