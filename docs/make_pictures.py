@@ -1,12 +1,17 @@
 """Make the pictures of the README and of docs/pictures.md, and the numbers that stand beside them.
 
 python docs/make_pictures.py             # sketches of the models, some seconds each
+python docs/make_pictures.py poles       # poles and step responses of docs/control.md
 python docs/make_pictures.py flight      # the flight, its film, and the printed equations, some minutes
 """
 
+import contextlib
 import json
+import re
 import sys
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -46,6 +51,16 @@ def gallery() -> None:
         figure = stm.draw(scene)
         stm.figures.save_figures({name: figure}, FIGURES / "gallery", "png", dpi=90)
         print(name)
+
+
+def poles() -> None:
+    """Poles and step responses of the cart and pole, by the code of docs/control.md itself."""
+    text = (FOLDER / "control.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    names: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        exec("\n".join(blocks[:2]), names)
+    stm.figures.save_figures(names["figures"], FIGURES / "control", "png", dpi=90)
 
 
 def state_at(data, k: int) -> stm.State:
@@ -123,7 +138,9 @@ def printed() -> dict[str, float]:
 
 def main() -> None:
     if sys.argv[1:] != ["flight"]:
-        gallery()
+        poles()
+        if sys.argv[1:] != ["poles"]:
+            gallery()
         return
     numbers = printed() | flight()
     text = json.dumps(numbers, indent=1) + "\n"

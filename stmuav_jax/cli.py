@@ -17,9 +17,10 @@ from .commands.estimate import estimate_options, run_estimate
 from .commands.flight import linear_options, run_linearize, run_trim, trim_options
 from .commands.fly import Fly, run_fly
 from .commands.listing import List, run_list
-from .commands.montecarlo import Montecarlo, Report, run_montecarlo, run_report
+from .commands.montecarlo import Montecarlo, run_montecarlo
 from .commands.options import arguments_of, check_options, check_words
 from .commands.output import explain, working
+from .commands.report import Report, run_report
 from .commands.show import run_show, show_class
 from .commands.simulate import run_simulate, simulate_class
 from .commands.sun import SunDay, run_sun
@@ -66,7 +67,7 @@ COMMANDS = {
     "tune": Command(tune_options, run_tune),
     "estimate": Command(estimate_options, run_estimate, "Compiling and running the filters"),
     "montecarlo": Command(Montecarlo, run_montecarlo),
-    "report": Command(Report, run_report, "Reading the store and drawing"),
+    "report": Command(Report, run_report, "Reading the results and drawing"),
 }
 
 

@@ -253,6 +253,7 @@ def test_linearize_command(tmp_path, capsys):
         assert found["A"].shape == (16, 16)
         assert list(found["outputs"]) == ["phi [rad]"]
         assert found["C"].shape == (1, 16)
+    assert {path.name for path in tmp_path.iterdir()} == {"linear.npz", "poles.png", "steps.png"}
     printed = capsys.readouterr().out
     assert "Modes" in printed
     assert "doubles or halves in [s]" in printed

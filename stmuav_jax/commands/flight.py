@@ -15,14 +15,16 @@ from ..checks.errors import ModelError, SettingError
 from ..figures.terminal import line, row, table
 from .models.steady import (
     LinearSettings,
+    StepEnd,
     TrimSettings,
     linear_class,
+    linear_figures,
     modes_table,
     run_linearize_scene,
     run_trim_scene,
     trim_class,
 )
-from .options import ANGLE, FORCE, SPEED, TURN, Cache, Number, default, shared
+from .options import ANGLE, FORCE, SPEED, TURN, Cache, Figures, Number, default, shared
 from .output import written
 from .simulate import named_scene
 
@@ -78,7 +80,7 @@ class TrimCommand:
 
 @dataclasses.dataclass
 class Linearize:
-    """Linearise about a steady flight; write A, B, C, D with names to linear.npz.
+    """Linearise about a steady flight; write A, B, C, D with names to linear.npz, poles and step responses to figures.
 
     Example: stmuav linearize --sun 150 60 --outputs phi theta. Another mechanism is linearised by `stmuav linearize
     model.toml`, or by a scene's name; `stmuav linearize model.toml --help` describes that.
@@ -88,7 +90,9 @@ class Linearize:
     outputs: Annotated[tuple[str, ...], default("all")] = ()
     """States that are measured, such as omega_x."""
     params: Annotated[Path | None, shared("params"), default("the report's values")] = None
+    t1: StepEnd = None
     out: Annotated[Path | None, shared("out"), default("runs/linearize")] = None
+    figures: Figures = "png"
     cache: Cache = True
 
 
@@ -263,5 +267,7 @@ def run_linearize(command: Any) -> int:
         f"{np.min(linear.observability()):.2g}.",
     )
     folder = command.out if command.out is not None else Path("runs") / "linearize"
-    written(out, [save_linear(linear, folder / "linear.npz")])
+    paths = [save_linear(linear, folder / "linear.npz")]
+    title = "UAV with its tracker, in steady flight"
+    written(out, paths + linear_figures(linear, title, folder, command.figures, command.t1))
     return 0

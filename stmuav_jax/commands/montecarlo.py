@@ -1,10 +1,10 @@
-"""Commands `stmuav montecarlo` and `stmuav report`: Monte Carlo studies and their reports."""
+"""Command `stmuav montecarlo`: Monte Carlo studies and their reports."""
 
 import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -47,19 +47,6 @@ class Montecarlo:
     out: Annotated[Path | None, shared("out"), default("runs/STUDY")] = None
     figures: Figures = "png"
     cache: Cache = True
-
-
-@dataclasses.dataclass
-class Report:
-    """Make figures, tables and a page from the store of a study.
-
-    Example: stmuav report runs/collapse/study.zarr --figures svg
-    """
-
-    store: tyro.conf.Positional[Path]
-    """Folder of the store."""
-    out: Annotated[Path | None, shared("out"), default("beside the store")] = None
-    figures: Annotated[Literal["png", "pdf", "svg"], shared("figures")] = "png"
 
 
 def cores() -> int:
@@ -155,7 +142,7 @@ def run_montecarlo(command: Montecarlo) -> int:
     out.print(outcome.words(), highlight=False, markup=False, emoji=False)
     paths = [folder / "study.zarr"]
     if command.figures != "none" or not outcome.interrupted:
-        paths += _report(folder / "study.zarr", folder, command.figures, out)
+        paths += report_study(folder / "study.zarr", folder, command.figures, out)
     written(out, paths)
     return 130 if outcome.interrupted else 0
 
@@ -178,11 +165,11 @@ def _carried_out(
         )  # fmt: skip
 
 
-def _report(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]:
+def report_study(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]:
     """Verify the store, write its report unless there are to be no figures, and print a summary."""
-    from ..figures.study_analysis import analyse
-    from ..figures.study_data import study_data
-    from ..figures.study_table import summary_lines, summary_table
+    from ..figures.studies.analysis import analyse
+    from ..figures.studies.data import study_data
+    from ..figures.studies.table import summary_lines, summary_table
     from ..files.store import open_store
 
     with open_store(store) as opened:
@@ -191,18 +178,10 @@ def _report(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]
         analysis = analyse(study_data(dataset))
         paths = []
         if figures != "none":
-            from ..figures.study_report import write_report
+            from ..figures.studies.report import write_report
 
             paths = write_report(dataset, folder, figures, analysis=analysis)
     out.print(summary_table(analysis), markup=False, emoji=False)
     for line in summary_lines(analysis):
         out.print(line, highlight=False, markup=False, emoji=False)
     return paths
-
-
-def run_report(command: Report) -> int:
-    """Run the command; return the exit code."""
-    out = Console()
-    folder = command.out if command.out is not None else command.store.resolve().parent
-    written(out, _report(command.store, folder, command.figures, out))
-    return 0

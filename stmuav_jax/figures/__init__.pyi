@@ -18,11 +18,22 @@ from .estimate import (
     rates as rates,
     summary_table as summary_table,
 )
+from .filter_record import (
+    FilterRecord as FilterRecord,
+    record_of_dataset as record_of_dataset,
+    record_of_file as record_of_file,
+)
+from .filter_report import write_filter_report as write_filter_report
+from .linear import (
+    pole_map as pole_map,
+    step_response as step_response,
+)
 from .loads import (
     loads_figure as loads_figure,
     loads_table as loads_table,
     save_loads as save_loads,
 )
+from .loop_report import write_loop_report as write_loop_report
 from .plot import (
     FIGURES as FIGURES,
     STYLES as STYLES,
@@ -37,14 +48,15 @@ from .report import (
     certificate_rows as certificate_rows,
     certificate_table as certificate_table,
 )
-from .study_analysis import (
+from .run_report import write_run_report as write_run_report
+from .studies.analysis import (
     Analysis as Analysis,
     analyse as analyse,
 )
-from .study_data import (
+from .studies.data import (
     StudyData as StudyData,
 )
-from .study_report import (
+from .studies.report import (
     write_report as write_report,
 )
 from .tuning import (

@@ -16,10 +16,8 @@ from ..files.netcdf import labelled
 from ..quadrotor.assess import CaseStudy, CaseSummary, Estimates, last_beyond, settled_from
 from ..quadrotor.filter_verdict import RunsVerdict
 from ..quadrotor.hover import Hover
+from .filter_record import FORMAT, FORMAT_VERSION
 from .plot import STYLES, grid
-
-FORMAT = "stmuav_jax estimate"
-FORMAT_VERSION = 1
 
 COMPONENTS = ("Omega_x", "Omega_y", "Omega_z", "offset_x", "offset_y")
 _LOOKS = {"truth": ("0.6", "-"), "report": STYLES[1], "consistent": STYLES[0]}
@@ -250,6 +248,7 @@ def labelled_case(study: CaseStudy) -> Labelled:
             "rad/s, m",
             "the filter's own",
         ),
+        "innovation": _innovations(found.values()),
         "nees": (scalar, together(lambda e: e.nees), "1", "of rates and offset, 5 degrees"),
         "nees_offset": (scalar, together(lambda e: e.nees_offset), "1", "2 degrees of freedom"),
         "nis": (scalar, together(lambda e: e.nis), "1", "of the innovations, 3 degrees"),
@@ -278,6 +277,7 @@ def labelled_hover(flights: dict[str, Hover]) -> Labelled:
         "estimate": (each, together(lambda h: h.mean), "rad/s, m", "means"),
         "standard_deviation": (each, together(lambda h: h.standard_deviation), "rad/s, m", "the filter's own"),
         "tilt": (scalar, together(lambda h: h.tilt), "rad", "true, of the rotors' axis"),
+        "innovation": _innovations(flights.values()),
         "nees": (scalar, together(lambda h: h.nees), "1", "of all 14 error states"),
         "nees_offset": (scalar, together(lambda h: h.nees_offset), "1", "2 degrees of freedom"),
         "nis": (scalar, together(lambda h: h.nis), "1", "6 degrees of freedom"),
@@ -285,7 +285,19 @@ def labelled_hover(flights: dict[str, Hover]) -> Labelled:
     }  # fmt: skip
     first = next(iter(flights.values()))
     coordinates = {"time": _times(first.t), "tuning": list(flights)}
-    return _dataset(table, coordinates, "Hover by a controller that sees the estimate", {})
+    found = {name: {"verdict": flight.verdict()._asdict()} for name, flight in flights.items()}
+    return _dataset(table, coordinates, "Hover by a controller that sees the estimate", found)
+
+
+def _innovations(found: Iterable[Estimates | Hover]) -> tuple[tuple[str, ...], Any, str, str]:
+    """Normalised innovations of all tunings; those that are missing, or that only another has, are NaN."""
+    every = [np.where(np.asarray(e.measured), np.asarray(e.normalised), np.nan) for e in found]
+    most = max(each.shape[1] for each in every)
+    wide = [
+        np.pad(e, ((0, 0), (0, most - e.shape[1]), (0, 0)), constant_values=np.nan) for e in every
+    ]
+    dims = ("tuning", "time", "reading", "seed")
+    return dims, np.stack(wide), "1", "normalised, of unit covariance if the filter is consistent"
 
 
 def _times(t: Any) -> tuple[tuple[str], np.ndarray, dict[str, str]]:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from .numbers import balances_of, joints_of, pose_of
+from .numbers import balances_of, joints_of, motion_of, pose_of
 
 if TYPE_CHECKING:
     from ..dynamics.run import Run
@@ -81,7 +81,7 @@ def pose(run: "Run") -> Figure:
     The base is the body with rotors, or else the last watched body; tilt is the angle of its z axis
     from the vertical.
     """
-    return _pose(*pose_of(run))
+    return _pose(*pose_of(motion_of(run)))
 
 
 def _pose(
@@ -104,7 +104,7 @@ def joints(run: "Run") -> Figure | None:
 
     None for a run without such joints.
     """
-    found = joints_of(run)
+    found = joints_of(motion_of(run))
     return _joints(*found) if found[-1] else None
 
 
@@ -166,7 +166,8 @@ def _logarithmic(
         ax.set_yscale("log")
     else:
         ax.set_yticks([])
-        ax.text(0.5, 0.5, "zero throughout", transform=ax.transAxes, ha="center", fontsize=9)
+        words = "zero throughout" if np.any(np.isfinite(values)) else "not known"
+        ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", fontsize=9)
 
 
 FIGURES = {"pose": pose, "joints": joints, "balances": balances}

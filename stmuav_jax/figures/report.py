@@ -1,11 +1,15 @@
 """Table of a run's certificate for the terminal."""
 
+import dataclasses
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from rich.table import Table
 from rich.text import Text
 
-from ..dynamics.run import Run
+from ..dynamics.run import Certificate, Run
+from ..files.netcdf import FileError
 from .terminal import row
 
 # Error estimates below this are differences of round-off, for motions of some metres.
@@ -28,7 +32,30 @@ def _estimate(largest: float, end: float, unit: str) -> str:
 
 def certificate_rows(run: Run) -> list[tuple[str, str]]:
     """Entries of a run's certificate as rows (quantity, value) in words."""
-    c = run.certificate
+    return rows_of(run.certificate)
+
+
+def certificate_from(plain: Mapping[str, Any]) -> Certificate:
+    """Certificate of a saved run from the plain data of `Certificate.to_dict`.
+
+    Raises:
+        FileError: entries are missing, as in a file of another version.
+    """
+    fields = [field.name for field in dataclasses.fields(Certificate)]
+    missing = [name for name in fields if name not in plain]
+    if missing:
+        raise FileError(f"The certificate of the run lacks {', '.join(missing)}.")
+    # None stands for NaN where a number may be undefined
+    numbers = {name for name in fields if Certificate.__annotations__[name] in (float, "float")}
+    given: dict[str, Any] = {
+        k: math.nan if k in numbers and plain[k] is None else plain[k] for k in fields
+    }
+    given["redundant"] = tuple(plain["redundant"])
+    return Certificate(**given)
+
+
+def rows_of(c: Certificate) -> list[tuple[str, str]]:
+    """Entries of a certificate as rows (quantity, value) in words."""
     rank = f"{c.rank} of {c.rows} rows" if c.rows else "no joints"
     if c.redundant:
         rank += f"; dependent rows in {', '.join(c.redundant)}"

@@ -50,6 +50,11 @@ def versions() -> dict[str, str]:
     return found | {"python": platform.python_version(), "device": device.device_kind}
 
 
+def now() -> str:
+    """Date and time of day in UTC, to the second."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
 def labelled(
     table: Mapping[str, tuple[tuple[str, ...], Any, str, str]],
     coordinates: Mapping[str, Any],
@@ -68,7 +73,7 @@ def labelled(
     }
     about = attributes | {"versions": versions()}
     texts = {k: v if isinstance(v, str | int) else json.dumps(v) for k, v in about.items()}
-    texts["date"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    texts["date"] = now()
     places = {k: v if isinstance(v, tuple) else ((k,), v, {}) for k, v in coordinates.items()}
     return Labelled(data, places, texts)
 
@@ -133,7 +138,7 @@ def _labelled_run(run: "Run") -> Labelled:
 
 def _analysed(run: "Run") -> dict[str, tuple[tuple[str, ...], Any, str, str]]:
     """Dimensions, values, unit and description of the analysis's results."""
-    view = run.snapshot
+    view, worst = run.snapshot, run.trajectory.worst
     vector, wrench = ("time", "body", "axis"), ("time", "joint", "axis")
     return {
         "acceleration": (vector, view.accelerations.v_rate, "m/s^2", "of the centre of mass"),
@@ -146,6 +151,8 @@ def _analysed(run: "Run") -> dict[str, tuple[tuple[str, ...], Any, str, str]]:
         "kinetic_energy": (("time",), view.kinetic, "J", "of all bodies"),
         "potential_energy": (("time",), view.potential, "J", "of gravity and springs"),
         "work": (("time",), run.trajectory.work, "J", "done by forces without potential"),
+        "position_violation": (("time",), worst.position, "m", "of lengths, the largest so far"),
+        "velocity_violation": (("time",), worst.velocity, "m/s", "of their rates, the largest so far"),
     }  # fmt: skip
 
 
@@ -195,6 +202,14 @@ def save_sealed(arrays: Labelled, path: str | os.PathLike[str]) -> Path:
 
 def _seal(content: bytes) -> bytes:
     return _SEAL + hashlib.sha256(content).hexdigest().encode() + b"\n"
+
+
+def is_sealed(path: str | os.PathLike[str]) -> bool:
+    """True if a file ends with a seal, as those of `save` do; `load` verifies it."""
+    with open(path, "rb") as file:
+        file.seek(0, os.SEEK_END)
+        file.seek(max(file.tell() - _SEAL_LENGTH, 0))
+        return file.read().startswith(_SEAL)
 
 
 def _verified(source: Path, kind: str = "a run") -> bytes:

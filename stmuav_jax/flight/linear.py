@@ -25,6 +25,10 @@ from ..checks.shapes import Numbers
 from ..dynamics.statespace.base import AbstractStateSpace, Time, check_regular, error_rate_columns
 from ..mechanics.inputs import Inputs, inputs_of
 
+# Size of an eigenvalue below which it is that of a free rigid body, with round-off [1/s], and share of
+# its size below which a real part is none.
+AT_ZERO = 1e-3
+
 
 @dataclass(frozen=True)
 class Mode:
@@ -99,6 +103,51 @@ class Linear:
         It is zero for an unobservable mode. The rows of C are scaled to unit length.
         """
         return _hautus(self.A.T, self.C.T)
+
+    def step(
+        self, duration: float | None = None, samples: int = 401
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k p m"]]:
+        """Times [s], and responses of the p outputs to a unit step of each of the m inputs from rest.
+
+        They are exact at their times: x_k+1 = F x_k + g with (F, g; 0, I) = exp((A, B; 0, 0) dt).
+
+        Args:
+            duration: end [s]; by default that of `settling_time`.
+            samples: number of times, two or more.
+
+        Raises:
+            SettingError: a duration that is not positive and finite, or fewer than two samples.
+        """
+        from scipy.linalg import expm  # slow to import
+
+        end = self.settling_time() if duration is None else duration
+        if not 0 < end < np.inf or samples < 2:
+            raise SettingError(
+                f"A step response needs a positive, finite duration and at least 2 samples, not {end:g} s "
+                f"and {samples}."
+            )
+        (n, m), dt = self.B.shape, end / (samples - 1)
+        block = expm(np.block([[self.A, self.B], [np.zeros((m, n + m))]]) * dt)
+        x, found = np.zeros((n, m)), []
+        for _ in range(samples):
+            found.append(self.C @ x + self.D)
+            x = block[:n, :n] @ x + block[:n, n:]
+        return np.linspace(0.0, end, samples), np.array(found)
+
+    def settling_time(self) -> float:
+        """Time that shows the modes [s]: 4 time constants of the slowest, or 3 of the fastest that grows.
+
+        Of an undamped oscillation it is 4 periods. Modes at zero (`AT_ZERO`) count for nothing; 1 s if all are.
+        """
+        values = np.linalg.eigvals(self.A)
+        values = values[np.abs(values) > AT_ZERO]
+        growing = values.real > AT_ZERO * np.abs(values)
+        if np.any(growing):
+            return float(3.0 / np.max(values.real[growing]))
+        undamped = np.abs(values.real) <= AT_ZERO * np.abs(values)
+        times = [4 * 2 * np.pi / abs(s) if free else 4.0 / abs(s.real)
+                 for s, free in zip(values, undamped, strict=True)]  # fmt: skip
+        return float(max(times, default=1.0))
 
 
 def _hautus(A: np.ndarray, B: np.ndarray) -> np.ndarray:

@@ -24,3 +24,4 @@ from .outcome import (
     to_data as to_data,
     verdict as verdict,
 )
+from .report import write_flight_report as write_flight_report

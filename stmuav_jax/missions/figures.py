@@ -6,6 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..figures.plot import STYLES, curves, grid
+from .outcome import margin_history
 
 _DEGREE = np.pi / 180
 
@@ -92,13 +93,34 @@ def flight_power(data: xr.Dataset) -> Figure:
     return _titled(figure, data)
 
 
+def flight_margins(data: xr.Dataset) -> Figure:
+    """Figure of the smallest margins of rotor speeds and strokes, as shares of their ranges."""
+    shown = {
+        label: 100 * np.nanmin(margin_history(data, name, limit), axis=1)
+        for name, limit, label in (
+            ("rotor_speed", "speed", "rotor speeds"), ("displacement", "displacement", "strokes"),
+        )
+        if f"lowest_{limit}" in data
+    }  # fmt: skip
+    figure, axes = grid(1, 1, 3.0)
+    if shown:
+        curves(axes[0, 0], data.time.values, np.stack(list(shown.values()), axis=1), tuple(shown))
+        axes[0, 0].axhline(0.0, color="0.3", linewidth=0.6)
+    else:
+        axes[0, 0].text(
+            0.5, 0.5, "no limits", transform=axes[0, 0].transAxes, ha="center", fontsize=9
+        )
+    _labelled(axes[0, 0], "smallest margin\n[% of the range]", legend=bool(shown))
+    return _titled(figure, data)
+
+
 FLIGHT_FIGURES = {
-    "errors": flight_errors, "rotors": flight_rotors, "power": flight_power,
+    "errors": flight_errors, "margins": flight_margins, "rotors": flight_rotors, "power": flight_power,
     "panel": flight_panel, "strokes": flight_strokes,
 }  # fmt: skip
 
 
 def flight_figures(data: xr.Dataset) -> dict[str, Figure]:
     """Figures of a mission's flight by name; those of the panel only for a machine with a tracker."""
-    names = list(FLIGHT_FIGURES) if "panel_error" in data else list(FLIGHT_FIGURES)[:3]
+    names = list(FLIGHT_FIGURES) if "panel_error" in data else list(FLIGHT_FIGURES)[:4]
     return {name: FLIGHT_FIGURES[name](data) for name in names}

@@ -158,16 +158,23 @@ def _of_gear(data: "xr.Dataset", wanted: TolerancesEntry) -> list[Measure]:
 
 def _margin(data: "xr.Dataset", name: str, what: str, limit: str) -> Measure:
     """Smallest distance from the limits as a share of the range."""
+    least = float(np.nanmin(margin_history(data, name, limit)))
+    name, kept = f"Smallest margin of the {what}", least >= -AT_LIMIT
+    return Measure(name, 100 * least, "% of the range", 0.0, kept)
+
+
+def margin_history(data: "xr.Dataset", name: str, limit: str) -> np.ndarray:
+    """Distances of a signal (k, n) from its limits as shares of the ranges, to the nearer limit each.
+
+    Rotors that have failed are within no limits: NaN.
+    """
     low, high = data[f"lowest_{limit}"].values, data[f"highest_{limit}"].values
     values = np.array(data[name].values)
     if name == "rotor_speed":
-        # a rotor that has failed is within no limits
         for fault in json.loads(data.attrs["mission"])["faults"]:
             if fault["rotor"] is not None:
                 values[data.time.values >= fault["at"], fault["rotor"] - 1] = np.nan
-    least = float(np.nanmin(np.minimum(values - low, high - values) / (high - low)))
-    name, kept = f"Smallest margin of the {what}", least >= -AT_LIMIT
-    return Measure(name, 100 * least, "% of the range", 0.0, kept)
+    return np.minimum(values - low, high - values) / (high - low)
 
 
 def _energy(data: "xr.Dataset") -> list[Measure]:

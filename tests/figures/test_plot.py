@@ -11,7 +11,7 @@ import pytest
 
 import stmuav_jax as stm
 from stmuav_jax.figures import drawing
-from stmuav_jax.figures.numbers import joints_of, numbers_of
+from stmuav_jax.figures.numbers import joints_of, motion_of, numbers_of
 from stmuav_jax.figures.plot import (
     FIGURES,
     STYLES,
@@ -83,7 +83,7 @@ def test_angles_of_a_machine_without_a_panel_are_continuous():
     scene = SimpleNamespace(system=system, title="bar", watch=())
     body = lambda name: jax.tree.map(lambda x: x[:, 0], states)
     run: Any = SimpleNamespace(scene=scene, ts=np.arange(40.0), states=states, body=body)
-    ((words, labels, found),) = joints_of(run)[2]
+    ((words, labels, found),) = joints_of(motion_of(run))[2]
     assert (words, labels) == ("joint angle [degrees]", ("hinge",))
     wanted = np.degrees(np.asarray(joint_motion(system, states, "hinge").coordinates))
     assert found == pytest.approx(wanted)

@@ -1,6 +1,5 @@
 """Reports of studies: what they say is what the statistics say, whatever a study holds."""
 
-import html.parser
 import io
 import json
 
@@ -8,46 +7,25 @@ import numpy as np
 import pytest
 import scipy.stats as st
 import xarray as xr
+from html_pages import Page
 from matplotlib.image import imread
 from rich.console import Console
 from studies import FACTORS, REASONS, study
 
 from stmuav_jax.checks.errors import SettingError
-from stmuav_jax.figures import study_data as data_module, study_plot, study_region
 from stmuav_jax.figures.plot import grid
-from stmuav_jax.figures.study_analysis import analyse, plain
-from stmuav_jax.figures.study_data import study_data
-from stmuav_jax.figures.study_report import write_report
-from stmuav_jax.figures.study_table import summary_lines, summary_table
+from stmuav_jax.figures.studies import (
+    data as data_module,
+    plot as study_plot,
+    region as study_region,
+)
+from stmuav_jax.figures.studies.analysis import analyse, plain
+from stmuav_jax.figures.studies.data import study_data
+from stmuav_jax.figures.studies.report import write_report
+from stmuav_jax.figures.studies.table import summary_lines, summary_table
 from stmuav_jax.files.netcdf import FileError
 from stmuav_jax.montecarlo.sensitivity import sobol
 from stmuav_jax.montecarlo.statistics import mean, probability, quantiles
-
-VOID = {"meta", "img", "br"}
-
-
-class Page(html.parser.HTMLParser):
-    """Checks that tags close in order; gathers text and what the page refers to."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.text: list[str] = []
-        self.sources: list[str] = []
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        self.sources += [str(value) for name, value in attrs if name in ("src", "href")]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.text.append(data)
 
 
 def tiny(count: int, **more) -> xr.Dataset:

@@ -1,7 +1,6 @@
 """Command `stmuav estimate MODEL`: a filter on a model's own sensors, over many seeds of their noise."""
 
 import dataclasses
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -55,8 +54,6 @@ cannot be trusted. Without a model's file: the report's eight cases, stmuav esti
 """
 # Substeps of the truth in a step of the filter.
 _FINER = 4
-# Level of the intervals in which consistent filters stay.
-_LEVEL = 0.999
 _UNTRUSTED = 3
 
 
@@ -67,6 +64,7 @@ class Record(NamedTuple):
         t: times (T,) [s]. error, deviation: estimates less truth, and the filters' standard
             deviations (T, n, s). nees, nis: normalised errors and innovations squared (T, s).
         degrees: components that a time's readings have (T,). ok: flags of the filters (s,).
+        innovation: normalised innovations, NaN where a reading is missing (T, m, s).
     """
 
     t: np.ndarray
@@ -76,6 +74,7 @@ class Record(NamedTuple):
     nis: np.ndarray
     degrees: np.ndarray
     ok: np.ndarray
+    innovation: np.ndarray
 
 
 def estimate_class(words: Sequence[str]) -> type:
@@ -85,7 +84,7 @@ def estimate_class(words: Sequence[str]) -> type:
 
 def run_estimate_model(command: Any) -> int:
     """Run the filters, print their errors and consistency, write estimate.npz; the exit code."""
-    from ...estimation.consistency import mean_interval
+    from ...figures.filter_record import end_consistency, record_content
     from ...files.netcdf import write_atomically
 
     scene, settings = chosen_scene(command), command.settings
@@ -100,24 +99,29 @@ def run_estimate_model(command: Any) -> int:
         row(shown, name, *(f"{v[k]:.3g}" for v in (first, error, own)), unit)
     out = Console()
     out.print(shown)
-    runs, fine = settings.seeds, True
-    for what, value, degrees, number in (
-        ("NEES at the end", found.nees[-1].mean(), space.size, runs),
-        ("NIS", found.nis.sum() / found.degrees.sum() / runs, 1, int(runs * found.degrees.sum())),
-    ):
-        low, high = mean_interval(degrees, number, _LEVEL)
-        fine = fine and bool(low < value < high)
-        line(out, f"{what}: {value:.4g}, consistent within {low:.4g} and {high:.4g}.")
+    fine = True
+    for one in end_consistency(found.nees, space.size, found.nis, found.degrees):
+        fine = fine and one.holds
+        line(out, one.words)
     folder = settings.out if settings.out is not None else Path("runs") / f"estimate_{scene.name}"
-    content = io.BytesIO()
-    names = np.array([f"{name} [{unit}]" for name, unit in space.names])
-    np.savez(content, states=names, **found._asdict())
-    written(out, [write_atomically(folder / "estimate.npz", content.getvalue())])
+    content = record_content(
+        scene.title or scene.name, space.names, found._asdict(), _about(command)
+    )
+    written(out, [write_atomically(folder / "estimate.npz", content)])
     lost = int(np.sum(~found.ok))
     if lost:
         line(out, f"{lost} filters lost their covariance.")
         return 1
     return 0 if fine else _UNTRUSTED
+
+
+def _about(command: Any) -> dict[str, Any]:
+    """Options of the filter as plain data, for its file."""
+    given = dataclasses.asdict(command.settings)
+    plain = {
+        k: str(v) if isinstance(v, Path) else v for k, v in given.items() if v not in (None, ())
+    }
+    return {"scene": command.scene} | {k: v for k, v in plain.items() if k not in ("out", "cache")}
 
 
 def _chosen(scene: "Scene", names: Sequence[str]) -> list[Any]:
@@ -209,8 +213,15 @@ def _estimated(
     return Record(
         scene.t0 + np.arange(1, steps + 1) / rate, np.asarray(every),
         np.asarray(out.standard_deviation), np.asarray(path_nees(out, truth, space)),
-        np.asarray(out.nis), degrees, np.asarray(out.ok)[-1],
+        np.asarray(out.nis), degrees, np.asarray(out.ok)[-1], _innovations(out.innovations),
     )  # fmt: skip
+
+
+def _innovations(found: Any) -> np.ndarray:
+    """Normalised innovations (T, m, s), NaN where a reading is missing."""
+    normalised, measured = np.asarray(found.normalised), np.asarray(found.measured)
+    there = measured.reshape(measured.shape + (1,) * (normalised.ndim - measured.ndim))
+    return np.where(there, normalised, np.nan)
 
 
 def _times(scene: "Scene", instruments: Sequence[Any], settings: Any) -> tuple[float, int]:

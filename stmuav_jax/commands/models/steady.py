@@ -13,7 +13,7 @@ from rich.table import Table
 
 from ...checks.errors import SettingError
 from ...figures.terminal import line, row, table
-from ..options import ANGLE, SPEED, TURN, default, shared
+from ..options import ANGLE, END, SPEED, TURN, Figures, default, shared
 from ..output import written
 from ..simulate import chosen_scene, scene_command
 from .point import PointSettings, inputs_named, scalars_by_name, starting_point
@@ -21,6 +21,12 @@ from .point import PointSettings, inputs_named, scalars_by_name, starting_point
 if TYPE_CHECKING:
     from ...dynamics.statespace.tree import TreeSpace
     from ...flight.equilibrium import Trim
+
+
+# End of the step responses.
+StepEnd = Annotated[float | None, END, shared("t1"), default("as the modes ask")]
+# Largest number of outputs in a figure of step responses.
+_OUTPUTS = 6
 
 
 @dataclasses.dataclass
@@ -54,7 +60,9 @@ class LinearSettings(SteadySettings):
     """The start, with the options' coordinates and rates, or the trim that is found from there."""
     outputs: Annotated[tuple[str, ...], default("all states")] = ()
     """States that are measured, such as hinge.angle."""
+    t1: StepEnd = None
     out: Annotated[Path | None, shared("out"), default("runs/linearize_SCENE")] = None
+    figures: Figures = "png"
 
 
 TRIM = """Find the inputs, and states if wanted, of a steady motion of any mechanism; write trim.json.
@@ -63,7 +71,8 @@ Example: stmuav trim model.toml --coordinates hinge=0 --free rail.displacement. 
 file the command trims the UAV with its tracker: stmuav trim --help. A mechanism with a floating base hovers,
 climbs or turns: its attitude is found too.
 """
-LINEAR = """Linearise any mechanism about its start, or about a trim; write A, B, C, D to linear.npz.
+LINEAR = """Linearise any mechanism about its start, or about a trim; write A, B, C, D to linear.npz, the
+poles and the step responses to figures.
 
 Example: stmuav linearize model.toml --about trim --outputs hinge.angle. Without a scene or a model's file the
 command linearises the flight of the UAV with its tracker: stmuav linearize --help.
@@ -137,9 +146,11 @@ def _changed(space: "TreeSpace", x: Any, found: "Trim") -> dict[str, tuple[float
 
 def modes_table(modes: Sequence[Any]) -> Table:
     """Table of the modes other than those of a free rigid body, which have eigenvalue zero."""
+    from ...flight.linear import AT_ZERO
+
     shown = table("s [1/s]", "doubles or halves in [s]", "states that take part", title="Modes")
     for mode in modes:
-        if abs(mode.eigenvalue) < 1e-3:
+        if abs(mode.eigenvalue) < AT_ZERO:
             continue
         s = f"{mode.eigenvalue.real:.4g}"
         if abs(mode.eigenvalue.imag) > 1e-9 * abs(mode.eigenvalue):
@@ -202,8 +213,29 @@ def run_linearize_scene(command: Any) -> int:
     if settings.about == "start":
         line(out, "About the start: departures from the motion that begins there.")
     folder = settings.out if settings.out is not None else Path("runs") / f"linearize_{scene.name}"
-    written(out, [save_linear(linear, folder / "linear.npz")])
+    paths = [save_linear(linear, folder / "linear.npz")]
+    title = scene.title or scene.name
+    written(out, paths + linear_figures(linear, title, folder, settings.figures, settings.t1))
     return 0
+
+
+def linear_figures(
+    linear: Any, title: str, folder: Path, figures: str, duration: float | None
+) -> list[Path]:
+    """Write the pole map and the step responses of a linear model; return their paths."""
+    if figures == "none":
+        return []
+    # matplotlib is slow to import: only where figures are drawn
+    from ...figures.linear import pole_map, step_response
+    from ...figures.plot import save_figures
+
+    drawn: dict[str, Any] = {"poles": pole_map(linear, title)}
+    names = [name for name, _ in linear.outputs]
+    for first in range(0, len(names) if linear.inputs else 0, _OUTPUTS):
+        some = names[first : first + _OUTPUTS]
+        name = "steps" if len(names) <= _OUTPUTS else f"steps_{first // _OUTPUTS + 1}"
+        drawn[name] = step_response(linear, title, outputs=some, duration=duration)
+    return save_figures(drawn, folder, figures)
 
 
 def _measures(linear: Any) -> str:

@@ -15,10 +15,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import xarray as xr
 
-from ..files.netcdf import FileError
-from ..montecarlo.statistics import independent
-from ..montecarlo.study import column_name
-from ..montecarlo.work import FINE, MISSING
+from ...files.netcdf import FileError
+from ...montecarlo.statistics import independent
+from ...montecarlo.study import column_name
+from ...montecarlo.work import FINE, MISSING
 
 # Largest number of components of one column, such as joints; the rest is left out with a note.
 COMPONENTS = 12

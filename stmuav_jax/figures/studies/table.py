@@ -4,10 +4,10 @@ import math
 
 from rich.table import Table
 
-from ..montecarlo.statistics import IntervalEstimate
-from .study_analysis import Analysis
-from .study_data import label
-from .terminal import row, table
+from ...montecarlo.statistics import IntervalEstimate
+from ..terminal import row, table
+from .analysis import Analysis
+from .data import label
 
 # Largest number of rows of the table; the report has all.
 _MOST = 24

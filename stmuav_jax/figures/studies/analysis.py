@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import rankdata
 
-from ..checks.errors import SettingError
-from ..montecarlo.sensitivity import (
+from ...checks.errors import SettingError
+from ...montecarlo.sensitivity import (
     IndexIntervals,
     SobolIndices,
     binned,
@@ -16,7 +16,7 @@ from ..montecarlo.sensitivity import (
     sobol,
     spearman,
 )
-from ..montecarlo.statistics import (
+from ...montecarlo.statistics import (
     LEVEL,
     SHARES,
     IntervalEstimate,
@@ -26,7 +26,7 @@ from ..montecarlo.statistics import (
     probability,
     summarise,
 )
-from .study_data import StudyData, StudyQuantity
+from .data import StudyData, StudyQuantity
 
 # Largest number of samples for first-order indices and rank correlations; more would change little.
 ROWS = 100_000

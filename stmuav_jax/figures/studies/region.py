@@ -8,12 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from ..montecarlo.sensitivity import separation
-from ..montecarlo.statistics import convergence, probability
-from .plot import grid
-from .study_analysis import ROWS, Analysis, QuantityAnalysis, is_event
-from .study_data import StudyData, StudyQuantity
-from .study_plot import (
+from ...montecarlo.sensitivity import separation
+from ...montecarlo.statistics import convergence, probability
+from ..plot import grid
+from .analysis import ROWS, Analysis, QuantityAnalysis, is_event
+from .data import StudyData, StudyQuantity
+from .plot import (
     BLACK,
     BLUE,
     ORANGE,

@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..montecarlo.statistics import SampleSummary, bands
-from .plot import STYLES, grid
-from .study_analysis import Analysis, QuantityAnalysis, is_event
-from .study_data import Curve, StudyData, StudyQuantity, label
+from ...montecarlo.statistics import SampleSummary, bands
+from ..plot import STYLES, grid
+from .analysis import Analysis, QuantityAnalysis, is_event
+from .data import Curve, StudyData, StudyQuantity, label
 
 BLUE, ORANGE, GREEN, BLACK = (colour for colour, _ in STYLES)
 
