@@ -26,6 +26,7 @@ PARTS: dict[str, tuple[str, Callable[[dict[str, Any]], Lines]]] = {
     "batch": ("Many trajectories", tables.batch),
     "scaling": ("Chains of closed loops", tables.scaling),
     "gradient": ("Gradients", tables.gradient),
+    "vector_steps": ("Steps of many flights at once", tables.vector_steps),
     "hexacopter": ("One free body against the same by hand", tables.hexacopter),
     "scenes": ("All scenes", tables.scenes),
     "published": ("Time against error, published problems", tables.curves),

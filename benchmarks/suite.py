@@ -28,13 +28,14 @@ from sections.precision import describe, published_problems, stiff_variants, wor
 from sections.scenes import hexacopter, scenes
 from sections.size import FULL, ONE, Size
 from sections.speed import acceleration, batch, scaling
+from sections.vector_steps import vector_steps
 from shared.command import begin, parser
 from shared.record import write
 
 SECTIONS: dict[str, Callable[[Size, list[Peer]], dict[str, Any]]] = {
     "work_precision": work_precision, "acceleration": acceleration, "batch": batch,
     "scaling": scaling, "gradient": gradient, "hexacopter": hexacopter, "scenes": scenes,
-    "published": published_problems, "stiff": stiff_variants,
+    "published": published_problems, "stiff": stiff_variants, "vector_steps": vector_steps,
 }  # fmt: skip
 
 

@@ -16,6 +16,8 @@ class Size:
             peer_trajectories: those of peers.
         batch_tolerances: tried for `batch_error` [m] against runs at `tight`.
         loops: of the four-bar chains; run_loops: those that are integrated, too.
+        flights: that take a step together, `group` of them side by side; compared: those of which
+            errors are found; inner: steps in a call; machines: how many; closed_loop: length [s].
         gradient_horizon: [s]. parameters: of the gradient. span: of scenes and hexacopter [s].
     """
 
@@ -41,6 +43,13 @@ class Size:
     gradient_horizon: float = 0.3
     gradient_tolerances: tuple[float, ...] = (1e-6, 1e-8, 1e-10)
     parameters: int = 20
+    flights: int = 4096
+    compared: int = 256
+    inner: int = 20
+    group: int = 64
+    step_repeats: int = 40
+    machines: int = 3
+    closed_loop: float = 30.0
     scenes: int = 99
     span: float = 2.0
 
@@ -50,5 +59,6 @@ ONE = Size(
     horizons=(0.02,), tolerances=(1e-4, 1e-6), stiff_tolerances=(1e-4,), reference=1e-9, methods=1,
     problems=1, repeats=1, budget=0.1, evaluations=10, batches=(2,), trajectories=(2,), blocks=(2,),
     peer_trajectories=2, batch_tolerances=(1e-6,), tight=1e-9, loops=(1, 2), run_loops=(1,),
+    flights=8, compared=4, inner=2, group=4, step_repeats=1, machines=1, closed_loop=0.0,
     gradient_horizon=0.02, gradient_tolerances=(1e-6,), parameters=2, scenes=1, span=0.02,
 )  # fmt: skip

@@ -1,5 +1,6 @@
 """The sections of the suite's page as Markdown: only what the JSON files hold."""
 
+from peers.flying import FINER
 from shared.pages import (
     Lines,
     Row,
@@ -182,6 +183,34 @@ def compile_times(result: Row) -> Lines:
             result["rows"], "program", ("trace [s]", "trace_seconds", number),
             ("lower [s]", "lower_seconds", number), COMPILE, ("all [s]", None, whole_time),
             "equations",
+        ),
+    ]  # fmt: skip
+
+
+def vector_steps(result: Row) -> Lines:
+    """Steps of many flights at once, beside other programs, and closed loops against real time."""
+    h, loops = result["horizon"], result["closed_loops"]
+    lines = [
+        "Medians of processor time. Errors are the largest distance of the base, after one period and after "
+        f"{h:g} s, from {FINER} times as many steps of RK4 of the same program in double precision; each program "
+        "has its own machine and equations.",
+        "",
+        *listed(
+            result["rows"], "program", "machine", "method", "precision",
+            ("side by side", None, lambda row: whole(row.get("side_by_side", row["flights"]))),
+            ("periods a call", "steps_per_call", whole), ("steps per second", "per_second", power),
+            ("error of one [m]", "position_error_one", power),
+            (f"after {h:g} s [m]", "position_error_many", power), COMPILE,
+        ),
+    ]  # fmt: skip
+    if not loops:
+        return lines
+    return [
+        *lines, "", "Closed loops of the UAV with noisy sensors and the estimator:", "",
+        *listed(
+            loops, "mission", ("native loops", "native_loops", lambda x: "yes" if x else "no"),
+            ("flown [s]", "t1", number), ("first flight, compiled too [s]", "first_flight_seconds", number),
+            ("flight [s]", "seconds", number), ("times real time", "times_real_time", number),
         ),
     ]  # fmt: skip
 

@@ -24,6 +24,7 @@ WANTED = {
     "batch": ({"rows", "single", "tried"}, {"trajectories", "block", "per_second"}),
     "scaling": ({"rows", "exponents"}, {"loops", "acceleration_seconds", "run_seconds"}),
     "gradient": ({"rows", "differences"}, {"mode", "seconds", "cost_in_simulations"}),
+    "vector_steps": ({"rows", "closed_loops"}, {"machine", "per_second", "position_error_many"}),
     "scenes": ({"rows"}, {"scene", "seconds", "accepted", "residual"}),
     "published": ({"curves"}, {"problem", "rows", "references", "cheapest", "failure"}),
     "stiff": ({"curves"}, {"problem", "rows", "references", "cheapest", "failure"}),

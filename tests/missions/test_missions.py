@@ -1,6 +1,7 @@
 """Missions on a hexacopter: flown, interrupted and resumed, saved, and refused before the flight."""
 
 import copy
+import importlib.util
 import json
 import re
 import tomllib
@@ -360,6 +361,32 @@ def test_a_touchdown_follows_a_time_in_flight_and_rebounds_do_not():
     assert [one.name for one in _of_gear(never, wanted)] == [sink.name, carried.name]
     # shorter than the time in flight that a touchdown takes
     assert len(_of_gear(data.isel(time=slice(0, 3)), TolerancesEntry())) == 2
+
+
+def test_the_table_of_flights_is_that_of_its_script(data):
+    """It has a row for each ready mission, in one order; a flight replaces its own row alone."""
+    spec = importlib.util.spec_from_file_location("table", ROOT / "docs" / "make_missions.py")
+    assert spec is not None
+    assert spec.loader is not None
+    table = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(table)
+    page = (ROOT / "docs" / "missions.md").read_text(encoding="utf-8")
+    rows = table.rows_of(page)
+    assert sorted(rows) == sorted(table.ORDER) == sorted(missions.mission_names())
+    assert table.with_rows(page, rows) == page
+    own = table.row("gusts", data)
+    cells = [cell.strip() for cell in own.strip("|\n").split("|")]
+    largest = np.linalg.norm(data.position_error.values, axis=1).max()
+    assert cells[:2] == ["`gusts`", "2.2 s"]
+    assert cells[2] == f"{100 * largest:.2g} cm"
+    assert cells[4::2] == ["", ""]
+    assert cells[-1] == "kept"
+    changed = table.with_rows(page, rows | {"gusts": own})
+    assert table.rows_of(changed) == rows | {"gusts": own}
+    fallen = data.assign(position_error=100.0 * data.position_error)
+    assert table.row("gusts", fallen).endswith("| | | | | | it falls, not kept |\n")
+    off = data.assign(position_error=2.0 * data.position_error / largest * 0.1)
+    assert "| 20 cm, not kept |" in table.row("gusts", off)
 
 
 @pytest.mark.slow

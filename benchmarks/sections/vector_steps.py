@@ -1,0 +1,232 @@
+"""Steps of many flights at once, beside crazyflow and rotorpy, and closed loops against real time.
+
+A step is one control period of 1/400 s with held inputs, from given starts, of all flights in one
+compiled program: of hexacopters and of UAVs with tracker by `Plant.step`, of a training environment by
+`Environment.step_or_reset`, and of each peer's own quadrotor. With the rates stand the errors of one
+step and of 0.1 s against eight times as many steps of RK4 of the same program in double precision.
+Apart from these, 30 s of the report's case 1 with noisy sensors and the estimator in the loop. Times
+are those of the processor.
+
+The peers are in an environment of their own, since crazyflow excludes JAX 0.10.2:
+
+    python3 -m venv venv-flight
+    venv-flight/bin/pip install --group peers-flight      # pip 25.1 or later
+    export STMUAV_FLIGHT_PEERS=venv-flight/bin/python
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from peers import flying
+from peers.adapter import Peer
+from sections.size import Size
+from shared.clock import compiled
+from shared.native import with_native_loops
+
+import stmuav_jax as stm
+
+INTERPRETER = "STMUAV_FLIGHT_PEERS"
+# What is run, and what is left out or done differently.
+PEERS = {
+    "crazyflow": ("`Sim` of cf21B_500, dynamics from first principles, commands of rotor speeds.",
+                  "A quadrotor with its motors' lag, drag and the rotors' momentum."),
+    "rotorpy": ("`BatchedMultirotor` of a Crazyflie, commands of rotor speeds, PyTorch on one thread.",
+                "A quadrotor with its motors' lag and the rotors' drag; some arrays are single precision."),
+}  # fmt: skip
+MACHINES: dict[str, dict[str, Any]] = {
+    "hexacopter": {"scene": "hexacopter"},
+    "hexacopter with motors' lag and drag": {
+        "scene": "hexacopter", "options": {"drag": {}, "motor": {}},
+    },
+    "UAV with tracker": {"scene": "uav_tracker"},
+}  # fmt: skip
+RK4 = {"program": "stmuav-jax", "method": "rk4", "precision": "double"}
+
+
+def ready(machine: dict[str, Any], flights: int, steps: int = 1) -> tuple[Any, Any, Any]:
+    """Plant, its states at the starts, and inputs about those of a hover (flights, m)."""
+    mission = stm.missions.make_mission({
+        "format": 1, "name": "step", "t1": 1.0, "machine": machine, "rates": {"steps": steps},
+    })  # fmt: skip
+    plant = mission.plant
+    first = plant.reset()
+    reference = mission.references(jnp.zeros(()))
+    hover, _ = mission.controller(first.estimate, reference, mission.controller.start())
+    rotors = len(mission.machine.rotors.spin)
+    at = flying.starts(flights, rotors)
+    own = jnp.asarray(at.command) ** 2
+    inputs = jnp.tile(hover, (flights, 1)).at[:, :rotors].multiply(own)
+
+    def begun(r: Any, p: Any, v: Any, omega: Any) -> Any:
+        return plant.reset(state0=moved(plant.state0, r, p, v, omega))
+
+    quaternion = jnp.roll(jnp.asarray(at.quaternion), 1, axis=1)
+    given = jnp.asarray(at.position), quaternion, jnp.asarray(at.velocity), jnp.asarray(at.omega)
+    return plant, stm.algebra.outer_jit(lambda *of: jax.vmap(begun)(*of))(*given), inputs
+
+
+def moved(state: stm.State, r: Any, p: Any, v: Any, omega: Any) -> stm.State:
+    """State at rest moved as one rigid body to a pose of its first body, with velocities of that body."""
+    rotation = stm.rotation
+    R = rotation.rotation_matrix(p)
+    # the first body is at the origin and level
+    arms = (state.r - state.r[0]) @ R.T
+    turning = R @ omega
+    own = jax.vmap(lambda q: rotation.rotation_matrix(q).T @ turning)
+    turned = jax.vmap(lambda q: rotation.product(p, q))(state.p)
+    return stm.State(r + arms, turned, v + jnp.cross(turning, arms), own(turned))
+
+
+def steps(plant: Any, inner: int, group: int) -> Any:
+    """Function of states and inputs of all flights, `inner` steps of each, `group` of them side by side."""
+
+    def one(now: Any, inputs: Any) -> Any:
+        if inner == 1:
+            return plant.step(now, inputs)
+        return jax.lax.scan(lambda now, _: (plant.step(now, inputs), None), now, length=inner)[0]
+
+    def all_of_them(now: Any, inputs: Any) -> Any:
+        count = inputs.shape[0] // group
+        folded = jax.tree.map(lambda x: x.reshape(count, group, *x.shape[1:]), (now, inputs))
+        done = jax.lax.map(lambda given: jax.vmap(one)(*given), folded)
+        return jax.tree.map(lambda x: x.reshape(count * group, *x.shape[2:]), done)
+
+    return lambda now, inputs: (
+        jax.vmap(one)(now, inputs) if len(inputs) == group else all_of_them(now, inputs)
+    )
+
+
+def rated(function: Any, given: tuple[Any, ...], size: Size, inner: int) -> dict[str, Any]:
+    """Rate of a function of all flights, and the seconds to compile it."""
+    program, seconds = compiled(function, *given, clock=time.process_time)
+    call = lambda: jax.block_until_ready(program(*given))
+    row = flying.rate_row(call, size.flights, inner, size.step_repeats)
+    finite = all(bool(jnp.all(jnp.isfinite(x))) for x in numbers_of(call()))
+    failure = "" if finite else "Some numbers are not finite."
+    return {**row, "compile_seconds": seconds, "failure": failure}
+
+
+def numbers_of(tree: Any) -> list[Any]:
+    """Arrays of floating-point numbers."""
+    return [x for x in jax.tree.leaves(tree) if eqx.is_inexact_array(x)]
+
+
+def poses(machine: dict[str, Any], flights: int, finer: int) -> dict[int, flying.Poses]:
+    """Poses of the base after one period and after more."""
+    plant, now, inputs = ready(machine, flights, finer)
+    step = stm.algebra.outer_jit(lambda now, inputs: jax.vmap(plant.step)(now, inputs))
+
+    def look(now: Any) -> flying.Poses:
+        state = now.state
+        return np.asarray(state.r)[:, 0], np.roll(np.asarray(state.p)[:, 0], -1, axis=1)
+
+    return flying.after(lambda now: step(now, inputs), now, look)
+
+
+def ours(size: Size) -> Iterator[dict[str, Any]]:
+    """Rows of our machines, with all flights side by side, one step or several in a call, and in groups."""
+    for name in list(MACHINES)[: size.machines]:
+        machine = MACHINES[name]
+        wrong = flying.errors(
+            poses(machine, size.compared, 1), poses(machine, size.compared, flying.FINER)
+        )
+        plant, now, inputs = ready(machine, size.flights)
+        for inner, group in ((1, size.flights), (size.inner, size.flights), (1, size.group)):
+            row = rated(steps(plant, inner, group), (now, inputs), size, inner)
+            yield {**RK4, "machine": name, "side_by_side": group, **row, **wrong}
+    yield {**RK4, **trained(size)}
+
+
+def trained(size: Size) -> dict[str, Any]:
+    """Row of a training environment: a hexacopter's step, observation, reward and new start."""
+    plant, _, inputs = ready(MACHINES["hexacopter"], size.flights)
+
+    def observe(now: Any) -> Any:
+        state = now.state
+        return jnp.concatenate([x[0] for x in (state.r, state.p, state.v, state.omega)])
+
+    environment = stm.control.Environment(
+        plant, observe, lambda before, inputs, after: -jnp.sum(observe(after)[:3] ** 2),
+        lowest=0.5 * plant.before, highest=2.0 * plant.before, samples=400,
+        failed=lambda now: jnp.sum(now.state.r[0] ** 2) > 100.0,
+    )  # fmt: skip
+    keys = jax.random.split(jax.random.key(0), size.flights)
+    begun = stm.algebra.outer_jit(lambda keys: jax.vmap(environment.reset)(keys))(keys)
+    step = lambda episodes, inputs: jax.vmap(environment.step_or_reset)(episodes, inputs)
+    row = rated(step, (begun, inputs), size, 1)
+    return {"machine": "environment of a hexacopter", "side_by_side": size.flights, **row}
+
+
+def of_peer(name: str, size: Size) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """A peer for the table of programs and its rows; without rows, the reason why there are none."""
+    interpreter = os.environ.get(INTERPRETER, sys.executable)
+    wanted = (size.flights, size.compared, size.inner, size.step_repeats)
+    # not this package's own options of XLA; crazyflow wants SciPy's arrays of other libraries
+    own = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "PYTHONPATH")}
+    own["SCIPY_ARRAY_API"] = "1"
+    done = subprocess.run(
+        [interpreter, flying.__file__, name, *map(str, wanted)],
+        capture_output=True, text=True, check=False, env=own,
+    )  # fmt: skip
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or ["no message"]
+        said = next((line for line in reversed(lines) if "Error" in line), lines[-1])
+        where = INTERPRETER if INTERPRETER in os.environ else "the suite's own interpreter"
+        return {"method": name, "reason": f"Not run with {where}: {said}"}, []
+    found = json.loads(done.stdout.strip().splitlines()[-1])
+    how, caveat = PEERS[name]
+    about = {"method": name, "version": found["version"], "how": how, "caveats": [caveat]}
+    rows = [
+        {"program": name, "machine": "its quadrotor", **row, "failure": ""} for row in found["rows"]
+    ]
+    return about, rows
+
+
+def closed(t1: float) -> dict[str, Any]:
+    """Seconds of processor time of a flight of case 1, of its program and of flying it again."""
+    mission = stm.missions.load_mission("case-1", t1=t1)
+    clock = time.process_time()
+    flight = stm.missions.fly(mission)
+    first = time.process_time() - clock
+    spent = []
+    for _ in range(3):
+        clock = time.process_time()
+        flight = stm.missions.fly(mission)
+        spent.append(time.process_time() - clock)
+    data = stm.missions.to_data(flight)
+    seconds = float(np.median(spent))
+    return {
+        "mission": "case-1", "t1": t1, "first_flight_seconds": first, "seconds": seconds,
+        "spent": spent, "times_real_time": t1 / seconds,
+        "largest_position_error": float(np.max(np.linalg.norm(data.position_error.values, axis=1))),
+    }  # fmt: skip
+
+
+def vector_steps(size: Size, there: list[Peer]) -> dict[str, Any]:
+    """The section; other programs are run if the suite compares at all."""
+    content: dict[str, Any] = {
+        "what": f"{size.flights} flights in one call, one control period of 1/{flying.RATE:g} s each, on one core",
+        "horizon": flying.HORIZON / flying.RATE, "peers": [], "skipped": [], "rows": [],
+        "closed_loops": [],
+    }  # fmt: skip
+    for name in PEERS if there else ():
+        about, rows = of_peer(name, size)
+        content["rows"] += rows
+        content["peers" if rows else "skipped"].append(about)
+    for row in ours(size):
+        print(row, flush=True)
+        content["rows"].append(row)
+    if size.closed_loop:
+        plain = {"native_loops": False, **closed(size.closed_loop)}
+        native = {"native_loops": True, **with_native_loops(closed, size.closed_loop)}
+        content["closed_loops"] = [plain, native]
+    return content
