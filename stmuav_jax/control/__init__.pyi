@@ -35,7 +35,6 @@ from .estimator import (
     EstimatorMemory as EstimatorMemory,
     MotionEstimate as MotionEstimate,
     MotionEstimator as MotionEstimator,
-    strapdown as strapdown,
 )
 from .flying import (
     FlightController as FlightController,
@@ -51,6 +50,9 @@ from .geometric import (
     along as along,
     at_point as at_point,
     wrench_for as wrench_for,
+)
+from .inertial import (
+    strapdown as strapdown,
 )
 from .instruments import (
     Instrument as Instrument,
@@ -71,6 +73,7 @@ from .plant import (
 from .quadratic import (
     Regulator as Regulator,
     StateFeedback as StateFeedback,
+    check_observable as check_observable,
     held_matrices as held_matrices,
     point_of as point_of,
     regulator as regulator,

@@ -23,29 +23,26 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
-from ..algebra.rotation import (
-    conjugate,
-    from_rotation_vector,
-    normalise,
-    product,
-    rotation_matrix,
-    skew,
-    to_rotation_vector,
-)
+from ..algebra.rotation import conjugate, product, rotation_matrix, to_rotation_vector
 from ..algebra.space import Composite, Point, Rotation, Vector
-from ..checks.errors import SettingError
+from ..checks.errors import ModelError, SettingError, concrete
 from ..checks.numbers import numbers
 from ..checks.shapes import Numbers
 from ..flight.flyer import FlyerPoint, whole_state
+from ..flight.linear import Linear
 from ..mechanics.state import State
 from ..mechanics.system import System
 from ..sensing.sensors import SENSORS, gravity_of
 from ..tracker.drive import SLIDER_JOINTS
 from ..tracker.kinematics import stroke_jacobian, strokes
+from .inertial import ERRORS, fix_rows, one_by_one, strapdown
 from .instruments import Instrument, Reading
 from .panel import PanelBodies, panel_motion
+from .quadratic import check_observable
 
 _BASE = Composite(
     p=Rotation(), r=Vector(3), v=Vector(3), gyroscope_bias=Vector(3), accelerometer_bias=Vector(3)
@@ -101,64 +98,6 @@ class EstimatorMemory(NamedTuple):
     begun: Bool[Array, ""]
 
 
-def _turn(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    return rotation_matrix(from_rotation_vector(v))
-
-
-def strapdown(
-    x: Point,
-    turning: Float[Array, "3"],
-    force: Float[Array, "3"],
-    gravity: Float[Array, "3"],
-    h: Float[Array, ""],
-) -> tuple[Point, Float[Array, "15 15"]]:
-    """Motion of a base over a step h [s] by readings of gyroscope and accelerometer.
-
-    Returns:
-        point at its end, and the matrix of errors there by those before, to first order in h for
-        the gyroscope's bias.
-    """
-    omega, felt = turning - x["gyroscope_bias"], force - x["accelerometer_bias"]
-    half = from_rotation_vector(h / 2 * omega)
-    middle = product(x["p"], half)
-    R = rotation_matrix(middle)
-    a = R @ felt + gravity
-    moved = {"p": normalise(product(middle, half)), "v": x["v"] + h * a}
-    moved = {**x, **moved, "r": x["r"] + h * x["v"] + h**2 / 2 * a}
-    back = rotation_matrix(half).T
-    by_attitude = -R @ skew(felt) @ back
-    one, none = jnp.eye(3), jnp.zeros((3, 3))
-    errors = jnp.block(
-        [
-            [back @ back, none, none, -h * one, none],
-            [h**2 / 2 * by_attitude, one, h * one, none, -(h**2) / 2 * R],
-            [h * by_attitude, none, one, none, -h * R],
-            [none, none, none, one, none],
-            [none, none, none, none, one],
-        ]
-    )
-    return moved, errors
-
-
-def one_by_one(
-    P: Float[Array, "n n"],
-    H: Float[Array, "m n"],
-    variance: Float[Array, " m"],
-    error: Float[Array, " m"],
-    fresh: Bool[Array, " m"],
-) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
-    """Move of the mean, covariance and NIS after the fresh components, one after the other."""
-    move, nis = jnp.zeros(P.shape[0]), jnp.zeros(())
-    for row, r, nu, new in zip(H, variance, error, fresh, strict=True):
-        along = P @ row
-        weight = jnp.where(new, 1 / (row @ along + r), 0.0)
-        left = nu - row @ move
-        move = move + weight * left * along
-        P = P - weight * along[:, None] * along[None, :]
-        nis = nis + weight * left**2
-    return move, P, nis
-
-
 class MotionEstimator(eqx.Module):
     """Estimator of pose, velocity and the biases of its sensors, and of the tracker's panel angles.
 
@@ -179,7 +118,8 @@ class MotionEstimator(eqx.Module):
 
     Raises:
         SettingError: an instrument that is missing or has no noise, a gyroscope or accelerometer that is
-            slow or late, an accelerometer off the centre of mass.
+            slow or late, an accelerometer off the centre of mass; fixes and encoders that do not see a
+            mode of the errors at rest (the message names the states in it).
     """
 
     tracker: PanelBodies | None
@@ -209,6 +149,7 @@ class MotionEstimator(eqx.Module):
         kinds = ("gyroscope", "accelerometer", "position", "attitude")
         wanted = [SENSORS[kind](name) for kind in kinds]
         wanted += [] if tracker is None else [SENSORS["encoder"](joint) for joint in SLIDER_JOINTS]
+        _check_observed(system, rate, instruments, wanted, tracker)
         found = [_of_name(instruments, one.name) for one in wanted]
         for one in found[:2]:
             if one.periods(rate) != 1 or one.delay != 0:
@@ -226,8 +167,7 @@ class MotionEstimator(eqx.Module):
         self.late = jnp.array([one.delay for one in found[2:]])
         noise = [_noise(one, system) for one in found]
         self.variance = jnp.concatenate(noise[2:]) ** 2
-        point = getattr(found[2].sensor, "point", None)
-        self.arm = jnp.zeros(3) if point is None else point - system.bodies.com[0]
+        self.arm = _arm(found[2], system)
         self.gravity = gravity_of(system)
         h = self.period
         drift = [
@@ -327,13 +267,7 @@ class MotionEstimator(eqx.Module):
         off = position.value - then["r"] - R @ self.arm
         turned = to_rotation_vector(product(conjugate(facing["p"]), attitude.value))
         omega = turning - x["gyroscope_bias"]
-        one, none = jnp.eye(3), jnp.zeros((3, 3))
-        H = jnp.block(
-            [
-                [-R @ skew(self.arm) @ _turn(late[0] * omega), one, -late[0] * one, none, none],
-                [_turn(late[1] * omega), none, none, late[1] * one, none],
-            ]
-        )
+        H = fix_rows(R, self.arm, omega, late)
         fresh = jnp.repeat(jnp.stack([position.fresh, attitude.fresh]), 3)
         error = jnp.concatenate([off, turned])
         move, P, nis = one_by_one(P, H, self.variance[:6], error, fresh)
@@ -343,7 +277,7 @@ class MotionEstimator(eqx.Module):
         """Belief about the panel a step h [s] later, after its encoders."""
         assert self.tracker is not None
         geometry = self.tracker.geometry
-        F = jnp.eye(4).at[:2, 2:].add(h * jnp.eye(2))
+        F = _drift(h)
         x = F @ before.mean
         P = F @ before.covariance @ F.T + self.panel_walk
         J, now = stroke_jacobian(geometry, x[:2]), strokes(geometry, x[:2]) - self.home
@@ -360,6 +294,58 @@ class MotionEstimator(eqx.Module):
         angles, rates = panel.mean[:2], panel.mean[2:]
         at = FlyerPoint(x["r"], x["p"], angles, x["v"], omega, rates)
         return whole_state(self.tracker.geometry, self.tracker.shift, at)
+
+
+def _drift(h: Float[Array, ""]) -> Float[Array, "4 4"]:
+    """Matrix of the panel's angles and rates over a step h [s]."""
+    return jnp.eye(4).at[:2, 2:].add(h * jnp.eye(2))
+
+
+def _arm(fix: Instrument, system: System) -> Float[Array, "3"]:
+    """Point of a position fix from the base's centre of mass, base axes (3,) [m]."""
+    point = getattr(fix.sensor, "point", None)
+    return jnp.zeros(3) if point is None else point - system.bodies.com[0]
+
+
+def _check_observed(
+    system: System,
+    rate: float,
+    instruments: Sequence[Any],
+    wanted: Sequence[Any],
+    tracker: PanelBodies | None,
+) -> None:
+    """Raise `SettingError` for fixes and encoders that do not see all errors of the estimator.
+
+    The test is that of `check_observable`, about rest at the reference, on the estimator's own matrices F
+    over a period h and H at the fixes, as the rate (F - 1) / h, whose modes have the same states.
+    """
+    known = {one.name: one for one in instruments if isinstance(one, Instrument)}
+    fixes, gravity, h = [known.get(one.name) for one in wanted[2:]], gravity_of(system), 1 / rate
+    delays = jnp.array([0.0 if one is None else one.delay for one in fixes])
+    arm = jnp.zeros(3) if fixes[0] is None else _arm(fixes[0], system)
+    zero, p = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
+    point = dict.fromkeys(dict(_BASE.parts), zero) | {"p": p}
+    _, F = strapdown(point, zero, -gravity, gravity, jnp.asarray(h))
+    H, names = fix_rows(jnp.eye(3), arm, zero, delays[:2]), list(ERRORS)
+    seen = np.repeat([one is not None for one in fixes], [3, 3] + [1] * len(fixes[2:]))
+    if tracker is not None:
+        J = stroke_jacobian(tracker.geometry, panel_motion(system.reference).value)
+        F, own = (
+            block_diag(F, _drift(jnp.asarray(h))),
+            jnp.concatenate([J, -delays[2:, None] * J], axis=1),
+        )
+        H, names = block_diag(H, own), [*names, "phi", "theta", "rate of phi", "rate of theta"]
+    if not concrete(F, H):
+        return
+    A, C = (np.asarray(F) - np.eye(len(names))) / h, np.asarray(H)[seen]
+    states = tuple((name, "") for name in names)
+    none = np.zeros((len(names), 0))
+    try:
+        check_observable(Linear(A, none, C, none[: len(C)], states, (), ()))
+    except ModelError as error:
+        lacking = [one.name for one, fix in zip(wanted[2:], fixes, strict=True) if fix is None]
+        words = f": there is no {', no '.join(repr(name) for name in lacking)}" if lacking else ""
+        raise SettingError(f"The estimator's instruments do not suffice{words}. {error}") from error
 
 
 def state_of(estimate: Any) -> Any:

@@ -29,6 +29,8 @@ from ..mechanics.state import State
 _HAUTUS = 1e-9
 # A mode counts as stable on its own if it decays by more than this share of its frequency.
 _DECAYS = 1e-9
+# Largest number of states that are named of a mode.
+_NAMED = 6
 
 
 @dataclass(frozen=True)
@@ -92,15 +94,27 @@ def regulator(linear: Linear, Q: Numbers, R: Numbers, *, rate: float | None = No
     try:
         S = solve(A, B, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ModelError(
-            f"The Riccati equation of the regulator has no stabilising solution ({error}). Weights of "
-            "very different sizes can be the reason: scale errors by the sizes that they may have."
-        ) from error
+        raise _unsolved(str(error)) from error
     if rate is None:
         K = np.linalg.solve(R, B.T @ S)
     else:
         K = np.linalg.solve(R + B.T @ S @ B, B.T @ S @ A)
-    return Regulator(K, S, np.linalg.eigvals(A - B @ K), rate)
+    if not np.all(np.isfinite(K)):
+        raise _unsolved("the gains are not finite")
+    poles = np.linalg.eigvals(A - B @ K)
+    # SciPy returns some matrices that are no stabilising solution without a word
+    growth = poles.real if rate is None else np.abs(poles) - 1
+    if np.max(growth) >= 0:
+        pole = poles[np.argmax(growth)]
+        raise _unsolved(f"with what was found the closed loop has a pole at {pole:.4g}")
+    return Regulator(K, S, poles, rate)
+
+
+def _unsolved(why: str) -> ModelError:
+    return ModelError(
+        f"The Riccati equation of the regulator has no stabilising solution ({why}). Weights of "
+        "very different sizes can be the reason: scale errors by the sizes that they may have."
+    )
 
 
 def _weights(given: Numbers, size: int, name: str, *, least: float | None) -> np.ndarray:
@@ -121,6 +135,25 @@ def _weights(given: Numbers, size: int, name: str, *, least: float | None) -> np
     return matrix
 
 
+def check_observable(linear: Linear) -> None:
+    """Check that the outputs of a linear system see each of its modes that does not decay by itself.
+
+    An estimator of the state cannot find a mode that they do not see.
+
+    Args:
+        linear: matrices of `stmuav_jax.linearize`, with the measured `outputs`.
+
+    Raises:
+        ModelError: a mode that does not decay and that the outputs do not see; the message names the
+            states in it.
+
+    Source: M. L. J. Hautus, Controllability and observability conditions of linear autonomous systems,
+    Indagationes Mathematicae 31 (1969) 443-448.
+    """
+    what = "The outputs do not observe"
+    _check_modes(linear, linear.C.T, what, "they do not see it", transposed=True)
+
+
 def _check_modes(
     linear: Linear, columns: np.ndarray, what: str, why: str, *, transposed: bool = False
 ) -> None:
@@ -135,10 +168,12 @@ def _check_modes(
         matrix = np.hstack([(s * np.eye(len(A)) - A) / max(size, 1.0), unit])
         left, values, _ = np.linalg.svd(matrix)
         if values[-1] < _HAUTUS:
-            share = np.abs(left[:, -1]) ** 2
+            # all modes of this eigenvalue
+            fixed = left[:, values < _HAUTUS]
+            share = np.mean(np.abs(fixed) ** 2, axis=1)
             parts = ", ".join(
                 f"{linear.states[k][0]} ({share[k]:.0%})"
-                for k in np.argsort(-share)[:3]
+                for k in np.argsort(-share, stable=True)[:_NAMED]
                 if share[k] > 0.05
             )
             raise ModelError(

@@ -66,10 +66,17 @@ Pilot = FlightController | UavController | AdaptiveController
 
 
 class MissionMemory(NamedTuple):
-    """Memory of the controller, and the strokes of jammed sliders (2,) [m], infinite for others."""
+    """Memory of a mission's controller.
+
+    Attributes:
+        flight: memory of the pilot.
+        held: strokes of jammed sliders (2,) [m], infinite for others.
+        asked: forces that the servo last asked of the actuators (2,) [N]; (0,) without a tracker.
+    """
 
     flight: FlightMemory | AdaptiveMemory
     held: Float[Array, "2"]
+    asked: Float[Array, " a"]
 
 
 class Told(NamedTuple):
@@ -80,24 +87,29 @@ class Told(NamedTuple):
 
 
 class MissionController(eqx.Module):
-    """Controller of a mission whose commands go through its faults, of which it may be told.
+    """Controller of a mission whose commands go through the limits of its actuators, and through its
+    faults, of which it may be told.
 
     Attributes:
         pilot: controller of the machine. told: those that follow it, by rising times.
         lost: time at which each rotor fails (k,) [s], infinite for none.
         share: share of its thrust that it keeps (k,).
         jam: faults of the sliders, or None.
+        force: largest force that each actuator gives, either way (2,) [N], infinite for no limit; (0,)
+            without a tracker.
     """
 
     pilot: Pilot
     lost: Float[Array, " k"]
     share: Float[Array, " k"]
     jam: Jam | None
+    force: Float[Array, " a"]
     told: tuple[Told, ...] = ()
 
     def start(self) -> MissionMemory:
         """First memory."""
-        return MissionMemory(self.pilot.start(), jnp.full(2, jnp.inf, dtype=float))
+        held = jnp.full(2, jnp.inf, dtype=float)
+        return MissionMemory(self.pilot.start(), held, jnp.zeros_like(self.force))
 
     def __call__(
         self, estimate: Any, reference: MissionReference, memory: MissionMemory
@@ -113,10 +125,11 @@ class MissionController(eqx.Module):
             )
         k = self.lost.shape[0]
         rotors = jnp.where(t >= self.lost, self.share, 1.0) * inputs[:k]
-        forces = inputs[k:]
+        asked = inputs[k:]
+        forces = jnp.clip(asked, -self.force, self.force)
         if self.jam is not None:
             forces, held = self.jam.forces(t, estimate, forces, held)
-        return jnp.concatenate([rotors, forces]), MissionMemory(after, held)
+        return jnp.concatenate([rotors, forces]), MissionMemory(after, held, asked)
 
 
 def _commanded(pilot: Any, estimate: Any, reference: MissionReference, memory: Any) -> Any:

@@ -51,6 +51,7 @@ _QUANTITIES: dict[str, tuple[str, str]] = {
     "panel_error": ("rad", "largest panel error"),
     "rotor_margin": ("1", "smallest margin of the rotor speeds, share of the range"),
     "stroke_margin": ("1", "smallest margin of the strokes, share of the range"),
+    "force_margin": ("1", "smallest margin of the actuators' forces, share of the range"),
     "energy": ("J", "electrical energy used"),
     "kept": ("1", "whether all tolerances and limits were kept"),
 }
@@ -72,7 +73,7 @@ class Worst(NamedTuple):
 
     Attributes:
         position [m], tilt, panel [rad]: largest errors from the times of the tolerances on.
-        rotors, strokes: smallest distances from the limits, as shares of the range.
+        rotors, strokes, forces: smallest distances from the limits, as shares of the range.
         energy: electrical energy used [J].
         reason: code of `LoopReason`. end: time of the last valid sample [s].
     """
@@ -82,6 +83,7 @@ class Worst(NamedTuple):
     panel: Float[Array, ""]
     rotors: Float[Array, ""]
     strokes: Float[Array, ""]
+    forces: Float[Array, ""]
     energy: Float[Array, ""]
     reason: Array
     end: Float[Array, ""]
@@ -198,6 +200,8 @@ class MissionWork(AbstractWork):
             none |= {"panel_error", "stroke_margin"}
         if machine.speeds is None:
             none |= {"rotor_margin"}
+        if machine.force is None:
+            none |= {"force_margin"}
         return [name for name in _QUANTITIES if name not in none]
 
     def _check_factors(self) -> None:
@@ -246,7 +250,7 @@ class MissionWork(AbstractWork):
         own = {
             "position_error": worst.position, "tilt_error": worst.tilt,
             "panel_error": worst.panel, "rotor_margin": worst.rotors,
-            "stroke_margin": worst.strokes, "energy": worst.energy,
+            "stroke_margin": worst.strokes, "force_margin": worst.forces, "energy": worst.energy,
         }  # fmt: skip
         found |= {k: np.where(fine, v, np.nan) for k, v in own.items()}
         kept = fine & self._kept(worst)
@@ -267,7 +271,7 @@ class MissionWork(AbstractWork):
     def _kept(self, worst: Any) -> np.ndarray:
         """Test whether flights kept the tolerances and limits of the mission (lanes,)."""
         wanted = self.mission.file.tolerances
-        fine = (worst.rotors >= -AT_LIMIT) & (worst.strokes >= -AT_LIMIT)
+        fine = np.minimum(np.minimum(worst.rotors, worst.strokes), worst.forces) >= -AT_LIMIT
         for value, most in (
             (worst.position, wanted.position),
             (worst.tilt / _DEGREE, wanted.tilt),
@@ -316,7 +320,7 @@ class MissionWork(AbstractWork):
 
         zero, one = jnp.zeros(()), jnp.ones(())
         reason = jnp.zeros((), jnp.int8)
-        begun = Worst(zero, zero, zero, one, one, zero, reason, zero)
+        begun = Worst(zero, zero, zero, one, one, one, zero, reason, zero)
         start = plant.reset(jax.random.key(seeds[1]))
         first = (start, jax.tree.map(jnp.asarray, of.controller.start()), begun)
         (_, _, worst), _ = jax.lax.scan(chunk, first, length=chunks)
@@ -351,26 +355,26 @@ def _joined(mission: Mission, of: _Nominal, worst: Worst, found: Rollout) -> Wor
     valid = flown & (found.reason == LoopReason.VALID) & (worst.reason == LoopReason.VALID)
     last = mission.samples - 1
     power = jnp.where(flown & (ts < (last - 0.5) / mission.plant.rate), own["electric_power"], 0.0)
-    rotors, strokes = worst.rotors, worst.strokes
+    rotors, strokes, forces = worst.rotors, worst.strokes, worst.forces
     if of.speeds is not None:
         low, high = (jnp.sqrt(x) for x in of.speeds.squared(mission.machine.rotors.spin.shape[0]))
         # a rotor that has failed is within no limits
-        gone = [jnp.inf] * len(low)
-        for fault in given.faults:
-            if fault.rotor is not None:
-                gone[fault.rotor - 1] = fault.at
-        counted = flown[:, None] & (ts[:, None] < jnp.array(gone))
+        counted = flown[:, None] & (ts[:, None] < of.controller.lost)
         rotors = jnp.minimum(rotors, _margin(own["rotor_speed"], low, high, counted))
     if of.limits is not None:
         low, high = of.limits.lower, of.limits.upper
         strokes = jnp.minimum(strokes, _margin(own["displacement"], low, high, flown[:, None]))
+    if mission.machine.force is not None:
+        top, jam = of.controller.force, of.controller.jam
+        counted = flown[:, None] & (True if jam is None else ts[:, None] < jam.at)
+        forces = jnp.minimum(forces, _margin(own["wanted_force"], -top, top, counted))
     turned = worst.panel
     if "panel_error" in own:
         turned = jnp.maximum(turned, most(own["panel_error"], panel))
     return Worst(
         jnp.maximum(worst.position, most(off, base)),
         jnp.maximum(worst.tilt, most(own["tilt_error"], base)),
-        turned, rotors, strokes, worst.energy + jnp.sum(power) / mission.plant.rate, reason,
+        turned, rotors, strokes, forces, worst.energy + jnp.sum(power) / mission.plant.rate, reason,
         jnp.maximum(worst.end, jnp.max(jnp.where(valid, ts, 0.0))),
     )  # fmt: skip
 

@@ -79,6 +79,14 @@ def flight_strokes(data: xr.Dataset) -> Figure:
     return _titled(figure, data)
 
 
+def flight_forces(data: xr.Dataset) -> Figure:
+    """Figure of the forces that the servo asks of the tracker's actuators, with their limits."""
+    figure, axes = grid(1, 1, 3.4)
+    _many(axes[0, 0], data, "wanted_force", "force", "slider")
+    _labelled(axes[0, 0], "force wanted [N]")
+    return _titled(figure, data)
+
+
 def flight_power(data: xr.Dataset) -> Figure:
     """Figure of the powers, and of the battery's charge if there is one."""
     charge = "state_of_charge" in data
@@ -116,7 +124,7 @@ def flight_margins(data: xr.Dataset) -> Figure:
 
 FLIGHT_FIGURES = {
     "errors": flight_errors, "margins": flight_margins, "rotors": flight_rotors, "power": flight_power,
-    "panel": flight_panel, "strokes": flight_strokes,
+    "panel": flight_panel, "strokes": flight_strokes, "forces": flight_forces,
 }  # fmt: skip
 
 

@@ -40,6 +40,7 @@ GAUGES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "wanted_panel_angles": (_ANGLES, "rad", "reference of the panel, at the base's true attitude"),
     "panel_error": (_TIME, "rad", "angle of the panel's normal from its reference"),
     "displacement": (_SLIDERS, "m", "of the sliders from the initial posture"),
+    "wanted_force": (_SLIDERS, "N", "that the servo asks of the actuators, before their limits"),
     "actuator_power": (_TIME, "W", "mechanical power of both actuators"),
     "gear_load": (_TIME, "N", "of the ground on all feet of the landing gear, upwards"),
     "gear_depth": (_TIME, "m", "of the lowest foot below the ground's height, negative in flight"),
@@ -117,6 +118,7 @@ class Gauges(eqx.Module):
         pushing = jnp.zeros(())
         if self.bodies is not None:
             own = self._panel(state, sample.reference, sample.inputs[self.rotors :])
+            own["wanted_force"] = sample.memory.asked
             pushing = jnp.maximum(own["actuator_power"], 0.0)
             found |= own
         return found | {"electric_power": power / self.efficiency + pushing + self.other}

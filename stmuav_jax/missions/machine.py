@@ -62,6 +62,7 @@ class Machine(NamedTuple):
         speeds: limits of the rotor speeds, or None.
         believed: system without the payload, of which the controller does not know; None where it is
             that of the scene. `bodies` are those that the controller believes.
+        force: largest force of each of the tracker's actuators, either way [N]; None for no limit.
     """
 
     scene: Scene
@@ -71,6 +72,7 @@ class Machine(NamedTuple):
     limits: Limits | None
     speeds: RotorLimits | None
     believed: System | None = None
+    force: float | None = None
 
 
 def machine_of(given: MissionFile, folder: Path) -> Machine:
@@ -106,7 +108,8 @@ def machine_of(given: MissionFile, folder: Path) -> Machine:
         return Machine(scene, rotors, table, None, None, speeds)
     geometry, shift = tracker_geometry(table), table.value("mount.shift")
     bodies = panel_bodies(scene.system, geometry, shift)
-    empty = Machine(scene, rotors, table, bodies, tracker_limits(table), speeds)
+    limits, force = tracker_limits(table), given.controller.force
+    empty = Machine(scene, rotors, table, bodies, limits, speeds, force=force)
     return empty if given.payload is None else _loaded(empty, given)
 
 
@@ -172,6 +175,7 @@ def _without_tracker(given: MissionFile, what: str) -> None:
     used = {
         "[[panel]]": given.panel, "[push]": given.push, "'controller.servo'": given.controller.servo,
         "'controller.feedforward'": given.controller.feedforward is not None,
+        "'controller.force'": given.controller.force is not None,
         "'sensors.encoders'": given.sensors and given.sensors.encoders,
         "'tolerances.panel'": given.tolerances.panel, "[payload]": given.payload,
         "'tolerances.panel_after'": given.tolerances.panel_after is not None,
@@ -387,4 +391,6 @@ def _faulty(given: MissionFile, machine: Machine, pilot: Any) -> MissionControll
             )
         assert machine.bodies is not None
         jam = Jam(machine.bodies.geometry, jnp.asarray(jammed))
-    return MissionController(pilot, jnp.asarray(lost), jnp.asarray(share), jam)
+    most = jnp.inf if machine.force is None else machine.force
+    force = jnp.full(0 if machine.bodies is None else 2, most)
+    return MissionController(pilot, jnp.asarray(lost), jnp.asarray(share), jam, force)

@@ -34,6 +34,7 @@ from ..tracker.kinematics import Reason, panel_angles, panel_normal
 from ..tracker.pointing import why_outside
 from ..tracker.workspace import survey
 from .disturbance import MissionController
+from .effort import check_forces
 from .gauges import Gauges
 from .machine import BEYOND, Machine, controller_of, machine_of, plant_of
 from .reference import DirectionMotion, HeldPath, PanelMoves, References, WaypointPath
@@ -142,6 +143,7 @@ def make_mission(plain: Mapping[str, Any], folder: str | os.PathLike[str] = ".")
     _check_thrust(mission)
     if panel is not None:
         _check_panel(mission)
+        check_forces(given, machine, mission.references)
     return mission
 
 

@@ -56,6 +56,12 @@ def labelled_flight(flight: MissionFlight) -> Labelled:
             "lowest_displacement": ("slider", np.asarray(machine.limits.lower), "m"),
             "highest_displacement": ("slider", np.asarray(machine.limits.upper), "m"),
         }
+        if machine.force is not None:
+            most = np.full(2, machine.force)
+            limits |= {
+                "lowest_force": ("slider", -most, "N"),
+                "highest_force": ("slider", most, "N"),
+            }
         names["slider"] = (("slider",), np.array([2, 3]), {})
         names["panel_angle"] = (("panel_angle",), ["phi", "theta"], {})
     own = {
@@ -89,6 +95,7 @@ def measures(data: "xr.Dataset") -> list[Measure]:
         found.append(_largest(data, "panel", panel, "degrees", wanted.panel, times[-1]))
     for name, what, limit in (
         ("rotor_speed", "rotor speeds", "speed"), ("displacement", "strokes", "displacement"),
+        ("wanted_force", "actuators' forces", "force"),
     ):  # fmt: skip
         if f"lowest_{limit}" in data:
             found.append(_margin(data, name, what, limit))
@@ -158,7 +165,7 @@ def _of_gear(data: "xr.Dataset", wanted: TolerancesEntry) -> list[Measure]:
 
 def _margin(data: "xr.Dataset", name: str, what: str, limit: str) -> Measure:
     """Smallest distance from the limits as a share of the range."""
-    least = float(np.nanmin(margin_history(data, name, limit)))
+    least = float(np.nanmin(margin_history(data, name, limit), initial=0.5))
     name, kept = f"Smallest margin of the {what}", least >= -AT_LIMIT
     return Measure(name, 100 * least, "% of the range", 0.0, kept)
 
@@ -166,14 +173,15 @@ def _margin(data: "xr.Dataset", name: str, what: str, limit: str) -> Measure:
 def margin_history(data: "xr.Dataset", name: str, limit: str) -> np.ndarray:
     """Distances of a signal (k, n) from its limits as shares of the ranges, to the nearer limit each.
 
-    Rotors that have failed are within no limits: NaN.
+    They are NaN for rotors that have failed and for the forces of a jammed slider.
     """
     low, high = data[f"lowest_{limit}"].values, data[f"highest_{limit}"].values
     values = np.array(data[name].values)
-    if name == "rotor_speed":
-        for fault in json.loads(data.attrs["mission"])["faults"]:
-            if fault["rotor"] is not None:
-                values[data.time.values >= fault["at"], fault["rotor"] - 1] = np.nan
+    # a rotor that has failed is within no limits, and the servo of a jammed slider asks in vain
+    kind, first = {"rotor_speed": ("rotor", 1), "wanted_force": ("slider", 2)}.get(name, ("", 0))
+    for fault in json.loads(data.attrs["mission"])["faults"] if kind else ():
+        if fault[kind] is not None:
+            values[data.time.values >= fault["at"], fault[kind] - first] = np.nan
     return np.minimum(values - low, high - values) / (high - low)
 
 

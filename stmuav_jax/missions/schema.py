@@ -97,7 +97,8 @@ class PayloadEntry(Entries):
 
 
 class ControllerEntry(Entries):
-    """Entry for the controller; the limits of the rotor speeds are in rad/s.
+    """Entry for the controller; the limits of the rotor speeds are in rad/s, the largest force of each of
+    the tracker's actuators in N.
 
     Of the payload it knows nothing, or all, or it estimates it.
     """
@@ -105,6 +106,7 @@ class ControllerEntry(Entries):
     gains: GainsEntry = GainsEntry()
     lowest: NotNegative | None = None
     highest: Positive | None = None
+    force: Positive | None = None
     servo: ServoEntry | None = None
     feedforward: bool | None = None
     payload: Literal["unknown", "estimated", "known"] = "unknown"

@@ -41,7 +41,8 @@ from ...rotorcraft.allocation import wrench_map
 from ...rotorcraft.motor import MotorRotors
 from ...rotorcraft.rotor import Rotors, hover_speed_squared
 from ...sensing.sensors import gravity_of
-from ..estimator import MotionEstimate, one_by_one
+from ..estimator import MotionEstimate
+from ..inertial import one_by_one
 from ..instruments import whole_periods
 from .moments import Carrier, Moments, Payload, carrying, payload_of
 
