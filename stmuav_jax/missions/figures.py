@@ -102,11 +102,12 @@ def flight_power(data: xr.Dataset) -> Figure:
 
 
 def flight_margins(data: xr.Dataset) -> Figure:
-    """Figure of the smallest margins of rotor speeds and strokes, as shares of their ranges."""
+    """Figure of the smallest margins of rotor speeds, strokes and forces, as shares of their ranges."""
     shown = {
-        label: 100 * np.nanmin(margin_history(data, name, limit), axis=1)
+        label: 100 * np.nanmin(margin_history(data, name, limit), axis=1, initial=0.5)
         for name, limit, label in (
             ("rotor_speed", "speed", "rotor speeds"), ("displacement", "displacement", "strokes"),
+            ("wanted_force", "force", "actuators' forces"),
         )
         if f"lowest_{limit}" in data
     }  # fmt: skip
