@@ -272,11 +272,8 @@ class MissionWork(AbstractWork):
         """Test whether flights kept the tolerances and limits of the mission (lanes,)."""
         wanted = self.mission.file.tolerances
         fine = np.minimum(np.minimum(worst.rotors, worst.strokes), worst.forces) >= -AT_LIMIT
-        for value, most in (
-            (worst.position, wanted.position),
-            (worst.tilt / _DEGREE, wanted.tilt),
-            (worst.panel / _DEGREE, wanted.panel),
-        ):
+        turned = (worst.tilt / _DEGREE, wanted.tilt), (worst.panel / _DEGREE, wanted.panel)
+        for value, most in ((worst.position, wanted.position), *turned):
             fine &= np.asarray(most is None) | (value <= (np.inf if most is None else most))
         return fine
 
@@ -284,15 +281,13 @@ class MissionWork(AbstractWork):
     def _program(self) -> Any:
         """Compiled function of values (lanes, d) and seeds (lanes, 2) that returns a `Worst`."""
         of, machine = self.mission, self.mission.machine
-        nominal = _Nominal(
-            of.plant, of.controller, of.references, of.gauges, machine.speeds, machine.limits
-        )
+        pilot = of.controller, of.references, of.gauges
+        nominal = _Nominal(of.plant, *pilot, machine.speeds, machine.limits)
         flights = lambda of, *each: jax.vmap(partial(self._flown, of))(*each)
         values = jax.ShapeDtypeStruct((LANES, len(self.sampling.names)), jnp.float64)
         seeds = jax.ShapeDtypeStruct((LANES, 2), jnp.uint32)
-        return partial(
-            program_of_shapes(flights, nominal, values, seeds, parts=self._parts), nominal
-        )
+        made = program_of_shapes(flights, nominal, values, seeds, parts=self._parts)
+        return partial(made, nominal)
 
     @property
     def _parts(self) -> tuple[Any, ...]:
