@@ -12,8 +12,8 @@ from rich.console import Console
 from ...checks.errors import SettingError, named_places
 from ...figures.terminal import line, row, table
 from ..options import Number, Seed, count, default, shared
-from ..output import written
-from ..simulate import chosen_scene, scene_command
+from ..output import results_folder, written
+from ..simulate import chosen_scene
 from .point import PointSettings, scalars_by_name, starting_point
 
 if TYPE_CHECKING:
@@ -57,7 +57,8 @@ cannot be trusted. Without a model's file: the report's eight cases, stmuav esti
 _FINER = 4
 # Level of the intervals in which consistent filters stay.
 _LEVEL = 0.999
-_UNTRUSTED = 3
+# Exit code of a completed run with a filter that cannot be trusted.
+UNTRUSTED = 3
 
 
 class Record(NamedTuple):
@@ -76,11 +77,6 @@ class Record(NamedTuple):
     nis: np.ndarray
     degrees: np.ndarray
     ok: np.ndarray
-
-
-def estimate_class(words: Sequence[str]) -> type:
-    """The command for tyro, see `scene_command`."""
-    return scene_command("EstimateModel", EstimateSettings, ABOUT, words)
 
 
 def run_estimate_model(command: Any) -> int:
@@ -108,7 +104,7 @@ def run_estimate_model(command: Any) -> int:
         low, high = mean_interval(degrees, number, _LEVEL)
         fine = fine and bool(low < value < high)
         line(out, f"{what}: {value:.4g}, consistent within {low:.4g} and {high:.4g}.")
-    folder = settings.out if settings.out is not None else Path("runs") / f"estimate_{scene.name}"
+    folder = results_folder(settings.out, f"estimate_{scene.name}")
     content = io.BytesIO()
     names = np.array([f"{name} [{unit}]" for name, unit in space.names])
     np.savez(content, states=names, **found._asdict())
@@ -117,7 +113,7 @@ def run_estimate_model(command: Any) -> int:
     if lost:
         line(out, f"{lost} filters lost their covariance.")
         return 1
-    return 0 if fine else _UNTRUSTED
+    return 0 if fine else UNTRUSTED
 
 
 def _chosen(scene: "Scene", names: Sequence[str]) -> list[Any]:
