@@ -1,17 +1,16 @@
 """Command `stmuav estimate`: the report's eight cases of estimation, and the hover."""
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from rich.console import Console
 from rich.table import Table
 
-from .models.estimation import EstimateSettings, estimate_class, run_estimate_model
+from .models.estimation import ABOUT, UNTRUSTED, EstimateSettings, run_estimate_model
 from .options import END, Cache, Figures, Number, Seed, count, default, shared
-from .output import written
-from .simulate import named_scene
+from .output import results_folder, written
+from .simulate import command_or_scene
 
 
 @dataclasses.dataclass
@@ -46,15 +45,7 @@ class Estimate:
     cache: Cache = True
 
 
-# Exit code of a completed run with a filter that cannot be trusted.
-UNTRUSTED = 3
-
-
-def estimate_options(words: Sequence[str]) -> type:
-    """Command on the model's file that the words name; without one, on the report's cases."""
-    if named_scene(EstimateSettings, words) is None:
-        return Estimate
-    return estimate_class(words)
+estimate_options = command_or_scene(Estimate, "EstimateModel", EstimateSettings, ABOUT)
 
 
 def run_estimate(command: Any) -> int:
@@ -149,7 +140,7 @@ def _hover(
         )
         for name in names
     }  # fmt: skip
-    folder = command.out if command.out is not None else Path("runs") / "hover"
+    folder = results_folder(command.out, "hover")
     paths = [save_labelled(labelled_hover(flights), folder / "hover.nc")]
     if command.figures != "none":
         paths += save_figures({"hover": hover}, folder, command.figures, flights)

@@ -14,19 +14,22 @@ from rich.table import Table
 from ..checks.errors import ModelError, SettingError
 from ..figures.terminal import line, row, table
 from .models.steady import (
+    LINEAR,
+    TRIM,
+    FlightSettings,
     LinearSettings,
     StepEnd,
     TrimSettings,
-    linear_class,
-    linear_figures,
-    modes_table,
+    flight_of,
+    measures_of,
+    print_linear,
     run_linearize_scene,
     run_trim_scene,
-    trim_class,
+    write_trim,
 )
-from .options import ANGLE, FORCE, SPEED, TURN, Cache, Figures, Number, default, shared
-from .output import written
-from .simulate import named_scene
+from .options import ANGLE, FORCE, Cache, Figures, Number, default, shared
+from .output import results_folder
+from .simulate import command_or_scene
 
 if TYPE_CHECKING:
     from ..parameters.table import Parameters
@@ -35,7 +38,7 @@ _ROTOR = Number("speed of the rotors", "rad/s", 0.0, 1e5)
 
 
 @dataclasses.dataclass
-class SteadyFlight:
+class SteadyFlight(FlightSettings):
     """A steady flight of the UAV with its tracker."""
 
     phi: Annotated[float | None, ANGLE, default("the initial one")] = None
@@ -45,11 +48,6 @@ class SteadyFlight:
     sun: Annotated[
         tuple[float, float] | None, ANGLE, shared("sun"), default("panel at --phi and --theta")
     ] = None
-    climb: Annotated[float, SPEED, shared("climb")] = 0.0
-    speed: Annotated[float, SPEED, shared("speed")] = 0.0
-    course: Annotated[float, ANGLE, shared("course")] = 0.0
-    turn: Annotated[float, TURN, shared("turn")] = 0.0
-    yaw: Annotated[float, ANGLE, shared("yaw")] = 0.0
 
 
 # Its options stand beside the command's own, without a prefix.
@@ -96,18 +94,8 @@ class Linearize:
     cache: Cache = True
 
 
-def trim_options(words: Sequence[str]) -> type:
-    """Command on the scene or model's file that the words name; without one, on the UAV's flight."""
-    if named_scene(TrimSettings, words) is None:
-        return TrimCommand
-    return trim_class(words)
-
-
-def linear_options(words: Sequence[str]) -> type:
-    """Command on the scene or model's file that the words name; without one, on the UAV's flight."""
-    if named_scene(LinearSettings, words) is None:
-        return Linearize
-    return linear_class(words)
+trim_options = command_or_scene(TrimCommand, "TrimScene", TrimSettings, TRIM)
+linear_options = command_or_scene(Linearize, "LinearizeScene", LinearSettings, LINEAR)
 
 
 def table_of(params: Path | None) -> "Parameters":
@@ -120,14 +108,10 @@ def table_of(params: Path | None) -> "Parameters":
 
 def wanted_of(given: SteadyFlight, values: "Parameters") -> Any:
     """The flight condition that the options describe."""
-    from ..checks.numbers import floats
-    from ..flight.flight_trim import climb, cruise, steady_turn
     from ..tracker.geometry import initial_angles
 
     if given.sun is not None and (given.phi is not None or given.theta is not None):
         raise SettingError("Give --sun or --phi and --theta, not both.")
-    yaw, course = math.radians(given.yaw), math.radians(given.course)
-    angles, sun = None, None
     if given.sun is not None:
         if given.turn:
             raise SettingError(
@@ -137,17 +121,11 @@ def wanted_of(given: SteadyFlight, values: "Parameters") -> Any:
         azimuth, height = (math.radians(x) for x in given.sun)
         level = math.cos(height)
         sun = [level * math.sin(azimuth), level * math.cos(azimuth), math.sin(height)]
-    else:
-        first = np.asarray(initial_angles(values))
-        own = (given.phi, given.theta)
-        angles = [a if x is None else math.radians(x) for a, x in zip(first, own, strict=True)]
-    if given.turn:
-        assert angles is not None
-        wanted = steady_turn(given.speed, math.radians(given.turn), angles, course, yaw)
-    else:
-        wanted = cruise(given.speed, course, angles, yaw, sun=sun)
-    up = climb(given.climb, angles, yaw, sun=sun)
-    return wanted._replace(v=floats(np.asarray(wanted.v) + np.asarray(up.v)))
+        return flight_of(given, sun=sun)
+    first = np.asarray(initial_angles(values))
+    own = (given.phi, given.theta)
+    angles = [a if x is None else math.radians(x) for a, x in zip(first, own, strict=True)]
+    return flight_of(given, angles)
 
 
 def _limits(command: TrimCommand) -> Any:
@@ -183,10 +161,6 @@ def run_trim(command: Any) -> int:
     """Find the trim, print it and write trim.json; return the exit code."""
     if not isinstance(command, TrimCommand):
         return run_trim_scene(command)
-    import json
-
-    from ..files.netcdf import versions, write_atomically
-
     given = table_of(command.params)
     found, slopes = _solved(command, given, _limits(command))
     unknowns, labels = np.asarray(found.vector), found.names
@@ -203,16 +177,12 @@ def run_trim(command: Any) -> int:
         "values": {name: float(v) for (name, _), v in zip(labels, unknowns, strict=True)},
         "units": dict(labels),
         "panel_angles_deg": degrees,
-        "residual": float(found.residual),
-        "conditioning": float(found.conditioning),
-        "versions": versions(),
     }
     if slopes:
         content["sensitivities"] = {k: v.tolist() for k, v in slopes.items()}
         for name, slope in slopes.items():
             out.print(_slope_table(name, given, slope, labels))
-    folder = command.out if command.out is not None else Path("runs") / "trim"
-    written(out, [write_atomically(folder / "trim.json", json.dumps(content, indent=2).encode())])
+    write_trim(out, found, content, results_folder(command.out, "trim"))
     return 0
 
 
@@ -243,7 +213,6 @@ def run_linearize(command: Any) -> int:
     if not isinstance(command, Linearize):
         return run_linearize_scene(command)
     from ..checks.numbers import floats
-    from ..figures.tuning import save_linear
     from ..flight.flight_trim import trim_flight
     from ..flight.linear import linearize
     from ..scenes.uav_tracker import uav_flyer
@@ -258,16 +227,8 @@ def run_linearize(command: Any) -> int:
     outputs = list(command.outputs) or None
     values = floats(np.concatenate([np.asarray(x) for x in found.inputs]))
     linear = linearize(flyer, found.coordinates, values=values, outputs=outputs)
-    out = Console()
-    out.print(modes_table(linear.modes()))
-    line(
-        out,
-        "The other modes are those of a free rigid body, at zero. Least measure of "
-        f"controllability {np.min(linear.controllability()):.2g}, of observability "
-        f"{np.min(linear.observability()):.2g}.",
-    )
-    folder = command.out if command.out is not None else Path("runs") / "linearize"
-    paths = [save_linear(linear, folder / "linear.npz")]
+    words = f"The other modes are those of a free rigid body, at zero. {measures_of(linear)}"
     title = "UAV with its tracker, in steady flight"
-    written(out, paths + linear_figures(linear, title, folder, command.figures, command.t1))
+    folder = results_folder(command.out, "linearize")
+    print_linear(linear, [words], folder, title, command.figures, command.t1)
     return 0

@@ -10,7 +10,7 @@ from rich.console import Console
 from ..checks.errors import SettingError, SimulationError
 from ..figures.terminal import line, row, table
 from .options import END, Cache, Figures, Resume, default, shared
-from .output import written
+from .output import results_folder, written
 
 if TYPE_CHECKING:
     from ..missions.flight import MissionFlight
@@ -59,7 +59,7 @@ def run_fly(command: Fly) -> int:
     from ..missions.outcome import labelled_flight, verdict
 
     mission = load_mission(command.mission, t1=command.t1, true_states=command.true_states)
-    folder = command.out if command.out is not None else Path("runs") / mission.file.name
+    folder = results_folder(command.out, mission.file.name)
     flight = _flown(command, mission, folder / UNFINISHED)
     arrays = labelled_flight(flight)
     data, paths = arrays.dataset(), [save_sealed(arrays, folder / "flight.nc")]

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from ..checks.errors import SettingError
 from .options import SEED, Cache, Figures, Resume, count, default, shared
-from .output import written
+from .output import results_folder, written
 
 if TYPE_CHECKING:
     from ..jobs.progress import Outcome
@@ -135,7 +135,7 @@ def run_montecarlo(command: Montecarlo) -> int:
     with stoppable():
         work, plain = _work(command)
         total = plain.get("samples", 1024) if command.samples is None else command.samples
-        folder = command.out if command.out is not None else Path("runs") / str(plain["name"])
+        folder = results_folder(command.out, str(plain["name"]))
         chunk = plain.get("chunk") if command.chunk is None else command.chunk
         outcome = _carried_out(command, work, folder / "study.zarr", total, chunk)
     out = Console()

@@ -17,6 +17,11 @@ from ..figures.terminal import line
 _LONGEST = 2000
 
 
+def results_folder(given: Path | None, name: str) -> Path:
+    """Folder for the results: the given one, else runs/NAME."""
+    return Path("runs") / name if given is None else given
+
+
 def written(out: Console, paths: Iterable[Path]) -> None:
     """Print the paths of the written files."""
     line(out, "Written:")

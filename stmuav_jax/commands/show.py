@@ -11,7 +11,7 @@ from rich.table import Table
 from ..figures.terminal import row, table
 from .check import CheckSettings
 from .options import default, shared
-from .output import written
+from .output import results_folder, written
 from .simulate import chosen_scene, scene_command
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def run_show(command: Any) -> int:
     from ..viewer.sketch import draw
 
     scene, settings = chosen_scene(command), command.settings
-    folder = settings.out if settings.out is not None else Path("runs") / scene.name
+    folder = results_folder(settings.out, scene.name)
     paths = save_figures({"mechanism": draw(scene)}, folder, settings.figures)
     out = Console()
     out.print(_joints_table(scene))

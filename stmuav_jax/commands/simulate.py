@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
@@ -27,7 +27,7 @@ from ..figures.numbers import numbers_of
 from ..figures.terminal import line
 from ..scenes.registry import SCENES
 from .options import END, TOLERANCE, Cache, Figures, Number, count, default, shared
-from .output import written
+from .output import results_folder, written
 from .scene_options import check_known, options_class, plain_of, scene_among
 
 if TYPE_CHECKING:
@@ -150,6 +150,23 @@ def scene_command(
     return dataclasses.make_dataclass(name, fields, namespace={"__doc__": about, "cache": cache})
 
 
+def command_or_scene(
+    own: type, name: str, settings: type, about: str, before: Sequence[Any] = ()
+) -> Callable[[Sequence[str]], type]:
+    """Function of the words after a command: its own class, or a `scene_command` if they name a scene.
+
+    Args:
+        own: dataclass of the command without a scene or model's file; the others as in `scene_command`.
+    """
+
+    def options(words: Sequence[str]) -> type:
+        if named_scene(settings, words) is None:
+            return own
+        return scene_command(name, settings, about, words, before)
+
+    return options
+
+
 def chosen_scene(command: Any) -> "Scene":
     """Scene of a `scene_command`, with its case, parameters and options, or of a model's file."""
     return _loaded(command) if command.scene not in SCENES else _registered(command)
@@ -269,7 +286,7 @@ def write_results(run: "Run", settings: Settings, drawer: Drawer) -> list[Path]:
     """Write results, certificate and figures; their paths."""
     from ..files.netcdf import save, save_certificate, write_atomically
 
-    folder = settings.out if settings.out is not None else Path("runs") / run.scene.name
+    folder = results_folder(settings.out, run.scene.name)
     if settings.figures != "none":
         drawer.ask(numbers_of(run), settings.figures)
     paths = [save(run, folder / "run.nc"), save_certificate(run, folder / "certificate.json")]

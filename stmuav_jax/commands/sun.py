@@ -10,7 +10,7 @@ from rich.console import Console
 from ..checks.errors import SettingError
 from ..figures.terminal import line
 from .options import ANGLE, Cache, Figures, Number, default, shared
-from .output import written
+from .output import results_folder, written
 
 
 @dataclasses.dataclass
@@ -90,7 +90,7 @@ def run_sun(command: SunDay) -> int:
         chosen = f"Heading chosen for the most energy: --yaw {math.degrees(yaw):g}."
         R_wb = turn(yaw)
     day = track_day(place, day_of, zone, R_wb, step=command.step, flaws=flaws, **settings)
-    folder = command.out if command.out is not None else Path("runs") / f"sun_{command.date}"
+    folder = results_folder(command.out, f"sun_{command.date}")
     paths = [save_labelled(labelled_day(day), folder / "day.nc")]
     if command.figures != "none":
         paths += save_figures(DAY_FIGURES, folder, command.figures, day)

@@ -2,23 +2,21 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from ..checks.errors import SettingError
-from ..figures.terminal import line, row, table
+from ..figures.terminal import row, table
 from .flight import table_of
-from .models.tuning import TuneSettings, run_tune_scene, tune_class
+from .models.searching import HOLDS, What, converged, ended, loss_figures, watched
+from .models.tuning import ABOUT, WHAT, TuneSettings, run_tune_scene
 from .options import ANGLE, END, FORCE, Cache, Figures, Number, Resume, Seed, count, default, shared
-from .output import written
-from .simulate import named_scene
+from .output import results_folder
+from .simulate import command_or_scene
 
 if TYPE_CHECKING:
     from ..algebra.least_squares import Search
@@ -30,8 +28,6 @@ SEGMENTS = "hold: one in 0.05 s, slew: one in 0.2 s"
 # Times over which departures count, and of the turn [s], and longest segments of both [s]. From
 # rest an untuned UAV falls far within 0.2 s: with segments so long the search does not converge.
 _TIMES = {"hold": 0.4, "slew": 1.0}
-# Loss below which inputs count as holding: departures of a millimetre or a milliradian.
-_HOLDS = 1e-6
 _LONGEST = {"hold": 0.05, "slew": 0.2}
 
 
@@ -45,7 +41,7 @@ class Tune:
     does not converge ends with exit code 1.
     """
 
-    what: Annotated[tyro.conf.Positional[Literal["hold", "slew", "identify"]], shared("what")]
+    what: Annotated[tyro.conf.Positional[What], shared("what")]
     to: Annotated[tuple[float, float], ANGLE] = (8.0, 0.0)
     """slew: panel angles at the end [degrees]; at the start they are the initial ones."""
     t1: Annotated[float | None, END, shared("duration"), default("hold 0.4, slew 1")] = None
@@ -66,73 +62,29 @@ class Tune:
     cache: Cache = True
 
 
-class _Watch:
-    """Display of progress on stderr, with a checkpoint after every step."""
-
-    def __init__(self, problem: str, path: Path, steps: int) -> None:
-        columns = (TextColumn("{task.description}"), TimeElapsedColumn())
-        self.bar = Progress(*columns, console=Console(stderr=True), transient=True)
-        self.task = self.bar.add_task("compiling")
-        self.problem, self.path, self.steps = problem, path, steps
-
-    def __call__(self, now: "Search") -> None:
-        from ..figures.tuning import save_search
-
-        words = f"step {now.steps} of {self.steps}: loss {now.history[-1]:.4g}, best {now.loss:.4g}"
-        self.bar.update(self.task, description=words)
-        save_search(now, self.problem, self.path)
-
-
-def _watched(command: Any, folder: Path, problem: str, start: Any, run: Any) -> Any:
-    """Call run(steps=, report=, resume=) with progress, checkpoints and the search to resume."""
-    from ..figures.tuning import load_search
-
-    path = folder / "search.npz"
-    before = load_search(path, problem, start) if command.resume else None
-    watch = _Watch(problem, path, command.steps)
-    with watch.bar:
-        return run(steps=command.steps, report=watch, resume=before)
-
-
 def _search(command: Tune, folder: Path, tuning: "InputTuning") -> "Search":
-    run = lambda **watched: tuning.search(patience=15, **watched)
-    return _watched(command, folder, tuning.name, tuning.start, run)
+    run = lambda **options: tuning.search(patience=15, **options)
+    return watched(command, folder, tuning.name, tuning.start, run)
 
 
-def tune_options(words: Sequence[str]) -> type:
-    """Command on the scene or model's file that the words name; without one, on the UAV."""
-    if named_scene(TuneSettings, words) is None:
-        return Tune
-    return tune_class(words)
+tune_options = command_or_scene(Tune, "TuneScene", TuneSettings, ABOUT, WHAT)
 
 
 def run_tune(command: Any) -> int:
     """Run the command; return the exit code."""
     if not isinstance(command, Tune):
-        return run_tune_scene(command, _watched)
-    from ..algebra.least_squares import SearchReason
-
+        return run_tune_scene(command)
     given = table_of(command.params)
-    folder = command.out if command.out is not None else Path("runs") / f"tune_{command.what}"
+    folder = results_folder(command.out, f"tune_{command.what}")
     if command.what != "slew" and (command.force is not None or command.reaction is not None):
         raise SettingError("--force and --reaction are limits of a slew.")
     work = {"hold": _hold, "slew": _slew, "identify": _identify}[command.what]
     found, shown, paths, done = work(command, given, folder)
-    out = Console()
-    out.print(shown)
-    line(out, found.words())
-    written(out, [folder / "search.npz", *paths])
-    if found.reason is SearchReason.INTERRUPTED:
-        return 130
-    if done:
-        return 0
-    more = found.steps + 60
-    line(
-        Console(stderr=True),
-        f"stmuav: the search has not converged; what it has reached is in {folder}. Continue with "
-        f"--resume --steps {more}, or try other --segments.",
+    words = (
+        f"what it has reached is in {folder}. Continue with --resume --steps {found.steps + 60}, or "
+        "try other --segments."
     )
-    return 1
+    return ended(found, shown, folder, paths, done, words)
 
 
 def _time(command: Tune) -> float:
@@ -144,12 +96,6 @@ def _segments(command: Tune) -> int:
         return command.segments
     # the quotient may exceed a whole number by round-off, as 0.3 / 0.05
     return max(1, math.ceil(_time(command) / _LONGEST[command.what] - 1e-9))
-
-
-def _converged(found: "Search") -> bool:
-    from ..algebra.least_squares import SearchReason
-
-    return found.reason is SearchReason.CONVERGED
 
 
 def titled(title: str, found: "Search", done: bool) -> str:
@@ -179,7 +125,7 @@ def _hold(
     tuning = hold(flyer, angles, untuned, horizon=_time(command), segments=_segments(command))
     found = _search(command, folder, tuning)
     # a search may come to rest where nothing holds
-    done = _converged(found) and found.loss < _HOLDS
+    done = converged(found) and found.loss < HOLDS
     values = np.asarray(tuning.inputs(found.values))
     inputs = RotorsAndForces(*(floats(part) for part in rotors_and_forces(values)))
     start = at_rest(angles)
@@ -193,7 +139,7 @@ def _hold(
         pair = (untuned.forces[k], inputs.forces[k])
         row(shown, f"actuator {k + 2} [N]", *(f"{float(x):.6f}" for x in pair))
     row(shown, "within 5 degrees until [s]", *(f"{t:.3f}" for t in times))
-    return found, shown, _figures(command, folder, found, {}), done
+    return found, shown, loss_figures(found, folder, command.figures), done
 
 
 def _speed(squared: float) -> str:
@@ -220,7 +166,7 @@ def _slew(
         knots=command.knots, segments=_segments(command),
     )  # fmt: skip
     found = _search(command, folder, tuning)
-    done = _converged(found)
+    done = converged(found)
     shown = table(
         "", "straight inputs", "tuned", "limit", title=titled("Turn of the panel", found, done)
     )
@@ -240,7 +186,8 @@ def _slew(
         row(shown, label, *(of(p) for p in each), limit)
     ts, curves = flown(tuning, found.values)
     marks = {"actuators [N]": [-command.force, command.force]} if command.force else {}
-    figures = _figures(command, folder, found, {"flight": flight_figure(ts, curves, marks)})
+    more = {"flight": flight_figure(ts, curves, marks)}
+    figures = loss_figures(found, folder, command.figures, more)
     return found, shown, figures, done
 
 
@@ -258,16 +205,16 @@ def _identify(
 
     make = lambda table: uav_flyer(table, friction=Friction())
     case = experiment(make, given, seed=command.seed)
-    run = lambda **watched: identify(
+    run = lambda **options: identify(
         case.predict, case.record, case.sigma, case.start, case.sizes,
-        labels=case.labels, min_singular_value=0.5, **watched,
+        labels=case.labels, min_singular_value=0.5, **options,
     )  # fmt: skip
-    found = _watched(command, folder, f"identify {case.name}", jnp.zeros(len(case.truth)), run)
+    found = watched(command, folder, f"identify {case.name}", jnp.zeros(len(case.truth)), run)
     # at the level of the noise a search may stop improving without convergence
     freedom = case.record.size - len(case.truth)
     stopped = found.search.reason is SearchReason.PATIENCE
     noise = stopped and found.reduced_chi_square * freedom <= chi2.ppf(0.999, freedom)
-    done = _converged(found.search) or bool(noise)
+    done = converged(found.search) or bool(noise)
     shown = table(
         "parameter", "true", "start", "found", "deviation",
         title=titled("Identified parameters", found.search, done),
@@ -275,14 +222,4 @@ def _identify(
     for k, label in enumerate(case.labels):
         numbers = (case.truth[k], case.start[k], found.values[k], found.standard_deviations[k])
         row(shown, label, *(f"{x:.5g}" for x in numbers))
-    return found.search, shown, _figures(command, folder, found.search, {}), done
-
-
-def _figures(command: Tune, folder: Path, found: "Search", more: dict[str, Any]) -> list[Path]:
-    from ..figures.plot import save_figures
-    from ..figures.tuning import loss_history
-
-    if command.figures == "none":
-        return []
-    figures = {"loss": loss_history(found.history), **more}
-    return save_figures(figures, folder, command.figures)
+    return found.search, shown, loss_figures(found.search, folder, command.figures), done

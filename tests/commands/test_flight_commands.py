@@ -5,7 +5,7 @@ import io
 import numpy as np
 from rich.console import Console
 
-from stmuav_jax.commands.flight import modes_table
+from stmuav_jax.commands.models.steady import modes_table
 from stmuav_jax.flight.linear import Mode
 
 

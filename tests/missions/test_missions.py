@@ -6,6 +6,7 @@ import json
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -78,7 +79,8 @@ def plain(**changes):
 
 def chunks():
     """Keys of the programs that fly a chunk."""
-    return {key for key in compiler._programs if key[0] is _chunk}
+    keys: list[Any] = list(compiler._programs)
+    return {key for key in keys if key[0] is _chunk}
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from rich.console import Console
 from ...checks.errors import SettingError, named_places
 from ...figures.terminal import line, row, table
 from ..options import Number, Seed, count, default, shared
-from ..output import written
-from ..simulate import chosen_scene, scene_command
+from ..output import results_folder, written
+from ..simulate import chosen_scene
 from .point import PointSettings, scalars_by_name, starting_point
 
 if TYPE_CHECKING:
@@ -54,7 +54,8 @@ cannot be trusted. Without a model's file: the report's eight cases, stmuav esti
 """
 # Substeps of the truth in a step of the filter.
 _FINER = 4
-_UNTRUSTED = 3
+# Exit code of a completed run with a filter that cannot be trusted.
+UNTRUSTED = 3
 
 
 class Record(NamedTuple):
@@ -75,11 +76,6 @@ class Record(NamedTuple):
     degrees: np.ndarray
     ok: np.ndarray
     innovation: np.ndarray
-
-
-def estimate_class(words: Sequence[str]) -> type:
-    """The command for tyro, see `scene_command`."""
-    return scene_command("EstimateModel", EstimateSettings, ABOUT, words)
 
 
 def run_estimate_model(command: Any) -> int:
@@ -103,7 +99,7 @@ def run_estimate_model(command: Any) -> int:
     for one in end_consistency(found.nees, space.size, found.nis, found.degrees):
         fine = fine and one.holds
         line(out, one.words)
-    folder = settings.out if settings.out is not None else Path("runs") / f"estimate_{scene.name}"
+    folder = results_folder(settings.out, f"estimate_{scene.name}")
     content = record_content(
         scene.title or scene.name, space.names, found._asdict(), _about(command)
     )
@@ -112,7 +108,7 @@ def run_estimate_model(command: Any) -> int:
     if lost:
         line(out, f"{lost} filters lost their covariance.")
         return 1
-    return 0 if fine else _UNTRUSTED
+    return 0 if fine else UNTRUSTED
 
 
 def _about(command: Any) -> dict[str, Any]:

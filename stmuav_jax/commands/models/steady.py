@@ -14,13 +14,16 @@ from rich.table import Table
 from ...checks.errors import SettingError
 from ...figures.terminal import line, row, table
 from ..options import ANGLE, END, SPEED, TURN, Figures, default, shared
-from ..output import written
-from ..simulate import chosen_scene, scene_command
+from ..output import results_folder, written
+from ..simulate import chosen_scene
 from .point import PointSettings, inputs_named, scalars_by_name, starting_point
 
 if TYPE_CHECKING:
     from ...dynamics.statespace.tree import TreeSpace
     from ...flight.equilibrium import Trim
+    from ...flight.flight_trim import FlightTrim
+    from ...flight.linear import Linear
+    from ...flight.steady import FlightCondition
 
 
 # End of the step responses.
@@ -30,7 +33,18 @@ _OUTPUTS = 6
 
 
 @dataclasses.dataclass
-class SteadySettings(PointSettings):
+class FlightSettings:
+    """Options of a steady flight."""
+
+    climb: Annotated[float, SPEED, shared("climb")] = 0.0
+    speed: Annotated[float, SPEED, shared("speed")] = 0.0
+    course: Annotated[float, ANGLE, shared("course")] = 0.0
+    turn: Annotated[float, TURN, shared("turn")] = 0.0
+    yaw: Annotated[float, ANGLE, shared("yaw")] = 0.0
+
+
+@dataclasses.dataclass
+class SteadySettings(FlightSettings, PointSettings):
     """Options of a steady motion of any mechanism."""
 
     inputs: Annotated[tuple[str, ...], shared("inputs"), default("all")] = ()
@@ -38,11 +52,6 @@ class SteadySettings(PointSettings):
     """States that may differ from the start, such as hinge.angle."""
     accelerations: Annotated[tuple[str, ...], default("zero")] = ()
     """Wanted rates of velocities, such as rail.displacement_rate=2 [m/s^2, rad/s^2]."""
-    climb: Annotated[float, SPEED, shared("climb")] = 0.0
-    speed: Annotated[float, SPEED, shared("speed")] = 0.0
-    course: Annotated[float, ANGLE, shared("course")] = 0.0
-    turn: Annotated[float, TURN, shared("turn")] = 0.0
-    yaw: Annotated[float, ANGLE, shared("yaw")] = 0.0
 
 
 @dataclasses.dataclass
@@ -79,14 +88,18 @@ command linearises the flight of the UAV with its tracker: stmuav linearize --he
 """
 
 
-def trim_class(words: Sequence[str]) -> type:
-    """The command for tyro, see `scene_command`."""
-    return scene_command("TrimScene", TrimSettings, TRIM, words)
+def flight_of(given: FlightSettings, angles: Any = None, sun: Any = None) -> "FlightCondition":
+    """Flight condition of the options, with the panel at angles (2,) [rad] or at the sun (3,)."""
+    from ...checks.numbers import floats
+    from ...flight.steady import climb, cruise, steady_turn
 
-
-def linear_class(words: Sequence[str]) -> type:
-    """The command for tyro, see `scene_command`."""
-    return scene_command("LinearizeScene", LinearSettings, LINEAR, words)
+    course, yaw = math.radians(given.course), math.radians(given.yaw)
+    if given.turn:
+        flight = steady_turn(given.speed, math.radians(given.turn), angles, course, yaw)
+    else:
+        flight = cruise(given.speed, course, angles, yaw, sun=sun)
+    up = climb(given.climb, angles, yaw, sun=sun)
+    return flight._replace(v=floats(np.asarray(flight.v) + np.asarray(up.v)))
 
 
 def trimmed(space: "TreeSpace", x: Any, settings: SteadySettings, t: float) -> "Trim":
@@ -98,7 +111,7 @@ def trimmed(space: "TreeSpace", x: Any, settings: SteadySettings, t: float) -> "
     """
     from ...dynamics.tree.topology import spanning_tree
     from ...flight.equilibrium import trim
-    from ...flight.steady import climb, cruise, steady_turn, trim_condition
+    from ...flight.steady import trim_condition
 
     inputs = inputs_named(space, settings.inputs)
     if not len(inputs) and not settings.free:
@@ -117,13 +130,7 @@ def trimmed(space: "TreeSpace", x: Any, settings: SteadySettings, t: float) -> "
         )  # fmt: skip
     if settings.accelerations:
         raise SettingError("--accelerations are for mechanisms on the ground; others fly steadily.")
-    course, yaw = math.radians(settings.course), math.radians(settings.yaw)
-    if settings.turn:
-        flight = steady_turn(settings.speed, math.radians(settings.turn), None, course, yaw)
-    else:
-        flight = cruise(settings.speed, course, None, yaw)
-    flight = flight._replace(v=flight.v + climb(settings.climb).v)
-    return trim_condition(space, flight, at=x, free=settings.free, inputs=inputs)
+    return trim_condition(space, flight_of(settings), at=x, free=settings.free, inputs=inputs)
 
 
 def _wanted(space: "TreeSpace", settings: SteadySettings) -> np.ndarray:
@@ -163,10 +170,22 @@ def modes_table(modes: Sequence[Any]) -> Table:
     return shown
 
 
-def run_trim_scene(command: Any) -> int:
-    """Find the trim, print it and write trim.json; return the exit code."""
+def write_trim(
+    out: Console, found: "Trim | FlightTrim", content: dict[str, Any], folder: Path
+) -> None:
+    """Write trim.json: the content, with what all trims have, and the versions."""
     from ...files.netcdf import versions, write_atomically
 
+    content |= {
+        "residual": float(found.residual),
+        "conditioning": float(found.conditioning),
+        "versions": versions(),
+    }
+    written(out, [write_atomically(folder / "trim.json", json.dumps(content, indent=2).encode())])
+
+
+def run_trim_scene(command: Any) -> int:
+    """Find the trim, print it and write trim.json; return the exit code."""
     scene, settings = chosen_scene(command), command.settings
     space, x = starting_point(scene, settings)
     found = trimmed(space, x, settings, scene.t0)
@@ -184,45 +203,56 @@ def run_trim_scene(command: Any) -> int:
         "inputs": {name: v for (name, _), v in zip(found.inputs.names, values, strict=True)},
         "changes": {name: value for name, (value, _) in moved.items()},
         "units": dict(found.inputs.names) | {name: unit for name, (_, unit) in moved.items()},
-        "residual": float(found.residual),
-        "conditioning": float(found.conditioning),
-        "versions": versions(),
     }
-    folder = settings.out if settings.out is not None else Path("runs") / f"trim_{scene.name}"
-    written(out, [write_atomically(folder / "trim.json", json.dumps(content, indent=2).encode())])
+    write_trim(out, found, content, results_folder(settings.out, f"trim_{scene.name}"))
     return 0
 
 
 def run_linearize_scene(command: Any) -> int:
     """Linearise, print the modes and write linear.npz; return the exit code."""
-    from ...figures.tuning import save_linear
     from ...flight.linear import linearize
 
     scene, settings = chosen_scene(command), command.settings
     space, x = starting_point(scene, settings)
-    out, inputs, values = Console(), inputs_named(space, settings.inputs), None
+    inputs, values = inputs_named(space, settings.inputs), None
     if settings.about == "trim":
         found = trimmed(space, x, settings, scene.t0)
         x, inputs, values = found.point, found.inputs, found.values
     outputs = list(settings.outputs) or None
     linear = linearize(space, x, inputs, values, outputs=outputs, t=scene.t0)
-    out.print(modes_table(linear.modes()))
     states = ", ".join(f"{name} [{unit}]" for name, unit in linear.states)
-    line(out, f"States: {states}.")
-    line(out, _measures(linear))
+    words = [f"States: {states}.", measures_of(linear)]
     if settings.about == "start":
-        line(out, "About the start: departures from the motion that begins there.")
-    folder = settings.out if settings.out is not None else Path("runs") / f"linearize_{scene.name}"
-    paths = [save_linear(linear, folder / "linear.npz")]
+        words.append("About the start: departures from the motion that begins there.")
+    folder = results_folder(settings.out, f"linearize_{scene.name}")
     title = scene.title or scene.name
-    written(out, paths + linear_figures(linear, title, folder, settings.figures, settings.t1))
+    print_linear(linear, words, folder, title, settings.figures, settings.t1)
     return 0
 
 
-def linear_figures(
-    linear: Any, title: str, folder: Path, figures: str, duration: float | None
+def print_linear(
+    linear: "Linear",
+    words: Sequence[str],
+    folder: Path,
+    title: str,
+    figures: str,
+    duration: float | None,
+) -> None:
+    """Print the modes of a linear system and sentences about it; write linear.npz and its figures."""
+    from ...figures.tuning import save_linear
+
+    out = Console()
+    out.print(modes_table(linear.modes()))
+    for sentence in words:
+        line(out, sentence)
+    paths = [save_linear(linear, folder / "linear.npz")]
+    written(out, paths + _linear_figures(linear, title, folder, figures, duration))
+
+
+def _linear_figures(
+    linear: "Linear", title: str, folder: Path, figures: str, duration: float | None
 ) -> list[Path]:
-    """Write the pole map and the step responses of a linear model; return their paths."""
+    """Write the pole map and the step responses of a linear system; return their paths."""
     if figures == "none":
         return []
     # matplotlib is slow to import: only where figures are drawn
@@ -238,7 +268,7 @@ def linear_figures(
     return save_figures(drawn, folder, figures)
 
 
-def _measures(linear: Any) -> str:
+def measures_of(linear: "Linear") -> str:
     """Sentence on the modes that inputs move and outputs show."""
     seen = f"of observability {np.min(linear.observability()):.2g}"
     if not linear.B.shape[1]:

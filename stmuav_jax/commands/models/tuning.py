@@ -3,18 +3,18 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
-from rich.console import Console
 
 from ...checks.errors import SettingError
-from ...figures.terminal import line, row, table
+from ...figures.terminal import row, table
 from ..options import END, Figures, Number, Resume, count, default, shared
-from ..output import written
-from ..simulate import chosen_scene, scene_command
+from ..output import results_folder
+from ..simulate import chosen_scene
 from .point import PointSettings, inputs_named, scalars_by_name, starting_point
+from .searching import HOLDS, What, converged, ended, loss_figures, watched
 
 if TYPE_CHECKING:
     from ...algebra.least_squares import Search
@@ -51,52 +51,21 @@ Examples: stmuav tune slew model.toml --to rail.displacement=0.5 --t1 1.5; stmua
 --record flight.csv --parameters mass=0.3 --sigma A.angle=0.001. hold finds constant inputs that keep the start.
 Without a scene or a model's file the command tunes the UAV with its tracker: stmuav tune --help.
 """
-What = Literal["hold", "slew", "identify"]
-# Loss below which inputs count as holding: departures of a millimetre or a milliradian.
-_HOLDS = 1e-6
+# Fields of the command in front of the scene.
+WHAT = [("what", Annotated[tyro.conf.Positional[What], shared("what")])]
 # Weight of a departure or of an end that is missed.
 _WEIGHT = 10.0
 
 
-def tune_class(words: Sequence[str]) -> type:
-    """The command for tyro, see `scene_command`."""
-    before = [("what", Annotated[tyro.conf.Positional[What], shared("what")])]
-    return scene_command("TuneScene", TuneSettings, ABOUT, words, before)
-
-
-def run_tune_scene(command: Any, watched: Any) -> int:
-    """Run the command; return the exit code.
-
-    Args:
-        watched: function (command, folder, problem, start, run) -> search, with progress and checkpoints.
-    """
-    from ...algebra.least_squares import SearchReason
-
+def run_tune_scene(command: Any) -> int:
+    """Run the command; return the exit code."""
     scene, settings = chosen_scene(command), command.settings
-    folder = settings.out
-    if folder is None:
-        folder = Path("runs") / f"tune_{command.what}_{scene.name}"
+    folder = results_folder(settings.out, f"tune_{command.what}_{scene.name}")
     _check(command.what, settings)
     work = _identified if command.what == "identify" else _tuned
-    found, shown, done = work(command, scene, folder, watched)
-    out = Console()
-    out.print(shown)
-    line(out, found.words())
-    paths = [folder / "search.npz"]
-    if settings.figures != "none":
-        from ...figures.plot import save_figures
-        from ...figures.tuning import loss_history
-
-        paths += save_figures({"loss": loss_history(found.history)}, folder, settings.figures)
-    written(out, paths)
-    if found.reason is SearchReason.INTERRUPTED:
-        return 130
-    if not done:
-        line(
-            Console(stderr=True),
-            f"stmuav: the search has not converged; {folder} has what it reached.",
-        )
-    return 0 if done else 1
+    found, shown, done = work(command, scene, folder)
+    figures = loss_figures(found, folder, settings.figures)
+    return ended(found, shown, folder, figures, done, f"{folder} has what it reached.")
 
 
 def _check(what: str, settings: TuneSettings) -> None:
@@ -109,8 +78,7 @@ def _check(what: str, settings: TuneSettings) -> None:
             raise SettingError(f"tune {what} needs --{name}.")
 
 
-def _tuned(command: Any, scene: "Scene", folder: Path, watched: Any) -> tuple["Search", Any, bool]:
-    from ...algebra.least_squares import SearchReason
+def _tuned(command: Any, scene: "Scene", folder: Path) -> tuple["Search", Any, bool]:
     from ...checks.numbers import floats
     from ...dynamics.statespace.base import places_of
     from ...flight.tuning import departures, end_at, tune_inputs
@@ -133,7 +101,7 @@ def _tuned(command: Any, scene: "Scene", folder: Path, watched: Any) -> tuple["S
     )  # fmt: skip
     run = lambda **options: tuning.search(patience=15, **options)
     found = watched(settings, folder, tuning.name, tuning.start, run)
-    done = found.reason is SearchReason.CONVERGED and (slews or found.loss < _HOLDS)
+    done = converged(found) and (slews or found.loss < HOLDS)
     every = np.asarray(tuning.motion(found.values).inputs)
     shown = table("input", "at the start", "at the end", "smallest", "largest", "unit")
     for k, (name, unit) in enumerate(inputs.names):
@@ -165,12 +133,9 @@ def _limits(inputs: Any, given: dict[str, float]) -> list[Any]:
     return found
 
 
-def _identified(
-    command: Any, scene: "Scene", folder: Path, watched: Any
-) -> tuple["Search", Any, bool]:
+def _identified(command: Any, scene: "Scene", folder: Path) -> tuple["Search", Any, bool]:
     import jax.numpy as jnp
 
-    from ...algebra.least_squares import SearchReason
     from ...files.model_file import read_model
     from ...flight.identification import Unknown, from_table, identify, motion_model
     from ...mechanics.inputs import inputs_of
@@ -209,7 +174,7 @@ def _identified(
         numbers = (start[name], found.values[k], found.standard_deviations[k])
         row(shown, name, *(f"{value:.6g}" for value in numbers), model.table[name].unit)
     shown.caption = f"chi-squared per degree of freedom {found.reduced_chi_square:.3g}"
-    return found.search, shown, found.search.reason is SearchReason.CONVERGED
+    return found.search, shown, converged(found.search)
 
 
 def read_record(
