@@ -30,6 +30,10 @@ from .design.schedule import (
     ScheduledFeedback as ScheduledFeedback,
     schedule_regulator as schedule_regulator,
 )
+from .design.shape import (
+    Slew as Slew,
+    within as within,
+)
 from .estimator import (
     Belief as Belief,
     EstimatorMemory as EstimatorMemory,

@@ -198,7 +198,8 @@ def _moves(given: MissionFile, machine: Machine) -> PanelMoves:
         tuple(jnp.asarray(getattr(move, name)) for move in given.panel)
         for name in ("at", "duration")
     )
-    return PanelMoves(start, targets, ats, durations, world)
+    shapes = tuple(jnp.asarray(move.shape, dtype=float) for move in given.panel)
+    return PanelMoves(start, targets, ats, durations, world, shapes)
 
 
 def _target(move: MoveEntry, t1: float) -> Any:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from ..algebra.rotation import rotation_matrix
 from ..algebra.sampled import Sampled, piecewise
 from ..checks.errors import SettingError
+from ..control.design.shape import rise
 from ..control.geometric import Waypoint, along, at_point
 from ..mechanics.state import State
 from ..tracker.kinematics import PairMotion, panel_angles
@@ -94,6 +95,8 @@ class PanelMoves(eqx.Module):
         targets: constant or function of t [s] for each move.
         ats, durations: beginnings and durations of the moves [s].
         world: true for directions of the world.
+        shapes: coefficients of the shape of each move (k,), see `stmuav_jax.control.Slew`; empty where
+            all are quintics.
     """
 
     start: Float[Array, " n"]
@@ -101,15 +104,17 @@ class PanelMoves(eqx.Module):
     ats: tuple[Float[Array, ""], ...]
     durations: tuple[Float[Array, ""], ...]
     world: bool = eqx.field(static=True)
+    shapes: tuple[Float[Array, " _"], ...] = ()
 
     def value(self, t: Float[Array, ""]) -> Float[Array, " n"]:
         """Wanted angles [rad] or direction (n,) at a time [s]."""
-        found = self.start
-        for target, at, duration in zip(self.targets, self.ats, self.durations, strict=True):
+        found, shapes = self.start, self.shapes or (jnp.zeros(0),) * len(self.targets)
+        for target, at, duration, shape in zip(
+            self.targets, self.ats, self.durations, shapes, strict=True
+        ):
             s = jnp.clip((t - at) / duration, 0.0, 1.0)
-            rise = s**3 * (10 - 15 * s + 6 * s**2)
             goal = target(t) if callable(target) else target
-            found = found + rise * (goal - found)
+            found = found + rise(s, shape) * (goal - found)
         return found
 
     def __call__(self, t: Float[Array, ""]) -> PairMotion | DirectionMotion:

@@ -146,13 +146,15 @@ class SunEntry(Entries):
 
 class MoveEntry(Entries):
     """Entry for a move of the panel: to angles [degrees] in the base's axes, to a direction of the
-    world, or to the sun; begun at a time [s], done after a duration [s]."""
+    world, or to the sun; begun at a time [s], done after a duration [s]. Its shape has the coefficients
+    of `stmuav_jax.control.Slew`."""
 
     angles: PanelAngles | None = None
     direction: Triple | None = None
     sun: SunEntry | None = None
     at: NotNegative = 0.0
     duration: Positive = 1.0
+    shape: Annotated[tuple[Finite, ...], Tuples] = ()
 
 
 class ChangeEntry(Entries):

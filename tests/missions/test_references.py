@@ -56,6 +56,22 @@ def test_moves_follow_each_other_from_rest_to_rest():
         np.testing.assert_allclose([found.rate, found.acceleration], 0.0, atol=1e-12)
 
 
+def test_a_move_may_have_a_shape_of_its_own():
+    """That of a `Slew`, after a move by the quintic."""
+    start, middle, goal = jnp.array([0.05, 0.05]), jnp.array([0.2, -0.1]), jnp.array([0.0, 0.3])
+    ats, durations = (jnp.asarray(0.5), jnp.asarray(2.0)), (jnp.asarray(1.0), jnp.asarray(0.5))
+    shapes = (jnp.zeros(0), jnp.array([0.1, -0.4]))
+    moves = PanelMoves(start, (middle, goal), ats, durations, False, shapes)
+    slew = stm.control.Slew(middle, goal, 0.5, [0.1, -0.4], at=2.0)
+    for t in (1.9, 2.1, 2.3, 2.5):
+        for found, wanted in zip(moves(jnp.asarray(t)), slew(jnp.asarray(t)), strict=True):
+            np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-13)
+    t = jnp.asarray(0.9)
+    np.testing.assert_allclose(
+        moves(t).acceleration, stm.control.Slew(start, middle, 1.0, at=0.5)(t)[2], rtol=1e-12
+    )
+
+
 def test_a_panel_that_faces_a_moving_direction_from_a_turning_base():
     """Rates and accelerations against derivatives of the angles along the motion itself."""
     omega = jnp.array([0.3, -0.5, 0.7])

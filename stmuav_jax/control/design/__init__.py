@@ -1,1 +1,1 @@
-"""Design of controllers: margins of the inputs, gains by gradients, gains over a posture."""
+"""Design of controllers: margins of the inputs, gains and shapes of references by gradients, schedules."""
