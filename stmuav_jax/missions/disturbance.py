@@ -97,7 +97,8 @@ class MissionController(eqx.Module):
 
     def start(self) -> MissionMemory:
         """First memory."""
-        return MissionMemory(self.pilot.start(), jnp.full(2, jnp.inf))
+        # not weakly typed, as no later memory is: a flight's program is compiled for one type
+        return MissionMemory(self.pilot.start(), jnp.full(2, jnp.inf, float))
 
     def __call__(
         self, estimate: Any, reference: MissionReference, memory: MissionMemory
