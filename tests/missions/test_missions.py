@@ -352,8 +352,8 @@ def test_the_table_of_flights_is_that_of_its_script(data):
     assert cells[-1] == "kept"
     changed = table.with_rows(page, rows | {"gusts": own})
     assert table.rows_of(changed) == rows | {"gusts": own}
-    fallen = data.assign(position_error=100.0 * data.position_error)
-    assert table.row("gusts", fallen).endswith("| | | | | | it falls, not kept |\n")
+    fallen = data.assign(position_error=1000.0 * data.position_error)
+    assert table.row("gusts", fallen).endswith("| | | | | | it falls |\n")
     off = data.assign(position_error=2.0 * data.position_error / largest * 0.1)
     assert "| 20 cm, not kept |" in table.row("gusts", off)
 
