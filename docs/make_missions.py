@@ -37,12 +37,16 @@ HEAD = (
 )
 # Errors above this are those of a machine that falls [m].
 FALLS = 3.0
+# Errors below this are those of the arithmetic [m, degrees].
+ROUND_OFF = 1e-9
 
 
 def shown(measure: stm.missions.Measure) -> str:
     """Value of a measure with its unit, and whether its tolerance was not kept."""
     value, unit = measure.value, measure.unit
-    if unit == "m":
+    if unit in ("m", "degrees") and value < ROUND_OFF:
+        words = "round-off"
+    elif unit == "m":
         words = f"{100 * value:.2g} cm" if value < 1 else f"{value:.2g} m"
     elif unit == "degrees":
         words = f"{value:.2g} deg" if value < 100 else f"{value:.0f} deg"
@@ -61,7 +65,7 @@ def row(name: str, data: object) -> str:
         own = [one for one in found if one.name.startswith(begins)]
         cells.append(shown(own[0]) if own else "")
     falls = found[0].value > FALLS
-    judged = "kept" if kept else ", ".join(["it falls"] * falls + [ending or "not kept"])
+    judged = "kept" if kept else "it falls" if falls else ending or "not kept"
     cells = [] if falls else cells
     told = " | ".join(cells) if cells else "| | | |"
     return f"| `{name}` | {end:g} s | {told} | {judged} |\n"

@@ -108,6 +108,7 @@ class MissionController(eqx.Module):
 
     def start(self) -> MissionMemory:
         """First memory."""
+        # not weakly typed, as no later memory is: a flight's program is compiled for one type
         held = jnp.full(2, jnp.inf, dtype=float)
         return MissionMemory(self.pilot.start(), held, jnp.zeros_like(self.force))
 
