@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,20 @@ def test_a_hard_case(case: Hard):
     assert holds(row), row
     if not case.name.startswith(NOT_KNOWN_WELL):
         assert row["reached"] <= 5 * row["estimated"] + ROUND_OFF
+
+
+def test_the_tracker_may_neither_open_nor_lose_energy():
+    """In ten minutes at 1e-11: joints within 1e-10 m, energy within 1e-8 of itself."""
+    case = next(one for one in EVERY if one.name == "ten minutes of the tracker")
+    assert (case.demanded, case.unit, case.method["rtol"]) == (1e-8, "relative", 1e-11)
+
+    def run(open_by: float) -> Any:
+        told = {"position_violation": open_by, "relative_energy_error": 1e-9}
+        return SimpleNamespace(certificate=SimpleNamespace(**told))
+
+    row = {"result": "successful", "demanded": case.demanded}
+    assert holds(row | {"reached": case.error(run(1e-10))})
+    assert not holds(row | {"reached": case.error(run(1.01e-10))})
 
 
 @pytest.mark.slow

@@ -17,11 +17,15 @@ from helpers import inertia_of, np_rotation, random_quaternion, unit
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 
 import stmuav_jax as stm
+from stmuav_jax.dynamics.certify import inspect_start
+from stmuav_jax.dynamics.tree.coordinates import read
+from stmuav_jax.dynamics.tree.projection import rows_after
 
 SETS = 25  # of numbers, for each structure
 SAME, ROUND_OFF = 1e-9, 1e-15
-# Rows that depend on each other to this are a singular posture, of which there may be few.
-SINGULAR, FEW = 1e-5, 0.1
+# Rows that depend on each other to this are a singular posture, of which there may be few. The closures
+# of loops in the tree's coordinates depend on each other to within this factor of it.
+SINGULAR, FEW, FACTOR = 1e-5, 0.1, 1000.0
 # Degrees of freedom that a joint takes.
 TREE = {
     "spherical": 3,
@@ -169,13 +173,19 @@ def built(
 
 
 class Found(NamedTuple):
-    """Velocities, accelerations by both formulations, and the ratio of extreme singular values."""
+    """Velocities and accelerations by both formulations, and their smallest singular values.
+
+    Both are relative to the largest one of all rows in the velocities of the bodies: `ratio` is the
+    smallest of the same rows, `closing` that of the closures of the loops in the velocities of the
+    tree; it is one if there are no loops.
+    """
 
     v: Any
     omega: Any
     tree: Any
     augmented: Any
     ratio: Any
+    closing: Any
 
 
 @eqx.filter_jit
@@ -195,7 +205,21 @@ def looked(system: stm.System, velocity: Any, both: bool = True) -> Found:
         return found.v_rate, found.omega_rate
 
     one = rates(stm.Tree())
-    return Found(v, omega, one, rates(stm.Augmented()) if both else one, sizes[-1] / sizes[0])
+    other = rates(stm.Augmented()) if both else one
+    closing = (
+        closing_value(system, rest) / sizes[0]
+        if both and stm.dynamics.spanning_tree(system).cut
+        else 1.0
+    )
+    return Found(v, omega, one, other, sizes[-1] / sizes[0], closing)
+
+
+def closing_value(system: stm.System, rest: stm.State) -> jax.Array:
+    """Smallest singular value of the loops' closures in the velocities of the tree."""
+    model = stm.Tree().prepare(system)
+    at = read(model.parameters, rest)
+    J = rows_after(model, jnp.zeros(()), at, jnp.zeros_like(at.u))
+    return jnp.linalg.svd(J, compute_uv=False)[-1]
 
 
 def apart(one: Any, other: Any) -> float:
@@ -234,8 +258,10 @@ def test_laws_of_random_mechanisms(structure: Structure):
         system, velocity = built(structure, seed)
         found = looked(system, velocity)
         if found.ratio < SINGULAR:
+            assert found.closing < FACTOR * SINGULAR
             singular += 1
             continue
+        assert found.closing > SINGULAR / FACTOR
         # multipliers follow from a matrix whose condition is the square of that of the rows
         same = SAME + ROUND_OFF / float(found.ratio) ** 2
         assert apart(found.tree, found.augmented) < same
@@ -256,6 +282,68 @@ def test_laws_of_random_mechanisms(structure: Structure):
             back = jax.tree.map(lambda x: np.asarray(x)[::-1], other.tree)
             assert apart(found.tree, back) < same
     assert singular <= FEW * SETS
+
+
+def direction(link: Link, at: dict[str, np.ndarray], q: np.ndarray) -> np.ndarray:
+    """Velocity of a point on the last body per velocity of a joint with one freedom."""
+    turned = np.cross(at["axis"], q - at["p"])
+    return {"revolute": turned, "translational": at["axis"],
+            "screw": turned + 0.1 * at["axis"]}[link.kind]  # fmt: skip
+
+
+def rod_across(first: str, second: str, seed: int) -> tuple[stm.System, float]:
+    """Two bodies on joints of one freedom each, and a rod to ground that neither joint can lengthen.
+
+    The number is the determinant of the rod's second derivatives by both joints: below zero two
+    branches of the motion meet, above it none leads away.
+    """
+    rng = np.random.default_rng(seed)
+    links = [Link(first, -1, 0), Link(second, 0, 1)]
+    ats = [{"p": rng.normal(size=3), "axis": unit(rng.normal(size=3))} for _ in links]
+    ats = [{**at, "metre": np.asarray(1.0)} for at in ats]
+    q = rng.normal(size=3)
+    d0, d1 = (direction(link, at, q) for link, at in zip(links, ats, strict=True))
+    w0, w1 = (
+        at["axis"] * (link.kind != "translational") for link, at in zip(links, ats, strict=True)
+    )
+    across, length = unit(np.cross(d0, d1)), 0.5 + rng.random()
+    bent = lambda w, d, other: other @ d / length - across @ np.cross(w, d)
+    curved = bent(w0, d0, d0) * bent(w1, d1, d1) - bent(w0, d1, d0) ** 2
+    joints = [
+        joint(name, link.kind, ends, at, swap=False)
+        for name, link, ends, at in zip(
+            ("j0", "j1"), links, (("ground", "b0"), ("b0", "b1")), ats, strict=True
+        )
+    ]
+    rod = stm.distance("rod", "ground", "b1", point_i=q + length * across, point_j=q)
+    bodies = [
+        stm.Body(name, 0.5 + rng.random(), inertia_of(rng), position=rng.normal(size=3))
+        for name in ("b0", "b1")
+    ]
+    gravity = stm.Gravity(9.81 * unit(rng.normal(size=3)))
+    return stm.System(bodies, [*joints, rod], [gravity]), float(curved)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("first", "second"), [("revolute", "screw"), ("translational", "revolute")]
+)
+def test_both_formulations_report_the_same_singular_posture(first: str, second: str):
+    """A rod across all that its end can do: two freedoms are left instead of one."""
+    branches = []
+    for seed in range(SETS // 5):
+        system, curved = rod_across(first, second, seed)
+        branches.append(curved < 0)
+        rank = stm.dynamics.rank(system, system.reference)
+        assert (rank.rows - rank.rank, rank.dof) == (1, 2)
+        # by relative coordinates; the numbers are those of independent velocities
+        words = r"loops closed by rod leave 2 independent velocities there, but 1"
+        with pytest.raises(stm.ModelError, match=words):
+            stm.TreeSpace(system)
+        for how in (stm.Tree(), stm.Augmented()):
+            with pytest.raises(stm.StateError, match=r"^The start is a singular posture of .*rod"):
+                inspect_start(system, system.reference, 0.0, how)
+    assert any(branches)
 
 
 def momentum_missing(system: stm.System, found: Found) -> float:

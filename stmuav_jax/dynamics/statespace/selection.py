@@ -33,6 +33,8 @@ RANK_TOLERANCE = 1e-9
 CLOSED = 1e-9
 # Distance along the mechanism's motions at which a posture has its neighbours [rad], [m].
 APART = 1e-2
+# Displacement for differences [rad], [m], and the share of the rows' size that is more than their round-off.
+_SHORT, _GAINED = 1e-4, 1e-5
 # Weight of the columns of spherical joints, which makes them dependent before angles and
 # displacements: a component of a rotation is a poor coordinate.
 _SPHERICAL = 100.0
@@ -46,12 +48,16 @@ class Selection(NamedTuple):
     rows: tuple[int, ...]
 
 
-def rank_of_rows(J: np.ndarray) -> int:
-    """Rank of a matrix: the number of singular values above `RANK_TOLERANCE` times the largest."""
+def rank_of_rows(J: np.ndarray, size: float = 0.0) -> int:
+    """Rank of a matrix: the number of singular values above `RANK_TOLERANCE` times the largest.
+
+    Args:
+        size: size of such matrices, in comparison with which all singular values may be zero.
+    """
     if not J.size:
         return 0
     values = np.linalg.svd(J, compute_uv=False)
-    return int(np.sum(values > RANK_TOLERANCE * values[0])) if values[0] > 0 else 0
+    return int(np.sum(values > RANK_TOLERANCE * max(values[0], size))) if values[0] > 0 else 0
 
 
 def _pivots(matrix: np.ndarray) -> np.ndarray:
@@ -95,21 +101,31 @@ def select(
     return Selection(independent, tuple(map(int, dependent)), tuple(map(int, rows)))
 
 
-def rank_nearby(
+def ranks_nearby(
     J: np.ndarray, value_and_rows: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-) -> int:
-    """Rank of the rows in a posture near the given one, on the constraints.
+) -> tuple[int, int]:
+    """Rank of the rows in a posture, and the largest found near it.
+
+    That is the largest rank in postures on the constraints, and the rank that is gained to first order
+    along a free motion, which shows postures too that no motion leaves.
 
     Args:
         value_and_rows: constraint values (m,) and rows (m, n) after a displacement (n,).
     """
-    Vt = np.linalg.svd(J)[2]
-    rank = rank_of_rows(J)
+    ahead, back = (value_and_rows(APART * sign * _mixed(J.shape[1], 0))[1] for sign in (1, -1))
+    # rows may vanish altogether in the posture itself
+    size = max(float(np.linalg.norm(x, 2)) for x in (J, ahead, back)) if J.size else 0.0
+    rank = rank_of_rows(J, size)
+    U, _, Vt = np.linalg.svd(J)
     free = Vt[rank:]
     best = rank
+    if len(free) and rank < len(J):
+        step = _mixed(len(free), 0) @ free
+        ahead, back = (value_and_rows(_SHORT * sign * step)[1] for sign in (1, -1))
+        gains = U[:, rank:].T @ (ahead - back) @ free.T / (2 * _SHORT)
+        best += int(np.sum(np.linalg.svd(gains, compute_uv=False) > _GAINED * size))
     for seed in range(3):
-        weights = np.random.default_rng(seed).standard_normal(len(free))
-        step = APART * (weights / max(np.linalg.norm(weights), 1e-300)) @ free
+        step = APART * _mixed(len(free), seed) @ free
         for _ in range(30):
             value, there = value_and_rows(step)
             if np.max(np.abs(value), initial=0.0) < 1e-14:
@@ -117,8 +133,14 @@ def rank_nearby(
             step = step - np.linalg.pinv(there, rcond=1e-6) @ value
         value, there = value_and_rows(step)
         if np.max(np.abs(value), initial=0.0) < 1e-10:
-            best = max(best, rank_of_rows(there))
-    return best
+            best = max(best, rank_of_rows(there, size))
+    return rank, best
+
+
+def _mixed(count: int, seed: int) -> np.ndarray:
+    """Direction (count,) without any pattern."""
+    weights = np.random.default_rng(seed).standard_normal(count)
+    return weights / max(np.linalg.norm(weights), 1e-300)
 
 
 # operation by operation it is a hundred small programs
@@ -153,11 +175,11 @@ def chosen(
             f"The loops closed by {joints} are open by {np.max(np.abs(value)):.3g} at the given "
             "state: find a consistent one with stmuav_jax.assemble(system, state)."
         )
-    nearby = rank_nearby(J, after)  # pyright: ignore[reportArgumentType]
-    if nearby > rank_of_rows(J):
+    here, nearby = ranks_nearby(J, after)  # pyright: ignore[reportArgumentType]
+    if nearby > here:
         raise ModelError(
             f"The given posture is singular: the loops closed by {joints} leave "
-            f"{count - rank_of_rows(J)} independent velocities there, but {count - nearby} in the "
+            f"{count - here} independent velocities there, but {count - nearby} in the "
             "postures around. Choose the coordinates at another posture of the same mechanism."
         )
     spherical = np.array([not tree.steps[f - 1].motion.flat for f in columns(tree).frame])
