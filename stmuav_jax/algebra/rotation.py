@@ -194,17 +194,22 @@ def from_matrix(A: Mat3Like) -> Quat:
     4 p p^T is linear in A; the row with the largest diagonal entry is used, so that no branch
     divides by a small number (the report's Eq. 6.14 is singular at e0 = 0).
     """
+    return jnp.asarray(from_matrix_in(jnp, A))
+
+
+def from_matrix_in(module: Any, A: Mat3Like) -> Float[Array | np.ndarray, "4"]:
+    """`from_matrix` by the functions of a module, `numpy` or `jax.numpy`."""
     d0, d1, d2 = A[0, 0], A[1, 1], A[2, 2]
     x, y, z = A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]
     xy, xz, yz = A[0, 1] + A[1, 0], A[0, 2] + A[2, 0], A[1, 2] + A[2, 1]
-    squares = jnp.stack([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2])
-    rows = jnp.stack(
+    squares = module.stack([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2])
+    rows = module.stack(
         [
-            jnp.stack([squares[0], x, y, z]),
-            jnp.stack([x, squares[1], xy, xz]),
-            jnp.stack([y, xy, squares[2], yz]),
-            jnp.stack([z, xz, yz, squares[3]]),
+            module.stack([squares[0], x, y, z]),
+            module.stack([x, squares[1], xy, xz]),
+            module.stack([y, xy, squares[2], yz]),
+            module.stack([z, xz, yz, squares[3]]),
         ]
     )
-    k = jnp.argmax(squares)
-    return rows[k] / (2.0 * jnp.sqrt(squares[k]))
+    k = module.argmax(squares)
+    return rows[k] / (2.0 * module.sqrt(squares[k]))

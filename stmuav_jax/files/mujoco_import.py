@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..algebra.rotation import from_matrix, rotation_matrix_in
+from ..algebra.rotation import from_matrix_in, rotation_matrix_in
 from ..checks.errors import ModelError, SettingError, StateError
 from ..checks.numbers import floats
 from ..dynamics.assembly.initial import assemble
@@ -153,6 +153,8 @@ def _check_finite(model: Any) -> None:
                 )
 
 
+# what overflows is refused by the body or the joint that it is part of
+@np.errstate(over="ignore", invalid="ignore")
 def scene_from_mujoco(model: Any, name: str = "robot", *, link_share: float = LINK_SHARE) -> Scene:
     """Scene of a compiled `mujoco.MjModel`; what cannot be carried over is in its notes.
 
@@ -235,7 +237,11 @@ def _body(reader: _Reader, b: int, share: float) -> tuple[list[Body], dict[int, 
     first, count = int(model.body_jntadr[b]), int(model.body_jntnum[b])
     numbers = range(first, first + count)
     free = any(model.jnt_type[j] == _FREE for j in numbers)
-    place: dict[str, Any] = {"com": com, "position": pose.r, "orientation": from_matrix(pose.R)}
+    place: dict[str, Any] = {
+        "com": com,
+        "position": pose.r,
+        "orientation": from_matrix_in(np, pose.R),
+    }
     name = reader.names[b]
     before, bodies, links = reader.body(int(model.body_parentid[b])), [], {}
     for j in () if free else numbers:
@@ -347,10 +353,15 @@ def _actuator(model: Any, a: int, found: dict[int, Joint], left_out: LeftOut) ->
     """Actuator as an effort or a servo; None, with a note, if it is neither."""
     j, gear = int(model.actuator_trnid[a, 0]), float(model.actuator_gear[a, 0])
     bias = model.actuator_biasprm[a].tolist() if model.actuator_biastype[a] else [0.0] * 3
-    stiffness, damping = -bias[1] * gear**2 + 0.0, -bias[2] * gear**2 + 0.0
+    stiffness, damping = -bias[1] * (gear * gear) + 0.0, -bias[2] * (gear * gear) + 0.0
     plain = model.actuator_gaintype[a] == 0 and model.actuator_biastype[a] in (0, 1)
     plain = plain and model.actuator_dyntype[a] == 0 and model.actuator_trntype[a] in (0, 1)
     plain = plain and j in found and model.jnt_type[j] in (_SLIDE, _HINGE)
+    if plain and not np.all(np.isfinite((gear, stiffness, damping))):
+        raise ModelError(
+            f"The actuator '{model.actuator(a).name or a}' has the gear {gear:g}, with which its "
+            f"stiffness is {stiffness:g} and its damping {damping:g}: they must be finite."
+        )
     if not (plain and stiffness >= 0 and damping >= 0):
         left_out.add("actuators", model.actuator(a).name or f"actuator_{a}")
         return None

@@ -434,6 +434,20 @@ def test_files_that_cannot_be_read_are_named(mujoco, tmp_path):
         load_robot(path)
 
 
+def test_a_gear_whose_square_is_not_finite_is_named(mujoco, tmp_path):
+    path = tmp_path / "odd.xml"
+    path.write_text(TREE.replace('gear="3"', 'gear="1e308"'))
+    with pytest.raises(FileError, match=r"odd.xml: The actuator 'push' has the gear 1e\+308"):
+        load_robot(path)
+
+
+def test_a_place_that_overflows_is_refused(mujoco, tmp_path):
+    path = tmp_path / "r.urdf"
+    path.write_text(URDF.replace("0 0 .1", "1e308 0 .1"))
+    with pytest.raises(FileError, match=r"r.urdf: .*'post'.* finite"):
+        load_robot(path)
+
+
 def test_without_mujoco_its_extra_is_named(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     assert main(["check", "robot.xml", "--no-cache"]) == 2

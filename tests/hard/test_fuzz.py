@@ -41,7 +41,7 @@ from stmuav_jax.files.netcdf import (
 )
 from stmuav_jax.files.store import create, open_store
 from stmuav_jax.missions import keep
-from stmuav_jax.missions.schema import MissionFile
+from stmuav_jax.missions.schema import MissionFile, MissionStudyFile
 from stmuav_jax.montecarlo import schema
 from stmuav_jax.parameters import PART_II
 from stmuav_jax.quadrotor import PART_III
@@ -200,6 +200,25 @@ relative = true
 fall = {signal = "pointing", take = "when_above", level = 0.5}
 phi = {signal = "phi", take = "path"}
 """
+STUDY_OF_MISSIONS = """kind = "missions"
+mission = "gusts"
+samples = 1000
+seed = 1
+t1 = 12.5
+design = "latin"
+stratum = 4
+correlation = [["mass.panel_7", "rotor.k_f", -0.25]]
+[factors."mass.panel_7"]
+distribution = "normal"
+mean = 1.0
+standard_deviation = 0.05
+relative = true
+[factors."rotor.k_f"]
+distribution = "uniform"
+low = 0.5
+high = 1.5
+relative = true
+"""
 NUMBERS = "time,force\n" + "\n".join(f"{0.1 * k:.1f},{k * k}" for k in range(20)) + "\n"
 
 
@@ -242,11 +261,16 @@ def as_study(path):
     schema.flights_file(stm.files.load_study(path))
 
 
+def as_study_of_missions(path):
+    checked(MissionStudyFile, stm.files.load_study(path), "A study of a mission")
+
+
 # use, contents, mutation
 FORMATS = {
     "model": (as_model, MODELS, mutated),
     "mission": (as_mission, MISSIONS, mutated),
     "study": (as_study, [STUDY], mutated),
+    "study of a mission": (as_study_of_missions, [STUDY_OF_MISSIONS], mutated),
     "parameters of the UAV": (
         lambda path: stm.files.load_parameters(path, PART_II), [table_text(PART_II)], mutated,
     ),
@@ -397,7 +421,7 @@ URDF = """<robot name="r">
 </robot>"""
 
 
-@pytest.mark.parametrize("count", [30, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [30, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("text", [ROBOT, URDF], ids=["MJCF", "URDF"])
 def test_robots(text, count, tmp_path, monkeypatch):
     """Files that MuJoCo's parser reads or refuses; it writes its log into the present folder."""
