@@ -32,6 +32,7 @@ LONG = (
     "16_it_flies",
     "17_does_the_panel_pay",
     "18_ten_thousand_collapses",
+    "19_your_own_study_on_a_cluster",
 )
 PICTURES = Path(__file__).parents[1] / "docs" / "make_pictures.py"
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))

@@ -86,7 +86,7 @@ class ModelFlights:
 
     def __getstate__(self) -> dict[str, Any]:
         """State without what is found again from the rest."""
-        names = ("model", "relative", "inputs", "independent", "gusts")
+        names = ("model", "relative", "inputs", "independent")
         return {name: self.__dict__[name] for name in names}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ import itertools
 import json
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import diffrax
 import jax
@@ -17,6 +18,7 @@ from stmuav_jax.algebra.compiler import quick_jit
 from stmuav_jax.algebra.rotation import rotation_matrix
 from stmuav_jax.dynamics.formulations.stabilisation import AbstractStabilisation
 from stmuav_jax.dynamics.loads import joint_loads
+from stmuav_jax.files import read_model
 from stmuav_jax.montecarlo.batch import FlightWork, _parts
 from stmuav_jax.montecarlo.disturbed_flights import Drawn
 from stmuav_jax.montecarlo.study import study_from_plain
@@ -280,6 +282,20 @@ def test_a_pickle_is_small_and_gives_the_same(turning):
     again = pickle.loads(content)
     assert again.identity == work.identity
     assert np.array_equal(again.run(3, 2)["tilt"], whole["tilt"][3:5])
+
+
+def test_a_study_of_a_model_can_be_sent_to_another_process():
+    model = Path(__file__).parents[2] / "docs" / "models" / "pendulum.toml"
+    plain = {
+        "model": read_model(model), "t1": 0.1, "factors": {"start.pin.angle": 0.1},
+        "quantities": {"angle": {"signal": "pin.angle", "take": "final"}},
+    }  # fmt: skip
+    work = FlightWork(study_from_plain(plain), block=16, lanes=8)
+    flights = work.study.flights
+    again = pickle.loads(pickle.dumps(work))
+    assert again.identity == work.identity
+    assert again.study.flights.gusts is flights.gusts is False
+    assert again.study.flights.own == flights.own
 
 
 def test_what_fails_is_data():
