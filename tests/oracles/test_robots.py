@@ -35,6 +35,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute")
 STATES = 100
 
 
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    # MuJoCo writes its log into the present folder
+    monkeypatch.chdir(tmp_path)
+
+
 @quick_jit
 def accelerations(space: stm.TreeSpace, start: Any, v: jax.Array) -> jax.Array:
     """Rates of the velocities at points of the space (count, dof), one compiled program."""
