@@ -1,12 +1,14 @@
 """The command line as a user meets it."""
 
 import json
+import re
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 import xarray as xr
+from html_pages import read
 
 import stmuav_jax as stm
 from stmuav_jax.cli import main
@@ -320,7 +322,14 @@ def test_estimate_hovers(tmp_path, capsys):
     code = run("estimate", "--hover", "--seeds", "2", "--t1", "0.05", "--out", str(tmp_path))
     assert code == 3
     assert {p.name for p in tmp_path.iterdir()} == {"hover.nc", "hover.png"}
-    assert "largest tilt" in capsys.readouterr().out.replace("\n", " ")
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "largest tilt" in printed
+    assert run("report", str(tmp_path)) == 0
+    page, text = read(tmp_path / "report.html")
+    assert len(page.sources) == 4
+    for tuning in ("Report", "Consistent"):
+        (words,) = re.findall(rf"Hover, {tuning.lower()} tuning: (\d of 2 runs are \w+)", printed)
+        assert re.search(rf"{tuning} tuning: \w+\. {words}", text)
 
 
 @pytest.mark.parametrize(

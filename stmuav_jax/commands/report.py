@@ -12,17 +12,20 @@ from .options import default, shared
 from .output import written
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     import xarray as xr
 
     from ..figures.filter_record import FilterRecord
+    from ..figures.page import Picture
 
 # Files of results that have a report, by the commands that write them.
 NAMES = {
     "run.nc": "simulate", "flight.nc": "fly", "estimate.nc": "estimate", "hover.nc": "estimate --hover",
     "estimate.npz": "estimate MODEL", "study.zarr": "montecarlo",
 }  # fmt: skip
+# Size of the picture of the mechanism [pixels], and the eye's elevation and azimuth [degrees], as of a film.
+_SIZE, _EYE = (640, 400), (24.0, -53.0)
 _ESTIMATE = "stmuav_jax estimate"
 _HDF5, _ZIP = b"\x89HDF\r\n\x1a\n", b"PK"
 
@@ -109,18 +112,41 @@ def _writer(source: Path) -> "tuple[str, Callable[[Path, Any], list[Path]]]":
         from ..figures.filter_record import record_of_dataset
 
         return _of_filters(record_of_dataset(data))
-    title = data.attrs.get("title") or data.attrs.get("scene", "")
+    title, drawn = data.attrs.get("title") or data.attrs.get("scene", ""), _mechanism(data)
     if data.attrs["format"] == FORMAT:
         from ..figures.run_report import write_run_report
 
-        return f"Run: {title}.", lambda path, kind: write_run_report(data, path, kind)
+        return f"Run: {title}.", lambda path, kind: write_run_report(
+            data, path, kind, pictures=drawn
+        )
     if "mission" in data.attrs:
         from ..missions.report import write_flight_report
 
-        return f"Flight: {title}.", lambda path, kind: write_flight_report(data, path, kind)
+        return f"Flight: {title}.", lambda path, kind: write_flight_report(
+            data, path, kind, pictures=drawn
+        )
     from ..figures.loop_report import write_loop_report
 
-    return f"Closed loop: {title}.", lambda path, kind: write_loop_report(data, path, kind)
+    return f"Closed loop: {title}.", lambda path, kind: write_loop_report(
+        data, path, kind, pictures=drawn
+    )
+
+
+def _mechanism(data: "xr.Dataset") -> "Iterator[Picture]":
+    """Picture of the mechanism at the last time with finite poses, if there are two."""
+    from ..figures.page import Picture
+    from ..viewer.content import check_viewable, finite_times
+    from ..viewer.stage import Stage
+
+    check_viewable(data)
+    ts = data["time"].values[finite_times(data)]
+    if len(ts) > 1:
+        span = (float(ts[0]), float(ts[-1]))
+        stage = Stage(data, _SIZE, _EYE, span)
+        stage.draw(span[1])
+        yield Picture(
+            "mechanism", f"The mechanism at t = {span[1]:g} s, and its way there", stage.figure
+        )
 
 
 def _of_filters(record: "FilterRecord") -> "tuple[str, Callable[[Path, Any], list[Path]]]":

@@ -45,7 +45,7 @@ img { max-width: 56rem; width: 100%; box-sizing: border-box; background: #fff; b
   grid-template-columns: repeat(auto-fill, minmax(min(30rem, 100%), 1fr)); }
 .side p { margin: 0.2rem 0; }
 @media (max-width: 40rem) { body { margin: 1rem auto; padding: 0 0.7rem; } h1 { font-size: 1.3rem; }
-  th, td { padding: 0.25rem 0.4rem; } td:first-child, td.text { min-width: 6.5rem; } }
+  th, td { padding: 0.25rem 0.4rem; } td:first-child { min-width: 6.5rem; } td.text { min-width: 3.6rem; } }
 @media print { :root { --ink: #000; --paper: #fff; } body { margin: 0; max-width: none; font-size: 9pt; }
   h2 { break-after: avoid; } table { font-size: 7.5pt; } th, td { padding: 0.15rem 0.4rem; }
   figure, tr, .side > div { break-inside: avoid; } .wide { overflow: visible; }

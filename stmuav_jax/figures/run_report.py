@@ -1,5 +1,6 @@
 """Report page of a saved run: what was run, how good it is, its numbers, its figures."""
 
+import itertools
 import json
 import math
 import os
@@ -41,7 +42,12 @@ Row = tuple[str, float | str, str]
 
 
 def write_run_report(
-    data: xr.Dataset, path: str | os.PathLike[str], format: str = "png", *, dpi: int = 160
+    data: xr.Dataset,
+    path: str | os.PathLike[str],
+    format: str = "png",
+    *,
+    dpi: int = 160,
+    pictures: Iterable[Picture] = (),
 ) -> list[Path]:
     """Write a self-contained page about a saved run of a scene; return the paths of its files.
 
@@ -52,6 +58,7 @@ def write_run_report(
         path: path of the page.
         format: format of the figures: "png", "svg" or "pdf".
         dpi: resolution of the figures [dots per inch].
+        pictures: figures before those of the run.
 
     Raises:
         FileError: the dataset is no run of a scene.
@@ -76,7 +83,8 @@ def write_run_report(
         section("Certificate", entries_table(rows_of(certificate))),
     ]
     tail = [section("What was run", _identity(data)), *about_parts(data)]
-    return write_page(title, head, run_pictures(data, numbers, loads), tail, path, format, dpi)
+    drawn = itertools.chain(pictures, run_pictures(data, numbers, loads))
+    return write_page(title, head, drawn, tail, path, format, dpi)
 
 
 def _verdict(certificate: Mapping[str, Any]) -> str:

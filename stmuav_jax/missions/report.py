@@ -1,8 +1,9 @@
 """Report page of a mission's flight: verdict, errors and margins with what is allowed, figures."""
 
+import itertools
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,12 @@ _WORDS = {
 
 
 def write_flight_report(
-    data: xr.Dataset, path: str | os.PathLike[str], format: str = "png", *, dpi: int = 160
+    data: xr.Dataset,
+    path: str | os.PathLike[str],
+    format: str = "png",
+    *,
+    dpi: int = 160,
+    pictures: Iterable[Picture] = (),
 ) -> list[Path]:
     """Write a self-contained page about a mission's flight; return the paths of its files.
 
@@ -36,6 +42,7 @@ def write_flight_report(
         path: path of the page.
         format: format of the figures: "png", "svg" or "pdf" (files beside the page).
         dpi: resolution of the figures [dots per inch].
+        pictures: figures before those of the flight.
 
     Raises:
         FileError: the dataset is no flight of a mission.
@@ -51,8 +58,9 @@ def write_flight_report(
         verdict_text(failure, False) if failure else "",
         section("Errors, margins, energy", _measures(data)),
     ]
+    drawn = itertools.chain(pictures, _pictures(data))
     return write_loop_report(
-        data, path, format, dpi=dpi, head=head, pictures=_pictures(data), identity=_entries(mission)
+        data, path, format, dpi=dpi, head=head, pictures=drawn, identity=_entries(mission)
     )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from html_pages import read
 
 import stmuav_jax as stm
 from stmuav_jax.cli import main
@@ -143,6 +144,21 @@ def test_a_four_bar_is_estimated_from_its_encoder(tmp_path, capsys):
         assert found["error"].shape == (20, 2, 40)
         assert np.std(found["error"][-1, 0]) < 0.3 * 1e-2
         assert found["ok"].all()
+        # of innovations that were kept, NIS by hand
+        np.testing.assert_allclose(
+            np.nansum(found["innovation"] ** 2, axis=1), found["nis"], rtol=1e-9
+        )
+        assert (
+            np.isfinite(found["innovation"]).sum(axis=1)[:, 0].tolist() == found["degrees"].tolist()
+        )
+    # the page says what the command said
+    (nees,) = re.findall(r"NEES at the end: [\d.]+, consistent within", shown)
+    assert main(["report", str(tmp_path)]) == 0
+    page, text = read(tmp_path / "report.html")
+    assert len(page.sources) == 3
+    assert nees in text
+    assert "independent A.angle" in text
+    assert "process 0.05" in text
 
 
 # --- the path of a newcomer, as docs/models.md has it
