@@ -18,7 +18,7 @@ RESULTS = sorted(record.RESULTS.glob("*.json"))
 KNOWN_STALE: dict[str, str] = {}
 
 # Benchmarks that have not been run on a quiet machine yet. A name leaves with its first result.
-NOT_RUN_YET: set[str] = {"suite_vector_steps"}
+NOT_RUN_YET: set[str] = set()
 
 
 def lost(path: Path) -> set[str]:

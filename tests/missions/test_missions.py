@@ -278,7 +278,7 @@ def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
     assert "Largest position error" in out
     folder = tmp_path / "runs" / "square"
     assert {path.name for path in folder.iterdir()} == {
-        "flight.nc", "errors.svg", "rotors.svg", "power.svg"
+        "flight.nc", "errors.svg", "margins.svg", "rotors.svg", "power.svg"
     }  # fmt: skip
     assert isinstance(stm.files.load(folder / "flight.nc"), xr.Dataset)
     (tmp_path / "mine.toml").write_text(TEXT.replace("tilt = 15.0", "tilt = 0.1"))
