@@ -110,7 +110,9 @@ class MissionController(eqx.Module):
         """First memory."""
         # not weakly typed, as no later memory is: a flight's program is compiled for one type
         held = jnp.full(2, jnp.inf, dtype=float)
-        return MissionMemory(self.pilot.start(), held, jnp.zeros(jnp.shape(self.force), dtype=float))
+        return MissionMemory(
+            self.pilot.start(), held, jnp.zeros(jnp.shape(self.force), dtype=float)
+        )
 
     def __call__(
         self, estimate: Any, reference: MissionReference, memory: MissionMemory
