@@ -45,6 +45,7 @@ def accelerations(scene, variant, t=0.1):
     return q[:, :3], 2 * (L @ q[:, 3:, None])[..., 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", [Variant(), Variant(frozen=True)], ids=["corrected", "frozen"])
 @pytest.mark.parametrize("couple", ["consistent", "printed"])
 def test_accelerations_are_those_of_the_package(moving, variant, couple):

@@ -37,6 +37,7 @@ def test_cheapest():
     assert long_horizon.cheapest(runs, 1e-10) == {"a": None}
 
 
+@pytest.mark.slow
 def test_symmetric_methods_are_kept():
     """The former record's runs and comparison stand beside new runs, which they do not touch."""
     former = json.loads((record.RESULTS / "long_horizon.json").read_text())["problems"][0]

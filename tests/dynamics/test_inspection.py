@@ -18,6 +18,7 @@ def by_name(found):
     return {each.what: each for each in found.findings}
 
 
+@pytest.mark.slow
 def test_a_parallelogram_near_and_in_its_singular_posture():
     sound = stm.check(parallelogram(0.5))
     assert sound.worst == "note"

@@ -589,6 +589,7 @@ for k in range({times}):
 """
 
 
+@pytest.mark.slow
 def test_two_processes_that_make_one_store(tmp_path):
     """Exactly one has it, the other says so; and what is there is a whole store."""
     times = 40

@@ -107,9 +107,10 @@ def test_an_interrupted_study_has_its_exit_code(study, tmp_path, monkeypatch, ca
 def test_errors_name_the_file(study, tmp_path, capsys):
     study.write_text(STUDY.replace('design = "sobol"', 'design = "sobl"'))
     assert main(["montecarlo", str(study), "--out", str(tmp_path / "x")]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "turning.toml: 'design' must be" in said
-    assert "Did you mean 'sobol'" in said
+    # a long path is broken anywhere, also before the colon
+    said = "".join(capsys.readouterr().err.split())
+    assert "turning.toml:'design'mustbe" in said
+    assert "Didyoumean'sobol'" in said
 
 
 def test_a_name_is_no_path(study, tmp_path, monkeypatch, capsys):

@@ -142,6 +142,7 @@ def passes(loops: int, rtol: float, coupler: float = 1.0) -> None:
 slow = pytest.mark.slow
 
 
+@pytest.mark.slow
 def test_every_tolerance_passes_the_singular_postures() -> None:
     """20 s, through some thirty singular postures; N = 20 is below."""
     for rtol in TOLERANCES:

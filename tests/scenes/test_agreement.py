@@ -19,11 +19,12 @@ def reference():
     return simulate(make_scene("uav_tracker", 2), method=Method(**TIGHT), **SPAN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "formulation"),
     [
         (diffrax.Tsit5(), Augmented()),
-        pytest.param(diffrax.Dopri8(), Augmented(solve="dense"), marks=pytest.mark.slow),
+        (diffrax.Dopri8(), Augmented(solve="dense")),
         (diffrax.Dopri8(), Augmented(solve="dense", rows="report")),
     ],
     ids=["tsit5", "dense", "report"],

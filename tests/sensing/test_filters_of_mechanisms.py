@@ -47,6 +47,7 @@ def twin_step(z, torque, dt):
     return estimation.rk4(rates)(z, torque, dt)
 
 
+@pytest.mark.slow
 def test_a_filter_of_a_four_bar_is_that_of_its_twin(bars):
     """Mean and covariance after four readings, from the simulator and by hand: to 1e-9."""
     space, model, x = bars

@@ -70,6 +70,7 @@ def test_three_routes_through_an_implicit_solver():
     np.testing.assert_allclose(reverse, expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_many_at_once():
     """Flights of different lengths: vmap of grad is a loop of grads."""
     several = Q + jnp.linspace(0.0, 0.4, 3)[:, None]
