@@ -10,16 +10,18 @@ PAGE = Path(__file__).parents[2] / "docs" / "control.md"
 
 
 @pytest.mark.slow
-def test_the_page_on_closed_loops_runs():
+def test_the_page_on_closed_loops_runs(tmp_path, monkeypatch):
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 8
+    assert len(blocks) == 10
     # a user's cart-pole, and a plain hexacopter
     assert len(blocks[0].splitlines()) < 40
-    assert "FlightController" in blocks[2]
-    assert len(blocks[2].splitlines()) < 40
+    flight = next(block for block in blocks if "FlightController" in block)
+    assert len(flight.splitlines()) < 40
     names: dict = {}
+    monkeypatch.chdir(tmp_path)
     exec("\n".join(blocks), names)
     assert np.max(np.abs(names["run"].states.r[-1, :, 0])) < 2e-3
+    assert {path.name for path in (tmp_path / "cart").iterdir()} == {"poles.png", "steps.png"}
     end = names["flight"].states.r[-1, 0]
     np.testing.assert_allclose(end, [np.cos(4.0) - 1, np.sin(4.0), 0.8], atol=5e-3)
     assert names["sensed"].reset().estimate.state.r.shape == (1, 3)
