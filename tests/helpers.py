@@ -330,3 +330,10 @@ def forked(floating):
         stm.translational("td", hub, "d", point=[-0.3, 0, 0], axis=[0, 0, 1]),
     ]
     return stm.System(bodies[0 if floating else 1 :], joints, [stm.Gravity()])
+
+
+def check_same_types(first: Any, later: Any) -> None:
+    """Check that two pytrees have one structure, and their arrays the same shapes and data types."""
+    assert jax.tree.structure(first) == jax.tree.structure(later)
+    kind = lambda x: (x.shape, x.dtype, x.weak_type)
+    assert list(map(kind, jax.tree.leaves(first))) == list(map(kind, jax.tree.leaves(later)))

@@ -36,6 +36,15 @@ def value_and_jacobian(
     return jax.tree.map(lambda v: v[0], value), columns
 
 
+def motion_along(
+    path: Callable[[Float[Array, ""]], Float[Array, " n"]], t: Float[Array, ""]
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+    """Value of a function of time, its rate and its acceleration, each (n,), by derivatives."""
+    moving = lambda t: jax.jvp(path, (t,), (jnp.ones_like(t),))
+    (value, rate), (_, acceleration) = jax.jvp(moving, (t,), (jnp.ones_like(t),))
+    return value, rate, acceleration
+
+
 def held_constant(tree: T) -> T:
     """Pytree with the same leaves, of which no floating-point array has a derivative."""
     still = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x

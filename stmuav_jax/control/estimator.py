@@ -247,7 +247,9 @@ class MotionEstimator(eqx.Module):
         panel = None if memory.panel is None else self._panel(memory.panel, h, encoders)
         state = self._state(base.mean, turning - base.mean["gyroscope_bias"], panel)
         felt = force - base.mean["accelerometer_bias"]
-        found = MotionEstimate(state, base, panel, nis, 3.0 * jnp.sum(fresh), felt)
+        # of a type of its own, as at every sample: a flight's program is compiled for one type
+        components = 3 * jnp.sum(fresh, dtype=nis.dtype)
+        found = MotionEstimate(state, base, panel, nis, components, felt)
         return found, EstimatorMemory(base, panel, turning, jnp.ones((), bool))
 
     def _fixed(
@@ -267,7 +269,7 @@ class MotionEstimator(eqx.Module):
         off = position.value - then["r"] - R @ self.arm
         turned = to_rotation_vector(product(conjugate(facing["p"]), attitude.value))
         omega = turning - x["gyroscope_bias"]
-        H = fix_rows(R, self.arm, omega, late)
+        H = fix_rows(R, self.arm, omega, late[:2])
         fresh = jnp.repeat(jnp.stack([position.fresh, attitude.fresh]), 3)
         error = jnp.concatenate([off, turned])
         move, P, nis = one_by_one(P, H, self.variance[:6], error, fresh)

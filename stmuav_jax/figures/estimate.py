@@ -16,7 +16,7 @@ from ..files.netcdf import labelled
 from ..quadrotor.assess import CaseStudy, CaseSummary, Estimates, last_beyond, settled_from
 from ..quadrotor.filter_verdict import RunsVerdict
 from ..quadrotor.hover import Hover
-from .filter_record import FORMAT, FORMAT_VERSION
+from .filter_record import FORMAT, FORMAT_VERSION, normalised_innovations
 from .plot import STYLES, grid
 
 COMPONENTS = ("Omega_x", "Omega_y", "Omega_z", "offset_x", "offset_y")
@@ -291,7 +291,7 @@ def labelled_hover(flights: dict[str, Hover]) -> Labelled:
 
 def _innovations(found: Iterable[Estimates | Hover]) -> tuple[tuple[str, ...], Any, str, str]:
     """Normalised innovations of all tunings; those that are missing, or that only another has, are NaN."""
-    every = [np.where(np.asarray(e.measured), np.asarray(e.normalised), np.nan) for e in found]
+    every = [normalised_innovations(e) for e in found]
     most = max(each.shape[1] for each in every)
     wide = [
         np.pad(e, ((0, 0), (0, most - e.shape[1]), (0, 0)), constant_values=np.nan) for e in every

@@ -101,6 +101,13 @@ def end_consistency(
     return found
 
 
+def normalised_innovations(found: Any) -> np.ndarray:
+    """Normalised innovations (T, m, ...) of a filter, NaN where a reading is missing."""
+    normalised, measured = np.asarray(found.normalised), np.asarray(found.measured)
+    there = measured.reshape(measured.shape + (1,) * (normalised.ndim - measured.ndim))
+    return np.where(there, normalised, np.nan)
+
+
 def record_content(
     title: str,
     names: Sequence[tuple[str, str]],

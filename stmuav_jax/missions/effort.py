@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.compiler import quick_jit
+from ..algebra.derivative import motion_along
 from ..checks.errors import SettingError
 from ..control.geometric import attitude_of
 from ..control.panel import PanelBodies, inverse_dynamics, panel_bodies
@@ -79,9 +80,7 @@ def needed_forces(
         return panel_angles(posed(t)[0].T @ value) if references.panel.world else value
 
     def at_one(t: Array) -> Array:
-        moving = lambda t: jax.jvp(angles, (t,), (jnp.ones_like(t),))
-        (x, rate), (_, acceleration) = jax.jvp(moving, (t,), (jnp.ones_like(t),))
-        moved = PairMotion(x, rate, acceleration)
+        moved = PairMotion(*motion_along(angles, t))
         return inverse_dynamics(bodies, moved, posed(t)[1], jnp.zeros(3)).forces
 
     return jax.vmap(at_one)(ts)

@@ -129,7 +129,11 @@ FLIGHT_FIGURES = {
 }  # fmt: skip
 
 
+# Variables without which a figure is left out: those of the panel are a tracker's.
+_NEEDED = {"panel": "panel_error", "strokes": "displacement", "forces": "wanted_force"}
+
+
 def flight_figures(data: xr.Dataset) -> dict[str, Figure]:
     """Figures of a mission's flight by name; those of the panel only for a machine with a tracker."""
-    names = list(FLIGHT_FIGURES) if "panel_error" in data else list(FLIGHT_FIGURES)[:4]
+    names = [name for name in FLIGHT_FIGURES if _NEEDED.get(name, "time") in data.variables]
     return {name: FLIGHT_FIGURES[name](data) for name in names}

@@ -132,9 +132,7 @@ def _onwards(mission: Mission, run: _Chunk, now: Reached) -> tuple[Reached, Endi
     if now.rows is None:
         seed = 0 if mission.file.sensors is None else mission.file.sensors.seed
         key = jax.random.key(seed)
-        begun = program(_begun, plant, key)(plant, key), mission.controller.start()
-        # weak types, which no later chunk has, would need a second program
-        start, memory = jax.tree.map(_strong, begun)
+        start, memory = program(_begun, plant, key)(plant, key), mission.controller.start()
     else:
         start, memory = now.rows.end, now.rows.memory
     made = program(_chunk, run, plant, start, memory)
@@ -149,12 +147,6 @@ def _onwards(mission: Mission, run: _Chunk, now: Reached) -> tuple[Reached, Endi
         rows, soc, empty = _discharged(mission.battery, soc, rows, plant.rate)
         ending = "battery empty" if empty else ending
     return Reached(_joined(now.rows, rows), soc, seconds), ending
-
-
-def _strong(leaf: Any) -> Any:
-    """Leaf of a pytree, an array with the data type that it has by itself."""
-    weak = getattr(leaf, "weak_type", False)
-    return jnp.asarray(leaf, dtype=leaf.dtype) if weak else leaf
 
 
 def _rows(found: Rollout) -> dict[str, Any]:

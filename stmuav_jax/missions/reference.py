@@ -4,11 +4,11 @@ import math
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.derivative import motion_along
 from ..algebra.rotation import rotation_matrix
 from ..algebra.sampled import Sampled, piecewise
 from ..checks.errors import SettingError
@@ -119,8 +119,7 @@ class PanelMoves(eqx.Module):
 
     def __call__(self, t: Float[Array, ""]) -> PairMotion | DirectionMotion:
         """Wanted motion of the angles [rad], or of the direction."""
-        rate = lambda f: lambda t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
-        moved = self.value(t), rate(self.value)(t), rate(rate(self.value))(t)
+        moved = motion_along(self.value, t)
         return DirectionMotion(*moved) if self.world else PairMotion(*moved)
 
 
@@ -138,11 +137,7 @@ def facing_motion(wanted: DirectionMotion, state: State) -> PairMotion:
     def angles(s: Array) -> Array:
         return panel_angles(ahead + s * first + s**2 / 2 * second)
 
-    def moved(s: Array) -> tuple[Array, Array]:
-        return jax.jvp(angles, (s,), (jnp.ones_like(s),))
-
-    (value, rates), (_, faster) = jax.jvp(moved, (jnp.zeros(()),), (jnp.ones(()),))
-    return PairMotion(value, rates, faster)
+    return PairMotion(*motion_along(angles, jnp.zeros(())))
 
 
 class MissionReference(NamedTuple):

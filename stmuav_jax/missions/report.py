@@ -13,7 +13,7 @@ from ..figures.loop_report import write_loop_report
 from ..figures.page import Picture, html_table, number_text, section, text, verdict_text
 from ..files.layout import flattened
 from ..files.netcdf import FileError
-from .figures import FLIGHT_FIGURES, flight_figures
+from .figures import flight_figures
 from .outcome import measures, verdict
 
 # Captions of the figures, by name.
@@ -23,6 +23,7 @@ _WORDS = {
     "panel": "Panel angles and the pointing error",
     "rotors": "Rotor speeds, with their limits as thin lines",
     "strokes": "Displacements of the sliders, with their limits as thin lines",
+    "forces": "Forces that the servo asks of the actuators, with their limits as thin lines",
     "power": "Power, and what is left in the battery",
 }
 
@@ -79,10 +80,8 @@ def _measures(data: xr.Dataset) -> str:
 
 
 def _pictures(data: xr.Dataset) -> Iterator[Picture]:
-    figures = flight_figures(data)
-    for name in FLIGHT_FIGURES:
-        if name in figures:
-            yield Picture(name, _WORDS[name], figures[name])
+    for name, figure in flight_figures(data).items():
+        yield Picture(name, _WORDS[name], figure)
 
 
 def _entries(mission: dict[str, Any]) -> list[tuple[str, Any]]:

@@ -164,6 +164,7 @@ def _estimated(
     from ...estimation.bank import filter_bank
     from ...estimation.consistency import path_nees
     from ...estimation.gaussians import gaussian
+    from ...figures.filter_record import normalised_innovations
     from ...sensing.process import system_model
 
     rate, steps = _times(scene, instruments, settings)
@@ -209,15 +210,8 @@ def _estimated(
     return Record(
         scene.t0 + np.arange(1, steps + 1) / rate, np.asarray(every),
         np.asarray(out.standard_deviation), np.asarray(path_nees(out, truth, space)),
-        np.asarray(out.nis), degrees, np.asarray(out.ok)[-1], _innovations(out.innovations),
+        np.asarray(out.nis), degrees, np.asarray(out.ok)[-1], normalised_innovations(out.innovations),
     )  # fmt: skip
-
-
-def _innovations(found: Any) -> np.ndarray:
-    """Normalised innovations (T, m, s), NaN where a reading is missing."""
-    normalised, measured = np.asarray(found.normalised), np.asarray(found.measured)
-    there = measured.reshape(measured.shape + (1,) * (normalised.ndim - measured.ndim))
-    return np.where(there, normalised, np.nan)
 
 
 def _times(scene: "Scene", instruments: Sequence[Any], settings: Any) -> tuple[float, int]:

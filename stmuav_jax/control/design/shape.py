@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...algebra.derivative import motion_along
 from ...checks.errors import SettingError, concrete
 from ...checks.numbers import numbers, positive
 from ...checks.shapes import Numbers
@@ -72,10 +73,7 @@ class Slew(eqx.Module):
         self, t: Float[Array, ""]
     ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
         """Values, rates and accelerations, each (n,); `PairMotion(*slew(t))` is for a panel."""
-        t = jnp.asarray(t, dtype=float)
-        moving = lambda t: jax.jvp(self.value, (t,), (jnp.ones_like(t),))
-        (value, rate), (_, acceleration) = jax.jvp(moving, (t,), (jnp.ones_like(t),))
-        return value, rate, acceleration
+        return motion_along(self.value, jnp.asarray(t, dtype=float))
 
 
 def within(x: Numbers, lowest: Numbers, highest: Numbers) -> Float[Array, "..."]:
