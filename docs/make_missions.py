@@ -51,7 +51,7 @@ def shown(measure: stm.missions.Measure) -> str:
     elif unit == "degrees":
         words = f"{value:.2g} deg" if value < 100 else f"{value:.0f} deg"
     else:
-        words = f"{value:.0f} %, at a limit" if abs(value) < 1e-6 else f"{value:.0f} %"
+        words = "0 %, at a limit" if abs(value) < 1e-6 else f"{value:.0f} %"
     return words if measure.kept else f"{words}, not kept"
 
 
