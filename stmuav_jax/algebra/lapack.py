@@ -61,14 +61,25 @@ def _one_by_one(factorise: Callable[[Array], Any], most: int, A: Array) -> Any:
     """Factorisations of a stack (*s, m, n), `most` matrices at a time."""
     *stack, m, n = A.shape
     count = math.prod(stack)
-    rows = -(-count // most)
-    # the last block is filled up with identities, which every factorisation takes
-    filled = jnp.broadcast_to(jnp.eye(m, n, dtype=A.dtype), (rows * most - count, m, n))
-    blocks = jnp.concatenate([A.reshape(count, m, n), filled]).reshape(rows, most, m, n)
-    found = jax.lax.map(factorise, blocks)
-    return jax.tree.map(
-        lambda x: x.reshape(-1, *x.shape[2:])[:count].reshape(*stack, *x.shape[2:]), found
-    )
+    # a divisor of the count needs no filling up
+    size = next((k for k in range(most, most // 2, -1) if count % k == 0), most)
+    rows = -(-count // size)
+    matrices = _turned(A.reshape(count, m, n))
+    if rows * size > count:
+        # the last block is filled up with identities, which every factorisation takes
+        filled = jnp.broadcast_to(jnp.eye(n, m, dtype=A.dtype), (rows * size - count, n, m))
+        matrices = jnp.concatenate([matrices, filled])
+    # LAPACK's matrices lie column by column, those that a loop reads and writes row by row: turned
+    # before and after, a matrix passes through the loop without a copy
+    block = lambda B: jax.tree.map(_turned, factorise(_turned(B)))
+    found = jax.lax.map(block, matrices.reshape(rows, size, n, m))
+    whole = lambda x: _turned(x.reshape(-1, *x.shape[2:])[:count])
+    return jax.tree.map(lambda x: whole(x).reshape(*stack, *whole(x).shape[1:]), found)
+
+
+def _turned(X: Array) -> Array:
+    """Transposes (k, n, m) of matrices (k, m, n); vectors (k, n) stay."""
+    return jnp.swapaxes(X, 1, 2) if X.ndim == 3 else X
 
 
 @_in_blocks(operations=1)
