@@ -9,6 +9,6 @@ folder, and are imported when they are first used: the command line answers `--h
 
 import lazy_loader
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
