@@ -83,10 +83,11 @@ def _configure(use_cache: bool) -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import jax
 
-    from .algebra.kept import keep_programs
+    from .algebra.kept import keep_programs, own_folder
 
     jax.config.update("jax_enable_x64", True)
-    if use_cache:
+    # what JAX reads there becomes part of the process, so nobody else may write to it
+    if use_cache and own_folder(cache_folder()):
         jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

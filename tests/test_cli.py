@@ -11,6 +11,8 @@ import xarray as xr
 from html_pages import read
 
 import stmuav_jax as stm
+from stmuav_jax import cli
+from stmuav_jax.algebra import kept
 from stmuav_jax.cli import main
 from stmuav_jax.files.netcdf import load
 from stmuav_jax.scenes.registry import SCENES, make_scene
@@ -222,6 +224,23 @@ def test_a_command_that_was_run_before_compiles_nothing(tmp_path, monkeypatch):
         "assert not {'xarray', 'pandas', 'scipy', 'matplotlib', 'dask'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code, *words], check=True, timeout=600)
+
+
+def test_a_cache_folder_that_others_may_write_is_not_used(tmp_path, monkeypatch):
+    """JAX reads compiled code from there as this package does."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = cli.cache_folder()
+    folder.mkdir()
+    folder.chmod(0o777)
+    done: dict[str, object] = {}
+    with monkeypatch.context() as changed:
+        changed.setattr("jax.config.update", done.__setitem__)
+        cli._configure(True)
+        assert set(done) == {"jax_enable_x64"}
+        folder.chmod(0o700)
+        cli._configure(True)
+    assert done["jax_compilation_cache_dir"] == str(folder)
+    kept.keep_programs(None)
 
 
 @pytest.mark.slow

@@ -73,11 +73,17 @@ def keep_programs(folder: Path | str | None) -> None:
     _Keeping.folder = None
     if folder is None:
         return
-    path = Path(folder)
-    with contextlib.suppress(OSError):
+    if own_folder(Path(folder)):
+        _Keeping.folder = Path(folder)
+
+
+def own_folder(path: Path) -> bool:
+    """True if a folder, which is made if it is missing, is the user's and nobody else may write to it."""
+    try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if _is_own(path):
-            _Keeping.folder = path
+        return _is_own(path)
+    except OSError:
+        return False
 
 
 def _is_own(path: Path) -> bool:

@@ -10,6 +10,8 @@ loops over stages and iterations call none and become native.
 
 import os
 import sys
+import warnings
+from functools import cache
 
 from ..checks.errors import SettingError
 
@@ -28,7 +30,7 @@ def use_native_loops() -> None:
     Raises:
         SettingError: JAX's backend has already started, which reads the variable only once.
     """
-    if native_loops():
+    if _OPTION in os.environ.get("XLA_FLAGS", ""):
         return
     if _backend_has_started():
         raise SettingError(
@@ -44,8 +46,36 @@ def use_native_loops() -> None:
 
 
 def native_loops() -> bool:
-    """True if the environment asks XLA to compile loops into native functions."""
-    return _OPTION in os.environ.get("XLA_FLAGS", "")
+    """True if the environment asks XLA to compile loops into native functions, and XLA does so.
+
+    A version of XLA that does not know the option says nothing. A small loop is therefore compiled
+    once; where it does not become native, a RuntimeWarning says so, and programs are compiled as
+    without the option. Devices other than CPUs have no such loops.
+    """
+    return _OPTION in os.environ.get("XLA_FLAGS", "") and _compiles_natively()
+
+
+@cache
+def _compiles_natively() -> bool:
+    """Test whether a loop beyond XLA's own threshold becomes a native function."""
+    import jax
+    import jax.numpy as jnp
+
+    if jax.default_backend() != "cpu":
+        return False
+    body = lambda at: (at[0] + 1, jnp.sin(at[1]) + jnp.flip(at[1]))
+    run = jax.jit(lambda x: jax.lax.while_loop(lambda at: at[0] < 9, body, (0, x)))
+    # XLA marks the functions that it compiles natively as small calls
+    given = jax.ShapeDtypeStruct((1000,), jnp.float32)
+    if "small_call" in str(run.lower(given).compile().as_text()):
+        return True
+    warnings.warn(
+        f"This version of jaxlib does not compile loops into native functions for the option {_OPTION} "
+        "in XLA_FLAGS. Results are the same; single flights take as long as without the option.",
+        RuntimeWarning,
+        stacklevel=3,
+    )
+    return False
 
 
 def _backend_has_started() -> bool:

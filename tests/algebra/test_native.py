@@ -66,6 +66,28 @@ def test_the_loop_is_one_native_function():
     assert quick[1] > 0
 
 
+UNKNOWN = """
+import warnings
+import jax, jax.numpy as jnp
+import stmuav_jax as stm
+from stmuav_jax.algebra import native
+from stmuav_jax.algebra.linalg import cholesky
+native._OPTION = "xla_cpu_an_option_of_no_version"
+stm.algebra.use_native_loops()
+S = 2.0 * jnp.eye(3)
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    L = jax.jit(cholesky)(S), jax.jit(lambda S: cholesky(S + S))(S)
+said = [str(x.message) for x in caught if native._OPTION in str(x.message)]
+print(len(said), float(L[0][0, 0] ** 2), float(L[1][0, 0] ** 2), int(native.native_loops()))
+"""
+
+
+def test_an_option_that_xla_does_not_know_is_said_once():
+    """Programs are those without native loops then; what is computed is right."""
+    assert outcome("native", UNKNOWN) == pytest.approx([1, 2, 4, 0], rel=1e-6)
+
+
 # Two implicit methods on ten nonlinear oscillators; their loops over stages hold no library call.
 IMPLICIT = """
 import sys
