@@ -5,6 +5,7 @@ from .compiler import (
     compiler_options as compiler_options,
     outer_jit as outer_jit,
 )
+from .corrected import CorrectedLevenbergMarquardt as CorrectedLevenbergMarquardt
 from .kept import keep_programs as keep_programs
 from .lapack import (
     inverse as inverse,

@@ -1,11 +1,11 @@
 """Iterative minimisation of a loss, with progress, the best values so far, and restarts.
 
-The methods are those of optimistix, and through `optimistix.OptaxMinimiser` those of optax. This
-module adds what long searches need: every step can be observed, the best values are kept, a loss
-that is not finite ends the search, and a search can be interrupted and resumed.
+The methods are those of optimistix, through `optimistix.OptaxMinimiser` those of optax, and
+`CorrectedLevenbergMarquardt`. This module adds what long searches need: every step can be observed, the
+best values are kept, a loss that is not finite ends the search, and a search can be interrupted and resumed.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,9 +20,12 @@ from jaxtyping import Array, PyTree
 from ..checks.errors import SettingError
 from ..checks.reason import AbstractReason
 from .compiler import quick_jit
+from .corrected import CorrectedLevenbergMarquardt
 from .derivative import value_and_jacobian
 
-Method = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
+Method = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | CorrectedLevenbergMarquardt
+# Values, their loss, and whether the method has converged there.
+_Seen = tuple[Any, Any, Any]
 
 
 class SearchReason(AbstractReason):
@@ -111,7 +114,7 @@ class _Stepper(eqx.Module):
     """
 
     function: Callable[[Any], Any]
-    method: Method
+    method: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
     shape: Any = eqx.field(static=True)
 
     @property
@@ -173,8 +176,8 @@ def search(
     """Minimise a loss, or the sum of squares of residuals, over the leaves of a pytree.
 
     Args:
-        function: for a least-squares method such as `optimistix.LevenbergMarquardt`, a function
-            from values to residuals (any pytree); for a minimiser such as
+        function: for a least-squares method such as `CorrectedLevenbergMarquardt()` or
+            `optimistix.LevenbergMarquardt`, a function from values to residuals (any pytree); for a minimiser such as
             `optimistix.OptaxMinimiser(optax.adam(1e-2), rtol, atol)`, from values to a loss ().
         steps: largest number of steps in all.
         patience: number of steps without a relative gain of `gain` after which the search ends.
@@ -193,6 +196,19 @@ def search(
     if resume is not None:
         _check_form(resume.values, values)
         values = resume.values
+    if isinstance(method, CorrectedLevenbergMarquardt):
+        going = _corrected(function, method, values)
+    else:
+        going = _stepped(function, method, values)
+    return _go(going, resume, steps, patience, gain, report)
+
+
+def _stepped(
+    function: Callable[[Any], Any],
+    method: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser,
+    values: Any,
+) -> Iterator[_Seen]:
+    """Steps of a method of optimistix; the first tells the loss at the start."""
     seen = None
     if isinstance(method, optx.AbstractGaussNewton):
         seen = value_and_columns(function, values)
@@ -201,13 +217,32 @@ def search(
         found = eqx.filter_eval_shape(_called, function, values)
     shape = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), found)
     stepper = _Stepper(function, method, shape)
-    return _go(stepper, values, seen, resume, steps, patience, gain, report)
+    arrays, place = stepper.begin(values, seen)
+    while True:
+        if seen is None and stepper.squares:
+            seen = value_and_columns(function, place)
+        values, (arrays, place), known, loss, done = stepper.step(values, arrays, seen)
+        seen = None
+        yield known, loss, done
+
+
+def _corrected(
+    function: Callable[[Any], Any], method: CorrectedLevenbergMarquardt, values: Any
+) -> Iterator[_Seen]:
+    """Steps of the corrected method; the first tells the loss at the start."""
+    seen = value_and_columns(function, values)
+    yield values, 0.5 * sum(np.sum(np.square(x)) for x in jax.tree.leaves(seen[0])), False
+    damping = jnp.ones(())
+    while True:
+        step = method.attempt(function, values, seen, damping)
+        values, damping = step.values, step.damping
+        yield values, step.loss, step.done
+        if step.taken:
+            seen = value_and_columns(function, values)
 
 
 def _go(
-    stepper: _Stepper,
-    values: Any,
-    seen: Any,
+    going: Iterator[_Seen],
     now: Search | None,
     steps: int,
     patience: int,
@@ -218,12 +253,8 @@ def _go(
     mark, mark_loss = (now.steps, now.loss) if now is not None else (0, np.inf)
     reason = SearchReason.STEPS
     try:
-        arrays, place = stepper.begin(values, seen)
         while now is None or now.steps < steps:
-            if seen is None and stepper.squares:
-                seen = value_and_columns(stepper.function, place)
-            values, (arrays, place), known, loss, done = stepper.step(values, arrays, seen)
-            seen = None
+            known, loss, done = next(going)
             if begun:
                 # the first step of a resumed search only evaluates the loss where it starts
                 begun = False

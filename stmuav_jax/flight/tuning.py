@@ -16,10 +16,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..algebra.compiler import quick_jit
+from ..algebra.corrected import CorrectedLevenbergMarquardt
 from ..algebra.least_squares import Method as SearchMethod, Search, SearchReason, search
 from ..algebra.sampled import Sampled
 from ..algebra.space import Point
@@ -216,12 +216,12 @@ class InputTuning:
         return self.residuals.cost.driven.signals(values["values"])  # pyright: ignore
 
     def search(self, method: SearchMethod | None = None, **options: Any) -> Search:
-        """Solve the problem; see `search` for the options. Default: Levenberg-Marquardt.
+        """Solve the problem; see `search` for the options. Default: `CorrectedLevenbergMarquardt`.
 
         A search that has ended with a motion that passes a limit by more than its tolerance has not
         succeeded: its reason is `SearchReason.LIMIT_PASSED`, and `excess` says by how much.
         """
-        method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8) if method is None else method
+        method = CorrectedLevenbergMarquardt() if method is None else method
         found = search(self.residuals, self.start, method, **options)
         if found.reason in (SearchReason.CONVERGED, SearchReason.PATIENCE):
             over = zip(self.excess(found.values), self._limits(), strict=True)

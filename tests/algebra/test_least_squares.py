@@ -5,11 +5,15 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
+from scipy.optimize import least_squares
 
 import stmuav_jax as stm
+from stmuav_jax.algebra import CorrectedLevenbergMarquardt
 from stmuav_jax.algebra.least_squares import SearchReason, search
 
 LM = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
+CORRECTED = CorrectedLevenbergMarquardt(rtol=1e-10, atol=1e-12)
+both = pytest.mark.parametrize("method", [LM, CORRECTED], ids=["plain", "corrected"])
 
 
 def rosenbrock(v):
@@ -20,9 +24,10 @@ def rosenbrock(v):
 START = {"x": -1.2, "y": 1.0}
 
 
-def test_least_squares():
+@both
+def test_least_squares(method):
     seen = []
-    found = search(rosenbrock, START, LM, report=lambda s: seen.append(s.loss))
+    found = search(rosenbrock, START, method, report=lambda s: seen.append(s.loss))
     assert found.reason == SearchReason.CONVERGED
     np.testing.assert_allclose([found.values["x"], found.values["y"]], 1, atol=1e-8)
     assert found.history[0] == pytest.approx(0.5 * (2.2**2 + (10 * 0.44) ** 2))
@@ -38,15 +43,42 @@ def test_a_minimiser_of_optax():
     assert float(found.values) == pytest.approx(2.0, abs=1e-3)
 
 
-def test_goes_on_where_it_was():
-    first = search(rosenbrock, START, LM, steps=5)
+@both
+def test_goes_on_where_it_was(method):
+    first = search(rosenbrock, START, method, steps=3)
     assert first.reason == SearchReason.STEPS
-    assert first.steps == 5
-    again = search(rosenbrock, START, LM, steps=100, resume=first)
-    assert again.history[:6] == first.history
+    assert first.steps == 3
+    again = search(rosenbrock, START, method, steps=100, resume=first)
+    assert again.history[:4] == first.history
     assert again.loss < 1e-16 < first.loss
     with pytest.raises(stm.SettingError, match="values of another form"):
-        search(rosenbrock, {"x": 0.0, "y": jnp.zeros(2)}, LM, resume=first)
+        search(rosenbrock, {"x": 0.0, "y": jnp.zeros(2)}, method, resume=first)
+
+
+def valley(v):
+    """Residuals of a narrow curved valley, y = sin x, along which the others are small."""
+    return 1e5 * (v[1] - jnp.sin(v[0])), 0.1 * (v[0] - 2), 0.1 * (v[1] + 1), 0.1 * v[2]
+
+
+def test_corrections_follow_a_curved_valley():
+    """The minimum of SciPy, which steps without corrections do not come near to meanwhile."""
+    start = jnp.array([-1.0, 1.0, 3.0])
+    corrected = search(valley, start, CorrectedLevenbergMarquardt(), steps=100, patience=100)
+    plain = search(valley, start, optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8), steps=100)
+    at = lambda x: np.array(valley(x))
+    exact = least_squares(at, [0.8, 0.7, 0.1], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert corrected.reason == SearchReason.CONVERGED
+    assert corrected.loss == pytest.approx(exact.cost, rel=1e-6)
+    np.testing.assert_allclose(corrected.values, exact.x, atol=1e-4)
+    assert plain.loss > 1.05 * corrected.loss
+
+
+def test_a_step_out_of_the_domain_is_shortened():
+    """The first step from 3 would lead to a negative logarithm's argument."""
+    found = search(lambda x: jnp.log(x) ** 3, jnp.asarray(3.0), CORRECTED, steps=200, patience=200)
+    assert found.reason == SearchReason.CONVERGED
+    assert float(found.values) == pytest.approx(1.0, abs=1e-2)
+    assert np.all(np.isfinite(found.history))
 
 
 def test_interrupted():

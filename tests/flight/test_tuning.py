@@ -122,7 +122,8 @@ def test_slew(flyer):
     stops = tracker_limits(stm.PART_II)
     limits = SlewLimits(6.2, stops.home, stops.lower, stops.upper, 30.0)
     tuning = slew(flyer, START, after, 1.0, limits, segments=5, outputs_per_segment=6)
-    found = search(tuning.residuals, tuning.start, LM, steps=25)
+    found = tuning.search(steps=60)
+    assert found.reason == stm.algebra.SearchReason.CONVERGED
     before, now = peaks(tuning, tuning.start), peaks(tuning, found.values)
     assert float(now.error) < 1e-4 < 0.1 < float(before.error)
     assert float(now.tilt) < 0.01 * float(before.tilt)
