@@ -7,7 +7,7 @@ writes `results/hard.json` and the page `docs/hard.md`.
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -97,11 +97,7 @@ def beside(case: Hard, peer: Peer) -> dict[str, Any]:
         clock = time.perf_counter()
         outcome = prepared.run()
         spent = outcome.seconds or [time.perf_counter() - clock]
-        row["setting"] = {
-            "solver": setting.solver,
-            "tolerance": setting.tolerance,
-            "step": setting.step,
-        }
+        row["setting"] = {key: getattr(setting, key) for key in ("solver", "tolerance", "step")}
         if outcome.failure or not np.all(np.isfinite(outcome.positions)):
             return row | {"reason": outcome.failure or "Its positions are not finite."}
         seen: Any = SimpleNamespace(ts=ts, states=SimpleNamespace(r=outcome.positions))
@@ -157,7 +153,7 @@ def result_of(one: dict[str, Any]) -> str:
         at = f"step {step:.2g} s" if tolerance is None else f"tolerance {tolerance:.0e}"
     if reason := one["reason"]:
         return f"{reason.rstrip('.')} ({at})." if at else reason
-    return f"{number(one['error'], digits=2)}, {number(one['seconds'], digits=2)} s ({at})"
+    return f"{two(one['error'])}, {two(one['seconds'])} s ({at})"
 
 
 def more(content: dict[str, Any]) -> list[str]:
@@ -176,37 +172,35 @@ def more(content: dict[str, Any]) -> list[str]:
     if ran:
         cell = lambda k: lambda row: result_of(row["peers"][k])
         names = [(one["peer"], None, cell(k)) for k, one in enumerate(ran[0]["peers"])]
-        ours = (
-            "reached here",
-            None,
-            lambda row: f"{number(row['reached'], digits=2)} {row['unit']}",
-        )
+        ours = ("reached here", None, with_unit("reached"))
         parts += [BESIDE, titled("", ran, ("case", "name"), ours, *names).lstrip(), ""]
     return parts
 
 
+def two(value: float | None) -> str:
+    """Two digits, or a dash."""
+    return number(value, digits=2)
+
+
+def with_unit(key: str) -> Callable[[dict[str, Any]], str]:
+    """Two digits of a case's number and its unit, or a dash."""
+    return lambda row: "-" if row[key] is None else f"{two(row[key])} {row['unit']}"
+
+
 def page(content: dict[str, Any]) -> str:
     """The page, from the record alone."""
-    with_unit = lambda key: (
-        lambda row: "-" if row[key] is None else f"{number(row[key], digits=2)} {row['unit']}"
-    )
-    effort = (
-        ("steps", None, lambda row: f"{row['accepted']:,} + {row['rejected']:,}"),
-        ("run [s]", "seconds", lambda x: number(x, digits=2)),
-    )
-    drift = (
-        ("joints open by [m]", "position_violation", lambda x: number(x, digits=2)),
-        ("energy, relative", "relative_energy_error", lambda x: number(x, digits=2)),
-    )
+    steps = lambda row: f"{row['accepted']:,} + {row['rejected']:,}"
+    effort = ("steps", None, steps), ("run [s]", "seconds", two)
+    energy = ("energy, relative", "relative_energy_error", two)
+    drift = ("joints open by [m]", "position_violation", two), energy
     reached = (
         ("demanded", None, lambda row: f"{row['demanded']:.0e} {row['unit']}"),
         ("reached", None, with_unit("reached")),
         ("estimated by the run", None, with_unit("estimated")),
     )
     about = content["environment"]
-    missed = [
-        row["name"] for key in ("cases", "tolerances") for row in content[key] if not holds(row)
-    ]
+    rows = [*content["cases"], *content["tolerances"]]
+    missed = [row["name"] for row in rows if not holds(row)]
     verdict = f"Not reached: {', '.join(missed)}." if missed else "All are reached."
     where = f"Commit {about['commit'][:10]}, {about['date'][:10]}, run times on one core."
     cases = titled(
@@ -216,19 +210,8 @@ def page(content: dict[str, Any]) -> str:
     swept = titled(
         "", content["tolerances"], ("tolerance", "tolerance", "{:.0e}".format), *reached, *effort
     )
-    parts = [
-        HEAD,
-        f"{where} {verdict}",
-        "",
-        cases,
-        "",
-        SWEEP,
-        swept.lstrip(),
-        "",
-        *more(content),
-        LIMITS,
-    ]
-    return "\n".join(parts)
+    parts = [HEAD, f"{where} {verdict}", "", cases, "", SWEEP, swept.lstrip(), ""]
+    return "\n".join([*parts, *more(content), LIMITS])
 
 
 def show(path: Path, folder: Path) -> str:

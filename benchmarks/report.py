@@ -1,4 +1,4 @@
-"""The suite's page, from its JSON files alone: tables in Markdown and figures.
+"""The suite's page, from its JSON files alone, and the figures of docs/failure.md from its own.
 
 python benchmarks/report.py
 """
@@ -6,14 +6,14 @@ python benchmarks/report.py
 import argparse
 import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sections import tables
+from sections import failure_page, tables
 from sections.figures import draw
 from sections.state import state
-from shared.pages import Lines, table
+from shared.pages import Lines, listed, save, table
 from shared.record import RESULTS, ROOT
 
 from stmuav_jax.files.netcdf import write_atomically
@@ -73,30 +73,28 @@ def circumstances(results: dict[str, dict[str, Any]]) -> Lines:
 def compared(results: dict[str, dict[str, Any]]) -> Lines:
     """The peers, with versions and caveats, and those that were skipped."""
 
-    def unique(key: str) -> Iterable[dict[str, Any]]:
+    def unique(key: str) -> list[dict[str, Any]]:
         found = (row for result in results.values() for row in result[key])
-        return {row["method"]: row for row in found}.values()
+        return list({row["method"]: row for row in found}.values())
 
-    told = lambda p: [
-        p["method"],
-        p["version"],
-        p.get("how", "not recorded"),
-        " ".join(p["caveats"]),
-    ]
-    there = [told(p) for p in unique("peers")]
-    absent = [[p["method"], p["reason"]] for p in unique("skipped")]
-    head = ["program", "version", "how it is run", "what is left out or done differently"]
-    lines = table(head, there) if there else ["No other program was run."]
-    return [*lines, *(["", *table(["skipped", "why"], absent)] if absent else [])]
+    there, absent = unique("peers"), unique("skipped")
+    how = ("how it is run", None, lambda peer: peer.get("how", "not recorded"))
+    left = ("what is left out or done differently", "caveats", " ".join)
+    lines = listed(there, ("program", "method"), "version", how, left)
+    lines = lines if there else ["No other program was run."]
+    gone = ["", *listed(absent, ("skipped", "method"), ("why", "reason"))] if absent else []
+    return [*lines, *gone]
 
 
 def build(results: Path, page: Path) -> Path:
-    """Write the page and, beside it in `figures/benchmarks`, its figures; returns its path."""
+    """Write the page; beside it in `figures` its figures and docs/failure.md's; returns its path."""
     found = load(results)
     if not found:
         raise SystemExit(f"There are no results in {results}.")
-    folder = page.parent / "figures" / "benchmarks"
-    figures = draw(found, folder)
+    folder = page.parent / "figures"
+    figures = draw(found, folder / "benchmarks")
+    if (failure := results / "failure.json").exists():
+        save(failure_page.figures(json.loads(failure.read_text())), folder / "failure")
     lines = [HEAD]
     if any(result["size"] != "full" for result in found.values()):
         lines += ["**Some sections were run at the smallest size: no measurements.**", ""]

@@ -64,12 +64,8 @@ def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
 
 def least(runs: list[dict[str, Any]]) -> dict[str, float]:
     """Least CPU time, which the machine's other work lengthens, and medians of the rest."""
-    median = lambda name: statistics.median(run[name] for run in runs)
-    return {
-        "cpu": min(run["cpu"] for run in runs),
-        "wall": median("wall"),
-        "memory": median("memory"),
-    }
+    medians = {k: statistics.median(run[k] for run in runs) for k in ("wall", "memory")}
+    return {"cpu": min(run["cpu"] for run in runs), **medians}
 
 
 def measured(name: str, repeats: int) -> dict[str, Any]:
@@ -100,10 +96,8 @@ def main() -> None:
         found[name] = measured(name, 1 if options.quick else options.repeats)
         for kind in ("cold", "warm"):
             own = found[name][kind]
-            print(
-                f"{name}, {kind}: "
-                + ", ".join(f"{k} {own[k]:.1f}" for k in ("cpu", "wall", "memory"))
-            )
+            told = ", ".join(f"{k} {own[k]:.1f}" for k in ("cpu", "wall", "memory"))
+            print(f"{name}, {kind}: {told}")
         print(write("waiting", {"what": ABOUT, "commands": found}, options.results))
 
 

@@ -182,7 +182,7 @@ def does_it_pay() -> tuple[dict, Figure]:
     axes[0, 0].set_xlim(0, 0.4)
     axes[0, 0].text(0.015, 1.66, f"the report's panel: {report:.0f} kg/m²", fontsize=8)
     axes[0, 0].set_title("a panel pays below its line", fontsize=10)
-    axes[0, 0].set_xlabel("efficiency of the cells", fontsize=9)
+    axes[0, 0].set_xlabel("efficiency of the cells [1]", fontsize=9)
     axes[0, 0].set_ylabel("panel's mass per area [kg/m²]", fontsize=9)
     axes[0, 0].legend(fontsize=8, loc="upper left")
     axes[0, 1].axhline(0.0, color="0.4", linewidth=0.8)

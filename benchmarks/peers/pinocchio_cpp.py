@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from problems.plain import start, starts, why_not
-from problems.tree import why_no_tree
+from problems.tree import span
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, tolerances
 from peers.pinocchio_model import linked, model_text, start_vectors, starts_text
@@ -144,7 +144,7 @@ class PinocchioCpp(Peer):
         return f"No headers of {', '.join(lacking)} were found." if lacking else ""
 
     def unsupported(self, scene: Scene) -> str:
-        return why_not(scene) or why_no_tree(scene)
+        return why_not(scene, span)
 
     def settings(self, scene: Scene | None = None) -> list[Setting]:
         return tolerances("rkf78")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from problems.plain import Plain, Sinus, UnsupportedError, axes, plain
+from problems.plain import Plain, Sinus, UnsupportedError, axes, plain, why_not
 from problems.tree import IDENTITY, Frame, Tree, coordinates, span
 
 from stmuav_jax import Scene, State
@@ -152,11 +152,7 @@ def generalised(links: LinkModel) -> tuple[np.ndarray, list[tuple[np.ndarray, Si
 
 def why_no_joint_forces(scene: Scene) -> str:
     """What lacks for a scene as a tree whose driving forces are joint forces; empty if nothing."""
-    try:
-        generalised(linked(scene)[1])
-    except UnsupportedError as error:
-        return str(error)
-    return ""
+    return why_not(scene, lambda scene: generalised(linked(scene)[1]))
 
 
 def start_vectors(tree: Tree, state: State) -> tuple[np.ndarray, np.ndarray]:

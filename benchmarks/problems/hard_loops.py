@@ -9,10 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from problems import four_bar
 from problems.bricard import bricard, exact_centres, slope_of, swing
-from problems.conservative import DOWN_Y, SMALL, moving
-from problems.hard import CRANK, ORIGIN, ROD, G, Hard, X, Z, apart, swinging
+from problems.conservative import DOWN_Y, SMALL
+from problems.hard import CRANK, ROD, G, Hard, Z, apart, four_bars, slider_crank, swinging
 
 import stmuav_jax as stm
 
@@ -31,34 +30,9 @@ def cube_off(run: Any) -> float:
     return float(np.max(np.linalg.norm(off, axis=2)))
 
 
-def chain() -> tuple[stm.System, stm.State, np.ndarray]:
-    """Four loops of four-bars side by side: twelve of their rows depend on others."""
-    system = four_bar.four_bar(LOOPS)
-    return system, four_bar.start(system), np.linspace(0.0, 5.0, 41)
-
-
-def chain_off(run: Any) -> float:
-    """Largest error of the first crank's end [m], against the closed form."""
-    exact = four_bar.closed_form(LOOPS, np.asarray(run.ts))[:, :2]
-    return float(np.max(np.abs(2 * np.asarray(run.states.r)[:, 0, :2] - exact)))
-
-
 def free_crank() -> tuple[stm.System, stm.State, np.ndarray]:
     """A slider-crank that is let go turning from a dead point, crank and rod in line."""
-    places = ((CRANK / 2, 0.0, 0.0), (CRANK + ROD / 2, 0.0, 0.0), (CRANK + ROD, 0.0, 0.0))
-    names = ("crank", "rod", "slider")
-    bodies = [stm.Body(n, 1.0, SMALL, position=r) for n, r in zip(names, places, strict=True)]
-    joints = [
-        stm.revolute("foot", "ground", "crank", point=ORIGIN, axis=Z),
-        stm.revolute("knee", "crank", "rod", point=(CRANK, 0.0, 0.0), axis=Z),
-        stm.revolute("wrist", "rod", "slider", point=places[2], axis=Z),
-        stm.translational("rail", "ground", "slider", point=places[2], axis=X),
-    ]
-    system = stm.System(bodies, joints, [stm.Gravity(DOWN_Y)])
-    tip = SPIN * CRANK
-    omega = SPIN * np.outer((1.0, -CRANK / ROD, 0.0), Z)
-    v = [(0.0, tip / 2, 0.0), (0.0, tip / 2, 0.0), ORIGIN]
-    return system, moving(system, v, omega), np.linspace(0.0, 5.0, 41)
+    return *slider_crank(SPIN), np.linspace(0.0, 5.0, 41)
 
 
 def crank_bodies(phi: Any) -> tuple[np.ndarray, Any]:
@@ -71,10 +45,7 @@ def crank_bodies(phi: Any) -> tuple[np.ndarray, Any]:
 
 def crank_inertia(phi: float) -> float:
     """Generalised inertia of the crank's angle [kg m^2]."""
-    places, lean = (
-        slope_of(lambda x: crank_bodies(x)[0], phi),
-        slope_of(lambda x: crank_bodies(x)[1], phi),
-    )
+    places, lean = (slope_of(lambda x, k=k: crank_bodies(x)[k], phi) for k in (0, 1))
     return float(np.sum(places**2) + SMALL[2] * (1 + lean**2))
 
 
@@ -90,7 +61,7 @@ LOOP_CASES: tuple[Hard, ...] = (
     Hard("redundant loops, Bricard", "one of 30 rows depends on the others wherever the loop closes",
          "its one coordinate, in SciPy at 1e-12", 1e-6, "m", cube, cube_off),
     Hard("redundant loops, four-bars", "four loops with twelve dependent rows, through postures in line",
-         "closed form", 1e-4, "m", chain, chain_off),
+         "closed form", 1e-4, "m", *four_bars(LOOPS)),
     Hard("dead points", "a free slider-crank turns from one dead point through the others",
          "the crank's angle alone, in SciPy at 1e-12", 1e-5, "m", free_crank, crank_off),
     Hard("2,000 s of a pendulum", "845 swings add their errors up, rtol 1e-11",
@@ -113,14 +84,8 @@ def in_line(centre: float) -> stm.System:
 
 
 STARTS: tuple[tuple[str, str, Callable[[], stm.System]], ...] = (
-    (
-        "folded four-bar",
-        "its last rod is heavy beyond its foot: no branch balances",
-        lambda: in_line(0.5),
-    ),
-    (
-        "four-bar in line",
-        "its rods fall as one parallelogram, or as crossed ones: both keep the joints together",
-        lambda: in_line(1.5),
-    ),
-)
+    ("folded four-bar", "its last rod is heavy beyond its foot: no branch balances",
+     lambda: in_line(0.5)),
+    ("four-bar in line", "its rods fall as one parallelogram, or as crossed ones: both keep the "
+     "joints together", lambda: in_line(1.5)),
+)  # fmt: skip

@@ -209,10 +209,10 @@ def _sinus(value: object) -> Sinus:
     return Sinus(np.asarray(value, dtype=float), 0.0, 0.5 * np.pi)
 
 
-def why_not(scene: Scene) -> str:
-    """What all our adapters lack for a scene; empty if they lack nothing."""
+def why_not(scene: Scene, make: Callable[[Scene], object] = plain) -> str:
+    """What all our adapters, or those that make more of it, lack for a scene; empty if nothing."""
     try:
-        plain(scene)
+        make(scene)
     except UnsupportedError as error:
         return str(error)
     return ""

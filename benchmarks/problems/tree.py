@@ -104,11 +104,8 @@ def span(scene: Scene, model: Plain | None = None) -> Tree:
     if plane is None and not spatial:
         said = "Cutting a spatial loop at a joint that is not spherical is not written."
         raise UnsupportedError(said)
-    bodies, parameters = (
-        tuple(carrier[k] for k in range(model.n)),
-        tree_parameters(scene.system, spanned),
-    )
-    return Tree(tuple(links), cuts, bodies, plane, parameters)
+    bodies = tuple(carrier[k] for k in range(model.n))
+    return Tree(tuple(links), cuts, bodies, plane, tree_parameters(scene.system, spanned))
 
 
 def in_plane(model: Plain) -> np.ndarray | None:
@@ -127,15 +124,6 @@ def in_plane(model: Plain) -> np.ndarray | None:
     if model.n not in normals:
         return None
     return np.linalg.svd(normals[model.n][None])[2][1:]
-
-
-def why_no_tree(scene: Scene) -> str:
-    """Why there is no tree that the peers can use; empty if there is one."""
-    try:
-        span(scene)
-    except UnsupportedError as error:
-        return str(error)
-    return ""
 
 
 def _link(joint: PlainJoint, parent: int, child: int, ahead: int, forward: bool) -> Link:

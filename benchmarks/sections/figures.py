@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
-from shared.pages import NATIVE, Row, legend_of, ours, panels, save
+from shared.pages import NATIVE, Row, legend, ours, panels, save
 
 from stmuav_jax.figures import look
 
@@ -56,11 +56,7 @@ def work_precision(curve: Row) -> Figure:
     for axes, end in zip(sides, ends, strict=True):
         axes.set(xlabel="position error [m]", title=f"to {end:g} s")
     sides[0].set_ylabel("run time [ms]")
-    lines = legend_of(sides)
-    figure.legend(
-        lines.values(), lines.keys(), loc="outside lower center", fontsize=6.5, ncols=2, handlelength=3,
-        title_fontsize=6.5, title=missing(not_drawn(curve), 130),
-    )  # fmt: skip
+    legend(figure, sides, 2, 6.5, title=missing(not_drawn(curve), 130))
     figure.suptitle(curve["title"], fontsize=10)
     return figure
 

@@ -116,11 +116,8 @@ def gradient(size: Size, others: list[Peer]) -> dict[str, Any]:
                 "failure": "" if np.all(np.isfinite(value)) else "The gradient is not finite.",
             }  # fmt: skip
             rows.append(row)
-            print(
-                f"  {name} {tolerance:.0e}: {1e3 * timing.median:.1f} ms, "
-                f"{row['cost_in_simulations']:.1f} simulations, error {row['error']}",
-                flush=True,
-            )
+            said = f"{row['cost_in_simulations']:.1f} simulations, error {row['error']}"
+            print(f"  {name} {tolerance:.0e}: {1e3 * timing.median:.1f} ms, {said}", flush=True)
     return {
         "what": "gradient of the panel's final position, uav_tracker case 2, tree, Dopri8",
         "horizon": size.gradient_horizon, "parameters": PARAMETERS, "count": size.parameters,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from shared.pages import Row, legend_of, number, panels, power, save, shown, titled
+from shared.pages import Row, legend, number, panels, power, save, shown, titled
 
 from stmuav_jax.figures import look
 
@@ -126,11 +126,7 @@ def each(problems: list[Row], draw: Callable[[Any, Row], None], note: str) -> Fi
     figure, axes = panels(rows, columns, 2.4 * rows + 1.0)
     for ax, problem in zip(axes, problems, strict=True):
         draw(ax, problem)
-    lines = legend_of(axes)
-    figure.legend(
-        lines.values(), lines.keys(), loc="outside lower center", ncols=3, fontsize=7, title=note,
-        title_fontsize=7, handlelength=3,
-    )  # fmt: skip
+    legend(figure, axes, 3, 7, title=note)
     return figure
 
 

@@ -76,9 +76,8 @@ def line(
         seconds = row["seconds"]["median"] if row["seconds"] else float("nan")
         if seconds > PATIENCE:
             slow[setting.solver] = f"Left out: the coarser setting took {seconds:.1f} s."
-        print(
-            f"  {peer.name} {setting}: {seconds} s, {row['error']} m {row['failure']}", flush=True
-        )
+        said = f"{seconds} s, {row['error']} m {row['failure']}"
+        print(f"  {peer.name} {setting}: {said}", flush=True)
     return rows
 
 

@@ -276,11 +276,8 @@ def scaling(size: Size, others: list[Peer]) -> dict[str, Any]:
             continue
         rows.append(row)
         run = f"{1e3 * row['run_seconds']['median']:.1f} ms" if row["run_seconds"] else "no run"
-        print(
-            f"  N = {loops}: {1e6 * row['acceleration_seconds']:.1f} us, {run}, "
-            f"all {timing.median:.0f} s {row['failure']}",
-            flush=True,
-        )
+        run += f", all {timing.median:.0f} s {row['failure']}"
+        print(f"  N = {loops}: {1e6 * row['acceleration_seconds']:.1f} us, {run}", flush=True)
         if timing.median > LONGEST:
             left = f"left out: N = {loops} took {timing.median:.0f} s"
     fits = lambda key: {str(least): exponent(rows, key, least) for least in (1, 8)}

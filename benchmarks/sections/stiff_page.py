@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from shared.pages import Row, legend_of, number, panels, power, save, shown, titled
+from shared.pages import Row, legend, number, panels, power, save, shown, titled
 
 from stmuav_jax.figures import look
 
@@ -102,15 +102,7 @@ def work(record: Row) -> Figure:
         ax.set_axis_off()
     figure.supxlabel("largest position error [m]", fontsize=9)
     figure.supylabel(f"run time for {record['t1']:g} s of motion [s]", fontsize=9)
-    lines = legend_of(axes)
-    figure.legend(
-        lines.values(),
-        lines.keys(),
-        loc="outside upper center",
-        ncols=4,
-        fontsize=8,
-        handlelength=3,
-    )
+    legend(figure, axes, 4, loc="outside upper center")
     return figure
 
 

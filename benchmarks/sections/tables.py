@@ -229,18 +229,14 @@ def commands(result: Row) -> Lines:
                 row.append(", ".join(str(code) for code in ended))
         rows.append(row)
     measures = ("CPU [s]", "wall [s]", "peak [MB]")
-    head = [
-        "command",
-        "words after `stmuav`",
-        *(f"{k}, {m}" for k in ("cold", "warm") for m in measures),
-    ]
+    both = [f"{k}, {m}" for k in ("cold", "warm") for m in measures]
     repeats = max(len(found["cold"]["runs"]) for found in result["commands"].values())
     return [
         f"Whole processes on {result['environment']['cores']} cores, {repeats} of each: least processor time, "
         "medians of wall time and peak memory. Cold is with an empty cache folder, warm the same command "
         "again. Exit code 3 says that a filter is not consistent, which is the report's.",
         "",
-        *table([*head, "exit code, if not 0"], rows),
+        *table(["command", "words after `stmuav`", *both, "exit code, if not 0"], rows),
     ]
 
 

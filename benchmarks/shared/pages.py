@@ -96,13 +96,14 @@ def panels(rows: int, columns: int, height: float, **shared: Any) -> tuple[Figur
     return figure, list(axes.flat)
 
 
-def legend_of(axes: Sequence[Any]) -> dict[str, Any]:
-    """Label -> line over all panels, for one legend."""
+def legend(figure: Figure, axes: Sequence[Any], columns: int, size: float = 8, **how: Any) -> None:
+    """Add one legend of all panels' labels, below them where nothing else is said."""
     lines: dict[str, Any] = {}
     for ax in axes:
         for line, label in zip(*ax.get_legend_handles_labels(), strict=True):
             lines.setdefault(label, line)
-    return lines
+    how = {"loc": "outside lower center", "handlelength": 3, "title_fontsize": size} | how
+    figure.legend(lines.values(), lines.keys(), ncols=columns, fontsize=size, **how)
 
 
 def save(figures: dict[str, Figure], folder: Path) -> list[Path]:

@@ -1,11 +1,13 @@
 """The pages that benchmarks write: failures with reasons, and honest words about other programs."""
 
 import json
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import report
-from sections import figures, state
+from sections import failure_page, figures, state
 from sections.tables import reference
 from sections.throughput_page import of_peer
 from shared.record import RESULTS
@@ -104,3 +106,55 @@ def test_reference_in_closed_form_is_called_so():
     check = {"horizon": 1.0, "second_code": None, "other_formulation": None}
     assert "The reference is the closed form" in reference(check, True)[0]
     assert "tightest tolerance" in reference(check, False)[0]
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Figures of docs/failure.md from the committed record."""
+    return failure_page.figures(json.loads((RESULTS / "failure.json").read_text()))
+
+
+def curve(ax, label):
+    """Points (k, 2) of the curves of a panel with this label."""
+    lines = [line for line in ax.lines if line.get_label() == label]
+    return np.concatenate([np.array(line.get_data()).T for line in lines])
+
+
+def test_figures_of_the_failure_page_have_units(drawn):
+    text = (FOLDER.parent / "docs" / "failure.md").read_text()
+    assert set(drawn) == set(re.findall(r"\(figures/failure/(\w+)\.png\)", text))
+    for name, figure in drawn.items():
+        whole = figure.get_supylabel()
+        for ax in figure.axes:
+            below = ax.get_subplotspec().is_last_row()
+            left = ax.get_subplotspec().is_first_col() and not whole
+            assert "[" in ax.get_xlabel() or not below, name
+            # names of runs have no unit
+            assert "[" in ax.get_ylabel() or not left or name == "collapse", name
+        assert not whole or "[" in whole
+
+
+def test_figures_of_the_failure_page_show_what_its_text_says(drawn):
+    (ax,) = drawn["violation"].axes
+    # half of the last digit of the page's table, and of the three that a curve's points have
+    for label, end in (("corrected, default tolerances", 9.8e-2), ("corrected", 2.5e-5)):
+        t, last = curve(ax, label)[-1]
+        assert t == 2.0
+        assert abs(last - end) <= 0.055 * 10.0 ** np.floor(np.log10(end))
+    (ax,) = drawn["collapse"].axes
+    times, places = curve(ax, failure_page.TIGHT).T
+    # the lower three rows are those of all four misprints
+    within = times[(places > 2.5) & (times >= 0.45) & (times <= 0.5)]
+    assert (len(times), len(within)) == (60, 4)
+    rates, _, steps, _ = drawn["stiffness"].axes
+    for ax, largest in ((rates, (56, 71, 85)), (steps, (0.72, 0.84, 0.72))):
+        for case, value in enumerate(largest, 1):
+            t, y = curve(ax, f"case {case}").T
+            assert np.max(y[t <= 0.5]) == pytest.approx(value, rel=0.01)
+    for case, close in ((1, 3), (2, 15), (3, 28)):
+        t, angle = curve(drawn["alignment"].axes[0], f"case {case}").T
+        # a rod that still comes closer at the end has not passed
+        passes = (angle < 5) & (t < 0.9995)
+        assert (np.sum(passes), len(t)) == (close, 48)
+    _, angle = curve(drawn["alignment"].axes[1], "case 2").T
+    assert np.min(angle) > 78
