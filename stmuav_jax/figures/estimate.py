@@ -17,7 +17,7 @@ from ..quadrotor.assess import CaseStudy, CaseSummary, Estimates, last_beyond, s
 from ..quadrotor.filter_verdict import RunsVerdict
 from ..quadrotor.hover import Hover
 from .filter_record import FORMAT, FORMAT_VERSION, normalised_innovations
-from .plot import STYLES, grid
+from .plot import STYLES, grid, look
 
 COMPONENTS = ("Omega_x", "Omega_y", "Omega_z", "offset_x", "offset_y")
 _LOOKS = {"truth": ("0.6", "-"), "report": STYLES[1], "consistent": STYLES[0]}
@@ -185,9 +185,12 @@ def consistency(study: CaseStudy) -> Figure:
     for row, (words, degrees) in enumerate((("NEES (5)", 5), ("NIS (3)", 3))):
         ax = axes[row, 0]
         ax.axhspan(*mean_interval(degrees, seeds), color="0.8", label="consistent: 99.9 %")
-        for name, found in study.estimates.items():
+        for k, (name, found) in enumerate(study.estimates.items()):
             values = np.asarray(found.nees if degrees == 5 else found.nis)
-            _line(ax, t, np.mean(values, axis=1), name, linewidth=0.8, linestyle="-")
+            # marks, since dashes drown in the noise
+            where = (len(t) // 20 * k, max(1, len(t) // 10))
+            own = {"marker": look(k)["marker"], "markeredgecolor": "white", "markevery": where}
+            _line(ax, t, np.mean(values, axis=1), name, linewidth=0.8, linestyle="-", **own)
         ax.set_yscale("log")
         ax.axvline(settled_from(t[-1]), color="0.4", linewidth=0.8, linestyle=":", label="settled")
         ax.set_ylabel(f"{words}, mean", fontsize=9)
