@@ -187,11 +187,10 @@ def consistency(study: CaseStudy) -> Figure:
         ax.axhspan(*mean_interval(degrees, seeds), color="0.8", label="consistent: 99.9 %")
         for k, (name, found) in enumerate(study.estimates.items()):
             values = np.asarray(found.nees if degrees == 5 else found.nis)
-            # dashes would be lost in the noise
-            every = max(1, len(t) // 20)
-            mark = {"marker": look(k)["marker"], "markersize": 4}
-            mark["markevery"] = ((k + 1) * every // 3, every)
-            _line(ax, t, np.mean(values, axis=1), name, linewidth=0.8, linestyle="-", **mark)
+            # marks, since dashes drown in the noise
+            where = (len(t) // 20 * k, max(1, len(t) // 10))
+            own = {"marker": look(k)["marker"], "markeredgecolor": "white", "markevery": where}
+            _line(ax, t, np.mean(values, axis=1), name, linewidth=0.8, linestyle="-", **own)
         ax.set_yscale("log")
         ax.axvline(settled_from(t[-1]), color="0.4", linewidth=0.8, linestyle=":", label="settled")
         ax.set_ylabel(f"mean {words} [1]", fontsize=9)

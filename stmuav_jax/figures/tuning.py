@@ -21,7 +21,7 @@ from ..checks.schema import Entries, Tuples, checked, named, shown
 from ..files.netcdf import FileError, load_checkpoint, save_checkpoint, write_atomically
 from ..flight.linear import Linear
 from ..flight.tuning import InputTuning
-from .plot import grid
+from .plot import grid, look
 
 _FORMAT = "stmuav_jax search 2"
 _Loss = Annotated[float, Field(strict=True, allow_inf_nan=True)]
@@ -100,7 +100,7 @@ def load_search(path: str | os.PathLike[str], problem: str, like: Any) -> Search
 def loss_history(history: tuple[float, ...]) -> Figure:
     """Figure of the loss over the steps."""
     figure, axes = grid(1, 1, 3.2)
-    axes[0, 0].semilogy(np.arange(len(history)), history, marker=".", lw=1)
+    axes[0, 0].semilogy(np.arange(len(history)), history, **look(0))
     axes[0, 0].set(xlabel="step", ylabel="loss")
     return figure
 
@@ -108,17 +108,17 @@ def loss_history(history: tuple[float, ...]) -> Figure:
 def flight_figure(
     ts: np.ndarray, rows: dict[str, dict[str, np.ndarray]], marks: dict[str, list[float]]
 ) -> Figure:
-    """Figure of curves over time, with a panel per "quantity [unit]" and limits as dashed lines."""
+    """Figure of curves over time, with a panel per "quantity [unit]" and limits as thin grey lines."""
     figure, panels = grid(len(rows), 1, 1.9 * len(rows) + 0.5, sharex=True)
     for axes, (label, curves) in zip(panels[:, 0], rows.items(), strict=True):
-        for name, values in curves.items():
-            axes.plot(ts, values, lw=1.2, label=name)
+        for k, (name, values) in enumerate(curves.items()):
+            axes.plot(ts, values, **look(k), markevery=(0.03 * k, 0.2), label=name)
         for mark in marks.get(label, []):
-            axes.axhline(mark, color="0.4", lw=0.8, ls="--")
+            axes.axhline(mark, color="0.3", linewidth=0.6)
         axes.set_ylabel(label, fontsize=9)
         if len(curves) > 1:
             axes.legend(fontsize=7, ncols=min(len(curves), 3))
-    panels[-1, 0].set_xlabel("t [s]", fontsize=9)
+    panels[-1, 0].set_xlabel("time [s]", fontsize=9)
     return figure
 
 
