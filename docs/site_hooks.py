@@ -24,6 +24,8 @@ OUTSIDE = {
 LINK = re.compile(r"(!?)\[([^\]\[]*)\]\(([^)#\s]+)(#[^)]*)?\)")
 REFERENCE = re.compile(r"^\[([^\]]+)\]: (\S+)$", re.MULTILINE)
 PICTURE = re.compile(r'(<img\b[^>]*\bsrc="([^"]+)"[^>]*>)')
+NAME = re.compile(r"<code>([\w/.:-]+)</code>")
+DATE = re.compile(r"(?<=<td>)(\d{4}-\d\d-\d\d)(?=</td>)")
 FORMULA = re.compile(r"^```math\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -73,7 +75,9 @@ def api_page(room: str) -> str:
     found = public_names(room)
     described = {name for module, names in found.items() if module for name in names}
     links = [f"[`{name}`][{place}.{name}]" for name in sorted(described, key=str.lower)]
-    lines = [f"# `{short}`", "", _about(room) if room else "Names at the root of the package.", ""]
+    # a search finds the names of the root before those of the same words elsewhere
+    lines = [] if room else ["---", "search: {boost: 4}", "---", ""]
+    lines += [f"# `{short}`", "", _about(room) if room else "Names at the root of the package.", ""]
     lines += ["\n".join(links), "{ .names }", ""]
     for module, names in found.items():
         if module == "":
@@ -225,6 +229,22 @@ def with_pictures_to_open(html: str) -> str:
     return "".join(parts)
 
 
+def with_whole_names(html: str) -> str:
+    """HTML of a page whose tables break long names at dots and underscores, short ones and dates nowhere."""
+
+    def name(found: re.Match[str]) -> str:
+        if len(found[1]) < 20:
+            return f'<code class="whole">{found[1]}</code>'
+        return "<code>" + re.sub(r"(::|[/._](?=\w))", r"\1<wbr>", found[1]) + "</code>"
+
+    def table(text: str) -> str:
+        return DATE.sub(r'<span class="whole">\1</span>', NAME.sub(name, text))
+
+    parts = re.split(r"(<table>.*?</table>)", html, flags=re.DOTALL)
+    parts[1::2] = [table(part) for part in parts[1::2]]
+    return "".join(parts)
+
+
 def _mathml(match: re.Match[str]) -> str:
     from latex2mathml.converter import convert
 
@@ -266,8 +286,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
-    """Let a click on a picture open it."""
-    return with_pictures_to_open(html)
+    """Let a click on a picture open it, and tables break long names only."""
+    return with_whole_names(with_pictures_to_open(html))
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:

@@ -256,6 +256,19 @@ def test_a_click_on_a_picture_opens_it():
     )
 
 
+def test_names_in_tables_break_at_their_parts_or_nowhere():
+    long, short = "stm.mechanics.AbstractForce", "case-1"
+    table = "<table><tr><td>{0}</td><td>{1}</td><td>{2}</td></tr></table>"
+    given = table.format(f"<code>{long}</code>", f"<code>{short}</code>", "2026-11-24")
+    found = table.format(
+        "<code>stm.<wbr>mechanics.<wbr>AbstractForce</code>",
+        f'<code class="whole">{short}</code>',
+        '<span class="whole">2026-11-24</span>',
+    )
+    outside = f"<p><code>{long}</code> <code>{short}</code></p>"
+    assert hooks.with_whole_names(outside + given) == outside + found
+
+
 def test_every_described_parameter_has_a_line_of_its_own():
     text = """Sum of two numbers; more: nothing. a: is no section.
 
