@@ -26,7 +26,9 @@ REFERENCE = re.compile(r"^\[([^\]]+)\]: (\S+)$", re.MULTILINE)
 PICTURE = re.compile(r'(<img\b[^>]*\bsrc="([^"]+)"[^>]*>)')
 NAME = re.compile(r"<code>([\w/.:-]+)</code>")
 DATE = re.compile(r"(?<=<td>)(\d{4}-\d\d-\d\d)(?=</td>)")
-FORMULA = re.compile(r"^```math\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+# a dollar before a blank, or after one, is money
+IN_A_LINE = re.compile(r"(?<![\\$\w])\$(?=[^\s$])([^$\n]*(?:\n(?!\n)[^$\n]*)?[^\s$])\$(?![\w$])")
+FORMULA = re.compile(r"^```math\n(.*?)^```$|^\$\$(.*?)\$\$$", re.MULTILINE | re.DOTALL)
 
 
 # --- API pages
@@ -248,7 +250,19 @@ def with_whole_names(html: str) -> str:
 def _mathml(match: re.Match[str]) -> str:
     from latex2mathml.converter import convert
 
-    return f'<div class="formula">{convert(match[1].strip(), display="block")}</div>'
+    return f'<div class="formula">{convert((match[1] or match[2]).strip(), display="block")}</div>'
+
+
+def with_formulas(text: str) -> str:
+    """Text of a page whose LaTeX, in fences or between dollars, is MathML; code stays as it is."""
+    from latex2mathml.converter import convert
+
+    parts = re.split(r"(^```.*?^```$|`[^`]+`)", FORMULA.sub(_mathml, text), flags=re.M | re.S)
+    parts[::2] = [
+        IN_A_LINE.sub(lambda found: f"<span>{convert(found[1].strip())}</span>", part)
+        for part in parts[::2]
+    ]
+    return "".join(parts)
 
 
 def _local(output: str, here: str) -> str:
@@ -282,7 +296,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     uri = page.file.src_uri
     if not uri.startswith("api/"):
         markdown = links_in_site(markdown, _repository_path(uri))
-    return FORMULA.sub(_mathml, markdown)
+    return with_formulas(markdown)
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:

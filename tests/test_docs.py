@@ -256,6 +256,28 @@ def test_a_click_on_a_picture_opens_it():
     )
 
 
+def test_formulas_of_the_site_are_mathml():
+    pytest.importorskip("latex2mathml")  # of the extra docs
+    code = "Pays 5 $ or 6 $. `$d$`\n\n```python\n'$e$'\n```\n"
+    text = "With $a_i$ and\n$b\\,\nc$:\n\n```math\nx^2\n```\n\n$$y =\nx$$\n\n" + code
+    page = hooks.with_formulas(text)
+    assert page.count("<math") == 4
+    assert page.count('<div class="formula"><math') == 2
+    assert re.search(r"<msub><mi>a</mi><mi>i</mi></msub>", page)
+    assert page.endswith(code)
+    assert page.count("<span><math") == 2
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda p: p.stem)
+def test_no_latex_is_left_in_a_tutorial(path):
+    pytest.importorskip("latex2mathml")  # of the extra docs
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    text = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+    page = re.sub(r"`[^`]+`", "", hooks.with_formulas(text))
+    assert "$" not in page
+    assert not re.search(r"\\[a-z]+\b", page)
+
+
 def test_names_in_tables_break_at_their_parts_or_nowhere():
     long, short = "stm.mechanics.AbstractForce", "case-1"
     table = "<table><tr><td>{0}</td><td>{1}</td><td>{2}</td></tr></table>"
