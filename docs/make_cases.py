@@ -13,10 +13,11 @@ FOLDER = Path(__file__).parent
 
 HEAD = """# The report's six cases
 
-Made by `python docs/make_cases.py`: 2 s, default settings (Dopri8, rtol = atol = 1e-8, projection
-after each step). Position error: estimated distance from the exact motion, the largest of all bodies and
+Two seconds of each case at the default settings (Dopri8, rtol = atol = 1e-8, projection after each
+step). Position error: estimated distance from the exact motion, the largest of all bodies and
 times. Violations of the constraints (lengths, angles) are the largest over all accepted steps; the
-energy balance counts the work of rotors and actuators and is relative to the largest energy.
+energy balance counts the work of rotors and actuators and is relative to the largest energy. Made
+by `python docs/make_cases.py`.
 
 | scene | case | position error | grows e-fold every | violation, lengths | angles | energy balance | steps |
 |---|---|---|---|---|---|---|---|

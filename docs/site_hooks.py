@@ -23,7 +23,12 @@ OUTSIDE = {
 }
 LINK = re.compile(r"(!?)\[([^\]\[]*)\]\(([^)#\s]+)(#[^)]*)?\)")
 REFERENCE = re.compile(r"^\[([^\]]+)\]: (\S+)$", re.MULTILINE)
-FORMULA = re.compile(r"^```math\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+PICTURE = re.compile(r'(<img\b[^>]*\bsrc="([^"]+)"[^>]*>)')
+NAME = re.compile(r"<code>([\w/.:-]+)</code>")
+DATE = re.compile(r"(?<=<td>)(\d{4}-\d\d-\d\d)(?=</td>)")
+# a dollar before a blank, or after one, is money
+IN_A_LINE = re.compile(r"(?<![\\$\w])\$(?=[^\s$])([^$\n]*(?:\n(?!\n)[^$\n]*)?[^\s$])\$(?![\w$])")
+FORMULA = re.compile(r"^```math\n(.*?)^```$|^\$\$(.*?)\$\$$", re.MULTILINE | re.DOTALL)
 
 
 # --- API pages
@@ -62,15 +67,21 @@ def _about(module: str) -> str:
     source = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     words = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
     first = words.split("\n\n")[0].replace("\n", " ")
-    return re.sub(r" Floor \d+\.", "", first)
+    return re.sub(r" Floor \d+[^.]*\.", "", first)
 
 
 def api_page(room: str) -> str:
     """Text of the API page of a sub-namespace, or of the root."""
     place = ".".join(p for p in ("stmuav_jax", room) if p)
     short = f"stm.{room}" if room else "stm"
-    lines = [f"# `{short}`", "", _about(room) if room else "Names at the root of the package.", ""]
-    for module, names in public_names(room).items():
+    found = public_names(room)
+    described = {name for module, names in found.items() if module for name in names}
+    links = [f"[`{name}`][{place}.{name}]" for name in sorted(described, key=str.lower)]
+    # a search finds the names of the root before those of the same words elsewhere
+    lines = [] if room else ["---", "search: {boost: 4}", "---", ""]
+    lines += [f"# `{short}`", "", _about(room) if room else "Names at the root of the package.", ""]
+    lines += ["\n".join(links), "{ .names }", ""]
+    for module, names in found.items():
         if module == "":
             lines += ["## Version", "", "`stmuav_jax.__version__` is the version as text.", ""]
             continue
@@ -127,7 +138,8 @@ def _output(match: re.Match[str]) -> str:
     lines = match[1].split("\n")
     if not any(line.strip() for line in lines):
         return match[1]
-    body = "\n".join(line[4:] for line in lines).strip("\n")
+    body = "\n".join(line[4:].rstrip() for line in lines).strip("\n")
+    body = re.sub(r"\n{3,}", "\n\n", body)  # between the outputs of one cell
     return f"\n\n```text\n{body}\n```\n\n"
 
 
@@ -145,10 +157,16 @@ def validation_page() -> str:
             lines += [f"**{about}** `tests/{folder}/{path.name}`", ""]
             for node in tree.body:
                 if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
-                    words = ast.get_docstring(node) or node.name[5:].replace("_", " ")
-                    lines.append("- " + words.split("\n\n")[0].replace("\n", " "))
+                    lines.append(f"- {_about_test(node)}")
             lines.append("")
     return "\n".join(lines)
+
+
+def _about_test(node: ast.FunctionDef) -> str:
+    """What a test's name says, and what the first paragraph of its docstring adds."""
+    name = node.name.removeprefix("test_").replace("_", " ")
+    words = (ast.get_docstring(node) or "").split("\n\n")[0].replace("\n", " ")
+    return f"{name[:1].upper()}{name[1:]}. {words}".rstrip()
 
 
 def outside_pages() -> Iterator[tuple[str, str | bytes]]:
@@ -159,8 +177,16 @@ def outside_pages() -> Iterator[tuple[str, str | bytes]]:
     yield from notebook_pages()
 
 
+def _title(path: str) -> str:
+    """Title of a page of the site, by its path in the repository."""
+    text = (ROOT / path).read_text(encoding="utf-8")
+    return re.findall(r"^# (.+)$", text, re.MULTILINE)[0]
+
+
 def links_in_site(text: str, source: str) -> str:
     """Text of a page whose links lead to places in the site, or are plain words.
+
+    A link whose words are the name of the page's file gets the title of that page.
 
     Args:
         text: text of the page.
@@ -188,6 +214,8 @@ def links_in_site(text: str, source: str) -> str:
         found = target(link)
         if found is None:
             return words
+        if words.endswith(".md") and posixpath.basename(words) == posixpath.basename(link):
+            words = _title(posixpath.normpath(posixpath.join(here, link)))
         return f"{picture}[{words}]({found}{anchor or ''})"
 
     for label, link in REFERENCE.findall(text):
@@ -196,10 +224,45 @@ def links_in_site(text: str, source: str) -> str:
     return LINK.sub(inline, text)
 
 
+def with_pictures_to_open(html: str) -> str:
+    """HTML of a page whose pictures lead to themselves, so that a click shows them whole."""
+    parts = re.split(r"(<a\b.*?</a>)", html, flags=re.DOTALL)
+    parts[::2] = [PICTURE.sub(r'<a href="\2">\1</a>', part) for part in parts[::2]]
+    return "".join(parts)
+
+
+def with_whole_names(html: str) -> str:
+    """HTML of a page whose tables break long names at dots and underscores, short ones and dates nowhere."""
+
+    def name(found: re.Match[str]) -> str:
+        if len(found[1]) < 20:
+            return f'<code class="whole">{found[1]}</code>'
+        return "<code>" + re.sub(r"(::|[/._](?=\w))", r"\1<wbr>", found[1]) + "</code>"
+
+    def table(text: str) -> str:
+        return DATE.sub(r'<span class="whole">\1</span>', NAME.sub(name, text))
+
+    parts = re.split(r"(<table>.*?</table>)", html, flags=re.DOTALL)
+    parts[1::2] = [table(part) for part in parts[1::2]]
+    return "".join(parts)
+
+
 def _mathml(match: re.Match[str]) -> str:
     from latex2mathml.converter import convert
 
-    return f'<div class="formula">{convert(match[1].strip(), display="block")}</div>'
+    return f'<div class="formula">{convert((match[1] or match[2]).strip(), display="block")}</div>'
+
+
+def with_formulas(text: str) -> str:
+    """Text of a page whose LaTeX, in fences or between dollars, is MathML; code stays as it is."""
+    from latex2mathml.converter import convert
+
+    parts = re.split(r"(^```.*?^```$|`[^`]+`)", FORMULA.sub(_mathml, text), flags=re.M | re.S)
+    parts[::2] = [
+        IN_A_LINE.sub(lambda found: f"<span>{convert(found[1].strip())}</span>", part)
+        for part in parts[::2]
+    ]
+    return "".join(parts)
 
 
 def _local(output: str, here: str) -> str:
@@ -233,7 +296,12 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     uri = page.file.src_uri
     if not uri.startswith("api/"):
         markdown = links_in_site(markdown, _repository_path(uri))
-    return FORMULA.sub(_mathml, markdown)
+    return with_formulas(markdown)
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
+    """Let a click on a picture open it, and tables break long names only."""
+    return with_whole_names(with_pictures_to_open(html))
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:

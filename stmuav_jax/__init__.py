@@ -1,4 +1,4 @@
-"""Differentiable simulation of a UAV that carries a parallel-mechanism solar tracker.
+"""Differentiable simulation, estimation and control of mechanisms with closed loops, in JAX.
 
 Conventions (frames, Euler parameters, signs, units): docs/conventions.md.
 

@@ -54,6 +54,7 @@ def module(path: Path):
 
 
 hooks = module(DOCS / "site_hooks.py")
+docstrings = module(DOCS / "site_griffe.py")
 
 
 @pytest.mark.parametrize(
@@ -191,6 +192,10 @@ def test_every_public_name_is_on_an_api_page(room):
     described = set(re.findall(rf"^::: {re.escape(place)}\.(\w+)$", page, re.MULTILINE))
     names = set(dir(getattr(stm, room) if room else stm)) - {"__version__"}
     assert described == (names if room else names - set(ROOMS))
+    # and is listed at its head
+    head = page.partition("{ .names }")[0]
+    assert set(re.findall(rf"\[`(\w+)`\]\[{re.escape(place)}\.\1\]", head)) == described
+    assert "Floor" not in head
 
 
 def test_the_site_has_every_page():
@@ -227,9 +232,110 @@ def test_links_of_the_site(source, link, found):
     assert hooks.links_in_site(f"[x]({link})", source) == found
 
 
+@pytest.mark.parametrize(
+    ("source", "link", "found"),
+    [
+        ("docs/sun.md", "[glossary.md](glossary.md#energy)", "[Glossary](glossary.md#energy)"),
+        (
+            "notebooks/04_a.md",
+            "[docs/glossary.md](../docs/glossary.md)",
+            "[Glossary](../glossary.md)",
+        ),
+        ("docs/sun.md", "[cli.py](../stmuav_jax/cli.py)", "cli.py"),
+    ],
+)
+def test_links_by_the_name_of_a_file_have_its_title_in_the_site(source, link, found):
+    assert hooks.links_in_site(link, source) == found
+
+
+def test_a_click_on_a_picture_opens_it():
+    html = '<p><img alt="a" src="b.png"/></p><a href="c.html"><img alt="d" src="e.gif"/></a>'
+    assert hooks.with_pictures_to_open(html) == (
+        '<p><a href="b.png"><img alt="a" src="b.png"/></a></p>'
+        '<a href="c.html"><img alt="d" src="e.gif"/></a>'
+    )
+
+
+def test_formulas_of_the_site_are_mathml():
+    pytest.importorskip("latex2mathml")  # of the extra docs
+    code = "Pays 5 $ or 6 $. `$d$`\n\n```python\n'$e$'\n```\n"
+    text = "With $a_i$ and\n$b\\,\nc$:\n\n```math\nx^2\n```\n\n$$y =\nx$$\n\n" + code
+    page = hooks.with_formulas(text)
+    assert page.count("<math") == 4
+    assert page.count('<div class="formula"><math') == 2
+    assert re.search(r"<msub><mi>a</mi><mi>i</mi></msub>", page)
+    assert page.endswith(code)
+    assert page.count("<span><math") == 2
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda p: p.stem)
+def test_no_latex_is_left_in_a_tutorial(path):
+    pytest.importorskip("latex2mathml")  # of the extra docs
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    text = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+    page = re.sub(r"`[^`]+`", "", hooks.with_formulas(text))
+    assert "$" not in page
+    assert not re.search(r"\\[a-z]+\b", page)
+
+
+def test_names_in_tables_break_at_their_parts_or_nowhere():
+    long, short = "stm.mechanics.AbstractForce", "case-1"
+    table = "<table><tr><td>{0}</td><td>{1}</td><td>{2}</td></tr></table>"
+    given = table.format(f"<code>{long}</code>", f"<code>{short}</code>", "2026-11-24")
+    found = table.format(
+        "<code>stm.<wbr>mechanics.<wbr>AbstractForce</code>",
+        f'<code class="whole">{short}</code>',
+        '<span class="whole">2026-11-24</span>',
+    )
+    outside = f"<p><code>{long}</code> <code>{short}</code></p>"
+    assert hooks.with_whole_names(outside + given) == outside + found
+
+
+def test_every_described_parameter_has_a_line_of_its_own():
+    text = """Sum of two numbers; more: nothing. a: is no section.
+
+Args:
+    a: first one [m]. b, c: others, long
+        enough. d: last; not_a_name: words.
+
+Raises:
+    StateError: a is negative. SettingError: b is.
+"""
+    assert docstrings.parted(text, {"a", "b", "c", "d"}) == (
+        "Sum of two numbers; more: nothing. a: is no section.\n\nArgs:\n    a: first one [m].\n"
+        "    b,\u00a0c: others, long\n        enough.\n    d: last; not_a_name: words.\n\n"
+        "Raises:\n    StateError: a is negative.\n    SettingError: b is.\n"
+    )
+
+
+def test_a_newcomer_finds_the_first_things_on_the_first_page():
+    """Install, a moving picture, a mechanism of one's own and `simulate` are one click away."""
+    head, *sections = (DOCS / "index.md").read_text(encoding="utf-8").split("\n## ")
+    titles = {section.splitlines()[0] for section in sections}
+    assert {"Install", "A moving picture", "A mechanism of your own"} <= titles
+    for link in (
+        "#install",
+        "#a-moving-picture",
+        "#a-mechanism-of-your-own",
+        "figures/flight/waypoints.html",
+    ):
+        assert f"]({link})" in head
+    assert re.search(r"^\[!\[[^\]]+\]\([\w/]+\.gif\)\]", head, re.MULTILINE)
+    (name,) = re.findall(r"\]\(api/root\.md#stmuav_jax\.(\w+)\)", head)
+    assert f"::: stmuav_jax.{name}\n" in hooks.api_pages()["api/root.md"]
+    assert name == "simulate"
+
+
 def test_the_tables_of_parameters_are_those_of_the_package():
     page = (DOCS / "parameters_file.md").read_text(encoding="utf-8")
     assert page.endswith(module(DOCS / "make_parameters.py").tables())
+
+
+def test_the_page_on_validation_says_what_every_test_claims():
+    page = hooks.validation_page()
+    claims = re.findall(r"^- (.+)$", page, re.MULTILINE)
+    assert len(claims) > 100
+    assert not [claim for claim in claims if claim.split(". ")[0].endswith(" class")]
 
 
 def test_figures_of_the_readme_are_there():
@@ -255,3 +361,6 @@ def test_outputs_of_notebooks_are_no_code():
     text = "```python\nfor x in y:\n    f(x)\n```\n\n    1.0 m\n    2.0 m\n\n\nWords.\n"
     fenced = "```python\nfor x in y:\n    f(x)\n```\n\n```text\n1.0 m\n2.0 m\n```\n\nWords.\n"
     assert hooks._outputs_as_text(text) == fenced
+    # outputs of one cell, which the notebook's blank lines part
+    text = "```python\nf()\n```\n\n    1.0 m\n    \n\n\n\n    2.0 m\n\n"
+    assert "```text\n1.0 m\n\n2.0 m\n```" in hooks._outputs_as_text(text)

@@ -106,7 +106,7 @@ def _errors_table(record: FilterRecord) -> str:
             words, unit = state.rstrip("]").rsplit(" [", 1)
             label = f"{words}, {name}" if several else words
             rows.append([text(label), number_text(found), number_text(said), text(unit)])
-    head = ["", "RMS error at the end", "the filter's own", "unit"]
+    head = ["", "RMS error at the end", "standard deviation by the filter", "unit"]
     return html_table(head, rows, left=(3,))
 
 

@@ -87,7 +87,7 @@ def run_estimate_model(command: Any) -> int:
     instruments = _chosen(scene, settings.sensors)
     space, x = starting_point(scene, settings)
     found = _estimated(scene, space, x, instruments, settings)
-    shown = table("state", "at the start", "error at the end", "the filter's own", "unit")
+    shown = table("state", "at the start", "error at the end", "the filter's deviation", "unit")
     error = np.sqrt(np.mean(found.error[-1] ** 2, axis=-1))
     own = np.sqrt(np.mean(found.deviation[-1] ** 2, axis=-1))
     first = _spreads(space, settings)
