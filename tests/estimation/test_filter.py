@@ -251,7 +251,7 @@ class Watched(AbstractFilter):
 @pytest.mark.parametrize(("count", "most", "width"), [(5, 4, 3), (50, 32, 25), (3, 64, 3)])
 def test_groups_of_a_bank_have_no_more_copies_than_needed(count, most, width):
     """A group that is filled up with copies of a filter costs as much as one of other filters."""
-    case, watched = random_linear(n=2, m=1, count=3), Watched([])
+    case, watched = random_linear(n=2, m=1, count=3), Watched(widths=[])
     run = lambda y: (
         filter_bank(case.model(), case.prior(), y, dt=1.0, method=watched, group=most).mean
     )
