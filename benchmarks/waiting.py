@@ -33,6 +33,7 @@ COMMANDS = {
     "tune slew": "tune slew --out {out}",
     "tune identify": "tune identify --out {out}",
     "estimate": "estimate --out {out}",
+    "estimate, one case": "estimate --case 4 --seeds 20 --out {out}",
     "montecarlo": "montecarlo collapse --samples 64 --out {out}",
     "report": "report {out}/study.zarr --out {out}",
 }

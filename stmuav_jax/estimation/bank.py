@@ -1,9 +1,11 @@
 """Banks of filters that run side by side: seeds of a Monte Carlo study, priors, tunings.
 
 The axis of the bank is the last of every array, as in the rest of the package. Filters run in
-groups whose numbers fit into the processor's nearest cache: larger ones are up to twice as slow.
+groups of equal size whose numbers fit into the processor's nearest cache: larger ones are up to twice
+as slow.
 """
 
+import math
 from functools import cache
 from typing import Any
 
@@ -29,7 +31,7 @@ def filter_bank(
     dt: Any = None,
     t: Any = None,
     method: AbstractFilter = DEFAULT,
-    group: int = 32,
+    group: int = 64,
 ) -> Filtered:
     """Run s filters, each on its own measurements; a failed one is flagged in `ok`.
 
@@ -41,7 +43,7 @@ def filter_bank(
         y: measurements (T, m, s).
         u: inputs with leaves (T, k), the same for all filters, or (T, k, s).
         dt, t, method: as in `kalman_filter`.
-        group: number of filters that run at once.
+        group: largest number of filters that run at once; all groups have the same size.
 
     Raises:
         ModelError: shapes do not fit.
@@ -63,7 +65,9 @@ def filter_bank(
     # inside a jit of the caller the zeros are a tracer
     outermost = concrete(model, priors, y, u, steps, jnp.zeros(()))
     run = _compiled() if outermost else _in_groups
-    return run(model, priors, y, u, steps, method, min(group, count))
+    # no group is larger than it has to be: the last one is filled up with copies, which cost as much
+    size = math.ceil(count / math.ceil(count / group))
+    return run(model, priors, y, u, steps, method, size)
 
 
 @cache

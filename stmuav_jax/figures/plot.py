@@ -1,8 +1,9 @@
 """Figures of a run in the report's style, readable in black and white."""
 
+import contextlib
 import io
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -180,8 +181,29 @@ DRAWN = {"pose": _pose, "joints": _joints, "balances": _balances}
 def content(figure: Figure, suffix: str, dpi: int = 200) -> bytes:
     """Content of a figure's file (png, pdf or svg)."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=suffix, dpi=dpi)
+    with _placed(figure, dpi) if suffix == "png" else contextlib.nullcontext():
+        figure.savefig(buffer, format=suffix, dpi=dpi)
     return buffer.getvalue()
+
+
+@contextlib.contextmanager
+def _placed(figure: Figure, dpi: int) -> Iterator[None]:
+    """Place a figure's axes at a resolution, so that saving it draws it once.
+
+    Matplotlib draws a figure that has a layout engine twice, the first time only to place its axes.
+    """
+    engine, before = figure.get_layout_engine(), figure.dpi
+    if engine is None or type(figure.canvas) is not FigureCanvasAgg:
+        yield
+        return
+    figure.set_dpi(dpi)
+    try:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+        yield
+    finally:
+        figure.set_dpi(before)
+        figure.set_layout_engine(engine)
 
 
 def save_figures(

@@ -13,19 +13,17 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from ..checks.errors import ModelError, SettingError
 from ..checks.schema import checked, shown
-from ..mechanics.internal import internal_names
-from ..parameters.table import ParameterEntry, Parameters
 from .labelled import Labelled
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from ..dynamics.run import Run
+    from ..parameters.table import Parameters
 
 # Largest size of a TOML file in bytes.
 MOST_TOML = 4_000_000
@@ -45,6 +43,8 @@ class FileError(ValueError):
 
 def versions() -> dict[str, str]:
     """Versions of the package, its libraries, Python and the device."""
+    import jax  # slow to import, and pages of what was computed are made without it
+
     found = {name: importlib.metadata.version(name) for name in _PACKAGES}
     device = jax.devices()[0]
     return found | {"python": platform.python_version(), "device": device.device_kind}
@@ -97,6 +97,7 @@ def _labelled_run(run: "Run") -> Labelled:
     """Content of a saved run; see `to_dataset`."""
     # commands without a run read and write files too, and need not wait for its modules
     from ..dynamics.run import saved
+    from ..mechanics.internal import internal_names
     from .machine import machine_coordinates, machine_table, rotor_table
 
     states, system, errors = run.states, run.scene.system, run.errors
@@ -336,7 +337,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise FileError(f"{source} is not a readable TOML file: {error}.") from error
 
 
-def load_parameters(path: str | os.PathLike[str] | None, base: Parameters) -> Parameters:
+def load_parameters(path: str | os.PathLike[str] | None, base: "Parameters") -> "Parameters":
     """Parameter table with values of `base` replaced by those of a TOML file, if there is one.
 
     The file's tables and dotted keys are the parameters' names; a value is a number or an
@@ -360,7 +361,9 @@ def load_parameters(path: str | os.PathLike[str] | None, base: Parameters) -> Pa
         raise ModelError(f"{source}: {error}") from None
 
 
-def _flat(content: Mapping[str, Any], base: Parameters, prefix: str = "") -> dict[str, Any]:
+def _flat(content: Mapping[str, Any], base: "Parameters", prefix: str = "") -> dict[str, Any]:
+    from ..parameters.table import ParameterEntry
+
     found: dict[str, Any] = {}
     for key, value in content.items():
         name = f"{prefix}{key}"

@@ -27,8 +27,8 @@ from ..dynamics.scene import Scene
 from ..montecarlo.factors import alike, drawn_table, possible_tables, table_entry
 from ..montecarlo.sampling import Sampling
 from ..montecarlo.schema import Drawing
-from ..montecarlo.study import column_name, factors_of
-from ..montecarlo.work import FINE, AbstractWork, Axis, Column
+from ..montecarlo.study import factors_of
+from ..montecarlo.work import FINE, AbstractWork, Axis, Column, column_name
 from .gauges import Gauges
 from .machine import Machine, input_names, scene_of
 from .mission import Mission, load_mission, make_mission

@@ -27,8 +27,8 @@ from ..dynamics.integration.problem import Problem, prepare
 from ..mechanics.state import State
 from .disturbed_flights import Drawn
 from .signal import RunPoint, Signal
-from .study import Quantity, Study, column_name
-from .work import AbstractWork, Axis, Column
+from .study import Quantity, Study
+from .work import AbstractWork, Axis, Column, column_name
 
 # Runs integrated together on one device: on a CPU as many as fit its cache, by measurement
 # (docs/throughput.md); a GPU needs thousands.

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer, Shaped
 
 from ..checks.errors import SettingError
-from .statistics import LEVEL
+from .statistics import LEVEL, value_ranks
 from .work import FINE, MISSING
 
 # Largest number of doubles in one batch of the bootstrap, 128 MiB.
@@ -166,7 +166,7 @@ def binned(
     Source: Pearson's correlation ratio, corrected for the bins (Kelley 1935); Plischke, Borgonovo
     and Smith (2013), Eur. J. Oper. Res. 226, 536-550.
     """
-    import scipy.stats
+    from scipy.special import fdtri
 
     n = len(values)
     m = bins if bins is not None else min(max(round(n ** (1 / 3)), 4), 50)
@@ -186,7 +186,7 @@ def binned(
         taken = count > 0
         within = np.sum(y**2) - np.sum(sums[taken] ** 2 / count[taken])
         found.append(1 - (n - 1) / (n - np.sum(taken)) * within / whole)
-    ratio = scipy.stats.f.ppf(level, m - 1, n - m)
+    ratio = fdtri(m - 1, n - m, level)
     return Binned(np.array(found), float(1 - (n - 1) / ((m - 1) * ratio + n - m)), m)
 
 
@@ -200,14 +200,14 @@ def spearman(
 
     Source: interval by Bonett and Wright (2000), Psychometrika 65, 23-28.
     """
-    import scipy.stats
+    from scipy.special import ndtri
 
     n = len(values)
     if n < 4:
         raise SettingError(f"A rank correlation needs at least 4 samples, but there are {n}.")
-    ranks = [_varying(scipy.stats.rankdata(x), "Rank correlations") for x in (*inputs.T, values)]
-    r = np.clip(np.corrcoef(np.stack(ranks))[-1, :-1], -1.0, 1.0)  # against round-off
-    half = scipy.stats.norm.ppf(0.5 + level / 2) * np.sqrt((1 + r**2 / 2) / (n - 3))
+    ranked = [_varying(value_ranks(x), "Rank correlations") for x in (*inputs.T, values)]
+    r = np.clip(np.corrcoef(np.stack(ranked))[-1, :-1], -1.0, 1.0)  # against round-off
+    half = ndtri(0.5 + level / 2) * np.sqrt((1 + r**2 / 2) / (n - 3))
     # correlations of +-1 have infinite arctanh, and an interval of zero length
     with np.errstate(divide="ignore"):
         z = np.arctanh(r)
@@ -226,14 +226,11 @@ def separation(
 
     Source: Monte Carlo filtering, Hornberger and Spear (1981), J. Environ. Manage. 12, 7-18.
     """
-    import scipy.stats
-
     k, n = int(np.sum(hits)), len(hits)
     if k in (0, n):
         raise SettingError(f"A comparison needs hits and others, but {k} of {n} samples are hits.")
-    # the first entry of the result is the distance
-    compare = lambda x: scipy.stats.ks_2samp(x[hits], x[~hits], method="asymp")[0]
-    return np.array([float(compare(x)) for x in inputs.T])
+    below = lambda part, x: np.searchsorted(np.sort(part), x, side="right") / len(part)
+    return np.array([np.max(np.abs(below(x[hits], x) - below(x[~hits], x))) for x in inputs.T])
 
 
 def _varying(values: np.ndarray, what: str) -> np.ndarray:

@@ -12,6 +12,7 @@ Nagaraja, Order Statistics, 3rd ed., section 7.1); Wilson (1927), J. Am. Stat. A
 (probabilities).
 """
 
+import bisect
 import functools
 import math
 from collections.abc import Mapping, Sequence
@@ -109,15 +110,20 @@ def probability(hits: int, count: int, level: float = LEVEL) -> IntervalEstimate
     """Probability of hits with Wilson's interval.
 
     Raises:
-        SettingError: no samples, or a level outside (0, 1).
+        SettingError: no samples, more hits than samples, or a level outside (0, 1).
     """
-    import scipy.stats
+    from scipy.special import ndtri
 
     _check_level(level)
     if count < 1:
         raise SettingError("A probability needs at least one sample, but there is none.")
-    ends = scipy.stats.binomtest(hits, count).proportion_ci(level, method="wilson")
-    return IntervalEstimate(hits / count, float(ends.low), float(ends.high))
+    if not 0 <= hits <= count:
+        raise SettingError(f"There cannot be {hits} hits among {count} samples.")
+    share, z = hits / count, float(ndtri(0.5 + level / 2))
+    middle = (2 * hits + z**2) / (2 * (count + z**2))
+    half = z * math.sqrt(4 * hits * (1 - share) + z**2) / (2 * (count + z**2))
+    low = 0.0 if hits == 0 else middle - half
+    return IntervalEstimate(share, low, 1.0 if hits == count else middle + half)
 
 
 def outcomes(
@@ -141,14 +147,14 @@ def mean(values: Values, level: float = LEVEL) -> IntervalEstimate:
     Raises:
         SettingError: no values, values that are not finite, a level outside (0, 1).
     """
-    import scipy.stats
+    from scipy.special import stdtrit
 
     _check_level(level)
     y, n = _finite(values, "A mean", 1), len(values)
     middle = float(np.mean(y))
     if n == 1:
         return IntervalEstimate(middle, None, None)
-    half = scipy.stats.t.ppf(0.5 + level / 2, n - 1) * _spread(y) / math.sqrt(n)
+    half = stdtrit(n - 1, 0.5 + level / 2) * _spread(y) / math.sqrt(n)
     return IntervalEstimate(middle, middle - float(half), middle + float(half))
 
 
@@ -163,16 +169,17 @@ def standard_deviation(values: Values, level: float = LEVEL) -> IntervalEstimate
     Raises:
         SettingError: fewer than 2 values, values that are not finite, a level outside (0, 1).
     """
-    import scipy.stats
+    from scipy.special import ndtri
 
     _check_level(level)
     y, n = _finite(values, "A standard deviation", 2), len(values)
     spread = _spread(y)
-    z = float(scipy.stats.norm.ppf(0.5 + level / 2))
+    z = float(ndtri(0.5 + level / 2))
     if n < 5 or n <= z or np.ptp(y) == 0:
         return IntervalEstimate(spread, None, None)
     scaled = (y - np.mean(y)) / np.max(np.abs(y - np.mean(y)))
-    trimmed = scipy.stats.trim_mean(scaled, 0.5 / math.sqrt(n - 4))
+    cut = int(0.5 / math.sqrt(n - 4) * n)
+    trimmed = np.mean(np.partition(scaled, (cut, n - cut - 1))[cut : n - cut])
     kurtosis = n * np.sum((scaled - trimmed) ** 4) / np.sum(scaled**2) ** 2
     c = n / (n - z)
     half = z * c * math.sqrt((kurtosis - (n - 3) / n) / (n - 1)) / 2
@@ -242,10 +249,13 @@ def _ranks(n: int, share: float, level: float) -> tuple[int, int]:
 
     The number of values below the quantile is binomial. Ranks 0 and n + 1 stand for an open end.
     """
-    import scipy.stats
+    from scipy.special import bdtr
 
-    ends = scipy.stats.binom.ppf([(1 - level) / 2, (1 + level) / 2], n, share)
-    return int(ends[0]), int(ends[1]) + 1
+    # a quantile of the binomial distribution is the smallest number with at least this probability
+    at = lambda probability: bisect.bisect_left(
+        range(n), probability, key=lambda k: bdtr(k, n, share)
+    )
+    return at((1 - level) / 2), at((1 + level) / 2) + 1
 
 
 def summarise(
@@ -297,6 +307,15 @@ def convergence(
         rows.append([math.nan if x is None else x for x in found])
     table = np.asarray(rows, dtype=float).reshape(-1, 3)
     return Convergence(np.asarray(sizes, dtype=int), *table.T)
+
+
+def value_ranks(values: Values) -> Float[np.ndarray, " n"]:
+    """Ranks of values from 1 on, equal ones with the mean of theirs; all NaN if one value is NaN."""
+    y = np.asarray(values, dtype=float)
+    if np.any(np.isnan(y)):
+        return np.full(len(y), np.nan)
+    _, place, count = np.unique(y, return_inverse=True, return_counts=True)
+    return (np.cumsum(count) - (count - 1) / 2)[place]
 
 
 def independent(count: int, together: int, design: str) -> Bool[np.ndarray, " n"]:

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, get_args
@@ -30,6 +29,7 @@ from .schema import (
     flights_file,
 )
 from .signal import Signal, signal
+from .work import column_name
 
 # Largest number of kept times of a run, all of which are held in memory.
 MOST_TIMES = 100_000
@@ -302,11 +302,6 @@ def _check_numbers(study: Study) -> None:
             raise SettingError(
                 f"The direction must be a unit vector, but its length is {size:.12g}."
             )
-
-
-def column_name(factor: str) -> str:
-    """Column name of a factor, in which dots and brackets are replaced by underscores."""
-    return re.sub(r"\W+", "_", factor).strip("_")
 
 
 def study_from_plain(

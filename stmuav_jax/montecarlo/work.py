@@ -1,6 +1,7 @@
 """Interface of a study to stores and schedulers: samples by number, named columns of results."""
 
 import abc
+import re
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -27,6 +28,11 @@ class Column(NamedTuple):
     words: str
     role: Literal["input", "quantity", "diagnostic", "status"] = "quantity"
     dims: tuple[str, ...] = ()
+
+
+def column_name(factor: str) -> str:
+    """Column name of a factor, in which dots and brackets are replaced by underscores."""
+    return re.sub(r"\W+", "_", factor).strip("_")
 
 
 class Axis(NamedTuple):

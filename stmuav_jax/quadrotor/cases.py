@@ -228,9 +228,13 @@ class _Flight(eqx.Module):
         """Attitude and body rates after one step, by substeps of RK4."""
         h = dt / self.world.substeps
         f = lambda w, t: self.turning(w, thrust, self.path(t, walk))
-        for k in range(self.world.substeps):
+
+        # written out, one substep after the other, the compiler computes each again for those after it,
+        # which takes six times as long
+        def substep(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            p, omega = carry
             now = t + k * h
-            end = rk4_step(lambda w, s, now=now: f(w, now + s), omega, h)
-            p = turned(p, omega, end, f(omega, now), f(end, now + h), h)
-            omega = end
-        return p, omega
+            end = rk4_step(lambda w, s: f(w, now + s), omega, h)
+            return turned(p, omega, end, f(omega, now), f(end, now + h), h), end
+
+        return jax.lax.fori_loop(0, self.world.substeps, substep, (p, omega))

@@ -237,6 +237,29 @@ def test_a_filter_of_ones_own_is_one_class():
     np.testing.assert_allclose(online.state.mean, out.mean[-1], rtol=0, atol=1e-14)
 
 
+class Watched(AbstractFilter):
+    """Kalman filter that notes how many filters it runs side by side."""
+
+    widths: list = eqx.field(static=True)
+    rule: AbstractRule = eqx.field(default_factory=sigma.Cubature)
+
+    def step(self, model, before, y, u, dt):
+        self.widths.append(before.factor.shape[2])
+        return DEFAULT.step(model, before, y, u, dt)
+
+
+@pytest.mark.parametrize(("count", "most", "width"), [(5, 4, 3), (50, 32, 25), (3, 64, 3)])
+def test_groups_of_a_bank_have_no_more_copies_than_needed(count, most, width):
+    """A group that is filled up with copies of a filter costs as much as one of other filters."""
+    case, watched = random_linear(n=2, m=1, count=3), Watched(widths=[])
+    run = lambda y: (
+        filter_bank(case.model(), case.prior(), y, dt=1.0, method=watched, group=most).mean
+    )
+    out = jax.eval_shape(run, jax.ShapeDtypeStruct((3, 1, count), float))
+    assert out.shape == (3, 2, count)
+    assert set(watched.widths) == {width}
+
+
 def test_likelihood_gradient():
     """By R's scale, against central differences."""
     case = random_linear(n=2, m=1, count=6)

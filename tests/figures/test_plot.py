@@ -1,5 +1,6 @@
 """Figures show what the run holds, in units, with a legend."""
 
+import io
 import sys
 from types import SimpleNamespace
 from typing import Any
@@ -8,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import stmuav_jax as stm
 from stmuav_jax.figures import drawing
@@ -17,6 +20,7 @@ from stmuav_jax.figures.plot import (
     STYLES,
     balances,
     content,
+    grid,
     joints,
     look,
     pose,
@@ -110,6 +114,33 @@ def test_saved_figures(short_run, tmp_path, suffix):
     assert [p.stem for p in paths] == list(FIGURES)
     magic = {"png": b"\x89PNG", "pdf": b"%PDF"}[suffix]
     assert all(p.read_bytes().startswith(magic) for p in paths)
+
+
+def test_a_png_is_drawn_once(monkeypatch):
+    """With the same bytes as by `savefig`, which draws it twice; the figure is left as it was."""
+
+    def curve() -> Figure:
+        figure, axes = grid(2, 1, 3.0)
+        axes[0, 0].plot([0.0, 1.0], [2e-7, 3e-7], label="a curve")
+        axes[0, 0].legend()
+        axes[1, 0].set_ylabel("a long name\nof an axis")
+        figure.suptitle("title")
+        return figure
+
+    buffer = io.BytesIO()
+    curve().savefig(buffer, format="png", dpi=150)
+    count, draw = [], Axes.draw
+    monkeypatch.setattr(Axes, "draw", lambda ax, renderer: (count.append(ax), draw(ax, renderer)))
+    figure = curve()
+    engine, dpi = figure.get_layout_engine(), figure.dpi
+    assert content(figure, "png", 150) == buffer.getvalue()
+    assert len(count) == 2
+    assert figure.get_layout_engine() is engine
+    assert figure.dpi == dpi
+    # one without a layout engine is saved as it stands
+    plain = Figure(figsize=(1.0, 1.0))
+    assert content(plain, "png", 50).startswith(b"\x89PNG")
+    assert plain.get_layout_engine() is None
 
 
 def test_certificate_rows_name_quantity_and_unit(short_run):

@@ -2,6 +2,8 @@
 
 import io
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -153,6 +155,20 @@ def test_without_inputs_or_quantities(tmp_path):
     _, page, summary = report(dataset, tmp_path)
     assert "No inputs." in " ".join(page.text)
     assert summary["quantities"] == {}
+
+
+def test_a_page_needs_no_jax(tmp_path):
+    """Nor the integrators and `scipy.stats`, which are slow to import: nothing is computed anew."""
+    tiny(30).to_netcdf(tmp_path / "study.nc", engine="h5netcdf")
+    code = (
+        "import sys, xarray as xr; from stmuav_jax.files.store import open_store; "
+        "from stmuav_jax.figures.studies.report import write_report; "
+        "write_report(xr.load_dataset(sys.argv[1], engine='h5netcdf'), sys.argv[2], dpi=20); "
+        "assert not {'jax', 'equinox', 'diffrax', 'scipy.stats', 'pvlib'} & set(sys.modules)"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path / "study.nc"), str(tmp_path / "page")]
+    subprocess.run(words, check=True, timeout=300)
+    assert (tmp_path / "page" / "report.html").exists()
 
 
 @pytest.mark.parametrize(

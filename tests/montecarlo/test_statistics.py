@@ -17,6 +17,7 @@ from stmuav_jax.montecarlo.statistics import (
     quantiles,
     standard_deviation,
     summarise,
+    value_ranks,
 )
 
 INF = math.inf
@@ -81,6 +82,21 @@ def test_intervals_of_quantiles_cover_the_truth_for_every_distribution(n):
             truth = quantile(share)
             most = 0.99 if n < 500 else 0.965
             covered((low <= truth) & (truth <= high), 0.95, most)
+
+
+def test_probabilities_are_as_by_scipy():
+    for hits, count in ((0, 5), (5, 5), (1, 3), (17, 400)):
+        for level in (0.5, 0.95, 0.999):
+            own = probability(hits, count, level)
+            wanted = st.binomtest(hits, count).proportion_ci(level, method="wilson")
+            assert own[1:] == pytest.approx([wanted.low, wanted.high], rel=0, abs=1e-15)
+
+
+def test_ranks_of_values_are_as_by_scipy():
+    """Also of ties and infinite values; a value that is not a number leaves no ranks."""
+    y = np.array([3.0, -np.inf, 2.0, 3.0, np.inf, 3.0, 2.0])
+    assert np.array_equal(value_ranks(y), st.rankdata(y))
+    assert np.all(np.isnan(value_ranks(np.array([1.0, np.nan]))))
 
 
 def test_quantiles_and_ranks_are_as_by_scipy():
@@ -218,6 +234,7 @@ def test_independent_samples_of_designs():
         (lambda: mean(np.array([])), "at least 1 values, but there are 0"),
         (lambda: standard_deviation(np.array([1.0])), "at least 2 values, but there are 1"),
         (lambda: probability(0, 0), "at least one sample"),
+        (lambda: probability(3, 2), "cannot be 3 hits among 2 samples"),
         (lambda: mean(np.array([1.0]), 1.0), "must lie in (0, 1), but it is 1"),
         (lambda: quantiles(np.array([1.0]), (1.5,)), "share of a quantile"),
         (lambda: quantiles(np.array([np.nan])), "not a number"),

@@ -66,6 +66,18 @@ def test_truth_by_scipy(case):
     np.testing.assert_array_equal(record.y[..., 0], record.omega[1:, :, 0])
 
 
+def test_substeps_are_one_loop():
+    """Written out they take six times as long, because the compiler computes them again and again."""
+
+    def lines(substeps: int) -> int:
+        world = World(substeps=substeps)
+        run = lambda u: simulate_case(1, seeds=2, t1=0.002, world=world).omega + u
+        return len(str(jax.make_jaxpr(run)(0.0)).splitlines())
+
+    assert lines(1) > 50
+    assert lines(8) <= lines(2)
+
+
 def test_noise_is_as_the_table_says():
     """Per-step variances of wandering offset and measured rates (statistical, 5 sigma)."""
     record = simulate_case(1, seeds=20, t1=0.5)

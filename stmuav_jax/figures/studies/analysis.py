@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import rankdata
 
 from ...checks.errors import SettingError
 from ...montecarlo.sensitivity import (
@@ -25,6 +24,7 @@ from ...montecarlo.statistics import (
     outcomes,
     probability,
     summarise,
+    value_ranks,
 )
 from .data import StudyData, StudyQuantity
 
@@ -194,7 +194,7 @@ def _from_samples(
     try:
         ranks = spearman(table, values, level)
         if np.any(np.isinf(values)):
-            values, note = rankdata(values), "shares are of the ranks, since values are infinite"
+            values, note = value_ranks(values), "shares are of the ranks, since values are infinite"
         found = binned(table, values, level=level)
         first, chance = found.value, found.noise_bound
     except SettingError as error:

@@ -17,8 +17,7 @@ import xarray as xr
 
 from ...files.netcdf import FileError
 from ...montecarlo.statistics import independent
-from ...montecarlo.study import column_name
-from ...montecarlo.work import FINE, MISSING
+from ...montecarlo.work import FINE, MISSING, column_name
 
 # Largest number of components of one column, such as joints; the rest is left out with a note.
 COMPONENTS = 12

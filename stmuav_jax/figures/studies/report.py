@@ -13,7 +13,7 @@ from ...files.layout import flattened
 from ...files.netcdf import write_atomically
 from ...montecarlo.sensitivity import IndexIntervals
 from ...montecarlo.statistics import LEVEL, IntervalEstimate, SampleSummary
-from ...montecarlo.study import column_name
+from ...montecarlo.work import column_name
 from ..page import (
     Picture,
     check_format,
