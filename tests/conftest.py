@@ -58,16 +58,17 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def optimise(level: int) -> None:
-    """Set the level at which the package has its programs compiled that need not run fast."""
+    """Set the level at which the package has its programs compiled."""
     from stmuav_jax.algebra import compiler
 
-    compiler._QUICK["xla_backend_optimization_level"] = level
+    for options in (compiler._QUICK, compiler._NO_LIBRARY):
+        options["xla_backend_optimization_level"] = level
     compiler.compiler_options.cache_clear()
 
 
 @pytest.fixture(scope="module")
 def optimised():
-    """For programs that run for longer than they compile: the package's own level."""
+    """For programs that run for longer than they compile: the level of the package's quick ones."""
     optimise(1)
     yield
     optimise(0)

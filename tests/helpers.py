@@ -12,16 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import stmuav_jax as stm
+from stmuav_jax.algebra.compiler import quick_jit
 from stmuav_jax.dynamics.integration.problem import begin, prepare
 
 GRAVITY = 9.81
 
-# XLA's own defaults, which conftest.py turns off: for tests that compute longer than they compile.
-THOROUGH: dict[str, Any] = {
-    "xla_backend_optimization_level": 3,
-    "xla_llvm_disable_expensive_passes": False,
-    "xla_cpu_use_fusion_emitters": True,
-}
+# Called as it is, the public function compiles one operation at a time.
+evaluated = quick_jit(stm.dynamics.evaluate)
 
 
 def np_skew(a: Any) -> np.ndarray:

@@ -93,7 +93,7 @@ def outer_jit(function: Callable[..., Any]) -> Any:
 
 
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`outer_jit` with `compiler_options(quick=True)`, determined at the first call.
+    """`outer_jit` with `compiler_options(quick=True)`, which are looked up at every call.
 
     Within a transformation (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a
     larger program.
@@ -108,9 +108,11 @@ def _stored_jit(function: Callable[..., Any], *, quick: bool) -> Callable[..., A
     within: Any = eqx.filter_jit(function)
 
     @cache
+    def made_with(options: tuple[tuple[str, Any], ...]) -> Any:
+        return eqx.filter_jit(function, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
+
     def made() -> Any:
-        options = compiler_options(quick=quick)
-        return eqx.filter_jit(function, compiler_options=options)  # pyright: ignore[reportCallIssue]
+        return made_with(tuple(compiler_options(quick=quick).items()))
 
     @wraps(function)
     def call(*args: Any, **named: Any) -> Any:

@@ -80,6 +80,20 @@ def test_within_a_transformation_it_is_part_of_the_larger_program(programs):
     assert jax.grad(closing)(2.0) == 3.0
 
 
+@pytest.mark.parametrize("jit", [compiler.quick_jit, compiler.outer_jit])
+def test_options_are_those_of_the_call(monkeypatch, jit):
+    """A function that was compiled before with other options is compiled with the new ones."""
+    function = jit(lambda x: (traced.append("x"), 2 * x)[1])
+    traced.clear()
+    counts = []
+    for level in (0, 1, 0, 1):
+        options = {"xla_backend_optimization_level": level}
+        monkeypatch.setattr(compiler, "compiler_options", lambda o=options, **_: o)
+        assert function(3.0) == 6.0
+        counts.append(len(traced))
+    assert counts == [1, 2, 2, 2]
+
+
 def test_a_warning_comes_once_and_long_before_the_limit(monkeypatch):
     counts = iter([(30_000, 65_530), (33_000, 65_530), (40_000, 65_530)])
     monkeypatch.setattr(compiler, "memory_maps", lambda: next(counts))

@@ -12,6 +12,7 @@ import pytest
 from dense.steps import Limits, Scheme, integrate
 from dense.system import Dense
 from dense.tables import Variant, g_and_l
+from helpers import evaluated
 
 import stmuav_jax as stm
 
@@ -51,7 +52,7 @@ def accelerations(scene, variant, t=0.1):
 def test_accelerations_are_those_of_the_package(moving, variant, couple):
     system = stm.make_scene("uav_tracker", 2, actuators=couple).system
     scene = dataclasses.replace(moving, system=system)
-    want = stm.dynamics.evaluate(system, scene.state0, 0.1).accelerations
+    want = evaluated(system, scene.state0, jnp.asarray(0.1)).accelerations
     v_rate, omega_rate = accelerations(scene, variant)
     assert np.max(np.abs(v_rate - want.v_rate)) <= 1e-10 * np.max(np.abs(want.v_rate))
     assert np.max(np.abs(omega_rate - want.omega_rate)) <= 1e-10 * np.max(np.abs(want.omega_rate))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense.system import Dense
+from helpers import evaluated
 from peers import (
     PEERS,
     MujocoC,
@@ -142,7 +143,7 @@ def test_every_peer_has_a_case_and_settings_from_coarse_to_fine():
 def test_accelerations_at_the_start(peer, scene):
     one, expected = (
         ready(peer),
-        stm.dynamics.evaluate(scene.system, scene.state0).accelerations.v_rate,
+        evaluated(scene.system, scene.state0).accelerations.v_rate,
     )
     assert one.unsupported(scene) == ""
     difference = ACCELERATIONS[peer.__name__](scene) - np.asarray(expected)
@@ -164,7 +165,7 @@ def test_scene_without_joints(peer):
     scene = stm.make_scene("hexacopter")
     one, expected = (
         ready(peer),
-        stm.dynamics.evaluate(scene.system, scene.state0).accelerations.v_rate,
+        evaluated(scene.system, scene.state0).accelerations.v_rate,
     )
     assert one.unsupported(scene) == ""
     np.testing.assert_allclose(ACCELERATIONS[peer.__name__](scene), expected, atol=1e-11)
@@ -242,7 +243,7 @@ def ours(key):
     scene = problem(key)
     redundant = key in ("squeezer", "four_bar_1")
     formulation = stm.Augmented(redundant=redundant)
-    found = stm.dynamics.evaluate(scene.system, scene.state0, formulation=formulation)
+    found = evaluated(scene.system, scene.state0, formulation=formulation)
     t1 = MOTION[key][0]
     if key == "four_bar_1":
         exact = compared.chain(1).exact

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import evaluated
 from scipy.optimize import brentq
 from scipy.special import ellipk
 
@@ -70,7 +71,7 @@ def test_a_period_of_the_pendulum_by_the_command_line(tmp_path, monkeypatch):
 
 def test_the_cart_and_pole_accelerate_as_published(gallery):
     scene = gallery["cart_pole"]
-    found = evaluate(scene.system, scene.state0).accelerations
+    found = evaluated(scene.system, scene.state0).accelerations
     # Florian (2007), Eq. 23 and 24, without friction
     angle, rate, force, m, half, g = 0.2, 0.5, 10.0, 0.1, 0.5, 9.8
     push = (-force - m * half * rate**2 * math.sin(angle)) / 1.1
@@ -128,7 +129,7 @@ def test_the_gyroscope_precesses_steadily(gallery):
 
 def test_the_legs_of_the_stewart_platform_share_its_weight(gallery):
     scene = gallery["stewart_platform"]
-    found = evaluate(scene.system, scene.state0)
+    found = evaluated(scene.system, scene.state0)
     leg = float(scene.system.joints[0].length)
     each = 12 * 9.81 * leg / 6
     assert np.linalg.norm(found.reactions.force, axis=1) == pytest.approx(np.full(6, each))
@@ -139,7 +140,7 @@ def test_the_legs_of_the_stewart_platform_share_its_weight(gallery):
 @pytest.mark.slow
 def test_the_arms_of_the_delta_robot_fall_together(gallery):
     scene = gallery["delta_robot"]
-    found = evaluate(scene.system, scene.state0, formulation=stm.Tree()).accelerations
+    found = evaluated(scene.system, scene.state0, formulation=stm.Tree()).accelerations
     arm, platform, length = 0.5, 0.8, 0.3
     moment = 0.00375 + arm * (length / 2) ** 2
     turning = (platform + 1.5 * arm) * length * 9.81 / (platform * length**2 + 3 * moment)
@@ -154,7 +155,7 @@ def test_the_linkage_of_bricard_moves_although_it_should_not(gallery):
     found = rank(scene.system, scene.state0)
     assert (found.rows, found.rank, found.dof) == (30, 29, 1)
     how = stm.Tree(redundant=True)
-    spin = evaluate(scene.system, scene.state0, formulation=how).accelerations.omega_rate
+    spin = evaluated(scene.system, scene.state0, formulation=how).accelerations.omega_rate
     # all hinges turn alike: by the rods' velocities per rate, 4.5 + 0.5 + 3e-4 kg m^2 and 1 m of fall
     wanted = 9.81 / 5.0003
     pattern = [[0, -1, 0], [0, -1, -1], [1, -1, -1], [1, 0, -1], [1, 0, 0]]
@@ -164,7 +165,7 @@ def test_the_linkage_of_bricard_moves_although_it_should_not(gallery):
 
 def test_the_slung_load_swings_below_a_quadrotor_that_gives_way(gallery):
     scene = gallery["quadrotor_slung_load"]
-    found = evaluate(scene.system, scene.state0, formulation=stm.Tree()).accelerations
+    found = evaluated(scene.system, scene.state0, formulation=stm.Tree()).accelerations
     M, m, length, J = 1.2, 0.4, 0.8, 2.56e-4
     swing = m * length**2 + J - (m * length) ** 2 / (M + m)
     wanted = -m * 9.81 * length * math.sin(0.2) / swing
@@ -175,8 +176,8 @@ def test_the_slung_load_swings_below_a_quadrotor_that_gives_way(gallery):
 
 def test_the_tracker_of_the_file_is_that_of_the_report(gallery):
     scene, own = gallery["tracker"], stm.make_scene("tracker", 2)
-    found = evaluate(scene.system, scene.state0, formulation=stm.Tree()).accelerations
-    wanted = evaluate(own.system, own.state0, formulation=stm.Tree()).accelerations
+    found = evaluated(scene.system, scene.state0, formulation=stm.Tree()).accelerations
+    wanted = evaluated(own.system, own.state0, formulation=stm.Tree()).accelerations
     assert found.v_rate == pytest.approx(np.asarray(wanted.v_rate), rel=1e-9, abs=1e-9)
     assert found.omega_rate == pytest.approx(np.asarray(wanted.omega_rate), rel=1e-9, abs=1e-9)
     assert found.v_rate[5, 2] == pytest.approx(-0.7907645, abs=1e-7)

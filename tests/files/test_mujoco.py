@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from helpers import evaluated
 
 import stmuav_jax as stm
 from stmuav_jax.cli import main
@@ -176,7 +177,7 @@ def test_loops_move_as_by_mujocos_matrices(mujoco):
     gamma = -J_rate @ data.qvel
     pull = np.linalg.solve(J @ np.linalg.solve(M, J.T), gamma - J @ free)
     data.qacc[:] = free + np.linalg.solve(M, J.T @ pull)
-    found = evaluate(scene.system, state_at(model, data, tree)).accelerations
+    found = evaluated(scene.system, state_at(model, data, tree)).accelerations
     compare(mujoco, model, data, scene.system, found)
 
 
@@ -241,8 +242,8 @@ def test_what_is_saved_moves_alike_when_it_is_loaded(mujoco, tmp_path, what):
         lambda x, y: x.at[np.array(theirs)].set(y[np.array(mine)]), other.reference, state
     )
     rows = lambda each, k: (np.asarray(each.v_rate)[k], np.asarray(each.omega_rate)[k])
-    found = rows(evaluate(system, state, formulation=stm.Tree()).accelerations, mine)
-    again = rows(evaluate(other, moved, formulation=stm.Tree()).accelerations, theirs)
+    found = rows(evaluated(system, state, formulation=stm.Tree()).accelerations, mine)
+    again = rows(evaluated(other, moved, formulation=stm.Tree()).accelerations, theirs)
     assert np.abs(found[0]).max() > 1
     np.testing.assert_allclose(again[0], found[0], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(again[1], found[1], rtol=1e-9, atol=1e-9)
@@ -266,7 +267,7 @@ def test_what_the_import_made_is_not_held_against_the_user(mujoco, tmp_path):
 
 
 def accelerated(scene, rows):
-    found = evaluate(scene.system, scene.state0, formulation=stm.Tree()).accelerations
+    found = evaluated(scene.system, scene.state0, formulation=stm.Tree()).accelerations
     return [np.asarray(x)[rows] for x in (found.v_rate, found.omega_rate)]
 
 
@@ -407,7 +408,7 @@ def test_a_spring_is_a_tendon_and_a_hinge_in_a_loop_two_points(mujoco, tmp_path)
     # at rest the rows hold the accelerations themselves
     pull = np.linalg.pinv(J @ np.linalg.solve(M, J.T), rcond=1e-9) @ (J @ free)
     wanted = (free - np.linalg.solve(M, J.T @ pull))[model.joint("A").dofadr[0]]
-    found = evaluate(system, system.reference, formulation=stm.Tree(redundant=True)).accelerations
+    found = evaluated(system, system.reference, formulation=stm.Tree(redundant=True)).accelerations
     # the crank turns about -y
     assert -found.omega_rate[0, 1] == pytest.approx(wanted, rel=1e-9)
     assert abs(wanted) > 1

@@ -41,6 +41,27 @@ def test_the_same_inputs_give_the_same_bits():
     assert bits(flown(1.7)) == first
 
 
+def test_other_numbers_trace_and_compile_nothing():
+    """Nothing is traced again either, which would take longer than a short run."""
+    flown(1.7)
+    flown(1.9)
+    traced: list[str] = []
+
+    def note(event: str, duration_secs: float, **_: object) -> None:
+        del duration_secs
+        traced.extend([event] if event.startswith("/jax/core/compile/") else [])
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        jax.jit(lambda x: x + 1.7)(1.0)
+        assert traced  # the events have these names
+        traced.clear()
+        flown(2.1)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
+    assert traced == []
+
+
 AGAIN = """
 import jax
 jax.config.update("jax_enable_x64", True)

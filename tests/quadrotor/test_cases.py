@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import THOROUGH
 from scipy.integrate import solve_ivp
 
-from stmuav_jax.algebra.compiler import compiler_options
+from stmuav_jax.algebra.compiler import outer_jit
 from stmuav_jax.algebra.rotation import rotation_matrix
 from stmuav_jax.checks.errors import SettingError
 from stmuav_jax.estimation.bank import filter_bank
@@ -93,7 +92,7 @@ def test_noise_is_as_the_table_says():
 
 
 @pytest.fixture(scope="module")
-def studies():
+def studies(optimised):
     """All cases, 50 seeds, 2 s, both tunings: what `stmuav estimate` prints."""
     report = report_tuning()
     fixed, moving = consistent_tuning(1), consistent_tuning(5)
@@ -188,14 +187,14 @@ def surviving(dtype, u, y):
         out = filter_bank(model, prior, y, u=u, dt=single(1e-3))
         return out.ok[-1], out.mean[-1], out.factor[-1]
 
-    compiled = jax.jit(run, compiler_options=compiler_options() | THOROUGH)
-    ok, mean, factor = compiled(jnp.asarray(u, dtype), jnp.asarray(y, dtype))
+    ok, mean, factor = outer_jit(run)(jnp.asarray(u, dtype), jnp.asarray(y, dtype))
     assert mean.dtype == factor.dtype == dtype
     assert np.all(np.isfinite(mean))
     return int(np.sum(ok))
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_no_covariance_is_lost_in_three_seconds(dtype):
     """8 cases x 50 seeds x 3 s, through the singular roll angle."""

@@ -175,7 +175,7 @@ SEEDS = 50
 
 
 @pytest.fixture(scope="module", params=[4, 8])
-def quadrotor(request):
+def quadrotor(request, optimised):
     """A case, its healthy record and consistent filter."""
     case = request.param
     return case, simulate_case(case, seeds=SEEDS), consistent_tuning(case)
@@ -233,6 +233,7 @@ def test_report_tuning_is_seen_through(quadrotor):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_false_alarms_of_the_quadrotor():
     """0.5 to 2 % of 1,000 healthy records of 1 s, case 4."""
     record, tuning = simulate_case(4, seeds=1000, t1=1.0, seed=100), consistent_tuning(4)

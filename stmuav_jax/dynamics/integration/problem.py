@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import diffrax
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ...algebra.compiler import kept_jit
+from ...algebra.compiler import MOST_PROGRAMS, kept_jit
 from ...checks.errors import SettingError
 from ...checks.numbers import floats
 from ...checks.shapes import Numbers
@@ -297,8 +298,24 @@ def prepare(system: System, method: AbstractMethod) -> Problem:
         lambda m: m.event, method, _as_arrays(method.event), is_leaf=lambda x: x is None
     )
     model = method.formulation.prepare(system)
-    n_state = eqx.filter_eval_shape(method.formulation.to_vector, model, system.reference).shape[0]
+    n_state = _vector_size(method.formulation, model, system.reference)
     return Problem(model, method, system.floating, n_state, internal_count(system))
+
+
+def _vector_size(formulation: AbstractFormulation, model: AbstractModel, state: State) -> int:
+    """Number of entries of the formulation's vector.
+
+    It follows from structure and shapes, and tracing takes longer than a short run: once for each.
+    """
+    leaves, structure = jax.tree.flatten((formulation, model, state))
+    shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x
+    return _traced_size(structure, tuple(map(shape, leaves)))
+
+
+@lru_cache(maxsize=MOST_PROGRAMS)
+def _traced_size(structure: Any, leaves: tuple[Any, ...]) -> int:
+    formulation, model, state = jax.tree.unflatten(structure, leaves)
+    return eqx.filter_eval_shape(formulation.to_vector, model, state).shape[0]
 
 
 def begin(problem: Problem, t0: Float[Array, ""], state0: State) -> IntegrationState:
