@@ -61,15 +61,16 @@ class _Trial(NamedTuple):
 class CorrectedLevenbergMarquardt(eqx.Module):
     """Method of `search`: Levenberg-Marquardt steps with second-order corrections.
 
-    A search has converged when a step changes values and loss by less than the tolerances.
+    A search has converged when a step changes the values by less than `atol + rtol |values|` and the loss,
+    which is a square, by less than `atol^2 + rtol loss`.
 
     Attributes:
-        rtol, atol: relative and absolute tolerances of values and loss.
+        rtol, atol: relative and absolute tolerances of the values.
         corrections: largest number of corrections of a step.
     """
 
-    rtol: float = 1e-6
-    atol: float = 1e-8
+    rtol: float = 1e-8
+    atol: float = 1e-10
     corrections: int = eqx.field(static=True, default=2)
 
     @quick_jit
@@ -116,8 +117,8 @@ class CorrectedLevenbergMarquardt(eqx.Module):
         taken = (ratio > _TAKEN) & jnp.isfinite(trial.squares)
         good = jnp.where(ratio > _GOOD, _LESS, 1.0)
         loss, after = 0.5 * before, 0.5 * trial.squares
-        small = lambda change, size: jnp.abs(change) <= self.atol + self.rtol * jnp.abs(size)
-        still = jnp.all(small(trial.best, x)) & small(loss - after, loss)
+        still = jnp.all(jnp.abs(trial.best) <= self.atol + self.rtol * jnp.abs(x))
+        still &= loss - after <= self.atol**2 + self.rtol * loss
         # nothing is left to gain beyond round-off
         flat = predicted <= 4 * jnp.finfo(x.dtype).eps * before
         return Attempt(
