@@ -24,8 +24,8 @@ from shared.record import ALLOW, MEASURED, RESULTS, ROOT, commit, moved, traced
 
 FOLDER = Path(__file__).parent
 ALONE = (
-    "stiff", "hard", "long_horizon", "trims", "singular", "errors", "estimation", "first_result", "waiting",
-    "failure", "compile_times", "montecarlo", "missions",
+    "stiff", "hard", "long_horizon", "trims", "singular", "errors", "estimation", "waiting",
+    "failure", "compile_times", "montecarlo", "batch_sizes", "missions",
 )  # fmt: skip
 # Result -> the script that measures it, with its arguments, in the order of running.
 BENCHMARKS: dict[str, tuple[str, ...]] = {
@@ -39,7 +39,7 @@ FINISHED = {
     "long_horizon": {"symmetric"},
 }
 # These measure more than one core, or the command line as a user starts it.
-ALL_CORES = ("montecarlo", "first_result", "waiting")
+ALL_CORES = ("montecarlo", "waiting")
 THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 

@@ -27,6 +27,7 @@ from sections.speed import errors, throughput
 from sections.throughput_page import write_page
 from shared.clock import compiled, measure
 from shared.command import begin, parser
+from shared.native import with_native_loops
 from shared.record import ROOT, write
 
 import stmuav_jax as stm
@@ -137,6 +138,16 @@ def by_lanes(size: Size, tolerance: float) -> list[dict[str, Any]]:
     return rows
 
 
+def rates(size: Size, tolerance: float, lanes: tuple[int, ...]) -> dict[str, float]:
+    """Flights per second by lanes, of as few flights as it takes."""
+    few, found = min(64, size.flights), {}
+    for k in lanes:
+        bare = Bare(size, tolerance, k)
+        timing, _ = measure(lambda b=bare: b.fly(few), repeats=size.repeats)
+        found[str(k)] = few / timing.median
+    return found
+
+
 def on_devices(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
     """A study's flights per second on so many cores, bare and with the store, in a new process."""
     given = [sys.executable, __file__, "--devices", str(devices), "--tolerance", str(tolerance)]
@@ -175,8 +186,8 @@ def run(size: Size) -> dict[str, Any]:
     tolerance, tried = tolerance_for(size, exact)
     rows = by_lanes(size, tolerance)
     best = max(rows, key=lambda row: row["per_second"])
-    alone, few = Bare(size, tolerance, 1), min(64, size.flights)
-    single, _ = measure(lambda: alone.fly(few), repeats=size.repeats)
+    alone = rates(size, tolerance, (1,))
+    native = with_native_loops(rates, size, tolerance, (1, *size.lanes[:2]))
     cores = sorted({1, os.cpu_count() or 1})
     label = size.scene if size.case is None else f"{size.scene} case {size.case}"
     given = (stm.make_scene(size.scene, size.case), tight.starts(size.checked), size.t1)
@@ -184,7 +195,8 @@ def run(size: Size) -> dict[str, Any]:
     return {
         "what": f"flights per second, {label}", "t1": size.t1, "flights": size.flights,
         "wanted_error": WANTED, "tolerance": tolerance, "tried": tried, "rows": rows,
-        "best_lanes": best["lanes"], "one_lane_per_second": few / single.median, "peers": found,
+        "best_lanes": best["lanes"], "one_lane_per_second": alone["1"],
+        "native_per_second": native, "peers": found,
         "cores": [on_devices(size, tolerance, count) for count in cores],
     }  # fmt: skip
 

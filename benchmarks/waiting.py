@@ -4,6 +4,7 @@ Each command with the example of its help, as a process of its own. Cold is a ne
 each run, warm the same folder again. CPU time is that of all threads, user and system.
 """
 
+import json
 import os
 import statistics
 import subprocess
@@ -60,7 +61,17 @@ def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
         "cpu": used.ru_utime + used.ru_stime,
         "memory": used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3),
         "exit": process.returncode,
+        **split(out),
     }
+
+
+def split(out: Path) -> dict[str, float]:
+    """Seconds of a simulation's parts by its certificate; empty for other commands."""
+    path = out / "certificate.json"
+    if not path.exists():
+        return {}
+    told = json.loads(path.read_text())["certificate"]
+    return {part: told[f"{part}_seconds"] for part in ("compile", "run", "analysis")}
 
 
 def least(runs: list[dict[str, Any]]) -> dict[str, float]:

@@ -25,16 +25,15 @@ def test_waiting(tmp_path):
 
 
 @pytest.mark.slow
-def test_first_result(tmp_path):
+def test_batch_sizes(tmp_path):
     subprocess.run(
-        [sys.executable, FOLDER / "first_result.py", "--quick", "--results", tmp_path],
+        [sys.executable, FOLDER / "batch_sizes.py", "--quick", "--results", tmp_path],
         check=True, capture_output=True, timeout=600,
     )  # fmt: skip
-    record = json.loads((tmp_path / "first_result.json").read_text())
-    assert {"commit", "dirty", "versions", "cores", "date"} <= set(record["environment"])
-    for kind in ("cold", "warm"):
-        figures = record[kind]["median"]
-        assert figures["total"] > figures["rest"] > 0
+    (row,) = json.loads((tmp_path / "batch_sizes.json").read_text())["rows"]
+    assert row["size"] == 8
+    assert min(row["flights_per_second"], row["filter_step_us"]) > 0
+    assert (row["flights_failed"], row["filters_failed"]) == (0, 0)
 
 
 def test_compile_times(tmp_path):

@@ -84,7 +84,9 @@ def write_page(result: Path, page: Path) -> Path:
         *listed(rows, "lanes", ("flights per second", "per_second", one),
                 ("us per step and flight", "microseconds_per_step", one),
                 ("compile [s]", "compile_seconds", one), "failed"),
-        "", f"One by one: {one(content['one_lane_per_second'])} per second.", "", "## Error", "",
+        "", f"One by one: {one(content['one_lane_per_second'])} per second. With native loops, of fewer flights: "
+        + ", ".join(f"{one(v)} by lanes of {k}" for k, v in content["native_per_second"].items()) + ".",
+        "", "## Error", "",
         *listed(tried, ("tolerance", "tolerance", "{:g}".format),
                 ("median [m]", "median_error", "{:.1e}".format),
                 ("largest [m]", "largest_error", "{:.1e}".format)),

@@ -31,6 +31,7 @@ from .output import results_folder, written
 from .scene_options import check_known, options_class, plain_of, scene_among
 
 if TYPE_CHECKING:
+    from ..dynamics.loads import JointLoads
     from ..dynamics.method import Method
     from ..dynamics.run import Run
     from ..dynamics.scene import Scene
@@ -282,51 +283,51 @@ def run_scene(scene: "Scene", settings: Settings, console: Console) -> "Run":
         )
 
 
-def write_results(run: "Run", settings: Settings, drawer: Drawer) -> list[Path]:
-    """Write results, certificate and figures; their paths."""
+def write_results(
+    run: "Run", settings: Settings, drawer: Drawer
+) -> tuple[list[Path], "JointLoads | None"]:
+    """Write results, certificate, reaction loads and figures; their paths, and the loads."""
+    from ..dynamics.loads import resolved_loads
+    from ..figures.loads import loads_numbers, save_loads
     from ..files.netcdf import save, save_certificate, write_atomically
 
-    folder = results_folder(settings.out, run.scene.name)
-    if settings.figures != "none":
+    folder, drawn, loads = (
+        results_folder(settings.out, run.scene.name),
+        settings.figures != "none",
+        None,
+    )
+    if drawn and not settings.loads:
         drawer.ask(numbers_of(run), settings.figures)
     paths = [save(run, folder / "run.nc"), save_certificate(run, folder / "certificate.json")]
-    if settings.figures != "none":
+    if settings.loads:
+        # after the run is written: nothing that happens here can lose it
+        loads = resolved_loads(run)
+        paths.append(save_loads(run.scene, loads, folder / "loads.csv"))
+        if drawn:
+            more = {"loads": loads_numbers(run.scene, loads)}
+            drawer.ask({**numbers_of(run), **more}, settings.figures)
+    if drawn:
         for name, content in drawer.files().items():
             path = folder / f"{name}.{settings.figures}"
             paths.append(write_atomically(path, content))
-    return paths
-
-
-def write_loads(run: "Run", settings: Settings, folder: Path, out: Console) -> list[Path]:
-    """Write the joints' reaction loads, resolved between saved times; print their peaks."""
-    from ..dynamics.loads import resolved_loads
-    from ..figures.loads import loads_figure, loads_table, save_loads
-
-    loads = resolved_loads(run)
-    out.print(loads_table(run.scene, loads))
-    paths = [save_loads(run.scene, loads, folder / "loads.csv")]
-    if settings.figures != "none":
-        from ..figures.plot import save_figures
-
-        draw = {"loads": loads_figure}
-        paths += save_figures(draw, folder, settings.figures, run.scene, loads)
-    return paths
+    return paths, loads
 
 
 def run_simulate(command: Any) -> int:
     """Build and simulate the scene, print and write what comes out; the exit code."""
+    from ..figures.loads import loads_table
     from ..figures.report import certificate_table
 
     settings: Settings = command.settings
     with drawing(settings.figures != "none") as drawer:
         run = run_scene(scene_of(command), settings, Console(stderr=True))
         clock = time.perf_counter()
-        paths = write_results(run, settings, drawer)
+        paths, loads = write_results(run, settings, drawer)
         writing = time.perf_counter() - clock
     out = Console()
     out.print(certificate_table(run))
-    if settings.loads:
-        paths += write_loads(run, settings, paths[0].parent, out)
+    if loads is not None:
+        out.print(loads_table(run.scene, loads))
     for note in run.scene.notes:
         line(out, f"Note: {note}")
     out.print(f"Results and figures {writing:.2f} s.", highlight=False)

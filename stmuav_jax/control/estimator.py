@@ -27,10 +27,11 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
+from ..algebra.compiler import quick_jit
 from ..algebra.rotation import conjugate, product, rotation_matrix, to_rotation_vector
 from ..algebra.space import Composite, Point, Rotation, Vector
 from ..checks.errors import ModelError, SettingError, concrete
-from ..checks.numbers import numbers
+from ..checks.numbers import array_module, as_numpy, floats, numbers, stacked
 from ..checks.shapes import Numbers
 from ..flight.flyer import FlyerPoint, whole_state
 from ..flight.linear import Linear
@@ -39,7 +40,7 @@ from ..mechanics.system import System
 from ..sensing.sensors import SENSORS, gravity_of
 from ..tracker.drive import SLIDER_JOINTS
 from ..tracker.kinematics import stroke_jacobian, strokes
-from .inertial import ERRORS, fix_rows, one_by_one, strapdown
+from .inertial import ERRORS, fix_rows, one_by_one, panel_step, strapdown, walks
 from .instruments import Instrument, Reading
 from .panel import PanelBodies, panel_motion
 from .quadratic import check_observable
@@ -162,32 +163,23 @@ class MotionEstimator(eqx.Module):
                 f"The estimator needs '{found[1].name}' at the centre of mass: give it no point."
             )
         self.names = tuple(one.name for one in found)
-        self.axes = jnp.stack([getattr(one.sensor, "axes") for one in found[:2]])  # noqa: B009
-        self.tracker, self.period = tracker, jnp.asarray(1.0 / rate)
-        self.late = jnp.array([one.delay for one in found[2:]])
+        self.axes = stacked([getattr(one.sensor, "axes") for one in found[:2]])  # noqa: B009
+        self.tracker, self.period = tracker, floats(1.0 / rate)
+        self.late = floats([one.delay for one in found[2:]])
         noise = [_noise(one, system) for one in found]
-        self.variance = jnp.concatenate(noise[2:]) ** 2
+        self.variance = _square(*noise[2:])
         self.arm = _arm(found[2], system)
         self.gravity = gravity_of(system)
-        h = self.period
         drift = [
-            numbers(value, (), f"The drift of the {what}'s bias", unit) * jnp.sqrt(h) * jnp.ones(3)
+            numbers(value, (), f"The drift of the {what}'s bias", unit)
             for value, what, unit in (
                 (gyroscope_drift, "gyroscope", "rad/s/sqrt(s)"),
                 (accelerometer_drift, "accelerometer", "m/s^2/sqrt(s)"),
             )
         ]
-        steps = [h * noise[0], h**2 / 2 * noise[1], h * noise[1], *drift]
-        Q = jnp.diag(jnp.concatenate(steps) ** 2)
-        # errors of position and velocity come from one reading of the accelerometer
-        k, cross = jnp.arange(3), h**3 / 2 * noise[1] ** 2
-        self.walk = Q.at[3 + k, 6 + k].set(cross).at[6 + k, 3 + k].set(cross)
-        q = numbers(panel_noise, (), "The noise of the panel", "rad/s^2/sqrt(Hz)") ** 2
-        one = q * jnp.array([[h**3 / 3, h**2 / 2], [h**2 / 2, h]])
-        self.panel_walk = jnp.kron(one, jnp.eye(2))
-        self.home = jnp.zeros(2)
-        if tracker is not None:
-            self.home = strokes(tracker.geometry, panel_motion(system.reference).value)
+        q = numbers(panel_noise, (), "The noise of the panel", "rad/s^2/sqrt(Hz)")
+        self.walk, self.panel_walk = walks(self.period, noise[0], noise[1], drift[0], drift[1], q)
+        self.home = floats(np.zeros(2)) if tracker is None else _home(tracker, system.reference)
 
     def start(
         self,
@@ -208,7 +200,7 @@ class MotionEstimator(eqx.Module):
             accelerometer_bias: [m/s^2], about zero. panel: panel angles [rad].
             panel_rate: their rates [rad/s].
         """
-        zero = jnp.zeros(3)
+        zero = floats(np.zeros(3))
         mean = {
             "p": state.p[0], "r": state.r[0], "v": state.v[0],
             "gyroscope_bias": zero, "accelerometer_bias": zero,
@@ -279,7 +271,7 @@ class MotionEstimator(eqx.Module):
         """Belief about the panel a step h [s] later, after its encoders."""
         assert self.tracker is not None
         geometry = self.tracker.geometry
-        F = _drift(h)
+        F = panel_step(h)
         x = F @ before.mean
         P = F @ before.covariance @ F.T + self.panel_walk
         J, now = stroke_jacobian(geometry, x[:2]), strokes(geometry, x[:2]) - self.home
@@ -298,15 +290,24 @@ class MotionEstimator(eqx.Module):
         return whole_state(self.tracker.geometry, self.tracker.shift, at)
 
 
-def _drift(h: Float[Array, ""]) -> Float[Array, "4 4"]:
-    """Matrix of the panel's angles and rates over a step h [s]."""
-    return jnp.eye(4).at[:2, 2:].add(h * jnp.eye(2))
+@quick_jit
+def _home(tracker: PanelBodies, state: State) -> Float[Array, "2"]:
+    """Strokes (2,) [m] at a state."""
+    return strokes(tracker.geometry, panel_motion(state).value)
+
+
+def _square(*deviations: Float[Array, "..."]) -> Float[Array, " n"]:
+    own = as_numpy(deviations)
+    return floats(array_module(*own).concatenate(own) ** 2)
 
 
 def _arm(fix: Instrument, system: System) -> Float[Array, "3"]:
     """Point of a position fix from the base's centre of mass, base axes (3,) [m]."""
     point = getattr(fix.sensor, "point", None)
-    return jnp.zeros(3) if point is None else point - system.bodies.com[0]
+    if point is None:
+        return floats(np.zeros(3))
+    point, com = as_numpy((point, system.bodies.com))
+    return floats(point - com[0])
 
 
 def _check_observed(
@@ -323,20 +324,13 @@ def _check_observed(
     """
     known = {one.name: one for one in instruments if isinstance(one, Instrument)}
     fixes, gravity, h = [known.get(one.name) for one in wanted[2:]], gravity_of(system), 1 / rate
-    delays = jnp.array([0.0 if one is None else one.delay for one in fixes])
-    arm = jnp.zeros(3) if fixes[0] is None else _arm(fixes[0], system)
-    zero, p = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
-    point = dict.fromkeys(dict(_BASE.parts), zero) | {"p": p}
-    _, F = strapdown(point, zero, -gravity, gravity, jnp.asarray(h))
-    H, names = fix_rows(jnp.eye(3), arm, zero, delays[:2]), list(ERRORS)
+    delays = floats([0.0 if one is None else one.delay for one in fixes])
+    arm = floats(np.zeros(3)) if fixes[0] is None else _arm(fixes[0], system)
+    F, H = _at_rest(tracker, system.reference, gravity, arm, delays, floats(h))
     seen = np.repeat([one is not None for one in fixes], [3, 3] + [1] * len(fixes[2:]))
+    names = list(ERRORS)
     if tracker is not None:
-        J = stroke_jacobian(tracker.geometry, panel_motion(system.reference).value)
-        F, own = (
-            block_diag(F, _drift(jnp.asarray(h))),
-            jnp.concatenate([J, -delays[2:, None] * J], axis=1),
-        )
-        H, names = block_diag(H, own), [*names, "phi", "theta", "rate of phi", "rate of theta"]
+        names += ["phi", "theta", "rate of phi", "rate of theta"]
     if not concrete(F, H):
         return
     A, C = (np.asarray(F) - np.eye(len(names))) / h, np.asarray(H)[seen]
@@ -350,14 +344,37 @@ def _check_observed(
         raise SettingError(f"The estimator's instruments do not suffice{words}. {error}") from error
 
 
+@quick_jit
+def _at_rest(
+    tracker: PanelBodies | None,
+    state: State,
+    gravity: Float[Array, "3"],
+    arm: Float[Array, "3"],
+    delays: Float[Array, " f"],
+    h: Float[Array, ""],
+) -> tuple[Float[Array, "n n"], Float[Array, "c n"]]:
+    """Matrices F over a period h [s] and H at the fixes of an estimator whose machine is at rest."""
+    zero, p = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
+    point = dict.fromkeys(dict(_BASE.parts), zero) | {"p": p}
+    _, F = strapdown(point, zero, -gravity, gravity, h)
+    H = fix_rows(jnp.eye(3), arm, zero, delays[:2])
+    if tracker is None:
+        return F, H
+    J = stroke_jacobian(tracker.geometry, panel_motion(state).value)
+    own = jnp.concatenate([J, -delays[2:, None] * J], axis=1)
+    return block_diag(F, panel_step(h)), block_diag(H, own)
+
+
 def state_of(estimate: Any) -> Any:
     """State of a `MotionEstimate`; any other estimate as it is."""
     return estimate.state if isinstance(estimate, MotionEstimate) else estimate
 
 
 def _spread(deviations: Sequence[Numbers], size: int) -> Float[Array, "n n"]:
-    each = [jnp.broadcast_to(jnp.asarray(x, float), (size,)) for x in deviations]
-    return jnp.diag(jnp.concatenate(each) ** 2)
+    own = as_numpy([floats(x) for x in deviations])
+    xp = array_module(*own)
+    each = [xp.broadcast_to(x, (size,)) for x in own]
+    return floats(xp.diag(xp.concatenate(each) ** 2))
 
 
 def _of_name(instruments: Sequence[Any], name: str) -> Instrument:
@@ -375,4 +392,5 @@ def _noise(one: Instrument, system: System) -> Float[Array, " c"]:
             f"The estimator needs the noise of '{one.name}': an Instrument with `noise`."
         )
     size = len(one.sensor.components(system))
-    return jnp.broadcast_to(jnp.asarray(one.noise, float), (size,))
+    noise = as_numpy(floats(one.noise))
+    return floats(array_module(noise).broadcast_to(noise, (size,)))

@@ -5,10 +5,13 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..algebra import lapack
+from ..algebra.compiler import quick_jit
 from ..checks.errors import ModelError
+from ..checks.numbers import array_module, as_numpy, floats
 from ..flight.mass_properties import centre_of_mass, inertia_about_centre, inner_momentum
 from ..mechanics.forces.contact import GroundContact
 from ..mechanics.state import State
@@ -101,7 +104,7 @@ class FlightController(eqx.Module):
     ) -> None:
         found = [f for f in system.forces if isinstance(f, Rotors | MotorRotors)]
         self.gravity = gravity_of(system)
-        if len(found) != 1 or not bool(jnp.any(self.gravity != 0)):
+        if len(found) != 1 or not np.any(as_numpy(self.gravity) != 0):
             raise ModelError(
                 "A flight controller needs one set of rotors and gravity, but the system has "
                 f"{len(found)} sets and gravity of {jnp.asarray(self.gravity).tolist()} m/s^2."
@@ -116,15 +119,17 @@ class FlightController(eqx.Module):
         own = getattr(motors, "squared_limits", None)
         if limits is None and own is not None:
             limits = RotorLimits(jnp.sqrt(own[0]), jnp.sqrt(own[1]))
-        weight = jnp.sum(system.bodies.mass) * jnp.linalg.norm(self.gravity)
+        mass_of_all, g = as_numpy((system.bodies.mass, self.gravity))
+        xp = array_module(mass_of_all, g)
+        weight = floats(xp.sum(mass_of_all) * xp.linalg.norm(g))
         if limits is not None:
             check_lift(rotors, limits, weight)
         # moments are about the base's centre of mass: the map does not change with the posture
         self.wrenches = wrench_map(rotors, system.bodies.com[0])
         self.working = working_rotors(lost, rotors.spin.shape[0])
         if self.working is None:
-            self.inverse = lapack.pseudoinverse(self.wrenches, 1e-14)
-            if not bool(jnp.all(self.inverse[:, 0] > 0)):
+            self.inverse = _pseudoinverse(self.wrenches)
+            if not np.all(np.asarray(self.inverse)[:, 0] > 0):
                 raise ModelError(
                     "Not every rotor adds to the thrust where its moments balance: the base's centre "
                     "of mass is too far from the rotors' middle for this flight controller."
@@ -132,7 +137,7 @@ class FlightController(eqx.Module):
         else:
             self.inverse = inverse_without_yaw(self.wrenches, self.working, limits, weight)
         self.gains = FlightGains() if gains is None else gains
-        self.limits, self.period = limits, jnp.asarray(1.0 / rate)
+        self.limits, self.period = limits, floats(1.0 / rate)
         self.mass = mass_properties(system, system.reference) if mass is None else mass
         self.feet = feet_of(system)
 
@@ -251,6 +256,12 @@ def _rotors(force: Rotors | MotorRotors) -> Rotors:
     return force.rotors if isinstance(force, MotorRotors) else force
 
 
+@quick_jit
+def _pseudoinverse(wrenches: Float[Array, "4 k"]) -> Float[Array, "k 4"]:
+    return lapack.pseudoinverse(wrenches, 1e-14)
+
+
+@quick_jit
 def mass_properties(
     system: System, state: State, moment: Float[Array, "3"] | None = None
 ) -> MassProperties:

@@ -10,6 +10,7 @@ ch. 5 and 6.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..algebra.compiler import quick_jit
 from ..algebra.rotation import from_rotation_vector, normalise, product, rotation_matrix, skew
 from ..algebra.space import Point
 
@@ -99,3 +100,28 @@ def fix_rows(
             [_turn(late[1] * omega), none, none, late[1] * one, none],
         ]
     )
+
+
+@quick_jit
+def walks(
+    h: Float[Array, ""],
+    gyroscope: Float[Array, "3"],
+    accelerometer: Float[Array, "3"],
+    gyroscope_drift: Float[Array, ""],
+    accelerometer_drift: Float[Array, ""],
+    panel: Float[Array, ""],
+) -> tuple[Float[Array, "15 15"], Float[Array, "4 4"]]:
+    """Covariances that a period h [s] adds to those of the base and of the panel."""
+    drift = [x * jnp.sqrt(h) * jnp.ones(3) for x in (gyroscope_drift, accelerometer_drift)]
+    steps = [h * gyroscope, h**2 / 2 * accelerometer, h * accelerometer, *drift]
+    Q = jnp.diag(jnp.concatenate(steps) ** 2)
+    # errors of position and velocity come from one reading of the accelerometer
+    k, cross = jnp.arange(3), h**3 / 2 * accelerometer**2
+    Q = Q.at[3 + k, 6 + k].set(cross).at[6 + k, 3 + k].set(cross)
+    one = panel**2 * jnp.array([[h**3 / 3, h**2 / 2], [h**2 / 2, h]])
+    return Q, jnp.kron(one, jnp.eye(2))
+
+
+def panel_step(h: Float[Array, ""]) -> Float[Array, "4 4"]:
+    """Matrix of the panel's angles and rates over a step h [s]."""
+    return jnp.eye(4).at[:2, 2:].add(h * jnp.eye(2))

@@ -17,10 +17,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import quick_jit
 from ..algebra.rotation import rotation_matrix
-from ..checks.numbers import positive
+from ..checks.numbers import as_numpy, floats, positive
 from ..checks.shapes import Numbers
 from ..mechanics.state import State
 from ..mechanics.system import System
@@ -51,9 +53,9 @@ class PanelBodies(NamedTuple):
 
 def panel_bodies(system: System, geometry: TrackerGeometry, shift: Numbers) -> PanelBodies:
     """The tracker's bodies of a system; raises `ModelError` if one of them is missing."""
-    rows = jnp.array([system.index(name) for name in TRACKER_BODIES])
-    own = system.bodies
-    return PanelBodies(geometry, jnp.asarray(shift, float), own.mass[rows], own.inertia[rows])
+    rows = np.array([system.index(name) for name in TRACKER_BODIES])
+    mass, inertia = as_numpy((system.bodies.mass, system.bodies.inertia))
+    return PanelBodies(geometry, floats(shift), floats(mass[rows]), floats(inertia[rows]))
 
 
 class PanelReaction(NamedTuple):
@@ -68,6 +70,7 @@ class PanelReaction(NamedTuple):
     moment: Float[Array, "3"]
 
 
+@quick_jit
 def panel_motion(state: State) -> PairMotion:
     """Panel angles and their rates, with accelerations of zero, from true states of base and panel.
 

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 # Arguments of the functions that draw, by the figures' names.
 Numbers = Mapping[str, tuple[Any, ...]]
 
+# Loads below this are round-off of joints without such a load; tables show them as 0 [N, N m].
+NOTHING = 1e-9
+
 # Largest number of curves in a panel: each has a style of its own.
 _MOST = 4
 _SLIDING = ("translational", "cylindrical", "screw")
@@ -169,6 +172,37 @@ def saved_numbers(data: "xr.Dataset") -> Numbers:
     found = {"pose": pose_of(motion), "joints": joints_of(motion), "balances": saved_balances(data)}
     drawn = {name: each for name, each in found.items() if each is not None}
     return {name: each for name, each in drawn.items() if name != "joints" or each[-1]}
+
+
+class SavedLoads(NamedTuple):
+    """Reaction loads in NumPy arrays, as in `JointLoads`: times (k,), force and moment (k, joints, 3)."""
+
+    ts: np.ndarray
+    force: np.ndarray
+    moment: np.ndarray
+    joints: tuple[str, ...]
+
+    @property
+    def components(self) -> np.ndarray:
+        """Force and its magnitude [N], moment and its magnitude [N m] (k, joints, 8)."""
+        parts = [
+            part
+            for vector in (self.force, self.moment)
+            for part in (vector, np.linalg.norm(vector, axis=-1)[..., None])
+        ]
+        return np.concatenate(parts, axis=-1)
+
+
+def saved_loads(data: "xr.Dataset") -> SavedLoads | None:
+    """Reaction loads at the saved times of a saved run; None where its file has none."""
+    if "reaction_force" not in data or not data.sizes["joint"]:
+        return None
+    motion = saved_motion(data)
+    frames = np.stack([joint_side(motion, joint, "i")[1] for joint in motion.joints], axis=1)
+    # components along the columns of each frame
+    own = lambda name: np.einsum("kjab,kja->kjb", frames, data[name].values)
+    names = tuple(joint.name for joint in motion.joints)
+    return SavedLoads(motion.ts, own("reaction_force"), own("reaction_moment"), names)
 
 
 # --- coordinates by NumPy, for which nothing is compiled

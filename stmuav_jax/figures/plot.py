@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from .numbers import balances_of, joints_of, motion_of, pose_of
+from .numbers import NOTHING, SavedLoads, balances_of, joints_of, motion_of, pose_of
 
 if TYPE_CHECKING:
     from ..dynamics.run import Run
@@ -35,6 +35,8 @@ _DASHES = (
     (0, (9, 2)),
 )
 _MARKS = "os^DvP*X<>hp8"
+# Peaks of more than so many usual loads are drawn on a logarithmic axis.
+_SPIKE = 5.0
 WIDTH = 7.0  # text width of a page [inch]
 
 
@@ -171,11 +173,64 @@ def _logarithmic(
         ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", fontsize=9)
 
 
+def loads(title: str, found: SavedLoads) -> Figure:
+    """Figure of force and moment over time in joint axes, with a row of panels per joint."""
+    rows = max(len(found.joints), 1)
+    figure, axes = grid(rows, 2, 0.9 + 1.35 * rows)
+    for k, name in enumerate(found.joints):
+        _history(found, k, axes[k])
+        axes[k, 0].set_ylabel(name, fontsize=9, fontweight="bold", parse_math=False)
+        for ax in axes[k]:
+            if k < len(found.joints) - 1:
+                ax.set_xlabel("")
+                ax.tick_params(labelbottom=False)
+    figure.align_ylabels(axes[:, 0])
+    axes[0, 0].set_title("force [N]", fontsize=10)
+    axes[0, 1].set_title("moment [N m]", fontsize=10)
+    if found.joints:
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), ncols=4, loc="outside lower center")
+    else:
+        for ax in axes.flat:
+            ax.set_axis_off()
+    words = "reactions in joint axes, body i on body j; beyond the thin lines logarithmic"
+    figure.suptitle(f"{title}\n{words}", fontsize=10, parse_math=False)
+    return figure
+
+
+def _history(found: SavedLoads, k: int, axes: np.ndarray) -> None:
+    values = found.components[:, k]
+    for ax, part in zip(axes, (slice(0, 4), slice(4, 8)), strict=True):
+        curves(ax, found.ts, values[:, part], ("x", "y", "z", "magnitude"))
+        if not np.any(np.abs(values[:, part]) > NOTHING):
+            ax.set_ylim(-1.0, 1.0)
+            ax.set_yticks([])
+            ax.text(0.5, 0.6, "none", transform=ax.transAxes, ha="center", fontsize=9)
+        else:
+            _room_for_spikes(ax, values[:, part][:, -1])
+
+
+def _room_for_spikes(ax: Axes, magnitude: np.ndarray) -> None:
+    """Make an axis logarithmic beyond the usual loads, where short peaks are far above them."""
+    sizes = magnitude[np.isfinite(magnitude)]
+    usual = float(np.quantile(sizes, 0.9))
+    if usual <= NOTHING or np.max(sizes) < _SPIKE * usual:
+        return
+    decade = 10 ** np.floor(np.log10(usual))
+    linear = float(decade * max(k for k in (1, 2, 5) if k * decade <= usual))
+    ax.set_yscale("symlog", linthresh=linear, linscale=1.5)
+    largest = 10 ** np.ceil(np.log10(np.max(sizes)))
+    ax.set_yticks([-largest, -linear, 0.0, linear, largest])
+    ax.minorticks_off()
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    for side in (-linear, linear):
+        ax.axhline(side, color="0.55", linewidth=0.5)
+
+
 FIGURES = {"pose": pose, "joints": joints, "balances": balances}
 
 
-# The same by the numbers that `numbers_of` takes from a run.
-DRAWN = {"pose": _pose, "joints": _joints, "balances": _balances}
+# The same by the numbers that `numbers_of` takes from a run, and its reaction loads.
+DRAWN = {"pose": _pose, "joints": _joints, "balances": _balances, "loads": loads}
 
 
 def content(figure: Figure, suffix: str, dpi: int = 200) -> bytes:

@@ -13,8 +13,7 @@ import xarray as xr
 
 from ..files.layout import flattened
 from ..files.netcdf import FORMAT, FileError
-from .loads import NOTHING, SavedLoads, histories, saved_loads
-from .numbers import Numbers, saved_numbers
+from .numbers import NOTHING, Numbers, SavedLoads, saved_loads, saved_numbers
 from .page import (
     Picture,
     entries_table,
@@ -222,7 +221,7 @@ def run_pictures(data: xr.Dataset, numbers: Numbers, loads: SavedLoads | None) -
         words += (
             "" if count <= _JOINTS else f", {first + 1} to {min(first + _JOINTS, count)} of {count}"
         )
-        yield Picture(f"loads_{first // _JOINTS + 1}", words, histories(title, some))
+        yield Picture(f"loads_{first // _JOINTS + 1}", words, DRAWN["loads"](title, some))
     if "rotor_speed" in data:
         yield Picture("rotors", "Speeds of the rotors", _rotors(data, title))
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra import lapack
-from ..algebra.compiler import kept_jit
+from ..algebra.compiler import kept_jit, quick_jit
 from ..algebra.rotation import (
     conjugate,
     from_rotation_vector,
@@ -355,6 +355,7 @@ def _first(x: Any, others: Array) -> Array:
     return jnp.concatenate([jnp.asarray(x)[None], others])
 
 
+@quick_jit
 def whole_state(
     geometry: TrackerGeometry, displacement: Float[Array, "3"], at: FlyerPoint
 ) -> State:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, named_places
-from ..checks.numbers import numbers
+from ..checks.numbers import as_numpy, floats, numbers
 from .load import AbstractForce
 from .system import System
 
@@ -116,7 +116,7 @@ class Inputs(eqx.Module):
             if callable(values):
                 new: Any = Components(values, tuple(places), shape)
             elif whole:
-                new = jnp.asarray(values)[np.array(places)].reshape(shape)
+                new = floats(as_numpy(floats(values))[np.array(places)].reshape(shape))
             else:
                 new = jnp.asarray(old)
                 for k in places:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..checks.errors import SettingError
+from ..checks.numbers import floats
 from ..control.adaptation.adaptive import AdaptiveController
 from ..control.adaptation.payload_filter import PayloadFilter
 from ..control.estimator import MotionEstimator
@@ -231,7 +232,7 @@ def _pushed(scene: Scene, given: MissionFile) -> Scene:
     for k, force in enumerate(forces):
         if isinstance(force, LinearActuator):
             own.append(force)
-            forces[k] = eqx.tree_at(lambda f: f.force, force, jnp.zeros(()))
+            forces[k] = eqx.tree_at(lambda f: f.force, force, floats(0.0))
     if given.push is not None:
         sine = Sine(jnp.asarray(given.push.force), jnp.asarray(given.push.angular_frequency))
         forces += [eqx.tree_at(lambda f: f.force, f, sine) for f in own]
@@ -254,9 +255,9 @@ def plant_of(given: MissionFile, machine: Machine) -> Plant:
     system, rate = machine.scene.system, given.rates.control
     known = system if machine.believed is None else machine.believed
     names = input_names(machine)
-    count, mass = machine.rotors.spin.shape[0], float(jnp.sum(known.bodies.mass))
+    count, mass = machine.rotors.spin.shape[0], float(np.sum(np.asarray(known.bodies.mass)))
     hover = hover_speed_squared(mass, gravity_of(system), machine.rotors.k_f, count)
-    before = jnp.concatenate([jnp.full(count, hover), jnp.zeros(len(names) - 1)])
+    before = np.concatenate([np.asarray(hover), np.zeros(len(names) - 1)])
     settings: dict[str, Any] = {"inputs": names, "before": before, "rate": rate}
     settings |= {"steps": given.rates.steps, "delay": given.rates.delay}
     if given.sensors is None:
@@ -391,6 +392,6 @@ def _faulty(given: MissionFile, machine: Machine, pilot: Any) -> MissionControll
             )
         assert machine.bodies is not None
         jam = Jam(machine.bodies.geometry, jnp.asarray(jammed))
-    most = jnp.inf if machine.force is None else machine.force
-    force = jnp.full(0 if machine.bodies is None else 2, most)
-    return MissionController(pilot, jnp.asarray(lost), jnp.asarray(share), jam, force)
+    most = np.inf if machine.force is None else machine.force
+    force = floats(np.full(0 if machine.bodies is None else 2, most))
+    return MissionController(pilot, floats(lost), floats(share), jam, force)

@@ -11,11 +11,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..algebra.compiler import quick_jit
 from ..algebra.rotation import rotation_matrix
 from ..algebra.sampled import Sampled
 from ..checks.errors import ModelError, SettingError, StateError, nearest_names
+from ..checks.numbers import floats
 from ..checks.schema import SHOWN, checked
 from ..control.closed_loop import inspected
 from ..control.geometric import attitude_of
@@ -26,6 +28,7 @@ from ..environment.ephemeris import Place
 from ..environment.sun import sun_position
 from ..files.netcdf import FileError, read_toml
 from ..mechanics.forces.contact import GroundContact
+from ..mechanics.state import State
 from ..parameters.energy import ENERGY
 from ..rotorcraft.battery import Battery
 from ..sensing.sensors import gravity_of
@@ -192,7 +195,7 @@ def _moves(given: MissionFile, machine: Machine) -> PanelMoves:
             "of the world and the sun."
         )
     world = kinds == {True}
-    start = rotation_matrix(state.p[0]) @ panel_normal(angles) if world else angles
+    start = _normal(state, angles) if world else angles
     targets = tuple(_target(move, given.t1) for move in given.panel)
     ats, durations = (
         tuple(jnp.asarray(getattr(move, name)) for move in given.panel)
@@ -200,6 +203,12 @@ def _moves(given: MissionFile, machine: Machine) -> PanelMoves:
     )
     shapes = tuple(jnp.asarray(move.shape, dtype=float) for move in given.panel)
     return PanelMoves(start, targets, ats, durations, world, shapes)
+
+
+@quick_jit
+def _normal(state: State, angles: Float[Array, "2"]) -> Float[Array, "3"]:
+    """Normal of the panel in the world."""
+    return rotation_matrix(state.p[0]) @ panel_normal(angles)
 
 
 def _target(move: MoveEntry, t1: float) -> Any:
@@ -246,13 +255,14 @@ def _check_thrust(mission: Mission) -> None:
     machine, speeds = mission.machine, mission.machine.speeds
     if speeds is None:
         return
-    ts = jnp.linspace(0.0, mission.file.t1, _CHECKED)
+    ts = floats(np.linspace(0.0, mission.file.t1, _CHECKED))
     wanted = quick_jit(lambda path, ts: jax.vmap(path)(ts))(mission.references.path, ts)
-    mass = jnp.sum(mission.plant.system.bodies.mass)
-    needed = mass * jnp.linalg.norm(wanted.a - gravity_of(mission.plant.system), axis=1)
-    lower, upper = speeds.squared(machine.rotors.spin.shape[0])
-    least, most = (float(machine.rotors.k_f * jnp.sum(x)) for x in (lower, upper))
-    beyond = np.asarray((needed > most) | (needed < least))
+    system = mission.plant.system
+    a, gravity, mass = map(np.asarray, (wanted.a, gravity_of(system), system.bodies.mass))
+    needed = np.sum(mass) * np.linalg.norm(a - gravity, axis=1)
+    limits = speeds.squared(machine.rotors.spin.shape[0])
+    least, most = (float(machine.rotors.k_f) * float(np.sum(np.asarray(x))) for x in limits)
+    beyond = (needed > most) | (needed < least)
     if np.any(beyond):
         k = int(np.argmax(beyond))
         raise SettingError(
@@ -281,11 +291,9 @@ def _check_panel(mission: Mission) -> None:
         R = attitude_of(at.waypoint.a - gravity, at.waypoint.heading)
         return panel_angles(R.T @ at.panel.value)
 
-    angles = quick_jit(lambda r, ts: jax.vmap(lambda t: wanted(r, t))(ts))(
-        references, jnp.asarray(ts)
-    )
+    angles = quick_jit(lambda r, ts: jax.vmap(lambda t: wanted(r, t))(ts))(references, floats(ts))
     geometry, limits = machine.bodies.geometry, machine.limits
-    found = survey(geometry, jnp.asarray(angles).T, limits)
+    found = quick_jit(survey)(geometry, floats(np.asarray(angles).T), limits)
     reason = np.asarray(found.reason)
     if not np.any(reason):
         return

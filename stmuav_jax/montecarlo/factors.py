@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..algebra.compiler import quick_jit
 from ..algebra.rotation import rotation_matrix
 from ..checks.errors import SettingError
 from ..checks.schema import named
@@ -132,7 +133,7 @@ def possible_tables(
 
 def faced(start: State) -> np.ndarray:
     """World direction of the last body's z axis in a state (3,); a panel faces it."""
-    return np.asarray(rotation_matrix(start.p[-1])[:, 2])
+    return np.asarray(quick_jit(rotation_matrix)(start.p[-1]))[:, 2]
 
 
 def alike(name: str, known: list[str]) -> str:

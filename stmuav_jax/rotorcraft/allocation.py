@@ -26,9 +26,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..algebra import lapack, linalg
+from ..algebra.compiler import quick_jit
 from ..algebra.derivative import safe_sqrt
 from ..checks.errors import ModelError, check_finite, concrete
-from ..checks.numbers import numbers
+from ..checks.numbers import as_numpy, floats, numbers
 from ..checks.reason import AbstractReason, first_reason
 from ..checks.shapes import Numbers
 from .rotor import Rotors
@@ -46,10 +47,11 @@ _RANK = 1e-9  # singular values below this fraction of the largest count as zero
 _MOST_STEPS = 12  # largest number of steps of the active-set method, per rotor
 
 
+@quick_jit
 def wrench_map(rotors: Rotors, about: Float[Array, "3"]) -> Float[Array, "4 k"]:
     """Allocation matrix B: thrust [N] and moments [N m] about a point of the body per unit of u."""
-    zero = jnp.zeros(rotors.spin.shape[0], rotors.arms.dtype)
-    return jax.jacfwd(lambda u: rotors.wrench(u, about))(zero)[jnp.array(_ROWS)]
+    rows = lambda u: rotors.wrench(u, about)[jnp.array(_ROWS)]
+    return jax.jacfwd(rows)(jnp.zeros_like(rotors.arms[:, 0]))
 
 
 def minimum_norm(B: Float[Array, "4 k"], wrench: Float[Array, "4"]) -> Float[Array, " k"]:
@@ -75,21 +77,21 @@ class RotorLimits(NamedTuple):
         found = []
         for name, value in (("lowest", self.lowest), ("highest", self.highest)):
             check_finite(value, f"The {name} rotor speed", "rad/s")
-            speed = jnp.asarray(value, dtype=float)
+            speed = as_numpy(floats(value))
             if speed.shape not in ((), (count,)):
                 raise ModelError(
                     f"The {name} rotor speed must be one number or one for each of {count} rotors, "
                     f"but its shape is {speed.shape}."
                 )
-            found.append(jnp.broadcast_to(speed, (count,)))
+            found.append(speed + np.zeros(count))
         lowest, highest = found
-        if concrete(lowest, highest) and not bool(jnp.all((lowest >= 0) & (lowest < highest))):
-            k = int(jnp.argmin((lowest >= 0) & (lowest < highest)))
+        if concrete(found) and not np.all(right := (lowest >= 0) & (lowest < highest)):
+            k = int(np.argmin(right))
             raise ModelError(
                 f"The speed limits of a rotor must be 0 <= lowest < highest, but those of rotor {k + 1} "
                 f"are {float(lowest[k]):g} and {float(highest[k]):g} rad/s."
             )
-        return lowest**2, highest**2
+        return floats(lowest**2), floats(highest**2)
 
 
 class AllocationReason(AbstractReason):
@@ -381,20 +383,17 @@ def check_lift(
     Raises:
         ModelError: the weight lies outside; the message has the required and available thrust.
     """
-    lower, upper = limits.squared(rotors.spin.shape[0])
-    lowest, most = rotors.k_f * jnp.sum(lower), rotors.k_f * jnp.sum(upper)
-    needed = jnp.asarray(weight, dtype=float)
-    if not concrete(lowest, most, needed):
+    k_f, *bounds = as_numpy((rotors.k_f, *limits.squared(rotors.spin.shape[0])))
+    lowest, most = (floats(k_f * each.sum()) for each in bounds)
+    if not concrete(lowest, most, weight):
         return lowest, most
     range_of = f"rotors of body '{rotors.body}' give {float(lowest):.4g} to {float(most):.4g} N"
-    if float(needed) > float(most):
+    if (needed := float(weight)) > float(most):
+        words = f"{needed:.4g} N are required, but within their speed limits the {range_of}"
+        raise ModelError(f"The rotors cannot carry the weight: {words}.")
+    if needed < float(lowest):
         raise ModelError(
-            f"The rotors cannot carry the weight: {float(needed):.4g} N are required, but within "
-            f"their speed limits the {range_of}."
-        )
-    if float(needed) < float(lowest):
-        raise ModelError(
-            f"The rotors cannot turn slowly enough to hover: the weight is {float(needed):.4g} N, "
+            f"The rotors cannot turn slowly enough to hover: the weight is {needed:.4g} N, "
             f"but within their speed limits the {range_of}."
         )
     return lowest, most

@@ -1,10 +1,12 @@
 """States of flying scenes and of the tracker from the numbers of their start."""
 
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import quick_jit
 from ..algebra.rotation import product, turn_about
 from ..checks.errors import StateError, check_finite, concrete
+from ..checks.numbers import as_numpy, floats, stacked
 from ..flight.flyer import FlyerPoint, whole_state
 from ..mechanics.state import State
 from ..parameters.table import Parameters
@@ -21,17 +23,23 @@ def _numbers(start: object, *names: str) -> Float[Array, " k"]:
     values = [getattr(start, name) for name in names]
     for name, value in zip(names, values, strict=True):
         check_finite(value, f"The start's {name}", "")
-    return jnp.stack([jnp.asarray(value, dtype=float) for value in values])
+    return stacked([floats(value) for value in values])
 
 
 def _base(start: AbstractStart) -> tuple[Array, Array, Array, Array]:
     """Position, Euler parameters, velocity and angular velocity of the base."""
     turns = _numbers(start, "yaw", "pitch", "roll")
-    yaw, pitch, roll = (turn_about(turns[k], axis) for k, axis in enumerate((2, 1, 0)))
     r, v, omega = (
         _numbers(start, *names) for names in (("x", "y", "z"), ("vx", "vy", "vz"), ("p", "q", "r"))
     )
-    return r, product(product(yaw, pitch), roll), v, omega
+    return r, _turned(turns), v, omega
+
+
+@quick_jit
+def _turned(turns: Float[Array, "3"]) -> Float[Array, "4"]:
+    """Euler parameters of turns about z, y and x, one after the other [rad]."""
+    yaw, pitch, roll = (turn_about(turns[k], axis) for k, axis in enumerate((2, 1, 0)))
+    return product(product(yaw, pitch), roll)
 
 
 def _panel(start: PanelStart | FlightStart, table: Parameters) -> tuple[Array, Array]:
@@ -40,16 +48,14 @@ def _panel(start: PanelStart | FlightStart, table: Parameters) -> tuple[Array, A
     for name, value in zip(("phi", "theta"), given, strict=True):
         if value is not None:
             check_finite(value, f"The start's {name}", "rad")
-    angles = [
-        u if g is None else jnp.asarray(g, dtype=float) for g, u in zip(given, usual, strict=True)
-    ]
-    return jnp.stack(angles), _numbers(start, "phi_rate", "theta_rate")
+    angles = [u if g is None else floats(g) for g, u in zip(given, as_numpy(usual), strict=True)]
+    return stacked(angles), _numbers(start, "phi_rate", "theta_rate")
 
 
 def base_state(start: BaseStart) -> State:
     """State of the bare hexacopter."""
     r, p, v, omega = _base(start)
-    return State(r[None], p[None], v[None], omega[None])
+    return State(*(stacked([x]) for x in (r, p, v, omega)))
 
 
 def panel_state(start: PanelStart, table: Parameters) -> State:
@@ -70,13 +76,13 @@ def flight_state(start: FlightStart, table: Parameters) -> State:
     """
     r, p, v, omega = _base(start)
     angles, rates = _panel(start, table)
-    shift = jnp.asarray(table.value("mount.shift"), dtype=float)
+    shift = floats(table.value("mount.shift"))
     at = FlyerPoint(r, p, angles, v, omega, rates)
     return _reached(whole_state(tracker_geometry(table), shift, at), angles)
 
 
 def _reached(state: State, angles: Float[Array, "2"]) -> State:
-    if concrete(state.r) and not bool(jnp.all(jnp.isfinite(state.r))):
+    if concrete(state.r) and not np.all(np.isfinite(np.asarray(state.r))):
         phi, theta = (float(angle) for angle in angles)
         raise StateError(
             f"The tracker cannot start with the panel angles phi = {phi:g} rad, theta = {theta:g} "

@@ -14,12 +14,13 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..algebra.rotation import relative_acceleration
 from ..algebra.space import AbstractSpace, CyclicVector, Point, Rotation, Vector
 from ..checks.errors import SettingError
-from ..checks.numbers import numbers
+from ..checks.numbers import as_numpy, floats, numbers
 from ..checks.shapes import Numbers
 from ..dynamics.run import Run
 from ..dynamics.statespace.base import AbstractStateSpace, Time
@@ -75,7 +76,7 @@ class AbstractSensor(eqx.Module):
 
 
 def _axes(axes: Numbers | None) -> Float[Array, "3 3"]:
-    return jnp.eye(3) if axes is None else numbers(axes, (3, 3), "The axes of a sensor", "")
+    return floats(np.eye(3)) if axes is None else numbers(axes, (3, 3), "The axes of a sensor", "")
 
 
 class Gyroscope(AbstractSensor):
@@ -253,8 +254,8 @@ SENSORS: dict[str, Callable[..., AbstractSensor]] = {
 
 def gravity_of(system: System) -> Float[Array, "3"]:
     """Acceleration of free fall by a system's gravity, world (3,) [m/s^2]; zero without any."""
-    found = [jnp.asarray(f.acceleration) for f in system.forces if isinstance(f, Gravity)]
-    return sum(found, start=jnp.zeros(3))  # pyright: ignore[reportReturnType]
+    found = [as_numpy(f.acceleration) for f in system.forces if isinstance(f, Gravity)]
+    return floats(sum(found, start=np.zeros(3)))
 
 
 def sensed_motion_at(

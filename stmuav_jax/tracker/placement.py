@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..algebra.compiler import quick_jit
 from ..algebra.rotation import angular_velocity, product, rotation_matrix, turn_about
 from ..mechanics.state import State
 from .geometry import TrackerGeometry, close_loops, turn_by_angles
@@ -101,6 +102,7 @@ def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RIS
     return Placement(at.r, at.p, points, axes)
 
 
+@quick_jit
 def posture(
     geometry: TrackerGeometry,
     angles: Float[Array, "2"],

@@ -18,7 +18,7 @@ FLOORS = {
 }
 TESTS = {path.stem for path in FOLDER.parent.joinpath("tests").rglob("*.py")} | {"tests"}
 # sixteen scripts are started
-LINES, STEPS, IN_A_FOLDER, IN_ALL = 400, 60, 16, 8_600
+LINES, STEPS, IN_A_FOLDER, IN_ALL = 400, 60, 16, 8_650
 
 each = pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(FOLDER)))
 

@@ -19,8 +19,7 @@ from stmuav_jax.figures.filter_record import (
     record_of_dataset,
     record_of_file,
 )
-from stmuav_jax.figures.loads import saved_loads
-from stmuav_jax.figures.numbers import numbers_of, saved_numbers
+from stmuav_jax.figures.numbers import numbers_of, saved_loads, saved_numbers
 from stmuav_jax.figures.report import certificate_rows
 from stmuav_jax.files.netcdf import _SEAL_LENGTH, labelled, save_labelled
 
