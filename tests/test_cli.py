@@ -309,6 +309,19 @@ def test_tune_commands(tmp_path, capsys):
     assert "limits of a slew" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("words", "wanted"), [((), True), (("--case", "4"), False)])
+def test_estimates_of_all_cases_ask_for_native_loops(monkeypatch, words, wanted):
+    asked, stopped = [], RuntimeError("the filters are not run here")
+
+    def cases(*_):
+        raise stopped
+
+    monkeypatch.setattr("stmuav_jax.algebra.native.use_native_loops", lambda: asked.append(True))
+    monkeypatch.setattr("stmuav_jax.commands.estimate._cases", cases)
+    assert main(["estimate", *words, "--no-cache"]) == 1
+    assert bool(asked) == wanted
+
+
 def test_estimate_prints_draws_and_saves_a_case(tmp_path, capsys):
     code = run("estimate", "--case", "4", "--seeds", "3", "--t1", "0.05", "--out", str(tmp_path))
     # done, but the report's tuning cannot be trusted

@@ -1,5 +1,6 @@
 """Command `stmuav estimate`: the report's eight cases of estimation, and the hover."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -59,6 +60,13 @@ def run_estimate(command: Any) -> int:
 
     if command.case is not None and command.case not in range(1, 9):
         raise SettingError(f"The report has cases 1 to 8, not {command.case}.")
+    if command.case is None and not command.hover:
+        from ..algebra.native import use_native_loops
+
+        # eight cases filter for longer than their loops take to compile; where JAX has started
+        # already, as in a program that calls this one, they run as they are
+        with contextlib.suppress(SettingError):
+            use_native_loops()
     table = load_parameters(command.params, PART_III)
     names = ("report", "consistent") if command.tuning == "both" else (command.tuning,)
     work = _hover if command.hover else _cases
