@@ -122,7 +122,7 @@ def _stored_jit(function: Callable[..., Any], *, quick: bool) -> Callable[..., A
             return made()(*args, **named)
         # NumPy's arrays are arguments here, while kept programs take those of JAX only
         given = jax.tree.map(lambda x: as_jax(x) if isinstance(x, np.ndarray) else x, args)
-        key = kept.key_of(function, given, _asked(quick))
+        key = _key_once(function, given, quick)
         return made()(*args) if key is None else _by_key(key, function, given, quick)(*given)
 
     call.lower = lambda *args, **named: made().lower(*args, **named)  # pyright: ignore
@@ -135,7 +135,35 @@ def _asked(quick: bool) -> Options:
 
 
 _programs: OrderedDict[Hashable, Callable[..., Any]] = OrderedDict()
+_keys: OrderedDict[Hashable, str | None] = OrderedDict()
 _lock = threading.Lock()
+
+
+def _key_once(function: Callable[..., Any], args: tuple[Any, ...], quick: bool) -> str | None:
+    """Key of a kept program; its text is made once for arguments of the same form."""
+    if not kept.keeps():
+        return None
+    options = _asked(quick)
+    brief = (function, quick, kept.keeps(), tuple(kept.settings()), *_form(args))
+    try:
+        if brief in _keys:
+            return _keys[brief]
+    except TypeError:
+        # what cannot be hashed may still have a text
+        return kept.key_of(function, args, options)
+    key = kept.key_of(function, args, options)
+    with _lock:
+        _keys[brief] = key
+        while len(_keys) > 4 * MOST_PROGRAMS:
+            _keys.popitem(last=False)
+    return key
+
+
+def _form(args: Any) -> tuple[Hashable, ...]:
+    """Structure of arguments, kinds of their leaves and settings of JAX, on which a program depends."""
+    leaves, structure = jax.tree.flatten(args)
+    setting = (jax.config.jax_enable_x64, jax.config.jax_default_device)  # pyright: ignore[reportAttributeAccessIssue]
+    return structure, setting, tuple(map(_kind, leaves))
 
 
 def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -184,9 +212,7 @@ def program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
     The program accepts arguments of the same structure, shapes and data types. It is compiled with
     the quick options of `compiler_options`; `kept_jit` describes which programs are kept.
     """
-    leaves, structure = jax.tree.flatten(args)
-    setting = (jax.config.jax_enable_x64, jax.config.jax_default_device)  # pyright: ignore[reportAttributeAccessIssue]
-    return _by_key((function, structure, setting, tuple(map(_kind, leaves))), function, args)
+    return _by_key((function, *_form(args)), function, args)
 
 
 def program_of_shapes(

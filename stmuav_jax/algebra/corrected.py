@@ -18,13 +18,11 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
 
-from ..checks.shapes import Matrix, Vector
-from . import lapack
-from .compiler import quick_jit
+from ..checks.numbers import as_jax
 
 # Smallest ratio of actual and predicted reduction with which a step is taken, the ratio from which on
 # the damping falls, and its factors after such a step and after one that is not taken.
@@ -42,20 +40,10 @@ class Attempt(NamedTuple):
     """
 
     values: Any
-    loss: Float[Array, ""]
-    damping: Float[Array, ""]
-    taken: Bool[Array, ""]
-    done: Bool[Array, ""]
-
-
-class _Trial(NamedTuple):
-    """Steps tried: the next one, the best one so far and its sum of squares, and whether to go on."""
-
-    count: Any
-    step: Vector
-    best: Vector
-    squares: Float[Array, ""]
-    open: Bool[Array, ""]
+    loss: float
+    damping: float
+    taken: bool
+    done: bool
 
 
 class CorrectedLevenbergMarquardt(eqx.Module):
@@ -73,66 +61,64 @@ class CorrectedLevenbergMarquardt(eqx.Module):
     atol: float = 1e-10
     corrections: int = eqx.field(static=True, default=2)
 
-    @quick_jit
     def attempt(
-        self, function: Callable[[Any], Any], values: Any, seen: Any, damping: Float[Array, ""]
+        self, residuals: Callable[[Any], Any], values: Any, seen: Any, damping: float
     ) -> Attempt:
         """One step from values whose residuals and Jacobian have been seen.
 
+        Everything but the residuals is computed by NumPy and LAPACK, for which nothing is compiled.
+
         Args:
-            function: values -> residuals, any pytree. seen: residuals and columns of their Jacobian at
+            residuals: values -> residuals, any pytree. seen: residuals and columns of their Jacobian at
                 the values, as `value_and_columns` gives them.
         """
-        x, unravel = ravel_pytree(values)
-        r, J = _flat(seen)
-        of = lambda step: ravel_pytree(function(unravel(x + step)))[0]
+        x, r, J = _vector(values), _vector(seen[0]), _rows(seen[1])
         m, n = J.shape
-        Q, R = lapack.qr(jnp.concatenate([J, jnp.sqrt(damping) * jnp.eye(n)]))
-        towards = lambda q: jax.lax.linalg.triangular_solve(
-            R, -(Q[:m].T @ q)[:, None], left_side=True, lower=False
-        )[:, 0]
-        step, before = towards(r), jnp.sum(r**2)
+        Q, R = scipy.linalg.qr(np.concatenate([J, np.sqrt(damping) * np.eye(n)]), mode="economic")
+        towards = lambda q: scipy.linalg.solve_triangular(R, -(Q[:m].T @ q))
+        step, before = towards(r), float(r @ r)
         linear = r + J @ step
-        predicted = before - jnp.sum(linear**2)
-
-        def tried(now: _Trial) -> _Trial:
-            found = of(now.step)
-            squares = jnp.sum(found**2)
-            better = squares < now.squares
-            rest = jnp.where(jnp.isfinite(found), found - linear, 0.0)
-            return _Trial(
-                count=now.count + 1,
-                step=now.step + towards(rest),
-                best=jnp.where(better, now.step, now.best),
-                squares=jnp.where(better, squares, now.squares),
-                open=jnp.isfinite(squares)
-                & (better | (now.count == 0))
-                & (squares > before - _ENOUGH * predicted),
-            )
-
-        start = _Trial(0, step, jnp.zeros(n), jnp.asarray(jnp.inf), jnp.asarray(True))
-        going = lambda now: now.open & (now.count <= self.corrections)
-        trial = jax.lax.while_loop(going, tried, start)
-        ratio = (before - trial.squares) / predicted
-        taken = (ratio > _TAKEN) & jnp.isfinite(trial.squares)
-        good = jnp.where(ratio > _GOOD, _LESS, 1.0)
-        loss, after = 0.5 * before, 0.5 * trial.squares
-        still = jnp.all(jnp.abs(trial.best) <= self.atol + self.rtol * jnp.abs(x))
+        predicted = before - float(linear @ linear)
+        best, squares = np.zeros(n), np.inf
+        for _ in range(1 + self.corrections):
+            found = _vector(residuals(_like(values, x + step)))
+            now = float(found @ found)
+            better = now < squares
+            if better:
+                best, squares = step, now
+            if not (better and np.isfinite(now)) or now <= before - _ENOUGH * predicted:
+                break
+            step = step + towards(found - linear)
+        ratio = (before - squares) / predicted if predicted > 0 else -np.inf
+        taken = bool(ratio > _TAKEN)
+        loss, after = 0.5 * before, 0.5 * squares
+        still = bool(np.all(np.abs(best) <= self.atol + self.rtol * np.abs(x)))
         still &= loss - after <= self.atol**2 + self.rtol * loss
         # nothing is left to gain beyond round-off
-        flat = predicted <= 4 * jnp.finfo(x.dtype).eps * before
+        flat = predicted <= 4 * np.finfo(float).eps * before
         return Attempt(
-            values=unravel(jnp.where(taken, x + trial.best, x)),
-            loss=jnp.where(taken, after, loss),
-            damping=damping * jnp.where(taken, good, _MORE),
+            values=_like(values, x + best) if taken else values,
+            loss=after if taken else loss,
+            damping=damping * ((_LESS if ratio > _GOOD else 1.0) if taken else _MORE),
             taken=taken,
-            done=(taken & still) | flat,
+            done=(taken and still) or flat,
         )
 
 
-def _flat(seen: tuple[Any, Any]) -> tuple[Vector, Matrix]:
-    """Residuals (m,) and their Jacobian (m, n)."""
-    value, columns = seen
-    r = ravel_pytree(value)[0]
-    rows = [x.reshape(-1, x.shape[-1]) for x in jax.tree.leaves(columns)]
-    return r, jnp.concatenate(rows)
+def _vector(tree: Any) -> Float[np.ndarray, " n"]:
+    """All numbers of a pytree."""
+    return np.concatenate([np.zeros(0), *(np.ravel(leaf) for leaf in jax.tree.leaves(tree))])
+
+
+def _rows(columns: Any) -> Float[np.ndarray, "m n"]:
+    """Jacobian from a pytree of its columns, which are the leaves' last axes."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(columns)]
+    return np.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in leaves])
+
+
+def _like(tree: Any, x: Float[np.ndarray, " n"]) -> Any:
+    """Pytree of the same form with other numbers."""
+    leaves, structure = jax.tree.flatten(tree)
+    parts = np.split(x, np.cumsum([np.size(leaf) for leaf in leaves])[:-1])
+    pairs = zip(parts, leaves, strict=True)
+    return jax.tree.unflatten(structure, [as_jax(x.reshape(np.shape(leaf))) for x, leaf in pairs])

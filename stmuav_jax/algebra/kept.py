@@ -77,6 +77,11 @@ def keep_programs(folder: Path | str | None) -> None:
         _Keeping.folder = Path(folder)
 
 
+def keeps() -> Path | None:
+    """Folder in which programs are kept, or None."""
+    return _Keeping.folder
+
+
 def own_folder(path: Path) -> bool:
     """True if a folder, which is made if it is missing, is the user's and nobody else may write to it."""
     try:
@@ -107,12 +112,15 @@ def key_of(function: Callable[..., Any], args: tuple[Any, ...], options: Any) ->
         text = _text((function, args, options))
     except (_NoTextError, RecursionError, ValueError):
         return None
-    # those of JAX's cache and of its messages make no difference to a program
+    whole = repr((text, _platform(), settings()))
+    return hashlib.sha256(whole.encode()).hexdigest()
+
+
+def settings() -> list[tuple[str, str]]:
+    """JAX's settings; those of its cache and of its messages make no difference to a program."""
     others = ("cache", "log", "traceback")
     values = {k: v for k, v in jax.config.values.items() if not any(x in k for x in others)}
-    settings = sorted((name, repr(value)) for name, value in values.items())
-    whole = repr((text, _platform(), settings))
-    return hashlib.sha256(whole.encode()).hexdigest()
+    return sorted((name, repr(value)) for name, value in values.items())
 
 
 def load(key: str | None) -> tuple[Call, Any] | None:

@@ -230,11 +230,16 @@ def _corrected(
     function: Callable[[Any], Any], method: CorrectedLevenbergMarquardt, values: Any
 ) -> Iterator[_Seen]:
     """Steps of the corrected method; the first tells the loss at the start."""
+    residuals: Callable[[Any], Any] = lambda values: _called(function, values)
+    of = getattr(function, "without_columns", None)
+    if of is not None and (alone := of(values)) is not None:
+        # the program of value and columns gives the value alone, and no second one is compiled
+        residuals = lambda values: value_and_columns(alone, values)[0]
     seen = value_and_columns(function, values)
     yield values, 0.5 * sum(np.sum(np.square(x)) for x in jax.tree.leaves(seen[0])), False
-    damping = jnp.ones(())
+    damping = 1.0
     while True:
-        step = method.attempt(function, values, seen, damping)
+        step = method.attempt(residuals, values, seen, damping)
         values, damping = step.values, step.damping
         yield values, step.loss, step.done
         if step.taken:

@@ -172,6 +172,33 @@ def test_quick_and_outer_programs_are_kept_too(folder, monkeypatch, jit):
     np.testing.assert_array_equal(jit(cross)(np.asarray(B), A), -EXPECTED)
 
 
+def test_the_name_of_a_program_is_made_once_for_arguments_of_one_form(folder, monkeypatch):
+    made = []
+    text = kept._text
+    monkeypatch.setattr(kept, "_text", lambda x, *more: made.append(x) or text(x, *more))
+    call = compiler.quick_jit(cross)
+    np.testing.assert_array_equal(call(A, B), EXPECTED)
+    count = len(made)
+    np.testing.assert_array_equal(call(B, A), -EXPECTED)
+    assert len(made) == count > 0
+    # other settings of JAX may be another program
+    with jax.default_matmul_precision("float32"):
+        call(A, B)
+    assert len(made) > count
+
+
+def test_what_cannot_be_hashed_is_kept_by_its_text(folder):
+    class Holds(eqx.Module):
+        numbers: list = eqx.field(static=True)
+
+    kept_before = len(files(folder))
+    unhashable = Holds([1.0, 2.0])
+    assert compiler._key_once(cross, (unhashable, A), quick=True) == kept.key_of(
+        cross, (unhashable, A), compiler._asked(quick=True)
+    )
+    assert len(files(folder)) == kept_before
+
+
 def test_programs_that_call_python_are_not_kept(folder):
     assert key(called_back, A) is not None
     np.testing.assert_allclose(result(called_back, A), np.sin(A))

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 from mechanisms import cart_pole, four_bar, ground_tracker
 
 import stmuav_jax as stm
+from stmuav_jax.algebra.least_squares import value_and_columns
 from stmuav_jax.algebra.sampled import Sampled
 from stmuav_jax.flight.identification import Misfit, predicted, residuals_and_jacobian
 from stmuav_jax.rotorcraft.rotor import hover_speed_squared
@@ -29,6 +31,27 @@ class Most(eqx.Module):
 
     def __call__(self, motion):
         return jnp.abs(motion.extremes) / self.effort - 1
+
+
+def test_columns_in_groups_and_values_alone(cart):
+    """Derivatives against differences; values without them come from one program, and are the same."""
+    space, x = cart
+    make = lambda knots: stm.flight.tune_inputs(
+        space, [stm.flight.end_at(space, x)], start=x, duration=0.2, inputs=["effort"],
+        sizes=[10.0], knots=knots, segments=2,
+    )  # fmt: skip
+    tuning = make(8)
+    function, start = tuning.residuals, jax.tree.map(lambda v: v + 0.1, tuning.start)
+    alone = function.without_columns(start)
+    value, columns = value_and_columns(function, start)
+    flat, unravel = ravel_pytree(start)
+    whole = lambda y: ravel_pytree(value_and_columns(alone, unravel(y))[0])[0]
+    np.testing.assert_array_equal(whole(flat), ravel_pytree(value)[0])
+    J = np.concatenate([c.reshape(-1, len(flat)) for c in jax.tree.leaves(columns)])
+    h = 1e-5
+    differences = [(whole(flat + h * e) - whole(flat - h * e)) / (2 * h) for e in np.eye(len(flat))]
+    np.testing.assert_allclose(J, np.stack(differences, axis=1), atol=1e-7 * np.max(np.abs(J)))
+    assert make(40).residuals.without_columns(make(40).start) is None
 
 
 @pytest.mark.slow
