@@ -74,7 +74,7 @@ class CorrectedLevenbergMarquardt(eqx.Module):
         """
         x, r, J = _vector(values), _vector(seen[0]), _rows(seen[1])
         m, n = J.shape
-        Q, R = scipy.linalg.qr(np.concatenate([J, np.sqrt(damping) * np.eye(n)]), mode="economic")
+        Q, R = np.linalg.qr(np.concatenate([J, np.sqrt(damping) * np.eye(n)]))
         towards = lambda q: scipy.linalg.solve_triangular(R, -(Q[:m].T @ q))
         step, before = towards(r), float(r @ r)
         linear = r + J @ step

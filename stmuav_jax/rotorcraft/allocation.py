@@ -388,7 +388,7 @@ def check_lift(
     if not concrete(lowest, most, weight):
         return lowest, most
     range_of = f"rotors of body '{rotors.body}' give {float(lowest):.4g} to {float(most):.4g} N"
-    if (needed := float(weight)) > float(most):
+    if (needed := float(floats(weight))) > float(most):
         words = f"{needed:.4g} N are required, but within their speed limits the {range_of}"
         raise ModelError(f"The rotors cannot carry the weight: {words}.")
     if needed < float(lowest):
