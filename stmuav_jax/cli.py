@@ -82,9 +82,6 @@ def cache_folder() -> Path:
 
 
 def _configure(use_cache: bool) -> None:
-    # JAX's factorisations are OpenBLAS's, whose threads wait for each other over small matrices;
-    # it reads this when JAX loads it
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import jax
 
     from .algebra.kept import keep_programs, own_folder

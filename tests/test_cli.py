@@ -1,6 +1,7 @@
 """The command line as a user meets it."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -39,6 +40,20 @@ def test_list_names_every_scene_and_case(capsys):
 def test_what_list_says_is_what_the_scenes_are():
     for name, entry in SCENES.items():
         assert make_scene(name).t1 == entry.t1
+
+
+@pytest.mark.parametrize(("given", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_factorisations_have_one_thread(given, used):
+    """OpenBLAS reads the variable when NumPy is imported, which must be later."""
+    words = (
+        "import os, sys, stmuav_jax, tyro, rich.console; assert 'numpy' not in sys.modules; "
+        "import stmuav_jax.cli; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    own = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run(
+        [sys.executable, "-c", words], env=own | given, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == used
 
 
 def test_version_and_help(capsys):
