@@ -53,7 +53,7 @@ class Command(NamedTuple):
     doing: str = ""
 
 
-# Thresholds of Python's garbage collector; a first command takes 3 to 5 % less time by them.
+# Thresholds of Python's garbage collector.
 _GARBAGE = (50_000, 20, 20)
 
 COMMANDS = {

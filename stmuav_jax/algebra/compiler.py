@@ -248,7 +248,7 @@ def _by_key(
             _programs.move_to_end(key)
             return found
     check_maps()
-    made = _compiled(function, args, quick, kept.key_of(function, args, _asked(quick)))
+    made = _compiled(function, args, quick, _key_once(function, args, quick))
     with _lock:
         _programs[key] = made
         while len(_programs) > MOST_PROGRAMS:

@@ -291,11 +291,8 @@ def write_results(
     from ..figures.loads import loads_numbers, save_loads
     from ..files.netcdf import save, save_certificate, write_atomically
 
-    folder, drawn, loads = (
-        results_folder(settings.out, run.scene.name),
-        settings.figures != "none",
-        None,
-    )
+    folder, drawn = results_folder(settings.out, run.scene.name), settings.figures != "none"
+    loads = None
     if drawn and not settings.loads:
         drawer.ask(numbers_of(run), settings.figures)
     paths = [save(run, folder / "run.nc"), save_certificate(run, folder / "certificate.json")]

@@ -178,7 +178,7 @@ class MotionEstimator(eqx.Module):
             )
         ]
         q = numbers(panel_noise, (), "The noise of the panel", "rad/s^2/sqrt(Hz)")
-        self.walk, self.panel_walk = walks(self.period, noise[0], noise[1], drift[0], drift[1], q)
+        self.walk, self.panel_walk = walks(self.period, *noise[:2], *drift, q)
         self.home = floats(np.zeros(2)) if tracker is None else _home(tracker, system.reference)
 
     def start(

@@ -25,6 +25,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ..algebra.derivative import value_and_slopes
 from ..algebra.space import Point
 from ..checks.errors import SettingError
 from ..checks.numbers import as_jax, floats, stacked
@@ -36,8 +37,8 @@ from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.system import System
 
 # Directions of a segment's derivatives that are computed together where it has few unknowns. Values
-# alone then cost a few groups less, and need no program of their own; with many unknowns they would
-# cost more than such a program (slew of the UAV, 80 unknowns: 17 instead of 11 s of processor time).
+# alone then cost one group, and need no program of their own; with many unknowns, as in the slew of the
+# UAV, whose search needs many values, the time of the groups would exceed that of compiling one.
 _GROUP, _FEW = 8, 32
 
 
@@ -178,10 +179,7 @@ def _in_groups(
 
     def group(_: None, given: tuple[Any, Any]) -> tuple[None, tuple[Any, Any]]:
         k, directions = given
-        push = lambda e: jax.jvp(lambda x: function(x, wanted | (k == 0)), (x,), (e,))
-        value, columns = jax.vmap(push, out_axes=(0, -1))(directions)
-        # the value is the same along every direction
-        return None, (jax.tree.map(lambda v: v[0], value), columns)
+        return None, value_and_slopes(lambda x: function(x, wanted | (k == 0)), x, directions)
 
     each = jnp.arange(count), jnp.asarray(directions.reshape(count, size, n), x.dtype)
     _, (values, columns) = jax.lax.scan(group, None, each)
@@ -285,14 +283,6 @@ def shooting(
     else:
         nodes = jax.tree.map(lambda x: floats(np.zeros((0, *x.shape))), start)
     return Shooting(
-        space,
-        system,
-        cost,
-        start,
-        nodes,
-        floats(edges),
-        method,
-        outputs_per_segment,
-        weight,
-        as_jax(np.ones((), bool)),
-    )
+        space, system, cost, start, nodes, floats(edges), method, outputs_per_segment, weight,
+        wanted=as_jax(np.ones((), bool)),
+    )  # fmt: skip

@@ -250,13 +250,23 @@ def _battery(given: MissionFile) -> Battery | None:
     return Battery.of(ENERGY.replaced({f"battery.{name}": value for name, value in own.items()}))
 
 
+# Compiled once for all missions of a process.
+_surveyed = quick_jit(survey)
+
+
+@quick_jit
+def _along(path: HeldPath | WaypointPath, ts: Float[Array, " k"]) -> Any:
+    """Path at times ts [s]."""
+    return jax.vmap(path)(ts)
+
+
 def _check_thrust(mission: Mission) -> None:
     """Raise `SettingError` for a path whose accelerations the rotors cannot give."""
     machine, speeds = mission.machine, mission.machine.speeds
     if speeds is None:
         return
     ts = floats(np.linspace(0.0, mission.file.t1, _CHECKED))
-    wanted = quick_jit(lambda path, ts: jax.vmap(path)(ts))(mission.references.path, ts)
+    wanted = _along(mission.references.path, ts)
     system = mission.plant.system
     a, gravity, mass = map(np.asarray, (wanted.a, gravity_of(system), system.bodies.mass))
     needed = np.sum(mass) * np.linalg.norm(a - gravity, axis=1)
@@ -293,7 +303,7 @@ def _check_panel(mission: Mission) -> None:
 
     angles = quick_jit(lambda r, ts: jax.vmap(lambda t: wanted(r, t))(ts))(references, floats(ts))
     geometry, limits = machine.bodies.geometry, machine.limits
-    found = quick_jit(survey)(geometry, floats(np.asarray(angles).T), limits)
+    found = _surveyed(geometry, floats(np.asarray(angles).T), limits)
     reason = np.asarray(found.reason)
     if not np.any(reason):
         return

@@ -131,9 +131,12 @@ def possible_tables(
     return fine
 
 
+_rotation = quick_jit(rotation_matrix)
+
+
 def faced(start: State) -> np.ndarray:
     """World direction of the last body's z axis in a state (3,); a panel faces it."""
-    return np.asarray(quick_jit(rotation_matrix)(start.p[-1]))[:, 2]
+    return np.asarray(_rotation(start.p[-1]))[:, 2]
 
 
 def alike(name: str, known: list[str]) -> str:
