@@ -88,6 +88,31 @@ def value_and_columns(function: Callable[[Any], Any], values: Any) -> tuple[Any,
     return value_and_jacobian(lambda x: function(unravel(x)), flat)
 
 
+# Jitted, so that a second search for a function of the same form does not trace it again.
+@quick_jit
+def _called(function: Callable[[Any], Any], values: Any) -> Any:
+    return function(values)
+
+
+def evaluated(
+    function: Callable[[Any], Any], values: Any, *, columns: bool = True
+) -> tuple[Any, Any]:
+    """Value of a function, and the columns of its Jacobian as of `value_and_columns`.
+
+    A function that has a method `evaluated(values, columns=...)` is evaluated by it: one that is made of
+    several programs, or gives its value by the program of its derivatives.
+
+    Args:
+        columns: false if these are not needed, and may be anything.
+    """
+    own = getattr(function, "evaluated", None)
+    if own is not None:
+        return own(values, columns=columns)
+    if columns:
+        return value_and_columns(function, values)
+    return _called(function, values), None
+
+
 def _with_columns(value: Any, columns: Any) -> Callable[[Any], Any]:
     """Function with this value and Jacobian at the one point where it is called."""
 
@@ -156,12 +181,6 @@ class _Stepper(eqx.Module):
         return after, self._read(state), known, loss, done
 
 
-# Jitted, so that a second search for a function of the same form does not trace it again.
-@quick_jit
-def _called(function: Callable[[Any], Any], values: Any) -> Any:
-    return function(values)
-
-
 def search(
     function: Callable[[Any], Any],
     start: PyTree[Any],
@@ -211,7 +230,7 @@ def _stepped(
     """Steps of a method of optimistix; the first tells the loss at the start."""
     seen = None
     if isinstance(method, optx.AbstractGaussNewton):
-        seen = value_and_columns(function, values)
+        seen = evaluated(function, values)
         found = seen[0]
     else:
         found = eqx.filter_eval_shape(_called, function, values)
@@ -220,7 +239,7 @@ def _stepped(
     arrays, place = stepper.begin(values, seen)
     while True:
         if seen is None and stepper.squares:
-            seen = value_and_columns(function, place)
+            seen = evaluated(function, place)
         values, (arrays, place), known, loss, done = stepper.step(values, arrays, seen)
         seen = None
         yield known, loss, done
@@ -230,12 +249,8 @@ def _corrected(
     function: Callable[[Any], Any], method: CorrectedLevenbergMarquardt, values: Any
 ) -> Iterator[_Seen]:
     """Steps of the corrected method; the first tells the loss at the start."""
-    residuals: Callable[[Any], Any] = lambda values: _called(function, values)
-    of = getattr(function, "without_columns", None)
-    if of is not None and (alone := of(values)) is not None:
-        # the program of value and columns gives the value alone, and no second one is compiled
-        residuals = lambda values: value_and_columns(alone, values)[0]
-    seen = value_and_columns(function, values)
+    residuals: Callable[[Any], Any] = lambda values: evaluated(function, values, columns=False)[0]
+    seen = evaluated(function, values)
     yield values, 0.5 * sum(np.sum(np.square(x)) for x in jax.tree.leaves(seen[0])), False
     damping = 1.0
     while True:
@@ -243,7 +258,7 @@ def _corrected(
         values, damping = step.values, step.damping
         yield values, step.loss, step.done
         if step.taken:
-            seen = value_and_columns(function, values)
+            seen = evaluated(function, values)
 
 
 def _go(

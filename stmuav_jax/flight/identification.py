@@ -35,7 +35,7 @@ from ..mechanics.inputs import with_inputs
 from ..mechanics.system import System
 from ..parameters.table import Parameters
 from ..sensing.sensors import AbstractSensor, sensed_motion_at
-from .multiple_shooting import fly
+from .segments import fly
 
 Predict = Callable[[Float[Array, " p"]], Float[Array, "k m"]]
 

@@ -25,40 +25,15 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..algebra.derivative import value_and_slopes
+from ..algebra.compiler import quick_jit
+from ..algebra.derivative import value_and_jacobian
 from ..algebra.space import Point
 from ..checks.errors import SettingError
-from ..checks.numbers import as_jax, floats, stacked
+from ..checks.numbers import as_jax, as_numpy, floats, stacked
 from ..dynamics.method import Method
 from ..dynamics.statespace.base import AbstractStateSpace
-from ..dynamics.statespace.tree import TreeSpace
-from ..dynamics.trajectory import integrate
-from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.system import System
-
-# Directions of a segment's derivatives that are computed together where it has few unknowns. Values
-# alone then cost one group, and need no program of their own; with many unknowns, as in the slew of the
-# UAV, whose search needs many values, the time of the groups would exceed that of compiling one.
-_GROUP, _FEW = 8, 32
-
-
-def fly(
-    space: AbstractStateSpace, system: System, start: Point, ts: Float[Array, " k"], method: Method
-) -> Point:
-    """The points of a motion at times ts [s], the first that of the start; a stack (k, .)."""
-    state, inside = space.to_state(start, ts[0]), 2 * space.dof
-    if isinstance(space, TreeSpace) and space.has_dependent_rows:
-        allowing = method.formulation.allowing_dependent_rows()
-        method = method if allowing is None else replace(method, formulation=allowing)
-    if space.size == inside:
-        run = integrate(system, state, ts, method)
-        return jax.vmap(space.from_state)(run.states)
-    # a state of all bodies has no states of forces: those of the point are set, and read, apart
-    own = internal_states(space.system)
-    first = own + space.difference(start, space.from_state(state))[inside:]
-    run = integrate(with_internal(system, first), state, ts, method)
-    v = jnp.pad(run.internal - own, ((0, 0), (inside, 0)))
-    return jax.vmap(space.retract)(jax.vmap(space.from_state)(run.states), v)
+from .segments import Legs, fly, legs_begun, legs_flown
 
 
 @eqx.filter_jit
@@ -121,70 +96,11 @@ def growth(
     return Growth(np.asarray(ts), factor, rate, float(ts[last]))
 
 
-class _Piece(NamedTuple):
-    """Data of one segment without its unknowns, and whether its derivatives are wanted."""
-
-    space: AbstractStateSpace
-    system: Callable[[Any], System]
-    origin: Point
-    ts: Float[Array, " m"]
-    method: Method
-    wanted: Bool[Array, ""] | bool
-
-
-def _segment(
-    unknowns: tuple[Any, Float[Array, " n"]], how: _Piece, flown: Bool[Array, ""] | bool = True
-) -> Point:
-    """Points of one segment as a function of the values and of the error at its start.
-
-    A segment that is not flown stays at its start, which costs no steps.
-    """
-    values, step = unknowns
-    start = how.space.retract(how.origin, step)
-    ts = how.ts if flown is True else jnp.where(flown, how.ts, how.ts[0])
-    return fly(how.space, how.system(values), start, ts, how.method)
-
-
-@eqx.filter_custom_jvp
-def _flown(unknowns: tuple[Any, Float[Array, " n"]], how: _Piece) -> Point:
-    """Points of one segment (`_segment`), differentiated by way of its whole Jacobian."""
-    return _segment(unknowns, how)
-
-
-@_flown.def_jvp
-def _flown_jvp(primals: Any, tangents: Any) -> tuple[Point, Point]:
-    # A segment depends only on its own start. By way of its own Jacobian, the derivatives by the
-    # starts of all n segments cost as much as those by one.
-    (unknowns, how), (moves, _) = primals, tangents
+@quick_jit
+def _assembled(problem: "Shooting", unknowns: Any, flown: Any) -> tuple[Any, Any]:
+    """Residuals and the columns of their Jacobian, from the segments and their derivatives."""
     flat, unravel = ravel_pytree(unknowns)
-    points, columns = _in_groups(lambda u, on: _segment(unravel(u), how, on), flat, how.wanted)
-    given = lambda x, move: jnp.zeros_like(x) if move is None else move
-    along = ravel_pytree(jax.tree.map(given, unknowns, moves, is_leaf=lambda x: x is None))[0]
-    return points, jax.tree.map(lambda J: J @ along, columns)
-
-
-def _in_groups(
-    function: Callable[[Float[Array, " n"], Any], Any], x: Float[Array, " n"], wanted: Any
-) -> tuple[Any, Any]:
-    """Value of a function of a vector, and its Jacobian with the columns last, a group at a time.
-
-    Args:
-        function: function of the vector and of a truth value, false where the result is not needed.
-        wanted: false if the columns are not needed; only the first group is evaluated then.
-    """
-    n = x.shape[0]
-    count = -(-n // _GROUP) if 0 < n <= _FEW else 1
-    size = -(-n // count)
-    directions = np.concatenate([np.eye(n), np.zeros((count * size - n, n))])
-
-    def group(_: None, given: tuple[Any, Any]) -> tuple[None, tuple[Any, Any]]:
-        k, directions = given
-        return None, value_and_slopes(lambda x: function(x, wanted | (k == 0)), x, directions)
-
-    each = jnp.arange(count), jnp.asarray(directions.reshape(count, size, n), x.dtype)
-    _, (values, columns) = jax.lax.scan(group, None, each)
-    whole = lambda J: jnp.moveaxis(J, 0, -2).reshape(*J.shape[1:-1], count * size)[..., :n]
-    return jax.tree.map(lambda v: v[0], values), jax.tree.map(whole, columns)
+    return value_and_jacobian(lambda x: problem.residuals(unravel(x), flown), flat)
 
 
 class Shooting(eqx.Module):
@@ -201,7 +117,6 @@ class Shooting(eqx.Module):
         method: integration method of the segments.
         outputs_per_segment: number of output times per segment.
         weight: weight of the defects at the nodes.
-        wanted: false where derivatives are not needed: they are wrong then, and cost little.
     """
 
     space: AbstractStateSpace
@@ -213,44 +128,89 @@ class Shooting(eqx.Module):
     method: Method
     outputs_per_segment: int = eqx.field(static=True, default=10)
     weight: float | Float[Array, ""] = 1e3
-    wanted: Bool[Array, ""] | bool = True
-
-    def without_columns(self, unknowns: PyTree[Any]) -> "Shooting | None":
-        """These residuals without derivatives, for the program with them; None where that costs more."""
-        count = sum(np.size(x) for x in jax.tree.leaves(unknowns["values"])) + self.space.size
-        return replace(self, wanted=as_jax(np.zeros((), bool))) if count <= _FEW else None
 
     def unknowns(self, values: PyTree[Any]) -> dict[str, Any]:
         """Initial unknowns of a search: the given values, and the guess at the nodes."""
         nodes = floats(np.zeros((len(self.edges) - 2, self.space.size)))
         return {"values": values, "nodes": nodes}
 
-    def path(self, unknowns: Any) -> tuple[Float[Array, " m"], Point, Float[Array, "n k"]]:
-        """Output times, points at these times, and the defects at the nodes."""
-        nodes = jax.vmap(self.space.retract)(self.guess, unknowns["nodes"])
-        joined = lambda a, b: jnp.concatenate([a[None], b])
+    def _parts(self, unknowns: Any, xp: Any) -> tuple[Point, Any, Legs]:
+        """Origins of the segments, the errors at their starts, and how they are flown.
+
+        Args:
+            xp: jax.numpy, or NumPy.
+        """
+        joined = lambda a, b: xp.concatenate([a[None], b])
         origins = jax.tree.map(joined, self.start, self.guess)
-        steps = joined(jnp.zeros(self.space.size), unknowns["nodes"])
-        share = jnp.linspace(0.0, 1.0, self.outputs_per_segment + 1)
+        steps = joined(xp.zeros(self.space.size), unknowns["nodes"])
+        share = xp.linspace(0.0, 1.0, self.outputs_per_segment + 1)
         first, last = self.edges[:-1, None], self.edges[1:, None]
         ts = first + share * (last - first)
+        return origins, steps, Legs(self.space, self.system, ts, self.method)
 
-        def one(step: Array, origin: Point, ts: Array) -> Point:
-            how = _Piece(self.space, self.system, origin, ts, self.method, self.wanted)
-            return _flown((unknowns["values"], step), how)
+    def path(
+        self, unknowns: Any, flown: Any = None
+    ) -> tuple[Float[Array, " m"], Point, Float[Array, "n k"]]:
+        """Output times, points at these times, and the defects at the nodes.
 
-        found = jax.vmap(one)(steps, origins, ts)
+        Args:
+            flown: points and derivatives of all segments where these are known.
+        """
+        nodes = jax.vmap(self.space.retract)(self.guess, unknowns["nodes"])
+        origins, steps, legs = self._parts(unknowns, jnp)
+        found = legs.flown(unknowns["values"], origins, steps, flown)
         ends = jax.tree.map(lambda x: x[:-1, -1], found)
         gaps = jax.vmap(self.space.difference)(ends, nodes)
         # shapes are given explicitly, since a point may have parts of size zero
         flat = lambda x: x[:, 1:].reshape(x.shape[0] * (x.shape[1] - 1), *x.shape[2:])
-        return flat(ts), jax.tree.map(flat, found), gaps
+        return flat(legs.ts), jax.tree.map(flat, found), gaps
+
+    def residuals(self, unknowns: Any, flown: Any = None) -> Any:
+        """Residuals of the cost, and weighted defects at the nodes; see `path`."""
+        ts, found, gaps = self.path(unknowns, flown)
+        system = self.system(unknowns["values"])
+        return self.cost(unknowns["values"], ts, found, system), self.weight * gaps
 
     def __call__(self, unknowns: Any) -> Any:
         """Residuals of the cost, and weighted defects at the nodes."""
-        ts, found, gaps = self.path(unknowns)
-        system = self.system(unknowns["values"])
-        return self.cost(unknowns["values"], ts, found, system), self.weight * gaps
+        return self.residuals(unknowns)
+
+    def evaluated(self, unknowns: Any, *, columns: bool = True) -> tuple[Any, Any]:
+        """Residuals, and the columns of their Jacobian, which are wrong where they are not wanted.
+
+        All segments of all motions of a search are flown by one program, with and without derivatives.
+        """
+        origins, steps, legs = self._parts(as_numpy(unknowns), np)
+        begun, slopes = legs_begun(legs, origins, steps)
+        flown, _ = legs_flown(legs, unknowns["values"], begun, slopes, _truth(columns))
+        return _assembled(self, unknowns, flown)
+
+    def motion(self, values: Any, ts: Float[np.ndarray, " m"]) -> Point:
+        """Points (m, .) at increasing times of the motion from its start, without gaps.
+
+        The program of the search flies it, a few output times at a time. Points that an integration
+        does not reach are NaN.
+        """
+        origins, steps, legs = self._parts(as_numpy(self.unknowns(values)), np)
+        every, slopes = legs_begun(legs, origins, 0 * steps)
+        count, size = len(steps), self.outputs_per_segment
+        now = jax.tree.map(lambda x: x[0], every)
+        found = [jax.tree.map(lambda x: np.asarray(x)[None], self.start)]
+        for k in range(0, len(ts) - 1, size):
+            part = np.full(size + 1, ts[min(k + size, len(ts) - 1)])
+            part[: len(ts) - k] = ts[k : k + size + 1]
+            # the first segment flies, and the others stay where they are
+            times = np.concatenate([part[None], np.full((count - 1, size + 1), ts[k])])
+            begun = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), as_numpy(now))
+            here = replace(legs, ts=times)
+            (points, _), ends = legs_flown(here, values, begun, slopes, _truth(False))
+            found.append(jax.tree.map(lambda x: np.asarray(x)[0, 1:], points))
+            now = jax.tree.map(lambda x: x[0], ends)
+        return jax.tree.map(lambda *x: np.concatenate(x)[: len(ts)], *found)
+
+
+def _truth(value: bool) -> Bool[Array, ""]:
+    return as_jax(np.asarray(value))
 
 
 def shooting(
@@ -283,6 +243,5 @@ def shooting(
     else:
         nodes = jax.tree.map(lambda x: floats(np.zeros((0, *x.shape))), start)
     return Shooting(
-        space, system, cost, start, nodes, floats(edges), method, outputs_per_segment, weight,
-        wanted=as_jax(np.ones((), bool)),
-    )  # fmt: skip
+        space, system, cost, start, nodes, floats(edges), method, outputs_per_segment, weight
+    )

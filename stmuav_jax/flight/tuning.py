@@ -9,7 +9,7 @@ Source: J. T. Betts, Practical Methods for Optimal Control (2010), ch. 3 (direct
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -33,7 +33,7 @@ from ..dynamics.statespace.base import AbstractStateSpace, places_of
 from ..dynamics.tree.formulation import Tree
 from ..mechanics.inputs import Inputs, inputs_of
 from ..mechanics.system import System
-from .multiple_shooting import Shooting, fly, shooting
+from .multiple_shooting import Shooting, shooting
 
 
 class TunedMotion(NamedTuple):
@@ -210,6 +210,7 @@ class InputTuning:
     name: str
     residuals: Shooting
     start: Any
+    _motions: dict[Any, TunedMotion] = field(default_factory=dict, repr=False, compare=False)
 
     def inputs(self, values: Any) -> Any:
         """The inputs that the values of a search stand for: numbers (k,), or a history of them."""
@@ -242,17 +243,24 @@ class InputTuning:
         return tuple(one for one in every if isinstance(one, Limit))
 
     def motion(self, values: Any, samples: int = 200) -> TunedMotion:
-        """The motion under the inputs of a search, from its start in one piece."""
-        edges = np.asarray(self.residuals.edges)
-        ts = floats(np.linspace(edges[0], edges[-1], samples))
-        return _in_one_piece(self.residuals, values["values"], ts)
+        """The motion under the inputs of a search, from its start without gaps."""
+        edges, values = np.asarray(self.residuals.edges), values["values"]
+        # the limits, the peaks and the figures of a solution ask for the same motion
+        key = (samples, *(np.asarray(x).tobytes() for x in jax.tree.leaves(values)))
+        if key not in self._motions:
+            ts = np.linspace(edges[0], edges[-1], samples)
+            path = self.residuals.motion(values, ts)
+            # that of the start is compared with that of the solution: two are kept
+            for oldest in list(self._motions)[:-1]:
+                del self._motions[oldest]
+            self._motions[key] = _seen(self.residuals, values, floats(ts), path)
+        return self._motions[key]
 
 
 @quick_jit
-def _in_one_piece(problem: Shooting, values: Any, ts: Float[Array, " m"]) -> TunedMotion:
-    system = problem.system(values)
-    path = fly(problem.space, system, problem.start, ts, problem.method)
-    return problem.cost.motion(values, ts, path, system)  # pyright: ignore
+def _seen(problem: Shooting, values: Any, ts: Float[Array, " m"], path: Point) -> TunedMotion:
+    """The motion with all that residuals see of it."""
+    return problem.cost.motion(values, ts, path, problem.system(values))  # pyright: ignore
 
 
 @quick_jit

@@ -242,7 +242,7 @@ def slew(
 
 
 def peaks(tuning: InputTuning, values: Any, samples: int = 200) -> Peaks:
-    """Peaks of a solution of `slew`, integrated from its start in one piece."""
+    """Peaks of a solution of `slew`, integrated from its start without gaps."""
     motion: Any = tuning.motion(values, samples)
     disturbed, end, _, kept = tuning.residuals.cost.residuals  # pyright: ignore
     return _peaks(motion, disturbed.point, end.point, kept.excess)

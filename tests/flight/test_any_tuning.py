@@ -12,7 +12,7 @@ from jaxtyping import Array
 from mechanisms import cart_pole, four_bar, ground_tracker
 
 import stmuav_jax as stm
-from stmuav_jax.algebra.least_squares import value_and_columns
+from stmuav_jax.algebra.least_squares import evaluated, value_and_columns
 from stmuav_jax.algebra.sampled import Sampled
 from stmuav_jax.flight.identification import Misfit, predicted, residuals_and_jacobian
 from stmuav_jax.rotorcraft.rotor import hover_speed_squared
@@ -33,25 +33,54 @@ class Most(eqx.Module):
         return jnp.abs(motion.extremes) / self.effort - 1
 
 
-def test_columns_in_groups_and_values_alone(cart):
-    """Derivatives against differences; values without them come from one program, and are the same."""
+@pytest.fixture(scope="module")
+def pushed(cart):
+    """A problem in two segments, and unknowns that are not those of its start."""
     space, x = cart
-    make = lambda knots: stm.flight.tune_inputs(
+    tuning = stm.flight.tune_inputs(
         space, [stm.flight.end_at(space, x)], start=x, duration=0.2, inputs=["effort"],
-        sizes=[10.0], knots=knots, segments=2,
+        sizes=[10.0], knots=8, segments=2,
     )  # fmt: skip
-    tuning = make(8)
-    function, start = tuning.residuals, jax.tree.map(lambda v: v + 0.1, tuning.start)
-    alone = function.without_columns(start)
-    value, columns = value_and_columns(function, start)
+    return tuning, jax.tree.map(lambda v: v + 0.1, tuning.start)
+
+
+def test_columns_in_groups_and_values_alone(pushed):
+    """Derivatives against differences; values without them come from one program, and are the same."""
+    tuning, start = pushed
+    function = tuning.residuals
+    value, columns = evaluated(function, start)
     flat, unravel = ravel_pytree(start)
-    whole = lambda y: ravel_pytree(value_and_columns(alone, unravel(y))[0])[0]
+    whole = lambda y: ravel_pytree(evaluated(function, unravel(y), columns=False)[0])[0]
     np.testing.assert_array_equal(whole(flat), ravel_pytree(value)[0])
     J = np.concatenate([c.reshape(-1, len(flat)) for c in jax.tree.leaves(columns)])
     h = 1e-5
     differences = [(whole(flat + h * e) - whole(flat - h * e)) / (2 * h) for e in np.eye(len(flat))]
     np.testing.assert_allclose(J, np.stack(differences, axis=1), atol=1e-7 * np.max(np.abs(J)))
-    assert make(40).residuals.without_columns(make(40).start) is None
+
+
+def test_residuals_within_a_program_are_the_same(pushed):
+    """Traced by JAX, residuals and derivatives are those that a search evaluates in parts."""
+    tuning, start = pushed
+    value, columns = evaluated(tuning.residuals, start)
+    traced, J = value_and_columns(tuning.residuals, start)
+    for found, wanted in ((traced, value), (J, columns)):
+        found, wanted = (ravel_pytree(x)[0] for x in (found, wanted))
+        np.testing.assert_allclose(found, wanted, atol=1e-8 * np.max(np.abs(wanted)))
+
+
+def test_a_motion_in_parts_is_that_in_one_piece(cart, pushed):
+    """23 output times, not a multiple of a call's, and two: the motion by `integrate`, to 1e-8."""
+    space, x = cart
+    tuning, start = pushed
+    problem = tuning.residuals
+    system = problem.system(start["values"])
+    for count in (23, 2):
+        motion = tuning.motion(start, count)
+        ts = jnp.linspace(0.0, 0.2, count)
+        run = stm.dynamics.integrate(system, space.to_state(x), ts, problem.method)
+        off = jax.vmap(space.difference)(motion.points, jax.vmap(space.from_state)(run.states))
+        assert float(jnp.max(jnp.abs(off))) < 1e-8
+        assert tuning.motion(start, count) is motion
 
 
 @pytest.mark.slow
