@@ -25,12 +25,12 @@ from jaxtyping import Float
 
 from ..checks.numbers import as_jax
 
-# Smallest ratio of actual and predicted reduction with which a step is taken, and the factor of the
-# damping after one that is not.
-_TAKEN, _MORE = 1e-2, 4.0
-# Ratios from which on the damping falls, and its factors. Where corrections follow the curvature a step
-# can be long: with a factor of 0.25 throughout, the slew of the UAV took 11 steps instead of 8.
-_FALLS = ((0.95, 0.05), (0.75, 0.25))
+# Smallest ratio of actual and predicted reduction with which a step is taken.
+_TAKEN = 1e-2
+# Ratios from which on the damping falls, and its factors; a step that is not taken takes back the largest
+# fall. Where corrections follow the curvature a step can be long: with factors of 0.25 and 4 the slew of
+# the UAV took 11 steps instead of 8, and holding it in segments of 0.05 s 9 instead of 6.
+_FALLS, _MORE = ((0.95, 0.05), (0.75, 0.25)), 20.0
 # A step that reaches this share of the predicted reduction needs no correction, and corrections end with
 # one that adds less than this share of the reduction so far.
 _ENOUGH, _LITTLE = 0.9, 0.01

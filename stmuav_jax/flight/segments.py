@@ -34,7 +34,7 @@ _GROUP = 4
 
 
 class Begun(NamedTuple):
-    """What a flight goes on from.
+    """State of the bodies and actuators that a flight goes on from.
 
     Attributes:
         state: state of all bodies.
@@ -82,7 +82,7 @@ def fly(
 
 
 class Legs(eqx.Module):
-    """How segments are flown.
+    """Segments of a motion, and all that flies them.
 
     Attributes:
         space: state space of the mechanism.
@@ -177,7 +177,7 @@ def _flown(unknowns: tuple[Any, Float[Array, " k"]], leg: Legs, origin: Point) -
     """Points of one segment, differentiated by way of its whole Jacobian."""
     values, step = unknowns
     start = leg.space.retract(origin, step)
-    return fly(leg.space, leg.system(values), start, leg.ts, leg.method)
+    return fly(leg.space, leg.system(values), start, jnp.asarray(leg.ts), leg.method)
 
 
 @_flown.def_jvp

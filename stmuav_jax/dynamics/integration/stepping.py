@@ -265,7 +265,8 @@ class StepSizeMemory(diffrax.AbstractAdaptiveStepSizeController):
         grown = grown + jnp.where(keep & (proposed >= most), 1, 0)
         step = jnp.where(cut_short, jnp.maximum(step, proposed), proposed)
         step = jnp.minimum(step, longest)
-        collapsed = ~keep & (step < _SHORTEST * (1 + jnp.abs(t0)))
+        # a state that is not finite has a step that is not either
+        collapsed = ~keep & ~(step >= _SHORTEST * (1 + jnp.abs(t0)))
         result = diffrax.RESULTS.where(collapsed, diffrax.RESULTS.dt_min_reached, result)
         return keep, next_t0, next_t0 + step, jump, (step, inner, grown), result
 

@@ -264,6 +264,16 @@ def test_a_step_that_the_projection_moves_far_is_not_kept():
     assert float(found.ys[-1, 0]) == pytest.approx(np.exp(-0.5), rel=1e-7)
 
 
+def test_a_start_that_is_not_finite_ends_at_once():
+    """It was tried until `max_steps`, which took a batch of large mechanisms minutes."""
+    scene = stm.make_scene("spin")
+    start = jax.tree.map(lambda x: x * jnp.nan, scene.state0)
+    found = stm.integrate(scene.system, start, jnp.linspace(0.0, 1.0, 3), stm.Method())
+    assert found.result == diffrax.RESULTS.dt_min_reached
+    assert int(found.counts.rejected[-1]) == 1
+    assert np.all(np.isnan(found.states.r))
+
+
 def test_an_ordinary_projection_leaves_the_error_as_it_is():
     y0, y1, error = jnp.array([1.0, 2.0]), jnp.array([1.1, 2.1]), jnp.array([1e-9, -2e-9])
     far = ProjectionLimit(1e-8, 1e-8, 2)
