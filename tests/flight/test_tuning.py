@@ -18,9 +18,11 @@ from stmuav_jax.flight.identification import (
     identify,
 )
 from stmuav_jax.flight.multiple_shooting import growth, shooting, transition
+from stmuav_jax.flight.segments import fly
 from stmuav_jax.flight.synthetic import experiment
 from stmuav_jax.flight.uav_tuning import SlewLimits, at_rest, hold, holding_time, peaks, slew
 from stmuav_jax.rotorcraft.rotor import hover_speed_squared
+from stmuav_jax.scenes.flight_options import Motor
 from stmuav_jax.scenes.uav_tracker import uav_flyer
 from stmuav_jax.tracker.tracker_options import Friction
 from stmuav_jax.tracker.workspace import tracker_limits
@@ -100,6 +102,22 @@ def test_hold(flyer, untuned, held):
     after = holding_time(flyer, inputs, start)
     assert before < 0.3
     assert after > 5 * before
+
+
+@pytest.mark.slow
+def test_a_motion_in_parts_keeps_the_speeds_of_its_motors(untuned):
+    """With motors that lag, the rotors' speeds go on from one call of the program to the next, to 1e-8."""
+    lagging = uav_flyer(motor=Motor(time_constant=0.05))
+    tuning = hold(lagging, START, untuned, horizon=0.1, segments=2)
+    values = jax.tree.map(lambda x: 1.05 * x, tuning.start)
+    motion = tuning.motion(values, 12)
+    problem, ts = tuning.residuals, jnp.linspace(0.0, 0.1, 12)
+    system = problem.system(values["values"])
+    whole = jax.jit(lambda at: fly(lagging, system, at, ts, problem.method))(problem.start)
+    off = np.asarray(jax.vmap(lagging.difference)(motion.points, whole))
+    scale = np.where(np.arange(off.shape[1]) < 16, 1.0, 1e3)
+    assert np.max(np.abs(off) / scale) < 1e-8
+    assert np.ptp(np.asarray(whole.internal)[:, 0]) > 10.0
 
 
 @pytest.mark.slow
