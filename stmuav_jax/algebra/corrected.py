@@ -6,8 +6,8 @@ along a curved valley. A correction takes the remainder of the linear model at t
 
     q = r(x + s) - (r + J d),    s <- s - (J^T J + damping 1)^-1 J^T q,
 
-which costs one more value of the residuals and no Jacobian. Corrections go on as long as they help: a
-value of a motion takes a tenth of the time of its Jacobian.
+which costs one more value of the residuals and no Jacobian. Corrections go on as long as they help:
+values of a motion cost much less than its Jacobian.
 
 Source: J. Fan, The modified Levenberg-Marquardt method for nonlinear equations with cubic convergence,
 Mathematics of Computation 81 (2012); J. Nocedal, S. J. Wright, Numerical Optimization (2006), ch. 10.3

@@ -30,17 +30,10 @@ def value_and_jacobian(
     function: Callable[[Float[Array, " n"]], Any], x: Float[Array, " n"]
 ) -> tuple[Any, Any]:
     """Value of a function of a vector, and its Jacobian with the columns last, in one pass."""
-    return value_and_slopes(function, x, jnp.eye(x.shape[0], dtype=x.dtype))
-
-
-def value_and_slopes(
-    function: Callable[[Float[Array, " n"]], Any], x: Float[Array, " n"], along: Float[Array, "k n"]
-) -> tuple[Any, Any]:
-    """Value of a function of a vector, and its derivatives along directions with these last."""
     push = lambda e: jax.jvp(function, (x,), (e,))
-    value, slopes = jax.vmap(push, out_axes=(0, -1))(along)
+    value, columns = jax.vmap(push, out_axes=(0, -1))(jnp.eye(x.shape[0], dtype=x.dtype))
     # the value is the same along every direction
-    return jax.tree.map(lambda v: v[0], value), slopes
+    return jax.tree.map(lambda v: v[0], value), columns
 
 
 def motion_along(

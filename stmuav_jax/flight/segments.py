@@ -27,9 +27,8 @@ from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.state import State
 from ..mechanics.system import System
 
-# Directions of a segment's derivatives that are computed together. A search of the UAV's slew (8 Jacobians,
-# 26 values, two motions) took 4.6 s with two, 5.6 s with four or eight, 8 s with 16 and 13 s with 40; with
-# two, problems of few unknowns pay more.
+# Directions of a segment's derivatives that are computed together. In larger groups a Jacobian costs less
+# and values alone, which take one group, cost more.
 _GROUP = 4
 
 
