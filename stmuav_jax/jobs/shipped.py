@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+import logging
 import signal
 import threading
 from collections.abc import Mapping
@@ -9,12 +10,22 @@ from collections.abc import Mapping
 import cloudpickle
 import jax
 from distributed import Worker, get_worker
+from distributed.comm import CommClosedError
 from distributed.diagnostics.plugin import WorkerPlugin
 
 from ..checks.errors import SettingError
 from ..files.layout import computing_versions
 from ..montecarlo.work import AbstractWork
 from .compute import Piece, Pieces
+
+def _worth_telling(record: logging.LogRecord) -> bool:
+    """False for a closed connection: the owner of scheduler and workers ends both, at any moment.
+
+    A heartbeat on its way meanwhile is reported with a traceback by Dask. That a connection was
+    really lost is reported by the process that has started the workers.
+    """
+    return record.exc_info is None or not isinstance(record.exc_info[1], CommClosedError)
+
 
 # The last work of this process, so that an extended study is not compiled again.
 _made: dict[str, "_Made"] = {}
@@ -57,6 +68,8 @@ class Shipped(WorkerPlugin):
         if self.ours and threading.current_thread() is threading.main_thread():
             # Ctrl-C reaches all processes of a terminal; the one that owns the workers ends them
             signal.signal(signal.SIGINT, signal.SIG_IGN)
+            for handler in logging.getLogger("distributed").handlers:
+                handler.addFilter(_worth_telling)
 
     def made(self) -> _Made:
         """Work in this process, unpickled when it is first needed."""

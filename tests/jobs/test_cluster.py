@@ -289,10 +289,13 @@ def test_a_chunk_that_kills_each_worker(tmp_path, whole):
 CTRL_C = """
 import sys
 sys.path.insert(0, {tests!r})
+import distributed.scheduler
 from jobs.toy import Toy
 from stmuav_jax.jobs.cluster import run_on_cluster
 
 if __name__ == "__main__":
+    # so frequent that some are on their way when the cluster ends
+    distributed.scheduler.heartbeat_interval = lambda n: 0.002
     work = Toy(seed=7, pause=0.1)
     tell = lambda now: print(now.done, flush=True)
     print(run_on_cluster(work, {path!r}, 900, workers=2, chunk=30, progress=tell).words())
