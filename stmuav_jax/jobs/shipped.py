@@ -10,13 +10,18 @@ from collections.abc import Mapping
 import cloudpickle
 import jax
 from distributed import Worker, get_worker
-from distributed.comm import CommClosedError
+from distributed.comm.core import CommClosedError
 from distributed.diagnostics.plugin import WorkerPlugin
 
 from ..checks.errors import SettingError
 from ..files.layout import computing_versions
 from ..montecarlo.work import AbstractWork
 from .compute import Piece, Pieces
+
+# The last work of this process, so that an extended study is not compiled again.
+_made: dict[str, "_Made"] = {}
+_making = threading.Lock()
+
 
 def _worth_telling(record: logging.LogRecord) -> bool:
     """False for a closed connection: the owner of scheduler and workers ends both, at any moment.
@@ -25,11 +30,6 @@ def _worth_telling(record: logging.LogRecord) -> bool:
     really lost is reported by the process that has started the workers.
     """
     return record.exc_info is None or not isinstance(record.exc_info[1], CommClosedError)
-
-
-# The last work of this process, so that an extended study is not compiled again.
-_made: dict[str, "_Made"] = {}
-_making = threading.Lock()
 
 
 class _Made:
