@@ -24,10 +24,11 @@ _making = threading.Lock()
 
 
 def _worth_telling(record: logging.LogRecord) -> bool:
-    """False for a closed connection: the owner of scheduler and workers ends both, at any moment.
+    """False for a message about a closed connection.
 
-    A heartbeat on its way meanwhile is reported with a traceback by Dask. That a connection was
-    really lost is reported by the process that has started the workers.
+    The process that has started scheduler and workers ends both at any moment, and Dask reports a
+    heartbeat that was on its way with a traceback. A connection that was really lost is reported
+    by that process.
     """
     return record.exc_info is None or not isinstance(record.exc_info[1], CommClosedError)
 

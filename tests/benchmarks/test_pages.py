@@ -73,6 +73,13 @@ def test_flights_that_were_lost_have_no_throughput(row, cells):
     assert of_peer(row)[2:] == cells
 
 
+def test_stored_page_is_that_of_the_stored_results(page):
+    """Beyond its head, whose distances to the present commit grow with every commit."""
+    stored = report.PAGE.read_text()
+    of_stored, of_results = (text.split("## Compared with")[1] for text in (stored, page))
+    assert of_stored == of_results
+
+
 def test_state_of_the_results_names_every_result(page):
     section = page.split("## State of the results")[1].split("\n## ")[0]
     names = {row[0].split(",")[0] for row in tables(section)[1:]}
