@@ -17,7 +17,7 @@ from estimation import programs, record_of_case
 from shared.clock import measure
 from shared.command import benchmark
 
-from stmuav_jax.estimation.update import DEFAULT
+from stmuav_jax.estimation.filter import DEFAULT
 
 # Largest batches: on a CPU the time of a larger one is in proportion.
 MOST = {"cpu": 1024}

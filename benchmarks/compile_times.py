@@ -52,38 +52,42 @@ def trim(differentiated: bool) -> Made:
     """Hover trim, and its derivative by a mass and the rods' lengths (`stmuav trim --by`)."""
     given = stm.PART_II
     values = {k: jnp.asarray(given.value(k), float) for k in ("mass.panel_7", "geometry.rods")}
-    wanted = stm.flight.hover(jnp.radians(jnp.array([10.0, -5.0])))
+    wanted = stm.analysis.hover(jnp.radians(jnp.array([10.0, -5.0])))
 
     def of(values: Any) -> Any:
-        flyer = stm.scenes.uav_flyer(given.replaced(values))
-        return stm.flight.trim_flight(flyer, wanted, throw=False).vector
+        uav = stm.uav.make_uav(given.replaced(values))
+        return stm.uav.trim_flight(uav, wanted, throw=False).vector
 
     return jax.jacfwd(of) if differentiated else of, (values,)
 
 
 def tune() -> Made:
-    """Residuals of `stmuav tune hold` with their Jacobian, eight segments."""
-    from stmuav_jax.algebra.least_squares import value_and_columns
-    from stmuav_jax.flight.uav_tuning import hold
+    """Residuals of a search for inputs that hold the UAV, with their Jacobian, eight segments."""
+    from stmuav_jax.math.least_squares import value_and_columns
 
-    flyer = stm.scenes.uav_flyer()
-    angles = jnp.zeros(2)
-    untuned = stm.flight.trim_flight(flyer, stm.flight.hover(angles)).inputs
-    tuning = hold(flyer, angles, untuned, horizon=0.4, segments=8)
+    uav, angles = stm.uav.make_uav(), jnp.zeros(2)
+    values = stm.uav.trim_flight(uav, stm.analysis.hover(angles)).values
+    start = uav.point(angles)
+    tuning = stm.analysis.tune_inputs(
+        uav.space, [stm.analysis.departures(uav.space, start)], start=start, duration=0.4,
+        inputs=uav.inputs, values=values, segments=8, weight=10.0,
+    )  # fmt: skip
     return value_and_columns, (tuning.residuals, tuning.start)
 
 
 def identify() -> Made:
-    """Residuals of `stmuav tune identify` with their Jacobian."""
-    from stmuav_jax.algebra.least_squares import value_and_columns
-    from stmuav_jax.flight.identification import Misfit
-    from stmuav_jax.flight.synthetic import experiment
-    from stmuav_jax.tracker.tracker_options import Friction
+    """Residuals of parameters from a record of the UAV's flight, with their Jacobian."""
+    from shared.uav_record import simulate_record
 
-    make = lambda table: stm.scenes.uav_flyer(table, friction=Friction())
-    case = experiment(make, stm.PART_II)
-    numbers = (jnp.asarray(x, float) for x in (case.record, case.sigma, case.start, case.sizes))
-    return value_and_columns, (Misfit(case.predict, *numbers), jnp.zeros(len(case.truth)))
+    from stmuav_jax.analysis.identification import Misfit
+    from stmuav_jax.math.least_squares import value_and_columns
+
+    case = simulate_record()
+    record, sigma, start, sizes = (
+        jnp.asarray(x, float) for x in (case.record, case.sigma, case.start, case.sizes)
+    )
+    misfit = Misfit(case.predict, record, sigma, start, sizes)
+    return value_and_columns, (misfit, jnp.zeros(len(case.truth)))
 
 
 UAV = ("uav_tracker", 2)
@@ -92,7 +96,6 @@ ROWS: dict[str, Callable[[], Made]] = {
     "spin, Dopri8": lambda: flight(diffrax.Dopri8(), stm.Tree(), "spin"),
     "uav_tracker 2, Dopri8": lambda: flight(diffrax.Dopri8(), stm.Tree(), *UAV),
     "uav_tracker 2, Tsit5": lambda: flight(diffrax.Tsit5(), stm.Tree(), *UAV),
-    "uav_tracker 2, Rodas5P": lambda: flight(stm.dynamics.Rodas5P(), stm.Tree(), *UAV),
     "uav_tracker 2, Kvaerno5": lambda: flight(stm.dynamics.kvaerno5(), stm.Tree(), *UAV),
     "uav_tracker 2, Dopri8, Augmented": lambda: flight(diffrax.Dopri8(), stm.Augmented(), *UAV),
     "forward (jacfwd), 20 parameters": lambda: derivative(reverse=False),
@@ -100,7 +103,7 @@ ROWS: dict[str, Callable[[], Made]] = {
     "trim": lambda: trim(differentiated=False),
     "trim by parameters": lambda: trim(differentiated=True),
     "tune hold": tune,
-    "tune identify": identify,
+    "identify": identify,
 }
 
 
@@ -116,7 +119,7 @@ def equations(jaxpr: Any) -> int:
 
 def measured(name: str) -> dict[str, Any]:
     """Seconds of one program, made in this process."""
-    options = stm.algebra.compiler_options(quick=True)
+    options = stm.math.compiler_options(quick=True)
     function, arguments = ROWS[name]()
     numbers, rest = eqx.partition(arguments, eqx.is_array)
     of = lambda numbers: eqx.filter(function(*eqx.combine(numbers, rest)), eqx.is_array)

@@ -16,9 +16,9 @@ import numpy as np
 from shared.command import benchmark
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.error_estimate import SecondRun, estimated
-from stmuav_jax.dynamics.integration.march import March
-from stmuav_jax.dynamics.integration.problem import prepare
+from stmuav_jax.dynamics.diagnostics import SecondRun, estimate_error
+from stmuav_jax.dynamics.integration.advance import March
+from stmuav_jax.dynamics.integration.problem import prepare_problem
 
 REFERENCE = 3e-13
 CASES = (
@@ -71,7 +71,7 @@ def second_run(scene: stm.Scene, march: March, factor: float, repeats: int) -> d
     first = march.trajectory()
     make = lambda: SecondRun(march.problem, scene.t0, scene.state0, factor=factor)
     second, seconds = least(repeats, make, lambda second: second.follow(first))
-    estimate = float(np.nanmax(estimated(first, second, None).position))
+    estimate = float(np.nanmax(estimate_error(first, second, None).position))
     counted = attempts(second.march)
     return {"factor": factor, "estimate": estimate, "attempts": counted, "seconds": seconds}
 
@@ -86,7 +86,9 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
             references[name, case] = simulated(scene, REFERENCE, size.t1)
         run = simulated(scene, tolerance, size.t1)
         apart = np.linalg.norm(run.states.r - references[name, case].states.r, axis=-1)
-        make = lambda of=scene, run=run: March(prepare(of.system, run.method), of.t0, of.state0)
+        make = lambda of=scene, run=run: March(
+            prepare_problem(of.system, run.method), of.t0, of.state0
+        )
         march, seconds = least(size.repeats, make, lambda march, ts=run.ts: march.to(ts))
         row: dict[str, Any] = {"scene": name, "case": case, "tolerance": tolerance}
         row |= {"true": float(np.max(apart)), "attempts": attempts(march), "seconds": seconds}

@@ -21,21 +21,25 @@ import jax.numpy as jnp
 import numpy as np
 from shared.clock import Timing, measure, summary
 from shared.command import benchmark
-from shared.native import in_process, with_native_loops
+from shared.process import in_process
 
-from stmuav_jax.algebra.compiler import compiler_options
-from stmuav_jax.estimation.bank import filter_bank
-from stmuav_jax.estimation.filter import kalman_filter
+from stmuav_jax.estimation.filter import (
+    DEFAULT,
+    AbstractFilter,
+    GaussianFilter,
+    filter_bank,
+    kalman_filter,
+)
 from stmuav_jax.estimation.online import OnlineFilter
 from stmuav_jax.estimation.sigma import Unscented
-from stmuav_jax.estimation.update import DEFAULT, AbstractFilter, GaussianFilter
-from stmuav_jax.quadrotor.model import (
+from stmuav_jax.math.compiler import compiler_options
+from stmuav_jax.uav.quadrotor.cases import thrusts
+from stmuav_jax.uav.quadrotor.model import (
     PART_III,
     observable_model,
-    rates,
     report_model,
     report_prior,
-    thrusts,
+    state_rates,
 )
 
 DT = 1e-3
@@ -61,7 +65,7 @@ def record_of_case(case: int, count: int, seed: int = 0) -> tuple[np.ndarray, np
     rng = np.random.default_rng(seed)
     u = np.asarray(thrusts(case, np.arange(count) * DT)).T
     noise = rng.normal(size=(count, 8)) * np.sqrt(PART_III.value("true.Q"))
-    rate = rates()
+    rate = state_rates()
 
     def step(q: Any, now: tuple) -> tuple:
         q = q + DT * rate(q, now[0]) + now[1]
@@ -139,11 +143,10 @@ def synchronous() -> None:
 
 
 def with_online(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
-    """The online filter as it is, in a process without asynchronous dispatch, and by native loops."""
+    """The online filter as it is, and in a process without asynchronous dispatch."""
     return {
         "default": online(size, u, y),
         "without_async_dispatch": in_process(synchronous, online, size, u, y),
-        "native_loops": with_native_loops(online, size, u, y),
     }
 
 
@@ -199,7 +202,7 @@ def with_dynamax(size: Size, u: np.ndarray, y: np.ndarray) -> dict[str, Any]:
 
     plain = ukf.psd_solve
     ukf.psd_solve = lambda A, b: plain(A, b, diagonal_boost=0.0)
-    rate = rates()
+    rate = state_rates()
     # it updates first: with our first prediction as its prior, and inputs one later
     model, start = report_model(propagation="euler"), report_prior()
     first = GaussianFilter(REPORT).predict(model, start, jnp.asarray(u[0]), DT)
@@ -234,7 +237,6 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
     """Our filters, and those of other programs that are installed."""
     u, y = record_of_case(2, size.steps)
     content: dict[str, Any] = {"ours": ours(size, u, y)}
-    content["native_loops"] = with_native_loops(ours, size, u, y)
     content["online"] = with_online(size, u, y)
     print("online", content["online"], flush=True)
     for name, peer in (("filterpy", with_filterpy), ("dynamax", with_dynamax)):

@@ -18,10 +18,10 @@ from dense.steps import Scheme
 from dense.system import attempt
 from dense.tables import Variant
 from shared.command import benchmark
-from shared.record import RESULTS, environment
+from shared.record import RESULTS, make_environment
 
 from stmuav_jax import make_scene
-from stmuav_jax.parameters import PRINTED_ORIENTATIONS
+from stmuav_jax.uav import PRINTED_ORIENTATIONS
 
 MISPRINTS = Variant(
     lost_dots=True, transposed_gamma=True, transposed_jacobian=True, shared_index=True
@@ -62,7 +62,7 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
     path = RESULTS / "failure.json"
     former = json.loads(path.read_text()) if path.exists() else {}
     former.pop("environment", None)
-    former["measured"] = {**former.get("measured", {}), "deciding": environment()}
+    former["measured"] = {**former.get("measured", {}), "deciding": make_environment()}
     yield {
         **former,
         "what": "the report's dense system and its variants, Part II",

@@ -2,7 +2,7 @@
 
     taskset -c 1 python benchmarks/hard.py
 
-writes `results/hard.json` and the page `docs/hard.md`.
+writes `results/hard.json` and the section "Hard cases" of `docs/validation.md`.
 """
 
 import json
@@ -18,49 +18,47 @@ from peers.adapter import Peer
 from problems.hard import CASES, TOLERANCES, Hard, run_of, swinging
 from problems.hard_loops import LOOP_CASES, STARTS
 from shared.command import benchmark
+from shared.page_sections import write_section
 from shared.pages import number, titled
 from shared.record import ROOT
 
 import stmuav_jax as stm
-from stmuav_jax.files.netcdf import write_atomically
 
 EVERY = (*CASES, *LOOP_CASES)
 PEERS: tuple[type[Peer], ...] = (MujocoC, ExudynPeer, PinocchioCpp)
-PAGE = ROOT / "docs" / "hard.md"
-HEAD = """# Hard cases
+PAGE = ROOT / "docs" / "validation.md"
+HEAD = """## Hard cases
 
-Made by `python benchmarks/hard.py` from `benchmarks/results/hard.json`; do not edit. Each case is
-simulated as a user would do it, with the defaults of `simulate` where the case names no other
-setting, and compared with a motion that is known without this package
-(`benchmarks/problems/hard.py`). The slow tests run all of them (`tests/hard`). Every run estimates
-its own error; the estimate stands beside the error here. Seconds are those of the run alone,
-without compilation.
+Each case is simulated with the defaults of `simulate`, unless the case sets others, and compared with a motion
+that is known independently of this package. The table has the error and the run's own estimate of it. Seconds
+are those of the run without compilation. `python benchmarks/hard.py` makes this section from
+`benchmarks/results/hard.json`; the cases are in `benchmarks/problems/hard.py`, and `tests/hard` runs them.
 """
-SWEEP = """## All tolerances
+SWEEP = """### All tolerances
 
-A pendulum of 1 m, released with its rod horizontal, for 15 radians of a small swing (4.8 s), at
-tolerances that users may give. The error that is demanded is 1,000 tolerances, and never less than
-1e-11 m.
+A pendulum of 1 m is released with its rod horizontal and swings for 15 radians of a small swing (4.8 s).
+The required error is 1,000 tolerances, and at least 1e-11 m.
 """
-SINGULAR = """## Starts at a singular posture
+SINGULAR = """### Starts at a singular posture
 
-Nothing says which branch the motion follows: the start has to be refused, and the posture named.
+The branch of the motion is undetermined: the start must raise an error that names the posture.
 """
-BESIDE = """## Other programs
+BESIDE = """### Other programs
 
-The same cases by the programs of `benchmarks/peers` that are installed, at their finest setting whose
-steps end at the output times, one run each: error, seconds, and that setting (fixed step, or tolerance).
-A case stands here if its error is one of positions; a sentence says why a program did not run it, or
-what became of it at that setting. Coarser settings are not tried then.
+The installed programs of `benchmarks/peers` run the cases with position errors, once each, at their finest
+setting whose steps end at the output times: error, seconds, and that setting (fixed step, or tolerance). A
+sentence gives the reason if a program did not run or complete a case; coarser settings are not tried then.
 """
-LIMITS = """## Where it ends
+LIMITS = """### Where it ends
 
-- A mechanism that only rods or cut loops tie to ground, 1,000 km or more from the origin, stops with
-  "step size collapsed": its positions are numbers that are 1e6 times as large as its motion. Put the
-  origin near the mechanism, or use `formulation=stm.Augmented()`. Trees that stand on ground by a joint
-  compute about that joint: a double pendulum at 10,000 km moves as at the origin.
-- Tolerances are lengths in metres as well as numbers. For a mechanism much smaller than a
-  millimetre the default of 1e-8 m is a large part of it, as the estimated error then tells.
+- The run of a mechanism 1,000 km or more from the origin that only rods or cut loops connect to ground stops
+  with "step size collapsed": its positions are 1e6 times as large as its motion. Put the origin near the
+  mechanism, or use `formulation=stm.Augmented()`. Trees with a joint to ground are
+  computed about that joint: the motion of a double pendulum at 10,000 km is the same as at the origin.
+- Tolerances are lengths in metres as well as numbers. Motion that is described by angles only, such as that
+  of rods on hinges, is equally accurate at any size: the scaled results of a slider-crank of a nanometre and
+  one of a metre agree to 1e-10. For sliding or floating bodies in a mechanism much smaller than a
+  millimetre, the default of 1e-8 m is too coarse: give tolerances that suit its size.
 """
 
 
@@ -163,9 +161,9 @@ def more(content: dict[str, Any]) -> list[str]:
         named = lambda x: "yes" if x else "no"
         columns = (
             ("start", "name"),
-            ("what makes it hard", "why"),
+            ("difficulty", "why"),
             ("named", "named", named),
-            "said",
+            ("message", "said"),
         )
         parts += [SINGULAR, titled("", starts, *columns).lstrip(), ""]
     ran = [row for row in content["cases"] if row.get("peers")]
@@ -192,9 +190,9 @@ def page(content: dict[str, Any]) -> str:
     steps = lambda row: f"{row['accepted']:,} + {row['rejected']:,}"
     effort = ("steps", None, steps), ("run [s]", "seconds", two)
     energy = ("energy, relative", "relative_energy_error", two)
-    drift = ("joints open by [m]", "position_violation", two), energy
+    drift = ("constraint violation [m]", "position_violation", two), energy
     reached = (
-        ("demanded", None, lambda row: f"{row['demanded']:.0e} {row['unit']}"),
+        ("required", None, lambda row: f"{row['demanded']:.0e} {row['unit']}"),
         ("reached", None, with_unit("reached")),
         ("estimated by the run", None, with_unit("estimated")),
     )
@@ -204,7 +202,7 @@ def page(content: dict[str, Any]) -> str:
     verdict = f"Not reached: {', '.join(missed)}." if missed else "All are reached."
     where = f"Commit {about['commit'][:10]}, {about['date'][:10]}, run times on one core."
     cases = titled(
-        "## Cases", content["cases"], ("case", "name"), ("what makes it hard", "why"),
+        "### Cases", content["cases"], ("case", "name"), ("difficulty", "why"),
         ("compared with", "truth"), *reached, *drift, *effort,
     )  # fmt: skip
     swept = titled(
@@ -220,7 +218,7 @@ def show(path: Path, folder: Path) -> str:
     place = (
         PAGE if path.parent == PAGE.parents[1] / "benchmarks" / "results" else folder / "hard.md"
     )
-    return str(write_atomically(place, page(content).encode()))
+    return str(write_section(place, "benchmarks/hard.py", page(content)))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 Six problems, 60 s each. Projected, unstabilised and Baumgarte-stabilised Dopri8 and Tsit5 at
 tolerances 1e-4 to 1e-12. Gauss-Legendre methods of order 2 and 4, which are symmetric, were compared
-with them once; their runs and the comparison stay in the record, and docs/long_times.md says by
+with them once; their runs and the comparison stay in the record, and docs/simulation.md says by
 which commit's scripts they were made.
 
 Trajectories of the tracker diverge whatever the method, so energies are compared, not states. The
@@ -26,7 +26,7 @@ from sections import long_page
 from shared.clock import compiled, ready, rounded, timed
 from shared.command import benchmark
 from shared.methods import evaluations, trajectory
-from shared.record import RESULTS, environment
+from shared.record import RESULTS, make_environment
 
 import stmuav_jax as stm
 
@@ -210,7 +210,7 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
             "seconds": "processor time of the process on one core",
             "horizon": size.horizon,
             "every": size.every,
-            "measured": {"explicit": environment(), **({"symmetric": once} if same else {})},
+            "measured": {"explicit": make_environment(), **({"symmetric": once} if same else {})},
             "problems": [*problems, *left],
         }
 

@@ -20,7 +20,7 @@ import numpy as np
 from shared.command import benchmark
 
 import stmuav_jax as stm
-from stmuav_jax.montecarlo.statistics import probability
+from stmuav_jax.studies.statistics import probability
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ MISSION: dict[str, Any] = {
 }  # fmt: skip
 
 
-def work(t1: float) -> stm.missions.MissionWork:
-    """Work of the study."""
-    sampling = stm.montecarlo.Sampling(dict.fromkeys(FACTORS, SHARE), 0)
+def make_study(t1: float) -> stm.Study:
+    """Study of the mission."""
     mission = stm.missions.make_mission(MISSION | {"t1": t1})
-    return stm.missions.MissionWork(mission, sampling, relative=frozenset(FACTORS))
+    factors = dict.fromkeys(FACTORS, SHARE)
+    return stm.missions.make_mission_study(mission, factors, relative=frozenset(FACTORS))
 
 
 def share(columns: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -78,10 +78,10 @@ def share(columns: dict[str, np.ndarray]) -> dict[str, Any]:
 
 def measure(size: Size) -> Iterator[dict[str, Any]]:
     """Yield the record after each block of flights; the first block's time includes compiling."""
-    of, parts, times = work(size.t1), [], []
+    of, parts, times = make_study(size.t1), [], []
     for first in range(0, size.flights, of.unit):
         clock = time.perf_counter()
-        parts.append(of.run(first, min(of.unit, size.flights - first)))
+        parts.append(of.compute(first, min(of.unit, size.flights - first)))
         times.append(time.perf_counter() - clock)
         columns = {k: np.concatenate([part[k] for part in parts]) for k in parts[0]}
         steady = times[1:] or times

@@ -26,16 +26,11 @@ from sections.ours import peers
 from sections.speed import errors, throughput
 from sections.throughput_page import write_page
 from shared.clock import compiled, measure
-from shared.command import begin, parser
-from shared.native import with_native_loops
-from shared.record import ROOT, write
+from shared.command import parser
+from shared.record import ROOT, write_record
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration.lanes import fly
-from stmuav_jax.jobs.local import run_study
-from stmuav_jax.montecarlo.batch import FlightWork
-from stmuav_jax.montecarlo.disturbed_flights import Drawn
-from stmuav_jax.montecarlo.study import study_from_plain
+from stmuav_jax.dynamics.integration.lanes import integrate_batch
 
 # Largest error that counts [m]; peers get finer settings until they reach it.
 WANTED = 1e-6
@@ -61,17 +56,18 @@ ONE = Size(flights=4, lanes=(2,), checked=2, t1=0.02, tolerances=(1e-6,), tight=
            scene="hexacopter", case=None)  # fmt: skip
 
 
-def study(size: Size, tolerance: float) -> stm.montecarlo.Study:
+def make_study(size: Size, tolerance: float, **settings: Any) -> stm.Study:
     """The flights, with what a study of them would keep."""
     normal = {"distribution": "normal", "mean": 0.0, "standard_deviation": 0.1}
     names = ("vx", "vy", "vz", "p", "q", "r")
-    return study_from_plain(
+    return stm.studies.make_study(
         {
             "name": "throughput", "scene": size.scene, "case": size.case, "t1": size.t1, "seed": 1,
             "rtol": tolerance, "atol": tolerance,
             "factors": {f"start.{name}": normal for name in names},
             "quantities": {name: {"signal": name, "take": "final"} for name in "xyz"},
-        }
+        },
+        **settings,
     )  # fmt: skip
 
 
@@ -79,11 +75,12 @@ class Bare:
     """Flights through lanes alone, without a study's columns."""
 
     def __init__(self, size: Size, tolerance: float, lanes: int) -> None:
-        work = FlightWork(study(size, tolerance))
-        plan = self.plan = work.plan
-        drawn = work.study.sampling.draw(0, size.flights)
-        self.queue = Drawn(jnp.asarray(drawn), jnp.zeros(len(drawn), jnp.uint32))
-        run = lambda queue, count: fly(plan, queue, count, lanes)
+        study = make_study(size, tolerance)
+        plan = self.plan = study.evaluate.plan
+        drawn = study.sampling.draw(0, size.flights).T
+        samples = dict(zip(study.sampling.names, map(jnp.asarray, drawn), strict=True))
+        self.queue = samples, jnp.zeros((size.flights, 2), jnp.uint32)
+        run = lambda queue, count: integrate_batch(plan, queue, count, lanes)
         self.program, self.compile_seconds = compiled(run, self.queue, jnp.asarray(1))
 
     def fly(self, count: int) -> Any:
@@ -94,7 +91,7 @@ class Bare:
         """Positions of all bodies at the end (count, n, 3) [m]."""
         last = self.fly(count).last[:count]
 
-        def positions(drawn: Drawn, y: Any) -> Any:
+        def positions(drawn: Any, y: Any) -> Any:
             problem, _ = self.plan.make(drawn)
             method = problem.method
             return method.formulation.to_state(problem.model, y[: problem.n_state]).r
@@ -138,14 +135,10 @@ def by_lanes(size: Size, tolerance: float) -> list[dict[str, Any]]:
     return rows
 
 
-def rates(size: Size, tolerance: float, lanes: tuple[int, ...]) -> dict[str, float]:
-    """Flights per second by lanes, of as few flights as it takes."""
-    few, found = min(64, size.flights), {}
-    for k in lanes:
-        bare = Bare(size, tolerance, k)
-        timing, _ = measure(lambda b=bare: b.fly(few), repeats=size.repeats)
-        found[str(k)] = few / timing.median
-    return found
+def rate_one_by_one(size: Size, tolerance: float) -> float:
+    """Flights per second in a single lane, of as few flights as it takes."""
+    few, bare = min(64, size.flights), Bare(size, tolerance, 1)
+    return few / measure(lambda: bare.fly(few), repeats=size.repeats)[0].median
 
 
 def on_devices(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
@@ -161,15 +154,15 @@ def on_devices(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
 def child(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
     """What `on_devices` runs: the same flights by bare calls, and as a study with its store."""
     count = size.flights * devices
-    work = FlightWork(study(size, tolerance), block=size.flights, devices=devices)
-    work.run(0, 2)
+    study = make_study(size, tolerance, block=size.flights, devices=devices)
+    study.compute(0, 2)
     seconds = []
     for _ in range(size.repeats):
         with tempfile.TemporaryDirectory() as folder:
             started = time.perf_counter()
-            work.run(0, count)
+            study.compute(0, count)
             between = time.perf_counter()
-            run_study(work, Path(folder) / "study.zarr", count, chunk=count)
+            study.run(Path(folder) / "study.zarr", count, chunk=count)
             seconds.append((between - started, time.perf_counter() - between))
     bare, stored = np.array(seconds).T
     return {
@@ -186,17 +179,15 @@ def run(size: Size) -> dict[str, Any]:
     tolerance, tried = tolerance_for(size, exact)
     rows = by_lanes(size, tolerance)
     best = max(rows, key=lambda row: row["per_second"])
-    alone = rates(size, tolerance, (1,))
-    native = with_native_loops(rates, size, tolerance, (1, *size.lanes[:2]))
-    cores = sorted({1, os.cpu_count() or 1})
+    cores = sorted({1, os.cpu_count() or 1}) if size == FULL else [1]
     label = size.scene if size.case is None else f"{size.scene} case {size.case}"
     given = (stm.make_scene(size.scene, size.case), tight.starts(size.checked), size.t1)
     found = [row for peer in peers()[0] for row in throughput(peer, given, exact, WANTED, 30.0)]
     return {
         "what": f"flights per second, {label}", "t1": size.t1, "flights": size.flights,
         "wanted_error": WANTED, "tolerance": tolerance, "tried": tried, "rows": rows,
-        "best_lanes": best["lanes"], "one_lane_per_second": alone["1"],
-        "native_per_second": native, "peers": found,
+        "best_lanes": best["lanes"], "one_lane_per_second": rate_one_by_one(size, tolerance),
+        "peers": found,
         "cores": [on_devices(size, tolerance, count) for count in cores],
     }  # fmt: skip
 
@@ -213,11 +204,10 @@ def main() -> None:
     if options.devices:
         print(json.dumps(child(size, options.tolerance, options.devices)))
         return
-    begin(options)
-    path = write("montecarlo", run(size), options.results)
+    path = write_record("montecarlo", run(size), options.results)
     print(path)
     if size == FULL or options.page:
-        print(write_page(path, options.page or ROOT / "docs" / "throughput.md"))
+        print(write_page(path, options.page or ROOT / "docs" / "studies.md"))
 
 
 if __name__ == "__main__":

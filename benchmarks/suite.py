@@ -29,8 +29,8 @@ from sections.scenes import hexacopter, scenes
 from sections.size import FULL, ONE, Size
 from sections.speed import acceleration, batch, scaling
 from sections.vector_steps import vector_steps
-from shared.command import begin, parser
-from shared.record import write
+from shared.command import parser
+from shared.record import write_record
 
 SECTIONS: dict[str, Callable[[Size, list[Peer]], dict[str, Any]]] = {
     "work_precision": work_precision, "acceleration": acceleration, "batch": batch,
@@ -54,7 +54,6 @@ def main() -> None:
     made.add_argument("--size", choices=("full", "one"), default="full")
     made.add_argument("--page", type=Path, default=report.PAGE)
     options = made.parse_args()
-    begin(options)
     size = FULL if options.size == "full" else ONE
     there, absent = ([], []) if options.no_peers else peers()
     for row in absent:
@@ -67,7 +66,7 @@ def main() -> None:
         took = time.perf_counter() - clock
         head = {"section": name, "size": options.size, "took_seconds": took, "machine": machine()}
         compared = {"peers": describe(there), "skipped": absent}
-        path = write(f"suite_{name}", {**head, **compared, **content}, options.results)
+        path = write_record(f"suite_{name}", {**head, **compared, **content}, options.results)
         print(f"{path}, {took:.0f} s", flush=True)
     if not options.no_report:
         print(report.build(options.results, options.page))

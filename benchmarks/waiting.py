@@ -14,13 +14,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from shared.command import begin, parser
-from shared.record import write
+from shared.command import parser
+from shared.record import write_record
 
 # Words of each command, with the folder for its results in the place of {out}.
 COMMANDS = {
     "list": "list",
-    "show": "show uav_tracker --out {out}",
+    "view, sketch": "view uav_tracker --out {out}",
     "check": "check uav_tracker --case 2",
     "simulate": "simulate uav_tracker --case 2 --out {out}",
     "simulate, loads": "simulate uav_tracker --case 2 --t1 1 --loads --out {out}",
@@ -29,24 +29,25 @@ COMMANDS = {
     "sun": "sun --lat 11.55 --lon 104.92 --date 2024-03-21 --timezone Asia/Phnom_Penh --out {out}",
     "trim": "trim --phi 10 --theta -5 --out {out}",
     "trim, sensitivities": "trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods --out {out}",
-    "linearize": "linearize --sun 150 60 --outputs phi theta --out {out}",
-    "tune hold": "tune hold --t1 0.4 --out {out}",
-    "tune slew": "tune slew --out {out}",
-    "tune identify": "tune identify --out {out}",
+    "trim, linear model": "trim --sun 150 60 --linear trim --out {out}",
+    "tune hold": "tune hold uav_tracker --t1 0.4 --segments 8 --inputs speed_squared force_slider_2 "
+    "force_slider_3 --out {out}",
+    "tune slew": "tune slew uav_tracker --to U47.angle_1=0.4 U47.angle_2=0.3 --t1 1 --segments 5 --inputs "
+    "speed_squared force_slider_2 force_slider_3 --out {out}",
     "estimate": "estimate --out {out}",
     "estimate, one case": "estimate --case 4 --seeds 20 --out {out}",
     "montecarlo": "montecarlo collapse --samples 64 --out {out}",
-    "report": "report {out}/study.zarr --out {out}",
+    "view, report": "view {out}/study.zarr --report {out}/report.html",
 }
 # Commands that read what another has written, which is run before them and not measured.
-BEFORE = {"view": "simulate", "report": "montecarlo"}
+BEFORE = {"view": "simulate", "view, report": "montecarlo"}
 ABOUT = "stmuav, whole process: CPU and wall time [s], peak memory [MB]"
 
 
 def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
     """Times [s] and peak memory [MB] of one run of the command line, and its exit code."""
     given = words.format(out=out).split()
-    command = [sys.executable, "-m", "stmuav_jax.cli", *given]
+    command = [sys.executable, "-m", "stmuav_jax.cli.main", *given]
     clock = time.perf_counter()
     process = subprocess.Popen(
         command,
@@ -101,7 +102,6 @@ def main() -> None:
     made.add_argument("--repeats", type=int, default=3)
     made.add_argument("--only", nargs="+", choices=tuple(COMMANDS), default=tuple(COMMANDS))
     options = made.parse_args()
-    begin(options)
     names = ("list",) if options.quick else options.only
     found: dict[str, Any] = {}
     for name in names:
@@ -110,7 +110,7 @@ def main() -> None:
             own = found[name][kind]
             told = ", ".join(f"{k} {own[k]:.1f}" for k in ("cpu", "wall", "memory"))
             print(f"{name}, {kind}: {told}")
-        print(write("waiting", {"what": ABOUT, "commands": found}, options.results))
+        print(write_record("waiting", {"what": ABOUT, "commands": found}, options.results))
 
 
 if __name__ == "__main__":

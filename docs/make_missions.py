@@ -1,4 +1,4 @@
-"""Make the table of flights of docs/missions.md from fresh flights of the ready missions.
+"""Make the table of flights of docs/control_and_missions.md from fresh flights of the ready missions.
 
     python docs/make_missions.py                 all; some fifteen minutes of processor time
     python docs/make_missions.py slew-30 gusts   only these; the other rows stay as they are
@@ -16,7 +16,7 @@ jax.config.update("jax_enable_x64", True)
 
 import stmuav_jax as stm
 
-PAGE = Path(__file__).parent / "missions.md"
+PAGE = Path(__file__).parent / "control_and_missions.md"
 BEGIN = "<!-- table made by docs/make_missions.py -->\n\n"
 END = "\n<!-- end of the table -->\n"
 ORDER = (
@@ -52,7 +52,7 @@ def shown(measure: stm.missions.Measure) -> str:
         words = f"{value:.2g} deg" if value < 100 else f"{value:.0f} deg"
     else:
         words = "0 %, at a limit" if abs(value) < 1e-6 else f"{value:.0f} %"
-    return words if measure.kept else f"{words}, not kept"
+    return words if measure.is_met else f"{words}, not kept"
 
 
 def row(name: str, data: object) -> str:
@@ -86,8 +86,6 @@ def with_rows(page: str, rows: dict[str, str]) -> str:
 
 
 def main() -> None:
-    # before anything else is computed: JAX reads the option only once
-    stm.algebra.use_native_loops()
     for name in sys.argv[1:] or ORDER:
         flight = stm.missions.fly(stm.missions.load_mission(name))
         data = stm.missions.to_data(flight)

@@ -1,4 +1,4 @@
-"""Make the tables of docs/parameters_file.md from the package's parameter tables."""
+"""Make the tables of docs/parameters.md from the package's parameter tables."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import numpy as np
 
 import stmuav_jax as stm
 
-PAGE = Path(__file__).parent / "parameters_file.md"
+PAGE = Path(__file__).parent / "parameters.md"
 MARK = "<!-- made by docs/make_parameters.py from here on -->\n"
 
 
@@ -18,7 +18,7 @@ def shown(value: object) -> str:
     return "; ".join(", ".join(f"{x:.6g}" for x in row) for row in array)
 
 
-def table(parameters: stm.parameters.Parameters) -> str:
+def table(parameters: stm.mechanics.Parameters) -> str:
     """Markdown table of all keys with value, unit and source."""
     rows = ["| key | value | unit | source |", "|---|---|---|---|"]
     for key, entry in parameters.items():
@@ -32,7 +32,7 @@ def tables() -> str:
     which = {
         "Part II: `uav_tracker`, `hexacopter`, `sun`, studies, missions": stm.PART_II,
         "Part I: `tracker`": stm.PART_I,
-        "Energy: `stm.parameters.ENERGY`": stm.parameters.ENERGY,
+        "Energy: `stm.uav.ENERGY`": stm.uav.ENERGY,
     }
     return "\n".join(f"\n## {title}\n\n{table(found)}\n" for title, found in which.items())
 

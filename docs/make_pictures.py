@@ -1,17 +1,12 @@
-"""Make the pictures of the README and of docs/pictures.md, and the numbers that stand beside them.
+"""Make the pictures of the README and of docs/viewer.md, and the numbers that stand beside them.
 
 python docs/make_pictures.py             # sketches of the models, some seconds each
-python docs/make_pictures.py poles       # poles and step responses of docs/control.md
 python docs/make_pictures.py flight      # the flight, its film, and the printed equations, some minutes
 """
 
-import contextlib
 import json
-import re
 import sys
-import tempfile
 from pathlib import Path
-from typing import Any
 
 import jax
 
@@ -30,6 +25,8 @@ MODELS = (
     "pendulum", "cart_pole", "four_bar", "slider_crank", "gyroscope", "stewart_platform",
     "delta_robot", "bricard", "quadrotor_slung_load", "tracker",
 )  # fmt: skip
+# Models whose sketches alone are in the README, where two are side by side on a wide window.
+OF_README = ("stewart_platform", "delta_robot", "tracker")
 # The time [s] at which the controlled flight is drawn, and the end of the runs beside it.
 SHOWN, END = 9.5, 1.0
 
@@ -47,20 +44,16 @@ def sketch_alone(figure: Figure, title: str) -> Figure:
 def gallery() -> None:
     """Sketches of all models of docs/models, alone and with the graphs of their joints."""
     for name in MODELS:
-        scene = stm.files.load_model(FOLDER / "models" / f"{name}.toml")
+        scene = stm.io.load_model(FOLDER / "models" / f"{name}.toml")
         figure = stm.draw(scene)
         stm.figures.save_figures({name: figure}, FIGURES / "gallery", "png", dpi=90)
+        if name in OF_README:
+            title = scene.title if name != "tracker" else "Solar tracker"
+            sketch = {f"{name}_sketch": sketch_alone(figure, title)}
+            stm.figures.save_figures(sketch, FIGURES / "gallery", "png", dpi=90)
         print(name)
-
-
-def poles() -> None:
-    """Poles and step responses of the cart and pole, by the code of docs/control.md itself."""
-    text = (FOLDER / "control.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    names: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        exec("\n".join(blocks[:2]), names)
-    stm.figures.save_figures(names["figures"], FIGURES / "control", "png", dpi=90)
+    figure = stm.draw(stm.make_scene("uav_tracker", 2))
+    stm.figures.save_figures({"mechanism": figure}, FIGURES / "viewer", "png", dpi=100)
 
 
 def state_at(data, k: int) -> stm.State:
@@ -138,9 +131,7 @@ def printed() -> dict[str, float]:
 
 def main() -> None:
     if sys.argv[1:] != ["flight"]:
-        poles()
-        if sys.argv[1:] != ["poles"]:
-            gallery()
+        gallery()
         return
     numbers = printed() | flight()
     text = json.dumps(numbers, indent=1) + "\n"

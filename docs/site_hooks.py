@@ -144,13 +144,16 @@ def _output(match: re.Match[str]) -> str:
 
 
 def validation_page() -> str:
-    """Text of the page on what is tested: laws, published problems and independent programs."""
-    head = (ROOT / "docs" / "validation_head.md").read_text(encoding="utf-8")
-    lines = [head]
+    """Text of the page on validation, with the list of what the tests claim at its end."""
+    lines = [
+        (ROOT / "docs" / "validation.md").read_text(encoding="utf-8"),
+        "## Tests by subject",
+        "",
+    ]
     titles = {"published": "Published problems", "oracles": "Independent programs", "laws": "Laws",
               "hard": "Hard cases"}  # fmt: skip
     for folder, title in titles.items():
-        lines += [f"## {title}", ""]
+        lines += [f"### {title}", ""]
         for path in sorted((ROOT / "tests" / folder).glob("test_*.py")):
             tree = ast.parse(path.read_text(encoding="utf-8"))
             about = (ast.get_docstring(tree) or "").split("\n\n")[0].replace("\n", " ")
@@ -285,8 +288,7 @@ def on_files(files: Any, config: Any) -> Any:
     """Add the pages that are made to those of docs/."""
     from mkdocs.structure.files import File
 
-    made = {**api_pages(), "validation.md": validation_page()}
-    for path, content in [*made.items(), *outside_pages()]:
+    for path, content in [*api_pages().items(), *outside_pages()]:
         files.append(File.generated(config, path, content=content))
     return files
 
@@ -294,6 +296,8 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Turn links to files outside of the site into words, and formulas into MathML."""
     uri = page.file.src_uri
+    if uri == "validation.md":
+        markdown = validation_page()
     if not uri.startswith("api/"):
         markdown = links_in_site(markdown, _repository_path(uri))
     return with_formulas(markdown)

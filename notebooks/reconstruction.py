@@ -10,7 +10,7 @@ fit minimises
 
 0.004 for bodies 5 and 7, whose printed p are the least consistent. What has to be decided
 before that (misprints, the order of a joint's axes, what is taken as equal) is a `Reading`;
-fitting each and comparing their sums is the evidence for the choices of docs/geometry.md.
+fitting each and comparing their sums is the evidence for the choices of docs/report_machine.md.
 
     python notebooks/reconstruction.py
 
@@ -29,8 +29,8 @@ import optimistix
 from jaxtyping import Array, Bool, Float
 
 from stmuav_jax import SettingError, rotation
-from stmuav_jax.parameters import PRINTED_CENTRES, PRINTED_ORIENTATIONS
-from stmuav_jax.tracker import TRACKER_BODIES, TrackerGeometry, place
+from stmuav_jax.uav import PRINTED_CENTRES, PRINTED_ORIENTATIONS
+from stmuav_jax.uav import TRACKER_BODIES, TrackerGeometry, place
 
 POSITION_DEVIATION = 5e-4  # [m]
 EULER_DEVIATION = {"post_4": 0.002, "rod_5": 0.004, "rod_6": 0.002, "panel_7": 0.004}

@@ -4,27 +4,24 @@ All else is in the sub-namespaces, which have lists like this one.
 """
 
 from . import (
-    algebra as algebra,
+    analysis as analysis,
     control as control,
     dynamics as dynamics,
-    environment as environment,
     estimation as estimation,
     figures as figures,
-    files as files,
-    flight as flight,
-    jobs as jobs,
+    io as io,
+    math as math,
     mechanics as mechanics,
     missions as missions,
-    montecarlo as montecarlo,
-    parameters as parameters,
-    quadrotor as quadrotor,
-    rotorcraft as rotorcraft,
-    scenes as scenes,
-    sensing as sensing,
-    tracker as tracker,
-    viewer as viewer,
+    studies as studies,
+    uav as uav,
 )
-from .algebra import rotation as rotation
+from .analysis.equilibrium import (
+    trim as trim,
+)
+from .analysis.linear import (
+    linearize as linearize,
+)
 from .checks.errors import (
     ModelError as ModelError,
     SettingError as SettingError,
@@ -48,54 +45,50 @@ from .dynamics.formulations.stabilisation import (
 from .dynamics.inspection import (
     check as check,
 )
-from .dynamics.integration.rosenbrock import (
-    Rodas5P as Rodas5P,
-)
 from .dynamics.method import (
     Method as Method,
 )
-from .dynamics.run import (
-    Run as Run,
-)
-from .dynamics.scene import (
-    Scene as Scene,
-)
 from .dynamics.simulation import (
+    Run as Run,
+    Scene as Scene,
+    integrate as integrate,
     simulate as simulate,
 )
 from .dynamics.statespace.tree import (
     TreeSpace as TreeSpace,
 )
-from .dynamics.trajectory import (
-    integrate as integrate,
-)
 from .dynamics.tree.formulation import (
     Tree as Tree,
 )
-from .files.netcdf import (
+from .figures.films import (
+    film as film,
+)
+from .figures.page import (
+    view as view,
+)
+from .figures.sketch import (
+    draw as draw,
+)
+from .io.netcdf import (
     load as load,
+)
+from .io.run_file import (
     save as save,
 )
-from .flight.equilibrium import (
-    trim as trim,
-)
-from .flight.linear import (
-    linearize as linearize,
+from .math import (
+    rotation as rotation,
 )
 from .mechanics.body import (
     GROUND as GROUND,
     Body as Body,
 )
-from .mechanics.forces.applied import (
+from .mechanics.forces import (
     AppliedForce as AppliedForce,
     AppliedMoment as AppliedMoment,
     Gravity as Gravity,
     JointDamping as JointDamping,
     LinearSpringDamper as LinearSpringDamper,
     TorsionalSpringDamper as TorsionalSpringDamper,
-)
-from .mechanics.forces.effort import (
-    JointEffort as JointEffort,
 )
 from .mechanics.inputs import (
     inputs_of as inputs_of,
@@ -105,6 +98,7 @@ from .mechanics.joint import (
     cylindrical as cylindrical,
     distance as distance,
     drive as drive,
+    mimic as mimic,
     revolute as revolute,
     revolute_spherical as revolute_spherical,
     screw as screw,
@@ -113,28 +107,25 @@ from .mechanics.joint import (
     universal as universal,
     weld as weld,
 )
+from .mechanics.joint_forces import (
+    JointEffort as JointEffort,
+)
 from .mechanics.state import (
     State as State,
 )
 from .mechanics.system import (
     System as System,
 )
-from .parameters.airframe import (
+from .studies.study import (
+    Study as Study,
+)
+from .uav.airframe import (
     PART_I as PART_I,
     PART_II as PART_II,
 )
-from .scenes.registry import (
+from .uav.scenes.registry import (
     SCENES as SCENES,
     make_scene as make_scene,
-)
-from .viewer.filming import (
-    film as film,
-)
-from .viewer.page import (
-    view as view,
-)
-from .viewer.sketch import (
-    draw as draw,
 )
 
 __version__: str

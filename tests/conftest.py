@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 
 # Published problems are those of the benchmarks.
@@ -17,14 +18,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Most programs here run once, and compiling is nearly all that the tests wait for. Those that the
 # package compiles itself have the options of `compiler_options` as everywhere; these are for the
 # rest, which would otherwise take three times as long.
-QUICK = {
-    "xla_backend_optimization_level": "0",
-    "xla_llvm_disable_expensive_passes": "true",
-    "xla_cpu_use_fusion_emitters": "false",
-}
-# what was given is kept for the notebooks; workers of pytest-xdist inherit both
-given = os.environ.setdefault("STMUAV_GIVEN_XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
-os.environ["XLA_FLAGS"] = " ".join([*(f"--{k}={v}" for k, v in QUICK.items()), given]).strip()
+QUICK = {"xla_backend_optimization_level": "0", "xla_llvm_disable_expensive_passes": "true"}
+# XLA ends a process that gives it a flag which it does not know.
+if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
+    QUICK["xla_cpu_use_fusion_emitters"] = "false"
+# Workers of pytest-xdist, notebooks and commands inherit them; flags of the user's come last, and win.
+flags = [*(f"--{k}={v}" for k, v in QUICK.items()), os.environ.get("XLA_FLAGS", "")]
+os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 
 import jax
 import numpy as np
@@ -59,11 +59,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def optimise(level: int) -> None:
     """Set the level at which the package has its programs compiled."""
-    from stmuav_jax.algebra import compiler
+    from stmuav_jax.math import compiler
+    from stmuav_jax.math.native import llvm
 
     for options in (compiler._QUICK, compiler._NO_LIBRARY):
         options["xla_backend_optimization_level"] = level
     compiler.compiler_options.cache_clear()
+    llvm.settings = llvm.Settings(level)
 
 
 @pytest.fixture(scope="module")

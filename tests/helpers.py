@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import stmuav_jax as stm
-from stmuav_jax.algebra.compiler import quick_jit
-from stmuav_jax.dynamics.integration.problem import begin, prepare
+from stmuav_jax.dynamics.integration.problem import begin_integration, prepare_problem
+from stmuav_jax.math.compiler import quick_jit
 
 GRAVITY = 9.81
 
@@ -118,8 +118,8 @@ def derivative_size(system: stm.System) -> tuple[int, int]:
                     total += count(getattr(value, "jaxpr", value))
         return total
 
-    problem = prepare(system, stm.Method())
-    y = begin(problem, jnp.zeros(()), system.reference).y
+    problem = prepare_problem(system, stm.Method())
+    y = begin_integration(problem, jnp.zeros(()), system.reference).y
     found = jax.make_jaxpr(lambda t, y: problem.field(t, y, problem.model))(0.0, y)
     return count(found.jaxpr), y.shape[0]
 
@@ -310,8 +310,8 @@ def random_seven(system: stm.System, rng: np.random.Generator) -> stm.State:
     return stm.assemble(system, guess).state
 
 
-def forked(floating):
-    """A body that carries two, one of them on a ball; another body on its own slide."""
+def forked(floating, *more):
+    """A body that carries two, one of them on a ball; another body on its own slide; more joints."""
     unit = [0.01, 0.02, 0.015]
     at = {"hub": [0, 0, 0], "a": [0, 0, 0.3], "b": [0.1, 0.2, 0.3], "c": [0.1, -0.2, 0.3]}
     at["d"] = [-0.3, 0, 0]
@@ -325,6 +325,7 @@ def forked(floating):
         stm.revolute("rb", "a", "b", point=[0, 0, 0.3], axis=[0, 1, 0]),
         stm.spherical("sc", "a", "c", point=[0, -0.1, 0.3]),
         stm.translational("td", hub, "d", point=[-0.3, 0, 0], axis=[0, 0, 1]),
+        *more,
     ]
     return stm.System(bodies[0 if floating else 1 :], joints, [stm.Gravity()])
 

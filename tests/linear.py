@@ -2,11 +2,22 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from stmuav_jax.estimation.gaussians import gaussian
 from stmuav_jax.estimation.model import Sensor, StateSpaceModel
+
+
+class Product(eqx.Module):
+    """A function A x: cases of one size share their programs."""
+
+    A: jax.Array
+
+    def __call__(self, x, *others):
+        return self.A @ x
 
 
 class Linear(NamedTuple):
@@ -22,8 +33,8 @@ class Linear(NamedTuple):
     x: np.ndarray
 
     def model(self):
-        F, H = jnp.asarray(self.F), jnp.asarray(self.H)
-        return StateSpaceModel(lambda x, u, dt: F @ x, self.Q, Sensor(lambda x, u: H @ x, self.R))
+        F, H = Product(jnp.asarray(self.F)), Product(jnp.asarray(self.H))
+        return StateSpaceModel(F, self.Q, Sensor(H, self.R))
 
     def prior(self):
         return gaussian(self.m0, self.P0)

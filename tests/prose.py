@@ -36,11 +36,6 @@ def paragraphs(text: str) -> Iterator[str]:
         yield re.sub(r"`[^`]*`|\$[^$]*\$", "CODE", words).strip("-*# ")
 
 
-def sentences(paragraph: str) -> list[str]:
-    """Sentences of a paragraph; a semicolon or a colon ends none."""
-    return re.split(r"(?<=[.!?])[)*\"]*\s+(?=[\"*(]*[A-Z0-9])", paragraph)
-
-
 def main(folder: Path) -> None:
     """Write the paragraphs of every page to a file of its own, for programs that check prose."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ from problems.conservative import FAST, top
 from problems.squeezer import squeezer
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.tree.coordinates import join, split
+from stmuav_jax.dynamics.tree.coordinates import join_coordinates, split_vector
 
 TRACKER_CASE = 2
 
@@ -46,14 +46,14 @@ def tracker(horizons: tuple[float, ...]) -> Problem:
 def stiff(horizon: float) -> list[Problem]:
     """The same with both sliders held by servos: the table's, and a much stiffer one."""
 
-    def held(key: str, servo: stm.tracker.Servo, title: str) -> Problem:
+    def held(key: str, servo: stm.uav.Servo, title: str) -> Problem:
         scene = stm.make_scene("uav_tracker", TRACKER_CASE, servo=servo)
         key, title = f"uav_tracker_2_{key}", f"uav_tracker case 2, {title}"
         return Problem(key, title, scene, (horizon,), stiff=True)
 
-    much = stm.tracker.Servo(stiffness=1e7, damping=6e4)
+    much = stm.uav.Servo(stiffness=1e7, damping=6e4)
     return [
-        held("servo", stm.tracker.Servo(), "sliders held by the table's servos (1e6 N/m)"),
+        held("servo", stm.uav.Servo(), "sliders held by the table's servos (1e6 N/m)"),
         held("stiff_servo", much, "sliders held at 1e7 N/m and 6e4 N s/m"),
     ]
 
@@ -110,5 +110,5 @@ def moving_base(model: Any, x: Any, v: Any, omega: Any) -> Any:
 
     The joints' own velocities stay, so a consistent state stays consistent.
     """
-    at = split(model.parameters.tree, x)
-    return join(at._replace(v=at.v + v[:, None], omega=at.omega + omega[:, None]))
+    at = split_vector(model.parameters.tree, x)
+    return join_coordinates(at._replace(v=at.v + v[:, None], omega=at.omega + omega[:, None]))

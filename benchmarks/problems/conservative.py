@@ -79,8 +79,8 @@ def four_bar() -> Problem:
 
 
 def _on_ground(gravity: Any) -> stm.System:
-    joints = stm.tracker.tracker_joints(stm.PART_I, stm.GROUND)
-    return stm.System(stm.tracker.tracker_bodies(stm.PART_I), joints, [stm.Gravity(gravity)])
+    joints = stm.uav.tracker_joints(stm.PART_I, stm.GROUND)
+    return stm.System(stm.uav.tracker_bodies(stm.PART_I), joints, [stm.Gravity(gravity)])
 
 
 def tracker_gravity() -> Problem:

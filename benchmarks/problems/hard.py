@@ -220,7 +220,7 @@ JUMP, PUSH, PULL = 0.31370, 3.0, -7.0  # s, N, N
 
 
 def pushed() -> tuple[stm.System, stm.State, np.ndarray]:
-    """A body on a rail whose force jumps at a time that no step knows."""
+    """A body on a rail whose force jumps at a time not given to the solver."""
     bodies, joints = on_rail(1)
     force = lambda t, _: jnp.where(t < JUMP, PUSH, PULL) * jnp.array([1.0, 0.0, 0.0])
     system = stm.System(bodies, joints, [stm.AppliedForce("m0", force)])
@@ -359,7 +359,7 @@ CASES: tuple[Hard, ...] = (
          of_positions=False),
     Hard("fast top", "a heavy top at 2,000 rad/s in steady precession", "circle at the slow rate",
          1e-6, "m", steady_top, top_off),
-    Hard("jump of a force", "a force changes its sign at a time that no step knows", "parabolas",
+    Hard("jump of a force", "a force changes its sign at a time not given to the solver", "parabolas",
          1e-6, "m", pushed, pushed_off),
     Hard("jump of a force, named", "the same with `jump_ts`", "parabolas", 1e-12, "m", pushed,
          pushed_off, {"jump_ts": (JUMP,)}),

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from stmuav_jax import AppliedForce, AppliedMoment, Gravity, LinearSpringDamper, Scene, State
 from stmuav_jax.mechanics import JointServo, Sine
-from stmuav_jax.rotorcraft import Rotors
-from stmuav_jax.tracker import LinearActuator
+from stmuav_jax.uav import LinearActuator, Rotors
 
 # Rows that each joint removes; also the joints that a peer has to know.
 ROWS = {"translational": 5, "revolute": 5, "universal": 4, "spherical": 3}

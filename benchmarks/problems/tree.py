@@ -15,11 +15,9 @@ import numpy as np
 from problems.plain import Plain, PlainJoint, UnsupportedError, plain
 
 from stmuav_jax import Scene, State
-from stmuav_jax.dynamics.tree.coordinates import read
-from stmuav_jax.dynamics.tree.frames import motion_groups
-from stmuav_jax.dynamics.tree.parameters import TreeParameters, tree_parameters
-from stmuav_jax.dynamics.tree.poses import by_group
-from stmuav_jax.dynamics.tree.topology import spanning_tree
+from stmuav_jax.dynamics.tree.coordinates import read_coordinates
+from stmuav_jax.dynamics.tree.parameters import TreeParameters, by_group, tree_parameters
+from stmuav_jax.dynamics.tree.topology import motion_groups, spanning_tree
 
 
 @dataclass(frozen=True)
@@ -135,7 +133,7 @@ def _link(joint: PlainJoint, parent: int, child: int, ahead: int, forward: bool)
     return Link(KINDS[joint.kind], parent, child, ahead, first, second, joint)
 
 
-_read = eqx.filter_jit(read)
+_read = eqx.filter_jit(read_coordinates)
 
 
 def coordinates(tree: Tree, state: State) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -17,7 +17,7 @@ from shared.clock import compiled, measure
 from shared.methods import trajectory
 
 import stmuav_jax as stm
-from stmuav_jax.rotorcraft.rotor import Rotors
+from stmuav_jax.uav.rotor import Rotors
 
 DIFFERENCES = (4e-3, 2e-3, 1e-3)
 PARAMETERS = (

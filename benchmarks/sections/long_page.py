@@ -29,7 +29,7 @@ def name_of(family: str) -> str:
 
 
 def show(path: Path, folder: Path) -> str:
-    """The tables for docs/long_times.md, and where the figures are that are drawn into a folder."""
+    """The tables for docs/simulation.md, and where the figures are that are drawn into a folder."""
     record = json.loads(path.read_text())
     problems = record["problems"]
     parts = [cheapest(problems, level) for level in problems[0]["cheapest"]]

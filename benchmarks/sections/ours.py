@@ -11,14 +11,11 @@ from shared.clock import compiled
 from shared.methods import evaluations, trajectory, words
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration.rosenbrock import Rodas5P
 
 
 def label(formulation: Any) -> str:
     """A formulation in words."""
-    if isinstance(formulation, stm.Tree):
-        return "tree"
-    return "augmented" if formulation.solve == "structured" else "augmented, dense"
+    return "tree" if isinstance(formulation, stm.Tree) else "augmented"
 
 
 def outcome(path: stm.dynamics.Trajectory, fine: Any, solver: Any) -> Outcome:
@@ -46,8 +43,6 @@ class Ours(Peer):
         self.name = f"stmuav-jax, {label(formulation)}"
         self._settings = [Setting(self.solver_name, tolerance=x) for x in tolerances]
         self._kept: dict[str, tuple[Any, float]] = {}
-        if isinstance(solver, Rodas5P):
-            self.caveats = ("Jacobians, one a step, are not counted as evaluations.",)
 
     def version(self) -> str:
         return stm.__version__
@@ -89,7 +84,7 @@ def explicit(tolerances: tuple[float, ...], *, redundant: bool = False) -> list[
 
 def for_stiff(tolerances: tuple[float, ...]) -> list[Ours]:
     """Explicit and implicit solvers on the spanning tree."""
-    solvers = (diffrax.Tsit5(), Rodas5P(), stm.dynamics.kvaerno5())
+    solvers = (diffrax.Tsit5(), stm.dynamics.kvaerno5())
     return [Ours(stm.Tree(), solver, tolerances) for solver in solvers]
 
 

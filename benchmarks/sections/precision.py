@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from peers.adapter import Outcome, Peer, Setting
 from problems.compared import Problem, published, stiff, tracker
-from sections.native import native
 from sections.ours import Ours, explicit, for_stiff
 from sections.size import Size
 from shared.clock import Timing, measure, summary
@@ -168,11 +167,10 @@ def describe(others: list[Peer]) -> list[dict[str, Any]]:
 
 
 def work_precision(size: Size, others: list[Peer]) -> dict[str, Any]:
-    """The seven-body UAV, ours with and without native loops, and all peers."""
+    """The seven-body UAV, ours and all peers."""
     implicit = for_stiff(size.stiff_tolerances)[1:]
-    alike = native(size.tolerances, size.repeats)[: size.methods]
     ours = [*explicit(size.tolerances), *implicit]
-    curves = [curve(tracker(size.horizons), ours, [*alike, *others], size)]
+    curves = [curve(tracker(size.horizons), ours, others, size)]
     return {"what": "time against error, uav_tracker case 2", "curves": curves}
 
 

@@ -13,8 +13,8 @@ from shared.clock import compiled, measure
 from shared.methods import trajectory
 
 import stmuav_jax as stm
-from stmuav_jax.algebra.rotation import rotation_matrix
-from stmuav_jax.rotorcraft.rotor import Rotors
+from stmuav_jax.math.rotation import rotation_matrix
+from stmuav_jax.uav.rotor import Rotors
 
 TOLERANCE = 1e-8
 # of the comparison with the body by hand

@@ -49,8 +49,7 @@ def formulation_cost(formulation: Any, scene: stm.Scene, size: Size) -> list[dic
     single = to_vector(scene.state0)
     ops = operations(jax.jit(field).lower(single))
     rows = []
-    dense = isinstance(formulation, stm.Augmented) and formulation.solve == "dense"
-    for batch in (1,) if dense else (1, *size.batches):
+    for batch in (1, *size.batches):
         count = max(1, size.evaluations // batch)
         x = single if batch == 1 else jax.vmap(to_vector)(disturbed(scene, batch))
         run = one_after_the_other(field if batch == 1 else jax.vmap(field), count)
@@ -67,7 +66,7 @@ def formulation_cost(formulation: Any, scene: stm.Scene, size: Size) -> list[dic
 def acceleration(size: Size, others: list[Peer]) -> dict[str, Any]:
     """One evaluation of all accelerations, a lower bound of any explicit step."""
     scene = tracker(size.horizons).scene
-    kinds = (stm.Tree(), stm.Augmented(), stm.Augmented(solve="dense"))[: size.methods]
+    kinds = (stm.Tree(), stm.Augmented())[: size.methods]
     rows = [row for formulation in kinds for row in formulation_cost(formulation, scene, size)]
     for peer in others:
         row: dict[str, Any] = {"method": peer.name, "batch": 1, "seconds": None, "failure": ""}

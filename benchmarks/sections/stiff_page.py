@@ -14,7 +14,7 @@ STYLES = {solver: look(k) | {"label": name} for k, (solver, name) in enumerate(N
 
 
 def show(path: Path, folder: Path) -> str:
-    """The tables for docs/stiff.md, and where the figures are that are drawn into a folder."""
+    """The tables for docs/simulation.md, and where the figures are that are drawn into a folder."""
     record = json.loads(path.read_text())
     scenes = record["scenes"]
     parts = [fastest(scenes, level) for level in scenes[0]["cheapest"]]
@@ -47,7 +47,7 @@ def eigenvalues(scenes: list[Row]) -> str:
     """The largest eigenvalue at the start and on the way, and what the references differ by."""
     at_start = lambda e: "{:.2g} {:+.2g} i".format(*e["start_value"])
     on_the_way = lambda e: f"{e['largest']:.2g} at {e['largest_at']:g} s"
-    apart = lambda r: ", ".join(power(a, 0) for a in r["dopri8_apart"])
+    apart = lambda r: ", ".join(power(a, 0) for key in r if key.endswith("_apart") for a in r[key])
     return titled(
         "Largest eigenvalue in size [1/s]", scenes, ("scene", "name"),
         ("at the start", "eigenvalue", at_start),
@@ -100,6 +100,9 @@ def work(record: Row) -> Figure:
         ax.set_title(named(scene))
     for ax in axes[len(scenes) :]:
         ax.set_axis_off()
+    # of shared axes only the last row has labels, which an incomplete row leaves out for some columns
+    for ax in axes[len(scenes) - columns : len(scenes)]:
+        ax.tick_params(labelbottom=True)
     figure.supxlabel("largest position error [m]", fontsize=9)
     figure.supylabel(f"run time for {record['t1']:g} s of motion [s]", fontsize=9)
     legend(figure, axes, 4, loc="outside upper center")

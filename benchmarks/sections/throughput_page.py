@@ -1,4 +1,4 @@
-"""The page docs/throughput.md from results/montecarlo.json, with its figure."""
+"""The section on throughput of docs/studies.md from results/montecarlo.json, with its figure."""
 
 import json
 import math
@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from shared.page_sections import write_section
 from shared.pages import Row, listed, panels, save
 
 from stmuav_jax.figures import look
-from stmuav_jax.files.netcdf import write_atomically
 
 PROGRAM = ("program", "tolerance or step", "per second", "median [m]", "largest [m]", "failure")
 
@@ -56,7 +56,8 @@ def figure(content: Row) -> Figure:
     ax.set_xticks(lanes, [str(k) for k in lanes])
     ax.set_ylim(bottom=0)
     ax.set(
-        xlabel="flights that go on together (lanes)", ylabel="flights per second, one core [1/s]"
+        xlabel="flights that are integrated together (lanes)",
+        ylabel="flights per second, one core [1/s]",
     )
     ax.legend(fontsize=8)
     return drawn
@@ -73,32 +74,31 @@ def write_page(result: Path, page: Path) -> Path:
     spent = lambda r: f"{100 * r['per_second'] / (r['devices'] * cores[0]['per_second']):.0f} %"
     peers: list[Row] = [dict(zip(PROGRAM, of_peer(r), strict=True)) for r in content["peers"]]
     lines = [
-        "# Throughput of studies", "",
-        "Made by `python benchmarks/montecarlo.py` from `benchmarks/results/montecarlo.json`; do not edit.",
+        "## Throughput", "",
+        "Measured by `python benchmarks/montecarlo.py` ([result](../benchmarks/results/montecarlo.json)).",
         "",
         f"Flights of {content['what'].split(', ')[1]} to {content['t1']:g} s, {content['flights']} of them, Dopri8 at "
         f"{content['tolerance']:g}; medians. {about['cores']} cores, commit {about['commit'][:10]}"
-        f"{dirty}, {about['date'][:10]}, load {about['load_at_start']:.0f} when it began (work that takes "
-        "all cores competes with other processes there).",
-        "", f"![lanes]({picture.relative_to(page.parent)})", "", "## One core", "",
+        f"{dirty}, {about['date'][:10]}, equations compiled by {about['versions'].get('equations', 'XLA')}, load "
+        f"{about['load_at_start']:.0f} at the start (work on all cores competes with other processes).",
+        "", f"![lanes]({picture.relative_to(page.parent)})", "", "### One core", "",
         *listed(rows, "lanes", ("flights per second", "per_second", one),
                 ("us per step and flight", "microseconds_per_step", one),
                 ("compile [s]", "compile_seconds", one), "failed"),
-        "", f"One by one: {one(content['one_lane_per_second'])} per second. With native loops, of fewer flights: "
-        + ", ".join(f"{one(v)} by lanes of {k}" for k, v in content["native_per_second"].items()) + ".",
-        "", "## Error", "",
+        "", f"One by one: {one(content['one_lane_per_second'])} per second.",
+        "", "### Error of a batch", "",
         *listed(tried, ("tolerance", "tolerance", "{:g}".format),
                 ("median [m]", "median_error", "{:.1e}".format),
                 ("largest [m]", "largest_error", "{:.1e}".format)),
-        "", "## Other programs, one core", "", *listed(peers, *PROGRAM), "",
+        "", "### Other programs, one core", "", *listed(peers, *PROGRAM), "",
         *(f"stmuav-jax completes {one(rate)} flights per second at a largest error of "
           f"{error:.1e} m. {p['method']} completes "
           f"{one(p['per_second'])} at {p['largest_error']:.1e} m, its fastest setting with at most twice "
           f"that error: a ratio of {rate / p['per_second']:.2f}." for p in comparable(content)),
-        "", "## More cores, and the store", "",
+        "", "### More cores, and the store", "",
         *listed(cores, ("cores", "devices"), "flights", ("per second", "per_second", one),
                 ("efficiency", None, spent), ("with study and store", "per_second_stored", one),
                 ("overhead", "overhead", lambda x: f"{100 * x:.1f} %")),
         "",
     ]  # fmt: skip
-    return write_atomically(page, "\n".join(lines).encode())
+    return write_section(page, "benchmarks/montecarlo.py", "\n".join(lines))

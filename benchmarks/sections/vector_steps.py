@@ -1,8 +1,8 @@
 """Steps of many flights at once, beside crazyflow and rotorpy, and closed loops against real time.
 
 A step is one control period of 1/400 s with held inputs, from given starts, of all flights in one
-compiled program: of hexacopters and of UAVs with tracker by `Plant.step`, of a training environment by
-`Environment.step_or_reset`, and of each peer's own quadrotor. With the rates stand the errors of one
+compiled program: of hexacopters and of UAVs with tracker by `Plant.step`, of an environment that
+begins anew after its end by `step_or_reset`, and of each peer's own quadrotor. With the rates stand the errors of one
 step and of 0.1 s against eight times as many steps of RK4 of the same program in double precision.
 Apart from these, 30 s of the report's case 1 with noisy sensors and the estimator in the loop. Times
 are those of the processor.
@@ -30,7 +30,6 @@ from peers import flying
 from peers.adapter import Peer
 from sections.size import Size
 from shared.clock import compiled
-from shared.native import with_native_loops
 
 import stmuav_jax as stm
 
@@ -71,7 +70,7 @@ def ready(machine: dict[str, Any], flights: int, steps: int = 1) -> tuple[Any, A
 
     quaternion = jnp.roll(jnp.asarray(at.quaternion), 1, axis=1)
     given = jnp.asarray(at.position), quaternion, jnp.asarray(at.velocity), jnp.asarray(at.omega)
-    return plant, stm.algebra.outer_jit(lambda *of: jax.vmap(begun)(*of))(*given), inputs
+    return plant, stm.math.outer_jit(lambda *of: jax.vmap(begun)(*of))(*given), inputs
 
 
 def moved(state: stm.State, r: Any, p: Any, v: Any, omega: Any) -> stm.State:
@@ -123,7 +122,7 @@ def numbers_of(tree: Any) -> list[Any]:
 def poses(machine: dict[str, Any], flights: int, finer: int) -> dict[int, flying.Poses]:
     """Poses of the base after one period and after more."""
     plant, now, inputs = ready(machine, flights, finer)
-    step = stm.algebra.outer_jit(lambda now, inputs: jax.vmap(plant.step)(now, inputs))
+    step = stm.math.outer_jit(lambda now, inputs: jax.vmap(plant.step)(now, inputs))
 
     def look(now: Any) -> flying.Poses:
         state = now.state
@@ -146,22 +145,35 @@ def ours(size: Size) -> Iterator[dict[str, Any]]:
     yield {**RK4, **trained(size)}
 
 
+def observe(now: Any) -> Any:
+    """Position, Euler parameters, velocity and angular velocity of the first body (13,)."""
+    state = now.state
+    return jnp.concatenate([x[0] for x in (state.r, state.p, state.v, state.omega)])
+
+
+def step_or_reset(plant: Any, episode: Any, inputs: Any) -> Any:
+    """State, observation, reward and end one period later, or of a new start where the episode is over."""
+    now, _, _, is_over = episode
+    begun, after = plant.reset(now.key), plant.step(now, inputs)
+    now = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), begun, after)
+    seen = observe(now)
+    reward = jnp.where(is_over, 0.0, -jnp.sum(seen[:3] ** 2))
+    return now, seen, reward, (jnp.sum(seen[:3] ** 2) > 100.0) | (now.k >= 400)
+
+
 def trained(size: Size) -> dict[str, Any]:
     """Row of a training environment: a hexacopter's step, observation, reward and new start."""
     plant, _, inputs = ready(MACHINES["hexacopter"], size.flights)
 
-    def observe(now: Any) -> Any:
-        state = now.state
-        return jnp.concatenate([x[0] for x in (state.r, state.p, state.v, state.omega)])
+    def begin(key: Any) -> Any:
+        now = plant.reset(key)
+        return now, observe(now), jnp.zeros(()), jnp.zeros((), bool)
 
-    environment = stm.control.Environment(
-        plant, observe, lambda before, inputs, after: -jnp.sum(observe(after)[:3] ** 2),
-        lowest=0.5 * plant.before, highest=2.0 * plant.before, samples=400,
-        failed=lambda now: jnp.sum(now.state.r[0] ** 2) > 100.0,
-    )  # fmt: skip
     keys = jax.random.split(jax.random.key(0), size.flights)
-    begun = stm.algebra.outer_jit(lambda keys: jax.vmap(environment.reset)(keys))(keys)
-    step = lambda episodes, inputs: jax.vmap(environment.step_or_reset)(episodes, inputs)
+    begun = stm.math.outer_jit(lambda keys: jax.vmap(begin)(keys))(keys)
+    step = lambda episodes, inputs: jax.vmap(lambda e, u: step_or_reset(plant, e, u))(
+        episodes, inputs
+    )
     row = rated(step, (begun, inputs), size, 1)
     return {"machine": "environment of a hexacopter", "side_by_side": size.flights, **row}
 
@@ -226,7 +238,5 @@ def vector_steps(size: Size, there: list[Peer]) -> dict[str, Any]:
         print(row, flush=True)
         content["rows"].append(row)
     if size.closed_loop:
-        plain = {"native_loops": False, **closed(size.closed_loop)}
-        native = {"native_loops": True, **with_native_loops(closed, size.closed_loop)}
-        content["closed_loops"] = [plain, native]
+        content["closed_loops"] = [closed(size.closed_loop)]
     return content

@@ -97,7 +97,7 @@ def compiled(
     """
     jax.clear_caches()
     start = clock()
-    call: Any = stm.algebra.outer_jit(function)
+    call: Any = stm.math.outer_jit(function)
     done = call.lower(*arguments).compile()
     return done, clock() - start
 

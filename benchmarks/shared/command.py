@@ -1,13 +1,12 @@
 """Command line of the benchmarks, which all have the same options and write the same way."""
 
 import argparse
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
-from shared.record import ALLOW, RESULTS, ROOT, DirtyTreeError, refuse, write
+from shared.record import RESULTS, ROOT, write_record
 
 # Every benchmark computes in double precision; this comes before the package makes any array.
 jax.config.update("jax_enable_x64", True)
@@ -15,31 +14,15 @@ jax.config.update("jax_enable_x64", True)
 FIGURES = ROOT / "docs" / "figures" / "benchmarks"
 
 
-def parser(about: str | None, **quick: str) -> argparse.ArgumentParser:
-    """A parser with the options that all scripts share: `--results` and `--allow-dirty`."""
+def parser(about: str | None, **switches: str) -> argparse.ArgumentParser:
+    """A parser with the option `--results` that all scripts share, and switches by name."""
     made = argparse.ArgumentParser(
         description=about, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     made.add_argument("--results", type=Path, default=RESULTS)
-    words = "overwrite committed results from a tree with changes; the result records it"
-    made.add_argument("--allow-dirty", action="store_true", help=words)
-    for name, said in quick.items():
-        made.add_argument(f"--{name}", action="store_true", help=said)
+    for name, help_text in switches.items():
+        made.add_argument(f"--{name}", action="store_true", help=help_text)
     return made
-
-
-def begin(options: argparse.Namespace) -> None:
-    """Refuse before anything is measured what `write` would refuse afterwards.
-
-    Raises:
-        SystemExit: with the reason, where `write` would raise.
-    """
-    if options.allow_dirty:
-        os.environ[ALLOW] = "1"
-    try:
-        refuse(options.results)
-    except DirtyTreeError as error:
-        raise SystemExit(str(error)) from None
 
 
 def benchmark(
@@ -60,10 +43,9 @@ def benchmark(
     if show:
         made.add_argument("--figures", type=Path, default=FIGURES)
     options = made.parse_args()
-    begin(options)
     path = options.results / f"{name}.json"
     for content in measure(sizes[options.quick]):
-        path = write(name, content, options.results)
+        path = write_record(name, content, options.results)
     print(path)
     if show:
         print(show(path, options.figures))

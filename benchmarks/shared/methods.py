@@ -5,12 +5,9 @@ from typing import Any
 import diffrax
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration.explicit import coefficients
-from stmuav_jax.dynamics.integration.rosenbrock import Rodas5P
+from stmuav_jax.dynamics.integration.solvers import butcher_coefficients
 
 STEPS = 1_000_000
-# Stages of a Rosenbrock step; its Jacobian comes on top.
-RODAS_STAGES = 8
 
 
 def trajectory(
@@ -31,10 +28,8 @@ def trajectory(
 
 def evaluations(solver: Any, steps: int) -> int | None:
     """Accelerations in so many attempted steps; None for iterative solvers, which do not count."""
-    if isinstance(solver, Rodas5P):
-        return RODAS_STAGES * steps
     if isinstance(solver, diffrax.AbstractERK):
-        return len(coefficients(solver)[3]) * steps
+        return len(butcher_coefficients(solver)[3]) * steps
     return None
 
 

@@ -13,8 +13,6 @@ Row = dict[str, Any]
 # A column: the key that is also its head; or head and key; or head, key and format. A format with
 # no key is given the whole row.
 Column = str | tuple[Any, ...]
-# What the names of methods end with that run in the process with native loops.
-NATIVE = ", native loops"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> Lines:
@@ -54,40 +52,9 @@ def number(value: float | None, unit: float = 1.0, digits: int = 3) -> str:
     return "-" if value is None else f"{unit * value:.{digits}g}"
 
 
-def micro(value: float | None) -> str:
-    """Three digits of a millionth, or a dash."""
-    return number(value, 1e6)
-
-
 def power(value: float | None, behind: int = 1) -> str:
     """One digit, some behind the point and a power of ten, or a dash."""
     return "-" if value is None else f"{value:.{behind}e}"
-
-
-def whole(value: int | None) -> str:
-    """A count, or a dash."""
-    return "-" if value is None else str(value)
-
-
-def milliseconds(timing: Row | None) -> str:
-    """Median and, in brackets, spread; a single run is marked."""
-    if timing is None:
-        return "-"
-    if timing["repeats"] == 1:
-        return f"{1e3 * timing['median']:.3g} (once)"
-    return f"{1e3 * timing['median']:.3g} ({1e3 * timing['spread']:.1g})"
-
-
-def setting(row: Row) -> str:
-    """Tolerance or step of a run."""
-    if row.get("tolerance") is not None:
-        return f"tol {row['tolerance']:.0e}"
-    return f"h = {row['step']:g} s" if row.get("step") is not None else "-"
-
-
-def ours(rows: Sequence[Row]) -> list[Row]:
-    """The rows of this package."""
-    return [row for row in rows if row["method"].startswith("stmuav-jax")]
 
 
 def panels(rows: int, columns: int, height: float, **shared: Any) -> tuple[Figure, list[Any]]:

@@ -1,1 +1,1 @@
-"""Checks of user input and the errors that they raise. Floor 0."""
+"""Checks of user input and the errors that they raise."""

@@ -1,20 +1,24 @@
-"""Checks of users' files against pydantic models, with errors in the users' own words.
+"""Checks of what users write in files and options, with errors in the users' own words.
 
-A model states the names, types and ranges that a file may hold. `checked` validates plain data,
-such as a TOML file's, by a model; its error gives the place of the first entry that does not fit,
-the value found there, and what would be valid.
+A pydantic model states the names, types and ranges of a file's entries; `validate_model` validates plain data by
+it. An option of a scene is a dataclass whose fields `quantity` describes; `option_from_plain` makes one.
 """
 
+import dataclasses
 import math
+import re
+import reprlib
+import unicodedata
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import pydantic
-from pydantic import ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field
 
 from .errors import SettingError, nearest_names
 
 Model = TypeVar("Model", bound=pydantic.BaseModel)
+Option = TypeVar("Option")
 
 # Characters of a value or a name that an error message shows.
 SHOWN = 80
@@ -26,154 +30,222 @@ class Entries(pydantic.BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
 
 
-def _tuples(given: Any) -> Any:
+def _convert_lists(value: Any) -> Any:
     """Convert lists and arrays to tuples, as strict models require."""
-    given = given.tolist() if hasattr(given, "tolist") else given
-    return tuple(_tuples(x) for x in given) if isinstance(given, list) else given
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return tuple(_convert_lists(x) for x in value) if isinstance(value, list) else value
 
 
-Tuples = pydantic.BeforeValidator(_tuples)
+Tuples = pydantic.BeforeValidator(_convert_lists)
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Triple = Annotated[tuple[Finite, Finite, Finite], Tuples]
+# Largest seed that the store's column types can hold.
+MOST_SEED = 2**63 - 1
+Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
 # Numbers of samples, chunks or steps: integers from 1 on that doubles represent exactly.
 MOST = 10**12
 Count = Annotated[int, Field(strict=True, ge=1, le=MOST)]
 
 
-def shown(value: Any, most: int = SHOWN) -> str:
-    """Text of a value for an error message: its Python form, shortened in the middle.
+class _Shortened(reprlib.Repr):
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel, self.maxlist, self.maxstring, self.maxother = 2, 6, SHOWN, SHOWN
 
-    Large integers and nested lists are shortened before they are written out.
-    """
-    if isinstance(value, int) and abs(value) >= 10**40:
-        return f"a whole number of about {int(value.bit_length() * math.log10(2)) + 1} digits"
-    if isinstance(value, str):
-        value = value if len(value) <= 4 * most else value[: 2 * most] + value[-2 * most :]
-        text = repr(value)
-    elif isinstance(value, Mapping):
-        names = ", ".join(shown(k, 20) for k in list(value)[:4])
-        text = f"a table of {names}" if names else "an empty table"
-    elif isinstance(value, list | tuple):
-        few = ", ".join(
-            "..." if isinstance(x, list | tuple | Mapping) else shown(x, 20) for x in value[:6]
-        )
-        text = f"[{few}{', ...' if len(value) > 6 else ''}]"
-    else:
-        text = repr(value)
-    half = most // 2
-    return text if len(text) <= most else f"{text[: half - 3]} ... {text[-half + 2 :]}"
+    def repr_int(self, x: int, level: int) -> str:
+        if abs(x) < 10**40:
+            return repr(x)
+        # Python refuses to write out integers of thousands of digits
+        return f"a whole number of about {int(x.bit_length() * math.log10(2)) + 1} digits"
 
 
-def named(name: Any, most: int = SHOWN) -> str:
+def format_value(value: Any) -> str:
+    """Text of a value for an error message: its Python form, shortened to `SHOWN` characters."""
+    text = _Shortened().repr(value)
+    return text if len(text) <= SHOWN else f"{text[: SHOWN // 2 - 3]} ... {text[-SHOWN // 2 + 2 :]}"
+
+
+def quote_name(name: Any) -> str:
     """Text of a name for an error message, quoted and shortened."""
-    return shown(str(name), most)
+    return format_value(str(name))
 
 
-def checked(model: type[Model], given: Any, what: str) -> Model:
+def validate_model(model: type[Model], data: Any, owner: str) -> Model:
     """Validate plain data and return them as a model.
 
     Args:
-        what: owner of the entries, such as "A study"; it begins some of the messages.
+        owner: owner of the entries, such as "A study"; it begins some of the messages.
 
     Raises:
         SettingError: an entry does not fit; the message says where the first one is, what it
             holds and what would be valid, and for an unknown entry the nearest known name.
     """
-    if not isinstance(given, Mapping):
-        raise SettingError(f"{what} must be a table of entries, but it is {shown(given)}.")
-    for key in given:
+    if not isinstance(data, Mapping):
+        raise SettingError(f"{owner} must be a table of entries, but it is {format_value(data)}.")
+    for key in data:
         if not isinstance(key, str):
-            raise SettingError(f"{what} has the entry {shown(key)}, which is no name.")
+            raise SettingError(f"{owner} has the entry {format_value(key)}, which is no name.")
     try:
-        return model.model_validate(dict(given))
+        return model.model_validate(dict(data))
     except pydantic.ValidationError as error:
-        found = error.errors(include_url=False, include_context=True)
+        errors = error.errors(include_url=False)
         # an unknown name often explains why another name is missing
-        first = next((one for one in found if one["type"] == "extra_forbidden"), found[0])
-        raise SettingError(_words(first, model, what)) from None
+        first = next(
+            (error_entry for error_entry in errors if error_entry["type"] == "extra_forbidden"),
+            errors[0],
+        )
+        raise SettingError(_describe_error(first, model, owner)) from None
     except (OverflowError, RecursionError) as error:
-        raise SettingError(f"{what} has entries that cannot be read: {error}.") from None
+        raise SettingError(f"{owner} has entries that cannot be read: {error}.") from None
 
 
-def _words(error: Any, model: type[pydantic.BaseModel], what: str) -> str:
-    """Sentence that describes one of pydantic's errors."""
-    kind, given, limits = error["type"], error["input"], error.get("ctx", {})
-    loc = [part for part in error["loc"] if part != "[key]"]
-    where = ".".join(shown(part, 60).strip("'\"") for part in loc)
-    if kind == "missing" and isinstance(loc[-1], int):
-        where = where.rpartition(".")[0]
-        return f"'{where}' must have more entries, but it is {shown(given)}."
-    if kind == "missing":
-        return f"{_owner(error, what)} needs '{error['loc'][-1]}'."
-    if kind == "extra_forbidden":
-        known = _known(model, error["loc"][:-1])
-        name = str(error["loc"][-1])
-        near = nearest_names(name[:SHOWN], known)
-        return f"{_owner(error, what)} has no entry {named(name)}.{near}"
-    if kind == "literal_error":
-        said = limits["expected"].replace("'", "")
-        choices = [word.strip() for part in said.split(" or ") for word in part.split(",")]
-        near = nearest_names(given[:SHOWN], choices) if isinstance(given, str) else ""
-        # the message names the choices already
-        near = near.partition(" Known names")[0]
-        words = " or ".join((", ".join(choices[:-1]), choices[-1])) if choices[1:] else choices[0]
-        return f"'{where}' must be {words}, not {shown(given)}.{near}"
-    if kind == "value_error":
-        return f"'{where}' {limits['error']}"
-    return f"'{where}' must be {_wanted(kind, limits)}, but it is {shown(given)}."
-
-
-def _owner(error: Any, what: str) -> str:
-    """Owner of the entry in an error: the whole file or a table within it."""
-    inner = ".".join(str(part)[:SHOWN] for part in error["loc"][:-1])
-    return f"'{inner}'" if inner else what
-
-
-_TYPES = {
-    "float": "a number", "int": "a whole number", "bool": "true or false", "string": "text",
-    "list": "a list", "tuple": "a list", "dict": "a table", "model": "a table",
-    "mapping": "a table",
+# Words of pydantic's messages, and those of a user.
+_WORDS = {
+    r"^(Input|\w+) should ": "must ", r" after validation, not .*": "", r", got .*": "",
+    "a valid number": "a number", "a valid integer": "a whole number",
+    "a valid boolean": "true or false", "a valid string": "text", "a valid (tuple|list)": "a list",
+    "a valid dictionary.*": "a table", "greater than or equal to": "at least",
+    "less than or equal to": "at most",
 }  # fmt: skip
 
 
-def _wanted(kind: str, limits: Mapping[str, Any]) -> str:
-    """Description of a valid value for a kind of pydantic error."""
-    if kind == "greater_than" and limits["gt"] == 0:
-        return "finite and positive"
-    for name, key, words in (
-        ("greater_than_equal", "ge", "at least"), ("greater_than", "gt", "greater than"),
-        ("less_than_equal", "le", "at most"), ("less_than", "lt", "less than"),
-        ("multiple_of", "multiple_of", "a multiple of"),
-    ):  # fmt: skip
-        if kind == name:
-            return f"{words} {limits[key]:g}" if isinstance(limits[key], float) else (
-                f"{words} {limits[key]}"
-            )  # fmt: skip
-    if kind == "finite_number":
-        return "finite"
-    if kind in ("too_short", "too_long"):
-        least = limits.get("min_length", limits.get("max_length"))
-        return f"of {'at least' if kind == 'too_short' else 'at most'} {least} entries"
-    if kind == "int_parsing_size":
-        return "a whole number of fewer digits"
-    return _TYPES.get(kind.split("_")[0], "of another kind")
+def _describe_error(error: Any, model: type[pydantic.BaseModel], subject: str) -> str:
+    """Sentence that describes one of pydantic's errors."""
+    kind, value, path = error["type"], error["input"], [x for x in error["loc"] if x != "[key]"]
+    *outer, last = path
+    inner = ".".join(str(part)[:SHOWN] for part in outer)
+    owner, where = (
+        f"'{inner}'" if inner else subject,
+        ".".join([*inner.split(".")[: len(outer)], ""]),
+    )
+    where += str(last)[:SHOWN]
+    if kind == "missing" and isinstance(last, int):
+        return f"'{inner}' must have more entries, but it is {format_value(value)}."
+    if kind == "missing":
+        return f"{owner} needs '{last}'."
+    if kind == "extra_forbidden":
+        return f"{owner} has no entry {quote_name(last)}.{nearest_names(str(last), _entry_names(model, outer))}"
+    if kind == "value_error":
+        return f"'{where}' {error['ctx']['error']}"
+    message, name_hint = error["msg"], ""
+    if kind == "literal_error":
+        choices = re.findall(r"'(.*?)'", message)
+        name_hint = (
+            nearest_names(value, choices).partition(" Known")[0] if isinstance(value, str) else ""
+        )
+    for pattern, replacement in _WORDS.items():
+        message = re.sub(pattern, replacement, message)
+    # pydantic writes small limits out
+    message = re.sub(r"\b0\.0000\d+", lambda number: f"{float(number[0]):g}", message)
+    return f"'{where}' {message}, but it is {format_value(value)}.{name_hint}"
 
 
-def _known(model: Any, where: Iterable[Any]) -> list[str]:
+def _entry_names(model: Any, path: Iterable[Any]) -> list[str]:
     """Names of the entries of a model, or of a table within it."""
-    for part in where:
-        fields = getattr(model, "model_fields", {})
-        if part in fields:
-            model = _inner(fields[part].annotation)
-        # other parts are names in a table of tables of one kind
+    for part in path:
+        if field := getattr(model, "model_fields", {}).get(part):
+            kinds = [field.annotation]
+            # the model in an annotation such as `dict[str, Model]` or `Model | None`
+            while kinds and not hasattr(kinds[0], "model_fields"):
+                kinds = [*kinds[1:], *getattr(kinds[0], "__args__", ())]
+            model = kinds[0] if kinds else None
     return list(getattr(model, "model_fields", {}))
 
 
-def _inner(annotation: Any) -> Any:
-    """Model inside an annotation such as `dict[str, Model]` or `Model | None`; None without one."""
-    if isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel):
-        return annotation
-    for part in getattr(annotation, "__args__", ()):
-        if (found := _inner(part)) is not None:
-            return found
+class OptionField(NamedTuple):
+    """Description of one field of an option.
+
+    Attributes:
+        description: a noun phrase for the help. unit: SI, "" where there is none.
+        counts: how many numbers it may consist of. kind: float, int, or bool for a switch that is
+            off by default.
+    """
+
+    description: str
+    unit: str = ""
+    counts: tuple[int, ...] = (1,)
+    kind: type = float
+
+
+def quantity(
+    description: str, unit: str = "", *counts: int, kind: type = float, default: Any = None
+) -> Any:
+    """Field of an option's dataclass; None by default, which leaves the number to the scene."""
+    described = OptionField(description, unit, counts or (1,), kind)
+    return dataclasses.field(default=default, metadata={"quantity": described})
+
+
+def quantity_fields(option: Any) -> dict[str, OptionField]:
+    """Descriptions of an option's fields by name; empty for any other class."""
+    fields = dataclasses.fields(option) if dataclasses.is_dataclass(option) else ()
+    return {f.name: f.metadata["quantity"] for f in fields if "quantity" in f.metadata}
+
+
+def option_from_plain(kind: type[Option], plain: Any, where: str) -> Option:
+    """An option from plain data, such as {"stiffness": 1e6}.
+
+    Args:
+        where: the option's name, for messages.
+
+    Raises:
+        SettingError: no table, an unknown field (with the known ones), a value of another type or
+            of another number of entries. Ranges are the business of what the option builds.
+    """
+    if not isinstance(plain, Mapping):
+        raise SettingError(
+            f"Option '{where}' must be a table of its fields, not {format_value(plain)}."
+        )
+    field_quantities, values = quantity_fields(kind), {}
+    for name, value in plain.items():
+        if name not in field_quantities:
+            name_hint = nearest_names(str(name), field_quantities)
+            raise SettingError(f"Option '{where}' has no field {quote_name(name)}.{name_hint}")
+        _, unit, counts, number = field_quantities[name]
+        entries = tuple(value) if isinstance(value, list | tuple) else (value,)
+        types = {float: (float, int), int: (int,), bool: (bool,)}[number]
+        fits = all(
+            isinstance(x, types) and isinstance(x, bool) == (number is bool) for x in entries
+        )
+        if not fits or len(entries) not in counts:
+            requirement = {float: "number", int: "whole number", bool: "true or false"}[number]
+            if number is not bool:
+                requirement = (
+                    f"a {requirement}"
+                    if counts == (1,)
+                    else f"{' or '.join(map(str, counts))} {requirement}s"
+                )
+            unit = f" [{unit}]" if unit else ""
+            raise SettingError(
+                f"'{where}.{name}' must be {requirement}{unit}, not {format_value(value)}."
+            )
+        alone = len(entries) == 1 and 1 in counts
+        values[name] = entries[0] if alone else entries
+    return kind(**values)
+
+
+# Longest name of a study, mission or model, which a folder has too.
+LONGEST_NAME = 100
+
+
+def name_fault(name: str) -> str | None:
+    """Requirement that a study's name, used for a folder, breaks: words after 'must', or None."""
+    if not 1 <= len(name) <= LONGEST_NAME:
+        return f"have 1 to {LONGEST_NAME} characters"
+    if name.startswith(".") or name != name.strip():
+        return "begin with neither a dot nor a space, nor end with one"
+    if any(c in '/\\:*?"<>|' or unicodedata.category(c).startswith("C") for c in name):
+        return "have no separators of folders, no wildcards and no control characters"
     return None
+
+
+def _check_name(name: str) -> str:
+    if fault := name_fault(name):
+        raise ValueError(
+            f"must {fault}, since a folder has it too, but it is {format_value(name)}."
+        )
+    return name
+
+
+Name = Annotated[str, AfterValidator(_check_name)]

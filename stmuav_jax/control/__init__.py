@@ -1,5 +1,5 @@
-"""Closed loops: sampled plants, controllers, runs of both together. Floor 11."""
+"""Closed loops: sampled plants, controllers, runs of both together."""
 
-import lazy_loader
+from ..checks.namespace import attach_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

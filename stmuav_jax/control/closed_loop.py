@@ -1,29 +1,256 @@
-"""Run of a closed loop with its certificate."""
+"""Closed loop of a plant and a controller: as one pure function of JAX, and as a run with its certificate.
+
+At each sample the controller reads the estimate and the reference and sets the inputs, which are
+held until the next. A controller is any function
+
+    (estimate, reference, memory) -> (inputs, memory).
+"""
 
 import dataclasses
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from ..algebra.compiler import program
-from ..algebra.rotation import conjugate, product, to_rotation_vector
-from ..checks.errors import SettingError, SimulationError
-from ..checks.numbers import numbers
-from ..dynamics.certify import inspect_start
-from ..dynamics.checks import check_start
-from ..dynamics.conserved import energy
-from ..dynamics.run import relative
+from ..checks.errors import (
+    AbstractReason,
+    SettingError,
+    SimulationError,
+    first_reason,
+    nearest_names,
+)
+from ..checks.numbers import check_numbers
+from ..dynamics.diagnostics import check_start, inspect_start, relative_error
+from ..dynamics.evaluation import energy
+from ..dynamics.formulations.base import Residuals
+from ..dynamics.integration.problem import Counts
+from ..math.compiler import cached_program
+from ..math.native.program import evaluate
+from ..math.rotation import conjugate, product, to_rotation_vector
 from ..mechanics.state import State
 from .instruments import whole_periods
-from .plant import Plant
-from .rolling import Controller, LoopReason, Rollout, Signals, rollout
+from .plant import Plant, PlantState, same_kind
+
+Controller = Callable[[Any, Any, Any], tuple[Any, Any]]
+
+
+class LoopReason(AbstractReason):
+    """Outcome of a closed loop at a sample."""
+
+    VALID = 0
+    """Everything is finite so far."""
+    STEP_FAILED = 1
+    """The integration ended before the sample."""
+    STATE_NOT_FINITE = 2
+    """A number of the true state is NaN or infinite."""
+    ESTIMATE_NOT_FINITE = 3
+    """A number of the estimate is NaN or infinite."""
+    INPUTS_NOT_FINITE = 4
+    """The controller returned an input that is NaN or infinite."""
+
+
+class Sample(NamedTuple):
+    """Sample of a closed loop, for the signals that are saved.
+
+    Attributes:
+        t: time [s]. state: true state. internal: true states of force elements (z,).
+        estimate, reference, memory: what the controller had, and its memory afterwards.
+        inputs: what it returned (m,). applied, held_inputs: inputs that are held until this sample and from it
+            on (m,), late by the plant's delay.
+        readings: readings by the sensor's name.
+    """
+
+    t: Float[Array, ""]
+    state: State
+    internal: Float[Array, " z"]
+    estimate: Any
+    reference: Any
+    memory: Any
+    inputs: Float[Array, " m"]
+    applied: Float[Array, " m"]
+    held_inputs: Float[Array, " m"]
+    readings: dict[str, Any]
+
+
+Signals = Mapping[str, Callable[[Sample], Any]]
+
+
+class Rollout(eqx.Module):
+    """Closed loop at its samples (k,), the first of which is the start.
+
+    After a sample that is not valid, all numbers are NaN.
+
+    Attributes:
+        ts: times (k,) [s].
+        states: true states of all bodies (k, n, .). internal: those of force elements (k, z).
+        inputs: commands of the controller at each sample (k, m).
+        signals: saved signals by name (k, ...).
+        work: work of forces without potential since the start, inputs included (k,) [J]; zero for
+            a method without `balances`.
+        counts: numbers of steps so far, each (k,).
+        worst: largest constraint residuals at any step so far, each (k,).
+        reason: codes of `LoopReason` (k,); the first that is not zero stays.
+        element: index of the first number that was not finite in state, estimate or inputs,
+            counted through the whole of it (k,); -1 where there is none.
+        end: state of the plant one period after the last sample. memory: the controller's.
+    """
+
+    ts: Float[Array, " k"]
+    states: State
+    internal: Float[Array, "k z"]
+    inputs: Float[Array, "k m"]
+    signals: dict[str, Any]
+    work: Float[Array, " k"]
+    counts: Counts
+    worst: Residuals
+    reason: Int[Array, " k"]
+    element: Int[Array, " k"]
+    end: PlantState
+    memory: Any
+
+
+def rollout(
+    plant: Plant,
+    controller: Controller,
+    samples: int,
+    *,
+    reference: Any = None,
+    memory: Any = None,
+    signals: Signals | None = None,
+    start: PlantState | None = None,
+) -> Rollout:
+    """Close the loop for a number of samples.
+
+    The function is pure: it may be jitted, vmapped and differentiated; reverse derivatives keep the
+    state at each sample and take its steps again. It raises no error for values: `Rollout.reason`
+    says whether, when and why numbers stopped being finite.
+
+    Args:
+        samples: number of samples, the start included.
+        reference: function of t [s] that returns what the controller reads as its reference, or
+            that value itself.
+        memory: the controller's first memory, any pytree of arrays.
+        signals: functions of a `Sample` by the name under which their values are saved.
+        start: state of the plant at the first sample; by default `plant.reset()`.
+
+    Raises:
+        SettingError: the controller returns another number of inputs, or its memory changes its
+            structure or shapes; fewer than two samples.
+    """
+    if samples < 2:
+        raise SettingError(f"A closed loop needs two samples or more, not {samples}.")
+    initial_state = plant.reset() if start is None else start
+    initial_memory = jax.tree.map(jnp.asarray, memory)
+    # A constant reference is a function of time too, so that the loop has one form and compiles
+    # once for both.
+    reference_at = reference if callable(reference) else lambda t: reference
+
+    def sample_loop(carry: tuple[PlantState, Any, Any, Any], _: None) -> tuple[Any, Any]:
+        now, controller_memory, reason, element = carry
+        setpoint = reference_at(now.t)
+        returned = evaluate(controller, now.estimate, setpoint, controller_memory)
+        inputs, next_memory = _check_returned(plant, returned, controller_memory)
+        reason_code, place = _check_sample(now, inputs)
+        # The first reason stays: later samples of a broken loop are left out and cannot replace it.
+        valid = reason == LoopReason.VALID
+        sample = Sample(
+            now.t, now.state, now.internal, now.estimate, setpoint, next_memory, inputs, now.applied,
+            now.pending[0] if plant.late else inputs, now.readings,
+        )  # fmt: skip
+        signal_values = {name: signal(sample) for name, signal in (signals or {}).items()}
+        numbers = (now.state, now.internal, inputs, signal_values, plant.motion.work(now.motion.y))
+        # After an invalid sample rows are NaN and not left as they are: a mean or a gradient over
+        # a batch of loops cannot take them for results.
+        row = (
+            now.t, jax.tree.map(lambda x: _or_nan(valid, x), numbers), now.motion.counts,
+            now.motion.worst, jnp.where(valid, reason_code, reason), jnp.where(valid, place, element),
+        )  # fmt: skip
+        return (plant.step(now, inputs), next_memory, row[-2], row[-1]), row
+
+    carry = (initial_state, initial_memory, jnp.zeros((), jnp.int8), jnp.full((), -1))
+    # Reverse mode keeps the carry of each sample and computes the rest again: memory grows with samples
+    # and not with stages.
+    body = jax.checkpoint(sample_loop, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
+    # The loop runs to its end even after a failure: a batch of loops has one length, and those
+    # that go on must not be ended by one that does not.
+    (end, final_memory, *_), rows = jax.lax.scan(body, carry, length=samples)
+    ts, (states, internal, inputs, signal_values, work), counts, worst, reason, element = rows
+    return Rollout(
+        ts,
+        states,
+        internal,
+        inputs,
+        signal_values,
+        work,
+        counts,
+        worst,
+        reason,
+        element,
+        end,
+        final_memory,
+    )
+
+
+def _check_returned(plant: Plant, returned: Any, before: Any) -> tuple[Float[Array, " m"], Any]:
+    """Inputs and memory that a controller returned, in the types that the loop carries on."""
+    if not isinstance(returned, tuple) or len(returned) != 2:
+        raise SettingError(
+            "A controller must return a pair (inputs, memory), but it returned "
+            f"{type(returned).__name__}."
+        )
+    returned_inputs, next_memory = returned
+    # Shapes are checked while the loop is traced: JAX's own error for a scan whose carry changes
+    # its shape names neither the controller nor the input.
+    names = [name for name, _ in plant.inputs.names]
+    inputs = jnp.asarray(returned_inputs, plant.before.dtype)
+    if inputs.shape != (len(names),):
+        raise SettingError(
+            f"The controller must return {len(names)} inputs, an array of shape ({len(names)},) for "
+            f"{', '.join(names)}, but it returned shape {inputs.shape}. Where it sets only some of "
+            "them, name these in Plant(..., inputs=[...]): the others keep their values."
+        )
+    # A loop of JAX carries arrays of fixed shapes; a mistake is told here in the user's words.
+    return inputs, same_kind(next_memory, before, "The controller's memory")
+
+
+def _check_sample(now: PlantState, inputs: Array) -> tuple[Array, Array]:
+    """Code of `LoopReason` at a sample, and the place of the first number that is not finite."""
+    # The order of the checks is that of cause and effect: a state that is not finite makes
+    # estimate and inputs so, and the message is about the first of them.
+    places = [_first_bad(part) for part in ((now.state, now.internal), now.estimate, inputs)]
+    is_bad_state, is_bad_estimate, is_bad_input = (place >= 0 for place in places)
+    # A state that is not finite is the cause and a failed step the consequence.
+    is_step_failure = (now.motion.result != diffrax.RESULTS.successful) & ~is_bad_state
+    reason = first_reason(
+        (is_step_failure, LoopReason.STEP_FAILED),
+        (is_bad_state, LoopReason.STATE_NOT_FINITE),
+        (is_bad_estimate, LoopReason.ESTIMATE_NOT_FINITE),
+        (is_bad_input, LoopReason.INPUTS_NOT_FINITE),
+    )
+    place = jnp.where(is_bad_state, places[0], jnp.where(is_bad_estimate, places[1], places[2]))
+    return reason, jnp.where(is_step_failure, -1, place)
+
+
+def _first_bad(part: Any) -> Int[Array, ""]:
+    """Index of the first number of a pytree that is not finite, through all leaves; -1 if none."""
+    leaves = [x for x in jax.tree.leaves(part) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
+    if not leaves:
+        return jnp.full((), -1)
+    bad_mask = ~jnp.isfinite(jnp.concatenate([jnp.ravel(x) for x in leaves]))
+    return jnp.where(jnp.any(bad_mask), jnp.argmax(bad_mask), -1)
+
+
+def _or_nan(valid: Array, x: Any) -> Any:
+    """Value where the loop is still valid; NaN for a number and the value itself for others."""
+    x = jnp.asarray(x)
+    return jnp.where(valid, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.inexact) else x
 
 
 @dataclass(frozen=True)
@@ -104,16 +331,18 @@ class LoopRun:
 
     def input(self, name: str) -> np.ndarray:
         """Commands of one input, or of all numbers of a vector: (k,) or (k, numbers)."""
-        own = self.plant.inputs.chosen([name]).entries
-        known = [entry.name for entry in self.plant.inputs.entries]
-        found = np.asarray(self.rollout.inputs)[:, [known.index(entry.name) for entry in own]]
-        return found[:, 0] if known.count(name) else found
+        chosen_entries = self.plant.inputs.chosen([name]).entries
+        entry_names = [entry.name for entry in self.plant.inputs.entries]
+        commands = np.asarray(self.rollout.inputs)[
+            :, [entry_names.index(entry.name) for entry in chosen_entries]
+        ]
+        return commands[:, 0] if entry_names.count(name) else commands
 
     def signal(self, name: str) -> Any:
         """Saved signal (k, ...); raises `SettingError` if there is none of that name."""
         if name not in self.rollout.signals:
-            known = ", ".join(self.rollout.signals) or "(none)"
-            raise SettingError(f"There is no signal '{name}'. Saved signals: {known}.")
+            hint = nearest_names(name, self.rollout.signals)
+            raise SettingError(f"The loop saved no signal '{name}'.{hint}")
         return self.rollout.signals[name]
 
 
@@ -149,30 +378,42 @@ def close_loop(
         SimulationError: the loop failed (with `throw`); the message says when and which number,
             and the error's `run` holds the result so far.
     """
-    end = numbers(t1, (), "The end of the run", "s", SettingError)
+    # A run ends with a sample: a part of a period would need a program of its own.
+    end = check_numbers(t1, (), "The end of the run", "s", SettingError)
     samples = whole_periods(float(end), plant.rate, "The time of the run") + 1
-    plant = inspected(plant)
+    # The start is checked once on concrete values, outside the compiled loop, where an error can
+    # name joints and residuals.
+    plant = inspect_plant(plant)
     if balances:
-        plant = plant.with_motion(plant.motion.with_method(balances=True))
+        if plant.changed:
+            raise SettingError(
+                "The energy balance is of a plant whose numbers stay: with 'changes' set balances to False."
+            )
+        # Work is one more state of the integration; a loop that is not certified does not pay for
+        # it.
+        plant = plant.with_motions(lambda motion: motion.with_method(balances=True))
     run = _Loop(controller, reference, memory, signals, samples)
-    (found, total), *times = _carried_out(run, plant, key)
+    # Compilation is timed apart, as speed against real time is a figure of the running loop.
+    (loop_rollout, total), *times = _carried_out(run, plant, key)
     compiling, running = times
-    difference = _difference(run, plant, key, found) if check_steps else (None, None)
-    certificate, failure = _certified(plant, found, total, (compiling, running), difference)
-    result = LoopRun(plant, found, certificate, failure)
+    difference = _compare_steps(run, plant, key, loop_rollout) if check_steps else (None, None)
+    certificate, failure = _certify_rollout(
+        plant, loop_rollout, total, (compiling, running), difference
+    )
+    result = LoopRun(plant, loop_rollout, certificate, failure)
     if failure and throw:
         raise SimulationError(failure, result)
     return result
 
 
-def run_of(plant: Plant, found: Rollout, seconds: tuple[float, float]) -> LoopRun:
+def run_of(plant: Plant, samples: Rollout, seconds: tuple[float, float]) -> LoopRun:
     """Run with its certificate, from a plant and the samples of its loop, without energy balance.
 
     Args:
-        plant: as `inspected` returns it. seconds: times of compiling and running [s].
+        plant: as `inspect_plant` returns it. seconds: times of compiling and running [s].
     """
-    certificate, failure = _certified(plant, found, np.zeros(0), seconds, (None, None))
-    return LoopRun(plant, found, certificate, failure)
+    certificate, failure = _certify_rollout(plant, samples, np.zeros(0), seconds, (None, None))
+    return LoopRun(plant, samples, certificate, failure)
 
 
 class _Loop(eqx.Module):
@@ -185,97 +426,116 @@ class _Loop(eqx.Module):
     samples: int = eqx.field(static=True)
 
 
-def _rolled(run: _Loop, plant: Plant, key: Any) -> tuple[Rollout, Float[Array, " k"]]:
+def _roll_out(run: _Loop, plant: Plant, key: Any) -> tuple[Rollout, Float[Array, " k"]]:
     """Closed loop and its total energies (k,) [J]."""
-    found = rollout(
+    loop_rollout = rollout(
         plant, run.controller, run.samples, reference=run.reference, memory=run.memory,
         signals=run.signals, start=plant.reset(key),
     )  # fmt: skip
-    total = jnp.zeros_like(found.ts)
+    total = jnp.zeros_like(loop_rollout.ts)
     if plant.motion.problem.method.balances:
-        total = jax.vmap(lambda x, t: energy(plant.system, x, t).total)(found.states, found.ts)
-    return found, total
+        total = jax.vmap(lambda x, t: energy(plant.system, x, t).total)(
+            loop_rollout.states, loop_rollout.ts
+        )
+    return loop_rollout, total
 
 
 def _carried_out(run: _Loop, plant: Plant, key: Any) -> tuple[Any, float, float]:
     """Result as NumPy arrays, and the times of compiling and running [s]."""
     clock = time.perf_counter()
-    made = program(_rolled, run, plant, key)
+    # The compiled program is called directly, so that the second time is that of running alone;
+    # `jax.jit` would count its dispatch and, at the first call, its compilation.
+    executable = cached_program(_roll_out, run, plant, key)
     compiled = time.perf_counter()
-    found = made(run, plant, key)
-    taken = time.perf_counter() - compiled
+    loop_output = executable(run, plant, key)
+    run_seconds = time.perf_counter() - compiled
     is_key = lambda x: jnp.issubdtype(getattr(x, "dtype", float), jax.dtypes.prng_key)
-    found = jax.tree.map(lambda x: x if is_key(x) else np.asarray(x), found)
-    return found, compiled - clock, taken
+    # Results become NumPy arrays here: the timer then includes the wait for JAX's asynchronous
+    # computation, and what reads the run compiles nothing.
+    loop_output = jax.tree.map(lambda x: x if is_key(x) else np.asarray(x), loop_output)
+    return loop_output, compiled - clock, run_seconds
 
 
-def inspected(plant: Plant) -> Plant:
+def inspect_plant(plant: Plant) -> Plant:
     """Plant with a checked start, and a formulation that allows for rows that depend on others."""
     check_start(plant.system, plant.state0)
-    own = plant.motion.problem.method.formulation
-    formulation, *_ = inspect_start(plant.system, plant.state0, 0.0, own)
-    if formulation is own:
+    method_formulation = plant.motion.problem.method.formulation
+    formulation, *_ = inspect_start(plant.system, plant.state0, 0.0, method_formulation)
+    if formulation is method_formulation:
         return plant
-    return plant.with_motion(plant.motion.with_method(formulation=formulation))
+    return plant.with_motions(lambda motion: motion.with_method(formulation=formulation))
 
 
-def _difference(run: _Loop, plant: Plant, key: Any, first: Rollout) -> tuple[float, float]:
+def _compare_steps(run: _Loop, plant: Plant, key: Any, first: Rollout) -> tuple[float, float]:
     """Largest differences in position [m] and attitude [rad] from a run with steps half as long."""
     if plant.motion.steps is None:
         raise SettingError("check_steps halves fixed steps; this plant's steps are adaptive.")
-    finer = dataclasses.replace(plant.motion, steps=2 * plant.motion.steps)
-    (again, _), *_ = _carried_out(run, plant.with_motion(finer), key)
-    apart = jax.vmap(jax.vmap(lambda p, q: to_rotation_vector(product(conjugate(p), q))))
-    turned = apart(jnp.asarray(first.states.p), jnp.asarray(again.states.p))
+    # Fixed steps have no error estimate; a run with half the step tells what they cost.
+    finer = lambda motion: dataclasses.replace(motion, steps=2 * motion.steps)
+    (finer_rollout, _), *_ = _carried_out(run, plant.with_motions(finer), key)
+    rotation_vectors_between = jax.vmap(
+        jax.vmap(lambda p, q: to_rotation_vector(product(conjugate(p), q)))
+    )
+    rotation_vectors = rotation_vectors_between(
+        jnp.asarray(first.states.p), jnp.asarray(finer_rollout.states.p)
+    )
     largest = lambda x: float(np.max(np.linalg.norm(np.asarray(x), axis=-1)))
-    return largest(first.states.r - again.states.r), largest(turned)
+    return largest(first.states.r - finer_rollout.states.r), largest(rotation_vectors)
 
 
-def _certified(
+def _certify_rollout(
     plant: Plant,
-    found: Rollout,
+    loop_rollout: Rollout,
     total: np.ndarray,
     seconds: tuple[float, float],
     difference: tuple[float | None, float | None],
 ) -> tuple[LoopCertificate, str]:
-    reason = np.asarray(found.reason)
+    reason = np.asarray(loop_rollout.reason)
+    # Only samples before the first failure count: residuals, steps and the time of the end are
+    # those of the last valid one.
     valid = int(np.argmax(reason != 0)) if np.any(reason) else len(reason)
-    last = max(valid - 1, 0)
-    failure = "" if valid == len(reason) else _failure(plant, found, valid)
+    last_sample = max(valid - 1, 0)
+    failure = "" if valid == len(reason) else _describe_failure(plant, loop_rollout, valid)
     errors: tuple[float | None, float | None] = (None, None)
     if plant.motion.problem.method.balances:
-        work = found.work[:valid]
+        work = loop_rollout.work[:valid]
+        # Energy of a loop is not constant; its change must equal the work of all inputs.
         drift = total[:valid] - total[0] - work
-        errors = float(np.max(np.abs(drift), initial=0.0)), relative(drift, total[:valid], work)
-    worst, t_end = found.worst, float(found.ts[last])
+        errors = (
+            float(np.max(np.abs(drift), initial=0.0)),
+            relative_error(drift, total[:valid], work),
+        )
+    worst, t_end = loop_rollout.worst, float(loop_rollout.ts[last_sample])
     return LoopCertificate(
-        result=LoopReason(int(reason[-1])).words if failure else "successful",
+        result=LoopReason(int(reason[-1])).label if failure else "successful",
         t_end=t_end,
-        position_violation=float(worst.position[last]),
-        angle_violation=float(worst.angle[last]),
-        velocity_violation=float(worst.velocity[last]),
-        angular_velocity_violation=float(worst.angular_velocity[last]),
-        norm_violation=float(worst.norm[last]),
+        position_violation=float(worst.position[last_sample]),
+        angle_violation=float(worst.angle[last_sample]),
+        velocity_violation=float(worst.velocity[last_sample]),
+        angular_velocity_violation=float(worst.angular_velocity[last_sample]),
+        norm_violation=float(worst.norm[last_sample]),
         energy_error=errors[0],
         relative_energy_error=errors[1],
         position_difference=difference[0],
         angle_difference=difference[1],
-        steps=int(found.counts.accepted[last]),
-        rejected_steps=int(found.counts.rejected[last]),
+        steps=int(loop_rollout.counts.accepted[last_sample]),
+        rejected_steps=int(loop_rollout.counts.rejected[last_sample]),
         compile_seconds=seconds[0],
         run_seconds=seconds[1],
-        speed=float(found.ts[-1] - found.ts[0]) / seconds[1],
+        speed=float(loop_rollout.ts[-1] - loop_rollout.ts[0]) / seconds[1],
     ), failure
 
 
-def _failure(plant: Plant, found: Rollout, at: int) -> str:
+def _describe_failure(plant: Plant, loop_rollout: Rollout, at: int) -> str:
     """Paragraph that says when and why a loop failed."""
-    t, reason = float(found.ts[at]), LoopReason(int(found.reason[at]))
-    k = int(found.element[at])
+    t, reason = float(loop_rollout.ts[at]), LoopReason(int(loop_rollout.reason[at]))
+    k = int(loop_rollout.element[at])
+    # The message says what was still finite, since that tells a user whether to look at the
+    # controller, the estimator or the plant.
     when = f"at t = {t:.6g} s (sample {at})"
     if reason == LoopReason.INPUTS_NOT_FINITE:
         name, unit = plant.inputs.names[k]
-        value = float(found.inputs[at, k])
+        value = float(loop_rollout.inputs[at, k])
         return (
             f"The controller returned {value} for the input '{name}' [{unit}] (element {k}) {when}; "
             f"its estimate was finite."

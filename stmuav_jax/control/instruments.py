@@ -1,5 +1,7 @@
 """Instruments: sensors that read at their own rate, with noise, bias and delay."""
 
+import dataclasses
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,15 +10,28 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..algebra.space import Point
-from ..checks.errors import SettingError
-from ..checks.numbers import numbers
+from ..analysis.sensors import AbstractSensor, SensedMotion
+from ..checks.errors import SettingError, has_values
+from ..checks.numbers import as_floats, check_numbers
 from ..checks.shapes import Numbers
+from ..math.space import Point
 from ..mechanics.system import System
-from ..sensing.sensors import AbstractSensor, SensedMotion
 
 # Relative difference from a whole number that counts as round-off of the given rates and delays.
 _WHOLE = 1e-9
+
+
+class SensorFault(NamedTuple):
+    """Outage of an instrument, whose readings are NaN, or a step of its bias, for a time.
+
+    Attributes:
+        at, until: first time of a reading that has it, and first one that has not [s].
+        bias: error that is added, as `Instrument.bias`; None for an outage.
+    """
+
+    at: Numbers
+    until: Numbers = math.inf
+    bias: Numbers | None = None
 
 
 class Instrument(eqx.Module):
@@ -30,10 +45,11 @@ class Instrument(eqx.Module):
             becomes one by multiplication with sqrt(rate).
         bias: constant error of every reading, as `noise`.
         delay: time from the motion to the controller's sight of it [s], whole control periods.
+        faults: outages and steps of the bias, each a `SensorFault`; several add up.
 
     Raises:
-        SettingError: a rate or delay that is not finite, a rate that is not positive, a delay below
-            zero, or no sensor.
+        SettingError: a rate or delay that is not finite, a rate that is not positive, a delay or a noise
+            below zero, or no sensor.
     """
 
     sensor: AbstractSensor
@@ -41,6 +57,7 @@ class Instrument(eqx.Module):
     noise: Numbers | None = None
     bias: Numbers | None = None
     delay: float = eqx.field(static=True, default=0.0)
+    faults: tuple[SensorFault, ...] = ()
 
     def __check_init__(self) -> None:
         if not isinstance(self.sensor, AbstractSensor):
@@ -57,6 +74,12 @@ class Instrument(eqx.Module):
                 f"The delay of the sensor '{self.name}' must be finite and not negative, but it is "
                 f"{self.delay} s."
             )
+        noise = np.asarray(self.noise if has_values(self.noise) else None)
+        if noise.dtype.kind in "biuf" and np.any(noise < 0):
+            raise SettingError(
+                f"The noise of the sensor '{self.name}' must not be negative, since it is a standard deviation, "
+                f"but it is {noise.tolist()}."
+            )
 
     @property
     def name(self) -> str:
@@ -71,29 +94,35 @@ class Instrument(eqx.Module):
         """
         if self.rate is None:
             return 1
-        ratio = rate / self.rate
-        whole = round(ratio)
-        if whole < 1 or abs(ratio - whole) > _WHOLE * ratio:
-            below, above = max(int(ratio), 1), max(int(ratio), 1) + 1
-            raise SettingError(
-                f"The sensor '{self.name}' reads at {self.rate:g} Hz, which is not a whole part of the "
-                f"control rate of {rate:g} Hz: near it are {rate / below:.6g} Hz (every "
-                f"{below} periods) and {rate / above:.6g} Hz (every {above} periods)."
-            )
-        return whole
+        return count_periods(self.rate, rate, f"The sensor '{self.name}'")
 
     def delayed(self, rate: float) -> int:
         """Delay as a number of control periods; raises `SettingError` if that is not whole."""
         return whole_periods(self.delay, rate, f"The delay of the sensor '{self.name}'")
 
 
-def whole_periods(time: float, rate: float, what: str) -> int:
+def count_periods(reading_rate: float, rate: float, owner: str) -> int:
+    """Number of control periods between readings [Hz]; raises `SettingError` if it is not whole."""
+    ratio = rate / reading_rate
+    whole = round(ratio)
+    # Readings at control samples only, since the motion is known there.
+    if whole < 1 or abs(ratio - whole) > _WHOLE * ratio:
+        floor_count, ceiling_count = max(int(ratio), 1), max(int(ratio), 1) + 1
+        raise SettingError(
+            f"{owner} reads at {reading_rate:g} Hz, which is not a whole part of the control rate of "
+            f"{rate:g} Hz: near it are {rate / floor_count:.6g} Hz (every {floor_count} periods) and "
+            f"{rate / ceiling_count:.6g} Hz (every {ceiling_count} periods)."
+        )
+    return whole
+
+
+def whole_periods(time: float, rate: float, subject: str) -> int:
     """Number of control periods in a time [s]; raises `SettingError` if it is not whole."""
     count = time * rate
     whole = round(count)
     if abs(count - whole) > _WHOLE * max(count, 1.0):
         raise SettingError(
-            f"{what} must be a whole number of control periods of {1e3 / rate:.6g} ms, but it is "
+            f"{subject} must be a whole number of control periods of {1e3 / rate:.6g} ms, but it is "
             f"{1e3 * time:.6g} ms, which are {count:.6g} periods."
         )
     return whole
@@ -120,88 +149,123 @@ class Bench(eqx.Module):
     """
 
     instruments: tuple[Instrument, ...]
+    rate: float = eqx.field(static=True)
     every: tuple[int, ...] = eqx.field(static=True)
     late: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, given: tuple[Any, ...], system: System, rate: float) -> None:
-        made = []
-        for one in given:
-            one = one if isinstance(one, Instrument) else Instrument(one)
-            size = len(one.sensor.components(system))
-            errors = {}
-            for name in ("noise", "bias"):
-                value = getattr(one, name)
-                if value is not None:
-                    shape = () if np.ndim(value) == 0 else (size,)
-                    what = f"The {name} of the sensor '{one.name}'"
-                    errors[name] = jnp.broadcast_to(
-                        numbers(value, shape, what, "", SettingError), (size,)
-                    )
-            made.append(Instrument(one.sensor, one.rate, delay=one.delay, **errors))
-        names = [one.name for one in made]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise SettingError(f"Two instruments have the name {', '.join(twice)}.")
-        self.instruments = tuple(made)
-        self.every = tuple(one.periods(rate) for one in made)
-        self.late = tuple(one.delayed(rate) for one in made)
+    def __init__(self, entries: tuple[Any, ...], system: System, rate: float) -> None:
+        instruments = []
+        for instrument in entries:
+            instrument = (
+                instrument if isinstance(instrument, Instrument) else Instrument(instrument)
+            )
+            size = len(instrument.sensor.components(system))
+
+            def spread(value: Any, label: str, size: int = size, owner: Any = instrument) -> Any:
+                if value is None:
+                    return None
+                shape = () if np.ndim(value) == 0 else (size,)
+                quantity = f"The {label} of the sensor '{owner.name}'"
+                return jnp.broadcast_to(
+                    check_numbers(value, shape, quantity, "", SettingError), (size,)
+                )
+
+            faults = tuple(
+                SensorFault(as_floats(at), as_floats(until), spread(bias, "step of the bias"))
+                for at, until, bias in instrument.faults
+            )
+            errors = {name: spread(getattr(instrument, name), name) for name in ("noise", "bias")}
+            instruments.append(dataclasses.replace(instrument, faults=faults, **errors))
+        names = [instrument.name for instrument in instruments]
+        duplicates = sorted({name for name in names if names.count(name) > 1})
+        if duplicates:
+            raise SettingError(f"Two instruments have the name {', '.join(duplicates)}.")
+        self.instruments, self.rate = tuple(instruments), float(rate)
+        self.every = tuple(instrument.periods(rate) for instrument in instruments)
+        self.late = tuple(instrument.delayed(rate) for instrument in instruments)
 
     @property
     def feels(self) -> bool:
         """True if a sensor needs accelerations."""
-        return any(one.sensor.needs_accelerations for one in self.instruments)
+        return any(instrument.sensor.needs_accelerations for instrument in self.instruments)
 
-    def first(self, seen: SensedMotion, system: System, key: Array) -> tuple[Any, ...]:
+    def fill_queues(self, motion: SensedMotion, system: System, key: Array) -> tuple[Any, ...]:
         """Queues of readings at the start: those of the first motion, as if it had lasted."""
         zero = jnp.zeros((), int)
-        values = self._values(seen, system, zero, key)
-        found = []
+        values = self._read_values(motion, system, zero, key)
+        queues = []
         for value, late in zip(values, self.late, strict=True):
+            # A delayed sensor would have nothing to say at first; it reads as if the start had lasted.
             queue = jax.tree.map(lambda x, late=late: jnp.stack([x] * (late + 1)), value)
-            found.append(Reading(queue, jnp.arange(late + 1) == late))
-        return tuple(found)
+            queues.append(Reading(queue, jnp.arange(late + 1) == late))
+        return tuple(queues)
 
-    def later(
+    def advance_queues(
         self,
         queues: tuple[Any, ...],
-        seen: SensedMotion,
+        motion: SensedMotion,
         system: System,
         k: Int[Array, ""],
         key: Array,
     ) -> tuple[Any, ...]:
         """Queues one sample later: what is read at sample k comes in, the oldest goes out."""
-        values = self._values(seen, system, k, key)
-        found = []
+        values = self._read_values(motion, system, k, key)
+        new_queues = []
         for queue, value, every in zip(queues, values, self.every, strict=True):
             due = k % every == 0
-            last = jax.tree.map(lambda x: x[-1], queue.value)
-            now = jax.tree.map(lambda new, old, due=due: jnp.where(due, new, old), value, last)
+            last_value = jax.tree.map(lambda x: x[-1], queue.value)
+            current_value = jax.tree.map(
+                lambda new, old, due=due: jnp.where(due, new, old), value, last_value
+            )
             join = lambda x, new: jnp.concatenate([x[1:], new[None]])
-            found.append(jax.tree.map(join, queue, Reading(now, due)))
-        return tuple(found)
+            new_queues.append(jax.tree.map(join, queue, Reading(current_value, due)))
+        return tuple(new_queues)
 
-    def arrived(self, queues: tuple[Any, ...]) -> dict[str, Reading]:
+    def oldest_readings(self, queues: tuple[Any, ...]) -> dict[str, Reading]:
         """Readings that the estimator sees now, by the sensor's name."""
-        first = [jax.tree.map(lambda x: x[0], queue) for queue in queues]
-        return {one.name: now for one, now in zip(self.instruments, first, strict=True)}
+        oldest_readings = [jax.tree.map(lambda x: x[0], queue) for queue in queues]
+        return {
+            instrument.name: reading
+            for instrument, reading in zip(self.instruments, oldest_readings, strict=True)
+        }
 
-    def _values(
-        self, seen: SensedMotion, system: System, k: Int[Array, ""], key: Array
+    def _read_values(
+        self, sensed_motion: SensedMotion, system: System, k: Int[Array, ""], key: Array
     ) -> list[Point]:
-        found = []
+        readings = []
+        # Noise depends on sample and instrument alone: another sensor or rate leaves the noise of the others
+        # as it is.
         draws = jax.random.fold_in(key, k) if self.instruments else key
-        for number, one in enumerate(self.instruments):
-            value, error = one.sensor.read(seen), self._error(one, draws, number)
+        for number, instrument in enumerate(self.instruments):
+            value, error = (
+                instrument.sensor.read(sensed_motion),
+                self._draw_error(instrument, draws, number),
+            )
+            present = [
+                (k >= jnp.asarray(fault.at) * self.rate)
+                & (k < jnp.asarray(fault.until) * self.rate)
+                for fault in instrument.faults
+            ]
+            for fault, is_present in zip(instrument.faults, present, strict=True):
+                if fault.bias is not None:
+                    step = jnp.where(is_present, jnp.asarray(fault.bias), 0.0)
+                    error = step if error is None else error + step
             if error is not None:
-                value = one.sensor.space(system).retract(value, error)
-            found.append(value)
-        return found
+                # Errors of an attitude are rotations, and are composed and not added.
+                value = instrument.sensor.space(system).retract(value, error)
+            for fault, is_present in zip(instrument.faults, present, strict=True):
+                if fault.bias is None:
+                    value = jax.tree.map(
+                        lambda x, lost=is_present: jnp.where(lost, jnp.nan, x), value
+                    )
+            readings.append(value)
+        return readings
 
     @staticmethod
-    def _error(one: Instrument, key: Array, number: int) -> Float[Array, " c"] | None:
-        error = None if one.bias is None else jnp.asarray(one.bias)
-        if one.noise is None:
+    def _draw_error(instrument: Instrument, key: Array, number: int) -> Float[Array, " c"] | None:
+        error = None if instrument.bias is None else jnp.asarray(instrument.bias)
+        if instrument.noise is None:
             return error
-        scale = jnp.asarray(one.noise)
+        scale = jnp.asarray(instrument.noise)
         white = scale * jax.random.normal(jax.random.fold_in(key, number), scale.shape, scale.dtype)
         return white if error is None else error + white

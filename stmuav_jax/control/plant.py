@@ -4,30 +4,165 @@
 
 Between the samples the motion is continuous and integrated by the steps of a `Method`, which end at
 the samples. `Plant.reset` and `Plant.step` are pure: they may be jitted, vmapped and
-differentiated, by whoever closes the loop; `rollout` closes it with a controller.
-"""
+differentiated, by whoever closes the loop; `rollout` closes it with a controller."""
 
+import dataclasses
+import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..checks.errors import SettingError, concrete
-from ..checks.numbers import numbers
+from ..analysis.sensors import SensedMotion, gravity_of
+from ..checks.errors import SettingError, has_values
+from ..checks.numbers import check_numbers
 from ..checks.shapes import Numbers
-from ..dynamics.integration.problem import IntegrationState, begin, prepare
+from ..dynamics.formulations.base import Accelerations
+from ..dynamics.formulations.stabilisation import Unstabilised
+from ..dynamics.integration.adjoint import DiscreteAdjoint
+from ..dynamics.integration.problem import (
+    Counts,
+    IntegrationState,
+    Problem,
+    at_internal,
+    begin_integration,
+    continue_from,
+    prepare_problem,
+    read_end,
+)
+from ..dynamics.integration.solvers import RungeKutta4
 from ..dynamics.method import Method
-from ..dynamics.scene import Scene
+from ..dynamics.simulation import Scene
+from ..math.native.program import evaluate
 from ..mechanics.inputs import Inputs, inputs_of
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
-from ..sensing.sensors import SensedMotion, gravity_of
-from .held import HeldMotion, check_steps, usable_method
 from .instruments import Bench, Reading, whole_periods
+
+
+class HeldMotion(eqx.Module):
+    """Motion over one control period.
+
+    Attributes:
+        problem: prepared problem of the integration, with plain numbers for the inputs.
+        inputs: inputs that are held.
+        steps: steps in a period; None for steps whose length the method's tolerances choose.
+    """
+
+    problem: Problem
+    inputs: Inputs
+    steps: int | None = eqx.field(static=True)
+
+    def with_method(self, **changes: Any) -> "HeldMotion":
+        """Motion by a method with other fields."""
+        method = dataclasses.replace(self.problem.method, **changes)
+        return dataclasses.replace(self, problem=dataclasses.replace(self.problem, method=method))
+
+    def advance_to(
+        self, now: IntegrationState, values: Float[Array, " m"], t1: Float[Array, ""]
+    ) -> IntegrationState:
+        """State of the integration at t1 [s], the inputs held at values (m,)."""
+        problem = self._hold_inputs(values)
+        # Steps of a fixed length have no loop of unknown length: they can be differentiated in
+        # reverse and batched without waiting for the slowest.
+        if self.steps is None:
+            return _integrate_adaptively(problem, now, t1)
+        h, steps = (t1 - now.t) / self.steps, self.steps
+
+        def step_once(carry: Any, j: Any) -> tuple[Any, None]:
+            y, state, result = carry
+            a, b = now.t + j * h, now.t + (j + 1) * h
+            step_output = problem.take_step(a, b, y, state)
+            # The first failure of a step is kept: a later step that happens to succeed starts from
+            # numbers that mean nothing.
+            is_successful = result == diffrax.RESULTS.successful
+            result = diffrax.RESULTS.where(is_successful, step_output[4], result)
+            return (step_output[0], step_output[3], result), None
+
+        carry = (now.y, now.solver_state, now.result)
+        if steps == 1:
+            carry, _ = step_once(carry, 0)
+        else:
+            carry, _ = jax.lax.scan(step_once, carry, jnp.arange(steps))
+        accepted = now.counts.accepted + steps
+        counts = Counts(accepted, now.counts.rejected, now.counts.at_growth_limit)
+        return dataclasses.replace(
+            now, t=t1, y=carry[0], solver_state=carry[1], counts=counts, result=carry[2]
+        )
+
+    def state(self, y: Float[Array, " n"]) -> tuple[State, Float[Array, " z"]]:
+        """State of all bodies, and states of force elements."""
+        problem = self.problem
+        n, z = problem.n_state, problem.n_internal
+        return evaluate(problem.method.formulation.to_state, problem.model, y[:n]), y[n : n + z]
+
+    def work(self, y: Float[Array, " n"]) -> Float[Array, ""]:
+        """Work of forces without potential since the start [J]; zero without `balances`."""
+        problem = self.problem
+        if not problem.method.balances:
+            return jnp.zeros((), y.dtype)
+        return y[problem.n_state + problem.n_internal]
+
+    def accelerations(
+        self, t: Array, state: State, internal: Array, values: Float[Array, " m"]
+    ) -> Accelerations:
+        """Accelerations of all bodies at values of the inputs (m,)."""
+        problem = self._hold_inputs(values)
+        model = at_internal(problem.model, internal) if problem.n_internal else problem.model
+        return evaluate(problem.method.formulation.accelerations, model, t, state, Unstabilised())
+
+    def _hold_inputs(self, values: Float[Array, " m"]) -> Problem:
+        # Inputs are leaves of the prepared model: they are exchanged without preparing it again,
+        # which is what makes a period cheap.
+        system = self.inputs.applied(self.problem.model.system, values)
+        return eqx.tree_at(lambda p: p.model.system, self.problem, system)
+
+
+def _integrate_adaptively(
+    problem: Problem, now: IntegrationState, t1: Float[Array, ""]
+) -> IntegrationState:
+    """Integrate to t1 [s] by steps of the method's own control; after a failure, stay there."""
+    # A plant that has failed integrates over no time: the loop around it goes on, and each further
+    # period costs nothing.
+    is_successful = now.result == diffrax.RESULTS.successful
+    solution = read_end(
+        problem.solve(now, jnp.where(is_successful, t1, now.t), problem.method.adjoint)
+    )
+    return continue_from(now, solution)
+
+
+def check_steps(steps: int | None) -> None:
+    """Raise `SettingError` unless the number of steps in a period is a whole number, or None."""
+    if steps is not None and (isinstance(steps, bool) or steps != int(steps) or steps < 1):
+        raise SettingError(
+            f"The number of steps in a period must be a whole number from 1, or None for steps that "
+            f"the method's tolerances choose, but it is {steps}."
+        )
+
+
+def usable_method(method: Method | None, steps: int | None) -> Method:
+    """Method for the steps of a plant; nothing bounds steps of a fixed length for derivatives."""
+    if method is None:
+        solver: Any = diffrax.Dopri8() if steps is None else RungeKutta4()
+        return usable_method(Method(solver=solver), steps)
+    if method.event is not None or method.jump_ts is not None:
+        raise SettingError("A plant's method can have neither an event nor times of jumps.")
+    adjoint = method.adjoint
+    if isinstance(adjoint, DiscreteAdjoint):
+        # The discrete adjoint records steps in arrays of a known length, which a loop over samples does not
+        # have.
+        adjoint = diffrax.RecursiveCheckpointAdjoint()
+    # The bound on steps for derivatives acts on the control of step sizes, which fixed steps do
+    # not have.
+    step_control = "state" if steps is not None else method.steps
+    return dataclasses.replace(method, adjoint=adjoint, steps=step_control)
+
 
 # Number that is folded into a key for the noise while standing; no sample of a run has it.
 _STANDING = np.uint32(2**32 - 1)
@@ -94,10 +229,13 @@ class Plant(eqx.Module):
         method: method of integration; by default the classical Runge-Kutta method of order 4 for
             fixed steps, Dopri8 for others. Its `steps` count where their length is not fixed.
         steps: steps in a period; None for steps whose length the method's tolerances choose.
+        changes: times [s], rising, and systems with other numbers that take over from the first sample at
+            each time on, such as the machine without a payload that it drops.
 
     Raises:
         SettingError: rates or delays that do not divide; a rate or a number of steps that is not
-            positive; fixed steps together with "auto" or an event; names of inputs that are unknown;
+            positive; times of changes that do not rise; fixed steps together with "auto" or an event;
+            names of inputs that are unknown;
             a time of standing that is negative, without sensors, or of a machine whose start moves.
         ModelError: values before the first command that do not fit the inputs.
     """
@@ -110,8 +248,10 @@ class Plant(eqx.Module):
     memory: Any
     observe: Observe | None
     rate: float = eqx.field(static=True)
+    changed: tuple[HeldMotion, ...]
     late: int = eqx.field(static=True)
     stood: int = eqx.field(static=True)
+    starts: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -129,6 +269,7 @@ class Plant(eqx.Module):
         observe: Observe | None = None,
         method: Method | None = None,
         steps: int | None = 1,
+        changes: Sequence[tuple[float, System]] = (),
     ) -> None:
         system = scene.system if isinstance(scene, Scene) else scene
         start = scene.state0 if isinstance(scene, Scene) and state is None else state
@@ -140,17 +281,37 @@ class Plant(eqx.Module):
             )
         check_steps(steps)
         self.rate = float(rate)
+        # Delays in whole periods leave the inputs constant within a period, so that steps need no break in
+        # between.
         self.late = whole_periods(delay, rate, "The delay of the inputs")
-        own = inputs_of(system, inputs)
-        if not len(own):
+        # A plant is made for a set of inputs; all others keep the values of the system, and a
+        # controller's vector has the order of these.
+        plant_inputs = inputs_of(system, inputs)
+        if not len(plant_inputs):
             raise SettingError("The system has no inputs that a controller could set.")
         if before is None:
-            self.before = own.values(system)
+            self.before = plant_inputs.values(system)
         else:
-            what = "The vector of the inputs before the first command"
-            self.before = numbers(before, (len(own),), what, "")
-        problem = prepare(own.applied(system, self.before), usable_method(method, steps))
-        self.motion = HeldMotion(problem, own, steps)
+            quantity = "The vector of the inputs before the first command"
+            self.before = check_numbers(before, (len(plant_inputs),), quantity, "")
+        # The system is prepared once, and a period only exchanges the inputs' numbers.
+        prepared = lambda system: HeldMotion(
+            prepare_problem(
+                plant_inputs.applied(system, self.before), usable_method(method, steps)
+            ),
+            plant_inputs,
+            steps,
+        )
+        self.motion = prepared(system)
+        self.starts = tuple(math.ceil(at * rate * (1 - 1e-12)) for at, _ in changes)
+        if any(after <= first for first, after in itertools.pairwise((0, *self.starts))):
+            raise SettingError(
+                "The times of a plant's changes must rise, by whole control periods from the start on, but they are "
+                f"{[float(at) for at, _ in changes]} s."
+            )
+        # Each change is prepared like the first system: they share a structure, so that a sample
+        # picks numbers and no branch is compiled.
+        self.changed = tuple(prepared(other) for _, other in changes)
         self.bench = Bench(tuple(sensors), system, self.rate)
         if not 0 <= standing < float("inf"):
             raise SettingError(
@@ -172,9 +333,22 @@ class Plant(eqx.Module):
         """Inputs that the controller sets, in the order of its vector."""
         return self.motion.inputs
 
-    def with_motion(self, motion: HeldMotion) -> "Plant":
+    def with_motions(self, change: Callable[[HeldMotion], HeldMotion]) -> "Plant":
         """Plant whose motion is integrated in another way."""
-        return eqx.tree_at(lambda plant: plant.motion, self, motion)
+        motions = change(self.motion), tuple(map(change, self.changed))
+        return eqx.tree_at(lambda plant: (plant.motion, plant.changed), self, motions)
+
+    def motion_at(self, k: Int[Array, ""]) -> HeldMotion:
+        """Motion from sample k on, with the numbers of the last change."""
+        motion = self.motion
+        for start, other in zip(self.starts, self.changed, strict=True):
+            pick = lambda old, new, late=k >= start: (
+                jnp.where(late, new, old) if eqx.is_array(new) else old
+            )
+            # A choice between numbers and not between programs: systems before and after a change
+            # have the same joints and forces with other masses.
+            motion = jax.tree.map(pick, motion, other)
+        return motion
 
     def reset(self, key: Any = None, state0: State | None = None, t0: Numbers = 0.0) -> PlantState:
         """State of the plant at its first sample.
@@ -188,21 +362,30 @@ class Plant(eqx.Module):
         """
         key = jax.random.key(0) if key is None else key
         t = jnp.asarray(t0, dtype=float)
-        motion = begin(self.motion.problem, t, self.state0 if state0 is None else state0)
+        motion = begin_integration(
+            self.motion.problem, t, self.state0 if state0 is None else state0
+        )
         state, internal = self.motion.state(motion.y)
+        # The first sample is complete, with readings and an estimate: a controller acts at t = 0,
+        # and not one period later.
         k = jnp.zeros((), int)
+        # Until the first command arrives, the inputs are those before the flight.
         pending = jnp.tile(self.before, (self.late, 1))
-        seen = self._seen(t, state, internal, self.before)
+        sensed_motion = self._sense_motion(self.motion, t, state, internal, self.before)
         if self.stood:
-            assert seen is not None
+            assert sensed_motion is not None
             if state0 is not None:
                 _check_standing(self.bench, state0)
-            queues, estimate, memory = self._after_standing(t, state, internal, seen, key)
-            readings = self.bench.arrived(queues)
+            queues, estimate, memory = self._after_standing(t, state, internal, sensed_motion, key)
+            readings = self.bench.oldest_readings(queues)
         else:
-            queues = self.bench.first(seen, self.system, key) if seen is not None else ()
-            readings = self.bench.arrived(queues)
-            estimate, memory = self._estimated(
+            queues = (
+                self.bench.fill_queues(sensed_motion, self.system, key)
+                if sensed_motion is not None
+                else ()
+            )
+            readings = self.bench.oldest_readings(queues)
+            estimate, memory = self._estimate_state(
                 t, state, internal, readings, self.before, self.memory
             )
         return PlantState(
@@ -213,56 +396,72 @@ class Plant(eqx.Module):
     def step(self, now: PlantState, inputs: Float[Array, " m"]) -> PlantState:
         """State of the plant one period later, after a command (m,) at this sample."""
         queue = jnp.concatenate([now.pending, jnp.asarray(inputs, self.before.dtype)[None]])
-        held, pending = queue[0], queue[1:]
+        # A delay of whole periods is a queue: commands wait in it, and the oldest one acts.
+        held_inputs, pending = queue[0], queue[1:]
         k = now.k + 1
         # times are counted in whole periods, so that round-off does not add up
         t = now.t0 + k / self.rate
-        motion = self.motion.moved(now.motion, held, t)
-        state, internal = self.motion.state(motion.y)
-        seen = self._seen(t, state, internal, held)
+        held_motion = self.motion_at(now.k)
+        motion = held_motion.advance_to(now.motion, held_inputs, t)
+        state, internal = held_motion.state(motion.y)
+        sensed_motion = self._sense_motion(held_motion, t, state, internal, held_inputs)
         queues = now.queues
-        if seen is not None:
-            queues = self.bench.later(queues, seen, self.system, k, now.key)
-        readings = self.bench.arrived(queues)
-        estimate, memory = self._estimated(t, state, internal, readings, held, now.memory)
+        if sensed_motion is not None:
+            # The noise of a sample depends on the key and the sample's number alone: a loop that
+            # is run again, or taken in parts, has the same readings.
+            queues = self.bench.advance_queues(queues, sensed_motion, self.system, k, now.key)
+        readings = self.bench.oldest_readings(queues)
+        estimate, memory = self._estimate_state(
+            t, state, internal, readings, held_inputs, now.memory
+        )
         return PlantState(
-            k, t, now.t0, state, internal, estimate, held, readings, motion, pending, queues, memory,
+            k, t, now.t0, state, internal, estimate, held_inputs, readings, motion, pending, queues, memory,
             now.key,
         )  # fmt: skip
 
     def _after_standing(
-        self, t: Array, state: State, internal: Array, seen: SensedMotion, key: Any
+        self, t: Array, state: State, internal: Array, sensed_motion: SensedMotion, key: Any
     ) -> tuple[tuple[Any, ...], Any, Any]:
         """Queues, estimate and memory at the first sample, after the samples of standing before it.
 
         At the first sample the machine is still held, and let go of right after it: its readings
         tell of the period before.
         """
-        own, zero = jax.random.fold_in(key, _STANDING), jnp.zeros_like(state.v)
-        still = seen._replace(v_rate=zero, omega_rate=zero)
+        # A key of its own: the noise of the flight is the same with and without a time of standing.
+        standing_key, zero = jax.random.fold_in(key, _STANDING), jnp.zeros_like(state.v)
+        # While it is held, the machine does not accelerate, although its forces would: the
+        # accelerometer reads gravity alone.
+        rest_motion = sensed_motion._replace(v_rate=zero, omega_rate=zero)
         # a reading is fresh only where it is due, and so that those of sample 0 are
         queues = tuple(
             Reading(queue.value, jnp.zeros_like(queue.fresh))
-            for queue in self.bench.first(still, self.system, key)
+            for queue in self.bench.fill_queues(rest_motion, self.system, key)
         )
 
-        def one(carry: Any, k: Array) -> tuple[Any, None]:
+        def sample_once(carry: Any, k: Array) -> tuple[Any, None]:
             queues, _, memory = carry
-            queues = self.bench.later(queues, still, self.system, k, own)
-            readings = self.bench.arrived(queues)
+            queues = self.bench.advance_queues(queues, rest_motion, self.system, k, standing_key)
+            readings = self.bench.oldest_readings(queues)
             return (
                 queues,
-                *self._estimated(t, state, internal, readings, self.before, memory),
+                *self._estimate_state(t, state, internal, readings, self.before, memory),
             ), None
 
         none = (queues, None, self.memory)
-        kind = jax.eval_shape(lambda: one(none, jnp.zeros((), int))[0][1])
+        # A scan needs the shapes of an estimate before there is one; they are found without
+        # computing it.
+        kind = jax.eval_shape(lambda: sample_once(none, jnp.zeros((), int))[0][1])
         blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), kind)
         ks = jnp.arange(-self.stood, 1)
-        return jax.lax.scan(one, (queues, blank, self.memory), ks)[0]
+        return jax.lax.scan(sample_once, (queues, blank, self.memory), ks)[0]
 
-    def _seen(
-        self, t: Array, state: State, internal: Array, held: Float[Array, " m"]
+    def _sense_motion(
+        self,
+        motion: HeldMotion,
+        t: Array,
+        state: State,
+        internal: Array,
+        held_inputs: Float[Array, " m"],
     ) -> SensedMotion | None:
         """Motion for the sensors; accelerations are those just before the next command acts."""
         if not self.bench.instruments:
@@ -270,18 +469,28 @@ class Plant(eqx.Module):
         system = self.system
         gravity, none = gravity_of(system), jnp.full_like(state.v, jnp.nan)
         kin = system.kinematics(state)
+        # Accelerations cost one evaluation of the equations of motion in every period; most
+        # sensors read positions and velocities only.
         if not self.bench.feels:
+            # Accelerations that no sensor reads are NaN: one that should have asked for them shows it at once.
             return SensedMotion(kin, state.p, none, none, gravity)
-        found = self.motion.accelerations(t, state, internal, held)
-        return SensedMotion(kin, state.p, found.v_rate, found.omega_rate, gravity)
+        accelerations = motion.accelerations(t, state, internal, held_inputs)
+        return SensedMotion(kin, state.p, accelerations.v_rate, accelerations.omega_rate, gravity)
 
-    def _estimated(
-        self, t: Array, state: State, internal: Array, readings: Any, held: Array, memory: Any
+    def _estimate_state(
+        self,
+        t: Array,
+        state: State,
+        internal: Array,
+        readings: Any,
+        held_inputs: Array,
+        memory: Any,
     ) -> tuple[Any, Any]:
         if self.estimator is not None:
-            estimate, after = self.estimator(readings, held, memory)
-            return estimate, same_kind(after, memory, "The estimator's memory")
+            estimate, next_memory = evaluate(self.estimator, readings, held_inputs, memory)
+            return estimate, same_kind(next_memory, memory, "The estimator's memory")
         if readings:
+            # Without an estimator the controller sees the readings; without sensors, the true state.
             return {name: reading.value for name, reading in readings.items()}, memory
         return (state if self.observe is None else self.observe(t, state, internal)), memory
 
@@ -293,9 +502,9 @@ def _check_standing(bench: Bench, start: State) -> None:
     """
     if not bench.instruments:
         raise SettingError(
-            "Nothing reads while the plant is standing, since it has no sensors: set 'standing' to 0."
+            "'standing' must be 0 for a plant without sensors, which reads nothing while it stands."
         )
-    if not concrete(start.v, start.omega):
+    if not has_values(start.v, start.omega):
         return
     # NumPy's, which stays concrete where something else is traced
     fastest = max(float(np.max(np.abs(np.asarray(x)), initial=0.0)) for x in (start.v, start.omega))
@@ -306,17 +515,17 @@ def _check_standing(bench: Bench, start: State) -> None:
         )
 
 
-def same_kind(after: Any, before: Any, what: str) -> Any:
+def same_kind(after: Any, before: Any, subject: str) -> Any:
     """New memory as arrays of the old one's types; `SettingError` for another structure or shape."""
     if jax.tree.structure(after) != jax.tree.structure(before):
         raise SettingError(
-            f"{what} must keep its structure from sample to sample: it was "
+            f"{subject} must keep its structure from sample to sample: it was "
             f"{jax.tree.structure(before)}, and {jax.tree.structure(after)} was returned."
         )
     for new, old in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
         if jnp.shape(new) != jnp.shape(old):
             raise SettingError(
-                f"{what} must keep the shapes of its arrays from sample to sample, but one of "
+                f"{subject} must keep the shapes of its arrays from sample to sample, but one of "
                 f"shape {jnp.shape(old)} became {jnp.shape(new)}."
             )
     return jax.tree.map(lambda new, old: jnp.asarray(new, jnp.result_type(old)), after, before)

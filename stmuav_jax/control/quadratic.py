@@ -12,17 +12,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
-from ..algebra.space import Point
+from ..analysis.linear import Linear
 from ..checks.errors import ModelError
-from ..checks.numbers import numbers
+from ..checks.numbers import check_numbers
 from ..checks.shapes import Numbers
 from ..dynamics.statespace.base import AbstractStateSpace
-from ..flight.linear import Linear
+from ..math.space import Point
 from ..mechanics.state import State
 
 # A singular value of the Hautus matrix below this fraction of the largest counts as zero.
@@ -60,8 +59,8 @@ def held_matrices(A: np.ndarray, B: np.ndarray, period: float) -> tuple[np.ndarr
     n, m = B.shape
     block = np.zeros((n + m, n + m))
     block[:n, :n], block[:n, n:] = A, B
-    found = scipy.linalg.expm(block * period)
-    return found[:n, :n], found[:n, n:]
+    exponential = scipy.linalg.expm(block * period)
+    return exponential[:n, :n], exponential[:n, n:]
 
 
 def regulator(linear: Linear, Q: Numbers, R: Numbers, *, rate: float | None = None) -> Regulator:
@@ -80,7 +79,7 @@ def regulator(linear: Linear, Q: Numbers, R: Numbers, *, rate: float | None = No
     """
     A, B = linear.A, linear.B
     n, m = B.shape
-    Q, R = _weights(Q, n, "Q", least=0.0), _weights(R, m, "R", least=None)
+    Q, R = _check_weights(Q, n, "Q", least=0.0), _check_weights(R, m, "R", least=None)
     _check_modes(linear, B, "The inputs cannot stabilise", "they do not move it")
     # Q sees what its square root sees
     _check_modes(linear, Q, "The weights Q do not determine", "they do not see it", transposed=True)
@@ -94,39 +93,39 @@ def regulator(linear: Linear, Q: Numbers, R: Numbers, *, rate: float | None = No
     try:
         S = solve(A, B, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise _unsolved(str(error)) from error
+        raise _riccati_error(str(error)) from error
     if rate is None:
         K = np.linalg.solve(R, B.T @ S)
     else:
         K = np.linalg.solve(R + B.T @ S @ B, B.T @ S @ A)
     if not np.all(np.isfinite(K)):
-        raise _unsolved("the gains are not finite")
+        raise _riccati_error("the gains are not finite")
     poles = np.linalg.eigvals(A - B @ K)
     # SciPy returns some matrices that are no stabilising solution without a word
     growth = poles.real if rate is None else np.abs(poles) - 1
     if np.max(growth) >= 0:
         pole = poles[np.argmax(growth)]
-        raise _unsolved(f"with what was found the closed loop has a pole at {pole:.4g}")
+        raise _riccati_error(f"the closed loop of the solution has a pole at {pole:.4g}")
     return Regulator(K, S, poles, rate)
 
 
-def _unsolved(why: str) -> ModelError:
+def _riccati_error(cause: str) -> ModelError:
     return ModelError(
-        f"The Riccati equation of the regulator has no stabilising solution ({why}). Weights of "
+        f"The Riccati equation of the regulator has no stabilising solution ({cause}). Weights of "
         "very different sizes can be the reason: scale errors by the sizes that they may have."
     )
 
 
-def _weights(given: Numbers, size: int, name: str, *, least: float | None) -> np.ndarray:
+def _check_weights(weights: Numbers, size: int, name: str, *, least: float | None) -> np.ndarray:
     """Weights as a symmetric matrix; positive definite, or with least=0 semidefinite."""
-    shape = (size,) if np.ndim(given) == 1 else (size, size)
-    matrix = np.asarray(numbers(given, shape, f"The weights {name} of the regulator", ""))
+    shape = (size,) if np.ndim(weights) == 1 else (size, size)
+    matrix = np.asarray(check_numbers(weights, shape, f"The weights {name} of the regulator", ""))
     matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
     if not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
         raise ModelError(f"The weights {name} of the regulator must be a symmetric matrix.")
     values = np.linalg.eigvalsh(matrix)
-    fine = values[0] > 0 if least is None else values[0] >= -1e-12 * max(values[-1], 0.0)
-    if not fine:
+    has_valid_sign = values[0] > 0 if least is None else values[0] >= -1e-12 * max(values[-1], 0.0)
+    if not has_valid_sign:
         kind = "definite" if least is None else "semidefinite"
         raise ModelError(
             f"The weights {name} of the regulator must be positive {kind}, but the smallest "
@@ -150,12 +149,12 @@ def check_observable(linear: Linear) -> None:
     Source: M. L. J. Hautus, Controllability and observability conditions of linear autonomous systems,
     Indagationes Mathematicae 31 (1969) 443-448.
     """
-    what = "The outputs do not observe"
-    _check_modes(linear, linear.C.T, what, "they do not see it", transposed=True)
+    claim = "The outputs do not observe"
+    _check_modes(linear, linear.C.T, claim, "they do not see it", transposed=True)
 
 
 def _check_modes(
-    linear: Linear, columns: np.ndarray, what: str, why: str, *, transposed: bool = False
+    linear: Linear, columns: np.ndarray, claim: str, cause: str, *, transposed: bool = False
 ) -> None:
     """Test of Popov, Belevitch and Hautus: raise `ModelError` for a mode that stays as it is."""
     A = linear.A.T if transposed else linear.A
@@ -166,10 +165,10 @@ def _check_modes(
         if s.real < -_DECAYS * max(abs(s), 1.0):
             continue
         matrix = np.hstack([(s * np.eye(len(A)) - A) / max(size, 1.0), unit])
-        left, values, _ = np.linalg.svd(matrix)
+        left_vectors, values, _ = np.linalg.svd(matrix)
         if values[-1] < _HAUTUS:
             # all modes of this eigenvalue
-            fixed = left[:, values < _HAUTUS]
+            fixed = left_vectors[:, values < _HAUTUS]
             share = np.mean(np.abs(fixed) ** 2, axis=1)
             parts = ", ".join(
                 f"{linear.states[k][0]} ({share[k]:.0%})"
@@ -177,7 +176,7 @@ def _check_modes(
                 if share[k] > 0.05
             )
             raise ModelError(
-                f"{what} the mode with eigenvalue {s:.4g} 1/s in {parts}: {why} (smallest singular "
+                f"{claim} the mode with eigenvalue {s:.4g} 1/s in {parts}: {cause} (smallest singular "
                 f"value {values[-1]:.1e} in the test of Popov, Belevitch and Hautus), and it does not "
                 "decay by itself."
             )
@@ -210,36 +209,29 @@ class StateFeedback(eqx.Module):
         gains = K.K if isinstance(K, Regulator) else K
         count = np.shape(inputs)[0] if np.ndim(inputs) == 1 else 0
         self.space, self.point = space, point
-        self.inputs = numbers(inputs, (count,), "The inputs of a state feedback", "")
-        self.K = numbers(gains, (count, space.size), "The gains of a state feedback", "")
+        self.inputs = check_numbers(inputs, (count,), "The inputs of a state feedback", "")
+        self.K = check_numbers(gains, (count, space.size), "The gains of a state feedback", "")
 
     def __call__(self, estimate: Any, reference: Any, memory: Any) -> tuple[Array, Any]:
         """Inputs (m,) and the unchanged memory."""
         space = self.space
+        target = self.point if reference is None else reference
         if isinstance(estimate, State):
             if space.size != 2 * space.dof:
                 raise ModelError(
                     "A state feedback of a system whose forces have states needs them in its "
                     "estimate: give the plant an estimator, or observe=point_of(space)."
                 )
-            estimate = space.from_state(estimate)
-        target = self.point if reference is None else reference
+            # a state gives angles up to whole turns: those nearest to the target
+            estimate = space.from_state(estimate, space.internal_at(target))
         return self.inputs - self.K @ space.difference(estimate, target), memory
 
 
 def point_of(space: AbstractStateSpace) -> Any:
-    """Function for `observe` of a plant: the true point of a space, states of forces included."""
+    """Function for `observe` of a plant: the true point of a space, with states of forces and turns."""
 
-    def observed(t: Array, state: State, internal: Array) -> Point:
+    def observe_point(t: Array, state: State, internal: Array) -> Point:
         del t
-        point = space.from_state(state)
-        if space.size == 2 * space.dof:
-            return point
-        inside = (
-            space.difference(point, point)
-            .at[2 * space.dof :]
-            .set(internal - jnp.asarray(point.internal))
-        )
-        return space.retract(point, inside)
+        return space.from_state(state, internal)
 
-    return observed
+    return observe_point

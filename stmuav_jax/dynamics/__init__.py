@@ -1,5 +1,5 @@
-"""Simulation of a system: method, run, certificate, evaluation at a state, joint loads. Floor 7."""
+"""Simulation of a system: method, run, certificate, evaluation at a state, joint loads."""
 
-import lazy_loader
+from ..checks.namespace import attach_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

@@ -1,30 +1,26 @@
 """Public names of this folder; `__init__.py` imports each when it is first used."""
 
-from .assembly.initial import (
-    Assembly as Assembly,
-    Rank as Rank,
-    assemble as assemble,
-    rank as rank,
-    ranks as ranks,
-)
+from .assembly.initial import Assembly as Assembly, assemble as assemble
 from .assembly.joint_start import (
     state_from_joints as state_from_joints,
 )
 from .assembly.prescribed import (
     KinematicPath as KinematicPath,
     PathReason as PathReason,
-    driven as driven,
+    add_drivers as add_drivers,
     driver_efforts as driver_efforts,
     kinematic_path as kinematic_path,
 )
-from .conserved import (
-    Energy as Energy,
-    energy as energy,
-    momentum as momentum,
+from .assembly.rank import Rank as Rank, rank as rank, ranks as ranks
+from .diagnostics import (
+    Certificate as Certificate,
 )
 from .evaluation import (
+    Energy as Energy,
     Evaluation as Evaluation,
+    energy as energy,
     evaluate as evaluate,
+    momentum as momentum,
 )
 from .formulations.augmented import (
     Augmented as Augmented,
@@ -34,8 +30,6 @@ from .formulations.base import (
     AbstractModel as AbstractModel,
     Accelerations as Accelerations,
     Reactions as Reactions,
-)
-from .formulations.reactions import (
     joint_reactions as joint_reactions,
     reaction_on as reaction_on,
 )
@@ -50,20 +44,15 @@ from .inspection import (
     Inspection as Inspection,
     check as check,
 )
-from .integration.adjoint import DiscreteAdjoint as DiscreteAdjoint
 from .integration.advance import (
     Trajectory as Trajectory,
 )
-from .integration.explicit import RungeKutta4 as RungeKutta4
-from .integration.rosenbrock import (
-    Rodas5P as Rodas5P,
+from .integration.solvers import (
+    RungeKutta4 as RungeKutta4,
 )
 from .integration.stepping import (
     kvaerno3 as kvaerno3,
     kvaerno5 as kvaerno5,
-)
-from .interpolation import (
-    states_at as states_at,
 )
 from .loads import (
     Envelope as Envelope,
@@ -75,17 +64,18 @@ from .loads import (
     smooth_peaks as smooth_peaks,
 )
 from .method import (
+    DiscreteAdjoint as DiscreteAdjoint,
     Method as Method,
-)
-from .run import (
-    Certificate as Certificate,
-    Run as Run,
-)
-from .scene import (
-    Scene as Scene,
+    choose_solver as choose_solver,
+    spectrum as spectrum,
 )
 from .simulation import (
+    Run as Run,
+    Scene as Scene,
+    describe_result as describe_result,
+    integrate as integrate,
     simulate as simulate,
+    states_at as states_at,
 )
 from .statespace.base import (
     AbstractStateSpace as AbstractStateSpace,
@@ -94,13 +84,6 @@ from .statespace.base import (
 from .statespace.tree import (
     TreePoint as TreePoint,
     TreeSpace as TreeSpace,
-)
-from .stiffness import (
-    choose_solver as choose_solver,
-    spectrum as spectrum,
-)
-from .trajectory import (
-    integrate as integrate,
 )
 from .tree.formulation import (
     Tree as Tree,

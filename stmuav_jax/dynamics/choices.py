@@ -6,10 +6,10 @@ these words. The object behind a word is imported when it is built.
 
 from typing import Any, Literal
 
-SolverName = Literal["dopri8", "tsit5", "kvaerno3", "kvaerno5", "rodas5p", "auto"]
+SolverName = Literal["dopri8", "tsit5", "kvaerno3", "kvaerno5", "auto"]
 # Many runs at once are stepped by explicit methods alone.
 ExplicitSolverName = Literal["dopri8", "tsit5"]
-FormulationName = Literal["tree", "augmented", "augmented-dense", "report"]
+FormulationName = Literal["tree", "augmented"]
 StabilisationName = Literal["projection", "baumgarte", "none"]
 
 # Default of rtol and atol, on positions [m], Euler parameters, velocities [m/s], [rad/s] alike.
@@ -24,7 +24,6 @@ def solver_named(name: SolverName) -> Any:
     """Solver of this name; the text "auto" is returned as it is, for `simulate` to resolve."""
     import diffrax
 
-    from .integration.rosenbrock import Rodas5P
     from .integration.stepping import kvaerno3, kvaerno5
 
     if name == "auto":
@@ -34,21 +33,15 @@ def solver_named(name: SolverName) -> Any:
         "tsit5": diffrax.Tsit5,
         "kvaerno3": kvaerno3,
         "kvaerno5": kvaerno5,
-        "rodas5p": Rodas5P,
     }[name]()
 
 
 def formulation_named(name: FormulationName) -> Any:
-    """Formulation of this name; "report" has the report's single system and its choice of rows."""
+    """Formulation of this name."""
     from .formulations.augmented import Augmented
     from .tree.formulation import Tree
 
-    return {
-        "tree": Tree(),
-        "augmented": Augmented(),
-        "augmented-dense": Augmented(solve="dense"),
-        "report": Augmented(solve="dense", rows="report"),
-    }[name]
+    return {"tree": Tree, "augmented": Augmented}[name]()
 
 
 def stabilisation_named(name: StabilisationName) -> Any:

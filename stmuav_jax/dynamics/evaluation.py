@@ -7,21 +7,58 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from ..algebra.compiler import in_blocks, kept_jit
 from ..checks.numbers import as_jax
 from ..checks.shapes import Numbers
-from ..mechanics.internal import with_internal
+from ..math.compiler import in_blocks, kept_jit
+from ..mechanics.body import check_bodies
+from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.load import Load, no_load
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
-from .conserved import energy, momentum
 from .formulations.augmented import Augmented, AugmentedModel
-from .formulations.base import AbstractFormulation, Accelerations, Reactions
-from .formulations.reactions import Frame, in_joint_axes
+from .formulations.base import (
+    AbstractFormulation,
+    Accelerations,
+    Frame,
+    Reactions,
+    in_joint_axes,
+)
 from .formulations.stabilisation import Unstabilised
 from .integration.problem import at_internal
+
+
+class Energy(eqx.Module):
+    """Kinetic and potential energy [J], each of shape ()."""
+
+    kinetic: Float[Array, ""]
+    potential: Float[Array, ""]
+
+    @property
+    def total(self) -> Float[Array, ""]:
+        """Total energy, kinetic plus potential [J]."""
+        return self.kinetic + self.potential
+
+
+def energy(system: System, state: State, t: Float[Array, ""]) -> Energy:
+    """Energy at one state, with the potential of conservative forces (gravity, springs)."""
+    kin = system.kinematics(state)
+    bodies = system.bodies
+    # In body axes, in which inertia tensors are constant: no rotation is needed.
+    spin = jnp.einsum("na,nab,nb->", state.omega, bodies.inertia, state.omega)
+    kinetic = 0.5 * (jnp.sum(bodies.mass[:, None] * state.v**2) + spin)
+    loads = [force.load(t, kin).potential for force in system.forces]
+    return Energy(kinetic, sum(loads, start=jnp.zeros_like(kinetic)))
+
+
+def momentum(system: System, state: State) -> Float[Array, "6"]:
+    """Linear momentum [N s], then angular momentum about the world's origin [N m s], (6,)."""
+    kin = system.kinematics(state)
+    linear = system.bodies.mass[:, None] * state.v
+    spin = jnp.einsum("nab,nbc,nc->na", kin.R_wb[:-1], system.bodies.inertia, state.omega)
+    angular = jnp.cross(state.r, linear) + spin
+    return jnp.concatenate([jnp.sum(linear, axis=0), jnp.sum(angular, axis=0)])
 
 
 class Snapshot(eqx.Module):
@@ -62,12 +99,12 @@ class RowsAt(NamedTuple):
             moment [N m] in body axes.
     """
 
-    residuals: Float[Array, " m"]
-    rates: Float[Array, " m"]
-    matrix: Float[Array, "m k"]
-    gamma: Float[Array, " m"]
-    finite_loads: Bool[Array, " forces"]
-    wrenches: Float[Array, "n 6"]
+    residuals: Any
+    rates: Any
+    matrix: Any
+    gamma: Any
+    finite_loads: Any
+    wrenches: Any
 
 
 class Saved(NamedTuple):
@@ -79,44 +116,52 @@ class Saved(NamedTuple):
 
 
 @kept_jit
-def _dynamics(
+def _evaluate_dynamics(
     formulation: AbstractFormulation, model: Any, saved: Saved, reacting: bool
 ) -> tuple[Accelerations, Reactions | None]:
-    def one(at: Saved) -> tuple[Accelerations, Reactions | None]:
-        here = at_internal(model, at.internal) if at.internal.shape[0] else model
-        found = formulation.accelerations(here, at.ts, at.states, Unstabilised())
-        return found, formulation.reactions(here, at.ts, at.states, found) if reacting else None
+    def dynamics_at(at: Saved) -> tuple[Accelerations, Reactions | None]:
+        current_model = at_internal(model, at.internal) if at.internal.shape[0] else model
+        body_accelerations = formulation.accelerations(
+            current_model, at.ts, at.states, Unstabilised()
+        )
+        return body_accelerations, formulation.reactions(
+            current_model, at.ts, at.states, body_accelerations
+        ) if reacting else None
 
-    return jax.lax.map(one, saved)
-
-
-@kept_jit
-def _balances(system: System, saved: Saved) -> Balances:
-    def one(at: Saved) -> Balances:
-        here = with_internal(system, at.internal)
-        now = energy(here, at.states, at.ts)
-        return Balances(now.kinetic, now.potential, momentum(here, at.states))
-
-    return jax.lax.map(one, saved)
+    # One state after the other and not all at once: saved states are many, and a batch of all
+    # would take memory in proportion.
+    return jax.lax.map(dynamics_at, saved)
 
 
 @kept_jit
-def _rows(model: AugmentedModel, saved: Saved) -> RowsAt:
-    def one(at: Saved) -> RowsAt:
+def _evaluate_balances(system: System, saved: Saved) -> Balances:
+    def balances_at(at: Saved) -> Balances:
+        current_system = with_internal(system, at.internal)
+        now = energy(current_system, at.states, at.ts)
+        return Balances(now.kinetic, now.potential, momentum(current_system, at.states))
+
+    return jax.lax.map(balances_at, saved)
+
+
+@kept_jit
+def _evaluate_rows(model: AugmentedModel, saved: Saved) -> RowsAt:
+    def constraint_rows_at(at: Saved) -> RowsAt:
         system, state = with_internal(model.system, at.internal), at.states
         kin = system.kinematics(state)
         eq = model.constraints.equations(at.ts, kin)
+        # Angles and lengths in one unit, so that one tolerance holds for all residuals.
         scale = model.constraints.scales()
         u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
         loads = [force.load(at.ts, kin) for force in system.forces]
         finite = [jnp.all(jnp.isfinite(x.force)) & jnp.all(jnp.isfinite(x.moment)) for x in loads]
-        fine = jnp.stack(finite) if finite else jnp.zeros((0,), bool)
-        off = scale * (eq.matrix @ u - eq.target)
+        finite_mask = jnp.stack(finite) if finite else jnp.zeros((0,), bool)
+        rate_residuals = scale * (eq.matrix @ u - eq.target)
+        # Loads are evaluated apart first: a message can name the force element that is not finite.
         total = sum(loads, start=no_load(kin))
         wrenches = jnp.concatenate([total.force, total.moment], axis=1)[:-1]
-        return RowsAt(scale * eq.value, off, eq.matrix, eq.gamma, fine, wrenches)
+        return RowsAt(scale * eq.value, rate_residuals, eq.matrix, eq.gamma, finite_mask, wrenches)
 
-    return jax.lax.map(one, saved)
+    return jax.lax.map(constraint_rows_at, saved)
 
 
 # One block size for the initial state and for all saved states: one compilation serves both.
@@ -127,7 +172,7 @@ def _in_blocks(function: Callable[[Saved], Any], saved: Saved) -> Any:
     return in_blocks(lambda *at: function(Saved(*jax.tree.map(as_jax, at))), _BLOCK, *saved)
 
 
-def snapshots(formulation: AbstractFormulation, model: Any, saved: Saved) -> Snapshot:
+def evaluate_snapshots(formulation: AbstractFormulation, model: Any, saved: Saved) -> Snapshot:
     """`Snapshot`s of saved states, as NumPy arrays stacked along the first axis.
 
     The accelerations are those of the formulation, without stabilisation.
@@ -135,24 +180,26 @@ def snapshots(formulation: AbstractFormulation, model: Any, saved: Saved) -> Sna
     Args:
         model: system prepared for the formulation.
     """
-    found = _in_blocks(lambda at: _dynamics(formulation, model, at, True), saved)
+    dynamics = _in_blocks(lambda at: _evaluate_dynamics(formulation, model, at, True), saved)
     now = balances(model.system, saved)
-    return Snapshot(found[0], found[1], now.kinetic, now.potential, now.momentum)
+    return Snapshot(dynamics[0], dynamics[1], now.kinetic, now.potential, now.momentum)
 
 
-def reactions(formulation: AbstractFormulation, model: Any, saved: Saved) -> Reactions:
-    """Reactions of saved states, as those of `snapshots` and by their program."""
-    return _in_blocks(lambda at: _dynamics(formulation, model, at, True), saved)[1]
+def evaluate_reactions(formulation: AbstractFormulation, model: Any, saved: Saved) -> Reactions:
+    """Reactions of saved states, as those of `evaluate_snapshots` and by their program."""
+    return _in_blocks(lambda at: _evaluate_dynamics(formulation, model, at, True), saved)[1]
 
 
-def accelerations(formulation: AbstractFormulation, model: Any, saved: Saved) -> Accelerations:
-    """Accelerations of saved states by a formulation, as those of `snapshots`."""
-    return _in_blocks(lambda at: _dynamics(formulation, model, at, False), saved)[0]
+def evaluate_accelerations(
+    formulation: AbstractFormulation, model: Any, saved: Saved
+) -> Accelerations:
+    """Accelerations of saved states by a formulation, as those of `evaluate_snapshots`."""
+    return _in_blocks(lambda at: _evaluate_dynamics(formulation, model, at, False), saved)[0]
 
 
 def balances(system: System, saved: Saved) -> Balances:
     """`Balances` of saved states, as NumPy arrays stacked along the first axis."""
-    return _in_blocks(lambda at: _balances(system, at), saved)
+    return _in_blocks(lambda at: _evaluate_balances(system, at), saved)
 
 
 def rows_at(model: AugmentedModel, saved: Saved) -> RowsAt:
@@ -161,7 +208,17 @@ def rows_at(model: AugmentedModel, saved: Saved) -> RowsAt:
     Args:
         model: system prepared for maximal coordinates, with the rows of all joints.
     """
-    return _in_blocks(lambda at: _rows(model, at), saved)
+    return _in_blocks(lambda at: _evaluate_rows(model, at), saved)
+
+
+def rows_of(model: AugmentedModel, states: State, t: float) -> RowsAt:
+    """`RowsAt` as of `rows_at`, at postures (k, n, .) of one time [s], with the forces' own states."""
+    count, internal = len(states.r), np.asarray(internal_states(model.system))
+    internal_by_posture = np.tile(internal, (count, 1))
+    states = jax.tree.map(np.asarray, states)
+    return jax.tree.map(
+        np.asarray, rows_at(model, Saved(np.full(count, t), states, internal_by_posture))
+    )
 
 
 def singular_values(rows: RowsAt) -> Float[np.ndarray, "k s"]:
@@ -201,10 +258,13 @@ def evaluate(
 
     Raises:
         SettingError: shapes or precision of the state do not fit the system.
+        ModelError: a mass or a tensor of inertia that no body can have.
     """
     check_state(system, state)
+    check_bodies(system.bodies)
     if load is not None:
-        system = eqx.tree_at(lambda s: s.forces, system, (*system.forces, _Given(load)))
+        # A given load joins the system as one more force element, and the equations need no case for it.
+        system = eqx.tree_at(lambda s: s.forces, system, (*system.forces, _ConstantLoad(load)))
     formulation = formulation if formulation is not None else Augmented()
     model: Any = formulation.prepare(system)
     time = jnp.asarray(t, dtype=state.r.dtype)
@@ -215,11 +275,11 @@ def evaluate(
     return Evaluation(result, reactions)
 
 
-class _Given(eqx.Module):
+class _ConstantLoad(eqx.Module):
     """Force element with a given load."""
 
-    given: Load
+    load_value: Load
 
     def load(self, t: Array, kin: Any) -> Load:
         del t, kin
-        return self.given
+        return self.load_value

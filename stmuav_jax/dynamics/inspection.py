@@ -1,6 +1,5 @@
 """Inspection of a mechanism and its posture before a run: what is wrong, and what it will demand."""
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -10,25 +9,41 @@ import numpy as np
 from jaxtyping import Float
 
 from ..checks.errors import ModelError, SettingError, StateError
-from ..checks.physical import check_inertia, check_mass
-from ..mechanics.forces.applied import Gravity
-from ..mechanics.internal import internal_states
+from ..checks.numbers import check_inertia, check_mass
+from ..mechanics.forces import Gravity
+from ..mechanics.inputs import Inputs, inputs_of, present_values
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .assembly.initial import Rank, rank_of
-from .assembly.singular import weakest_rows
-from .certify import allow_dependent, branches_at, check_determined
-from .checks import (
-    POSITION_TOLERANCE,
-    VELOCITY_TOLERANCE,
-    check_consistent,
-    check_loads,
-    check_start,
+from .actuation import (
+    WEAK,
+    Actuation,
+    actuation_along,
+    force_units,
+    input_labels,
+    joints_in_motion,
+    mechanism_size,
+    names_of_largest,
 )
-from .evaluation import RowsAt, Saved, rows_at
-from .formulations.augmented import Augmented, AugmentedModel, displace
-from .scene import Scene
-from .stiffness import EXPLICIT_LIMIT, spectrum
+from .assembly.rank import Rank, rank_of
+from .assembly.singular import weakest_rows
+from .diagnostics import (
+    POSITION_TOLERANCE,
+    branches_at,
+    check_compatible,
+    check_consistent,
+    check_determined,
+    check_loads,
+    check_rounded,
+    check_start,
+    consistent_limits,
+)
+from .evaluation import RowsAt, rows_of
+from .formulations.augmented import AugmentedModel, prepare_rows
+from .formulations.base import count_left_out
+from .formulations.independence import displace_postures, longest_arm
+from .method import EXPLICIT_LIMIT, spectrum
+from .simulation import Scene
+from .statespace.tree import TreeSpace
 from .tree.formulation import Tree
 from .tree.topology import spanning_tree
 
@@ -48,6 +63,10 @@ _SMALL, _LARGE = 1e-3, 1e4
 _RATIO, _CONDITION = 1e8, 1e10
 # Distance to a singular posture [m or rad] that gets a warning, and the step that finds it.
 _NEAR, _STEP = 0.05, 1e-3
+# Extrapolated distance beyond which there is none to speak of [m or rad].
+_FAR = 100.0
+# Directions beside a posture that mix its independent coordinates.
+_MIXTURES = 4
 # Newton's steps that put the posture beside it on the constraints.
 _CORRECTIONS = 6
 # Singular value, as a fraction of the largest, that a dependent row gains beside a singular posture.
@@ -62,12 +81,12 @@ class Finding(NamedTuple):
     Attributes:
         severity: "fault" if the mechanism cannot be simulated so, "warning" if it probably is not
             what is meant or is near its limits, "note" for what is good to know.
-        what: quantity or thing. value: its value with its unit, or what was found, in words.
+        quantity: quantity or thing. value: its value with its unit, or what was found, in words.
         valid: what would be valid, or advice; may be empty.
     """
 
     severity: Severity
-    what: str
+    quantity: str
     value: str
     valid: str = ""
 
@@ -83,60 +102,75 @@ class Inspection(NamedTuple):
         return self.findings[0].severity if self.findings else "note"
 
     def __str__(self) -> str:
-        rows = (f"{f.severity}: {f.what}: {f.value} {f.valid}".strip() for f in self.findings)
+        rows = (f"{f.severity}: {f.quantity}: {f.value} {f.valid}".strip() for f in self.findings)
         return "\n".join(rows)
 
 
-def check(what: Scene | System, state: State | None = None, t: float | None = None) -> Inspection:
+def check(
+    mechanism: Scene | System,
+    state: State | None = None,
+    t: float | None = None,
+    *,
+    inputs: Inputs | None = None,
+) -> Inspection:
     """Inspect a mechanism in one posture: everything that can be said before a run.
 
     These are looked at: masses, inertia tensors, sizes and gravity, which show wrong units; residuals
     of the posture and its velocities; degrees of freedom, dependent and contradictory constraints by
     the names of their joints; conditions of the mass matrix and of the constraint Jacobian; the
-    distance to a singular posture; the eigenvalues of the linearised motion, and which formulation
-    and solver suit them.
+    distance to a singular posture of the constraints and of the inputs; the eigenvalues of the linearised
+    motion, and which formulation and solver suit them.
 
     Args:
-        what: scene, or system. state: state of a system; by default its reference posture, at rest.
+        mechanism: scene, or system. state: state of a system; by default its reference posture, at rest.
         t: time [s]; by default the scene's t0, or zero.
+        inputs: inputs of the actuators, see `inputs_of`; by default all of the system.
 
     Raises:
         SettingError: neither a scene nor a system is given, or a scene together with a state.
     """
     between: tuple[str, ...] = ()
-    if isinstance(what, Scene) and state is None:
-        between = what.links_between
-        system, state, t = what.system, what.state0, what.t0 if t is None else t
-    elif isinstance(what, System):
-        system, state, t = what, what.reference if state is None else state, t or 0.0
+    lost: tuple[str, ...] = ()
+    if isinstance(mechanism, Scene) and state is None:
+        between, lost = mechanism.links_between, mechanism.warnings
+        system, state, t = mechanism.system, mechanism.state0, mechanism.t0 if t is None else t
+    elif isinstance(mechanism, System):
+        system, state, t = mechanism, mechanism.reference if state is None else state, t or 0.0
     else:
         raise SettingError("check takes a Scene, or a System with or without a State.")
-    found = [*_bodies(system), *_magnitudes(system, state, between)]
-    found += list(_faults("initial state", lambda: check_start(system, state)))
-    if not any(each.severity == "fault" for each in found):
-        found += _posture(system, state, t)
-    return Inspection(tuple(sorted(found, key=lambda each: SEVERITIES.index(each.severity))))
+    findings = [Finding("warning", "import", sentence) for sentence in lost]
+    findings += [*_check_bodies(system), *_check_magnitudes(system, state, between)]
+    findings += list(_catch_fault("initial state", lambda: check_start(system, state)))
+    if not any(finding.severity == "fault" for finding in findings):
+        findings += _check_posture(
+            system, state, t, inputs_of(system) if inputs is None else inputs
+        )
+    return Inspection(
+        tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
+    )
 
 
-def _faults(what: str, look: Callable[[], Any]) -> Iterator[Finding]:
+def _catch_fault(subject: str, look: Callable[[], Any]) -> Iterator[Finding]:
     """Error of a check as a finding."""
     try:
         look()
     except (ModelError, StateError) as error:
-        yield Finding("fault", what, str(error))
+        yield Finding("fault", subject, str(error))
 
 
 # --- bodies and magnitudes
 
 
-def _bodies(system: System) -> Iterator[Finding]:
+def _check_bodies(system: System) -> Iterator[Finding]:
     """Findings on masses and inertia tensors."""
     for name, mass, inertia in zip(
         system.names, np.asarray(system.bodies.mass), np.asarray(system.bodies.inertia), strict=True
     ):
-        yield from _faults(f"mass of {name}", lambda m=mass, n=name: check_mass(m, f"body '{n}'"))
+        yield from _catch_fault(
+            f"mass of {name}", lambda m=mass, n=name: check_mass(m, f"body '{n}'")
+        )
         wrong = list(
-            _faults(
+            _catch_fault(
                 f"inertia of {name}",
                 lambda J=inertia, n=name: check_inertia(J, f"body '{n}'", _ROUNDED),
             )
@@ -144,6 +178,8 @@ def _bodies(system: System) -> Iterator[Finding]:
         yield from wrong
         if wrong or not mass > 0:
             continue
+        # The principal moments of a body in millimetres or grams imply an impossible density, which is how
+        # wrong units are found.
         moments = np.linalg.eigvalsh(inertia)
         excess = moments[2] / (moments[0] + moments[1]) - 1
         if excess > 1e-12:
@@ -154,19 +190,19 @@ def _bodies(system: System) -> Iterator[Finding]:
         # squared semi-axes of the solid ellipsoid with these moments
         square = 2.5 / mass * np.maximum(np.sum(moments) - 2 * moments, 0.0)
         ball, solid = max(square) ** 1.5, np.sqrt(np.prod(square))
-        for volume, off, words in (
+        for volume, is_implausible, comparison in (
             (ball, mass > _DENSE * 4 / 3 * np.pi * ball, "as dense as a sphere of"),
             (solid, mass < _LIGHT * 4 / 3 * np.pi * solid, "as dense as an ellipsoid of"),
         ):
-            if off:
+            if is_implausible:
                 density = mass / (4 / 3 * np.pi * volume)
                 yield Finding(
-                    "warning", f"mass and inertia of {name}", f"{words} {density:.2g} kg/m^3",
+                    "warning", f"mass and inertia of {name}", f"{comparison} {density:.2g} kg/m^3",
                     f"{_LIGHT:g} to {_DENSE:g} kg/m^3; are they in kg and kg m^2?",
                 )  # fmt: skip
 
 
-def _magnitudes(system: System, state: State, between: Sequence[str]) -> Iterator[Finding]:
+def _check_magnitudes(system: System, state: State, between: Sequence[str]) -> Iterator[Finding]:
     """Findings on the ratio of masses, the size of the mechanism and gravity.
 
     Args:
@@ -179,20 +215,17 @@ def _magnitudes(system: System, state: State, between: Sequence[str]) -> Iterato
             f"{len(between)}, of at most {largest:.2g} kg",
             "the import made them; the tree's coordinates carry them (formulation Tree)",
         )  # fmt: skip
-    own = [k for k, name in enumerate(system.names) if name not in between]
-    mass = np.asarray(system.bodies.mass)[own]
+    body_indices = [k for k, name in enumerate(system.names) if name not in between]
+    mass = np.asarray(system.bodies.mass)[body_indices]
     if max(mass) > _RATIO * min(mass):
-        light, heavy = (system.names[own[k]] for k in (np.argmin(mass), np.argmax(mass)))
+        light, heavy = (system.names[body_indices[k]] for k in (np.argmin(mass), np.argmax(mass)))
         yield Finding(
             "warning", "ratio of masses", f"{max(mass) / min(mass):.2g} ({heavy} to {light})",
             f"below {_RATIO:g}; a light body between heavy ones is best carried by the tree's "
             "coordinates (formulation Tree)",
         )  # fmt: skip
-    kin = system.kinematics(state)
-    ends = [(j.body_i, j.point_i) for j in system.joints]
-    ends += [(j.body_j, j.point_j) for j in system.joints]
-    points = np.array([*np.asarray(state.r), *(np.asarray(kin.point(*end)[0]) for end in ends)])
-    size = float(np.max(np.ptp(points, axis=0)))
+    # Lengths in millimetres make a mechanism of 100 m, which no check of single numbers would notice.
+    size = float(mechanism_size(system, state))
     if 0 < size < _SMALL or size > _LARGE:
         yield Finding(
             "warning", "size of the mechanism", f"{size:.3g} m",
@@ -211,40 +244,45 @@ def _magnitudes(system: System, state: State, between: Sequence[str]) -> Iterato
 # --- the posture
 
 
-def _posture(system: System, state: State, t: float) -> list[Finding]:
+def _check_posture(system: System, state: State, t: float, inputs: Inputs) -> list[Finding]:
     """Findings on loads, residuals, rank, conditions and the linearised motion at a state."""
-    model = Augmented().prepare(system)
-    seen = _rows(system, model, [state], t)
-    residuals, rates, matrix, gamma, loads, wrenches = (np.asarray(x)[0] for x in seen)
-    found = list(_faults("loads", lambda: check_loads(system, loads, t)))
-    off = list(_faults("posture", lambda: check_consistent(system, model, residuals, rates)))
-    if not off and system.joints:
+    model = prepare_rows(system)
+    posture_rows = RowsAt(
+        *(x[0] for x in rows_of(model, jax.tree.map(lambda x: x[None], state), t))
+    )
+    residuals, rates, matrix, gamma, loads, wrenches = posture_rows
+    findings = list(_catch_fault("loads", lambda: check_loads(system, loads, t)))
+    most = consistent_limits(system, model, state, posture_rows)
+    posture_faults = list(
+        _catch_fault("posture", lambda: check_consistent(system, model, residuals, rates, most))
+    )
+    if not posture_faults and system.joints:
         value = f"{np.max(np.abs(residuals)):.2g} m or rad, "
         value += f"rates {np.max(np.abs(rates)):.2g} m/s or rad/s"
-        limits = f"at most {POSITION_TOLERANCE:g} and {VELOCITY_TOLERANCE:g}"
-        found.append(Finding("note", "largest residual of the constraints", value, limits))
+        limits = f"at most {np.min(most[0]):.1g} and {np.min(most[1]):.1g}"
+        findings.append(Finding("note", "largest residual of the constraints", value, limits))
     rank = rank_of(system, model, state, t, matrix)
     free = _free_motions(matrix, rank, 6 * system.n_bodies)
-    found += [*off, *_freedom(system, rank), *_conditions(system, rank, matrix, free)]
+    findings += [
+        *posture_faults,
+        *_describe_freedom(system, rank),
+        *_check_conditions(system, rank, matrix, free),
+    ]
+    findings += _catch_fault("rounded numbers", lambda: check_rounded(system, model))
     if rank.redundant:
-        wrong = list(_faults("constraints", lambda: allow_dependent(Tree(), rank, matrix, gamma)))
-        if not (wrong or off):
-            beside = branches_at(model, state, t, matrix)
-            start = lambda: check_determined(system, state, beside, gamma, wrenches)
-            wrong += _faults("singular posture at rest", start)
-        found += wrong
-    if rank.rank and not off:
-        found += _nearness(system, model, state, t, rank, free)
-    if rank.dof and not any(each.severity == "fault" for each in found):
-        found += _motion(system, state, t, rank)
-    return found
-
-
-def _rows(system: System, model: AugmentedModel, states: list[State], t: float) -> RowsAt:
-    """Constraint rows and loads at several states, stacked along the first axis."""
-    stack: Any = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *states)
-    internal = np.stack([np.asarray(internal_states(system))] * len(states))
-    return jax.tree.map(np.asarray, rows_at(model, Saved(np.full(len(states), t), stack, internal)))
+        wrong = list(_catch_fault("constraints", lambda: check_compatible(rank, matrix, gamma)))
+        if not (wrong or posture_faults):
+            branching = branches_at(model, state, t, matrix)
+            start = lambda: check_determined(system, state, branching, gamma, wrenches)
+            wrong += _catch_fault("singular posture at rest", start)
+        findings += wrong
+    if rank.rank and not posture_faults:
+        findings += _check_nearness(system, model, state, t, rank, free)
+    if len(inputs) and rank.dof and not posture_faults:
+        findings += _check_actuation(system, state, t, inputs)
+    if rank.dof and not any(finding.severity == "fault" for finding in findings):
+        findings += _check_motion(system, state, t, rank)
+    return findings
 
 
 def _free_motions(matrix: np.ndarray, rank: Rank, columns: int) -> Float[np.ndarray, "k dof"]:
@@ -254,7 +292,7 @@ def _free_motions(matrix: np.ndarray, rank: Rank, columns: int) -> Float[np.ndar
     return np.linalg.svd(matrix)[2][rank.rank :].T
 
 
-def _freedom(system: System, rank: Rank) -> Iterator[Finding]:
+def _describe_freedom(system: System, rank: Rank) -> Iterator[Finding]:
     bodies, joints = system.n_bodies, len(system.joints)
     counted = f"(bodies {bodies}, joints {joints}, rows {rank.rows} of rank {rank.rank})"
     valid = "" if rank.dof else "none is left: a structure, or a motion that drivers prescribe"
@@ -270,42 +308,48 @@ def _freedom(system: System, rank: Rank) -> Iterator[Finding]:
     yield Finding("note", "formulation", value, valid)
 
 
-def _conditions(
+def _check_conditions(
     system: System, rank: Rank, matrix: np.ndarray, free: np.ndarray
 ) -> Iterator[Finding]:
     """Findings on the condition numbers of the mass matrix and of the constraint Jacobian."""
-    found: list[tuple[str, float]] = []
+    condition_numbers: list[tuple[str, float]] = []
     if rank.dof:
         n = system.n_bodies
         M = np.zeros((n, 6, n, 6))
         for k in range(n):
             M[k, :3, k, :3] = np.asarray(system.bodies.mass)[k] * np.eye(3)
             M[k, 3:, k, 3:] = np.asarray(system.bodies.inertia)[k]
+        # Only the motions that the joints allow count: a light body between heavy ones need not be ill-
+        # conditioned.
         values = np.linalg.eigvalsh(free.T @ M.reshape(6 * n, 6 * n) @ free)
         condition = values[-1] / values[0] if values[0] > 0 else np.inf
-        found.append(("condition of the mass matrix in the free motions", float(condition)))
+        condition_numbers.append(
+            ("condition of the mass matrix in the free motions", float(condition))
+        )
     if rank.rank:
         largest = np.linalg.svd(matrix, compute_uv=False)[0]
         condition = float(largest / rank.smallest_singular_value)
-        found.append(("condition of the constraint Jacobian", condition))
-    for what, condition in found:
+        condition_numbers.append(("condition of the constraint Jacobian", condition))
+    for subject, condition in condition_numbers:
         bad = not condition < _CONDITION
         yield Finding(
-            "warning" if bad else "note", what, f"{condition:.2g}",
+            "warning" if bad else "note", subject, f"{condition:.2g}",
             f"below {_CONDITION:g}; as many digits as this number has are lost" if bad else "",
         )  # fmt: skip
 
 
-def _nearness(
+def _check_nearness(
     system: System, model: AugmentedModel, state: State, t: float, rank: Rank, free: np.ndarray
 ) -> Iterator[Finding]:
     """Findings on dependent rows and singular postures, from postures beside this one."""
     names, at, change = ", ".join(rank.redundant), rank.smallest_singular_value, 0.0
     if rank.dof:
-        beside = _beside(system, model, state, t, free)
+        nearby_rows = _evaluate_neighbours(model, state, t, free)
         # a motion that is not along a branch of the mechanism finds no posture beside it
-        held = np.max(np.abs(beside.residuals), axis=1) <= POSITION_TOLERANCE
-        values = np.linalg.svd(beside.matrix[held], compute_uv=False)
+        arm = float(longest_arm(system, model.constraints))
+        size = np.where(model.constraints.angular, 1.0, arm)
+        closed_mask = np.max(np.abs(nearby_rows.residuals) / size, axis=1) <= POSITION_TOLERANCE
+        values = np.linalg.svd(nearby_rows.matrix[closed_mask], compute_uv=False)
         if np.any(values[:, rank.rank :][:, :1] > _GAINED * values[:, :1]):
             yield Finding(
                 "warning", "singular posture", f"rank {rank.rank} here, more beside it",
@@ -320,18 +364,156 @@ def _nearness(
             "the motion is as without them, but how reactions are shared is not determined; a "
             "joint that holds less, such as a spherical one, would not repeat them",
         )  # fmt: skip
-    if change > 0 and at * _STEP / change < _NEAR:
+    if not rank.dof:
+        return
+    # The smallest singular value goes to zero linearly at a singular posture: its rate of change gives
+    # the distance to the zero.
+    distance = at * _STEP / change if change > 0 else np.inf
+    if distance < _NEAR:
         _, joints = weakest_rows(system, model, state, t, rank.rank)
         yield Finding(
             "warning", "distance to a singular posture",
-            f"a movement of about {at * _STEP / change:.2g} m or rad",
+            f"a movement of about {distance:.2g} m or rad",
             f"above {_NEAR:g}; lead the motion around it. Its rows are those of {', '.join(joints)}",
         )  # fmt: skip
+    else:
+        yield Finding(
+            "note", "distance to a singular posture", _format_distance(distance), f"above {_NEAR:g}"
+        )
 
 
-def _beside(
-    system: System, model: AugmentedModel, state: State, t: float, free: np.ndarray
-) -> RowsAt:
+def _format_distance(distance: float) -> str:
+    """Words for a distance that is extrapolated from the posture's neighbours."""
+    if distance > _FAR:
+        return "none near: no singular value changes"
+    return f"a movement of about {distance:.2g} m or rad"
+
+
+def _check_actuation(system: System, state: State, t: float, inputs: Inputs) -> Iterator[Finding]:
+    """Findings on singular postures of the inputs: direct (type 2) and inverse (type 1) ones.
+
+    Ranks are those of the postures one step to either side along each independent coordinate, where the
+    largest movement of a body is `_STEP` [m or rad]. Distances are extrapolated from there.
+    """
+    try:
+        space = TreeSpace(system, state, t=t)
+    except ModelError:
+        return  # a singular posture of the constraints has its own finding
+    x, dof, time = space.from_state(state), space.dof, jnp.asarray(t, float)
+    values = jnp.stack([
+        jnp.zeros(()) if callable(v) else jnp.asarray(v, float) for v in present_values(system, inputs)
+    ])  # fmt: skip
+    # besides the coordinates one by one, mixtures: a singular value may stay at zero along each of them
+    directions = np.vstack([np.eye(dof), np.random.default_rng(0).normal(size=(_MIXTURES, dof))])
+    steps = np.zeros((1 + 2 * len(directions), space.size))
+    evaluate = lambda: jax.tree.map(
+        np.asarray, actuation_along(space, x, jnp.asarray(steps), inputs, values, time)
+    )
+    start = evaluate()
+    reach = np.max(np.abs(start.velocities[0] @ directions.T), axis=0)
+    steps[1::2, :dof] = _STEP * directions / reach[:, None]
+    steps[2::2, :dof] = -steps[1::2, :dof]
+    neighbours = evaluate()
+    yield from _check_direct(system, state, inputs, neighbours)
+    yield from _check_inverse(system, state, inputs, neighbours)
+
+
+def _scaled_forces(
+    system: System, inputs: Inputs, neighbours: Actuation
+) -> tuple[np.ndarray, bool]:
+    """Effects of the inputs on the unit motions (k, dof, m), and whether all are in weights.
+
+    Inputs of other units, such as targets of servos, are scaled to their largest effect.
+    """
+    in_weights = np.array([bool(unit) for unit in force_units(system, inputs)])
+    effect = np.nanmax(np.linalg.norm(neighbours.forces, axis=1), axis=0)
+    scaled = np.asarray(neighbours.forces) / np.where(in_weights | (effect == 0), 1.0, effect)
+    return scaled, bool(np.all(in_weights))
+
+
+def _check_direct(
+    system: System, state: State, inputs: Inputs, neighbours: Actuation
+) -> Iterator[Finding]:
+    """Findings on motions that the inputs do not hold."""
+    scaled, in_weights = _scaled_forces(system, inputs, neighbours)
+    nearness = _extrapolate_rank(scaled)
+    if nearness is None:
+        return
+    rank, sigma, distance = nearness
+    if not (distance < _NEAR or (sigma < WEAK and in_weights)):
+        yield Finding(
+            "note", "distance to a singular posture of the inputs", _format_distance(distance),
+            f"above {_NEAR:g}; smallest singular value {sigma:.2g}",
+        )  # fmt: skip
+        return
+    row_vectors, values, column_vectors = np.linalg.svd(scaled[0], full_matrices=False)
+    round_off = _GAINED * np.nanmax(np.linalg.norm(scaled, axis=(1, 2)))
+    weak = (np.arange(len(values)) < rank) & (values <= max(2 * sigma, round_off))
+    lost = np.asarray(neighbours.motions[0]) @ row_vectors[:, weak]
+    moving = joints_in_motion(system, state, lost, float(neighbours.size[0]))
+    acting = names_of_largest(input_labels(system, inputs), column_vectors[weak].T)
+    yield Finding(
+        "warning", "singular posture of the inputs",
+        f"a movement of about {distance:.2g} m or rad; smallest singular value {sigma:.2g}",
+        f"above {_NEAR:g} m or rad and {WEAK:g}; direct singularity (type 2): the inputs "
+        f"{', '.join(acting)} hardly hold the motion of the joints {', '.join(moving)}"
+        + ("" if in_weights else "; inputs that are no forces are scaled to their largest effect"),
+    )  # fmt: skip
+
+
+def _check_inverse(
+    system: System, state: State, inputs: Inputs, neighbours: Actuation
+) -> Iterator[Finding]:
+    """Findings on bodies of the most freedom, such as a platform, that lose a direction of motion."""
+    size = float(neighbours.size[0])
+    # angular velocities in units of the size, as in the metric of the motions
+    metric = np.repeat([1.0, size], 3)[:, None]
+    rows = np.split(np.asarray(neighbours.motions), len(system.names), axis=1)
+    nearness = {
+        name: _extrapolate_rank(V * metric) for name, V in zip(system.names, rows, strict=True)
+    }
+    freedom = max((measure[0] for measure in nearness.values() if measure), default=0)
+    resting = {
+        name: measure
+        for name, measure in nearness.items()
+        if measure and measure[0] == freedom and measure[2] < _NEAR
+    }
+    if not resting:
+        return
+    first = min(resting, key=lambda name: resting[name][2])
+    V = rows[system.names.index(first)][0] * metric
+    direction = np.linalg.svd(V)[2][resting[first][0] - 1]
+    scaled, _ = _scaled_forces(system, inputs, neighbours)
+    rates = scaled[0].T @ direction
+    if not np.max(np.abs(rates), initial=0.0) > WEAK:
+        return  # a motion that the inputs do not see is a direct singularity
+    acting = names_of_largest(input_labels(system, inputs), rates)
+    moving = joints_in_motion(
+        system, state, np.asarray(neighbours.motions[0]) @ direction[:, None], size
+    )
+    yield Finding(
+        "note", "dead centre",
+        f"a movement of about {resting[first][2]:.2g} m or rad, of {', '.join(resting)}",
+        "inverse singularity (type 1): a direction of motion is lost, while the inputs "
+        f"{', '.join(acting)} and the joints {', '.join(moving)} move",
+    )  # fmt: skip
+
+
+def _extrapolate_rank(matrices: np.ndarray) -> tuple[int, float, float] | None:
+    """Rank beside the first of some matrices, its singular value of that place, and the distance to zero.
+
+    None where all vanish. Matrices that are not finite, of loops that do not close, are left out.
+    """
+    values = np.linalg.svd(matrices[np.isfinite(matrices).all(axis=(1, 2))], compute_uv=False)
+    rank = int(np.max(np.sum(values > _GAINED * np.max(values, initial=0.0), axis=1), initial=0))
+    if not rank:
+        return None
+    sigma = float(values[0, rank - 1])
+    change = float(np.max(np.abs(values[1:, rank - 1] - sigma), initial=0.0))
+    return rank, sigma, sigma * _STEP / change if change > 0 else np.inf
+
+
+def _evaluate_neighbours(model: AugmentedModel, state: State, t: float, free: np.ndarray) -> RowsAt:
     """Rows at postures one step to either side along each free motion, put on the constraints.
 
     The largest movement of a body is `_STEP` [m or rad].
@@ -339,26 +521,20 @@ def _beside(
     scales = np.asarray(model.constraints.scales())
     units = free / np.max(np.abs(free), axis=0)
     steps = [sign * _STEP * column for column in units.T for sign in (-1.0, 1.0)]
-    states = [_moved(state, step) for step in steps]
-    rows = _rows(system, model, states, t)
+    states = displace_postures(state, np.array(steps))
+    rows = rows_of(model, states, t)
     for _ in range(_CORRECTIONS):
-        back = [
-            -np.linalg.lstsq(J, phi / scales, rcond=1e-9)[0]
-            for J, phi in zip(rows.matrix, rows.residuals, strict=True)
-        ]
-        states = list(itertools.starmap(_moved, zip(states, back, strict=True)))
-        rows = _rows(system, model, states, t)
+        pairs = zip(rows.matrix, rows.residuals, strict=True)
+        back = [-np.linalg.lstsq(J, phi / scales, rcond=1e-9)[0] for J, phi in pairs]
+        states = displace_postures(states, np.array(back))
+        rows = rows_of(model, states, t)
     return rows
 
 
-def _moved(state: State, step: np.ndarray) -> State:
-    r, p = displace(state.r, state.p, jnp.asarray(step.reshape(-1, 6)))
-    return State(r, p, state.v, state.omega)
-
-
-def _motion(system: System, state: State, t: float, rank: Rank) -> list[Finding]:
+def _check_motion(system: System, state: State, t: float, rank: Rank) -> list[Finding]:
     """Findings on the eigenvalues of the linearised motion, and the solver that they ask for."""
-    formulation = Tree().allowing_dependent_rows() if rank.redundant else Tree()
+    more = rank.rows - rank.rank > count_left_out(Tree().prepare(system))
+    formulation = Tree(redundant=more)
     try:
         values = spectrum(system, state, t, formulation=formulation)
     except StateError as error:
@@ -367,16 +543,18 @@ def _motion(system: System, state: State, t: float, rank: Rank) -> list[Finding]
     sizes = sizes[sizes > _ZERO * max(sizes[0], 1e-3)]
     if not sizes.size:
         return [Finding("note", "solver", "no eigenvalue but zero", "Dopri8")]
-    found = [
+    findings = [
         Finding("note", "rates of the linearised motion",
                 f"{sizes[-1]:.3g} to {sizes[0]:.3g} 1/s, ratio {sizes[0] / sizes[-1]:.2g}"),
         Finding("note", "solver", f"fastest rate {sizes[0]:.3g} 1/s",
                 f"Dopri8, since the fastest rate is below {EXPLICIT_LIMIT:g} 1/s"
                 if sizes[0] <= EXPLICIT_LIMIT else
-                f"Rodas5P, or solver=\"auto\": above {EXPLICIT_LIMIT:g} 1/s explicit steps are short"),
+                f"kvaerno5, or solver=\"auto\": above {EXPLICIT_LIMIT:g} 1/s explicit steps are short"),
     ]  # fmt: skip
     growth = float(np.max(np.real(values)))
     if growth > 1e-3 * sizes[0]:
         value = f"e-fold in {1 / growth:.3g} s"
-        found.append(Finding("note", "growth of small deviations", value, "unstable at this point"))
-    return found
+        findings.append(
+            Finding("note", "growth of small deviations", value, "unstable at this point")
+        )
+    return findings

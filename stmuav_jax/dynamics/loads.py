@@ -15,20 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..algebra.compiler import in_blocks, kept_jit
-from ..algebra.derivative import safe_norm
-from ..checks.errors import SettingError, concrete
-from ..checks.numbers import array_module, as_jax, as_numpy, floats
+from ..checks.errors import SettingError, has_values
+from ..checks.numbers import array_module, as_floats, as_jax, as_numpy
 from ..checks.shapes import Numbers
+from ..math.compiler import in_blocks, kept_jit
+from ..math.derivative import safe_norm
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .evaluation import Saved, reactions
-from .formulations.base import AbstractFormulation, Reactions
-from .formulations.reactions import in_joint_axes
+from .evaluation import Saved, evaluate_reactions
+from .formulations.base import AbstractFormulation, Reactions, in_joint_axes
 from .formulations.stabilisation import Unstabilised
 from .integration.problem import at_internal
-from .interpolation import between
-from .run import Run
+from .simulation import Run, interpolate_states
 from .tree.formulation import Tree
 
 # Load components that size a joint; the last axis of `JointLoads.components`, with units.
@@ -93,42 +91,48 @@ def joint_loads(
 ) -> JointLoads:
     """Reaction loads of states (k, n, .) at times ts (k,) [s], such as those of `integrate`.
 
-    The function is pure: it may be jitted, vmapped and differentiated. With dependent rows in a
-    loop the reactions are not determined: `Tree(redundant=True)` gives those of minimum norm.
+    The function is pure: it may be jitted, vmapped and differentiated. If rows of a loop depend on each
+    other, the equations of motion do not determine all reactions; those given have multipliers of minimum
+    norm, as those of `run_loads`, and a reaction that is determined is right. They are NaN at states that
+    are, and with a formulation that allows for no dependent rows.
 
     Args:
-        formulation: default `Tree()`.
+        formulation: default `Tree(redundant=True)`.
         internal: actuator states of the forces (k, m), if any; by default those that they hold.
     """
-    how = formulation if formulation is not None else Tree()
-    model: Any = how.prepare(system)
+    chosen_formulation = formulation if formulation is not None else Tree(redundant=True)
+    model: Any = chosen_formulation.prepare(system)
 
-    def one(t: Float[Array, ""], state: State, z: Float[Array, " m"] | None) -> Reactions:
+    def reactions_at(t: Float[Array, ""], state: State, z: Float[Array, " m"] | None) -> Reactions:
         now = model if z is None else at_internal(model, z)
-        result = how.accelerations(now, t, state, Unstabilised())
-        return in_joint_axes(system, state, how.reactions(now, t, state, result))
+        result = chosen_formulation.accelerations(now, t, state, Unstabilised())
+        return in_joint_axes(system, state, chosen_formulation.reactions(now, t, state, result))
 
-    found = jax.vmap(one)(ts, states, internal)
-    return JointLoads(ts, found.force, found.moment, tuple(j.name for j in system.joints))
+    joint_reactions = jax.vmap(reactions_at)(ts, states, internal)
+    return JointLoads(
+        ts, joint_reactions.force, joint_reactions.moment, tuple(j.name for j in system.joints)
+    )
 
 
 def run_loads(run: Run) -> JointLoads:
     """Reaction loads at the saved times of a run, from its analysis."""
     system = run.scene.system
-    found = _in_joint_axes(system, run.states, run.snapshot.reactions)
-    force, moment = floats(found.force), floats(found.moment)
-    return JointLoads(floats(run.ts), force, moment, tuple(j.name for j in system.joints))
+    joint_reactions = _in_joint_axes(system, run.states, run.snapshot.reactions)
+    force, moment = as_floats(joint_reactions.force), as_floats(joint_reactions.moment)
+    return JointLoads(as_floats(run.ts), force, moment, tuple(j.name for j in system.joints))
 
 
 def _in_joint_axes(system: System, states: State, world: Reactions) -> Reactions:
     """Reactions at many states (k, joints, 3) in the joints' axes, as NumPy arrays."""
-    turned = lambda *at: _turned(system, *jax.tree.map(as_jax, at))
-    return in_blocks(turned, _BLOCK, states, world)
+    rotate_block = lambda *at: _rotate_reactions(system, *jax.tree.map(as_jax, at))
+    return in_blocks(rotate_block, _BLOCK, states, world)
 
 
 @kept_jit
-def _turned(system: System, states: State, world: Reactions) -> Reactions:
-    return jax.vmap(lambda state, found: in_joint_axes(system, state, found))(states, world)
+def _rotate_reactions(system: System, states: State, world: Reactions) -> Reactions:
+    return jax.vmap(lambda state, world_reactions: in_joint_axes(system, state, world_reactions))(
+        states, world
+    )
 
 
 def resolved_loads(run: Run, rtol: float = 0.01) -> JointLoads:
@@ -150,33 +154,38 @@ def resolved_loads(run: Run, rtol: float = 0.01) -> JointLoads:
     for turn in range(_ROUNDS):
         if not len(todo):
             break
+        # An interval whose middle lies on the chord has no peak that linear interpolation would miss.
         middle = todo.mean(axis=1)
-        fresh = _between(run, middle)
+        fresh = _loads_at(run, middle)
         ends = values[np.searchsorted(ts, todo)]
         order = np.argsort(np.concatenate([ts, middle]), kind="stable")
         ts = np.concatenate([ts, middle])[order]
         values = np.concatenate([values, fresh])[order]
-        off = np.abs(fresh - ends.mean(axis=1)).reshape(*fresh.shape[:2], 2, 3)
-        peak = np.linalg.norm(values.reshape(-1, *off.shape[1:]), axis=-1).max(axis=0)
+        deviations = np.abs(fresh - ends.mean(axis=1)).reshape(*fresh.shape[:2], 2, 3)
+        peak = np.linalg.norm(values.reshape(-1, *deviations.shape[1:]), axis=-1).max(axis=0)
         # a joint whose load is mere round-off needs no further times
         scale = np.maximum(peak, 1e-9 * peak.max(axis=0, initial=1e-300))[:, :, None]
-        curved = np.any(off > rtol * scale, axis=(1, 2, 3)) | (turn < 2)
+        # The first two rounds halve every interval: a load may cross the chord in the middle and depart from
+        # it elsewhere.
+        curved = np.any(deviations > rtol * scale, axis=(1, 2, 3)) | (turn < 2)
         halves = np.stack([todo[:, 0], middle, middle, todo[:, 1]], axis=1)
         todo = halves[curved].reshape(-1, 2)
-    return JointLoads(floats(ts), floats(values[..., :3]), floats(values[..., 3:]), first.joints)
+    return JointLoads(
+        as_floats(ts), as_floats(values[..., :3]), as_floats(values[..., 3:]), first.joints
+    )
 
 
-def _between(run: Run, ts: np.ndarray) -> np.ndarray:
+def _loads_at(run: Run, ts: np.ndarray) -> np.ndarray:
     """Force and moment at all joints, at any times of a run (k, joints, 6)."""
 
-    def block(ts: np.ndarray) -> np.ndarray:
-        states, own = between(run, ts)
+    def evaluate_block(ts: np.ndarray) -> np.ndarray:
+        states, internal = interpolate_states(run, ts)
         # by the programs of the run's analysis, which are compiled already
-        world = reactions(run.method.formulation, run.model, Saved(ts, states, own))
+        world = evaluate_reactions(run.method.formulation, run.model, Saved(ts, states, internal))
         loads = _in_joint_axes(run.scene.system, states, world)
         return np.concatenate([loads.force, loads.moment], axis=-1)
 
-    return in_blocks(block, _BLOCK, ts)
+    return in_blocks(evaluate_block, _BLOCK, ts)
 
 
 def envelope(loads: JointLoads) -> Envelope:
@@ -191,12 +200,12 @@ def envelope(loads: JointLoads) -> Envelope:
     rows = values.reshape(loads.ts.size, joints, len(COMPONENTS))
     times = loads.ts.reshape(-1)
 
-    def at(index: Any) -> list[Array]:
+    def extreme_at(index: Any) -> list[Array]:
         value = xp.take_along_axis(rows, index[None], axis=0)[0]
         return [as_jax(x) for x in (value, times[index], index // count)]
 
-    least, t_least, run_least = at(xp.argmin(rows, axis=0))
-    most, t_most, run_most = at(xp.argmax(rows, axis=0))
+    least, t_least, run_least = extreme_at(xp.argmin(rows, axis=0))
+    most, t_most, run_most = extreme_at(xp.argmax(rows, axis=0))
     return Envelope(least, most, t_least, t_most, run_least, run_most, loads.joints)
 
 
@@ -209,13 +218,16 @@ def smooth_peaks(loads: JointLoads, order: Numbers = 64.0) -> Float[Array, "*b j
     Raises:
         SettingError: the order is below 1.
     """
-    if concrete(order) and not np.all(np.asarray(order) >= 1):
+    if has_values(order) and not np.all(np.asarray(order) >= 1):
         raise SettingError(f"The order of a smooth peak must be at least 1, but it is {order}.")
     p = jnp.asarray(order, dtype=float)
     sizes = jnp.stack([safe_norm(part, axis=-1) for part in (loads.force, loads.moment)], axis=-1)
+    # Divided by the largest, no power overflows; the result does not depend on the divisor, and its
+    # derivative is left out.
     top = jax.lax.stop_gradient(jnp.max(sizes, axis=-3, keepdims=True))
     scale = jnp.where(top > 0, top, 1.0)
     total = jnp.sum((sizes / scale) ** p, axis=-3)
     some = total > 0
     norm = jnp.where(some, total, 1.0) ** (1.0 / p)
+    # A maximum has derivatives at one time only and jumps between peaks; the norm is smooth.
     return jnp.where(some, scale[..., 0, :, :] * norm, 0.0)

@@ -1,9 +1,11 @@
-"""Simulation of a scene, which returns a `Run` with its certificate."""
+"""Scenes and runs: `integrate`, the pure function, and `simulate`, which checks and certifies a `Run`."""
 
 import contextlib
 import dataclasses
+import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import diffrax
@@ -11,25 +13,463 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from equinox.internal import nondifferentiable_backward
+from jaxtyping import Array, Float
 
-from ..checks.errors import SettingError, SimulationError
-from ..mechanics.internal import with_internal
+from ..checks.errors import ModelError, SettingError, SimulationError, has_values, nearest_names
+from ..checks.numbers import as_jax, increasing_times
+from ..checks.shapes import Numbers
+from ..math.compiler import kept_jit
+from ..math.native.program import describe_code
+from ..mechanics.body import check_bodies
+from ..mechanics.internal import counted_hinges, with_internal
+from ..mechanics.joint_states import JointMotion, coordinates_of, joint_motion
 from ..mechanics.state import State
-from ..mechanics.system import System
-from .assembly.singular import singular_posture
-from .certify import Checked, Start, certify, check_saved, inspect_start, violations
-from .checks import check_method, check_start, output_times, scene_of
-from .error_estimate import LOOSER, ErrorEstimate, SecondRun, estimated, without
-from .evaluation import accelerations
-from .integration.advance import Trajectory
-from .integration.march import CHUNK, March, same_result
-from .integration.problem import Problem, prepare
-from .method import Method, described
-from .run import Run, Seconds, saved
-from .scene import Scene
-from .stiffness import choose_solver
+from ..mechanics.system import System, check_state, moved_centres
+from .assembly.singular import describe_driver_jump, singular_posture
+from .diagnostics import (
+    LOOSER,
+    Certificate,
+    Checked,
+    ErrorEstimate,
+    SecondRun,
+    Seconds,
+    Start,
+    check_saved,
+    check_start,
+    describe_open_joints,
+    empty_estimate,
+    estimate_error,
+    inspect_start,
+    largest_violations,
+    make_certificate,
+    saved_states,
+)
+from .evaluation import Snapshot, evaluate_accelerations, evaluate_snapshots
+from .formulations.base import AbstractModel, count_left_out
+from .formulations.independence import compare_clearance, find_extreme_bodies
+from .integration.advance import CHUNK, March, Trajectory, integrate_times, same_result
+from .integration.problem import (
+    MASSES_REFUSED,
+    IntegrationState,
+    Problem,
+    compiled_begin,
+    fit_first_step,
+    prepare_problem,
+)
+from .method import Method, choose_solver, describe_part
+
+
+class Frame(NamedTuple):
+    """Frame of a link that is part of a body: position (3,) [m] and axes (3, 3) in the body's frame.
+
+    Attributes:
+        body: name of the body, or "ground".
+    """
+
+    body: str
+    position: np.ndarray
+    axes: np.ndarray
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Complete description of a simulation's subject: system, initial state, span and notes.
+
+    Attributes:
+        name: short name, for files. title: one line, for people.
+        system: bodies, joints, forces.
+        state0: state at t0 that satisfies the joints (see `assemble`).
+        t0, t1: time span [s]. save_every: spacing of the saved times [s].
+        parameters: numbers from which the scene was built, by name: each a mapping with "value",
+            "unit" and "source"; kept with the results.
+        notes: facts that the reader of a result must know, one sentence each.
+        warnings: facts that make the motion another one than the source's, such as a constraint that an
+            import lost; `check` has them as warnings.
+        watch: names of the bodies that figures show.
+        links_between: names of the bodies of nearly no mass that an import put between several
+            joints of one body.
+        sensors: instruments of the mechanism (`stmuav_jax.control.Instrument`) by name.
+        frames: links without joints of their own by name, with the body that each is part of.
+    """
+
+    name: str
+    title: str
+    system: System
+    state0: State
+    t0: float = 0.0
+    t1: float = 2.0
+    save_every: float = 0.01
+    parameters: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    watch: tuple[str, ...] = ()
+    links_between: tuple[str, ...] = ()
+    sensors: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    frames: Mapping[str, Frame] = field(default_factory=dict)
+
+    def with_(
+        self, *forces: Any, parameters: Mapping[str, Any] | None = None, **fields: Any
+    ) -> "Scene":
+        """Scene with forces added, other numbers of its system, or other fields such as t1.
+
+        Args:
+            forces: as of `System.with_forces`. parameters: as of `System.with_parameters`; the frames of the
+                bodies start as before. fields: fields of the scene.
+
+        Raises:
+            SettingError: an unknown field. ModelError: see `System.with_forces` and `System.with_parameters`.
+        """
+        # `dataclasses.replace` would raise a TypeError of Python for an unknown field, without the
+        # nearest name.
+        names = [entry.name for entry in dataclasses.fields(self)]
+        for name in fields:
+            if name not in names:
+                raise SettingError(f"A scene has no field '{name}'.{nearest_names(name, names)}")
+        scene = dataclasses.replace(self, **fields)
+        system = scene.system.with_forces(*forces).with_parameters(parameters or {})
+        # States hold centres of mass: with another centre the bodies' frames, and with them the
+        # joints, would be displaced if the start stayed as it is.
+        state0 = moved_centres(scene.state0, scene.system, system)
+        return dataclasses.replace(scene, system=system, state0=state0)
+
+
+# --- the pure function
+
+AHEAD = (
+    "A run with Method(adjoint=diffrax.ForwardMode()) cannot be differentiated in reverse mode: leave "
+    "`adjoint` out for jax.grad, or use jax.jacfwd, also for derivatives of its own derivatives."
+)
+
+
+def integrate(
+    system: System, state0: State, ts: Float[Array, " k"], method: Method | None = None
+) -> Trajectory:
+    """Integrate a system from state0 at ts[0] through the output times ts.
+
+    The function is pure: it may be jitted, vmapped and differentiated. It assumes a consistent
+    start (see `assemble`) and raises no error for values: `Trajectory.result` holds the outcome.
+    `simulate` adds checks, progress and a certificate. Times that a failed run did not reach have
+    NaN states and derivatives, so that a sum over runs reveals it. A run that ended at an event
+    keeps the state there. With a mass or a principal moment of inertia that is not positive the motion
+    does not start; `describe_result` says so in words. A run whose joints have come open, by more than
+    its tolerances and the size of the mechanism allow, has the result
+    `diffrax.RESULTS.nonlinear_divergence` and NaN from then on.
+
+    Rows of closed loops that depend on others in every posture, as those of planar loops of hinges do,
+    are left out, if the joints' geometry holds known numbers; masses, loads and the state may be traced.
+    With traced geometry such a loop takes `Tree(redundant=True)`, which chooses rows in every step.
+
+    Args:
+        system: bodies, joints, forces.
+        state0: state at ts[0], unbatched.
+        ts: output times (k,) [s], beginning with the start. The motion goes from each to the next, also
+            back in time; with the method's `jump_ts` or an event they must increase.
+        method: method of integration; default `Method()`.
+
+    Raises:
+        SettingError: shapes or precision of the state do not fit the system, or known times do not
+            increase where they must.
+    """
+    check_state(system, state0)
+    problem = prepare_problem(system, method if method is not None else Method())
+    # Times may run backwards, as for the motion before a given state; jumps and events are sought
+    # forwards only.
+    ordered = problem.method.jump_ts is not None or problem.method.event is not None
+    if ordered and has_values(ts) and np.any(np.diff(np.asarray(ts)) < 0):
+        raise SettingError(
+            "The output times must increase with a method that has an event or times of jumps, but "
+            f"they are {np.asarray(ts).tolist()} s."
+        )
+    ts = jnp.asarray(ts, dtype=state0.r.dtype)
+    # The default first step is made for seconds: a run of microseconds would step over its whole
+    # span.
+    problem = fit_first_step(problem, ts[-1] - ts[0])
+    start = compiled_begin(problem, ts[0], state0)
+    trajectory = _compiled_path(problem, start, ts)
+    # Reverse mode through a loop for forward mode fails deep inside of JAX; marked here, it fails
+    # with a sentence that says what to do.
+    if isinstance(problem.method.adjoint, diffrax.ForwardMode):
+        return nondifferentiable_backward(trajectory, msg=AHEAD)
+    return trajectory
+
+
+def describe_result(system: System, path: Trajectory) -> str:
+    """Outcome of one run of `integrate` in words, "successful" or the reason why it ended.
+
+    Args:
+        system: system of the run. path: its trajectory; of a batch, that of one member.
+    """
+    if same_result(path.result, MASSES_REFUSED):
+        try:
+            check_bodies(system.bodies)
+        except ModelError as error:
+            return str(error)
+        return "A mass or a principal moment of inertia of the system is not positive."
+    stopped = same_result(path.result, diffrax.RESULTS.dt_min_reached)
+    jump = describe_driver_jump(system, float(path.ts[-1])) if stopped else ""
+    if jump:
+        return jump
+    reasons = {
+        "successful": "successful",
+        "event_occurred": "event occurred",
+        "max_steps_reached": "max_steps steps did not reach the next output time",
+        "dt_min_reached": "the step size fell to round-off",
+        "nonfinite": "the value of the event is not a number",
+        "nonlinear_divergence": "the joints have come open",
+    }
+    for name, text in reasons.items():
+        if same_result(path.result, getattr(diffrax.RESULTS, name)):
+            return text
+    return diffrax.RESULTS[path.result].splitlines()[0]
+
+
+def _mark_unreached(problem: Problem, trajectory: Trajectory, ts: Float[Array, " k"]) -> Trajectory:
+    """Trajectory with NaN values and derivatives at times that a failed run did not reach."""
+    is_successful = trajectory.result == diffrax.RESULTS.successful
+    is_successful = is_successful | (trajectory.result == diffrax.RESULTS.event_occurred)
+    # Decisions on values have no derivative: without the stop JAX would trace derivatives of all
+    # residuals for them.
+    missed = ~is_successful & (jax.lax.stop_gradient(trajectory.ts) < ts)
+    open_mask = problem.is_open(jax.lax.stop_gradient(trajectory.worst))
+    missed = missed | open_mask
+    diverged: Any = diffrax.RESULTS.nonlinear_divergence
+    result = diffrax.RESULTS.where(is_successful & jnp.any(open_mask), diverged, trajectory.result)
+    trajectory = eqx.tree_at(lambda path: path.result, trajectory, result)
+    # multiplication also marks the derivatives
+    factor = jnp.where(missed, jnp.nan, 1.0)
+    mark = lambda x: x * factor.reshape(-1, *(1,) * (x.ndim - 1)).astype(x.dtype)
+    where = lambda path: (path.states, path.work, path.impulse, path.internal)
+    return eqx.tree_at(where, trajectory, jax.tree.map(mark, where(trajectory)))
+
+
+def _integrate_path(
+    problem: Problem, start: IntegrationState, ts: Float[Array, " k"]
+) -> Trajectory:
+    return _mark_unreached(problem, integrate_times(problem, start, ts)[1], ts)
+
+
+# An eager call does not compile again for a system of the same structure.
+_compiled_path = kept_jit(_integrate_path)
+
+
+# --- runs
+
+# Results of a run that reached the end of its span or an event, with closed joints.
+SUCCESSFUL = ("successful", "event occurred")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Simulated scene: its saved states, their analysis, and the certificate.
+
+    Attributes:
+        scene: simulated scene. method: method of the integration.
+        trajectory: saved times, states, work, impulse (NumPy arrays).
+        model: system prepared for the method's formulation, for the analysis of the saved states;
+            None if it was left out.
+        errors: estimated errors at the saved times.
+        certificate: summary of the run's quality.
+        settings: description of the method in words, kept with the results.
+        failure: reason why the end was not reached, in one paragraph; empty if it was.
+    """
+
+    scene: Scene
+    method: Method
+    trajectory: Trajectory
+    model: AbstractModel | None
+    errors: ErrorEstimate
+    certificate: Certificate
+    settings: dict[str, Any]
+    failure: str = ""
+
+    @functools.cached_property
+    def snapshot(self) -> Snapshot:
+        """Accelerations, reactions, energies at the saved times, computed when first asked for.
+
+        Raises:
+            SettingError: the run was made with analysis=False.
+        """
+        if self.model is None:
+            raise SettingError(
+                "This run was made with analysis=False and has no accelerations, reactions or energies."
+            )
+        return evaluate_snapshots(
+            self.method.formulation, self.model, saved_states(self.trajectory)
+        )
+
+    @property
+    def ts(self) -> np.ndarray:
+        """Saved times (k,) [s]."""
+        return np.asarray(self.trajectory.ts)
+
+    @property
+    def states(self) -> State:
+        """Saved states, arrays (k, n, .)."""
+        return self.trajectory.states
+
+    @property
+    def successful(self) -> bool:
+        """True if the end of the span, or an event, was reached, and the joints are closed."""
+        return self.certificate.result in SUCCESSFUL
+
+    def body(self, name: str) -> State:
+        """Saved states of one body, arrays (k, .)."""
+        k = self.scene.system.index(name)
+        return jax.tree.map(lambda x: np.asarray(x)[:, k], self.states)
+
+    def joint(self, name: str) -> JointMotion:
+        """Coordinates and rates of one joint at the saved times, with continuous angles: `.angle`,
+        `.displacement`, or `.coordinates` (k, c).
+
+        The angle of a hinge starts in (-pi, pi], or from that of `with_start_angles`. Where a force
+        depends on the angle, the run itself has counted its turns; see `joint_motion` for others.
+        """
+        system = self.scene.system
+        motion = jax.tree.map(np.asarray, joint_motion(system, self.states, name, self.ts))
+        # Turns that a force has integrated are exact even if two saved times are more than half a turn apart,
+        # where unwrapping of saved angles would be ambiguous.
+        hinges = counted_hinges(system)
+        if name not in hinges:
+            return motion
+        counted = np.asarray(self.trajectory.internal)[:, hinges.index(name)]
+        column = [word for word, _ in coordinates_of(motion.kind)].index("angle")
+        values = np.array(motion.coordinates)
+        values[:, column] += 2 * np.pi * np.round((counted - values[:, column]) / (2 * np.pi))
+        return dataclasses.replace(motion, coordinates=values)
+
+
+def states_at(run: Run, times: Numbers) -> State:
+    """States of a run at any times within it, arrays (k, n, .).
+
+    Each state is integrated from the last saved state before it with the run's own method; a
+    polynomial between steps would be of lower order than the steps.
+
+    Args:
+        times: times (k,) [s], in any order.
+
+    Raises:
+        SettingError: a time is not finite or outside the run.
+    """
+    return interpolate_states(run, times)[0]
+
+
+def interpolate_states(run: Run, times: Numbers) -> tuple[State, np.ndarray]:
+    """States at any times as in `states_at`, and the actuator states of the forces (k, m)."""
+    ts = np.atleast_1d(np.asarray(times, dtype=float))
+    first, last = run.ts[0], run.ts[-1]
+    inside = np.isfinite(ts) & (ts >= first) & (ts <= last)
+    if not np.all(inside):
+        raise SettingError(
+            f"The run covers {first:g} s to {last:g} s, but a state at {ts[~inside][0]:g} s was requested."
+        )
+    # Starting from the last saved state keeps the accuracy of the run; a polynomial between steps is of
+    # lower order, and of none where the step was cut short.
+    before = np.searchsorted(run.ts, ts, side="right") - 1
+    starts = jax.tree.map(
+        lambda x: as_jax(np.asarray(x)[before]), (run.states, run.trajectory.internal)
+    )
+    method = dataclasses.replace(run.method, event=None)
+    spans = as_jax(np.stack([run.ts[before], ts], axis=1))
+    end_values = _end_states(run.scene.system, method, starts, spans)
+    return jax.tree.map(np.asarray, end_values)
+
+
+@kept_jit
+def _end_states(
+    system: System, method: Method, starts: tuple[State, Array], spans: Float[Array, "k 2"]
+) -> tuple[State, Float[Array, "k m"]]:
+    def end_state(start: tuple[tuple[State, Array], Array]) -> tuple[State, Array]:
+        (state, z), span = start
+        path = integrate(with_internal(system, z), state, span, method)
+        # a saved state is returned unchanged, not by way of the formulation's coordinates
+        same = span[0] == span[1]
+        path_values = (path.states, path.internal)
+        return jax.tree.map(lambda x, y: jnp.where(same, y, x[-1]), path_values, (state, z))
+
+    return jax.lax.map(end_state, (starts, spans))
+
+
+# --- simulation
 
 Progress = Callable[[float], None]
+
+# A run ended where the rows that its equations hold become dependent if their smallest singular value is
+# below this part of that at its start.
+_LOST = 1e-2
+# A run that stops names the bodies whose inertias differ by more than this.
+_UNEQUAL = 1e8
+
+
+# Number of intervals between saved times of a run that is given by its end alone.
+_INTERVALS = 100
+
+
+def scene_of(
+    mechanism: Scene | System, state: State | None, t1: float | None, every: float | None, ts: Any
+) -> Scene:
+    """Scene as given, or made of a system, its state and the given times."""
+    if isinstance(mechanism, Scene):
+        if state is not None:
+            raise SettingError(
+                "A scene has its own initial state: give a scene, or a system and a state."
+            )
+        return mechanism
+    if not isinstance(mechanism, System):
+        raise SettingError(
+            f"simulate takes a Scene, or a System and a State, but it was given a {type(mechanism).__name__}."
+        )
+    if not isinstance(state, State):
+        type_text = "none" if state is None else f"a {type(state).__name__}"
+        raise SettingError(
+            f"To simulate a system give its initial State, such as system.reference (given: {type_text})."
+        )
+    title = "System of " + ", ".join(mechanism.names)
+    if ts is not None:
+        times = increasing_times(ts, "The output times ts")
+        return Scene("system", title, mechanism, state, times[0], times[-1])
+    if t1 is None:
+        raise SettingError("To simulate a system give the end t1 [s], or the saved times ts [s].")
+    every = abs(float(t1)) / _INTERVALS if every is None else every
+    return Scene("system", title, mechanism, state, 0.0, float(t1), every or 1.0)
+
+
+def output_times(
+    scene: Scene, t1: float | None, save_every: float | None, ts: Sequence[float] | Any
+) -> np.ndarray:
+    """Saved times (k,) [s], beginning with the scene's t0."""
+    if ts is not None:
+        times = increasing_times(ts, "The output times ts")
+        if times[0] != scene.t0:
+            raise SettingError(
+                f"The first output time must be the scene's t0 = {scene.t0} s, not {times[0]} s."
+            )
+        return times
+    end = scene.t1 if t1 is None else float(t1)
+    every = scene.save_every if save_every is None else float(save_every)
+    if not np.isfinite(end) or end < scene.t0:
+        raise SettingError(f"The end t1 = {end} s must be finite and not before t0 = {scene.t0} s.")
+    if not np.isfinite(every) or every <= 0:
+        raise SettingError(f"save_every must be finite and positive, but it is {every} s.")
+    # Round-off of a quotient such as 2 / 0.01 must not lose the last interval or add one of length zero.
+    count = int(np.floor((end - scene.t0) / every * (1 + 1e-12)))
+    times = scene.t0 + every * np.arange(count + 1)
+    if end - times[-1] > 1e-9 * every:
+        times = np.append(times, end)
+    times[-1] = end if count else times[-1]
+    return times
+
+
+def check_method(method: Any) -> None:
+    """Raise `SettingError` unless the method is a `Method` with an adaptive or automatic solver."""
+    if not isinstance(method, Method):
+        method_text = f"the class {method.__name__}" if isinstance(method, type) else repr(method)
+        raise SettingError(f"method must be a Method(...), but it is {method_text:.80}.")
+    if not isinstance(method.solver, str | diffrax.AbstractAdaptiveSolver):
+        raise SettingError(
+            f"{type(method.solver).__name__} has no error estimate and cannot adapt its steps; "
+            "choose Dopri8, Tsit5 or kvaerno5, or wrap it in diffrax.HalfSolver."
+        )
 
 
 def simulate(
@@ -51,11 +491,11 @@ def simulate(
     Args:
         scene: a scene; or a system, which then takes `state` and `t1` or `ts`.
         state: initial state of the system, at t = 0 or at ts[0].
-        method: method of integration; default `Method()`. If constraint rows depend on each other,
-            the formulation is replaced by one that allows for them. The solver "auto" is chosen at
-            the start. Three fields are for `integrate` alone, as nobody differentiates a `Run`:
-            here `adjoint` is always `diffrax.ForwardMode()`, `steps` always "state", and
-            `balances` is `analysis`.
+        method: method of integration; default `Method()`. If constraint rows become dependent in the
+            posture of the start, or in one that the run comes to and cannot pass, the formulation is
+            replaced by one that allows for them. The solver "auto" is chosen at the start. Three
+            fields are for `integrate` alone, as nobody differentiates a `Run`: here `adjoint` is always
+            `diffrax.ForwardMode()`, `steps` always "state", and `balances` is `analysis`.
         t1: end [s]; default the scene's.
         save_every: spacing of the saved times [s]; default the scene's, or a hundredth of the span
             for a system. No step is longer than the spacing, as a saved time ends a step.
@@ -91,21 +531,57 @@ def simulate(
     method = Method() if method is None else method
     check_method(method)
     check_start(scene.system, scene.state0)
+    # Derivatives of a run are for `integrate`: steps that are safe for them would cost a run that nobody
+    # differentiates.
     method = dataclasses.replace(
         method,
-        solver=_solver(scene, method),
         adjoint=diffrax.ForwardMode(),
         steps="state",
         balances=analysis,
     )
-    wanted = _Wanted(error_estimate, analysis, certificate == "full")
-    run, start = _carried_out(scene, method, times, progress, wanted)
+    run_options = _Wanted(error_estimate, analysis, certificate == "full")
+    # Dependent rows are rarely known beforehand: the cheaper equations are tried first, and those that
+    # choose rows anew only if the run stops at such a posture.
+    outcome = _carried_out(scene, method, times, progress, run_options)
+    if not outcome.run.successful and _held_rows_fail(outcome):
+        allowing = method.formulation.allowing_dependent_rows()
+        changed = dataclasses.replace(method, formulation=allowing)
+        second = _carried_out(scene, changed, times, progress, run_options)
+        # A second attempt counts only if it came further; otherwise the first failure has the clearer reason.
+        if second.run.successful or second.run.certificate.t_end > outcome.run.certificate.t_end:
+            outcome = second
+    run = outcome.run
     if run.successful or run.certificate.result == "interrupted":
         return run
-    run = dataclasses.replace(run, failure=_failure(run, float(times[-1]), start))
+    failure = _describe_failure(run, float(times[-1]), outcome.start, outcome.opened)
+    run = dataclasses.replace(run, failure=failure)
     if throw:
         raise SimulationError(run.failure, run)
     return run
+
+
+class _Outcome(NamedTuple):
+    """Run with its problem, what was found at its start, and a text on joints that have come open."""
+
+    run: Run
+    problem: Problem
+    start: Start
+    opened: str
+
+
+def _held_rows_fail(outcome: _Outcome) -> bool:
+    """True if a run stopped where rows that its equations hold throughout become dependent."""
+    model: Any = outcome.problem.model
+    row_mask, formulation = getattr(model, "row_mask", None), outcome.problem.method.formulation
+    # A run that stops for another reason, such as stiffness, would stop with the dearer equations
+    # too: rows are chosen anew only where those that are held have become dependent.
+    stopped = outcome.run.certificate.result != "interrupted"
+    if row_mask is None or not stopped or formulation.allowing_dependent_rows() is formulation:
+        return False
+    joints = getattr(getattr(model, "parameters", None), "tree", None)
+    joints = None if joints is None else joints.cut
+    system, states = outcome.run.scene.system, outcome.run.states
+    return not compare_clearance(system, np.asarray(row_mask), states, joints) > _LOST
 
 
 class _Wanted(NamedTuple):
@@ -121,46 +597,55 @@ def _carried_out(
     method: Method,
     times: np.ndarray,
     progress: Progress | None,
-    wanted: _Wanted,
-) -> tuple[Run, Start]:
-    """Run with its certificate, complete or not, and what was found at its start."""
+    run_options: _Wanted,
+) -> _Outcome:
+    """Run with its certificate, complete or not."""
     clock = time.perf_counter()
-    problem = prepare(scene.system, method)
-    prepared = time.perf_counter() - clock
-    how = method.formulation
-    formulation, rows, start = inspect_start(scene.system, scene.state0, scene.t0, how)
-    if formulation is not how:
-        allowing = dataclasses.replace(problem.method, formulation=formulation)
-        problem = dataclasses.replace(problem, method=allowing)
-    looked = time.perf_counter() - clock - prepared
-    done = _run(scene, problem, times, progress, wanted.estimate)
-    clock = time.perf_counter()
-    method = dataclasses.replace(method, formulation=problem.method.formulation)
-    first = done.trajectory
-    if wanted.analysis:
-        checked = check_saved(problem, rows, start, first, wanted.full)
-    else:
-        worst = violations(rows.constraints, first, start.rows, start.norm)
-        checked = Checked(None, None, None, worst, start.branches)
-    errors = _errors(scene, problem, done, wanted.analysis)
-    seconds = dataclasses.replace(
-        done.seconds,
-        compile=done.seconds.compile + prepared,
-        analysis=looked + time.perf_counter() - clock,
+    method_formulation = method.formulation
+    # The start is examined before the integration is compiled, which takes most of the time: a bad
+    # input is answered first.
+    left_out = count_left_out(method_formulation.prepare(scene.system))
+    formulation, rows, start = inspect_start(
+        scene.system, scene.state0, scene.t0, method_formulation, left_out
     )
-    result = done.stopped or _words(first)
-    certificate = certify(scene.system, first, checked, errors, start.rank, result, seconds)
-    model = problem.model if wanted.analysis else None
-    run = Run(scene, method, first, model, errors, certificate, _settings(method))
-    return run, start
+    method = dataclasses.replace(method, formulation=formulation)
+    inspection_seconds = time.perf_counter() - clock
+    clock = time.perf_counter()
+    method = dataclasses.replace(method, solver=_choose_solver(scene, method))
+    problem = fit_first_step(prepare_problem(scene.system, method), times[-1] - times[0])
+    prepared = time.perf_counter() - clock
+    integration = _run_chunks(scene, problem, times, progress, run_options.estimate)
+    clock = time.perf_counter()
+    first = integration.trajectory
+    if run_options.analysis:
+        checked = check_saved(problem, rows, start, first, run_options.full)
+    else:
+        worst = largest_violations(rows.constraints, first, start.rows, start.norm)
+        checked = Checked(None, None, None, worst, start.branches)
+    errors = _estimate_errors(scene, problem, integration, run_options.analysis)
+    seconds = dataclasses.replace(
+        integration.seconds,
+        compile=integration.seconds.compile + prepared,
+        analysis=inspection_seconds + time.perf_counter() - clock,
+    )
+    result = integration.stopped or _describe_result(first)
+    opened = describe_open_joints(problem, rows, first, checked.worst)
+    if opened and result in SUCCESSFUL:
+        result = "joints came open"
+    certificate = make_certificate(
+        scene.system, first, checked, errors, start.rank, result, seconds
+    )
+    model = problem.model if run_options.analysis else None
+    run = Run(scene, method, first, model, errors, certificate, _describe_method(method))
+    return _Outcome(run, problem, start, opened)
 
 
-def _solver(scene: Scene, method: Method) -> diffrax.AbstractSolver:
+def _choose_solver(scene: Scene, method: Method) -> diffrax.AbstractSolver:
     """Solver of the method, or the choice of `choose_solver` at the start for "auto"."""
     if isinstance(method.solver, diffrax.AbstractSolver):
         return method.solver
-    how = method.formulation
-    return choose_solver(scene.system, scene.state0, scene.t0, formulation=how)
+    formulation = method.formulation
+    return choose_solver(scene.system, scene.state0, scene.t0, formulation=formulation)
 
 
 class _Done(NamedTuple):
@@ -172,25 +657,29 @@ class _Done(NamedTuple):
     stopped: str
 
 
-def _run(
+def _run_chunks(
     scene: Scene, problem: Problem, times: np.ndarray, progress: Progress | None, estimate: bool
 ) -> _Done:
     """Integrate in chunks, with the second run following chunk by chunk."""
     clock = time.perf_counter()
+    # Both runs share one compiled program, since tolerances are numbers of the problem: the second
+    # costs its steps alone.
     march = March(problem, times[0], scene.state0)
     second = SecondRun(problem, times[0], scene.state0) if estimate else None
     compiling = time.perf_counter() - clock
     running = [0.0, 0.0]
     stopped = ""
     try:
+        # Chunk by chunk and not one run after the other: an interrupted simulation has an error
+        # estimate as far as it came.
         for start in range(0, len(times), CHUNK):
             part = times[start : start + CHUNK]
             clock = time.perf_counter()
-            reached = march.to(part)
+            part_trajectory = march.to(part)
             running[0] += time.perf_counter() - clock
             if second is not None:
                 clock = time.perf_counter()
-                second.follow(reached)
+                second.follow(part_trajectory)
                 running[1] += time.perf_counter() - clock
             if progress is not None:
                 progress((start + len(part)) / len(times))
@@ -198,6 +687,8 @@ def _run(
                 break
     except KeyboardInterrupt:
         stopped = "interrupted"
+    # Nothing was reached yet, so there is no run to return: the interruption goes on to the
+    # caller.
     if not march.parts:
         raise KeyboardInterrupt
     joined = march.trajectory()
@@ -205,71 +696,82 @@ def _run(
     first = jax.tree.map(
         lambda x, y: np.r_[np.asarray(y)[None], x[1:]], joined.states, scene.state0
     )
-    joined = eqx.tree_at(lambda found: found.states, joined, first)
+    joined = eqx.tree_at(lambda path: path.states, joined, first)
     return _Done(joined, second, Seconds(compiling, *running), stopped)
 
 
-def _errors(scene: Scene, problem: Problem, done: _Done, analysis: bool) -> ErrorEstimate:
+def _estimate_errors(
+    scene: Scene, problem: Problem, integration: _Done, analysis: bool
+) -> ErrorEstimate:
     """Error estimate, by a run at larger tolerances if the second run has stopped early."""
-    first, second = done.trajectory, done.second
+    first, second = integration.trajectory, integration.second
     if second is None:
-        return without(first, "none was asked for")
+        return empty_estimate(first, "none was asked for")
     rates = None
     happened = same_result(first.result, diffrax.RESULTS.event_occurred)
     if analysis and happened:
         # the second run's event is at another time, by which its end is moved
-        last = jax.tree.map(lambda x: np.asarray(x)[-1:], saved(first))
-        found = accelerations(problem.method.formulation, problem.model, last)
-        rates = np.asarray(found.v_rate[0]), np.asarray(found.omega_rate[0])
-    if done.stopped:
-        return estimated(first, second, rates, "the run was interrupted")
-    found = estimated(first, second, rates)
-    if not found.note or happened:
-        return found
+        last = jax.tree.map(lambda x: np.asarray(x)[-1:], saved_states(first))
+        result = evaluate_accelerations(problem.method.formulation, problem.model, last)
+        rates = np.asarray(result.v_rate[0]), np.asarray(result.omega_rate[0])
+    if integration.stopped:
+        return estimate_error(first, second, rates, "the run was interrupted")
+    result = estimate_error(first, second, rates)
+    # An estimate is wanted for all that was reached. A run at larger tolerances passes where one
+    # at smaller ones has stopped; of two estimates the one that reaches further is kept.
+    if not result.note or happened:
+        return result
     looser = SecondRun(second.first, float(first.ts[0]), scene.state0, factor=LOOSER)
     with contextlib.suppress(KeyboardInterrupt):
         looser.follow(first)
-    again = estimated(first, looser, rates)
-    return found if again.reached < found.reached else again
+    looser_estimate = estimate_error(first, looser, rates)
+    return result if looser_estimate.estimated_count < result.estimated_count else looser_estimate
 
 
-def _words(trajectory: Trajectory) -> str:
+def _describe_result(trajectory: Trajectory) -> str:
     names = (
         (diffrax.RESULTS.successful, "successful"),
         (diffrax.RESULTS.event_occurred, "event occurred"),
         (diffrax.RESULTS.max_steps_reached, "max_steps reached"),
         (diffrax.RESULTS.dt_min_reached, "step size collapsed"),
     )
-    for code, words in names:
+    for code, text in names:
         if same_result(trajectory.result, code):
-            return words
+            return text
     return diffrax.RESULTS[trajectory.result].splitlines()[0]
 
 
-def _settings(method: Method) -> dict[str, Any]:
+def _describe_method(method: Method) -> dict[str, Any]:
     """Description of the method in words and numbers, as results keep it."""
-    found = {
+    settings = {
         "formulation": str(method.formulation),
         "solver": type(method.solver).__name__,
         "rtol": float(method.rtol),
         "atol": float(method.atol),
         "stabilisation": type(method.stabilisation).__name__,
         "max_steps_between_saved_times": method.max_steps,
+        "equations_compiled_by": describe_code(),
     }
+    # Settings in the results name what differs from the defaults, so that a reader sees at once
+    # what was chosen.
     usual = Method()
     if float(method.first_step) != float(usual.first_step):
-        found["first_step"] = float(method.first_step)
+        settings["first_step"] = float(method.first_step)
     if np.isfinite(float(method.max_step)):
-        found["max_step"] = float(method.max_step)
+        settings["max_step"] = float(method.max_step)
     if method.jump_ts is not None:
-        found["jump_times"] = np.asarray(method.jump_ts).tolist()
+        settings["jump_times"] = np.asarray(method.jump_ts).tolist()
     if not eqx.tree_equal(method.stabilisation, usual.stabilisation):
-        found["stabilisation_settings"] = described(method.stabilisation)
-    return found
+        settings["stabilisation_settings"] = describe_part(method.stabilisation)
+    return settings
 
 
-def _failure(run: Run, end: float, start: Start) -> str:
-    """Reason why a run stopped, in one paragraph."""
+def _describe_failure(run: Run, end: float, start: Start, opened: str) -> str:
+    """Reason why a run stopped, or is none of the mechanism's, in one paragraph.
+
+    Args:
+        opened: text on joints that have come open.
+    """
     t = run.certificate.t_end
     state = jax.tree.map(lambda x: jnp.asarray(x[-1]), run.states)
     reason = {
@@ -287,7 +789,14 @@ def _failure(run: Run, end: float, start: Start) -> str:
     system = with_internal(run.scene.system, jnp.asarray(run.trajectory.internal[-1]))
     ends = jax.tree.map(lambda x: jnp.asarray(x)[np.array([0, -1])], run.states)
     posture = singular_posture(system, ends, t, start.rank.rank, start.followed)
-    reason = start.branches or posture or reason
+    light, heavy, ratio = find_extreme_bodies(system)
+    if ratio > _UNEQUAL:
+        reason += (
+            f". The inertias of the bodies '{light}' and '{heavy}' differ by {ratio:.1g}, which round-off "
+            "and the steps of this method may not tolerate"
+        )
+    reason = opened or start.branches or posture or reason
+    reason = describe_driver_jump(system, t) or reason
     kin = system.kinematics(state)
     for force in system.forces:
         # a load may cease to be finite right after the last state at which it was

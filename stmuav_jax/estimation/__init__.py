@@ -1,5 +1,5 @@
-"""State estimation for any model: sigma-point filters, smoother, consistency. Floor 2."""
+"""State estimation for any model: sigma-point filters, smoother, consistency."""
 
-import lazy_loader
+from ..checks.namespace import attach_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

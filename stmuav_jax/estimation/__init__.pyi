@@ -1,24 +1,34 @@
 """Public names of this folder; `__init__.py` imports each when it is first used."""
 
-from .bank import (
-    filter_bank as filter_bank,
-)
 from .consistency import (
+    RunsVerdict as RunsVerdict,
+    Verdict as Verdict,
     autocorrelation as autocorrelation,
     chi2_interval as chi2_interval,
     inconsistent as inconsistent,
     mean_interval as mean_interval,
     nees as nees,
+    over_runs as over_runs,
     path_nees as path_nees,
+    verdict as verdict,
+    verdicts as verdicts,
 )
 from .filter import (
+    AbstractFilter as AbstractFilter,
     EstimationError as EstimationError,
     Filtered as Filtered,
+    GaussianFilter as GaussianFilter,
+    Innovation as Innovation,
+    filter_bank as filter_bank,
     kalman_filter as kalman_filter,
 )
 from .gaussians import (
     Gaussian as Gaussian,
     gaussian as gaussian,
+)
+from .inertial import (
+    Belief as Belief,
+    strapdown as strapdown,
 )
 from .likelihood import (
     Tuned as Tuned,
@@ -29,6 +39,8 @@ from .likelihood import (
 from .model import (
     Sensor as Sensor,
     StateSpaceModel as StateSpaceModel,
+    euler as euler,
+    rk4 as rk4,
 )
 from .observable import (
     Observability as Observability,
@@ -37,10 +49,6 @@ from .observable import (
 from .online import (
     OnlineEstimate as OnlineEstimate,
     OnlineFilter as OnlineFilter,
-)
-from .propagate import (
-    euler as euler,
-    rk4 as rk4,
 )
 from .sigma import (
     AbstractRule as AbstractRule,
@@ -52,10 +60,4 @@ from .sigma import (
 from .smoother import (
     Smoothed as Smoothed,
     smooth as smooth,
-)
-from .update import (
-    AbstractFilter as AbstractFilter,
-    GaussianFilter as GaussianFilter,
-    Innovation as Innovation,
-    ReusingFilter as ReusingFilter,
 )

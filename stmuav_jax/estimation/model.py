@@ -4,6 +4,7 @@
     y_k = h(x_k, u_k) + v_k,           v_k ~ N(0, R)
 
 The inputs u_k are held over the step to time t_k. On a manifold the noise is an error from f or h.
+`euler` and `rk4` make f from rates x'(x, u) of vector states.
 """
 
 import math
@@ -15,10 +16,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.space import AbstractSpace, Point, Vector
-from ..checks.errors import ModelError
+from ..checks.errors import ModelError, SettingError
 from ..checks.shapes import Numbers
-from .gaussians import root
+from ..math.space import AbstractSpace, Point, Vector
+from .gaussians import covariance_root
 
 Inputs = Any
 
@@ -51,7 +52,7 @@ class Sensor(eqx.Module):
         stacked: bool = False,
     ) -> None:
         self.function = function
-        self.noise = root(R, "R")
+        self.noise = covariance_root(R, "R")
         m = self.noise.shape[0]
         self.space = Vector(m) if space is None else space
         self.names = names or tuple(f"y{i}" for i in range(m))
@@ -73,8 +74,9 @@ class StateSpaceModel(eqx.Module):
         noise: lower triangular root of Q (n, n).
         sensor: measurement model.
         space: space of the states.
-        names: names of the n error components, for messages and `Observability.words`.
-        noise_per: "step", or "second" if the noise of a step is N(0, Q dt).
+        names: names of the n error components, for messages and `Observability.describe`.
+        noise_per: "step", or "second" if the noise of a step is N(0, Q dt), which steps of different
+            lengths need. A step of no length adds no noise.
         stacked: True if f takes stacks, as for `Sensor`.
     """
 
@@ -98,7 +100,9 @@ class StateSpaceModel(eqx.Module):
         stacked: bool = False,
     ) -> None:
         self.function = function
-        self.noise = root(Q, "Q")
+        # Noise is kept as a factor: Q of a filter of square roots is never formed, and cannot lose its
+        # definiteness.
+        self.noise = covariance_root(Q, "Q")
         n = self.noise.shape[0]
         self.sensor = sensor
         self.space = Vector(n) if space is None else space
@@ -113,19 +117,25 @@ class StateSpaceModel(eqx.Module):
         return over_stack(lambda x, u: self.function(x, u, dt), x, u, stacked=self.stacked)
 
     def step_noise(self, dt: Any, ndim: int) -> Float[Array, "n n *s"]:
-        """Root of the covariance of one step's noise, with `ndim` axes."""
-        noise = widened(self.noise, ndim, 2)
-        return noise * jnp.sqrt(dt) if self.noise_per == "second" else noise
+        """Root of the covariance of one step's noise, with `ndim` axes; zero for a step of no length.
 
-
-def _check_size(size: int, expected: int, matrix: str, what: str) -> None:
-    if size != expected:
-        raise ModelError(
-            f"{matrix} has {expected} rows, but {what} has {size} components: they must agree."
+        Rows of one time are one step, whose noise is added once.
+        """
+        passes = jnp.asarray(dt) > 0
+        root_dt = jnp.sqrt(jnp.where(passes, dt, 1.0)) if self.noise_per == "second" else 1.0
+        return insert_axes(self.noise, ndim, 2) * jnp.where(passes, root_dt, 0.0).astype(
+            self.noise.dtype
         )
 
 
-def widened(a: Array, ndim: int, leading: int = 1) -> Array:
+def _check_size(size: int, expected: int, matrix: str, subject: str) -> None:
+    if size != expected:
+        raise ModelError(
+            f"{matrix} has {expected} rows, but {subject} has {size} components: they must agree."
+        )
+
+
+def insert_axes(a: Array, ndim: int, leading: int = 1) -> Array:
     """Array with axes of length one inserted after its leading ones, up to `ndim` axes."""
     missing = ndim - a.ndim
     if missing <= 0:
@@ -141,15 +151,92 @@ def over_stack(
     Inputs are arrays with their components first and the axes of a filter bank last.
     """
     ndim = jax.tree.leaves(x)[0].ndim
-    u = jax.tree.map(lambda leaf: widened(jnp.asarray(leaf), ndim), u)
+    u = jax.tree.map(lambda leaf: insert_axes(jnp.asarray(leaf), ndim), u)
+    # A function that computes with stacks itself is called once; vmap would turn its products into other
+    # programs.
     if stacked or ndim == 1:
         return function(x, u)
     lanes = jax.tree.leaves(x)[0].shape[1:]
 
-    def flat(leaf: Array) -> Array:
+    def flatten_leaf(leaf: Array) -> Array:
         wide = jnp.broadcast_to(leaf, (*leaf.shape[:1], *lanes))
         return wide.reshape(leaf.shape[0], math.prod(lanes))
 
-    each = jax.vmap(function, in_axes=-1, out_axes=-1)
-    out = each(jax.tree.map(flat, x), jax.tree.map(flat, u))
+    vectorised = jax.vmap(function, in_axes=-1, out_axes=-1)
+    out = vectorised(jax.tree.map(flatten_leaf, x), jax.tree.map(flatten_leaf, u))
     return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], *lanes), out)
+
+
+Rates = Callable[[Float[Array, "n *s"], Any], Float[Array, "n *s"]]
+Step = Callable[[Float[Array, "n *s"], Any, Any], Float[Array, "n *s"]]
+
+# Node and six times the weight of each stage of the classical Runge-Kutta method.
+_STAGES = ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0))
+
+
+class EulerStep(eqx.Module):
+    """Step of Euler's method; see `euler`."""
+
+    rates: Rates
+
+    def __call__(self, x: Array, u: Any, dt: Any) -> Array:
+        return x + dt * self.rates(x, u)
+
+
+class RungeKuttaStep(eqx.Module):
+    """Step of the classical fourth-order Runge-Kutta method; see `rk4`."""
+
+    rates: Rates
+    substeps: int = eqx.field(static=True)
+
+    def __call__(self, x: Array, u: Any, dt: Any) -> Array:
+        h = dt / self.substeps
+        for _ in range(self.substeps):
+            x = rk4_step(lambda x, _: self.rates(x, u), x, h)
+        return x
+
+
+def euler(rates: Rates) -> Step:
+    """Step x + dt rates(x, u) of Euler's method."""
+    return EulerStep(rates)
+
+
+def rk4_step(
+    rate: Callable[[Array, Any], Array], x: Array, h: Any, *, in_loop: bool = False
+) -> Array:
+    """State after h [s] by the classical fourth-order method.
+
+    Args:
+        rate: function of the state and of the time since the beginning of the step [s].
+        in_loop: take the four stages in a loop, for rates that take long to compile: once there,
+            against four times. Short rates run faster one after the other.
+    """
+
+    def rk4_stage(carry: Any, now: Any) -> tuple[Any, None]:
+        k, total = carry
+        node, weight = now
+        k = rate(x + h * node * k, h * node)
+        return (k, total + weight * k), None
+
+    if in_loop:
+        zero = 0.0 * x
+        # In a loop the rates are compiled once and not four times: worth it for a mechanism, but not for a
+        # few operations.
+        (_, total), _ = jax.lax.scan(rk4_stage, (zero, zero), jnp.array(_STAGES, x.dtype))
+        return x + h / 6 * total
+    first = rate(x, 0.0)
+    carry = (first, first)
+    for now in _STAGES[1:]:
+        carry, _ = rk4_stage(carry, now)
+    return x + h / 6 * carry[1]
+
+
+def rk4(rates: Rates, substeps: int = 1) -> Step:
+    """Step of the classical fourth-order Runge-Kutta method, with inputs held over the step.
+
+    Raises:
+        SettingError: `substeps` is less than one.
+    """
+    if substeps < 1:
+        raise SettingError(f"rk4 needs at least one substep, not {substeps}.")
+    return RungeKuttaStep(rates, substeps)

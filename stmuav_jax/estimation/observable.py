@@ -16,9 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.space import AbstractSpace, Point
-from .factor import divide_lower
+from ..checks.errors import ModelError, SettingError, check_finite, has_values
+from ..math.space import AbstractSpace, Point
+from .filter import compiled_once
+from .gaussians import divide_lower
 from .model import Inputs, StateSpaceModel
+from .records import as_numbers, read_inputs
 
 # A component below this fraction of a direction's largest is not named.
 _NAMED = 1e-3
@@ -41,22 +44,23 @@ class Observability(NamedTuple):
     names: tuple[str, ...]
     scale: np.ndarray
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Sentences on the rank, the unobservable states and their unobservable combinations."""
         n = len(self.names)
         if self.rank == n:
             return f"All {n} states are observable."
-        alone, combined = _separate(self.null_space)
+        alone, combined = _separate_states(self.null_space)
         lines = [f"{self.rank} of {n} directions are observable."]
         if alone:
             listed = ", ".join(self.names[i] for i in alone)
             lines.append(f"Not observable at all: {listed}.")
         for direction in combined.T:
-            lines.append(f"Not observable together: {self._sum(direction * self.scale)}.")
+            lines.append(f"Not observable together: {self._format_sum(direction * self.scale)}.")
         return " ".join(lines)
 
-    def _sum(self, v: np.ndarray) -> str:
+    def _format_sum(self, v: np.ndarray) -> str:
         """Text of a direction as a sum of states, scaled to a largest component of one."""
+        # A direction has neither length nor sign; the largest component is made one.
         v = v / v[np.argmax(np.abs(v))]
         parts = [
             f"{'-' if c < 0 else '+'} {'' if abs(abs(c) - 1) < 1e-9 else f'{abs(c):.3g} '}{self.names[i]}"
@@ -66,14 +70,15 @@ class Observability(NamedTuple):
         return " ".join(parts).removeprefix("+ ")
 
 
-def _separate(null: np.ndarray) -> tuple[list[int], np.ndarray]:
+def _separate_states(null: np.ndarray) -> tuple[list[int], np.ndarray]:
     """States that are unobservable by themselves, and a reduced basis of the other directions."""
+    # Share of a state's axis in the null space, whose basis is orthonormal: 1 if it lies within.
     inside = np.sum(null**2, axis=1)
     alone = [i for i in range(len(null)) if inside[i] > 1 - 1e-6]
     rest = null.copy()
     rest[alone] = 0.0
-    left, values, _ = np.linalg.svd(rest, full_matrices=False)
-    basis = left[:, values > 1e-6]
+    directions, values, _ = np.linalg.svd(rest, full_matrices=False)
+    basis = directions[:, values > 1e-6]
     # reduced echelon form: each direction has a component that the others do not have
     for k in range(basis.shape[1]):
         i, j = np.unravel_index(np.argmax(np.abs(basis[:, k:])), basis[:, k:].shape)
@@ -96,23 +101,28 @@ def observability_matrix(
         dt: length of the steps [s].
     """
     n, sensor = model.space.size, model.sensor
+    # a perfect sensor has no noise to be a unit: its readings keep their own
+    perfect = jnp.diagonal(sensor.noise) == 0
+    noise = sensor.noise + jnp.diag(jnp.where(perfect, 1.0, 0.0).astype(sensor.noise.dtype))
     zero = jnp.zeros(n, model.noise.dtype)
 
-    def seen(x: Point, now: Inputs) -> Array:
+    def sensed_rows(x: Point, now: Inputs) -> Array:
         centre = sensor(x, now)
         error = lambda v: sensor.space.difference(sensor(model.space.retract(x, v), now), centre)
-        return divide_lower(sensor.noise, jax.jacfwd(error)(zero))
+        return divide_lower(noise, jax.jacfwd(error)(zero))
 
-    def step(carry: tuple, now: Inputs) -> tuple:
+    def propagate_step(carry: tuple, now: Inputs) -> tuple:
         x, F = carry
-        moved = model(x, now, dt)
-        error = lambda v: model.space.difference(model(model.space.retract(x, v), now, dt), moved)
+        propagated = model(x, now, dt)
+        error = lambda v: model.space.difference(
+            model(model.space.retract(x, v), now, dt), propagated
+        )
         F = jax.jacfwd(error)(zero) @ F
-        return (moved, F), seen(moved, now) @ F
+        return (propagated, F), sensed_rows(propagated, now) @ F
 
     first = jax.tree.map(lambda leaf: leaf[0], u)
-    path = jax.lax.scan(step, (start, jnp.eye(n, dtype=zero.dtype)), u, length=count)[1]
-    return jnp.concatenate([seen(start, first), path.reshape(-1, n)])
+    path = jax.lax.scan(propagate_step, (start, jnp.eye(n, dtype=zero.dtype)), u, length=count)[1]
+    return jnp.concatenate([sensed_rows(start, first), path.reshape(-1, n)])
 
 
 def observability(
@@ -137,10 +147,24 @@ def observability(
     """
     if space is not None:
         model = eqx.tree_at(lambda m: m.space, model, space)
+    if isinstance(start, list | tuple) and not hasattr(start, "_fields"):
+        start = jnp.asarray(as_numbers(start, "The start"), model.noise.dtype)
+    u = read_inputs(u)
     model.space.check(start, "The start")
-    rows = jax.jit(lambda s, u: observability_matrix(model, s, u, dt, count))(start, u)
+    check_finite(start, "The start", "")
+    check_finite(dt, "dt", "s", SettingError)
+    for leaf in jax.tree.leaves(u):
+        if leaf.shape[0] != count:
+            raise ModelError(f"Inputs of {count} steps are needed, but there are {leaf.shape[0]}.")
+        if has_values(leaf) and not np.all(np.isfinite(leaf)):
+            k = int(np.argwhere(~np.isfinite(np.asarray(leaf)))[0][0])
+            raise SettingError(f"The inputs of step {k} are not finite: {np.asarray(leaf[k])}.")
+    rows = compiled_once(observability_matrix)(
+        model, start, u, jnp.asarray(dt, model.noise.dtype), count
+    )
     n = rows.shape[1]
     size = np.ones(n) if scale is None else np.asarray(scale, dtype=float)
+    # In units of the scale, or else a change of units would change the rank.
     _, values, right = np.linalg.svd(np.asarray(rows) * size, full_matrices=True)
     rank = int(np.sum(values > tolerance * max(values[0], np.finfo(float).tiny)))
     return Observability(values, rank, right[rank:].T, model.names, size)

@@ -11,6 +11,11 @@ sum, rearranged. For the scaled unscented transform the last factor is beta + al
 even a central weight of -95 (the report's) needs no subtraction, and P is a sum of squares
 unless kappa or beta is negative; then its square root needs a downdate.
 
+On a space with angles, points beyond half a turn would come back on the other side. Where the farthest
+of them is more than a quarter turn away, in the state or (by the function's values close to the mean)
+after a step, all distances are reduced by one factor c and the weights w_j divided by c^2, as Julier's
+scaling does: W grows likewise, and the last term's factor stays, so that P is a sum of squares as before.
+
 Source: S. J. Julier, The scaled unscented transformation, ACC (2002); I. Arasaratnam, S. Haykin,
 Cubature Kalman filters, IEEE TAC 54 (2009); fifth degree: B. Jia, M. Xin, Y. Cheng, High-degree
 cubature Kalman filter, Automatica 49 (2013).
@@ -28,14 +33,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.space import AbstractSpace, Point, expanded
 from ..checks.errors import SettingError
+from ..math.space import AbstractSpace, Point, expand_axis, half_turns
 from .gaussians import Gaussian
 
 Function = Callable[[Point], Point]
 
 # Relative error of a mean up to which a rule may be used in a given precision.
 _LOST = 2e-5
+
+# Largest angle between a point and the central one, in half turns: the other half is for what is not linear.
+_FARTHEST = 0.5
+
+# Distance, in that of the points, at which their images are taken to grow in proportion.
+_NEAR = 1e-3
 
 
 class Transformed(NamedTuple):
@@ -124,7 +135,7 @@ class Unscented(AbstractPointRule):
         lost = float(jnp.finfo(dtype).eps) / square
         if lost > _LOST:
             raise SettingError(
-                f"alpha = {self.alpha:g} cannot work in {jnp.dtype(dtype).name}: sigma points so "
+                f"alpha = {self.alpha:g} is too small for {jnp.dtype(dtype).name}: sigma points so "
                 f"close lose 1 / (alpha^2 (n + kappa)) = {1 / square:.3g} times the precision, a "
                 f"relative error of {lost:.1g} of every mean. Use alpha >= 0.1, the Cubature rule, "
                 "or double precision (jax_enable_x64)."
@@ -149,6 +160,8 @@ class Cubature5(AbstractPointRule):
     """
 
     def points(self, n: int) -> Points:
+        # Points on the axes and on the diagonals of all coordinate planes match all moments up to the fifth
+        # (McNamee and Stenger 1967).
         axes = math.sqrt(n + 2) * np.eye(n)
         pairs = [
             math.sqrt((n + 2) / 2) * (np.eye(n)[i] + sign * np.eye(n)[j])
@@ -172,14 +185,18 @@ class Linearised(AbstractRule):
     def transform(
         self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
     ) -> Transformed:
+        # The extended filter is the limit of the point rules for points at no distance: derivatives along the
+        # columns of L take the place of differences.
         centre = function(prior.mean)
 
-        def error(v: Array) -> Array:
+        def image_error(v: Array) -> Array:
             return target.difference(function(source.retract(prior.mean, v)), centre)
 
         zero = jnp.zeros(prior.factor.shape[:1] + prior.factor.shape[2:], prior.factor.dtype)
-        along = lambda v: jax.jvp(error, (zero,), (v,))[1]
-        rows = jax.vmap(along, in_axes=1)(prior.factor)
+        derivative = lambda v: jax.jvp(image_error, (zero,), (v,))[1]
+        # Forward derivatives along n columns cost as much as n points; a full Jacobian times L would cost a
+        # product more.
+        rows = jax.vmap(derivative, in_axes=1)(prior.factor)
         return Transformed(centre, rows, None, jnp.swapaxes(prior.factor, 0, 1), True)
 
     def check(self, n: int, dtype: jnp.dtype) -> None:
@@ -199,6 +216,7 @@ def _by_points(
     directions, weights, _ = points
     L = prior.factor
     n, q = L.shape[0], len(weights)
+    # Points along the columns of L need no product with a matrix of directions.
     axial = q == n
     lanes = (1,) * (L.ndim - 2)
     if axial:
@@ -206,36 +224,82 @@ def _by_points(
     else:
         D = jnp.asarray(directions.T, L.dtype).reshape(1, n, q, *lanes)
         steps = jnp.sum(L[:, :, None] * D, axis=1)
-    moves = jnp.concatenate([jnp.zeros_like(L[:, :1]), steps, -steps], axis=1)
-    images = function(source.retract(expanded(prior.mean), moves))
-    mean, rows, less = _moments(images, points, target, means)
-    scale = np.sqrt(2 * weights)
-    inputs = jnp.swapaxes(L if axial else steps * _column(scale, steps), 0, 1)
+    scale = _reduction_factor(function, prior, steps, source, target)
+    reduced = steps if scale is None else steps * scale
+    # All points go through the function in one call: a simulator compiles once for the stack.
+    moves = jnp.concatenate([jnp.zeros_like(L[:, :1]), reduced, -reduced], axis=1)
+    images = function(source.retract(expand_axis(prior.mean), moves))
+    mean, rows, less = _image_moments(images, points, target, means, scale)
+    weight = np.sqrt(2 * weights)
+    inputs = jnp.swapaxes(L if axial else steps * _align_weights(weight, steps), 0, 1)
     return Transformed(mean, rows, less, inputs, axial)
 
 
-def _column(values: np.ndarray, like: Array) -> Array:
+def _reduction_factor(
+    function: Function, prior: Gaussian, steps: Array, source: AbstractSpace, target: AbstractSpace
+) -> Float[Array, "*s"] | None:
+    """Factor of the points' distances that leaves no angle beyond `_FARTHEST`; None if no space has any.
+
+    Args:
+        steps: displacements of the points on one side (n, q, *s).
+    """
+    # which factor is taken changes what is not linear only: it counts as a constant in derivatives
+    steps, prior = jax.lax.stop_gradient((steps, prior))
+    turns = None if source.is_flat else half_turns(source, steps)
+    if turns is None:
+        return None
+    largest = jnp.max(turns, axis=0)
+    if target is source:
+        # a step: a rate that is hardly known turns far in a long one. A sensor's images are left
+        # alone, since a bearing has at most half a turn however wide the state is
+        moves = jnp.concatenate([jnp.zeros_like(steps[:, :1]), _NEAR * steps], axis=1)
+        images = function(source.retract(expand_axis(prior.mean), moves))
+        centre = jax.tree.map(lambda leaf: leaf[:, :1], images)
+        turns = half_turns(target, target.difference(images, centre))
+        assert turns is not None
+        largest = jnp.maximum(largest, jnp.max(turns, axis=0) / _NEAR)
+    largest = jax.lax.stop_gradient(largest)
+    return jnp.where(largest > _FARTHEST, _FARTHEST / jnp.maximum(largest, _FARTHEST), 1.0)
+
+
+def _align_weights(values: np.ndarray, like: Array) -> Array:
     """Weights (q,) shaped for the second axis of an array (n, q, *s)."""
     return jnp.asarray(values, like.dtype).reshape(1, -1, *(1,) * (like.ndim - 2))
 
 
-def _moments(
-    images: Point, points: Points, target: AbstractSpace, means: int
+def _image_moments(
+    images: Point,
+    points: Points,
+    target: AbstractSpace,
+    means: int,
+    scale: Float[Array, "*s"] | None,
 ) -> tuple[Point, Array, Array | None]:
-    """Mean, rows and subtracted square of the images (m, 1 + 2 q, *s)."""
+    """Mean, rows and subtracted square of the images (m, 1 + 2 q, *s).
+
+    Args:
+        scale: factor of the points' distances; None for one.
+    """
     _, weights, extra = points
+    inverse = 1.0 if scale is None else 1 / scale
+    # Deviations are taken from the image of the centre, so that large values of a state cancel before
+    # they are squared and weights of -95 multiply small numbers only.
     reference = jax.tree.map(lambda leaf: leaf[:, 0], images)
-    odd, even, delta, centre = _parts(images, reference, weights, target)
+    odd, even, delta, centre = _split_images(images, reference, weights, target, inverse)
     if target.is_flat:
         # the centre is the reference, and one round is exact
         reference = target.retract(reference, delta)
     else:
+        # On a manifold the mean is defined implicitly by deviations that sum to zero; three rounds of this
+        # fixed point leave an error of the order of the deviations to the power of seven.
         for _ in range(means):
             reference = target.retract(reference, delta + centre)
-            odd, even, delta, centre = _parts(images, reference, weights, target)
+            odd, even, delta, centre = _split_images(images, reference, weights, target, inverse)
     total = float(np.sum(2 * weights))
-    scale = _column(np.sqrt(2 * weights), odd)
-    parts = [odd * scale, (even - delta[:, None] / total) * scale]
+    weight = _align_weights(np.sqrt(2 * weights), odd) * inverse
+    mean_even = delta[:, None] / (total * inverse**2)
+    parts = [odd * weight, (even - mean_even) * weight]
+    # The sign of this factor decides whether the shift of the mean adds a row or has to be subtracted.
+    # Only kappa or beta below zero make it negative.
     factor = extra - 1 + 1 / total
     less: Array | None = None
     if factor > 1e-14:
@@ -245,14 +309,19 @@ def _moments(
     return reference, jnp.swapaxes(jnp.concatenate(parts, axis=1), 0, 1), less
 
 
-def _parts(
-    images: Point, reference: Point, weights: np.ndarray, target: AbstractSpace
+def _split_images(
+    images: Point,
+    reference: Point,
+    weights: np.ndarray,
+    target: AbstractSpace,
+    inverse: Float[Array, "*s"] | float,
 ) -> tuple[Array, Array, Array, Array]:
     """Odd and even parts o_j, e_j (m, q, *s), delta, and the central error from a reference."""
     q = len(weights)
-    a = target.difference(images, expanded(reference))
+    a = target.difference(images, expand_axis(reference))
     centre = a[:, :1]
     plus, minus = a[:, 1 : q + 1] - centre, a[:, q + 1 :] - centre
     odd, even = 0.5 * (plus - minus), 0.5 * (plus + minus)
-    delta = jnp.sum(jnp.swapaxes(even * _column(2 * weights, even), 0, 1), axis=0)
+    weighted = even * _align_weights(2 * weights, even) * inverse**2
+    delta = jnp.sum(jnp.swapaxes(weighted, 0, 1), axis=0)
     return odd, even, delta, centre[:, 0]

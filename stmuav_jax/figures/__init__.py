@@ -1,5 +1,5 @@
-"""Figures, reports and tables of results. Floor 14."""
+"""Figures, reports, films and pages in 3-D of results."""
 
-import lazy_loader
+from ..checks.namespace import attach_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

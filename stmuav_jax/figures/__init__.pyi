@@ -12,58 +12,65 @@ from .estimate import (
     CASE_FIGURES as CASE_FIGURES,
     consistency as consistency,
     errors as errors,
-    hover as hover,
-    hover_table as hover_table,
     offset as offset,
     rates as rates,
     summary_table as summary_table,
 )
-from .filter_record import (
-    FilterRecord as FilterRecord,
-    record_of_dataset as record_of_dataset,
-    record_of_file as record_of_file,
+from .films import (
+    film as film,
 )
-from .filter_report import write_filter_report as write_filter_report
-from .linear import (
-    pole_map as pole_map,
-    step_response as step_response,
+from .flight_log import (
+    FLIGHT_LOG_FIGURES as FLIGHT_LOG_FIGURES,
+    IdentifiedFlight as IdentifiedFlight,
+    draw_filtered_centre as draw_filtered_centre,
 )
-from .loads import (
-    loads_figure as loads_figure,
-    loads_table as loads_table,
-    save_loads as save_loads,
+from .page import (
+    RunPage as RunPage,
+    view as view,
 )
-from .loop_report import write_loop_report as write_loop_report
 from .plot import (
-    FIGURES as FIGURES,
     STYLES as STYLES,
-    balances as balances,
     grid as grid,
-    joints as joints,
     look as look,
-    pose as pose,
     save_figures as save_figures,
 )
-from .report import (
-    certificate_rows as certificate_rows,
-    certificate_table as certificate_table,
+from .posture_survey import (
+    effort_histories as effort_histories,
+    survey_map as survey_map,
 )
-from .run_report import write_run_report as write_run_report
-from .studies.analysis import (
+from .report import (
+    write_report as write_report,
+)
+from .run import (
+    FIGURES as FIGURES,
+    balances as balances,
+    joints as joints,
+    loads_figure as loads_figure,
+    pose as pose,
+    positions as positions,
+    save_loads as save_loads,
+)
+from .shapes import (
+    Shape as Shape,
+)
+from .sketch import (
+    draw as draw,
+)
+from .study_data import (
     Analysis as Analysis,
+    StudyData as StudyData,
     analyse as analyse,
 )
-from .studies.data import (
-    StudyData as StudyData,
-)
-from .studies.report import (
-    write_report as write_report,
+from .terminal import (
+    certificate_rows as certificate_rows,
+    certificate_table as certificate_table,
+    loads_table as loads_table,
 )
 from .tuning import (
     flight_figure as flight_figure,
-    flown as flown,
     load_search as load_search,
     loss_history as loss_history,
     save_linear as save_linear,
     save_search as save_search,
+    tuned_curves as tuned_curves,
 )

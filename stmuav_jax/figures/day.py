@@ -4,7 +4,7 @@ import csv
 import math
 import os
 from collections.abc import Callable
-from pathlib import Path
+from datetime import datetime
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,16 +15,15 @@ from matplotlib.figure import Figure
 from rich.table import Table
 from rich.text import Text
 
-from ..algebra.compiler import quick_jit
-from ..environment.sun import attitude
-from ..files.labelled import Labelled
-from ..files.netcdf import FileError, labelled
-from ..tracker.day import PANELS, Day
-from ..tracker.geometry import TrackerGeometry
-from ..tracker.kinematics import Reason, panel_angles
-from ..tracker.workspace import Limits, direction_grid, survey
+from ..io.netcdf import FileError, Labelled, label_table, regular_file
+from ..math.compiler import quick_jit
+from ..uav.environment.sun import attitude
+from ..uav.tracker.day import PANELS, Day
+from ..uav.tracker.geometry import TrackerGeometry
+from ..uav.tracker.kinematics import Reason, panel_angles
+from ..uav.tracker.workspace import Limits, direction_grid, survey
 from .plot import STYLES, grid
-from .terminal import row, table
+from .terminal import add_row, make_table
 
 FORMAT = "stmuav_jax day"
 FORMAT_VERSION = 1
@@ -38,13 +37,18 @@ PANEL_NAMES = {
 }
 
 
-def clock(hours: float) -> str:
-    """Clock time of hours since midnight, such as '07:30' of 7.5."""
+def clock_time(day: Day, hours: float) -> str:
+    """Time that a clock of the place shows some hours after the start of a day, such as '07:30'."""
     minutes = round(60 * hours)
-    return f"{minutes // 60:02d}:{minutes % 60:02d}"
+    # A clock shows the end of the day as 00:00, the same as its start.
+    if minutes >= round(60 * day.hours[-1]):
+        return "24:00"
+    # by way of UTC, because clocks may have changed since the start
+    when = datetime.fromtimestamp(day.start.timestamp() + 60.0 * minutes, day.start.tzinfo)
+    return f"{when:%H:%M}"
 
 
-def title(day: Day) -> str:
+def day_title(day: Day) -> str:
     """Title with place and date in words."""
     lat, lon = math.degrees(float(day.place.latitude)), math.degrees(float(day.place.longitude))
     where = (
@@ -54,58 +58,61 @@ def title(day: Day) -> str:
 
 
 def _reason_words(day: Day) -> str:
-    codes, counts = np.unique(day.reason[day.is_up & ~day.facing], return_counts=True)
-    hour = (day.hours[1] - day.hours[0]) * counts
+    codes = np.unique(day.lit.reason[day.lit.is_up & ~day.lit.facing])
+    hour = np.array([day.lit.hours_of(day.lit.reason == code) for code in codes])
     order = np.argsort(-hour)
-    words = [f"{Reason(int(codes[k])).words} {hour[k]:.1f} h" for k in order]
-    return ", ".join(words) or "-"
+    reason_durations = [f"{Reason(int(codes[k])).label} {hour[k]:.1f} h" for k in order]
+    return ", ".join(reason_durations) or "-"
 
 
-def _span(values: np.ndarray, unit: str, digits: int = 1) -> str:
+def _format_span(values: np.ndarray, unit: str, digits: int = 1) -> str:
     return f"{np.nanmin(values):.{digits}f} to {np.nanmax(values):.{digits}f} {unit}"
 
 
 def day_rows(day: Day) -> list[tuple[str, str]]:
     """Main results of the day as rows (quantity, value) in words."""
-    height = np.degrees(np.asarray(day.sun.elevation))
-    error = np.degrees(day.pointing_error)
-    up = ", ".join(f"{clock(a)} to {clock(b)}" for a, b in day.daylight)
-    top = int(np.argmax(height))
-    angles = np.degrees(day.angles)
+    lit = day.lit
+    error = np.degrees(lit.pointing_error)
+    up = ", ".join(f"{clock_time(day, a)} to {clock_time(day, b)}" for a, b in day.daylight)
+    height = math.degrees(np.max(np.asarray(lit.sun.elevation)))
+    angles, q = np.degrees(lit.angles), 1e3 * lit.strokes
     rows = [
         ("Sun above the horizon", f"{up} ({sum(b - a for a, b in day.daylight):.1f} h)"),
-        ("Highest", f"{height[top]:.1f}° at {clock(day.hours[top])}"),
-        ("Within the tracker's reach", f"{day.hours_of(day.facing):.1f} h"),
+        ("Highest", f"{height:.1f}° at {clock_time(day, day.culmination)}"),
+        ("Within the tracker's reach", f"{lit.hours_of(lit.facing):.1f} h"),
         ("Out of reach because of", _reason_words(day)),
-        ("Panel angles phi, theta", f"{_span(angles[0], '°')}, {_span(angles[1], '°')}"),
         (
-            "Strokes q2, q3",
-            f"{_span(1e3 * day.strokes[0], 'mm')}, {_span(1e3 * day.strokes[1], 'mm')}",
+            "Panel angles phi, theta",
+            f"{_format_span(angles[0], '°')}, {_format_span(angles[1], '°')}",
         ),
+        ("Strokes q2, q3", f"{_format_span(q[0], 'mm')}, {_format_span(q[1], 'mm')}"),
     ]
-    if np.any(day.facing):
-        rows.append(("Pointing error within reach, largest", f"{np.max(error[day.facing]):.2g}°"))
-    cosine = day.incidence_cosine[day.is_up]
+    # On a day on which the sun is never within reach there is no largest error.
+    if np.any(lit.facing):
+        worst = np.max(error[lit.facing])
+        rows.append(("Pointing error within reach, largest", f"{worst:.2g}°"))
+    mean = lambda values: float(np.average(values, weights=lit.weights))
+    cosine = lit.incidence_cosine
     return [
         *rows,
         ("Pointing error in daylight, mean, largest",
-         f"{np.nanmean(error):.1f}°, {np.nanmax(error):.1f}°"),
-        ("Incidence cosine, mean, smallest", f"{np.mean(cosine):.3f}, {np.min(cosine):.3f}"),
+         f"{mean(error):.1f}°, {np.max(error):.1f}°"),
+        ("Incidence cosine, mean, smallest", f"{mean(cosine):.3f}, {np.min(cosine):.3f}"),
         ("Lost by the tracker's reach and errors", f"{-100 * day.gain('tracker', 'two_axis'):.2f} %"),
     ]  # fmt: skip
 
 
 def day_tables(day: Day) -> tuple[Table, Table]:
     """Tables for the terminal: main results, and the energies of the panels."""
-    figures = Table(title=Text(title(day)), show_header=False, title_justify="left")
+    figures = Table(title=Text(day_title(day)), show_header=False, title_justify="left")
     figures.add_column(style="bold")
     figures.add_column()
     for cells in day_rows(day):
-        row(figures, *cells)
+        add_row(figures, *cells)
     heads = ("panel", "kWh/m² a day", "more than level", "more than single axis")
-    energies = table(*heads, title="Under a clear sky", right=1)
+    energies = make_table(*heads, title="Under a clear sky", right=1)
     for panel in PANELS:
-        row(
+        add_row(
             energies,
             PANEL_NAMES[panel],
             f"{day.energy[panel] / 3.6e6:.3f}",
@@ -145,9 +152,9 @@ def labelled_day(day: Day) -> Labelled:
         "irradiance": (("panel", s), np.stack([day.irradiance[k] for k in PANELS]), "W/m^2", ""),
         "energy": (("panel",), np.array([day.energy[k] for k in PANELS]), "J/m^2", "of the day"),
     }  # fmt: skip
-    words = {"units": "s", "description": "since local midnight"}
+    time_attributes = {"units": "s", "description": "since local midnight"}
     coordinates = {
-        "time": ((s,), day.unix - day.unix[0], words),
+        "time": ((s,), day.unix - day.unix[0], time_attributes),
         "axis": ["x", "y", "z"],
         "axis_b": ["x", "y", "z"],
         "angle": ["phi", "theta"],
@@ -155,10 +162,10 @@ def labelled_day(day: Day) -> Labelled:
         "panel": list(PANELS),
     }
     place = {k: float(getattr(day.place, k)) for k in ("latitude", "longitude", "altitude")}
-    return labelled(
-        table, coordinates, format=FORMAT, format_version=FORMAT_VERSION, title=title(day),
+    return label_table(
+        table, coordinates, format=FORMAT, format_version=FORMAT_VERSION, title=day_title(day),
         place=place, start=day.start.isoformat(), settings=day.settings,
-        reasons={int(reason): reason.words for reason in Reason},
+        reasons={int(reason): reason.label for reason in Reason},
         parameters=day.parameters.to_dict(),
     )  # fmt: skip
 
@@ -179,16 +186,17 @@ def load_attitude(path: str | os.PathLike[str]) -> Callable[[Array], Float[Array
     Raises:
         FileError: the file is missing, or has other columns, values or order.
     """
-    source, names = Path(path), ["t", "roll", "pitch", "yaw"]
+    source, names = regular_file(path), ["t", "roll", "pitch", "yaw"]
     try:
         with source.open(newline="", encoding="utf-8") as file:
             rows = [row for row in csv.reader(file) if row]
-    except FileNotFoundError:
-        raise FileError(f"There is no file {source}.") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(f"{source} is not a readable CSV file: {error}.") from error
     if not rows or [cell.strip() for cell in rows[0]] != names:
-        raise FileError(f"{source} must begin with the line t,roll,pitch,yaw.")
+        first = ",".join(rows[0])[:80] if rows else ""
+        raise FileError(
+            f"{source} must begin with the line t,roll,pitch,yaw, but it begins with '{first}'."
+        )
     try:
         # rows of another length are refused, also where all numbers would fill rows of four
         numbers = np.array(rows[1:], dtype=float)
@@ -196,28 +204,31 @@ def load_attitude(path: str | os.PathLike[str]) -> Callable[[Array], Float[Array
     except ValueError:
         raise FileError(f"{source} must have four numbers in each line after the first.") from None
     if len(t) == 0 or not np.all(np.isfinite([t, *degrees])) or np.any(t[1:] <= t[:-1]):
-        raise FileError(f"{source} must have finite numbers and times that rise from line to line.")
+        raise FileError(
+            f"{source} must have finite numbers and times that increase from line to line."
+        )
     if np.max(np.abs(degrees)) > _MOST_TURNED:
         raise FileError(f"{source} has angles beyond {_MOST_TURNED:g} degrees.")
+    # Interpolation between 359 and 1 degrees must go by zero.
     angles = np.unwrap(np.radians(degrees), axis=1)
 
-    def history(time: Array) -> Float[Array, "3 3"]:
+    def attitude_at(time: Array) -> Float[Array, "3 3"]:
         return attitude(*(jnp.interp(time, t, angle) for angle in angles))
 
-    return history
+    return attitude_at
 
 
 # --- figures
 
 
-def _hours(ax: Axes, day: Day) -> None:
+def _set_hours(ax: Axes, day: Day) -> None:
     """Set the x axis to local hours, from a little before sunrise to a little after sunset."""
     first, last = day.daylight[0][0], day.daylight[-1][1]
     ax.set_xlim(max(first - 0.5, 0.0), min(last + 0.5, day.hours[-1]))
-    ax.set_xlabel("local time [h]", fontsize=9)
+    ax.set_xlabel("time since local midnight [h]", fontsize=9)
 
 
-def _shade(ax: Axes, day: Day) -> None:
+def _shade_unreachable(ax: Axes, day: Day) -> None:
     """Shade the times in which the sun is up but out of reach."""
     out = day.is_up & ~day.facing
     ax.fill_between(
@@ -240,19 +251,22 @@ def tracking(day: Day) -> Figure:
     }  # fmt: skip
     for place, (name, label, lines) in curves.items():
         ax = axes[place]
-        _shade(ax, day)
-        for (words, values), (color, dash) in zip(lines, STYLES, strict=False):
-            ax.plot(day.hours, values, label=words, color=color, linestyle=dash, linewidth=1.4)
+        _shade_unreachable(ax, day)
+        for (legend_text, values), (color, dash) in zip(lines, STYLES, strict=False):
+            ax.plot(
+                day.hours, values, label=legend_text, color=color, linestyle=dash, linewidth=1.4
+            )
         ax.set_title(name, fontsize=10)
         ax.set_ylabel(label, fontsize=9)
-        _hours(ax, day)
+        _set_hours(ax, day)
         if len(lines) > 1:
-            handles, words = ax.get_legend_handles_labels()
-            ax.legend(handles[1:], words[1:], fontsize=8)
+            # The first entry is the shading, which the legend of the last panel explains for all.
+            handles, legend_text = ax.get_legend_handles_labels()
+            ax.legend(handles[1:], legend_text[1:], fontsize=8)
     axes[0, 0].set_ylim(bottom=0)
     axes[1, 1].set_ylim(bottom=0)
     axes[1, 1].legend(fontsize=8)
-    figure.suptitle(title(day), fontsize=11)
+    figure.suptitle(day_title(day), fontsize=11)
     return figure
 
 
@@ -261,18 +275,19 @@ def sky(day: Day) -> Figure:
     figure, axes = grid(1, 1, 5.2, subplot_kw={"projection": "polar"})
     ax: Any = axes[0, 0]
     turn, tilt = np.radians(np.arange(0, 361, 1.0)), np.radians(np.arange(0, 90.1, 0.5))
-    inside = np.asarray(_room(day.geometry, day.limits, turn, tilt)).T
+    inside = np.asarray(_smallest_margin(day.geometry, day.limits, turn, tilt)).T
     ax.contourf(turn, np.degrees(tilt), inside, levels=[0.0, np.inf], colors=["#DDEEDD"])
     ax.contour(turn, np.degrees(tilt), inside, levels=[0.0], colors=["#009E73"], linewidths=1.0)
     up = day.is_up
     panel_b = np.einsum("jin,jn->in", day.R_wb, day.normals_w)
-    for way, words, (color, dash) in zip(
+    for way, label, (color, dash) in zip(
         (day.s_b, panel_b), ("sun", "panel's normal"), STYLES, strict=False
     ):
         around = np.full(len(up), np.nan)
+        # A jump by a turn would draw a line across the picture.
         around[up] = np.unwrap(np.arctan2(way[1, up], way[0, up]))
         down = np.degrees(np.arccos(np.clip(way[2], -1, 1)))
-        ax.plot(around, down, color=color, linestyle=dash, label=words)
+        ax.plot(around, down, color=color, linestyle=dash, label=label)
     _mark_hours(ax, day)
     ax.fill([], [], color="#DDEEDD", ec="#009E73", label="reach of the tracker")
     ax.set_ylim(0, 90)
@@ -280,17 +295,18 @@ def sky(day: Day) -> Figure:
     ax.set_xticks(np.radians([0, 90, 180, 270]), ["x", "y", "-x", "-y"])
     ax.set_yticks([15, 30, 45, 60, 75], ["15°", "30°", "45°", "60°", "75°"], fontsize=8)
     ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.05, 1.0))
-    ax.set_title(f"{title(day)}\nin the UAV's axes, angle from its z axis", fontsize=10)
+    ax.set_title(f"{day_title(day)}\nin the UAV's axes, angle from its z axis", fontsize=10)
     return figure
 
 
 @quick_jit
-def _room(
+def _smallest_margin(
     geometry: TrackerGeometry, limits: Limits, turn: Float[Array, " n"], tilt: Float[Array, " m"]
 ) -> Float[Array, "n m"]:
     """Smallest scaled margin: positive in the workspace, zero on its boundary."""
     angles = panel_angles(direction_grid(turn, tilt))
     m = survey(geometry, angles, limits).margins
+    # Only the sign of the smallest counts; the scale keeps the contour lines of metres and radians alike.
     parts = jnp.stack([m.tilt, m.parallel, *(m.lower / 0.05), *(m.upper / 0.05)])
     # compiled minima may ignore NaN
     return jnp.min(jnp.where(jnp.isfinite(parts), parts, -1.0), axis=0)
@@ -300,8 +316,8 @@ def _free_azimuth(day: Day) -> float:
     """Azimuth [degrees] at which labels are farthest from the sun's path, off the axes."""
     path = np.arctan2(day.s_b[1], day.s_b[0])[day.is_up & (day.s_b[2] > 0)]
     choices = np.radians([22.5, 67.5, 112.5, 157.5, 202.5, 247.5, 292.5, 337.5])
-    apart = np.abs((path[:, None] - choices + np.pi) % (2 * np.pi) - np.pi)
-    return float(np.degrees(choices[np.argmax(np.min(apart, axis=0, initial=np.pi))]))
+    angular_distances = np.abs((path[:, None] - choices + np.pi) % (2 * np.pi) - np.pi)
+    return float(np.degrees(choices[np.argmax(np.min(angular_distances, axis=0, initial=np.pi))]))
 
 
 def _mark_hours(ax: Axes, day: Day) -> None:
@@ -317,33 +333,40 @@ def _mark_hours(ax: Axes, day: Day) -> None:
 def light(day: Day) -> Figure:
     """Figure of the panels' irradiances over the day, and of their energies."""
     figure, axes = grid(1, 2, 3.4, width_ratios=(3, 2))
-    left, right = axes[0]
-    shown = [p for p in PANELS if p != "airframe" or abs(day.gain("airframe")) > 1e-6]
-    own: tuple[str, Any] = ("#CC79A7", (0, (5, 1, 1, 1)))
-    looks = (STYLES[0], STYLES[3], STYLES[1], own, STYLES[2])
+    irradiance_axes, energy_axes = axes[0]
+    # On a level UAV the fixed panel is the level one, and its curve would cover that one's.
+    plotted_panels = [p for p in PANELS if p != "airframe" or abs(day.gain("airframe")) > 1e-6]
+    dash_dot_style: tuple[str, Any] = ("#CC79A7", (0, (5, 1, 1, 1)))
+    looks = (STYLES[0], STYLES[3], STYLES[1], dash_dot_style, STYLES[2])
     styles: dict[str, tuple[str, Any]] = dict(zip(PANELS, looks, strict=True))
-    for panel in shown:
+    for panel in plotted_panels:
         color, dash = styles[panel]
-        left.plot(
+        irradiance_axes.plot(
             day.hours, day.irradiance[panel], color=color, linestyle=dash, linewidth=1.4,
             label=PANEL_NAMES[panel],
         )  # fmt: skip
-    left.set_ylabel("irradiance [W/m²]", fontsize=9)
-    left.set_ylim(bottom=0)
-    _hours(left, day)
-    left.legend(fontsize=8, loc="lower center")
-    energies = [day.energy[panel] / 3.6e6 for panel in shown]
-    bars = right.barh(
-        [PANEL_NAMES[p] for p in shown], energies, color=[styles[p][0] for p in shown], height=0.6
+    irradiance_axes.set_ylabel("irradiance [W/m²]", fontsize=9)
+    irradiance_axes.set_ylim(bottom=0)
+    _set_hours(irradiance_axes, day)
+    irradiance_axes.legend(fontsize=8, loc="lower center")
+    energies = [day.energy[panel] / 3.6e6 for panel in plotted_panels]
+    bars = energy_axes.barh(
+        [PANEL_NAMES[p] for p in plotted_panels],
+        energies,
+        color=[styles[p][0] for p in plotted_panels],
+        height=0.6,
     )
-    right.bar_label(bars, [f" {100 * day.gain(p):+.1f} %" for p in shown], fontsize=8)
-    right.set_xlim(0, 1.4 * max(energies))
-    right.invert_yaxis()
-    right.set_xlabel("energy [kWh/m² a day]", fontsize=9)
-    right.grid(False, axis="y")
-    for ax in (left, right):
+    energy_axes.bar_label(
+        bars, [f" {100 * day.gain(p):+.1f} %" for p in plotted_panels], fontsize=8
+    )
+    energy_axes.set_xlim(0, 1.4 * max(energies))
+    # Matplotlib stacks bars upwards, while the legend beside them reads downwards.
+    energy_axes.invert_yaxis()
+    energy_axes.set_xlabel("energy [kWh/m² a day]", fontsize=9)
+    energy_axes.grid(False, axis="y")
+    for ax in (irradiance_axes, energy_axes):
         ax.set_axisbelow(True)
-    figure.suptitle(title(day), fontsize=11)
+    figure.suptitle(day_title(day), fontsize=11)
     return figure
 
 

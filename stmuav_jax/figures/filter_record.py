@@ -5,13 +5,14 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ..estimation.consistency import mean_interval
-from ..files.netcdf import FileError, now, versions
+from ..io.netcdf import FileError, list_versions, regular_file, utc_now
+from .plot import STYLES, grid
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,6 +23,8 @@ FORMAT_VERSION = 1
 
 # Level of the intervals in which consistent filters stay.
 LEVEL = 0.999
+# Largest number of seeds whose errors are drawn.
+_SEEDS = 20
 # Entries of estimate.npz that a record needs.
 _ARRAYS = ("states", "t", "error", "deviation", "nees", "nis", "degrees", "ok")
 _UNITS = {"Omega": "rad/s", "offset": "m"}
@@ -34,14 +37,8 @@ class FilterRecord(NamedTuple):
         title: what was estimated. t: times (T,) [s]. tunings: their names.
         states: "name [unit]" of the n states.
         error, deviation: estimates less truth, and the filters' standard deviations (d, T, n, s).
-        truth: true states (d, T, n, s); None where only errors were kept.
-        nees, nis: normalised errors and innovations squared (d, T, s).
-        size: degrees of freedom of NEES. degrees: those of NIS at each time (d, T).
-        innovation: normalised innovations (d, T, m, s), NaN where missing; None in older files.
-        ok: whether the filters kept their covariances (d, s).
-        summaries: what was found of each tuning, by its name.
+        verdicts: sentence on each tuning, and whether it is good, None where that is undecided.
         about: options and other plain data on what was run.
-        versions: versions of the software.
     """
 
     title: str
@@ -50,22 +47,14 @@ class FilterRecord(NamedTuple):
     states: tuple[str, ...]
     error: np.ndarray
     deviation: np.ndarray
-    truth: np.ndarray | None
-    nees: np.ndarray
-    nis: np.ndarray
-    size: int
-    degrees: np.ndarray
-    innovation: np.ndarray | None
-    ok: np.ndarray
-    summaries: Mapping[str, Mapping[str, Any]]
+    verdicts: tuple[tuple[str, bool | None], ...]
     about: Mapping[str, Any]
-    versions: Mapping[str, str]
 
 
 class Consistency(NamedTuple):
     """Mean of a chi-squared quantity of consistent filters, and the interval that it should be in."""
 
-    what: str
+    statistic: str
     value: float
     low: float
     high: float
@@ -76,11 +65,9 @@ class Consistency(NamedTuple):
         return bool(self.low < self.value < self.high)
 
     @property
-    def words(self) -> str:
+    def explanation(self) -> str:
         """Sentence with the numbers."""
-        return (
-            f"{self.what}: {self.value:.4g}, consistent within {self.low:.4g} and {self.high:.4g}."
-        )
+        return f"{self.statistic}: {self.value:.4g}, consistent within {self.low:.4g} and {self.high:.4g}."
 
 
 def end_consistency(
@@ -92,20 +79,21 @@ def end_consistency(
         nees, nis: (T, s). size: degrees of freedom of NEES. degrees: those of NIS (T,).
     """
     seeds, readings = nees.shape[1], int(np.sum(degrees))
-    found = [
+    tests = [
         Consistency("NEES at the end", float(nees[-1].mean()), *mean_interval(size, seeds, LEVEL))
     ]
     if readings:
+        # A sum over sensors of different sizes has as many degrees of freedom as numbers were read.
         value = float(nis.sum() / readings / seeds)
-        found.append(Consistency("NIS", value, *mean_interval(1, seeds * readings, LEVEL)))
-    return found
+        tests.append(Consistency("NIS", value, *mean_interval(1, seeds * readings, LEVEL)))
+    return tests
 
 
-def normalised_innovations(found: Any) -> np.ndarray:
+def normalised_innovations(result: Any) -> np.ndarray:
     """Normalised innovations (T, m, ...) of a filter, NaN where a reading is missing."""
-    normalised, measured = np.asarray(found.normalised), np.asarray(found.measured)
-    there = measured.reshape(measured.shape + (1,) * (normalised.ndim - measured.ndim))
-    return np.where(there, normalised, np.nan)
+    normalised, measured = np.asarray(result.normalised), np.asarray(result.measured)
+    measured_mask = measured.reshape(measured.shape + (1,) * (normalised.ndim - measured.ndim))
+    return np.where(measured_mask, normalised, np.nan)
 
 
 def record_content(
@@ -115,73 +103,107 @@ def record_content(
     about: Mapping[str, Any],
 ) -> bytes:
     """Content of estimate.npz: arrays, names of the states with units, and what was run as JSON."""
-    said = {"title": title, "about": dict(about), "versions": versions(), "date": now()}
+    said = {"title": title, "about": dict(about), "versions": list_versions(), "date": utc_now()}
     states = np.array([f"{name} [{unit}]" for name, unit in names])
     content = io.BytesIO()
     np.savez(content, states=states, head=np.array(json.dumps(said)), **arrays)
     return content.getvalue()
 
 
-def record_of_file(path: str | os.PathLike[str]) -> FilterRecord:
+def load_record(path: str | os.PathLike[str]) -> FilterRecord:
     """Record of a file estimate.npz, as `stmuav estimate MODEL` writes it.
 
     Raises:
         FileError: the file is damaged or holds something else.
     """
-    source = Path(path)
+    source = regular_file(path)
     try:
+        # A pickle in a file from elsewhere could run any code.
         with np.load(source, allow_pickle=False) as file:
-            found = {name: file[name] for name in file.files}
-            head = json.loads(str(found.get("head", "{}")))
+            arrays = {name: file[name] for name in file.files}
+            head = json.loads(str(arrays.get("head", "{}")))
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise FileError(f"{source} is damaged or no npz file ({type(error).__name__}).") from error
-    missing = [name for name in _ARRAYS if name not in found]
+    missing = [name for name in _ARRAYS if name not in arrays]
     if missing:
         raise FileError(
-            f"{source} is no record of filters: it holds {', '.join(found) or 'nothing'}, and lacks "
+            f"{source} is not a filter record: it holds {', '.join(arrays) or 'nothing'}, and lacks "
             f"{', '.join(missing)}."
         )
-    many = lambda name: found[name][None]
-    innovation = many("innovation") if "innovation" in found else None
+    lost = int(np.sum(~arrays["ok"]))
+    tests = end_consistency(
+        arrays["nees"], arrays["error"].shape[1], arrays["nis"], arrays["degrees"]
+    )
+    is_good = all(test.holds for test in tests) and not lost
+    verdict_text = f"{lost} filters lost their covariance. " if lost else ""
+    verdict_text += (
+        "Consistent. " if is_good else "Inconsistent: the covariance is not that of the errors. "
+    )
+    verdict_text += " ".join(test.explanation for test in tests)
+    about = {**head.get("about", {}), **{k: head[k] for k in ("versions", "date") if k in head}}
     return FilterRecord(
-        head.get("title", source.parent.name), found["t"], ("filter",), tuple(map(str, found["states"])),
-        many("error"), many("deviation"), None, many("nees"), many("nis"), found["error"].shape[1],
-        many("degrees"), innovation, many("ok"), {},
-        head.get("about", {}) | ({"date": head["date"]} if "date" in head else {}),
-        head.get("versions", {}),
+        head.get("title", source.parent.name), arrays["t"], ("filter",),
+        tuple(map(str, arrays["states"])), arrays["error"][None], arrays["deviation"][None],
+        ((verdict_text, is_good),), about,
     )  # fmt: skip
 
 
 def record_of_dataset(data: "xr.Dataset") -> FilterRecord:
-    """Record of a dataset of estimate.nc or hover.nc, as `stmuav estimate` writes them.
-
-    Raises:
-        FileError: the dataset is something else, or of another version.
-    """
-    kind, version = data.attrs.get("format", ""), int(data.attrs.get("format_version", 0))
-    if (kind, version) != (FORMAT, FORMAT_VERSION):
-        raise FileError(
-            f"The dataset is no record of filters: its format is '{kind}' {version}, not '{FORMAT}' "
-            f"{FORMAT_VERSION}."
-        )
-    # only hovers hold positions
-    size, readings = (14, 6) if "position" in data else (5, 3)
+    """Record of a dataset of estimate.nc or hover.nc, as `stmuav estimate` writes them."""
     mean = data["estimate"].values
     # a hover is flown by the estimate, and has a truth of its own with each tuning
     truth = np.broadcast_to(data["truth"].values, mean.shape)
-    count = mean.shape[:2]
-    innovation = data["innovation"].values if "innovation" in data else None
-    if innovation is not None:
-        degrees = np.isfinite(innovation[..., 0]).sum(axis=2)
-    else:
-        degrees = np.full(count, readings)
     names = [str(name) for name in data["component"].values]
     states = tuple(f"{name} [{_UNITS[name.rpartition('_')[0]]}]" for name in names)
-    summaries = json.loads(data.attrs.get("summaries", "{}"))
-    seeds = {"seeds": data.sizes["seed"], "date": data.attrs.get("date", "")}
+    tunings = tuple(map(str, data["tuning"].values))
+    verdicts = []
+    for tuning, summary in json.loads(data.attrs.get("summaries", "{}")).items():
+        if "verdict" in summary:
+            status, verdict_text = summary["verdict"]["status"], summary["verdict"]["explanation"]
+            is_good = {"consistent": True, "undecided": None}.get(status, False)
+            verdicts.append((f"{tuning.capitalize()} tuning: {status}. {verdict_text}", is_good))
+    about = {k: data.attrs[k] for k in ("versions", "date") if k in data.attrs}
     return FilterRecord(
-        str(data.attrs.get("title", "")), data["time"].values, tuple(map(str, data["tuning"].values)),
-        states, mean - truth, data["standard_deviation"].values, truth, data["nees"].values,
-        data["nis"].values, size, degrees, innovation, data["ok"].values[:, -1].astype(bool),
-        summaries, seeds, json.loads(data.attrs.get("versions", "{}")),
+        str(data.attrs.get("title", "")), data["time"].values, tunings, states, mean - truth,
+        data["standard_deviation"].values, tuple(verdicts), about | {"seeds": data.sizes["seed"]},
     )  # fmt: skip
+
+
+def error_figure(record: FilterRecord, part: range) -> Figure:
+    """Figure of errors over time, a column for each tuning, with the 3-sigma band of the first run.
+
+    The axes are those of the second half; what is larger before is cut.
+
+    Args:
+        part: indices of the states that are shown, a row each.
+    """
+    columns = len(record.tunings)
+    figure, axes = grid(len(part), columns, 0.9 + 1.3 * len(part), sharex=True)
+    # Errors at the start would set the scale and hide those of the settled filter.
+    late = record.t >= record.t[0] + 0.5 * (record.t[-1] - record.t[0])
+    for tuning_index, name in enumerate(record.tunings):
+        for ax, k in zip(axes[:, tuning_index], part, strict=True):
+            error, band = (
+                record.error[tuning_index, :, k, :_SEEDS],
+                3 * record.deviation[tuning_index, :, k, 0],
+            )
+            ax.plot(record.t, error, color="0.65", linewidth=0.5)
+            for sign in (1, -1):
+                ax.plot(
+                    record.t,
+                    sign * band,
+                    color=STYLES[tuning_index % len(STYLES)][0],
+                    linewidth=1.3,
+                )
+            sizes = np.concatenate([np.abs(error[late]).ravel(), band[late]])
+            most = float(np.max(sizes[np.isfinite(sizes)], initial=0.0))
+            if most > 0:
+                ax.set_ylim(-1.5 * most, 1.5 * most)
+            if tuning_index == 0:
+                ax.set_ylabel(record.states[k].replace(" [", "\n["), fontsize=8, parse_math=False)
+        if columns > 1:
+            axes[0, tuning_index].set_title(f"{name} tuning", fontsize=9, parse_math=False)
+        axes[-1, tuning_index].set_xlabel("time [s]", fontsize=9)
+    figure.align_ylabels(axes[:, 0])
+    figure.suptitle(record.title, fontsize=10, parse_math=False)
+    return figure

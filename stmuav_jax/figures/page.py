@@ -1,193 +1,436 @@
-"""Frame of a self-contained report page: style for light and dark, tables, embedded figures.
+"""Self-contained page with the moving mechanism of one run, or of two runs side by side.
 
-A page needs no network and no script. Cells of tables are HTML already: `text` escapes words.
+The page works without network: scripts, style and numbers are in it, and its own content security
+policy forbids any request. It draws with three.js and uPlot (docs/viewer.md). Arrays are base64 texts of
+little-endian numbers, float64 for times and float32 for all else.
 """
 
 import base64
 import html
-import math
+import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+import re
+import tempfile
+import webbrowser
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from matplotlib.figure import Figure
+import numpy as np
+import xarray as xr
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation, Slerp
 
 from ..checks.errors import SettingError, nearest_names
-from ..files.netcdf import write_atomically
-from .plot import content
+from ..checks.numbers import check_vector
+from ..checks.shapes import Numbers
+from ..control.closed_loop import LoopRun
+from ..dynamics.simulation import Run
+from ..io.netcdf import FileError, load, write_atomically
+from ..io.run_file import loop_to_dataset, to_dataset
+from ..mechanics.body import GROUND
+from .shapes import SLIDING, Shape, body_centre, body_shapes, joint_points, rotor_points
 
-# Media types of figures embedded in the page; a figure without one is a file beside it.
-TYPES = {"png": "image/png", "svg": "image/svg+xml", "pdf": ""}
+# Largest number of saved times in a page: more are thinned out evenly.
+MOST_TIMES = 2000
 
-_STYLE = """
-:root { color-scheme: light dark; --ink: #222; --paper: #fff; --faint: #666; --line: #ddd;
-        --strong: #888; --bad: #a33000; --good: #00664a; }
-@media (prefers-color-scheme: dark) { :root { --ink: #ddd; --paper: #16181c; --faint: #a0a4aa;
-        --line: #33373d; --strong: #777; --bad: #ff9a70; --good: #5fd0a8; } }
-body { font: 15px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper);
-       max-width: 70rem; margin: 2rem auto; padding: 0 1rem; overflow-wrap: break-word; }
-h1 { font-size: 1.6rem; line-height: 1.25; } h2 { font-size: 1.2rem; margin-top: 2.2rem; }
-table { border-collapse: collapse; margin: 0.8rem 0; font-size: 0.86rem; }
-th, td { padding: 0.25rem 0.6rem; text-align: right; border-bottom: 1px solid var(--line);
-         vertical-align: top; font-variant-numeric: tabular-nums; }
-th { border-bottom: 1px solid var(--strong); } caption { text-align: left; font-weight: 600; }
-th:first-child, td:first-child, td.text, th.text { text-align: left; }
-td { white-space: nowrap; } td:first-child, td.text { white-space: normal; min-width: 9rem; }
-td.text { overflow-wrap: anywhere; }
-small { color: var(--faint); } summary { cursor: pointer; font-weight: 600; }
-.verdict { border-left: 0.3rem solid var(--strong); padding-left: 0.8rem; }
-.good { border-color: var(--good); } .bad { border-color: var(--bad); }
-strong.good { color: var(--good); } strong.bad { color: var(--bad); }
-figure { margin: 1.4rem 0; } figcaption { font-weight: 600; margin-bottom: 0.4rem; }
-img { max-width: 56rem; width: 100%; box-sizing: border-box; background: #fff; border-radius: 4px; }
-.wide { overflow-x: auto; } .side { display: grid; gap: 0 2rem; align-items: start;
-  grid-template-columns: repeat(auto-fill, minmax(min(30rem, 100%), 1fr)); }
-.side p { margin: 0.2rem 0; }
-@media (max-width: 40rem) { body { margin: 1rem auto; padding: 0 0.7rem; } h1 { font-size: 1.3rem; }
-  th, td { padding: 0.25rem 0.4rem; } td:first-child { min-width: 6.5rem; } td.text { min-width: 3.6rem; } }
-@media print { :root { --ink: #000; --paper: #fff; } body { margin: 0; max-width: none; font-size: 9pt; }
-  h2 { break-after: avoid; } table { font-size: 7.5pt; } th, td { padding: 0.15rem 0.4rem; }
-  figure, tr, .side > div { break-inside: avoid; } .wide { overflow: visible; }
-  .side { grid-template-columns: 1fr 1fr; gap: 0 1rem; } }
-"""
+_NEEDED = ("position", "euler_parameters", "mass", "inertia", "centre_of_mass")
+_OF_JOINTS = ("joint_point_i", "joint_point_j", "joint_frame_i", "joint_frame_j")
+
+# Variables that have plots of their own, and the largest number of curves of any other.
+_SHOWN = (
+    "kinetic_energy",
+    "potential_energy",
+    "work",
+    "rotor_thrust",
+    "reaction_force",
+    "reaction_moment",
+)
+_MOST_CURVES = 12
+
+Curves = list[dict[str, Any]]
 
 
-class Picture(NamedTuple):
-    """Figure of a page with its name and caption."""
-
-    name: str
-    words: str
-    figure: Figure
-
-
-def framed(title: str, parts: Iterable[str]) -> str:
-    """HTML page with a title and parts that are HTML already; empty ones are left out."""
-    body = "\n".join(part for part in parts if part)
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{text(title)}</title>\n<style>{_STYLE}</style></head>\n"
-        f"<body>\n{body}\n</body></html>\n"
-    )
-
-
-def check_format(format: str) -> None:
-    """Raise SettingError for a format that figures of a page cannot have."""
-    if format not in TYPES:
-        raise SettingError(f"Figures cannot be '{format}'.{nearest_names(format, TYPES)}")
-
-
-def drawn(
-    pictures: Iterable[Picture], folder: Path, format: str, dpi: int, *, keep: bool = True
-) -> tuple[list[Path], list[str]]:
-    """Files of the figures in `folder`/figures, and the HTML that shows each.
+def content_of(
+    run: xr.Dataset, sun: Numbers | None = None, shapes: Mapping[str, Sequence[Shape]] | None = None
+) -> dict[str, Any]:
+    """Content of the page for one saved run, as plain numbers and texts.
 
     Args:
-        pictures: figures, drawn one at a time.
-        folder: folder of the page.
-        format: "png", "svg" or "pdf"; a page refers to the files of pdf.
-        dpi: resolution [dots per inch].
-        keep: write files also of figures that are embedded.
+        run: saved run, as `load` reads it.
+        sun: vector from the ground towards the sun, world axes (3,), of any length.
+        shapes: shapes of bodies by name, instead of those of `body_shapes`.
+
+    Raises:
+        FileError: the run lacks what the page shows, or has no time with finite poses.
+        SettingError: shapes for a body that the run does not have, or a sun without direction.
     """
-    paths, shown = [], []
-    for name, words, figure in pictures:
-        drawing, kind = content(figure, format, dpi), TYPES[format]
-        if keep or not kind:
-            path = folder / "figures" / f"{name}.{format}"
-            paths.append(write_atomically(path, drawing))
-        shown.append(_shown(f"{name}.{format}", words, drawing, kind))
-    return paths, shown
+    check_viewable(run)
+    # A browser holds a few thousand poses of many bodies with ease, but not a million.
+    time_indices, note = _shown_times(run)
+    run = run.isel(time=time_indices)
+    names = [str(name) for name in run["body"].values]
+    custom_shapes = dict(shapes or {})
+    for name in custom_shapes:
+        if name not in names:
+            raise SettingError(f"There is no body '{name}' to draw.{nearest_names(name, names)}")
+    towards = None if sun is None else _sun_direction(sun)
+    return {
+        "title": str(run.attrs.get("title", "")) or str(run.attrs.get("scene", "")) or "Motion",
+        "note": note,
+        # Times in double precision: a late one in single precision loses the digits that tell frames apart.
+        # Poses in single precision halve the page.
+        "times": encode_array(run["time"].values, "<f8"),
+        "positions": encode_array(run["position"].values),
+        "orientations": encode_array(run["euler_parameters"].values),
+        "bodies": [
+            {
+                "name": name,
+                "shapes": [
+                    shape.to_dict() for shape in custom_shapes.get(name, body_shapes(run, name))
+                ],
+            }
+            for name in names
+        ],
+        "joints": [joint_of(run, k) for k in range(run.sizes.get("joint", 0))],
+        "reactions": encode_array(run["reaction_force"].values)
+        if "reaction_force" in run
+        else None,
+        "wanted": encode_array(run["wanted_position"].values) if "wanted_position" in run else None,
+        "rotors": _rotor_data(run),
+        "sun": None if towards is None else towards.tolist(),
+        "watch": watched_bodies(run),
+        "size": machine_size(run),
+        "curves": plot_curves(run, towards),
+    }
 
 
-def _shown(name: str, words: str, drawing: bytes, kind: str) -> str:
-    said = text(words)
-    if not kind:
-        return f'<p><a href="figures/{text(name)}">{said}</a></p>'
-    source = f"data:{kind};base64,{base64.b64encode(drawing).decode()}"
-    return f'<figure><figcaption>{said}</figcaption><img alt="{said}" src="{source}"></figure>'
+def check_viewable(run: xr.Dataset) -> None:
+    """Raise `FileError` unless a saved run has all that the viewer draws."""
+    joints = _OF_JOINTS if run.sizes.get("joint", 0) else ()
+    missing = [name for name in (*_NEEDED, *joints) if name not in run]
+    if missing:
+        raise FileError(
+            f"The run of scene '{run.attrs.get('scene', '')}' cannot be drawn, because it was saved "
+            f"without {', '.join(missing)}: an earlier version of stmuav_jax did not keep them. "
+            "Simulate and save it again."
+        )
 
 
-def write_page(
-    title: str,
-    head: Iterable[str],
-    pictures: Iterator[Picture],
-    tail: Iterable[str],
-    path: str | os.PathLike[str],
-    format: str,
-    dpi: int,
-) -> list[Path]:
-    """Write a page with figures between its head and its tail, atomically; return its files' paths."""
-    check_format(format)
-    target = Path(path)
-    paths, shown = drawn(pictures, target.parent, format, dpi, keep=False)
-    figures = ["<h2>Figures</h2>", *(shown or ["<p>There is nothing to draw.</p>"])]
-    page = framed(title, [f"<h1>{text(title)}</h1>", *head, *figures, *tail])
-    return [write_atomically(target, page.encode()), *paths]
+def encode_array(values: Any, kind: str = "<f4") -> str:
+    """Base64 text of an array's numbers in the order of its last index first."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii")
 
 
-# --- pieces of a page
+def finite_times(run: xr.Dataset) -> Int[np.ndarray, " k"]:
+    """Indices of the saved times at which all poses are finite; `FileError` if there is none."""
+    finite = np.all(np.isfinite(run["position"].values), axis=(1, 2))
+    finite &= np.all(np.isfinite(run["euler_parameters"].values), axis=(1, 2))
+    finite_indices = np.flatnonzero(finite)
+    if not len(finite_indices):
+        raise FileError(
+            f"The run of scene '{run.attrs.get('scene', '')}' has no saved time at which all poses are "
+            "finite numbers, so that there is nothing to draw."
+        )
+    return finite_indices
 
 
-def text(value: Any) -> str:
-    """Words with the characters escaped that HTML gives a meaning."""
-    return html.escape(str(value))
+def interpolate_poses(
+    run: xr.Dataset, times: Float[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, "k n 3"], Float[np.ndarray, "k n 3 3"]]:
+    """Positions [m] and rotation matrices, body to world, of a saved run's bodies at times within it [s].
+
+    Positions are linear between the saved times; orientations turn by the shortest rotation.
+
+    Raises:
+        FileError: fewer than two saved times have finite poses.
+    """
+    finite = finite_times(run)
+    if len(finite) < 2:
+        raise FileError(
+            f"The run of scene '{run.attrs.get('scene', '')}' has one saved time with finite poses, but "
+            f"a motion needs two."
+        )
+    ts, p = run["time"].values[finite], run["euler_parameters"].values[finite]
+    # Between saved times bodies turn along the shortest arc; a mean of Euler parameters is no rotation.
+    turns = (Slerp(ts, Rotation.from_quat(p[:, n, [1, 2, 3, 0]])) for n in range(p.shape[1]))
+    k = np.clip(np.searchsorted(ts, times, side="right") - 1, 0, len(ts) - 2)
+    share = ((times - ts[k]) / (ts[k + 1] - ts[k]))[:, None, None]
+    r = run["position"].values[finite]
+    R_wb = np.stack([turn(times).as_matrix() for turn in turns], axis=1)
+    return (1 - share) * r[k] + share * r[k + 1], R_wb
 
 
-def short(value: Any) -> str:
-    """Text of plain data; long lists and long texts are cut."""
-    if isinstance(value, list) and len(value) > 8:
-        return f"{', '.join(short(x) for x in value[:3])}, ... ({len(value):,} in all)"
-    if isinstance(value, list):
-        return ", ".join(short(x) for x in value)
-    words = f"{value:g}" if isinstance(value, float) else str(value)
-    return words if len(words) <= 300 else f"{words[:300]} ..."
+def _shown_times(run: xr.Dataset) -> tuple[np.ndarray, str]:
+    """Indices of the saved times that are shown, and a sentence about the others."""
+    time_indices, count = finite_times(run), run.sizes["time"]
+    note = ""
+    if len(time_indices) < count:
+        note = f"{count - len(time_indices)} of {count} saved times are not finite and left out. "
+    if len(time_indices) > MOST_TIMES:
+        some = np.unique(np.round(np.linspace(0, len(time_indices) - 1, MOST_TIMES)).astype(int))
+        note += f"{MOST_TIMES} of {len(time_indices)} saved times are shown."
+        time_indices = time_indices[some]
+    return time_indices, note.strip()
 
 
-def number_text(value: float | None) -> str:
-    """Number with four digits; empty for none, words for infinity."""
-    if value is None or math.isnan(value):
-        return ""
-    if math.isinf(value):
-        return "infinite" if value > 0 else "\N{MINUS SIGN}infinite"
-    return f"{value:.4g}".replace("-", "\N{MINUS SIGN}")
+def _sun_direction(sun: Numbers) -> Float[np.ndarray, "3"]:
+    sun_vector = np.asarray(check_vector(sun, "The direction of the sun", ""))
+    length = float(np.linalg.norm(sun_vector))
+    if length == 0:
+        raise SettingError("The direction of the sun has zero length; give any vector towards it.")
+    return sun_vector / length
 
 
-def verdict_text(words: str, good: bool | None) -> str:
-    """Paragraph of a verdict with a mark for good or bad; None has none."""
-    kind = "" if good is None else " good" if good else " bad"
-    return f'<p class="verdict{kind}">{text(words)}</p>'
+def watched_bodies(run: xr.Dataset) -> list[str]:
+    """Names of the bodies that figures of the scene show.
+
+    Where it names none: those with rotors and panels, and without such bodies all.
+    """
+    return json.loads(run.attrs.get("watch", "[]")) or _upright_bodies(run) or _body_names(run)
 
 
-def html_table(
-    head: list[str], rows: Iterable[list[str]], title: str = "", left: tuple[int, ...] = ()
-) -> str:
-    """HTML table of cells that are HTML already; columns in `left` are left-aligned words."""
-    mark = lambda k: ' class="text"' if k in left else ""
-    cells = lambda row, tag: "".join(f"<{tag}{mark(k)}>{x}</{tag}>" for k, x in enumerate(row))
-    top = f"<thead><tr>{cells(head, 'th')}</tr></thead>" if any(head) else ""
-    body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
-    name = f"<caption>{title}</caption>" if title else ""
-    return f'<div class="wide"><table>{name}{top}<tbody>{body}</tbody></table></div>'
+def _body_names(run: xr.Dataset) -> list[str]:
+    return [str(name) for name in run["body"].values]
 
 
-def entries_table(entries: Iterable[tuple[str, Any]]) -> str:
-    """HTML table of names and values; empty without entries."""
-    rows = [[text(name), text(short(value))] for name, value in entries]
-    return html_table(["", ""], rows, left=(1,)) if rows else ""
+def _upright_bodies(run: xr.Dataset) -> list[str]:
+    """Names of the bodies whose z axis has a meaning: those with rotors, and panels."""
+    return [n for n in _body_names(run) if len(rotor_points(run, n)) or "panel" in n.lower()]
 
 
-def section(title: str, content: str) -> str:
-    """Section with a title; empty without content."""
-    return f"<h2>{text(title)}</h2>{content}" if content else ""
+def _body_poses(run: xr.Dataset, body: str) -> tuple[Any, Any]:
+    """Positions (k, 3) [m] and rotation matrices (k, 3, 3) of a body or ground at all times."""
+    count = run.sizes["time"]
+    if body == GROUND:
+        return np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3))
+    k = list(run["body"].values).index(body)
+    e = run["euler_parameters"].values[:, k]
+    rotation_matrices = Rotation.from_quat(e[:, [1, 2, 3, 0]]).as_matrix()
+    return run["position"].values[:, k], rotation_matrices
 
 
-def folded(title: str, content: str) -> str:
-    """Section that the reader opens; empty without content."""
-    return f"<details><summary>{text(title)}</summary>{content}</details>" if content else ""
+def joint_of(run: xr.Dataset, k: int) -> dict[str, Any]:
+    """Plain data of a joint, with points from the bodies' centres of mass."""
+    i, j = (str(run[f"joint_body_{side}"].values[k]) for side in ("i", "j"))
+    point_i = run["joint_point_i"].values[k] - body_centre(run, i)
+    point_j = run["joint_point_j"].values[k] - body_centre(run, j)
+    frame_i, kind = run["joint_frame_i"].values[k], str(run["joint_kind"].values[k])
+    joint_data = {
+        "name": str(run["joint"].values[k]), "kind": kind, "body_i": i, "body_j": j,
+        "point_i": point_i.tolist(), "point_j": point_j.tolist(),
+        "frame_i": frame_i.tolist(), "frame_j": run["joint_frame_j"].values[k].tolist(),
+    }  # fmt: skip
+    if kind in SLIDING:
+        displacements = joint_displacement(run, k)
+        joint_data["slide"] = [float(np.min(displacements)), float(np.max(displacements))]
+    return joint_data
 
 
-def identity_table(attributes: Mapping[str, Any], left_out: Iterable[str]) -> str:
-    """HTML table of the attributes of a dataset, without those left out."""
-    skip = set(left_out)
-    return entries_table((str(k), v) for k, v in attributes.items() if k not in skip and v != "")
+def joint_displacement(run: xr.Dataset, k: int) -> Float[np.ndarray, " t"]:
+    """Displacement of a joint's point on body j along the axis on body i (t,) [m]."""
+    ends = []
+    for side in ("i", "j"):
+        body = str(run[f"joint_body_{side}"].values[k])
+        r, R = _body_poses(run, body)
+        ends.append(r + R @ (run[f"joint_point_{side}"].values[k] - body_centre(run, body)))
+    R_i = _body_poses(run, str(run["joint_body_i"].values[k]))[1]
+    return np.sum((ends[1] - ends[0]) * (R_i @ run["joint_frame_i"].values[k][:, 2]), axis=1)
+
+
+def _rotor_data(run: xr.Dataset) -> dict[str, Any] | None:
+    if "rotor_thrust" not in run:
+        return None
+    at, bodies = [], [str(name) for name in run["rotor_body"].values]
+    for body in dict.fromkeys(bodies):
+        at += rotor_points(run, body).tolist()
+    return {
+        "bodies": bodies, "positions": at, "spin": run["rotor_spin"].values.tolist(),
+        "speed": encode_array(run["rotor_speed"].values),
+        "thrust": encode_array(run["rotor_thrust"].values),
+    }  # fmt: skip
+
+
+def machine_size(run: xr.Dataset) -> float:
+    """Diagonal [m] of the box around all joints, rotors and centres of mass at the start."""
+    point_sets = [run["position"].values[0]]
+    for body in (str(name) for name in run["body"].values):
+        r, R = _body_poses(run, body)
+        for points in (joint_points(run, body)[0], rotor_points(run, body)):
+            point_sets.append(r[0] + points @ R[0].T)
+    every = np.concatenate(point_sets)
+    diagonal = float(np.linalg.norm(np.max(every, axis=0) - np.min(every, axis=0)))
+    # A single body has no extent of points; its radius of gyration stands for its size.
+    gyration = np.sqrt(
+        np.max(np.linalg.eigvalsh(run["inertia"].values)[:, -1] / run["mass"].values)
+    )
+    return max(diagonal, 3 * float(gyration))
+
+
+# --- curves
+
+
+def plot_curves(run: xr.Dataset, sun: Float[np.ndarray, "3"] | None) -> Curves:
+    """Curves for the plots: title with unit, and labelled values over the shown times."""
+    names, curves_by_title = _body_names(run), {}
+    for body in watched_bodies(run):
+        r = run["position"].values[:, names.index(body)]
+        curves_by_title[f"position of {_spell_name(body)} [m]"] = dict(zip("xyz", r.T, strict=True))
+    normals = {
+        _spell_name(name): _body_poses(run, name)[1][:, :, 2] for name in _upright_bodies(run)
+    }
+    curves_by_title["tilt of z from the vertical [degrees]"] = {
+        name: _angle_degrees(z[:, 2]) for name, z in normals.items()
+    }
+    if sun is not None:
+        curves_by_title["angle from the panel's normal to the sun [degrees]"] = {
+            name: _angle_degrees(z @ sun) for name, z in normals.items() if "panel" in name.lower()
+        }
+    joints = [str(name) for name in run["joint"].values] if "joint" in run else []
+    curves_by_title["displacement in joints [m]"] = {
+        name: joint_displacement(run, k)
+        for k, name in enumerate(joints)
+        if str(run["joint_kind"].values[k]) in SLIDING
+    }
+    if "reaction_force" in run:
+        force = np.linalg.norm(run["reaction_force"].values, axis=2)
+        curves_by_title["reaction force [N]"] = dict(zip(joints, force.T, strict=True))
+    if "rotor_thrust" in run:
+        thrust = run["rotor_thrust"].values.T
+        curves_by_title["thrust of rotors [N]"] = {
+            str(k + 1): history for k, history in enumerate(thrust)
+        }
+    if "kinetic_energy" in run:
+        potential = run["potential_energy"].values
+        curves_by_title["energy [J]"] = {
+            # The potential has an arbitrary zero; from the start, its change can be compared with the kinetic
+            # energy.
+            "kinetic": run["kinetic_energy"].values, "potential": potential - potential[0],
+            "work done": run["work"].values,
+        }  # fmt: skip
+    return [
+        {
+            "title": title,
+            "curves": [{"label": k, "values": encode_array(v)} for k, v in values_by_label.items()],
+        }
+        for title, values_by_label in (curves_by_title | _loop_signals(run)).items()
+        if values_by_label
+    ]
+
+
+def _loop_signals(run: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Signals that a closed loop saved: numbers over time, alone or few together."""
+    curves_by_title = {}
+    for name, variable in run.data_vars.items():
+        alone = variable.dims[:1] == ("time",) and variable.dtype.kind == "f"
+        columns = variable.values.reshape(run.sizes["time"], -1).T if alone else ()
+        # Quantities of every body would be too many curves to read.
+        if name in _SHOWN or "body" in variable.dims or not 1 <= len(columns) <= _MOST_CURVES:
+            continue
+        last = variable.dims[-1]
+        labels = run[last].values if last in run.coords else range(1, len(columns) + 1)
+        curve_labels = (
+            [_spell_name(str(name))] if variable.ndim == 1 else [str(label) for label in labels]
+        )
+        if len(curve_labels) == len(columns):
+            title = f"{_spell_name(str(name))} [{variable.attrs.get('units', '')}]"
+            curves_by_title[title] = dict(zip(curve_labels, columns, strict=True))
+    return curves_by_title
+
+
+def _angle_degrees(cosine: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    # the cosine of two unit vectors may exceed 1 by round-off
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _spell_name(name: str) -> str:
+    return name.replace("_", " ")
+
+
+_PARTS = ("library.css", "viewer.css", "library.min.js", "motion.js", "machine.js", "viewer.js")
+
+
+@dataclass(frozen=True)
+class RunPage:
+    """Self-contained page of one or two runs; a notebook shows it as the value of a cell.
+
+    Attributes:
+        html: text of the page.
+        height: height in a notebook [pixels].
+    """
+
+    html: str
+    height: int = 560
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the page to a file, atomically; return its path."""
+        return write_atomically(path, self.html.encode())
+
+    def show(self) -> Path:
+        """Write the page to a temporary file and open it in the browser; return the file's path."""
+        handle, name = tempfile.mkstemp(prefix="stmuav-view-", suffix=".html")
+        os.close(handle)
+        path = self.save(name)
+        webbrowser.open(path.as_uri())
+        return path
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe srcdoc="{html.escape(self.html)}" '
+            f'style="width:100%;height:{self.height}px;border:0"></iframe>'
+        )
+
+
+def view(
+    *runs: Run | LoopRun | xr.Dataset | str | os.PathLike[str],
+    sun: Numbers | None = None,
+    shapes: Mapping[str, Sequence[Shape]] | None = None,
+) -> RunPage:
+    """Page with the moving mechanism of a run, or of two runs side by side.
+
+    Args:
+        runs: one or two runs or closed loops' runs; or datasets, files or folders of saved ones.
+        sun: vector towards the sun, world axes (3,), of any length; default no sun.
+        shapes: shapes of bodies by name (see `Shape`); default by the dimensions in the run.
+
+    Raises:
+        FileError: a file is no saved run, or a run lacks what the page shows.
+        SettingError: not one or two runs, shapes for an unknown body, or a sun without direction.
+    """
+    if len(runs) not in (1, 2):
+        raise SettingError(f"The viewer shows one run or two side by side, not {len(runs)}.")
+    content = {"runs": [content_of(dataset_of(run), sun, shapes) for run in runs]}
+    titles = dict.fromkeys(run_content["title"] for run_content in content["runs"])
+    # "<" within the numbers and names would end the script element
+    # Everything is in one file, which opens without a network and can be sent.
+    data = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
+    parts = {name: _read_asset(name) for name in _PARTS}
+    parts |= {"title": html.escape(" | ".join(titles)), "data": data}
+    # One pass: text that a part brings along is not searched for placeholders.
+    page = re.sub(
+        r"\{\{([\w.]+)\}\}", lambda placeholder: parts[placeholder[1]], _read_asset("page.html")
+    )
+    return RunPage(page)
+
+
+def dataset_of(run: Run | LoopRun | xr.Dataset | str | os.PathLike[str]) -> xr.Dataset:
+    """Labelled dataset of a run: of one in memory, or of a saved one by its file or folder."""
+    if isinstance(run, xr.Dataset):
+        return run
+    if isinstance(run, Run):
+        return to_dataset(run)
+    if isinstance(run, LoopRun):
+        return loop_to_dataset(run)
+    path = Path(run)
+    if path.is_dir():
+        path = next(
+            (path / n for n in ("run.nc", "flight.nc") if (path / n).exists()), path / "run.nc"
+        )
+    return load(path)
+
+
+@cache
+def _read_asset(name: str) -> str:
+    return (Path(__file__).with_name("assets") / name).read_text(encoding="utf-8")

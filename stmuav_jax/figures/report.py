@@ -1,113 +1,236 @@
-"""Table of a run's certificate for the terminal."""
+"""Report page of a result in one self-contained HTML file: verdict, tables of numbers and settings, figures.
 
-import dataclasses
+A result is the dataset of a run, a closed loop, filters with known truth or a study, or a `FilterRecord`. The
+template `report.html` beside this module is the same for all.
+"""
+
+import base64
+import itertools
+import json
 import math
-from collections.abc import Mapping
-from typing import Any
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
-from rich.table import Table
-from rich.text import Text
+import jinja2
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
 
-from ..dynamics.run import Certificate, Run
-from ..files.netcdf import FileError
-from .terminal import row
+from ..io.netcdf import FORMAT, LOOP_FORMAT, FileError, flatten_tables, write_atomically
+from ..studies.statistics import IntervalEstimate
+from . import filter_record
+from .filter_record import FilterRecord, error_figure, record_of_dataset
+from .plot import draw_histories, figure_content
+from .run import FIGURES, draw_loads, saved_loads
+from .study import study_figures
+from .study_data import Analysis, analyse, label_unit, study_data, summary_lines
 
-# Error estimates below this are differences of round-off, for motions of some metres.
-_ROUND_OFF = 1e-14
+_MEDIA_TYPES = {"png": "image/png", "svg": "image/svg+xml"}
+# Curves in a panel of inputs, and states of a filter in a figure.
+_CURVES, _STATES = 4, 6
 
-
-def _number(value: float | None, unit: str) -> str:
-    if value is None or math.isnan(value):
-        return "not applicable" if value is None else "not found"
-    return f"{value:.2e} {unit}".rstrip()
-
-
-def _estimate(largest: float, end: float, unit: str) -> str:
-    if math.isnan(largest):
-        return "none"
-    words = f"{largest:.1e} {unit}"
-    words += "" if math.isnan(end) else f", at the end {end:.1e} {unit}"
-    return f"{words} (round-off)" if largest < _ROUND_OFF else words
-
-
-def certificate_rows(run: Run) -> list[tuple[str, str]]:
-    """Entries of a run's certificate as rows (quantity, value) in words."""
-    return rows_of(run.certificate)
+Verdict = tuple[str, bool | None]
+Captioned = tuple[str, Figure]
 
 
-def certificate_from(plain: Mapping[str, Any]) -> Certificate:
-    """Certificate of a saved run from the plain data of `Certificate.to_dict`.
+class ReportTable(NamedTuple):
+    """Table of a report: title, heads of the columns or none, and rows of cells."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+
+class _Content(NamedTuple):
+    title: str
+    verdicts: list[Verdict]
+    tables: Sequence[ReportTable]
+    figures: Iterable[Captioned]
+
+
+def write_report(
+    result: xr.Dataset | FilterRecord,
+    path: str | os.PathLike[str],
+    format: Literal["png", "svg"] = "png",
+    *,
+    dpi: int = 160,
+    verdict: Verdict | None = None,
+    tables: Sequence[ReportTable] = (),
+    figures: Iterable[Captioned] = (),
+    analysis: Analysis | None = None,
+) -> Path:
+    """Write a self-contained page about a result, atomically; return its path.
+
+    Args:
+        result: dataset of a run, a closed loop, an estimation or a study, as `stm.load` and
+            `stm.studies.open_store` read them, or record of filters.
+        path: path of the page.
+        format: format of the embedded figures. dpi: their resolution [dots per inch].
+        verdict: sentence on the result and whether it is good, in place of its own.
+        tables: tables before those of the result. figures: captions and figures before its own.
+        analysis: analysis of a study, if it is known already.
 
     Raises:
-        FileError: entries are missing, as in a file of another version.
+        FileError: the dataset is no result of this package.
     """
-    fields = [field.name for field in dataclasses.fields(Certificate)]
-    missing = [name for name in fields if name not in plain]
-    if missing:
-        raise FileError(f"The certificate of the run lacks {', '.join(missing)}.")
-    # None stands for NaN where a number may be undefined
-    numbers = {name for name in fields if Certificate.__annotations__[name] in (float, "float")}
-    given: dict[str, Any] = {
-        k: math.nan if k in numbers and plain[k] is None else plain[k] for k in fields
-    }
-    given["redundant"] = tuple(plain["redundant"])
-    return Certificate(**given)
+    page = _report_content(result, analysis)
+    embedded_figures = []
+    for caption, figure in itertools.chain(figures, page.figures):
+        # Pictures within the page: one file that can be sent and kept.
+        code = base64.b64encode(figure_content(figure, format, dpi)).decode()
+        embedded_figures.append((caption, f"data:{_MEDIA_TYPES[format]};base64,{code}"))
+    source = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
+    # Names come from users' files; escaped, they cannot become elements of the page.
+    template = jinja2.Environment(autoescape=True, trim_blocks=True).from_string(source)
+    text = template.render(
+        title=page.title, verdicts=page.verdicts if verdict is None else [verdict],
+        tables=[*tables, *page.tables], figures=embedded_figures,
+    )  # fmt: skip
+    return write_atomically(path, text.encode())
 
 
-def rows_of(c: Certificate) -> list[tuple[str, str]]:
-    """Entries of a certificate as rows (quantity, value) in words."""
-    rank = f"{c.rank} of {c.rows} rows" if c.rows else "no joints"
-    if c.redundant:
-        rank += f"; dependent rows in {', '.join(c.redundant)}"
-    rows = [
-        ("Result", f"{c.result} at t = {c.t_end:g} s"),
-        ("Estimated position error", _estimate(c.position_error, c.position_error_end, "m")),
-        ("Estimated orientation error", _estimate(c.angle_error, c.angle_error_end, "rad")),
-    ]
-    if c.error_words:
-        rows.append(("About these errors", c.error_words))
-    rows += [
-        ("Constraint violation, lengths", _number(c.position_violation, "m")),
-        ("Constraint violation, angles", _number(c.angle_violation, "rad")),
-        ("Violation of the lengths' rates", _number(c.velocity_violation, "m/s")),
-        ("Violation of the angles' rates", _number(c.angular_velocity_violation, "rad/s")),
-        ("Violation of the Euler parameters' norm", _number(c.norm_violation, "")),
-        ("Energy balance, of the largest energy", _number(c.relative_energy_error, "")),
-    ]
-    if c.momentum_error is not None:
-        rows += [
-            ("Momentum balance, relative", _number(c.momentum_error, "")),
-            ("Angular momentum balance, relative", _number(c.angular_momentum_error, "")),
-        ]
-    rows.append(("Rank of the constraint Jacobian", rank))
-    if c.smallest_singular_value is not None:
-        rows.append(("Smallest singular value on the way", _number(c.smallest_singular_value, "")))
-    difference = c.formulation_difference
-    words = "not computed" if difference is None else _number(difference, "")
-    rows.append(("Accelerations by another formulation, difference", words))
-    rows.append(("Steps accepted, rejected", f"{c.accepted_steps}, {c.rejected_steps}"))
-    if 2 * c.steps_at_growth_limit > c.accepted_steps:
-        rows.append(
-            (
-                "Steps that grew at their limit",
-                f"{c.steps_at_growth_limit}: not the error but the saved times, or nothing, chose most lengths",
-            )
+def _report_content(result: xr.Dataset | FilterRecord, analysis: Analysis | None) -> _Content:
+    if isinstance(result, FilterRecord):
+        return _of_filters(result)
+    kind = result.attrs.get("format", "")
+    if "sample" in result.dims:
+        return _of_study(result, analysis)
+    if kind in (FORMAT, LOOP_FORMAT):
+        return _of_motion(result)
+    if kind == filter_record.FORMAT:
+        return _of_filters(record_of_dataset(result))
+    raise FileError(
+        f"A report needs a run, a closed loop, a filter record or a study, but the dataset has the format '{kind}'."
+    )
+
+
+def _of_motion(data: xr.Dataset) -> _Content:
+    """Content of a run or of a closed loop."""
+    certificate, failure = json.loads(data.attrs["certificate"]), data.attrs.get("failure", "")
+    verdict_text = (
+        failure or f"It ended at t = {certificate['t_end']:g} s: {certificate['result']}."
+    )
+    if certificate.get("position_error") is not None:
+        verdict_text += (
+            f" Its distance from the exact motion is estimated as at most {certificate['position_error']:.2g} m "
+            f"and {certificate['angle_error']:.2g} rad."
         )
+    is_good = certificate["result"] in ("successful", "event occurred") and not failure
+    accuracy = [
+        (k.replace("_", " "), _shorten_data(v)) for k, v in certificate.items() if v is not None
+    ]
+    title = str(data.attrs.get("title") or data.attrs.get("scene") or "Run")
+    captioned_figures = [(name.capitalize(), draw(data)) for name, draw in FIGURES.items()]
+    figures = [(caption, figure) for caption, figure in captioned_figures if figure is not None]
+    loads = saved_loads(data)
+    if loads is not None:
+        figures.append(("Reaction loads at the saved times", draw_loads(title, loads)))
+    if data.sizes.get("input", 0):
+        names, units = (data[name].values.astype(str) for name in ("input", "input_unit"))
+        panels = []
+        # Inputs of one unit share an axis, a few curves in each panel.
+        for unit in dict.fromkeys(units):
+            group = np.flatnonzero(units == unit)
+            for places in (group[k : k + _CURVES] for k in range(0, len(group), _CURVES)):
+                labels = tuple(f"{names[k]} {k + 1}" for k in places)
+                panels.append((f"input [{unit}]", labels, data["command"].values[:, places]))
+        histories = draw_histories(title, data["time"].values, panels)
+        figures.append(("Inputs from the controller", histories))
+    notes = [(f"Note: {note}", None) for note in json.loads(data.attrs.get("notes", "[]"))]
+    tables = [ReportTable("Accuracy", (), accuracy), *_settings_tables(data)]
+    return _Content(title, [(verdict_text, is_good), *notes], tables, figures)
+
+
+def _settings_tables(data: xr.Dataset) -> list[ReportTable]:
+    """Tables of the settings, of the parameters that were changed, and of the versions."""
+    read = lambda name: json.loads(data.attrs.get(name, "{}"))
+    ts, mission = data["time"].values, read("mission")
+    rows = [
+        ("scene", data.attrs.get("scene", "")), ("date", data.attrs.get("date", "")),
+        ("saved times", f"{len(ts):,}, from {ts[0]:g} s to {ts[-1]:g} s"),
+        *((name.replace("_", " "), _shorten_data(value)) for name, value in flatten_tables(read("settings"))),
+        *(
+            (f"mission: {name}", _shorten_data(value)) for name, value in flatten_tables(mission)
+            if value not in (None, {}, [], "")
+        ),
+    ]  # fmt: skip
+    changed = [
+        (name, _shorten_data(entry["value"]), entry.get("unit", ""), entry["source"])
+        for name, entry in read("parameters").items()
+        # A table of all parameters is long; what a reader must know is what differs.
+        if str(entry.get("source", "")).startswith("given")
+    ]
     return [
-        *rows,
-        ("Time to compile the integration", f"{c.compile_seconds:.2f} s"),
-        ("Time to run it", f"{c.run_seconds:.2f} s"),
-        ("Time for the second run, for the errors", f"{c.estimate_seconds:.2f} s"),
-        ("Time for checks and balances", f"{c.analysis_seconds:.2f} s"),
+        ReportTable("Settings", (), rows),
+        ReportTable("Parameters that were changed", ("", "value", "unit", "source"), changed),
+        ReportTable("Versions", (), list(read("versions").items())),
     ]
 
 
-def certificate_table(run: Run) -> Table:
-    """Table of a run's certificate for the terminal."""
-    # names of bodies and joints are printed literally: brackets in them are no markup
-    table = Table(title=Text(run.scene.title), show_header=False, title_justify="left")
-    table.add_column(style="bold")
-    table.add_column()
-    for cells in certificate_rows(run):
-        row(table, *cells)
-    return table
+def _of_filters(record: FilterRecord) -> _Content:
+    rows = []
+    for tuning_index, tuning in enumerate(record.tunings):
+        rms = [
+            np.sqrt(np.mean(part[tuning_index, -1] ** 2, axis=-1))
+            for part in (record.error, record.deviation)
+        ]
+        rows += [
+            (f"{state}, {tuning}", *(f"{x:.4g}" for x in numbers))
+            for state, *numbers in zip(record.states, *rms, strict=True)
+        ]
+    head = ("state", "RMS error at the end", "standard deviation by the filter")
+    about = [
+        (name, _shorten_data(value)) for name, value in flatten_tables(record.about) if value != ""
+    ]
+    tables = [ReportTable("Errors", head, rows), ReportTable("Settings", (), about)]
+    caption = "Errors of up to 20 runs, and the filters' 3-sigma bands"
+    count = len(record.states)
+    figures = (
+        (caption, error_figure(record, range(k, min(k + _STATES, count))))
+        for k in range(0, count, _STATES)
+    )
+    return _Content(record.title, list(record.verdicts), tables, figures)
+
+
+def _of_study(dataset: xr.Dataset, analysis: Analysis | None) -> _Content:
+    data = study_data(dataset)
+    analysis = analyse(data) if analysis is None else analysis
+    rows = []
+    for finding in analysis.findings:
+        summary = finding.summary
+        shares = [summary.quantiles.get(share) for share in (0.05, 0.5, 0.95)]
+        numbers = (finding.event or summary.mean, summary.standard_deviation, *shares)
+        name = label_unit(finding.quantity.label, finding.quantity.unit)
+        rows.append((name, f"{summary.values:,}", *map(_format_interval, numbers)))
+    head = ("", "values", "mean or probability", "standard deviation", "5 %", "median", "95 %")
+    about = [(name, _shorten_data(value)) for name, value in flatten_tables(data.identity)]
+    tables = [
+        ReportTable("Quantities, over the completed samples", head, rows),
+        ReportTable("Settings", (), about),
+    ]
+    level = f"Intervals hold with {100 * analysis.level:g} %, each by itself."
+    verdicts: list[Verdict] = [
+        (text, None) for text in (*summary_lines(analysis), *analysis.notes, level)
+    ]
+    figures = ((text, figure) for _, text, figure in study_figures(data, analysis))
+    return _Content(data.title, verdicts, tables, figures)
+
+
+def _format_interval(estimate: IntervalEstimate | None) -> str:
+    """Number with its interval in brackets."""
+    if estimate is None or math.isnan(estimate.value):
+        return ""
+    if estimate.low is None or estimate.high is None:
+        return f"{estimate.value:.4g}"
+    return f"{estimate.value:.4g} ({estimate.low:.4g} to {estimate.high:.4g})"
+
+
+def _shorten_data(value: Any) -> str:
+    """Text of plain data; long lists and long texts are cut."""
+    if isinstance(value, list | tuple):
+        text = ", ".join(_shorten_data(x) for x in value[:8])
+        return text if len(value) <= 8 else f"{text}, ... ({len(value):,} in all)"
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 300 else f"{text[:300]} ..."

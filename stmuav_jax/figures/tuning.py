@@ -12,15 +12,13 @@ from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 from pydantic import Field
 
-from ..algebra.compiler import quick_jit
-from ..algebra.least_squares import Search, SearchReason
-from ..algebra.rotation import to_rotation_vector
+from ..analysis.linear import Linear
+from ..analysis.tuning import InputTuning, TunedMotion
 from ..checks.errors import SettingError
-from ..checks.numbers import as_numpy
-from ..checks.schema import Entries, Tuples, checked, named, shown
-from ..files.netcdf import FileError, load_checkpoint, save_checkpoint, write_atomically
-from ..flight.linear import Linear
-from ..flight.tuning import InputTuning
+from ..checks.schema import Entries, Tuples, format_value, quote_name, validate_model
+from ..io.netcdf import FileError, load_checkpoint, save_checkpoint, write_atomically
+from ..math.compiler import quick_jit
+from ..math.least_squares import Search, SearchReason
 from .plot import grid, look
 
 _FORMAT = "stmuav_jax search 2"
@@ -75,22 +73,26 @@ def load_search(path: str | os.PathLike[str], problem: str, like: Any) -> Search
     Raises:
         FileError: no such file, not a search, a damaged one, or one of another problem.
     """
-    given, arrays = load_checkpoint(path, "a search")
+    head_data, arrays = load_checkpoint(path, "a search")
     try:
-        head = checked(_Head, given, "A search")
+        head = validate_model(_Head, head_data, "A search")
     except SettingError as error:
         raise FileError(f"{path} is not a search, or it is damaged: {error}") from None
+    # Shapes do not tell what values are of: another problem may have the same ones.
     if head.problem != problem:
         raise FileError(
-            f"{path} holds a search of another problem: {named(head.problem)}, not {named(problem)}."
+            f"{path} holds a search of another problem: {quote_name(head.problem)}, not {quote_name(problem)}."
         )
     leaves, form = jax.tree.flatten(like)
-    forms = lambda every: [(np.shape(one), np.asarray(one).dtype.kind) for one in every]
+    # Precisions may differ, since a search of one may be resumed in the other; shapes and kinds of
+    # numbers may not.
+    forms = lambda every: [(np.shape(leaf), np.asarray(leaf).dtype.kind) for leaf in every]
     if forms(leaves) != forms(arrays):
         raise FileError(
-            f"{path} holds values of shapes {shown([a.shape for a in arrays])}, where "
-            f"{shown([np.shape(leaf) for leaf in leaves])} of numbers are wanted."
+            f"{path} holds values of shapes {format_value([a.shape for a in arrays])}, but "
+            f"{format_value([np.shape(leaf) for leaf in leaves])} are needed."
         )
+    # A search that resumed from NaN would never leave it.
     if not all(np.all(np.isfinite(a)) for a in arrays) or head.best >= len(head.history):
         raise FileError(f"{path} holds values that are not finite, or a best step beyond its last.")
     values = jax.tree.unflatten(form, [jnp.asarray(a) for a in arrays])
@@ -100,6 +102,7 @@ def load_search(path: str | os.PathLike[str], problem: str, like: Any) -> Search
 def loss_history(history: tuple[float, ...]) -> Figure:
     """Figure of the loss over the steps."""
     figure, axes = grid(1, 1, 3.2)
+    # A loss falls by orders of magnitude, of which a linear axis shows only the first.
     axes[0, 0].semilogy(np.arange(len(history)), history, **look(0))
     axes[0, 0].set(xlabel="step", ylabel="loss")
     return figure
@@ -112,6 +115,8 @@ def flight_figure(
     figure, panels = grid(len(rows), 1, 1.9 * len(rows) + 0.5, sharex=True)
     for axes, (label, curves) in zip(panels[:, 0], rows.items(), strict=True):
         for k, (name, values) in enumerate(curves.items()):
+            # Markers of each curve begin a little later, so that curves that coincide are told
+            # apart.
             axes.plot(ts, values, **look(k), markevery=(0.03 * k, 0.2), label=name)
         for mark in marks.get(label, []):
             axes.axhline(mark, color="0.3", linewidth=0.6)
@@ -123,25 +128,25 @@ def flight_figure(
 
 
 @quick_jit
-def _rotation_vectors(p: Float[Array, "k 4"]) -> Float[Array, "k 3"]:
-    return jax.vmap(to_rotation_vector)(p)
+def _point_differences(motion: TunedMotion) -> Float[Array, "k n"]:
+    # Points may hold attitudes, which have no difference by subtraction; the space's difference has
+    # a component for each state.
+    start = jax.tree.map(lambda x: x[0], motion.points)
+    return jax.vmap(lambda now: motion.space.difference(now, start))(motion.points)
 
 
-def flown(
+def tuned_curves(
     tuning: InputTuning, values: Any, samples: int = 200
 ) -> tuple[Float[np.ndarray, " k"], dict[str, dict[str, np.ndarray]]]:
-    """Times and curves of a solution of `slew`, by "quantity [unit]" and name, for figures."""
+    """Times and curves of tuned inputs and their motion, by "quantity [unit]" and name, for figures.
+
+    Coordinates are differences from the start; each unit has a panel.
+    """
     motion = tuning.motion(values, samples)
-    path, inputs = as_numpy((motion.points, motion.inputs))
-    squared, forces = inputs[:, :-2], inputs[:, -2:]
-    tilt = np.asarray(_rotation_vectors(path.p))
-    deg = lambda x: np.degrees(np.asarray(x))
-    return np.asarray(motion.ts), {
-        "panel [degrees]": {"phi": deg(path.angles[:, 0]), "theta": deg(path.angles[:, 1])},
-        "UAV [degrees]": {k: deg(tilt[:, i]) for i, k in enumerate(("roll", "pitch", "yaw"))},
-        "UAV [mm]": {k: 1e3 * np.asarray(path.r[:, i]) for i, k in enumerate("xyz")},
-        "actuators [N]": {f"slider {i + 2}": np.asarray(forces[:, i]) for i in range(2)},
-        "rotors [rad/s]": {
-            f"{i + 1}": np.sqrt(np.asarray(squared[:, i])) for i in range(squared.shape[1])
-        },
-    }
+    x, inputs = np.asarray(_point_differences(motion)), np.asarray(motion.inputs)
+    rows: dict[str, dict[str, np.ndarray]] = {}
+    for k, (name, unit) in enumerate(motion.space.names[: motion.space.dof]):
+        rows.setdefault(f"moved by [{unit}]", {})[name] = x[:, k]
+    for k, (name, unit) in enumerate(tuning.residuals.system.inputs.names):  # pyright: ignore
+        rows.setdefault(f"inputs [{unit}]", {})[name] = inputs[:, k]
+    return np.asarray(motion.ts), rows

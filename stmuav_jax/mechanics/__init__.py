@@ -1,5 +1,5 @@
-"""Bodies, joints, states and systems. Floor 2; the force elements are on floor 3."""
+"""Bodies, joints, states, forces and systems."""
 
-import lazy_loader
+from ..checks.namespace import attach_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

@@ -3,25 +3,22 @@
 from .body import (
     GROUND as GROUND,
     Body as Body,
+    Part as Part,
+    box as box,
+    compound as compound,
+    cylinder as cylinder,
+    point_mass as point_mass,
+    rod as rod,
+    sphere as sphere,
 )
-from .forces.applied import (
+from .forces import (
     AppliedForce as AppliedForce,
     AppliedMoment as AppliedMoment,
     Gravity as Gravity,
+    GroundContact as GroundContact,
     JointDamping as JointDamping,
     LinearSpringDamper as LinearSpringDamper,
     TorsionalSpringDamper as TorsionalSpringDamper,
-)
-from .forces.contact import (
-    GroundContact as GroundContact,
-)
-from .forces.effort import (
-    JointEffort as JointEffort,
-)
-from .forces.joint import (
-    EndStop as EndStop,
-    JointFriction as JointFriction,
-    JointServo as JointServo,
 )
 from .inputs import (
     Inputs as Inputs,
@@ -32,13 +29,18 @@ from .internal import (
     AbstractInternalForce as AbstractInternalForce,
     internal_names as internal_names,
     with_internal as with_internal,
+    with_start_angles as with_start_angles,
 )
 from .joint import (
     CATALOGUE as CATALOGUE,
+    Freedom as Freedom,
     Joint as Joint,
+    JointKind as JointKind,
+    Term as Term,
     cylindrical as cylindrical,
     distance as distance,
     drive as drive,
+    mimic as mimic,
     revolute as revolute,
     revolute_spherical as revolute_spherical,
     screw as screw,
@@ -47,10 +49,11 @@ from .joint import (
     universal as universal,
     weld as weld,
 )
-from .joint_kind import (
-    Freedom as Freedom,
-    JointKind as JointKind,
-    Term as Term,
+from .joint_forces import (
+    EndStop as EndStop,
+    JointEffort as JointEffort,
+    JointFriction as JointFriction,
+    JointServo as JointServo,
 )
 from .joint_states import (
     JointMotion as JointMotion,
@@ -64,25 +67,16 @@ from .load import (
     SineMotion as SineMotion,
     push as push,
 )
-from .motions.axial import (
+from .motions import (
     PRISMATIC as PRISMATIC,
     REVOLUTE as REVOLUTE,
+    SPHERICAL as SPHERICAL,
+    AbstractRelativeMotion as AbstractRelativeMotion,
     Axial as Axial,
 )
-from .motions.base import (
-    AbstractRelativeMotion as AbstractRelativeMotion,
-)
-from .motions.spherical import (
-    SPHERICAL as SPHERICAL,
-)
-from .parts import (
-    Part as Part,
-    box as box,
-    compound as compound,
-    cylinder as cylinder,
-    point_mass as point_mass,
-    rod as rod,
-    sphere as sphere,
+from .parameters import (
+    Parameter as Parameter,
+    Parameters as Parameters,
 )
 from .state import (
     Kinematics as Kinematics,

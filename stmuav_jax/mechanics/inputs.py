@@ -7,6 +7,7 @@ and makes the system in which they have other values or histories.
 
 import inspect
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,8 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, named_places
-from ..checks.numbers import as_numpy, floats, numbers
+from ..checks.numbers import as_floats, as_numpy, check_numbers
+from .joint import choose_coordinate
 from .load import AbstractForce
+from .state import State
 from .system import System
 
 
@@ -81,15 +84,26 @@ class Inputs(eqx.Module):
         Raises:
             ModelError: an input is a function of time and has no single value.
         """
-        found = []
-        for entry in self.entries:
-            value = _field(system, entry)
+        numbers = present_values(system, self)
+        for entry, value in zip(self.entries, numbers, strict=True):
             if callable(value):
                 raise ModelError(
                     f"The input '{entry.name}' is a function of time in this system: give its value."
                 )
-            found.append(jnp.asarray(value, dtype=float)[entry.place])
-        return jnp.stack(found) if found else jnp.zeros((0,))
+        return jnp.stack(numbers) if numbers else jnp.zeros((0,))
+
+    def values_at(
+        self, system: System, state: State, t: Float[Array, ""] | float
+    ) -> Float[Array, " m"]:
+        """Values of the inputs (m,) at a state and time [s], at which functions of time are evaluated."""
+        time, kin = jnp.asarray(t, dtype=float), system.kinematics(state)
+        numbers = []
+        for entry, value in zip(self.entries, present_values(system, self), strict=True):
+            if callable(value):
+                count = len(inspect.signature(value).parameters)
+                value = jnp.asarray(value(*(time, kin)[:count]), dtype=float)[entry.place]
+            numbers.append(value)
+        return jnp.stack(numbers) if numbers else jnp.zeros((0,))
 
     def applied(self, system: System, values: Any) -> System:
         """System whose inputs are set to values or to a history.
@@ -101,13 +115,17 @@ class Inputs(eqx.Module):
             ModelError: only some numbers of a field are set, and field or values are functions of
                 time.
         """
+        # Inputs of one field are set together, since each replacement copies the pytree.
         fields: dict[tuple[int, str], list[int]] = {}
         for k, entry in enumerate(self.entries):
             fields.setdefault((entry.force, entry.field), []).append(k)
+        kinematics = _KinematicsShape(system)
         for (force, field), places in fields.items():
-            old = _field(system, self.entries[places[0]])
-            shape = _shape(system, old)
+            old = _read_field(system, self.entries[places[0]])
+            shape = _value_shape(old, kinematics)
             whole = len(places) == int(np.prod(shape))
+            # A function returns a whole field: some of its numbers cannot be replaced from outside
+            # without calling it in the middle of another one.
             if not whole and (callable(old) or callable(values)):
                 raise ModelError(
                     f"All numbers of '{field}' must be inputs together where it is a function of "
@@ -115,13 +133,15 @@ class Inputs(eqx.Module):
                 )
             if callable(values):
                 new: Any = Components(values, tuple(places), shape)
+            # The usual case, all speeds of all rotors, goes through NumPy where values are known:
+            # setting one number after the other would be as many operations of JAX.
             elif whole:
-                new = floats(as_numpy(floats(values))[np.array(places)].reshape(shape))
+                new = as_floats(as_numpy(as_floats(values))[np.array(places)].reshape(shape))
             else:
                 new = jnp.asarray(old)
                 for k in places:
                     new = new.at[self.entries[k].place].set(values[k])
-            where = lambda s, force=force, field=field: _walk(s.forces[force], field)
+            where = lambda s, force=force, field=field: _walk_fields(s.forces[force], field)
             system = eqx.tree_at(where, system, new)
         return system
 
@@ -130,26 +150,39 @@ class Inputs(eqx.Module):
 
         The name of a vector without a number, such as `speed_squared`, stands for all of its.
         """
-        known = [entry.name for entry in self.entries]
+        input_names = [entry.name for entry in self.entries]
         if not isinstance(names, str) and all(isinstance(name, str) for name in names):
-            names = [one for name in names for one in self._numbered(name) or (name,)]
-        places = named_places(names, known, "The chosen inputs", "input")
+            names = [
+                entry_name for name in names for entry_name in self._numbered_names(name) or (name,)
+            ]
+        places = named_places(names, input_names, "The chosen inputs", "input")
         return Inputs(tuple(self.entries[k] for k in places))
 
     def constant(self, system: System) -> "Inputs":
         """These inputs without those that are functions of time."""
-        return Inputs(tuple(e for e in self.entries if not callable(_field(system, e))))
+        return Inputs(tuple(e for e in self.entries if not callable(_read_field(system, e))))
 
-    def _numbered(self, stem: str) -> tuple[str, ...]:
+    def _numbered_names(self, stem: str) -> tuple[str, ...]:
         """The names of the numbers of a vector."""
-        return tuple(e.name for e in self.entries if e.place and e.name == stem + _number(e.place))
+        return tuple(
+            e.name for e in self.entries if e.place and e.name == stem + _number_suffix(e.place)
+        )
 
 
-def with_inputs(system: System, given: Mapping[str, Any]) -> System:
+def present_values(system: System, inputs: Inputs) -> tuple[Any, ...]:
+    """Value of each input in a system: a number, or the function of time that its field has."""
+    fields = [_read_field(system, entry) for entry in inputs.entries]
+    return tuple(
+        value if callable(value) else jnp.asarray(value, dtype=float)[entry.place]
+        for value, entry in zip(fields, inputs.entries, strict=True)
+    )
+
+
+def with_inputs(system: System, values: Mapping[str, Any]) -> System:
     """The system with some inputs set by name, see `inputs_of`; the others stay as they are.
 
     Args:
-        given: by the name of an input, or of a vector without its number: its value, or a function of
+        values: by the name of an input, or of a vector without its number: its value, or a function of
             (t, kinematics) that returns it, such as `Sampled`.
 
     Raises:
@@ -157,14 +190,16 @@ def with_inputs(system: System, given: Mapping[str, Any]) -> System:
             finite, or a function for a part of a vector.
     """
     every = inputs_of(system)
-    for name, value in given.items():
-        own = every.chosen([name])
+    for name, value in values.items():
+        chosen_inputs = every.chosen([name])
         if callable(value):
-            system = own.applied(system, _Vector(value))
+            system = chosen_inputs.applied(system, _Vector(value))
         else:
-            shape = (len(own),) if np.ndim(value) or len(own) > 1 else ()
-            found = numbers(value, shape, f"The input '{name}'", own.entries[0].unit)
-            system = own.applied(system, found.reshape(-1))
+            shape = (len(chosen_inputs),) if np.ndim(value) or len(chosen_inputs) > 1 else ()
+            input_values = check_numbers(
+                value, shape, f"The input '{name}'", chosen_inputs.entries[0].unit
+            )
+            system = chosen_inputs.applied(system, input_values.reshape(-1))
     return system
 
 
@@ -179,54 +214,80 @@ def inputs_of(system: System, names: Sequence[str] | None = None) -> Inputs:
         SettingError: a name is unknown.
     """
     raw = [
-        (k, force, field, unit)
+        (k, force, field, _input_unit(system, force, unit))
         for k, force in enumerate(system.forces)
         for field, unit in force.inputs
     ]
     entries: list[NamedInput] = []
+    kinematics = _KinematicsShape(system)
     for k, force, field, unit in raw:
         last = field.split(".")[-1]
+        # Short names where they are unambiguous: a second force with the same field makes both longer.
         alone = sum(other.split(".")[-1] == last for _, _, other, _ in raw) == 1
         names_of = force.acts_on()
         owner = [*names_of.bodies[-1:], *names_of.joints, *(j for j, _ in names_of.coordinates)]
         stem = last if alone else "_".join([last, *owner])
-        shape = _shape(system, _walk(force, field))
+        shape = _value_shape(_walk_fields(force, field), kinematics)
+        # Each number of a vector is an input of its own: a linear model has a column for each, and
+        # a study a factor.
         for place in np.ndindex(*shape):
-            entries.append(NamedInput(stem + _number(place), unit, k, field, place))
-    taken: dict[str, int] = {}
+            entries.append(NamedInput(stem + _number_suffix(place), unit, k, field, place))
+    # Two forces of one kind on one body have the same name; numbers in the order of the forces
+    # keep them apart, and the first keeps the short name.
+    name_counts: dict[str, int] = {}
     for i, entry in enumerate(entries):
-        taken[entry.name] = taken.get(entry.name, 0) + 1
-        if taken[entry.name] > 1:
-            entries[i] = entry._replace(name=f"{entry.name}.{taken[entry.name]}")
-    found = Inputs(tuple(entries))
-    return found if names is None else found.chosen(names)
+        name_counts[entry.name] = name_counts.get(entry.name, 0) + 1
+        if name_counts[entry.name] > 1:
+            entries[i] = entry._replace(name=f"{entry.name}.{name_counts[entry.name]}")
+    system_inputs = Inputs(tuple(entries))
+    return system_inputs if names is None else system_inputs.chosen(names)
 
 
-def _number(place: tuple[int, ...]) -> str:
+def _input_unit(system: System, force: AbstractForce, unit: str) -> str:
+    """Unit of an input; of "N or N m" and its like, the one of the coordinate that the force acts on."""
+    sliding, _, turning = unit.partition(" or ")
+    coordinates = force.acts_on().coordinates
+    if not turning or len(coordinates) != 1:
+        return unit
+    name, coordinate = coordinates[0]
+    chosen = choose_coordinate(
+        system.joints[system.joint_index(name)], coordinate, type(force).__name__
+    )
+    return turning if chosen == "angle" else sliding
+
+
+def _number_suffix(place: tuple[int, ...]) -> str:
     """The end of a name that says which number of a vector it is."""
     return "".join(f"_{i + 1}" for i in place)
 
 
-def _walk(force: AbstractForce, field: str) -> Any:
+def _walk_fields(force: AbstractForce, field: str) -> Any:
     value: Any = force
     for part in field.split("."):
         value = getattr(value, part)
     return value
 
 
-def _field(system: System, entry: NamedInput) -> Any:
-    return _walk(system.forces[entry.force], entry.field)
+def _read_field(system: System, entry: NamedInput) -> Any:
+    return _walk_fields(system.forces[entry.force], entry.field)
 
 
-def _shape(system: System, value: Any) -> tuple[int, ...]:
+class _KinematicsShape:
+    """Shapes of a system's kinematics, found when they are first asked for: a trace takes 0.05 s."""
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+
+    @cached_property
+    def value(self) -> Any:
+        return eqx.filter_eval_shape(self._system.kinematics, self._system.reference)
+
+
+def _value_shape(value: Any, kinematics: _KinematicsShape) -> tuple[int, ...]:
     """Shape of a field's value, or of the result of its function."""
     if not callable(value):
         return jnp.shape(value)
     # loads take (t, kinematics), motions along a joint's coordinate t alone
     count = len(inspect.signature(value).parameters)
-
-    def called() -> Array:
-        kin = system.kinematics(system.reference)
-        return jnp.asarray(value(*(jnp.zeros(()), kin)[: min(count, 2)]))
-
-    return eqx.filter_eval_shape(called).shape
+    arguments = (jnp.zeros(()),) if count < 2 else (jnp.zeros(()), kinematics.value)
+    return eqx.filter_eval_shape(lambda *a: jnp.asarray(value(*a)), *arguments).shape

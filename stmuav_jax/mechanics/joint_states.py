@@ -20,25 +20,84 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra import lapack
-from ..algebra.rotation import (
-    cross,
-    from_matrix,
-    from_rotation_vector,
-    product,
-    rotation_matrix,
-)
-from ..algebra.stacked import apply_transposed, multiply
 from ..checks.errors import ModelError, SettingError
 from ..checks.shapes import Numbers
-from .joint import CATALOGUE, Joint
-from .joint_coordinate import coordinate
-from .joint_kind import Freedom, Z
-from .motions.axial import PRISMATIC, REVOLUTE
-from .motions.base import AbstractRelativeMotion, ColumnParts, RelativeFrames, RelativePose
-from .motions.sequence import frame_columns, references
+from ..math import lapack
+from ..math.rotation import cross, from_matrix, from_rotation_vector, product, rotation_matrix
+from ..math.stacked import apply_matrix, apply_transposed, dot_product, multiply_matrices
+from .joint import CATALOGUE, Freedom, Joint, Which, Z
+from .load import Load, couple_load, push
+from .motions import (
+    PRISMATIC,
+    REVOLUTE,
+    AbstractRelativeMotion,
+    ColumnParts,
+    RelativeFrames,
+    RelativePose,
+    frame_columns,
+    reference_directions,
+    whole_turns,
+)
 from .state import Kinematics, State
 from .system import System, check_state
+
+
+class JointCoordinate(eqx.Module):
+    """Angle or displacement of a joint at one state.
+
+    Attributes:
+        kind: "angle" or "displacement". body_i, body_j: the joint's bodies.
+        value: angle about z from body i to body j [rad], in (-pi, pi] except that of a screw, whose
+            displacement determines the whole turns; or displacement of j's point along z from i's
+            [m]. rate: its time derivative [rad/s] or [m/s].
+        axis: z axis of the joint on body i, world (3,). point: j's point, world (3,) [m].
+    """
+
+    kind: Which = eqx.field(static=True)
+    body_i: str = eqx.field(static=True)
+    body_j: str = eqx.field(static=True)
+    value: Float[Array, ""]
+    rate: Float[Array, ""]
+    axis: Float[Array, "3"]
+    point: Float[Array, "3"]
+
+    def load(self, kin: Kinematics, effort: Float[Array, ""]) -> Load:
+        """Load of an effort ([N m] or [N] on the coordinate) on body j, and its opposite on body i.
+
+        Its power is effort times rate. Both forces act at j's point, so that they have no
+        net moment.
+        """
+        effort_vector = effort * self.axis
+        if self.kind == "angle":
+            return couple_load(kin, self.body_j, self.body_i, effort_vector)
+        arm_i = self.point - kin.r[kin.index(self.body_i)]
+        arm_j = self.point - kin.r[kin.index(self.body_j)]
+        return push(kin, self.body_j, effort_vector, arm_j) + push(
+            kin, self.body_i, -effort_vector, arm_i
+        )
+
+
+def evaluate_coordinate(kin: Kinematics, joint: Joint, kind: Which) -> JointCoordinate:
+    """Coordinate of a joint (resolved in a system) at a state."""
+    i, j = kin.index(joint.body_i), kin.index(joint.body_j)
+    F_i = multiply_matrices(kin.R_wb[i], joint.frame_i)
+    axis = F_i[:, 2]
+    a, a_rate = kin.point(joint.body_i, joint.point_i)
+    b, b_rate = kin.point(joint.body_j, joint.point_j)
+    if kind == "angle":
+        x_j = apply_matrix(kin.R_wb[j], joint.frame_j[:, 0])
+        # Both components are used: an arc cosine has no sign, and no derivative at its ends.
+        value = jnp.arctan2(dot_product(F_i[:, 1], x_j), dot_product(F_i[:, 0], x_j))
+        if joint.pitched:
+            # The displacement of a screw counts the turns that an angle cannot.
+            value = value + whole_turns(value, dot_product(axis, b - a), joint.length)
+        rate = dot_product(axis, kin.omega_w[j] - kin.omega_w[i])
+    else:
+        value = dot_product(axis, b - a)
+        # Velocity relative to the frame of body i: the part of its rotation is subtracted.
+        rate = dot_product(axis, b_rate - a_rate - cross(kin.omega_w[i], b - a))
+    return JointCoordinate(kind, joint.body_i, joint.body_j, value, rate, axis, b)
+
 
 _DRIVERS = {"drive_angle": REVOLUTE.coordinates, "drive_displacement": PRISMATIC.coordinates}
 
@@ -46,8 +105,10 @@ _DRIVERS = {"drive_angle": REVOLUTE.coordinates, "drive_displacement": PRISMATIC
 def coordinates_of(kind: str) -> tuple[tuple[str, str], ...]:
     """Names and units of the coordinates that a kind of joint leaves free, in their order."""
     motions = CATALOGUE[kind].motion or ()
-    own = ((name + f.place, unit) for f in motions for name, unit in f.motion.coordinates)
-    return _DRIVERS[kind] if kind in _DRIVERS else tuple(own)
+    motion_coordinates = (
+        (name + f.place, unit) for f in motions for name, unit in f.motion.coordinates
+    )
+    return _DRIVERS[kind] if kind in _DRIVERS else tuple(motion_coordinates)
 
 
 class JointMotion(eqx.Module):
@@ -68,25 +129,25 @@ class JointMotion(eqx.Module):
     @property
     def angle(self) -> Float[Array | np.ndarray, "*s"]:
         """Angle about z from body i to body j (...,) [rad]; revolute, cylindrical, screw."""
-        return self.coordinates[..., self._place("angle")]
+        return self.coordinates[..., self._coordinate_place("angle")]
 
     @property
     def angle_rate(self) -> Float[Array | np.ndarray, "*s"]:
         """Rate of `angle` (...,) [rad/s]."""
-        return self.rates[..., self._place("angle")]
+        return self.rates[..., self._coordinate_place("angle")]
 
     @property
     def displacement(self) -> Float[Array | np.ndarray, "*s"]:
         """Displacement of j's point along z from i's (...,) [m]; translational and cylindrical."""
-        return self.coordinates[..., self._place("displacement")]
+        return self.coordinates[..., self._coordinate_place("displacement")]
 
     @property
     def displacement_rate(self) -> Float[Array | np.ndarray, "*s"]:
         """Rate of `displacement` (...,) [m/s]."""
-        return self.rates[..., self._place("displacement")]
+        return self.rates[..., self._coordinate_place("displacement")]
 
-    def _place(self, name: str) -> int:
-        names = [found for found, _ in coordinates_of(self.kind)]
+    def _coordinate_place(self, name: str) -> int:
+        names = [coordinate_name for coordinate_name, _ in coordinates_of(self.kind)]
         if name not in names:
             raise ModelError(
                 f"Joint '{self.name}' is {self.kind} and has no {name} of its own; its coordinates "
@@ -118,7 +179,7 @@ def joint_motion(
     states = jax.tree.map(jnp.asarray, states)  # those of a run are NumPy arrays
     check_state(system, states)
     if states.r.ndim == 2:
-        return JointMotion(joint.name, joint.kind, *_read(system, states, joint))
+        return JointMotion(joint.name, joint.kind, *_read_joint(system, states, joint))
     if states.r.ndim != 3:
         raise SettingError(
             f"States along a run have shape (k, n, .), but State.r has shape {states.r.shape}: use "
@@ -129,7 +190,7 @@ def joint_motion(
         raise SettingError(
             f"There are {states.r.shape[0]} states, but the times have shape {times.shape}."
         )
-    return JointMotion(joint.name, joint.kind, *_along(system, states, joint, times))
+    return JointMotion(joint.name, joint.kind, *_evaluate_along(system, states, joint, times))
 
 
 def coordinate_count(joint: Joint) -> int:
@@ -144,7 +205,7 @@ def coordinate_count(joint: Joint) -> int:
     return count
 
 
-def relative(kin: Kinematics, joint: Joint) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+def relative_motion(kin: Kinematics, joint: Joint) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
     """Coordinates and rates of a joint at one state; angles in (-pi, pi] except those of screws."""
     motions = CATALOGUE[joint.kind].motion or ()
     if any(axis != Z or len(motion.columns) > 1 for motion, axis, _ in motions):
@@ -152,8 +213,8 @@ def relative(kin: Kinematics, joint: Joint) -> tuple[Float[Array, " c"], Float[A
     names = [motion.coordinates[0][0] for motion, *_ in motions] or [
         coordinates_of(joint.kind)[0][0]
     ]
-    found = [coordinate(kin, joint, which) for which in names]  # pyright: ignore[reportArgumentType]
-    return jnp.stack([c.value for c in found]), jnp.stack([c.rate for c in found])
+    coordinates = [evaluate_coordinate(kin, joint, name) for name in names]  # pyright: ignore[reportArgumentType]
+    return jnp.stack([c.value for c in coordinates]), jnp.stack([c.rate for c in coordinates])
 
 
 def _of_motions(
@@ -161,38 +222,43 @@ def _of_motions(
 ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
     """Coordinates and rates of any sequence of motions, read one after the other."""
     i, j = kin.index(joint.body_i), kin.index(joint.body_j)
-    F_i, F_j = multiply(kin.R_wb[i], joint.frame_i), multiply(kin.R_wb[j], joint.frame_j)
+    F_i, F_j = (
+        multiply_matrices(kin.R_wb[i], joint.frame_i),
+        multiply_matrices(kin.R_wb[j], joint.frame_j),
+    )
     (a, a_rate), (b, b_rate) = (
         kin.point(joint.body_i, joint.point_i),
         kin.point(joint.body_j, joint.point_j),
     )
-    R, d = multiply(F_i.T, F_j), apply_transposed(F_i, b - a)
-    behind, zero = references([f[:2] for f in motions], f"Joint '{joint.name}'")
+    R, d = multiply_matrices(F_i.T, F_j), apply_transposed(F_i, b - a)
+    behind, zero = reference_directions([f[:2] for f in motions], f"Joint '{joint.name}'")
     last = frame_columns(motions[-1].axis)
-    E, o, found = jnp.eye(3, dtype=R.dtype), jnp.zeros_like(d), []
+    # Motions are read in order, each from what those before it leave.
+    E, o, coordinate_blocks = jnp.eye(3, dtype=R.dtype), jnp.zeros_like(d), []
     for n, (motion, axis, _) in enumerate(motions):
-        own = frame_columns(axis)
-        G = E @ own
-        seen = RelativeFrames(
+        axis_frame = frame_columns(axis)
+        G = E @ axis_frame
+        relative_frames = RelativeFrames(
             (G.T @ R @ last)[..., None],
             behind[:, [n]],
             zero[:, [n]],
             (G.T @ (d - o))[:, None],
-            lambda G=G, own=own: from_matrix(G.T @ R @ own)[:, None],
+            lambda G=G, frame=axis_frame: from_matrix(G.T @ R @ frame)[:, None],
         )
-        q, X, along = motion.read(seen, _parts(joint, motion))
+        q, X, translation = motion.read(relative_frames, _motion_columns(joint, motion))
         at_zero = jnp.zeros_like(q).at[0].set(1.0) if motion.unit_norm else jnp.zeros_like(q)
-        found.append(motion.difference(q, at_zero).reshape(-1))
-        E, o = G @ X[..., 0] @ own.T, o + G @ along[:, 0]
-    x = jnp.concatenate(found)
+        coordinate_blocks.append(motion.difference(q, at_zero).reshape(-1))
+        E, o = G @ X[..., 0] @ axis_frame.T, o + G @ translation[:, 0]
+    x = jnp.concatenate(coordinate_blocks)
     twist = [kin.omega_w[j] - kin.omega_w[i], b_rate - a_rate - cross(kin.omega_w[i], b - a)]
     motion_of = lambda rate: jnp.concatenate(relative_pose(joint, x, rate)[2:])
     S = jax.vmap(motion_of, out_axes=1)(jnp.eye(len(x), dtype=x.dtype))
     seen_twist = jnp.concatenate([apply_transposed(F_i, part) for part in twist])
+    # Least squares: the twist lies in the span of the motions, up to the constraints' residual.
     return x, lapack.solve(S.T @ S, S.T @ seen_twist)
 
 
-def _parts(joint: Joint, motion: AbstractRelativeMotion) -> ColumnParts:
+def _motion_columns(joint: Joint, motion: AbstractRelativeMotion) -> ColumnParts:
     """Columns of one motion of a joint, as `AbstractRelativeMotion.read` takes them."""
     shape = (*motion.velocities, 1)
     angular = np.array([c.angular for c in motion.columns]).reshape(shape)
@@ -206,54 +272,61 @@ def _parts(joint: Joint, motion: AbstractRelativeMotion) -> ColumnParts:
 def relative_pose(joint: Joint, q: Float[Array, " c"], u: Float[Array, " c"]) -> RelativePose:
     """Pose of frame j in frame i from a joint's coordinates and rates; a weld has no motion."""
     zero = jnp.zeros(3, q.dtype)
-    found = RelativePose(from_rotation_vector(zero), zero, zero, zero)
+    total_pose = RelativePose(from_rotation_vector(zero), zero, zero, zero)
     start = 0
     for number, freedom in enumerate(CATALOGUE[joint.kind].motion or ()):
-        own = slice(start, start + len(freedom.motion.coordinates))
-        step = freedom.motion.pose(q[own], u[own], freedom.axis, joint.length)
-        found, start = step if number == 0 else _after(found, step), own.stop
-    return found
+        coordinate_slice = slice(start, start + len(freedom.motion.coordinates))
+        step = freedom.motion.pose(
+            q[coordinate_slice], u[coordinate_slice], freedom.axis, joint.length
+        )
+        total_pose, start = (
+            step if number == 0 else _compose_poses(total_pose, step),
+            coordinate_slice.stop,
+        )
+    return total_pose
 
 
-def _after(first: RelativePose, then: RelativePose) -> RelativePose:
+def _compose_poses(first: RelativePose, second: RelativePose) -> RelativePose:
     """Pose of the child frame of two successive motions in the parent frame of the first."""
     R = rotation_matrix(first.p)
-    d = R @ then.d
+    d = R @ second.d
     return RelativePose(
-        product(first.p, then.p),
+        product(first.p, second.p),
         first.d + d,
-        first.w + R @ then.w,
-        first.v + R @ then.v + cross(first.w, d),
+        first.w + R @ second.w,
+        first.v + R @ second.v + cross(first.w, d),
     )
 
 
 @eqx.filter_jit
-def _read(
+def _read_joint(
     system: System, state: State, joint: Joint
 ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
-    return relative(system.kinematics(state), joint)
+    return relative_motion(system.kinematics(state), joint)
 
 
 @eqx.filter_jit
-def _along(
+def _evaluate_along(
     system: System, states: State, joint: Joint, ts: Float[Array, " k"] | None
 ) -> tuple[Float[Array, "k c"], Float[Array, "k c"]]:
-    values, rates = jax.vmap(lambda state: relative(system.kinematics(state), joint))(states)
+    values, rates = jax.vmap(lambda state: relative_motion(system.kinematics(state), joint))(states)
     if joint.pitched:
         return values, rates
     # a rotation vector is the shortest one
     vectors = sum(3 * f.motion.unit_norm for f in CATALOGUE[joint.kind].motion or ())
     turns = np.array([unit == "rad" for _, unit in coordinates_of(joint.kind)])
     turns[len(turns) - vectors :] = False
-    return jnp.where(turns, _unwrapped(values, rates, ts), values), rates
+    return jnp.where(turns, _unwrap_angles(values, rates, ts), values), rates
 
 
-def _unwrapped(
+def _unwrap_angles(
     values: Float[Array, "k c"], rates: Float[Array, "k c"], ts: Float[Array, " k"] | None
 ) -> Float[Array, "k c"]:
     """Angles made continuous by multiples of whole turns."""
     steps = jnp.diff(values, axis=0)
     if ts is not None:
+        # With rates the expected change is known, so that more than half a turn between two saved times is
+        # counted as well.
         steps = steps - 0.5 * jnp.diff(ts)[:, None] * (rates[1:] + rates[:-1])
     turns = jnp.cumsum(jnp.round(steps / (2 * jnp.pi)), axis=0)
     return values.at[1:].add(-2 * jnp.pi * turns)

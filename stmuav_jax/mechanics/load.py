@@ -9,26 +9,29 @@ numbers are leaves of the pytree, so that they can be differentiated.
 import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import cross
-from ..algebra.stacked import apply_transposed, dot
 from ..checks.errors import ModelError, check_finite, check_shape
-from ..checks.numbers import floats, scalar
+from ..checks.numbers import as_floats, check_scalar
 from ..checks.shapes import Numbers
-from .joint_kind import Which
+from ..math.rotation import cross
+from ..math.stacked import apply_transposed, dot_product
+from .joint import Which
 from .state import Kinematics
+
+if TYPE_CHECKING:
+    from .joint import Joint
 
 Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Array, "..."]]
 
 
-def signal(
-    value: "Numbers | Callable[..., object]", what: str, shape: tuple[int, ...], unit: str
+def check_signal(
+    value: "Numbers | Callable[..., object]", subject: str, shape: tuple[int, ...], unit: str
 ) -> Signal:
     """Check a constant or a function of (t, kinematics); return the constant as an array.
 
@@ -37,20 +40,23 @@ def signal(
             take these two arguments.
     """
     if callable(value):
-        check_arguments(value, what)
+        check_arguments(value, subject)
         return value  # pyright: ignore[reportReturnType]
-    check_shape(value, shape, what)
-    check_finite(value, what, unit)
-    return floats(value)
+    # Constants are checked when a force is made and functions when they are called, since only
+    # then have they a value.
+    check_shape(value, shape, subject)
+    check_finite(value, subject, unit)
+    return as_floats(value)
 
 
-def check_arguments(function: Callable[..., object], what: str) -> None:
+def check_arguments(function: Callable[..., object], subject: str) -> None:
     """Raise `ModelError` unless the function can be called with (t, kinematics)."""
     try:
+        # A wrong signature is told here, by name, and not in the middle of a trace.
         inspect.signature(function).bind(None, None)
     except TypeError as error:
         raise ModelError(
-            f"{what} must be given by a function of two arguments, the time and the kinematics "
+            f"{subject} must be given by a function of two arguments, the time and the kinematics "
             f"(lambda t, kin: ...), but calling it with two is not possible: {error}."
         ) from None
     except ValueError:
@@ -58,29 +64,33 @@ def check_arguments(function: Callable[..., object], what: str) -> None:
 
 
 def evaluate(
-    value: Signal, t: Float[Array, ""], kin: Kinematics, what: str, shape: tuple[int, ...]
+    value: Signal, t: Float[Array, ""], kin: Kinematics, subject: str, shape: tuple[int, ...]
 ) -> Float[Array, "..."]:
     """Value of a signal at time t [s].
 
     Args:
-        what: name of the signal for the message. shape: shape of its value.
+        subject: name of the signal for the message. shape: shape of its value.
 
     Raises:
         ModelError: the function returns another shape, or no array.
     """
     if not callable(value):
         return value
-    found: Any = value(t, kin)
+    signal_value: Any = value(t, kin)
     try:
-        array = jnp.asarray(found, dtype=kin.r.dtype)
+        # The type of the state decides: a Python integer from a user's function must not make a
+        # program of other types.
+        array = jnp.asarray(signal_value, dtype=kin.r.dtype)
     except (TypeError, ValueError):
-        kind = type(found).__name__
+        kind = type(signal_value).__name__
         raise ModelError(
-            f"{what} must be numbers of shape {shape}, but its function returns {kind}."
+            f"{subject} must be numbers of shape {shape}, but its function returns {kind}."
         ) from None
+    # A scalar would be broadcast to three equal components, which is hardly ever a force that was
+    # meant.
     if array.shape != shape:
         raise ModelError(
-            f"{what} must have shape {shape}, but its function returns shape {array.shape}."
+            f"{subject} must have shape {shape}, but its function returns shape {array.shape}."
         )
     return array
 
@@ -97,8 +107,8 @@ class Sine(eqx.Module):
 
     def __init__(self, amplitude: Numbers, angular_frequency: Numbers) -> None:
         check_finite((amplitude, angular_frequency), "A sine signal", "")
-        self.amplitude = floats(amplitude)
-        self.angular_frequency = floats(angular_frequency)
+        self.amplitude = as_floats(amplitude)
+        self.angular_frequency = as_floats(angular_frequency)
 
     def __call__(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "*shape"]:
         del kin
@@ -130,11 +140,11 @@ class SineMotion(eqx.Module):
         angular_frequency: Numbers = 0.0,
         phase: Numbers = 0.0,
     ) -> None:
-        self.start = scalar(start, "The start of a driver's motion", "m or rad")
-        self.rate = scalar(rate, "The rate of a driver's motion", "m/s or rad/s")
-        self.amplitude = scalar(amplitude, "The amplitude of a driver's motion", "m or rad")
-        self.angular_frequency = scalar(angular_frequency, "The angular frequency", "rad/s")
-        self.phase = scalar(phase, "The phase of a driver's motion", "rad")
+        self.start = check_scalar(start, "The start of a driver's motion", "m or rad")
+        self.rate = check_scalar(rate, "The rate of a driver's motion", "m/s or rad/s")
+        self.amplitude = check_scalar(amplitude, "The amplitude of a driver's motion", "m or rad")
+        self.angular_frequency = check_scalar(angular_frequency, "The angular frequency", "rad/s")
+        self.phase = check_scalar(phase, "The phase of a driver's motion", "rad")
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         swing = self.amplitude * jnp.sin(self.angular_frequency * t + self.phase)
@@ -187,10 +197,17 @@ def push(
     total = zero if moment_w is None else moment_w
     if arm_w is not None:
         total = total + cross(arm_w, force_w)
+    # A product with a constant row instead of an update at an index, which compiles to a slower scatter.
     row = jnp.asarray(np.eye(len(kin.names))[:, k, None])
-    power = dot(force_w, kin.v[k]) + dot(total, kin.omega_w[k])
+    # Power of the load is integrated beside the motion, for the balance of energy.
+    power = dot_product(force_w, kin.v[k]) + dot_product(total, kin.omega_w[k])
     return Load(
-        row * force_w, row * apply_transposed(kin.R_wb[k], total), jnp.zeros((), kin.r.dtype), power
+        row * force_w[None],
+        # Moments are kept in body axes, in which inertia tensors are constant; forces in the
+        # world's, in which positions are.
+        row * apply_transposed(kin.R_wb[k], total)[None],
+        jnp.zeros((), kin.r.dtype),
+        power,
     )
 
 
@@ -203,24 +220,25 @@ def total_load(forces: "Sequence[AbstractForce]", t: Float[Array, ""], kin: Kine
     """
     total = no_load(kin)
     for force in forces:
-        found = force.load(t, kin)
-        _check_load(force, found, total)
-        total = total + found
+        element_load = force.load(t, kin)
+        _check_load(force, element_load, total)
+        total = total + element_load
     return total
 
 
-def _check_load(force: "AbstractForce", found: object, expected: Load) -> None:
+def _check_load(force: "AbstractForce", element_load: object, expected: Load) -> None:
     for name in ("force", "moment", "potential", "power"):
+        # Loads are added, and addition broadcasts: a wrong shape would be spread over all bodies.
         must = jnp.shape(getattr(expected, name))
-        shape = jnp.shape(getattr(found, name)) if isinstance(found, Load) else None
+        shape = jnp.shape(getattr(element_load, name)) if isinstance(element_load, Load) else None
         if shape != must:
-            given = f"has {name} of shape {shape}" if shape is not None else "is none"
+            mismatch = f"has {name} of shape {shape}" if shape is not None else "is none"
             raise ModelError(
                 f"The load of {type(force).__name__} on {force.acts_on()} must be a Load with {name} of "
-                f"shape {must}, a row for every body and one for ground, but it {given}."
+                f"shape {must}, a row for every body and one for ground, but it {mismatch}."
                 if must
                 else f"The load of {type(force).__name__} on {force.acts_on()} must be a Load with {name} a "
-                f"single number, but it {given}."
+                f"single number, but it {mismatch}."
             )
 
 
@@ -260,8 +278,13 @@ class AbstractForce(eqx.Module):
     def acts_on(self) -> ActsOn:
         """Names of the bodies and joints on which this force acts."""
 
+    def resolve(self, joints: "Sequence[Joint]") -> "AbstractForce":
+        """Force element as a system of these joints holds it; most need nothing of them."""
+        del joints
+        return self
 
-def couple(kin: Kinematics, body_i: str, body_j: str, moment_w: Float[Array, "3"]) -> Load:
+
+def couple_load(kin: Kinematics, body_i: str, body_j: str, moment_w: Float[Array, "3"]) -> Load:
     """Load of the moment `moment_w` [N m] on body i and its opposite on body j."""
     none = jnp.zeros_like(moment_w)
     return push(kin, body_i, none, moment_w=moment_w) + push(kin, body_j, none, moment_w=-moment_w)

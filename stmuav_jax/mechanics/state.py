@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..algebra.rotation import cross, rotation_matrix
-from ..algebra.stacked import apply
 from ..checks.errors import ModelError, nearest_names
+from ..math.rotation import cross, rotation_matrix
+from ..math.stacked import apply_matrix
 from .body import GROUND
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Kinematics(eqx.Module):
     def arm(self, name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """World vector from the centre of mass to a point of the body's reference frame [m]."""
         k = self.index(name)
-        return apply(self.R_wb[k], point - self.com[k])
+        return apply_matrix(self.R_wb[k], point - self.com[k])
 
     def point(
         self, name: str, point: Float[Array, "3"]
@@ -90,7 +90,7 @@ class Kinematics(eqx.Module):
         return self.r[k] + s, self.v[k] + cross(self.omega_w[k], s)
 
 
-def kinematics(
+def compute_kinematics(
     state: State,
     *,
     mass: Float[Array, " n"],

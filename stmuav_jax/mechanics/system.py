@@ -1,7 +1,11 @@
 """Systems: bodies, joints and forces, connected by name and checked as a graph."""
 
+import dataclasses
+import functools
+import inspect
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,22 +14,25 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, SettingError, nearest_names
-from ..checks.numbers import stacked
+from ..checks.numbers import stack_arrays
+from ..math.rotation import rotation_matrix
 from .body import GROUND, Bodies, Body, stack_bodies
-from .joint import Joint, resolve
-from .joint_coordinate import choose
+from .joint import Joint, choose_coordinate, resolve_joint
 from .load import AbstractForce
-from .state import Kinematics, State, kinematics
+from .state import Kinematics, State, compute_kinematics
 
 
 class System(eqx.Module):
     """Multibody system of bodies, joints and forces.
 
     Args:
-        bodies: moving bodies; "ground" exists without being listed.
+        bodies: moving bodies; "ground" exists without being listed. The stacked bodies of a system
+            that exists are taken too, with its joints and its reference: so
+            `dataclasses.replace(system, forces=...)` is the same system with other forces.
         joints: see `stmuav_jax.mechanics.joint`; geometry in the world at the bodies'
             reference posture.
-        forces: see `stmuav_jax.mechanics.forces.applied` and `stmuav_jax.mechanics.forces.joint`.
+        forces: see `stmuav_jax.mechanics.forces` and `stmuav_jax.mechanics.joint_forces`.
+        reference: reference posture of stacked bodies; that of `Body` objects is in them.
         allow_float32: accept single precision, in which closed loops lose most digits.
 
     Attributes:
@@ -49,30 +56,72 @@ class System(eqx.Module):
 
     def __init__(
         self,
-        bodies: Sequence[Body],
+        bodies: Sequence[Body] | Bodies,
         joints: Sequence[Joint] = (),
-        forces: Sequence[AbstractForce] = (),
+        forces: Sequence[Any] = (),
         *,
+        reference: State | None = None,
         allow_float32: bool = False,
     ) -> None:
-        by_name = {b.name: b for b in bodies}
-        _check_names(bodies, joints)
-        _check_references(by_name, joints, forces)
-        _check_connected(bodies, joints)
-        self.bodies = stack_bodies(tuple(bodies))
-        self.joints = tuple(
-            resolve(j, by_name.get(j.body_i), by_name.get(j.body_j)) for j in joints
-        )
-        self.forces = tuple(forces)
-        zero = stacked([np.zeros(3, self.bodies.com.dtype)] * len(bodies))
-        self.reference = State(
-            r=stacked([b.com_position for b in bodies]),
-            p=stacked([b.orientation for b in bodies]),
-            v=zero,
-            omega=zero,
-        )
+        # `dataclasses.replace` calls the constructor with the fields of a system that exists: its
+        # joints are in body frames already and must not be resolved again.
+        if isinstance(bodies, Bodies):
+            self.bodies, self.joints = bodies, tuple(joints)
+            self.reference = _check_stacked(bodies, joints, reference)
+            names: Sequence[str] = bodies.names
+        else:
+            if reference is not None:
+                raise ModelError(
+                    "The reference posture of Body objects is in them (position, orientation): leave "
+                    "reference= out."
+                )
+            by_name = {b.name: b for b in bodies}
+            _check_names(bodies, joints)
+            _check_joints(list(by_name), joints)
+            # A body without a joint is more often a wrong name than a free body; a free one must be declared.
+            _check_connected(bodies, joints)
+            self.bodies = stack_bodies(tuple(bodies))
+            self.joints = tuple(resolve_joint(j, by_name) for j in joints)
+            zero = stack_arrays([np.zeros(3, self.bodies.com.dtype)] * len(bodies))
+            self.reference = State(
+                r=stack_arrays([b.com_position for b in bodies]),
+                p=stack_arrays([b.orientation for b in bodies]),
+                v=zero,
+                omega=zero,
+            )
+            names = list(by_name)
+        _check_forces(names, self.joints, forces)
+        # A force in a joint may need the joint's kind and frames, which are known from here on.
+        self.forces = tuple(force.resolve(self.joints) for force in forces)
         self.allow_float32 = allow_float32
+        # Single precision is the default of JAX and a common oversight: closed loops then drift by
+        # what looks like a modelling error, so that it has to be asked for.
         check_precision(self.bodies.mass, allow_float32)
+
+    def with_forces(self, *forces: Any) -> "System":
+        """System with forces added to those of this one, which stay first.
+
+        To exchange its forces, use `dataclasses.replace(system, forces=(...))`.
+
+        Raises:
+            ModelError: a force acts on a body, joint or coordinate that the system does not have.
+        """
+        return dataclasses.replace(self, forces=(*self.forces, *forces))
+
+    def with_parameters(self, values: Mapping[str, Any]) -> "System":
+        """System with other numbers, by names such as "camera.mass", "pitch.stiffness" or "frame.k_f".
+
+        A name is OWNER.FIELD: mass, com or inertia of a body, or a field of the force that acts on this body or
+        in this joint; "Gravity.acceleration" names a force by its class. Numbers are checked as where they were
+        first given. The frames of bodies stay where they are at the reference posture.
+
+        Raises:
+            ModelError: a name that is none, or that several forces have, or a number that does not fit.
+        """
+        system = self
+        for name, value in values.items():
+            system = _with_parameter(system, name, value)
+        return system
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -104,7 +153,7 @@ class System(eqx.Module):
 
     def kinematics(self, state: State) -> Kinematics:
         """Positions, rotations and velocities of all bodies and ground, for one state."""
-        return kinematics(
+        return compute_kinematics(
             state,
             mass=self.bodies.mass,
             com=self.bodies.com,
@@ -116,6 +165,102 @@ class System(eqx.Module):
         """Centre of mass of the whole system in the world (3,) [m]."""
         mass = self.bodies.mass
         return mass @ state.r / jnp.sum(mass)
+
+
+def moved_centres(state: State, before: System, after: System) -> State:
+    """State with the same motion of the bodies' frames, where the centres of mass in them have changed."""
+    shift = after.bodies.com - before.bodies.com
+    R = jax.vmap(rotation_matrix)(state.p)
+    to_world = lambda x: jnp.einsum("nij,nj->ni", R, x)
+    r, v = state.r + to_world(shift), state.v + to_world(jnp.cross(state.omega, shift))
+    return State(r, state.p, v, state.omega)
+
+
+_OF_BODY = ("mass", "com", "inertia")
+
+
+def _with_parameter(system: System, name: str, value: Any) -> System:
+    owner, _, field = name.partition(".")
+    if owner in system.names and field in _OF_BODY:
+        k = system.index(owner)
+        # A body is made anew with the other number, by its own constructor: the checks of masses
+        # and inertia tensors are those of the first one.
+        numbers = {key: getattr(system.bodies, key)[k] for key in _OF_BODY} | {field: value}
+        body = Body(owner, numbers["mass"], numbers["inertia"], com=numbers["com"])
+        bodies = eqx.tree_at(
+            lambda b: getattr(b, field), system.bodies, getattr(system.bodies, field).at[k].set(getattr(body, field))
+        )  # fmt: skip
+        changed = eqx.tree_at(lambda s: s.bodies, system, bodies)
+        reference = moved_centres(system.reference, system, changed)
+        return eqx.tree_at(lambda s: s.reference, changed, reference)
+    places = [
+        (k, path)
+        for k, force in enumerate(system.forces)
+        if owner in _force_owners(force) and (path := _field_path(force, field))
+    ]
+    # Two springs in one joint have the same name: guessing which is meant would change the wrong
+    # one without a word.
+    if len(places) != 1:
+        parts = {f"{n}.{key}" for n in system.names for key in _OF_BODY}
+        parts |= {
+            f"{n}.{key}"
+            for f in system.forces
+            for n in _force_owners(f)
+            for key in _constructor_fields(f)
+        }
+        wrong = (
+            "several forces have it: exchange them by dataclasses.replace(system, forces=(...))."
+        )
+        wrong = (
+            wrong if places else f"there is none of this name.{nearest_names(name, sorted(parts))}"
+        )
+        raise ModelError(f"The parameter '{name}' cannot be set: {wrong}")
+    k, path = places[0]
+    walk = lambda part: functools.reduce(getattr, path, part)
+    checked_value = walk(_rebuild_part(system.forces[k], path, value))
+    is_none = lambda x: x is None
+    force = eqx.tree_at(walk, system.forces[k], checked_value, is_leaf=is_none)
+    forces = (*system.forces[:k], force, *system.forces[k + 1 :])
+    return eqx.tree_at(lambda s: s.forces, system, forces)
+
+
+def _force_owners(force: AbstractForce) -> set[str]:
+    """Bodies and joints of a force, and its class."""
+    of = force.acts_on()
+    return {*of.bodies, *of.joints, *(joint for joint, _ in of.coordinates), type(force).__name__}
+
+
+def _constructor_fields(part: Any) -> list[str]:
+    """Numbers that the constructor of a force, or of a part of it, takes."""
+    names = list(inspect.signature(type(part)).parameters)
+    return [
+        n
+        for n in names
+        if n != "internal" and not isinstance(getattr(part, n, ""), str | eqx.Module)
+    ]
+
+
+def _field_path(force: AbstractForce, field: str) -> tuple[str, ...]:
+    """Path to a field of a force, or of a part of it; () if there is none."""
+    if field in _constructor_fields(force):
+        return (field,)
+    parts = {n: getattr(force, n, None) for n in inspect.signature(type(force)).parameters}
+    inner = [
+        n
+        for n, part in parts.items()
+        if isinstance(part, eqx.Module) and field in _constructor_fields(part)
+    ]
+    return (inner[0], field) if len(inner) == 1 else ()
+
+
+def _rebuild_part(part: Any, path: tuple[str, ...], value: Any) -> Any:
+    """Part made anew, and so checked, with another value of a field."""
+    arguments = {n: getattr(part, n, None) for n in inspect.signature(type(part)).parameters}
+    # States of actuators are no parameters: a new part starts with its own.
+    arguments.pop("internal", None)
+    head, *rest = path
+    arguments[head] = _rebuild_part(arguments[head], tuple(rest), value) if rest else value
+    return type(part)(**arguments)
 
 
 def check_precision(array: Float[Array | np.ndarray, "..."], allow_float32: bool) -> None:
@@ -138,6 +283,8 @@ def check_state(system: System, state: State) -> None:
                 f"State.{name} must be an array of shape (..., {n}, {width}), but it is of type "
                 f"{type(array).__name__}: write jnp.asarray(...) around the numbers."
             )
+        # JAX would broadcast one row to all bodies, and find an error many operations later, in
+        # names of its own.
         if jnp.shape(array)[-2:] != (n, width):
             raise SettingError(
                 f"State.{name} must have shape (..., {n}, {width}) for bodies "
@@ -157,31 +304,65 @@ def _check_names(bodies: Sequence[Body], joints: Sequence[Joint]) -> None:
             )
 
 
-def _check_references(
-    by_name: dict[str, Body], joints: Sequence[Joint], forces: Sequence[AbstractForce]
-) -> None:
-    known = [*by_name, GROUND]
-    joint_names = [j.name for j in joints]
+def _check_stacked(bodies: Bodies, joints: Sequence[Joint], reference: State | None) -> State:
+    """Reference posture of stacked bodies, checked to be that of a system with these joints."""
+    if reference is None or any(joint.in_world for joint in joints):
+        raise ModelError(
+            "The bodies of a system that exists (system.bodies) come with its joints and its "
+            "reference posture. To add forces, use system.with_forces(...); to exchange them, "
+            "dataclasses.replace(system, forces=(...)); for other joints, make a System of Body "
+            "objects."
+        )
+    if reference.r.shape[-2:] != (len(bodies.names), 3):
+        raise ModelError(
+            f"The reference posture must have one row for each of the {len(bodies.names)} bodies, "
+            f"but its r has shape {reference.r.shape}."
+        )
+    _check_joints(bodies.names, joints)
+    return reference
+
+
+def _check_joints(names: Sequence[str], joints: Sequence[Joint]) -> None:
+    body_names, joint_names = [*names, GROUND], [joint.name for joint in joints]
     for joint in joints:
-        for name in (joint.body_i, joint.body_j):
-            if name not in known:
+        # Couplings name other joints and not bodies, and are checked against those.
+        coupled = () if joint.mate is None else (joint.mate.dependent, joint.mate.joint.name)
+        for name in coupled:
+            if name not in joint_names:
                 raise ModelError(
-                    f"Joint '{joint.name}' names the unknown body '{name}'.{nearest_names(name, known)}"
+                    f"The coupling '{joint.name}' is of the joint '{name}', which is not in the system."
+                    f"{nearest_names(name, joint_names)}"
                 )
+        for name in (joint.body_i, joint.body_j):
+            if name not in body_names:
+                raise ModelError(
+                    f"Joint '{joint.name}' names the unknown body '{name}'.{nearest_names(name, body_names)}"
+                )
+
+
+def _check_forces(names: Sequence[str], joints: Sequence[Joint], forces: Sequence[Any]) -> None:
+    body_names, joint_names = [*names, GROUND], [j.name for j in joints]
     for force in forces:
+        if not isinstance(force, AbstractForce):
+            raise ModelError(
+                "The forces of a system must be forces, such as Gravity(...), but one is of type "
+                f"{type(force).__name__}."
+            )
         kind, named = type(force).__name__, force.acts_on()
         for name in named.bodies:
-            if name not in known:
+            if name not in body_names:
                 raise ModelError(
-                    f"A {kind} names the unknown body '{name}'.{nearest_names(name, known)}"
+                    f"A {kind} names the unknown body '{name}'.{nearest_names(name, body_names)}"
                 )
         for name in (*named.joints, *(name for name, _ in named.coordinates)):
             if name not in joint_names:
                 raise ModelError(
                     f"A {kind} names the unknown joint '{name}'.{nearest_names(name, joint_names)}"
                 )
-        for name, which in named.coordinates:
-            choose(joints[joint_names.index(name)], which, f"{kind} in joint '{name}'")
+        for name, coordinate in named.coordinates:
+            choose_coordinate(
+                joints[joint_names.index(name)], coordinate, f"{kind} in joint '{name}'"
+            )
 
 
 def _check_connected(bodies: Sequence[Body], joints: Sequence[Joint]) -> None:
@@ -190,15 +371,17 @@ def _check_connected(bodies: Sequence[Body], joints: Sequence[Joint]) -> None:
     for joint in joints:
         neighbours[joint.body_i].add(joint.body_j)
         neighbours[joint.body_j].add(joint.body_i)
-    reached = {GROUND, *(b.name for b in bodies if b.free)}
-    todo = list(reached)
+    attached_names = {GROUND, *(b.name for b in bodies if b.free)}
+    # A search over the graph from ground and from all free bodies.
+    todo = list(attached_names)
     while todo:
-        for name in neighbours[todo.pop()] - reached:
-            reached.add(name)
+        for name in neighbours[todo.pop()] - attached_names:
+            attached_names.add(name)
             todo.append(name)
-    loose = [b.name for b in bodies if b.name not in reached]
+    loose = [b.name for b in bodies if b.name not in attached_names]
     if loose:
         raise ModelError(
-            f"Attached to nothing: {', '.join(loose)}. Join each to '{GROUND}' or to a body that "
+            f"Bodies without a path of joints to '{GROUND}' or to a free body: {', '.join(loose)}. Join "
+            f"each to '{GROUND}' or to a body that "
             "is, or declare the body that may float with Body(..., free=True)."
         )

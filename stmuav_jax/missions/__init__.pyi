@@ -1,8 +1,9 @@
 """Public names of this folder; `__init__.py` imports each when it is first used."""
 
 from .ensemble import (
-    MissionWork as MissionWork,
-    mission_work as mission_work,
+    MissionEvaluation as MissionEvaluation,
+    load_mission_study as load_mission_study,
+    make_mission_study as make_mission_study,
 )
 from .figures import (
     FLIGHT_FIGURES as FLIGHT_FIGURES,
@@ -22,6 +23,6 @@ from .outcome import (
     Measure as Measure,
     measures as measures,
     to_data as to_data,
+    to_flight_record as to_flight_record,
     verdict as verdict,
 )
-from .report import write_flight_report as write_flight_report

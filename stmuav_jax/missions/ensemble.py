@@ -5,10 +5,8 @@ estimator believe stays that of the mission's file. Flights go side by side in o
 which keeps of each its largest errors and smallest margins.
 """
 
-import hashlib
 import json
 from collections.abc import Mapping
-from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,22 +16,35 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.compiler import program_of_shapes
 from ..checks.errors import SettingError
-from ..checks.schema import SHOWN, checked, named
+from ..checks.numbers import as_floats
+from ..checks.schema import SHOWN, quote_name, validate_model
+from ..control.closed_loop import LoopReason, Rollout, rollout
 from ..control.plant import Plant, PlantState
-from ..control.rolling import LoopReason, Rollout, rollout
-from ..dynamics.scene import Scene
-from ..montecarlo.factors import alike, drawn_table, possible_tables, table_entry
-from ..montecarlo.sampling import Sampling
-from ..montecarlo.schema import Drawing
-from ..montecarlo.study import factors_of
-from ..montecarlo.work import FINE, AbstractWork, Axis, Column, column_name
-from .gauges import Gauges
+from ..dynamics.simulation import Scene
+from ..mechanics.parameters import Parameter, Parameters
+from ..studies.columns import FINE, Column, column_name
+from ..studies.disturbed_flights import (
+    FactorTarget,
+    digest_table,
+    drawn_table,
+    factor_columns,
+    is_possible,
+    suggest_names,
+    table_entry,
+)
+from ..studies.schema import factors_of
+from ..studies.study import Study
+from ..studies.study_file import check_study, study_settings
+from ..uav.allocation import RotorLimits
+from ..uav.motor import MotorRotors, only_rotors
+from .controller import AT_ONCE
 from .machine import Machine, input_names, scene_of
 from .mission import Mission, load_mission, make_mission
-from .outcome import AT_LIMIT, AT_ONCE
-from .schema import MissionStudyFile
+from .outcome import AT_LIMIT, list_unreached
+from .payloads import Payloads
+from .schema import MissionFile, MissionStudyFile
+from .signals import Gauges
 
 # Flights side by side in one program, of which a sample always has the same place.
 LANES = 16
@@ -52,6 +63,7 @@ _QUANTITIES: dict[str, tuple[str, str]] = {
     "rotor_margin": ("1", "smallest margin of the rotor speeds, share of the range"),
     "stroke_margin": ("1", "smallest margin of the strokes, share of the range"),
     "force_margin": ("1", "smallest margin of the actuators' forces, share of the range"),
+    "effort_margin": ("1", "smallest margin of the joints' efforts, share of the range"),
     "energy": ("J", "electrical energy used"),
     "kept": ("1", "whether all tolerances and limits were kept"),
 }
@@ -73,7 +85,8 @@ class Worst(NamedTuple):
 
     Attributes:
         position [m], tilt, panel [rad]: largest errors from the times of the tolerances on.
-        rotors, strokes, forces: smallest distances from the limits, as shares of the range.
+        joints: largest errors of the driven joints (n,) [rad] or [m].
+        rotors, strokes, forces, efforts: smallest distances from the limits, as shares of the range.
         energy: electrical energy used [J].
         reason: code of `LoopReason`. end: time of the last valid sample [s].
     """
@@ -81,319 +94,389 @@ class Worst(NamedTuple):
     position: Float[Array, ""]
     tilt: Float[Array, ""]
     panel: Float[Array, ""]
+    joints: Float[Array, " n"]
     rotors: Float[Array, ""]
     strokes: Float[Array, ""]
     forces: Float[Array, ""]
+    efforts: Float[Array, ""]
     energy: Float[Array, ""]
     reason: Array
     end: Float[Array, ""]
 
 
-class MissionWork(AbstractWork):
-    """Work of a study of a mission: its flights by sample number.
+class MissionEvaluation(eqx.Module):
+    """Function of a sample that flies a mission by a machine with its numbers and returns the worst of the flight.
 
-    Args:
-        mission: the mission, of a scene, without a battery.
-        sampling: factors, lines of the scene's parameter table, with their design.
-        relative: names of factors that multiply the mission's value.
-        name: short name for files.
+    The sample's key gives the seeds of gusts and of noise.
 
-    Raises:
-        SettingError: a model's mission, one with a battery, factors that are unknown, lengths, or of
-            no effect.
+    Attributes:
+        nominal: parts of the mission that all flights have, as arrays. mission: the mission.
+        table: parameters that can be factors. relative: names of factors that multiply the mission's value.
     """
 
-    def __init__(
-        self,
-        mission: Mission,
-        sampling: Sampling,
-        *,
-        relative: frozenset[str] = frozenset(),
-        name: str = "mission",
-    ) -> None:
-        if mission.machine.table is None:
-            raise SettingError("A study of a mission needs one whose machine is a scene.")
-        if mission.battery is not None:
-            raise SettingError("A study of a mission has no battery: leave [battery] out.")
-        self.mission, self.sampling = mission, sampling
-        self.relative, self.name = relative, name
-        self._check_factors()
+    nominal: _Nominal
+    mission: Mission
+    table: Parameters
+    relative: frozenset[str] = eqx.field(static=True)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __init__(self, mission: Mission, relative: frozenset[str] = frozenset()) -> None:
+        machine = mission.machine
+        self.nominal = _Nominal(
+            mission.plant, mission.controller, mission.references, mission.gauges, machine.speeds,
+            machine.limits,
+        )  # fmt: skip
+        self.mission, self.relative = mission, relative
+        self.table = _factor_table(mission)
+
+    def __reduce__(self) -> Any:
         """State as entries of the mission's file, from which it is made again."""
-        keep = {"sampling": self.sampling, "relative": self.relative, "name": self.name}
-        return {**keep, "file": self.mission.file.model_dump()}
-
-    def __setstate__(self, state: Mapping[str, Any]) -> None:
-        for name in ("sampling", "relative", "name"):
-            setattr(self, name, state[name])
-        with jax.enable_x64(True):
-            self.mission = make_mission(state["file"])
-
-    @property
-    def identity(self) -> Mapping[str, Any]:
-        """Plain data of the mission, the parameters and the sampling."""
-        text = json.dumps(self._numbers, sort_keys=True)
-        return {
-            "kind": "missions", "name": self.name, "lanes": LANES,
-            "mission": json.loads(self.mission.file.model_dump_json(exclude={"title"})),
-            "parameters": hashlib.sha256(text.encode()).hexdigest()[:16],
-            "relative": sorted(self.relative), "sampling": self.sampling.plain(),
-            "failure": {"quantity": "kept", "below": 0.5},
-        }  # fmt: skip
-
-    @property
-    def unit(self) -> int:
-        """Number of flights side by side."""
-        return LANES
-
-    @property
-    def columns(self) -> Mapping[str, Column]:
-        """Columns of factors, largest errors, smallest margins, energy, end, and status."""
-        found = {}
-        for name in self.sampling.names:
-            unit = table_entry(self._table, name, name in self.relative).unit
-            words = f"{name}, share of the mission's" if name in self.relative else name
-            found[column_name(name)] = Column("float64", unit, words, "input")
-        for name in self._quantities:
-            unit, words = _QUANTITIES[name]
-            found[name] = Column("int8" if name == "kept" else "float64", unit, words)
-        found["end"] = Column("float64", "s", "last time with valid numbers", "diagnostic")
-        return found | {"status": Column("int8", "1", "how the flight ended", "status")}
-
-    @property
-    def axes(self) -> Mapping[str, Axis]:
-        """No axes: each quantity is one number."""
-        return {}
-
-    @property
-    def reasons(self) -> Mapping[int, str]:
-        """Reasons of flights whose numbers did not stay finite, by code."""
-        found = {1 + int(one): one.words for one in LoopReason if one != LoopReason.VALID}
-        return found | {NOT_PHYSICAL: "masses or inertias that no body can have"}
-
-    def run(self, first: int, count: int) -> dict[str, np.ndarray]:
-        """Columns of the samples first, first + 1, ..."""
-        if not count:
-            return {name: np.zeros(0, column.dtype) for name, column in self.columns.items()}
-        blocks = range(first // LANES, (first + count - 1) // LANES + 1)
-        with jax.enable_x64(True):
-            parts = [self._block(number) for number in blocks]
-        skip = first - blocks[0] * LANES
-        joined = {k: np.concatenate([part[k] for part in parts]) for k in parts[0]}
-        return {k: joined[k][skip : skip + count].astype(c.dtype) for k, c in self.columns.items()}
-
-    @property
-    def _table(self) -> Any:
-        table = self.mission.machine.table
-        assert table is not None
-        return table
-
-    @property
-    def _numbers(self) -> dict[str, Any]:
-        return {name: np.asarray(self._table.value(name)).tolist() for name in self._table}
-
-    @property
-    def _quantities(self) -> list[str]:
-        machine, none = self.mission.machine, set()
-        if machine.bodies is None:
-            none |= {"panel_error", "stroke_margin"}
-        if machine.speeds is None:
-            none |= {"rotor_margin"}
-        if machine.force is None:
-            none |= {"force_margin"}
-        return [name for name in _QUANTITIES if name not in none]
-
-    def _check_factors(self) -> None:
-        table, scene = self._table, self.mission.machine.scene
-        unknown = lambda name: (
-            lambda: (
-                f"is no parameter of {scene.name}.{alike(name.partition('[')[0][:SHOWN], list(table))}"
-            )
+        return _remake_evaluation, (
+            self.mission.file.model_dump(),
+            self.mission.folder,
+            self.relative,
         )
-        columns: dict[str, str] = {}
-        for factor in self.sampling.names:
-            name = table_entry(table, factor, factor in self.relative, unknown(factor)).name
-            if name.startswith(_FIXED) and name not in _FREE:
-                raise SettingError(
-                    f"{named(factor)} can be no factor of a mission's study: loops and limits of strokes "
-                    "are those of the mission's machine. Masses, inertias, centres of mass, rotors, "
-                    "drag and motors can be."
-                )
-            line = scene.parameters.get(name)
-            if line is None:
-                raise SettingError(
-                    f"{named(factor)} has no effect on this mission: its machine does not use it."
-                )
-            if line != table[name].plain():
-                raise SettingError(
-                    f"'{name}' is given by the mission's options: it can be no factor."
-                )
-            column = column_name(factor)
-            if column in columns or column in {*_QUANTITIES, "end", "status", "sample"}:
-                raise SettingError(f"The column '{column}' of {named(factor)} is there already.")
-            columns[column] = factor
 
-    def _block(self, number: int) -> dict[str, np.ndarray]:
-        """Columns of all flights of a block."""
-        first, names = number * LANES, self.sampling.names
-        drawn = self._drawn(first)
-        possible = possible_tables(self._table, names, drawn, self.relative)
-        # impossible samples fly as the first possible one does, and are left out
-        flown = np.where(possible[:, None], drawn, drawn[np.argmax(possible)])
-        worst: Any = Worst(*(np.zeros(LANES) for _ in Worst._fields))  # pyright: ignore[reportArgumentType]
-        if np.any(possible):
-            worst = jax.tree.map(np.asarray, self._program(flown, self._seeds(first)))
-        status = np.where(possible, FINE + worst.reason, NOT_PHYSICAL)
-        fine = status == FINE
-        found = {column_name(name): drawn[:, k] for k, name in enumerate(names)}
-        own = {
-            "position_error": worst.position, "tilt_error": worst.tilt,
-            "panel_error": worst.panel, "rotor_margin": worst.rotors,
-            "stroke_margin": worst.strokes, "force_margin": worst.forces, "energy": worst.energy,
-        }  # fmt: skip
-        found |= {k: np.where(fine, v, np.nan) for k, v in own.items()}
-        kept = fine & self._kept(worst)
-        return found | {"kept": kept, "end": np.where(possible, worst.end, 0.0), "status": status}
+    def __call__(self, sample: Mapping[str, Array], key: Array) -> dict[str, Any]:
+        """Outcomes of one flight by column."""
+        possible = is_possible(self.table, sample, self.relative)
+        sampled = drawn_table(self.table, sample, self.relative)
+        # impossible samples fly as the mission's own machine does, and are left out
+        changed = {
+            name: sampled.value(name) for name in sampled if sampled[name] is not self.table[name]
+        }
+        choose = lambda name: jnp.where(possible, changed[name], as_floats(self.table.value(name)))
+        worst = self._fly(self.table.replaced({name: choose(name) for name in changed}), key)
+        valid = possible & (worst.reason == LoopReason.VALID)
+        hide = lambda x: jnp.where(valid, x, jnp.nan)
+        joints = self.mission.machine.joints
+        values = worst.position, worst.tilt, worst.panel, *worst[4:9]
+        measures = dict(zip(_QUANTITIES, values, strict=False))
+        measures |= {
+            f"{column_name(drive.name)}_error": worst.joints[k] for k, drive in enumerate(joints)
+        }
+        return {name: hide(x) for name, x in measures.items()} | {
+            "kept": valid & self._check_compliance(worst),
+            "end": jnp.where(possible, worst.end, 0.0),
+            "status": jnp.where(possible, FINE + worst.reason, NOT_PHYSICAL),
+        }
 
-    def _drawn(self, first: int) -> np.ndarray:
-        """Values of a block (lanes, d); beyond the design's end, those of its last sample again."""
-        limit = self.sampling.limit
-        count = LANES if limit is None else min(LANES, limit - first)
-        drawn = self.sampling.draw(first, count)
-        return np.concatenate([drawn, np.repeat(drawn[-1:], LANES - count, axis=0)])
+    def _check_compliance(self, worst: Worst) -> Array:
+        """True if a flight kept the tolerances and limits of the mission."""
+        target = self.mission.file.tolerances
+        margins = (worst.rotors, worst.strokes, worst.forces, worst.efforts)
+        is_compliant = jnp.min(jnp.stack(margins)) >= -AT_LIMIT
+        for k, drive in enumerate(self.mission.machine.joints):
+            most = target.joints.get(drive.name, np.inf) * (_DEGREE if drive.unit == "rad" else 1.0)
+            is_compliant &= worst.joints[k] <= most
+        angle_checks = (worst.tilt / _DEGREE, target.tilt), (worst.panel / _DEGREE, target.panel)
+        for value, most in ((worst.position, target.position), *angle_checks):
+            is_compliant &= True if most is None else value <= most
+        return is_compliant
 
-    def _seeds(self, first: int) -> np.ndarray:
-        """Seeds of gusts and of noise (lanes, 2)."""
-        own = lambda k: np.random.SeedSequence((self.sampling.seed, k)).generate_state(2)
-        return np.stack([own(first + k) for k in range(LANES)]).astype(np.uint32)
-
-    def _kept(self, worst: Any) -> np.ndarray:
-        """Test whether flights kept the tolerances and limits of the mission (lanes,)."""
-        wanted = self.mission.file.tolerances
-        fine = np.minimum(np.minimum(worst.rotors, worst.strokes), worst.forces) >= -AT_LIMIT
-        turned = (worst.tilt / _DEGREE, wanted.tilt), (worst.panel / _DEGREE, wanted.panel)
-        for value, most in ((worst.position, wanted.position), *turned):
-            fine &= np.asarray(most is None) | (value <= (np.inf if most is None else most))
-        return fine
-
-    @cached_property
-    def _program(self) -> Any:
-        """Compiled function of values (lanes, d) and seeds (lanes, 2) that returns a `Worst`."""
-        of, machine = self.mission, self.mission.machine
-        pilot = of.controller, of.references, of.gauges
-        nominal = _Nominal(of.plant, *pilot, machine.speeds, machine.limits)
-        flights = lambda of, *each: jax.vmap(partial(self._flown, of))(*each)
-        values = jax.ShapeDtypeStruct((LANES, len(self.sampling.names)), jnp.float64)
-        seeds = jax.ShapeDtypeStruct((LANES, 2), jnp.uint32)
-        made = program_of_shapes(flights, nominal, values, seeds, parts=self._parts)
-        return partial(made, nominal)
-
-    @property
-    def _parts(self) -> tuple[Any, ...]:
-        """All that the compiled program depends on: not how many samples are drawn, nor from what."""
-        names = tuple(self.sampling.names)
-        return self.mission.file.model_dump(), self._numbers, names, self.relative
-
-    def _flown(self, of: _Nominal, values: Float[Array, " d"], seeds: Array) -> Worst:
-        """Largest errors and smallest margins of one flight; traced."""
-        mission = self.mission
-        own = dict(zip(self.sampling.names, values, strict=True))
-        table = drawn_table(self._table, own, self.relative)
-        plant = _plant_of(of.plant, mission.machine, scene_of(mission.file, table, seeds[0]))
-        gauges = eqx.tree_at(lambda g: g.k_tau, of.gauges, table.value("rotor.k_tau"))
+    def _fly(self, table: Parameters, key: Array) -> Worst:
+        """Largest errors and smallest margins of one flight, by the numbers of a table."""
+        of, mission, seeds = self.nominal, self.mission, jax.random.key_data(key)
+        scene = scene_of(mission.file, table, seeds[0], mission.machine.model)
+        payloads = of.gauges.payloads
+        if payloads is not None:
+            masses = [table.value(f"payload_{k + 1}.mass") for k in range(len(payloads.bodies))]
+            payloads = eqx.tree_at(lambda p: p.mass, payloads, as_floats(masses))
+        plant = _plant_of(of.plant, mission.machine, scene, payloads)
+        of = of._replace(speeds=_narrow_limits(of.speeds, scene))
+        gauges = eqx.tree_at(
+            lambda g: (g.k_tau, g.payloads),
+            of.gauges,
+            (only_rotors(scene.system, "A mission").rotors.k_tau, payloads),
+            is_leaf=lambda x: x is None,
+        )
+        if gauges.jointed is not None:
+            gauges = eqx.tree_at(lambda g: g.jointed, gauges, plant.system)
+        # Worst values are joined chunk by chunk: rows of whole flights, of all lanes, would not
+        # fit in memory. The last chunk goes beyond the end by less than one sample per chunk.
         chunks = -(-mission.samples // max(round(CHUNK * plant.rate), 2))
         samples = -(-mission.samples // chunks)
 
-        def chunk(now: tuple[PlantState, Any, Worst], _: None) -> tuple[Any, None]:
+        def fly_chunk(now: tuple[PlantState, Any, Worst], _: None) -> tuple[Any, None]:
             start, memory, worst = now
-            found = rollout(
+            chunk_rollout = rollout(
                 plant, of.controller, samples, reference=of.references, memory=memory,
                 signals={"gauges": gauges}, start=start,
             )  # fmt: skip
-            return (found.end, found.memory, _joined(mission, of, worst, found)), None
+            return (
+                chunk_rollout.end,
+                chunk_rollout.memory,
+                _join_worst(mission, of, worst, chunk_rollout),
+            ), None
 
-        zero, one = jnp.zeros(()), jnp.ones(())
+        zero, top = jnp.zeros(()), jnp.ones(())
         reason = jnp.zeros((), jnp.int8)
-        begun = Worst(zero, zero, zero, one, one, one, zero, reason, zero)
+        joints = jnp.zeros(len(mission.machine.joints))
+        initial_worst = Worst(zero, zero, zero, joints, top, top, top, top, zero, reason, zero)
         start = plant.reset(jax.random.key(seeds[1]))
-        first = (start, jax.tree.map(jnp.asarray, of.controller.start()), begun)
-        (_, _, worst), _ = jax.lax.scan(chunk, first, length=chunks)
+        first = (start, jax.tree.map(jnp.asarray, of.controller.start()), initial_worst)
+        (_, _, worst), _ = jax.lax.scan(fly_chunk, first, length=chunks)
         return worst
 
 
-def _plant_of(nominal: Plant, machine: Machine, scene: Scene) -> Plant:
+def _check_judged(mission_file: MissionFile) -> None:
+    """Raise `SettingError` for entries of a mission that no flight of its study comes to."""
+    tolerances = mission_file.tolerances
+    for name in ("touchdown", "sink"):
+        if getattr(tolerances, name) is not None:
+            raise SettingError(
+                f"A study of a mission does not judge 'tolerances.{name}': leave it out."
+            )
+    late = list_unreached(json.loads(mission_file.model_dump_json()), mission_file.t1)
+    late += [
+        f"the tolerances of {subject}, which hold from t = {t:g} s on"
+        for subject, t in (
+            ("position and tilt", tolerances.after),
+            ("the panel", tolerances.panel_after),
+        )
+        if t is not None and t > mission_file.t1 + AT_ONCE
+    ]
+    if late:
+        raise SettingError(
+            f"The flights of a study end at t = {mission_file.t1:g} s, before {', '.join(late)}: give the study a "
+            "later 't1', or leave these entries out of its mission."
+        )
+
+
+def _narrow_limits(speeds: RotorLimits | None, scene: Scene) -> RotorLimits | None:
+    """Limits of the rotor speeds within those of a scene's motors."""
+    limits = [f.limits for f in scene.system.forces if isinstance(f, MotorRotors)]
+    if speeds is None or not limits or limits[0] is None:
+        return speeds
+    return RotorLimits(
+        jnp.maximum(as_floats(speeds.lowest), as_floats(limits[0].lowest)),
+        jnp.minimum(as_floats(speeds.highest), as_floats(limits[0].highest)),
+    )
+
+
+def _plant_of(nominal: Plant, machine: Machine, scene: Scene, payloads: Payloads | None) -> Plant:
     """Plant of another scene with the instruments, estimator and inputs of a mission's plant."""
     rate, method = nominal.rate, nominal.motion.problem.method
-    made = Plant(
-        scene, rate=rate, inputs=input_names(machine), before=nominal.before,
+    scene = scene if payloads is None else payloads.load(scene)
+    changes = () if payloads is None else payloads.changes(scene.system)
+    plant = Plant(
+        scene, rate=rate, changes=changes, observe=nominal.observe, inputs=input_names(machine), before=nominal.before,
         delay=nominal.late / rate, standing=nominal.stood / rate,
         sensors=nominal.bench.instruments, estimator=nominal.estimator, memory=nominal.memory,
         steps=nominal.motion.steps,
     )  # fmt: skip
-    return made.with_motion(made.motion.with_method(formulation=method.formulation))
+    return plant.with_motions(lambda motion: motion.with_method(formulation=method.formulation))
 
 
-def _joined(mission: Mission, of: _Nominal, worst: Worst, found: Rollout) -> Worst:
+def _join_worst(mission: Mission, of: _Nominal, worst: Worst, chunk_rollout: Rollout) -> Worst:
     """Largest errors and smallest margins after further samples."""
-    given, own, ts = mission.file, found.signals["gauges"], found.ts
-    wanted = given.tolerances
-    flown = ts <= given.t1 + AT_ONCE
-    base = flown & (ts >= wanted.after - AT_ONCE)
-    later = wanted.after if wanted.panel_after is None else wanted.panel_after
-    panel = flown & (ts >= later - AT_ONCE)
+    entries, gauges, ts = mission.file, chunk_rollout.signals["gauges"], chunk_rollout.ts
+    target = entries.tolerances
+    flight_mask = ts <= entries.t1 + AT_ONCE
+    base = flight_mask & (ts >= target.after - AT_ONCE)
+    if "gear_load" in gauges:
+        # as in a verdict, what the ground carries is not in flight
+        base = base & (gauges["gear_load"] == 0.0)
+    later = target.after if target.panel_after is None else target.panel_after
+    panel = flight_mask & (ts >= later - AT_ONCE)
+    # Samples that do not count become the value that changes nothing: shapes are fixed in a
+    # compiled program.
     most = lambda values, of: jnp.max(jnp.where(of, values, 0.0))
-    off = jnp.sqrt(jnp.sum(own["position_error"] ** 2, axis=1))
+    distances = jnp.sqrt(jnp.sum(gauges["position_error"] ** 2, axis=1))
     # a reason stays for the rest of a chunk
-    now = jnp.max(jnp.where(flown, found.reason, 0))
+    now = jnp.max(jnp.where(flight_mask, chunk_rollout.reason, 0))
     reason = jnp.where(worst.reason == LoopReason.VALID, now, worst.reason)
-    valid = flown & (found.reason == LoopReason.VALID) & (worst.reason == LoopReason.VALID)
+    valid = (
+        flight_mask
+        & (chunk_rollout.reason == LoopReason.VALID)
+        & (worst.reason == LoopReason.VALID)
+    )
     last = mission.samples - 1
-    power = jnp.where(flown & (ts < (last - 0.5) / mission.plant.rate), own["electric_power"], 0.0)
+    # Energy is a sum of rectangles, which begins at each sample: the last one begins none.
+    power = jnp.where(
+        flight_mask & (ts < (last - 0.5) / mission.plant.rate), gauges["electric_power"], 0.0
+    )
     rotors, strokes, forces = worst.rotors, worst.strokes, worst.forces
     if of.speeds is not None:
         low, high = (jnp.sqrt(x) for x in of.speeds.squared(mission.machine.rotors.spin.shape[0]))
         # a rotor that has failed is within no limits
-        counted = flown[:, None] & (ts[:, None] < of.controller.lost)
-        rotors = jnp.minimum(rotors, _margin(own["rotor_speed"], low, high, counted))
+        counted = flight_mask[:, None] & (ts[:, None] < of.controller.lost[:, 0])
+        rotors = jnp.minimum(rotors, _smallest_margin(gauges["rotor_speed"], low, high, counted))
     if of.limits is not None:
         low, high = of.limits.lower, of.limits.upper
-        strokes = jnp.minimum(strokes, _margin(own["displacement"], low, high, flown[:, None]))
+        strokes = jnp.minimum(
+            strokes, _smallest_margin(gauges["displacement"], low, high, flight_mask[:, None])
+        )
     if mission.machine.force is not None:
         top, jam = of.controller.force, of.controller.jam
-        counted = flown[:, None] & (True if jam is None else ts[:, None] < jam.at)
-        forces = jnp.minimum(forces, _margin(own["wanted_force"], -top, top, counted))
-    turned = worst.panel
-    if "panel_error" in own:
-        turned = jnp.maximum(turned, most(own["panel_error"], panel))
+        counted = flight_mask[:, None] & (True if jam is None else ts[:, None] < jam.at)
+        forces = jnp.minimum(forces, _smallest_margin(gauges["wanted_force"], -top, top, counted))
+    efforts, joints = worst.efforts, worst.joints
+    if "joint_error" in gauges:
+        counted = base[:, None]
+        errors = jnp.where(counted, jnp.abs(gauges["joint_error"]), 0.0)
+        joints = jnp.maximum(joints, jnp.max(errors, axis=0))
+        top = of.gauges.efforts
+        is_limited = np.isfinite(mission.machine.efforts)
+        counted = flight_mask[:, None] & is_limited
+        efforts = jnp.minimum(
+            efforts, _smallest_margin(gauges["wanted_effort"], -top, top, counted)
+        )
+    panel_error = worst.panel
+    if "panel_error" in gauges:
+        panel_error = jnp.maximum(panel_error, most(gauges["panel_error"], panel))
     return Worst(
-        jnp.maximum(worst.position, most(off, base)),
-        jnp.maximum(worst.tilt, most(own["tilt_error"], base)),
-        turned, rotors, strokes, forces, worst.energy + jnp.sum(power) / mission.plant.rate, reason,
+        jnp.maximum(worst.position, most(distances, base)),
+        jnp.maximum(worst.tilt, most(gauges["tilt_error"], base)),
+        panel_error, joints, rotors, strokes, forces, efforts,
+        worst.energy + jnp.sum(power) / mission.plant.rate, reason,
         jnp.maximum(worst.end, jnp.max(jnp.where(valid, ts, 0.0))),
     )  # fmt: skip
 
 
-def _margin(values: Array, low: Array, high: Array, counted: Array) -> Float[Array, ""]:
+def _smallest_margin(values: Array, low: Array, high: Array, counted: Array) -> Float[Array, ""]:
     """Smallest distance from limits as a share of the range, of those values that count."""
-    left = jnp.minimum(values - low, high - values) / (high - low)
-    return jnp.min(jnp.where(counted, left, 1.0))
+    margins = jnp.minimum(values - low, high - values) / (high - low)
+    return jnp.min(jnp.where(counted, margins, 1.0))
 
 
-def mission_work(plain: Mapping[str, Any], folder: Path | str = ".") -> MissionWork:
-    """Work of a study of a mission from its plain data, in the form of its TOML file.
+def _remake_evaluation(
+    entries: Mapping[str, Any], folder: Path, relative: frozenset[str]
+) -> MissionEvaluation:
+    with jax.enable_x64(True):
+        return MissionEvaluation(make_mission(entries, folder), relative)
+
+
+def _factor_table(mission: Mission) -> Parameters:
+    """Parameters of the mission's machine, and the masses of its payloads."""
+    table = mission.machine.table
+    payloads = {
+        f"payload_{k}.mass": Parameter(payload.mass, "kg", "the mission's payload")
+        for k, payload in enumerate(mission.file.payloads, 1)
+    }
+    return Parameters(table.name, {name: table[name] for name in table} | payloads)
+
+
+def make_mission_study(
+    mission: Mission,
+    factors: Mapping[str, Any],
+    *,
+    relative: frozenset[str] = frozenset(),
+    lanes: int | None = None,
+    **settings: Any,
+) -> Study:
+    """Study of a mission, flown by many machines, each in its own gusts and noise.
+
+    Args:
+        mission: the mission, without a battery.
+        factors: distributions by name: of lines of the parameter table of the scene or of the model's file, and
+            of the masses `payload_1.mass`, ... of the mission's payloads [kg].
+        relative: names of factors that multiply the mission's value.
+        lanes: flights computed together, default 16 on any device.
+        settings: samples, seed, design, name and others of `stmuav_jax.Study`.
+
+    Raises:
+        SettingError: a mission with a battery, entries that its flights do not come to,
+            factors that are unknown, lengths, or of no effect.
+    """
+    if mission.battery is not None:
+        raise SettingError("A study of a mission has no battery: leave [battery] out.")
+    _check_judged(mission.file)
+    evaluation = MissionEvaluation(mission, relative)
+    model = mission.machine.model
+    loop_reasons = {
+        1 + int(reason): reason.label for reason in LoopReason if reason != LoopReason.VALID
+    }
+    quantities = _list_quantities(mission.machine)
+    find_target = lambda factor: _find_target(evaluation, factor)
+    columns = factor_columns(
+        factors, find_target, relative, {*quantities, "end", "status", "sample"}
+    )
+    for name, (unit, description) in quantities.items():
+        columns[name] = Column("int8" if name == "kept" else "float64", unit, description)
+    columns["end"] = Column("float64", "s", "last time with valid numbers", "diagnostic")
+    columns["status"] = Column("int8", "1", "how the flight ended", "status")
+    return Study(
+        evaluation, factors, columns=columns,
+        reasons=loop_reasons | {NOT_PHYSICAL: "masses or inertias that no body can have"},
+        identity={
+            "kind": "missions",
+            "mission": json.loads(mission.file.model_dump_json(exclude={"title"})),
+            "parameters": digest_table(evaluation.table, "" if model is None else model.digest),
+            "relative": sorted(relative), "failure": {"quantity": "kept", "below": 0.5},
+        },
+        lanes=LANES if lanes is None else lanes, **settings,
+    )  # fmt: skip
+
+
+def load_mission_study(
+    plain: Mapping[str, Any], folder: Path | str = ".", **settings: Any
+) -> Study:
+    """Study of a mission from its plain data, in the form of its TOML file.
 
     Args:
         folder: folder from which a mission's file is sought.
+        settings: `lanes` and `devices` of the `stmuav_jax.Study`.
 
     Raises:
-        SettingError: entries that are unknown, missing or out of range; also as for `MissionWork`.
+        SettingError: entries that are unknown, missing or out of range; also as for `make_mission_study`.
         FileError: see `load_mission`.
     """
-    given = checked(MissionStudyFile, plain, "A study of a mission")
-    factors, relative = factors_of(given.factors)
-    source = given.mission
+    entries = validate_model(MissionStudyFile, plain, "A study of a mission")
+    factors, relative = factors_of(entries.factors)
+    # the study's own entries first: a mission takes time to make
+    check_study(plain)
+    source = entries.mission
     path = Path(folder) / source if source.endswith(".toml") else source
-    mission = load_mission(path, t1=given.t1)
-    drawing = given.model_dump(include=set(Drawing.model_fields))
-    return MissionWork(mission, Sampling(factors, **drawing), relative=relative, name=given.name)
+    mission = load_mission(path, t1=entries.t1)
+    return make_mission_study(
+        mission, factors, relative=relative, **study_settings(entries), **settings
+    )
+
+
+def _list_quantities(machine: Machine) -> dict[str, tuple[str, str]]:
+    """Units and descriptions of the quantities that a machine's flights have."""
+    none = set()
+    if machine.bodies is None:
+        none |= {"panel_error", "stroke_margin"}
+    if machine.speeds is None:
+        none |= {"rotor_margin"}
+    if machine.force is None:
+        none |= {"force_margin"}
+    if not np.any(np.isfinite(machine.efforts)):
+        none |= {"effort_margin"}
+    of_joints = {
+        f"{column_name(drive.name)}_error": (drive.unit, f"largest error of joint {drive.name}")
+        for drive in machine.joints
+    }
+    return {name: _QUANTITIES[name] for name in _QUANTITIES if name not in none} | of_joints
+
+
+def _find_target(evaluation: MissionEvaluation, factor: str) -> FactorTarget:
+    """Target of a factor, which the mission's machine uses."""
+    table, machine = evaluation.table, evaluation.mission.machine
+    unknown = lambda: (
+        f"is no parameter of {machine.scene.name}."
+        f"{suggest_names(factor.partition('[')[0][:SHOWN], list(table))}"
+    )
+    target = table_entry(table, factor, factor in evaluation.relative, unknown)
+    if target.name in machine.table:
+        _check_effect(machine, factor, target.name)
+    return target
+
+
+def _check_effect(machine: Machine, factor: str, name: str) -> None:
+    """Raise `SettingError` for a factor that no flight of the machine would have, or not rightly."""
+    scene, model = machine.scene, machine.model
+    if model is None and name.startswith(_FIXED) and name not in _FREE:
+        raise SettingError(
+            f"{quote_name(factor)} can be no factor of a mission's study: loops and limits of strokes "
+            "are those of the mission's machine. Masses, inertias, centres of mass, rotors, "
+            "drag and motors can be."
+        )
+    line = scene.parameters.get(name)
+    if (line is None) if model is None else (name not in model.used_parameters()):
+        raise SettingError(
+            f"{quote_name(factor)} has no effect on this mission: its machine does not use it."
+        )
+    if model is None and line != machine.table[name].plain():
+        raise SettingError(f"'{name}' is given by the mission's options: it can be no factor.")

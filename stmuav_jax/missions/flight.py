@@ -1,4 +1,4 @@
-"""Flight of a mission: in chunks of one compiled program, interrupted and resumed."""
+"""Flight of a mission in chunks of one compiled program, whose samples an interruption leaves."""
 
 import dataclasses
 import time
@@ -12,19 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.compiler import program
-from ..control.closed_loop import LoopRun, run_of
+from ..control.closed_loop import LoopRun, Rollout, rollout, run_of
 from ..control.plant import Plant, PlantState
-from ..control.rolling import Rollout, rollout
-from ..rotorcraft.battery import Battery
+from ..math.compiler import cached_program
+from ..uav.battery import Battery
 from .mission import Mission
 
-# Time of a chunk [s]: progress is reported and Ctrl-C is heard after each.
+# Time of a chunk [s]: progress is reported and Ctrl-C ends a flight after each.
 CHUNK = 1.0
 Ending = Literal["", "interrupted", "battery empty", "failed"]
 
 
-class Reached(NamedTuple):
+class FlightProgress(NamedTuple):
     """Flight as far as it has come.
 
     Attributes:
@@ -49,60 +48,103 @@ class MissionFlight:
 
     Attributes:
         mission: the mission. run: run of its closed loop, with the signals of `GAUGES`.
-        reached: samples from which it can go on.
+        progress: samples, and the state of plant and controller after them.
         ending: reason for an early end; empty if the flight reached its end.
     """
 
     mission: Mission
     run: LoopRun
-    reached: Reached
+    progress: FlightProgress
     ending: Ending
 
 
-def start_of(mission: Mission) -> Reached:
+def start_of(mission: Mission) -> FlightProgress:
     """Flight that has not begun."""
-    given = mission.file.battery
-    return Reached(None, 1.0 if given is None else given.state_of_charge, (0.0, 0.0))
+    battery = mission.file.battery
+    return FlightProgress(None, 1.0 if battery is None else battery.state_of_charge, (0.0, 0.0))
 
 
 def fly(
     mission: Mission,
     *,
-    reached: Reached | None = None,
     progress: Callable[[float], object] | None = None,
-    keep: Callable[[Reached], object] | None = None,
-    heard: Callable[[], object] | None = None,
 ) -> MissionFlight:
     """Fly a mission to its end, to an empty battery, or until Ctrl-C; what was flown is kept.
 
     Args:
         mission: mission, from `load_mission` or `make_mission`.
-        reached: samples from which an interrupted flight goes on; by default it begins.
         progress: function that is called with the completed fraction after each second of flight.
-        keep: function that is called with the samples so far at the same times.
-        heard: function that is called once an interruption is noticed.
 
     Raises:
         KeyboardInterrupt: an interruption before anything was flown.
     """
-    now = start_of(mission) if reached is None else reached
+    now = start_of(mission)
     ending: Ending = ""
+    # Chunks of one length share a program; samples beyond the end are computed and left out, which
+    # costs less than a program for the rest.
     chunk = min(max(round(CHUNK * mission.plant.rate), 2), mission.samples)
     run = _Chunk(mission.controller, mission.references, mission.gauges, chunk)
     try:
         while now.samples < mission.samples and not ending:
-            now, ending = _onwards(mission, run, now)
+            now, ending = _fly_onwards(mission, run, now)
             if progress is not None:
                 progress(now.samples / mission.samples)
-            if keep is not None and not ending and now.samples < mission.samples:
-                keep(now)
     except KeyboardInterrupt:
-        if heard is not None:
-            heard()
         ending = "interrupted"
     if now.rows is None:
         raise KeyboardInterrupt
-    return MissionFlight(mission, run_of(mission.plant, now.rows, now.seconds), now, ending)
+    run = run_of(mission.plant, now.rows, now.seconds)
+    if run.failure:
+        # numbers until the failure: what follows it is no flight
+        # The battery may be the first without a number: a demand beyond its largest power has no
+        # current.
+        broken = now.rows.reason != 0
+        if mission.battery is not None:
+            broken |= ~np.isfinite(now.rows.signals["battery_current"])
+        rows = first_rows(now.rows, max(int(np.argmax(broken)), 1))
+        message = describe_failure(mission, rows, run)
+        now, run = now._replace(rows=rows), dataclasses.replace(run, rollout=rows, failure=message)
+    return MissionFlight(mission, run, now, ending)
+
+
+def describe_failure(mission: Mission, rows: Rollout, run: LoopRun) -> str:
+    """Reason for a failed flight: the first limit that it had left before, if there is one.
+
+    Args:
+        rows: samples until the failure.
+    """
+    machine, signals, exits = mission.machine, rows.signals, []
+
+    def note_first(outside: np.ndarray, describe: Callable[[Any], str]) -> None:
+        if np.any(outside):
+            place = np.argwhere(outside)[0]
+            exits.append((int(place[0]), describe(place)))
+
+    if machine.limits is not None:
+        low, high = np.asarray(machine.limits.lower), np.asarray(machine.limits.upper)
+        q = np.asarray(signals["displacement"])
+        note_first(
+            (q < low) | (q > high),
+            lambda k: f"slider {k[1] + 2} left its stroke of {low[k[1]]:.4g} to {high[k[1]]:.4g} m",
+        )
+    if machine.force is not None:
+        note_first(
+            np.abs(signals["wanted_force"]) > machine.force,
+            lambda k: f"the servo asked slider {k[1] + 2} for more than {machine.force:g} N",
+        )
+    note_first(signals["tilt_error"] > np.pi / 2, lambda k: "the base was upside down")
+    # A flight that diverges passes limits long before its numbers overflow: the first of them is
+    # the useful message.
+    t_end = run.certificate.t_end
+    if rows.ts[-1] < t_end:
+        exits.append((len(rows.ts), "it asked its battery for more than that can give"))
+    if not exits:
+        return run.failure
+    k, exit_text = min(exits)
+    return (
+        f"The flight got out of control: at t = {run.ts[k]:.6g} s {exit_text}, and after t = "
+        f"{t_end:.6g} s its motion had diverged: its numbers were no longer finite."
+    )
 
 
 class _Chunk(eqx.Module):
@@ -114,92 +156,126 @@ class _Chunk(eqx.Module):
     samples: int = eqx.field(static=True)
 
 
-def _begun(plant: Plant, key: Array) -> PlantState:
+def _reset_plant(plant: Plant, key: Array) -> PlantState:
     return plant.reset(key)
 
 
-def _chunk(run: _Chunk, plant: Plant, start: PlantState, memory: Any) -> Rollout:
+def _fly_chunk(run: _Chunk, plant: Plant, start: PlantState, memory: Any) -> Rollout:
     return rollout(
         plant, run.controller, run.samples, reference=run.reference, memory=memory,
         signals={"gauges": run.gauges}, start=start,
     )  # fmt: skip
 
 
-def _onwards(mission: Mission, run: _Chunk, now: Reached) -> tuple[Reached, Ending]:
+def _fly_onwards(
+    mission: Mission, run: _Chunk, now: FlightProgress
+) -> tuple[FlightProgress, Ending]:
     """Flight after one more chunk, and the reason if it ends there early."""
     clock = time.perf_counter()
     plant = mission.plant
     if now.rows is None:
         seed = 0 if mission.file.sensors is None else mission.file.sensors.seed
+        # The noise is that of the mission's seed: the same mission is the same flight.
         key = jax.random.key(seed)
-        start, memory = program(_begun, plant, key)(plant, key), mission.controller.start()
+        start, memory = (
+            cached_program(_reset_plant, plant, key)(plant, key),
+            mission.controller.start(),
+        )
     else:
         start, memory = now.rows.end, now.rows.memory
-    made = program(_chunk, run, plant, start, memory)
+    chunk_program = cached_program(_fly_chunk, run, plant, start, memory)
     compiled = time.perf_counter()
-    found = made(run, plant, start, memory)
-    seconds = now.seconds[0] + compiled - clock, now.seconds[1] + time.perf_counter() - compiled
-    rows = first_rows(found, mission.samples - now.samples)
-    rows = _with(rows, signals=dict(rows.signals["gauges"]))
+
+    def fly_chunk(start: PlantState, memory: Any, count: int) -> Rollout:
+        rows = first_rows(chunk_program(run, plant, start, memory), count)
+        return _replace_rows(rows, signals=dict(rows.signals["gauges"]))
+
+    remaining_count = mission.samples - now.samples
+    rows = fly_chunk(start, memory, remaining_count)
     ending: Ending = "failed" if np.any(rows.reason) else ""
     soc = now.soc
     if mission.battery is not None:
-        rows, soc, empty = _discharged(mission.battery, soc, rows, plant.rate)
-        ending = "battery empty" if empty else ending
-    return Reached(_joined(now.rows, rows), soc, seconds), ending
+        charge = _discharge_battery(mission.battery, soc, rows, plant.rate)
+        if charge.ending == "overloaded" and not ending and len(rows.ts) < remaining_count:
+            # a motion that diverges asks for it too, and its numbers break off within a second
+            beyond = fly_chunk(rows.end, rows.memory, remaining_count - len(rows.ts))
+            if np.any(beyond.reason):
+                rows, ending = _join_rows(rows, beyond), "failed"
+                charge = _discharge_battery(mission.battery, soc, rows, plant.rate)
+        rows, soc = _replace_rows(rows, signals=rows.signals | charge.signals), charge.soc
+        if charge.ending == "empty" or (charge.ending and not ending):
+            rows, ending = first_rows(rows, charge.samples), "battery empty"
+    seconds = now.seconds[0] + compiled - clock, now.seconds[1] + time.perf_counter() - compiled
+    return FlightProgress(_join_rows(now.rows, rows), soc, seconds), ending
 
 
-def _rows(found: Rollout) -> dict[str, Any]:
+def _sample_arrays(flight_rollout: Rollout) -> dict[str, Any]:
     """Arrays with a row for each sample."""
-    names = [field.name for field in dataclasses.fields(found)]
-    return {name: getattr(found, name) for name in names if name not in ("end", "memory")}
+    names = [field.name for field in dataclasses.fields(flight_rollout)]
+    return {name: getattr(flight_rollout, name) for name in names if name not in ("end", "memory")}
 
 
-def _with(found: Rollout, **rows: Any) -> Rollout:
+def _replace_rows(flight_rollout: Rollout, **rows: Any) -> Rollout:
     """Rollout with other rows, which may be NumPy arrays."""
-    return eqx.tree_at(lambda r: [getattr(r, name) for name in rows], found, list(rows.values()))
+    return eqx.tree_at(
+        lambda r: [getattr(r, name) for name in rows], flight_rollout, list(rows.values())
+    )
 
 
-def first_rows(found: Rollout, count: int) -> Rollout:
+def first_rows(samples: Rollout, count: int) -> Rollout:
     """Rollout of the first samples, as NumPy arrays."""
-    return _with(found, **jax.tree.map(lambda x: np.asarray(x)[:count], _rows(found)))
+    return _replace_rows(
+        samples, **jax.tree.map(lambda x: np.asarray(x)[:count], _sample_arrays(samples))
+    )
 
 
-def _joined(before: Rollout | None, after: Rollout) -> Rollout:
+def _join_rows(before: Rollout | None, after: Rollout) -> Rollout:
     if before is None:
         return after
-    both = jax.tree.map(lambda a, b: np.concatenate([a, b]), _rows(before), _rows(after))
-    return _with(after, **both)
+    both = jax.tree.map(
+        lambda a, b: np.concatenate([a, b]), _sample_arrays(before), _sample_arrays(after)
+    )
+    return _replace_rows(after, **both)
 
 
-def _drained(
+def _drain_samples(
     battery: Battery, soc: Float[Array, ""], power: Float[Array, " k"], period: Float[Array, ""]
-) -> tuple[Array, Array, Array]:
-    """State of charge and current at each sample, and the state of charge after the last.
+) -> tuple[Array, Array, Array, Array]:
+    """State of charge, current and voltage at each sample, and the state of charge after the last.
 
     The power is held from sample to sample, and the current is that at the state of charge before.
     """
 
-    def one(soc: Array, power: Array) -> tuple[Array, tuple[Array, Array]]:
+    # Explicit steps of a control period, within which the charge hardly changes.
+    def discharge_step(soc: Array, power: Array) -> tuple[Array, tuple[Array, Array]]:
         current = battery.current(power, soc)
         return soc - period * current / battery.capacity, (soc, current)
 
-    last, (socs, currents) = jax.lax.scan(one, soc, power)
-    return socs, currents, last
+    last, (socs, currents) = jax.lax.scan(discharge_step, soc, power)
+    return socs, currents, battery.voltage(socs) - battery.resistance * currents, last
 
 
-def _discharged(
-    battery: Battery, soc: float, rows: Rollout, rate: float
-) -> tuple[Rollout, float, bool]:
-    """Samples with the battery's signals, up to the one at which it can no more, if there is one."""
+class _Discharge(NamedTuple):
+    """Signals of the battery, its charge afterwards, and the samples until it ends, with the reason."""
+
+    signals: dict[str, np.ndarray]
+    soc: float
+    samples: int
+    ending: Literal["", "empty", "overloaded"]
+
+
+def _discharge_battery(battery: Battery, soc: float, rows: Rollout, rate: float) -> _Discharge:
+    """Discharge by samples: until its reserve is used up, or it is asked for more than it can give."""
     power = jnp.asarray(rows.signals["electric_power"])
-    given = (battery, jnp.asarray(soc), power, jnp.asarray(1.0 / rate))
-    socs, currents, last = (np.asarray(x) for x in program(_drained, *given)(*given))
-    voltage = np.asarray(battery.voltage(socs)) - float(battery.resistance) * currents
-    own = {"state_of_charge": socs, "battery_current": currents, "battery_voltage": voltage}
-    rows = _with(rows, signals=rows.signals | own)
-    over = (socs <= float(battery.reserve)) | (np.isfinite(power) & ~np.isfinite(currents))
+    arguments = (battery, jnp.asarray(soc), power, jnp.asarray(1.0 / rate))
+    socs, currents, voltages, last = (
+        np.asarray(x) for x in cached_program(_drain_samples, *arguments)(*arguments)
+    )
+    signals = {"state_of_charge": socs, "battery_current": currents, "battery_voltage": voltages}
+    empty = socs <= float(battery.reserve)
+    over = empty | (np.isfinite(power) & ~np.isfinite(currents))
     if not np.any(over):
-        return rows, float(last), bool(last <= battery.reserve)
+        ending = "empty" if last <= battery.reserve else ""
+        return _Discharge(signals, float(last), len(socs), ending)
     k = int(np.argmax(over))
-    return first_rows(rows, k + 1), float(socs[k]), True
+    return _Discharge(signals, float(socs[k]), k + 1, "empty" if empty[k] else "overloaded")

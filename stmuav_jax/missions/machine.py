@@ -1,5 +1,6 @@
 """Machine of a mission: its scene, sensors and controller, from the entries of its file."""
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -8,43 +9,109 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from ..checks.errors import SettingError
-from ..checks.numbers import floats
-from ..control.adaptation.adaptive import AdaptiveController
-from ..control.adaptation.payload_filter import PayloadFilter
-from ..control.estimator import MotionEstimator
-from ..control.flying import FlightController
-from ..control.geometric import FlightGains
-from ..control.instruments import Instrument
-from ..control.panel import PanelBodies, PanelServo, StrokeServo, panel_bodies
+from ..analysis.sensors import SENSORS, gravity_of
+from ..checks.errors import SettingError, nearest_names
+from ..checks.numbers import as_floats
+from ..checks.schema import SHOWN, quote_name
+from ..control.instruments import Instrument, SensorFault, count_periods, whole_periods
 from ..control.plant import Plant
-from ..control.uav import UavController
-from ..dynamics.scene import Scene
-from ..environment.wind import dryden, low_altitude
-from ..files.model_file import load_model
+from ..dynamics.simulation import Scene
+from ..io.air_entries import make_wind
+from ..io.model_file import ParametricModel, read_model
+from ..io.model_schema import DATASHEET
+from ..math.rotation import rotation_matrix
+from ..mechanics.inputs import inputs_of
 from ..mechanics.load import Sine
+from ..mechanics.parameters import Parameters
+from ..mechanics.state import State
 from ..mechanics.system import System
-from ..parameters.table import Parameters
-from ..rotorcraft.allocation import RotorLimits
-from ..rotorcraft.motor import MotorRotors
-from ..rotorcraft.rotor import Rotors, hover_speed_squared
-from ..scenes.registry import entry_of, make_scene, options_from_plain
-from ..sensing.sensors import SENSORS, gravity_of
-from ..tracker.actuator import LinearActuator
-from ..tracker.drive import SLIDER_JOINTS
-from ..tracker.geometry import tracker_geometry
-from ..tracker.workspace import Limits, tracker_limits
-from .disturbance import Jam, MissionController, MissionWind, Pilot, Told
-from .payload import WithoutPayload, table_carrying, tracker_carrying
-from .schema import MissionFile, SensorsEntry, ServoEntry, WindEntry
+from ..uav.adaptation import AdaptiveController, Payload, PayloadFilter, bodies_carrying
+from ..uav.airframe import PART_II
+from ..uav.allocation import RotorLimits
+from ..uav.drag import AirframeDrag, with_wind
+from ..uav.flight_controller import FlightController, FlightGains, UavController
+from ..uav.inner_motion import JointChain
+from ..uav.joint_controller import DrivenJoint, JointController, JointGains, driven_joints
+from ..uav.motion_estimator import MotionEstimator
+from ..uav.motor import MotorRotors, only_rotors
+from ..uav.panel_servo import PanelBodies, PanelServo, StrokeServo, panel_bodies
+from ..uav.rotor import Rotors, hover_speed_squared
+from ..uav.scenes.registry import entry_of, make_scene, options_from_plain
+from ..uav.tracker.bodies import SLIDER_JOINTS, LinearActuator
+from ..uav.tracker.geometry import tracker_geometry
+from ..uav.tracker.workspace import Limits, tracker_limits
+from .controller import Jam, MissionController, Pilot, PilotChange
+from .payloads import Payloads, Unloaded
+from .schema import (
+    FaultEntry,
+    InstrumentEntry,
+    JointServoEntry,
+    MissionFile,
+    PayloadEntry,
+    RatesEntry,
+    SensorsEntry,
+    ServoEntry,
+)
 
+
+def tracker_carrying(bodies: PanelBodies, payload: PayloadEntry) -> PanelBodies:
+    """The tracker's bodies with the payload on its panel."""
+    mass, place = jnp.asarray(payload.mass), jnp.asarray(payload.position, dtype=float)
+    # A point mass has no inertia of its own, only that of its place (Steiner).
+    inertia = mass * (place @ place * jnp.eye(3) - jnp.outer(place, place))
+    return bodies_carrying(bodies, Payload(mass, mass * place, jnp.zeros(3)), inertia)
+
+
+def table_carrying(table: Parameters, bodies: PanelBodies) -> Parameters:
+    """Parameter table of the machine whose panel has these numbers."""
+    return table.replaced(
+        {
+            "mass.panel_7": bodies.mass[-1],
+            "geometry.panel_com": bodies.geometry.panel_com,
+            "inertia.panel_7": bodies.inertia[-1],
+        },
+        "the table's panel with the mission's payload",
+    )
+
+
+class WithoutPayload(eqx.Module):
+    """Function of a plant's true state that returns that of the machine which its controller believes.
+
+    The panel's row is where the panel's own centre of mass is, not where that of panel and payload is.
+
+    Args:
+        loaded, empty: systems with and without the payload.
+    """
+
+    shift: Float[Array, "3"]
+
+    def __init__(self, loaded: System, empty: System) -> None:
+        # Rows of a state are centres of mass: with a payload that of the panel moves, and a
+        # controller that does not know of it would see the panel displaced.
+        R = rotation_matrix(empty.reference.p[-1])
+        self.shift = R.T @ (empty.reference.r[-1] - loaded.reference.r[-1])
+
+    def __call__(self, t: Float[Array, ""], state: State, internal: Float[Array, " z"]) -> State:
+        del t, internal
+        R = rotation_matrix(state.p[-1])
+        velocity_shift = R @ jnp.cross(state.omega[-1], self.shift)
+        r, v = state.r.at[-1].add(R @ self.shift), state.v.at[-1].add(velocity_shift)
+        return State(r, state.p, v, state.omega)
+
+
+# Density of the accelerations of a model's joints [rad/s^2/sqrt(Hz)]: the estimate follows encoders of 1e-3 rad
+# at 200 Hz with some 850 rad/s. With a tenth it lags so far behind a servo of 120 rad/s that this diverges.
+JOINT_NOISE = 50.0
 FORCES = ("force_slider_2", "force_slider_3")
 # Seconds by which gusts are longer than a flight, whose last samples are computed and left out.
 BEYOND = 10.0
+# Round-off of the motors' limits, as a share.
+AT_MOTORS = 1e-9
 _DEGREE = np.pi / 180
 # A common inertial unit at 400 Hz (0.005 degrees/s/sqrt(Hz), 100 micro-g/sqrt(Hz)), a position to
-# 1 cm, an attitude to 0.5 degrees, encoders to 0.01 mm.
+# 1 cm, an attitude to 0.5 degrees, encoders to 0.01 mm or 1e-5 rad.
 INSTRUMENTS: dict[str, dict[str, Any]] = {
     "gyroscope": {"noise": 1.75e-3},
     "accelerometer": {"noise": 0.02},
@@ -58,25 +125,35 @@ class Machine(NamedTuple):
     """Machine of a mission.
 
     Attributes:
-        scene: its scene. rotors: the rotors or motors. table: its parameters; None for a model.
+        scene: its scene. rotors: the rotors or motors. table: its parameters.
         bodies: bodies of the tracker, and limits: of its workspace; None without a tracker.
         speeds: limits of the rotor speeds, or None.
         believed: system without the payload, of which the controller does not know; None where it is
             that of the scene. `bodies` are those that the controller believes.
         force: largest force of each of the tracker's actuators, either way [N]; None for no limit.
+        model: the model's file; None for a ready scene. joints: its driven joints.
     """
 
     scene: Scene
     rotors: Rotors
-    table: Parameters | None
+    table: Parameters
     bodies: PanelBodies | None
     limits: Limits | None
     speeds: RotorLimits | None
     believed: System | None = None
     force: float | None = None
+    model: ParametricModel | None = None
+    joints: tuple[DrivenJoint, ...] = ()
+
+    @property
+    def efforts(self) -> np.ndarray:
+        """Largest efforts of the driven joints (n,) [N] or [N m]; infinite for no limit."""
+        forces: Any = self.scene.system.forces
+        limits = [forces[drive.force].limit for drive in self.joints]
+        return np.array([np.inf if limit is None else float(limit) for limit in limits])
 
 
-def machine_of(given: MissionFile, folder: Path) -> Machine:
+def machine_of(mission_file: MissionFile, folder: Path) -> Machine:
     """Machine of a mission; models' files are looked for from a folder.
 
     Raises:
@@ -84,314 +161,552 @@ def machine_of(given: MissionFile, folder: Path) -> Machine:
             rotors that are none.
         ModelError: numbers that the scene refuses. FileError: see `load_model`.
     """
-    entry = given.machine
+    entry = mission_file.machine
     if (entry.scene is None) == (entry.model is None):
         raise SettingError("'machine' needs a scene or a model's file, and not both.")
     if entry.model is not None:
-        return _model(given, folder / entry.model)
+        return _model_machine(mission_file, folder / entry.model)
     assert entry.scene is not None
     has_panel = entry.scene == "uav_tracker"
     if not has_panel:
-        _without_tracker(given, f"The scene {entry.scene}")
+        _without_tracker(mission_file, f"The scene {entry.scene}")
+    _check_joints(mission_file, ())
+    # A scene's own options and a mission's tables would set the same thing twice.
     for name, instead in (("wind", "[wind]"), ("strokes", "[[panel]]"), ("case", "[push]")):
         if name in entry.options:
             raise SettingError(
                 f"'machine.options' of a mission has no {name}: {instead} takes its place."
             )
+    # One table for scene, controller and limits: a mass that is changed is changed in all of them,
+    # unless it is drawn for the true machine alone.
     table = entry_of(entry.scene).parameters.replaced(entry.parameters)
-    scene = scene_of(given, table)
-    motors = next(f for f in scene.system.forces if isinstance(f, Rotors | MotorRotors))
-    own = getattr(motors, "limits", None)
+    scene = scene_of(mission_file, table)
+    motors = only_rotors(scene.system, "A mission")
+    rotors, rotor_limits = motors.rotors, getattr(motors, "limits", None)
     usual = RotorLimits(table.value("motor.lowest"), table.value("motor.highest"))
-    speeds = _speeds(given, own or usual)
-    rotors = motors.rotors if isinstance(motors, MotorRotors) else motors
+    speeds = _speed_limits(mission_file, rotor_limits or usual)
     if not has_panel:
         return Machine(scene, rotors, table, None, None, speeds)
     geometry, shift = tracker_geometry(table), table.value("mount.shift")
     bodies = panel_bodies(scene.system, geometry, shift)
-    limits, force = tracker_limits(table), given.controller.force
+    limits, force = tracker_limits(table), mission_file.controller.force
     empty = Machine(scene, rotors, table, bodies, limits, speeds, force=force)
-    return empty if given.payload is None else _loaded(empty, given)
+    return empty if mission_file.payload is None else _add_payload(empty, mission_file)
 
 
-def _loaded(empty: Machine, given: MissionFile) -> Machine:
+def _add_payload(empty: Machine, entries: MissionFile) -> Machine:
     """Machine with the mission's payload, from the one without."""
-    assert given.payload is not None
+    assert entries.payload is not None
     assert empty.bodies is not None
-    assert empty.table is not None
-    bodies = tracker_carrying(empty.bodies, given.payload)
+    bodies = tracker_carrying(empty.bodies, entries.payload)
     table = table_carrying(empty.table, bodies)
-    loaded = empty._replace(scene=scene_of(given, table), table=table)
-    if given.controller.payload == "known":
+    loaded = empty._replace(scene=scene_of(entries, table), table=table)
+    if entries.controller.payload == "known":
         return loaded._replace(bodies=bodies)
+    # A controller that does not know of the payload flies by the model of the empty machine.
     return loaded._replace(believed=empty.scene.system)
 
 
-def scene_of(given: MissionFile, table: Parameters, gusts: Any = None) -> Scene:
+def scene_of(
+    mission_file: MissionFile,
+    table: Parameters,
+    gusts: Any = None,
+    model: ParametricModel | None = None,
+) -> Scene:
     """Scene of a mission's machine in its air, with a table of parameters, which may be traced.
 
     Args:
-        gusts: seed of the gusts in place of the mission's.
+        gusts: seed of the gusts in place of the mission's. model: a model's file; None for a ready scene.
 
     Raises:
         SettingError: wind without drag, gusts without wind, options that the scene does not have.
         ModelError: numbers that the scene refuses.
     """
-    entry = given.machine
-    assert entry.scene is not None
-    options = options_from_plain(entry.scene, entry.options)
-    if given.wind is not None:
-        if "drag" not in options:
-            raise SettingError(
-                "Wind acts through the airframe's drag, which this machine does not have: add "
-                "'options.drag = {}' to [machine]."
-            )
-        options["wind"] = _wind(given.wind, table, given.t1, gusts)
-    # case 2 has actuators; a mission's own forces take the place of the report's
-    has_panel = entry.scene == "uav_tracker"
-    scene = make_scene(entry.scene, 2 if has_panel else None, table, **options)
-    return _pushed(scene, given) if has_panel else scene
-
-
-def _model(given: MissionFile, path: Path) -> Machine:
-    _without_tracker(given, "A model's file")
-    for name in ("options", "parameters"):
-        if getattr(given.machine, name):
-            raise SettingError(
-                f"'machine.{name}' is for scenes; a model's file has its own numbers."
-            )
-    if given.wind is not None:
-        raise SettingError("[wind] is for scenes; a model's file has no drag.")
-    scene = load_model(path)
-    found = [f for f in scene.system.forces if isinstance(f, Rotors)]
-    if len(found) != 1:
-        raise SettingError(
-            f"A mission needs a machine with one set of rotors, but {path} has {len(found)}."
+    entry = mission_file.machine
+    if model is None:
+        assert entry.scene is not None
+        # case 2 has actuators; a mission's own forces take the place of the report's
+        has_panel = entry.scene == "uav_tracker"
+        options = options_from_plain(entry.scene, entry.options)
+        scene = make_scene(entry.scene, 2 if has_panel else None, table, **options)
+        scene, wind, advice = (
+            _add_pushes(scene, mission_file),
+            mission_file.wind,
+            "'options.drag = {}' to [machine]",
         )
-    return Machine(scene, found[0], None, None, None, _speeds(given, None))
+    else:
+        system = model.system(table)
+        scene = dataclasses.replace(model.scene, system=system, state0=model.start(system, table))
+        wind = mission_file.wind or model.file.wind
+        advice = "a force of the kind 'drag' to the model's file"
+    if wind is None:
+        return scene
+    if not any(isinstance(force, AirframeDrag) for force in scene.system.forces):
+        raise SettingError(
+            f"Wind acts through the airframe's drag, which this machine does not have: add {advice}."
+        )
+    of_gusts = PART_II if model is not None else table
+    # Gusts are drawn for longer than the flight, since steps of the last period look beyond its
+    # end.
+    air = make_wind(wind, mission_file.t1 + BEYOND, table=of_gusts, seed=gusts)
+    return dataclasses.replace(scene, system=with_wind(scene.system, air))
 
 
-def _without_tracker(given: MissionFile, what: str) -> None:
+def _model_machine(entries: MissionFile, path: Path) -> Machine:
+    _without_tracker(entries, "A model's file")
+    if entries.machine.options:
+        raise SettingError(
+            "'machine.options' is for ready scenes (machine.scene): a model's file has drag, motors and landing "
+            "gear as forces of its own."
+        )
+    model = read_model(path)
+    table = model.table.replaced(entries.machine.parameters)
+    scene = scene_of(entries, table, model=model)
+    motors = only_rotors(scene.system, "A mission")
+    rotors, limits = motors.rotors, getattr(motors, "limits", None)
+    joints = driven_joints(scene.system)
+    _check_joints(entries, joints)
+    return Machine(
+        scene, rotors, table, None, None, _speed_limits(entries, limits), model=model, joints=joints
+    )
+
+
+def _check_joints(entries: MissionFile, joints: tuple[DrivenJoint, ...]) -> None:
+    """Raise `SettingError` for entries of joints that no effort and no servo of the machine drives."""
+    controller, tolerances = entries.controller, entries.tolerances
+    if entries.machine.model is not None and controller.feedforward is not None and not joints:
+        raise SettingError(
+            "'controller.feedforward' is of joints that move, which this model does not have."
+        )
+    names = [drive.name for drive in joints]
+    used = {
+        "[[joints]]": [move.joint for move in entries.joints],
+        "'controller.joints'": list(controller.joints),
+        "'tolerances.joints'": list(tolerances.joints),
+    }
+    for place, of_place in used.items():
+        for name in of_place:
+            if name not in names:
+                raise SettingError(
+                    f"{place} names {quote_name(name)}, but no effort or servo of the machine drives a joint of this "
+                    f"name.{nearest_names(name[:SHOWN], names)}"
+                )
+
+
+def _without_tracker(entries: MissionFile, machine_label: str) -> None:
     """Raise `SettingError` for entries that only a machine with a tracker can have."""
     used = {
-        "[[panel]]": given.panel, "[push]": given.push, "'controller.servo'": given.controller.servo,
-        "'controller.feedforward'": given.controller.feedforward is not None,
-        "'controller.force'": given.controller.force is not None,
-        "'sensors.encoders'": given.sensors and given.sensors.encoders,
-        "'tolerances.panel'": given.tolerances.panel, "[payload]": given.payload,
-        "'tolerances.panel_after'": given.tolerances.panel_after is not None,
-        "A fault of a slider": any(fault.slider for fault in given.faults),
+        "[[panel]]": entries.panel, "[push]": entries.push, "'controller.servo'": entries.controller.servo,
+        "'controller.feedforward'": entries.controller.feedforward is not None and not entries.machine.model,
+        "'controller.force'": entries.controller.force is not None,
+        "'sensors.encoders'": entries.sensors and entries.sensors.encoders and not entries.machine.model,
+        "'tolerances.panel'": entries.tolerances.panel, "[payload]": entries.payload,
+        "'tolerances.panel_after'": entries.tolerances.panel_after is not None,
+        "A fault of a slider": any(fault.slider for fault in entries.faults),
     }  # fmt: skip
     for name, value in used.items():
         if value:
             raise SettingError(
-                f"{name} needs the tracker of the scene uav_tracker. {what} has none."
+                f"{name} needs the tracker of the scene uav_tracker. {machine_label} has none."
             )
 
 
-def _speeds(given: MissionFile, own: RotorLimits | None) -> RotorLimits | None:
-    low, high = given.controller.lowest, given.controller.highest
-    if own is None and (low is None) != (high is None):
-        raise SettingError("Limits of the rotor speeds need 'lowest' and 'highest'.")
-    if own is None and low is None:
-        return None
-    lowest = low if low is not None else getattr(own, "lowest", 0.0)
-    return RotorLimits(lowest, high if high is not None else getattr(own, "highest", 0.0))
-
-
-def _wind(given: WindEntry, table: Parameters, t1: float, seed: Any) -> MissionWind:
-    steady = jnp.asarray(given.steady, dtype=float)
-    before: Any = steady
-    if given.gusts is not None:
-        numbers = [
-            table.value(f"gust.{name}") if (own := getattr(given.gusts, name)) is None else own
-            for name in ("height", "speed_20ft")
-        ]
-        speed = float(np.linalg.norm(given.steady))
-        if speed == 0.0:
-            raise SettingError(
-                "Gusts pass at the speed of the steady wind, which must not be zero."
-            )
-        before = dryden(
-            given.gusts.seed if seed is None else seed,
-            low_altitude(*numbers),
-            airspeed=speed,
-            duration=t1 + BEYOND,
-            mean=steady,
+def _speed_limits(mission_file: MissionFile, motors: RotorLimits | None) -> RotorLimits | None:
+    """Limits of the rotor speeds: the controller's, which lie within those of the motors."""
+    low, high = mission_file.controller.lowest, mission_file.controller.highest
+    if motors is None:
+        if low is None and high is None:
+            return None
+        if low is None or high is None:
+            raise SettingError("Limits of the rotor speeds need 'lowest' and 'highest'.")
+        return RotorLimits(low, high)
+    slowest, fastest = (
+        float(np.max(np.asarray(motors.lowest))),
+        float(np.min(np.asarray(motors.highest))),
+    )
+    # round-off of limits that are kept as squares
+    if low is not None and low < slowest * (1 - AT_MOTORS):
+        raise SettingError(
+            f"'controller.lowest' is {low:g} rad/s, but the motors turn no more slowly than {slowest:g} rad/s: "
+            "give a limit within the motors' range, or other motors ('options.motor = {lowest = ...}' in "
+            "[machine], machine.parameters \"motor.lowest\", or 'lowest' in a model)."
         )
-    change = given.change
-    if change is None:
-        return MissionWind(before, jnp.zeros(3), jnp.zeros(()), jnp.ones(()))
-    added = jnp.asarray(change.to, dtype=float) - steady
-    return MissionWind(before, added, jnp.asarray(change.at), jnp.asarray(change.rise))
+    if high is not None and high > fastest * (1 + AT_MOTORS):
+        raise SettingError(
+            f"'controller.highest' is {high:g} rad/s, but the motors turn no faster than {fastest:g} rad/s: "
+            "give a limit within the motors' range, or other motors ('options.motor = {highest = ...}' in "
+            '[machine], or machine.parameters "motor.highest").'
+        )
+    return RotorLimits(
+        motors.lowest if low is None else low, motors.highest if high is None else high
+    )
 
 
-def _pushed(scene: Scene, given: MissionFile) -> Scene:
+def _add_pushes(scene: Scene, entries: MissionFile) -> Scene:
     """Scene whose own actuators have plain forces, and others with sinusoidal ones if wanted."""
-    forces, own = list(scene.system.forces), []
+    forces, actuators = list(scene.system.forces), []
     for k, force in enumerate(forces):
         if isinstance(force, LinearActuator):
-            own.append(force)
-            forces[k] = eqx.tree_at(lambda f: f.force, force, floats(0.0))
-    if given.push is not None:
-        sine = Sine(jnp.asarray(given.push.force), jnp.asarray(given.push.angular_frequency))
-        forces += [eqx.tree_at(lambda f: f.force, f, sine) for f in own]
+            actuators.append(force)
+            # The scene's own forces would be added to those of the controller.
+            forces[k] = eqx.tree_at(lambda f: f.force, force, as_floats(0.0))
+    if entries.push is not None:
+        sine = Sine(jnp.asarray(entries.push.force), jnp.asarray(entries.push.angular_frequency))
+        forces += [eqx.tree_at(lambda f: f.force, f, sine) for f in actuators]
     system = eqx.tree_at(lambda s: s.forces, scene.system, tuple(forces))
     return dataclasses.replace(scene, system=system)
 
 
 def input_names(machine: Machine) -> list[str]:
     """Names of the inputs that a mission's controller sets."""
-    return ["speed_squared", *(FORCES if machine.bodies is not None else ())]
+    of_joints = [drive.input for drive in machine.joints]
+    return ["speed_squared", *(FORCES if machine.bodies is not None else of_joints)]
 
 
-def plant_of(given: MissionFile, machine: Machine) -> Plant:
+def plant_of(mission_file: MissionFile, machine: Machine) -> Plant:
     """Sampled plant of a machine, with instruments and estimator if the mission has them.
 
     Raises:
         SettingError: rates or delays that do not divide, instruments that do not suffice, a start that
             moves although it is to stand first.
     """
-    system, rate = machine.scene.system, given.rates.control
-    known = system if machine.believed is None else machine.believed
+    system, rate = machine.scene.system, mission_file.rates.control
+    # The controller's numbers are those it believes, and only the plant has the true ones.
+    believed_system = system if machine.believed is None else machine.believed
     names = input_names(machine)
-    count, mass = machine.rotors.spin.shape[0], float(np.sum(np.asarray(known.bodies.mass)))
+    count, mass = (
+        machine.rotors.spin.shape[0],
+        float(np.sum(np.asarray(believed_system.bodies.mass))),
+    )
     hover = hover_speed_squared(mass, gravity_of(system), machine.rotors.k_f, count)
-    before = np.concatenate([np.asarray(hover), np.zeros(len(names) - 1)])
+    rest = (
+        inputs_of(system, names).values(system)[count:]
+        if machine.joints
+        else np.zeros(len(names) - 1)
+    )
+    # Until the first command arrives the rotors carry the weight: with a delay the machine would
+    # otherwise begin with a fall.
+    before = np.concatenate([np.asarray(hover), np.asarray(rest)])
     settings: dict[str, Any] = {"inputs": names, "before": before, "rate": rate}
-    settings |= {"steps": given.rates.steps, "delay": given.rates.delay}
-    if given.sensors is None:
-        observe = None if machine.believed is None else WithoutPayload(system, known)
-        return Plant(machine.scene, observe=observe, **settings)
-    instruments = _instruments(given.sensors, machine)
-    estimator = MotionEstimator(system, rate, instruments, tracker=machine.bodies)
+    settings |= {"steps": mission_file.rates.steps, "delay": mission_file.rates.delay}
+    payloads = payloads_of(mission_file, machine.scene)
+    scene = machine.scene if payloads is None else payloads.load(machine.scene)
+    settings["changes"] = () if payloads is None else payloads.changes(scene.system)
+    if mission_file.sensors is None:
+        # True states are those of the true machine; a controller without the payload has to get
+        # those of its own model.
+        observe = None if machine.believed is None else WithoutPayload(system, believed_system)
+        observe = observe if payloads is None else Unloaded(payloads, observe)
+        return Plant(scene, observe=observe, **settings)
+    chain = None if machine.model is None or not system.joints else JointChain(believed_system)
+    instruments = _make_instruments(mission_file.sensors, machine, chain, mission_file.faults)
+    estimator_settings: dict[str, Any] = {"tracker": machine.bodies}
+    if chain is not None:
+        estimator_settings = {"joints": chain, "panel_noise": JOINT_NOISE}
+    estimator = MotionEstimator(system, rate, instruments, **estimator_settings)
+    # The estimator starts at the mission's start with its usual deviations, as a vehicle does
+    # whose pose on the ground was measured.
     memory = estimator.start(machine.scene.state0)
-    settings |= {"sensors": instruments, "standing": given.sensors.standing}
-    return Plant(machine.scene, estimator=estimator, memory=memory, **settings)
+    settings |= {"sensors": instruments, "standing": mission_file.sensors.standing}
+    return Plant(scene, estimator=estimator, memory=memory, **settings)
 
 
-def _instruments(given: SensorsEntry, machine: Machine) -> list[Instrument]:
+def payloads_of(entries: MissionFile, scene: Scene) -> Payloads | None:
+    """Payloads that the machine of a mission picks up or drops; None without any."""
+    return Payloads(entries.payloads, scene.system.names) if entries.payloads else None
+
+
+def _make_instruments(
+    sensor_entries: SensorsEntry,
+    machine: Machine,
+    chain: JointChain | None,
+    faults: tuple[FaultEntry, ...],
+) -> list[Instrument]:
+    """Instruments of the estimator, with the numbers of the mission, else of the model, else the usual ones."""
+    if (
+        any(fault.sensor == "encoders" for fault in faults)
+        and machine.bodies is None
+        and chain is None
+    ):
+        raise SettingError("A fault of encoders needs a machine with joints.")
     body = machine.scene.system.names[0]
     names = ("gyroscope", "accelerometer", "position", "attitude")
     kinds: dict[str, list[Any]] = {name: [SENSORS[name](body)] for name in names}
     if machine.bodies is not None:
         kinds["encoders"] = [SENSORS["encoder"](joint) for joint in SLIDER_JOINTS]
-    found = []
+    if chain is not None:
+        kinds["encoders"] = [SENSORS["encoder"](joint) for joint in chain.joints]
+    instruments = []
     for name, sensors in kinds.items():
-        entry = getattr(given, name)
-        own = {} if entry is None else entry.model_dump(exclude_none=True)
-        numbers: dict[str, Any] = INSTRUMENTS[name] | {
+        entry = getattr(sensor_entries, name)
+        instrument_settings = {} if entry is None else entry.model_dump(exclude_none=True)
+        mission_numbers: dict[str, Any] = {
             key: np.asarray(value) if key in ("noise", "bias") else value
-            for key, value in own.items()
+            for key, value in instrument_settings.items()
         }
-        found += [Instrument(sensor, **numbers) for sensor in sensors]
-    return found
+        mission_numbers["faults"] = tuple(
+            SensorFault(
+                fault.at,
+                np.inf if fault.until is None else fault.until,
+                None if fault.bias is None else np.asarray(fault.bias),
+            )
+            for fault in faults
+            if fault.sensor == name
+        )
+        # Numbers of the mission come before those of the model, and these before the usual ones:
+        # the more special file decides.
+        for usual in sensors:
+            sensor, numbers = _of_model(machine.scene, usual)
+            instruments.append(
+                Instrument(sensor, **(INSTRUMENTS[name] | numbers | mission_numbers))
+            )
+    return instruments
 
 
-def controller_of(given: MissionFile, machine: Machine, plant: Plant) -> MissionController:
+def _of_model(scene: Scene, usual: Any) -> tuple[Any, dict[str, Any]]:
+    """Sensor of a model's file that takes the place of the usual one, and its numbers; else this one, none."""
+    owner = lambda sensor: (
+        type(sensor),
+        getattr(sensor, "body", None),
+        getattr(sensor, "joint", None),
+    )
+    for instrument in scene.sensors.values():
+        if owner(instrument.sensor) == owner(usual):
+            sensor = copy.copy(instrument.sensor)
+            # The estimator finds instruments by the usual names; a model's file gives them names
+            # of its own.
+            object.__setattr__(sensor, "name", usual.name)
+            sheet = {key: getattr(instrument, key) for key in DATASHEET}
+            return sensor, {key: value for key, value in sheet.items() if value is not None}
+    return usual, {}
+
+
+def check_instruments(mission_file: MissionFile) -> None:
+    """Raise `SettingError` for instruments' rates and delays that cannot be flown."""
+    if mission_file.sensors is None:
+        return
+    rate = mission_file.rates.control
+    whole_periods(mission_file.sensors.standing, rate, "The time of standing")
+    for name, usual in INSTRUMENTS.items():
+        entry = getattr(mission_file.sensors, name) or InstrumentEntry()
+        numbers = usual | entry.model_dump(exclude_none=True)
+        reading_rate, delay = numbers.get("rate", rate), numbers.get("delay", 0.0)
+        # The estimator's prediction runs on these two at each period.
+        if name in ("gyroscope", "accelerometer") and (reading_rate != rate or delay):
+            raise SettingError(
+                f"'sensors.{name}' must read at every control period, at {rate:g} Hz, and without delay, because "
+                f"the estimator integrates it, but it reads at {reading_rate:g} Hz, late by {delay:g} s: leave "
+                "'rate' and 'delay' out, or set 'rates.control' to its rate."
+            )
+        count_periods(reading_rate, rate, f"'sensors.{name}'")
+        whole_periods(delay, rate, f"'sensors.{name}.delay'")
+
+
+def controller_of(mission_file: MissionFile, machine: Machine, plant: Plant) -> MissionController:
     """Controller of a mission with its faults.
 
     Raises:
         SettingError: entries that do not fit the servo, faults that the machine cannot have.
         ModelError: a machine that the controller cannot fly.
     """
-    pilot = _pilot(given, machine, plant, ())
-    found = _faulty(given, machine, pilot)
-    known: dict[float, list[int]] = {}
-    for fault in given.faults:
-        if not fault.known:
-            continue
-        if fault.rotor is None or fault.share:
-            raise SettingError(
-                "A fault that is 'known' must be the loss of a rotor, without a share of its thrust: "
-                "the controller has no other way to fly with a jammed slider or a weak rotor."
-            )
-        known.setdefault(fault.at, []).append(fault.rotor)
+    pilot = _make_pilot(mission_file, machine, plant, ())
+    controller = _add_faults(mission_file, machine, pilot)
+    # Controllers for lost rotors differ in structure and cannot be made within the compiled
+    # flight.
+    known_losses: dict[float, list[int]] = {}
+    for fault in mission_file.faults:
+        if fault.known and fault.rotor is not None:
+            known_losses.setdefault(fault.at, []).append(fault.rotor)
     lost: list[int] = []
-    told = []
-    for at in sorted(known):
-        lost = lost + known[at]
-        told.append(Told(jnp.asarray(at), _pilot(given, machine, plant, tuple(lost))))
-    return dataclasses.replace(found, told=tuple(told))
+    pilot_changes = []
+    for at in sorted(known_losses):
+        # Each known loss has a controller for all losses so far; all of them are built before the flight.
+        lost = lost + known_losses[at]
+        pilot_changes.append(
+            PilotChange(jnp.asarray(at), _make_pilot(mission_file, machine, plant, tuple(lost)))
+        )
+    return dataclasses.replace(controller, pilot_changes=tuple(pilot_changes))
 
 
-def _pilot(given: MissionFile, machine: Machine, plant: Plant, lost: tuple[int, ...]) -> Pilot:
+def _make_pilot(
+    entries: MissionFile, machine: Machine, plant: Plant, lost: tuple[int, ...]
+) -> Pilot:
     """Controller of a machine that knows of lost rotors."""
-    entry = given.controller
-    system = plant.system if machine.believed is None else machine.believed
+    entry = entries.controller
+    system = machine.scene.system if machine.believed is None else machine.believed
     gains = FlightGains(**entry.gains.model_dump(exclude_none=True))
+    # The same flight controller under all of them: joints and panel only add what they need from
+    # the rotors.
     flight = FlightController(system, plant.rate, gains=gains, limits=machine.speeds, lost=lost)
-    pilot: FlightController | UavController = flight
+    pilot: FlightController | UavController | JointController = flight
+    if machine.joints:
+        usual = JointGains(frequency=default_servo_frequency(entries.rates))
+        gains = {
+            name: _joint_gains(name, joint_entry, usual)
+            for name, joint_entry in entry.joints.items()
+        }
+        efforts = [drive.name for drive in machine.joints if drive.is_effort]
+        gains = dict.fromkeys(efforts, usual) | gains
+        pilot = JointController(system, flight, gains, feedforward=entry.feedforward is not False)
     if machine.bodies is not None:
-        servo = _servo(entry.servo or ServoEntry(), machine.bodies)
+        servo = _make_servo(entry.servo or ServoEntry(), machine.bodies, entries.rates)
         pilot = UavController(system, flight, servo, entry.feedforward is not False)
-    if entry.payload == "known" and given.payload is None:
+    if entry.payload == "known" and entries.payload is None:
         raise SettingError("'controller.payload' is known, but the mission has no [payload].")
     if entry.payload != "estimated":
         return pilot
-    if given.sensors is None:
+    if isinstance(pilot, JointController):
+        raise SettingError(
+            "'controller.payload' cannot be estimated by a machine with driven joints."
+        )
+    if entries.sensors is None:
         raise SettingError(
             "'controller.payload' is estimated from gyroscope and accelerometer, which only a mission with "
             "[sensors] has."
         )
-    own = given.sensors.gyroscope.noise
-    noise = np.asarray(INSTRUMENTS["gyroscope"]["noise"] if own is None else own)
-    found = PayloadFilter(
-        system, plant.rate, delay=given.rates.delay, gyroscope=float(np.sqrt(np.mean(noise**2)))
+    # The filter of the payload is tuned by the gyroscope's datasheet, as on a real machine.
+    gyroscope_noise = entries.sensors.gyroscope.noise
+    noise = np.asarray(
+        INSTRUMENTS["gyroscope"]["noise"] if gyroscope_noise is None else gyroscope_noise
     )
-    return AdaptiveController(pilot, found)
+    payload_filter = PayloadFilter(
+        system, plant.rate, delay=entries.rates.delay, gyroscope=float(np.sqrt(np.mean(noise**2)))
+    )
+    return AdaptiveController(pilot, payload_filter)
 
 
-def _servo(entry: ServoEntry, bodies: PanelBodies) -> PanelServo | StrokeServo:
-    own = entry.model_dump(exclude_none=True, exclude={"kind"})
+def default_servo_frequency(rates: RatesEntry) -> float:
+    """Natural frequency of the panel's servo [rad/s]: 120, or less where commands act late.
+
+    With the damping ratio 1 the servo's phase margin without delay is 76 degrees, at a crossover of 2.06
+    times its frequency. Half a period of hold and the delay take 35 degrees of it at this frequency.
+    """
+    return min(120.0, 0.3 / (rates.delay + 0.5 / rates.control))
+
+
+def _joint_gains(name: str, entry: JointServoEntry, usual: JointGains) -> JointGains:
+    """Gains of a joint's servo; what is left out is usual."""
+    numbers = entry.model_dump(exclude_none=True, exclude={"kind"})
+    if entry.kind == "pd":
+        if "stiffness" not in numbers or "frequency" in numbers:
+            raise SettingError(
+                f"'controller.joints.{name}' of the kind pd needs 'stiffness' and 'damping', and no frequency."
+            )
+        return JointGains(**numbers)
+    if "stiffness" in numbers:
+        raise SettingError(
+            f"'controller.joints.{name}' of the kind computed_torque has 'frequency' and 'damping', and no stiffness."
+        )
+    ratio = numbers.pop("damping", usual.damping_ratio)
+    return usual._replace(damping_ratio=ratio, **numbers)
+
+
+def _make_servo(
+    entry: ServoEntry, bodies: PanelBodies, rates: RatesEntry
+) -> PanelServo | StrokeServo:
+    servo_settings = entry.model_dump(exclude_none=True, exclude={"kind"})
+    if entry.kind == "computed_torque":
+        servo_settings = {"frequency": default_servo_frequency(rates)} | servo_settings
     kinds: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
         "computed_torque": (PanelServo, ("frequency", "damping")),
         "strokes": (StrokeServo, ("stiffness", "damping")),
     }
-    make, known = kinds[entry.kind]
-    for name in own:
-        if name not in known:
+    make, setting_names = kinds[entry.kind]
+    for name in servo_settings:
+        if name not in setting_names:
             raise SettingError(
-                f"'controller.servo' of the kind {entry.kind} has no {name}; it has {' and '.join(known)}."
+                f"'controller.servo' of the kind {entry.kind} has no {name}; it has {' and '.join(setting_names)}."
             )
-    return make(bodies, **own)
+    return make(bodies, **servo_settings)
 
 
-def _faulty(given: MissionFile, machine: Machine, pilot: Any) -> MissionController:
-    count = machine.rotors.spin.shape[0]
-    lost, share, jammed = np.full(count, np.inf), np.ones(count), np.full(2, np.inf)
-    for fault in given.faults:
-        if (fault.rotor is None) == (fault.slider is None):
-            raise SettingError("A fault needs a rotor or a slider, and not both.")
-        if fault.slider is not None:
-            if fault.share is not None:
-                raise SettingError(
-                    "'share' is for faults of rotors: a jammed slider does not move."
-                )
-            jammed[fault.slider - 2] = fault.at
+def check_faults(mission_file: MissionFile) -> None:
+    """Raise `SettingError` for faults that contradict themselves or each other."""
+    places: dict[str, FaultEntry] = {}
+    for fault in sorted(mission_file.faults, key=lambda fault: fault.at):
+        if sum(x is not None for x in (fault.rotor, fault.slider, fault.sensor)) != 1:
+            raise SettingError("A fault needs one of a rotor, a slider and a sensor.")
+        if fault.sensor is not None:
+            _check_sensor_fault(mission_file, fault)
             continue
-        assert fault.rotor is not None
+        if fault.bias is not None or fault.until is not None:
+            raise SettingError("'bias' and 'until' are for faults of sensors.")
+        if fault.slider is not None and fault.share is not None:
+            raise SettingError("'share' is for faults of rotors: a jammed slider does not move.")
+        if fault.known and (fault.rotor is None or fault.share):
+            raise SettingError(
+                "A fault that is 'known' must be the loss of a rotor, without a share of its thrust: "
+                "the controller has no law for a jammed slider or a weak rotor."
+            )
+        place = f"Rotor {fault.rotor}" if fault.rotor is not None else f"Slider {fault.slider}"
+        # Faults of one part are looked at in the order of time: one after a final fault, or at the
+        # same time, would silently have no effect.
+        before = places.get(place)
+        if before is not None and before.at == fault.at:
+            raise SettingError(
+                f"{place} has two faults at t = {fault.at:g} s: leave one of them out."
+            )
+        if before is not None and (before.known or fault.slider is not None):
+            raise SettingError(
+                f"{place} {'is lost' if before.known else 'is jammed'} from t = {before.at:g} s on, so that "
+                f"its fault at t = {fault.at:g} s has no effect: leave one of them out."
+            )
+        places[place] = fault
+
+
+def _check_sensor_fault(entries: MissionFile, fault: FaultEntry) -> None:
+    """Raise `SettingError` for a fault of a sensor that the mission cannot have."""
+    if entries.sensors is None:
+        raise SettingError("A fault of a sensor needs a mission with [sensors].")
+    if fault.known or fault.share is not None:
+        raise SettingError("'known' and 'share' are for faults of rotors.")
+    if fault.until is not None and fault.until <= fault.at:
+        raise SettingError(
+            f"A fault of a sensor must end after it begins, but it lasts from {fault.at:g} to {fault.until:g} s."
+        )
+
+
+def _add_faults(entries: MissionFile, machine: Machine, pilot: Any) -> MissionController:
+    count, jammed = machine.rotors.spin.shape[0], np.full(2, np.inf)
+    of_rotors: list[list[tuple[float, float]]] = [[] for _ in range(count)]
+    for fault in sorted(entries.faults, key=lambda fault: fault.at):
+        if fault.slider is not None:
+            jammed[fault.slider - 2] = fault.at
+        if fault.rotor is None:
+            continue
         if fault.rotor > count:
             raise SettingError(
                 f"The machine has rotors 1 to {count}, but no rotor {fault.rotor} to fail."
             )
-        lost[fault.rotor - 1] = fault.at
-        share[fault.rotor - 1] = fault.share or 0.0
+        of_rotors[fault.rotor - 1].append((fault.at, fault.share or 0.0))
+    # a row for each rotor, its faults in the order of their times, filled up with faults that never come
+    most = max(1, *map(len, of_rotors))
+    rows = [[*faults, *[(np.inf, 1.0)] * (most - len(faults))] for faults in of_rotors]
+    # Arrays of times and shares, padded: the number of faults is structure, their times and sizes
+    # are numbers that a study may draw.
+    lost, share = np.moveaxis(np.array(rows), -1, 0)
     motors = [f for f in machine.scene.system.forces if isinstance(f, MotorRotors)]
+    # A lost rotor stands still, which motors with a lowest speed could not.
     slowest = [f.limits.lowest for f in motors if f.limits is not None]
     if np.any(np.isfinite(lost)) and slowest and float(np.max(np.asarray(slowest[0]))) > 0:
         raise SettingError(
             "A rotor that fails turns more slowly than the motors' lowest speed: give "
-            "'options.motor = {lowest = 0.0}', and the controller's limit as 'controller.lowest'."
+            "'options.motor = {lowest = 0.0}' (a model's motors 'lowest = 0.0'), and the controller's limit as "
+            "'controller.lowest'."
         )
     jam = None
     if np.any(np.isfinite(jammed)):
-        if given.sensors is not None:
+        if entries.sensors is not None:
             raise SettingError(
                 "A jammed slider is held by its true stroke, which only a mission without [sensors] has."
             )
         assert machine.bodies is not None
         jam = Jam(machine.bodies.geometry, jnp.asarray(jammed))
-    most = np.inf if machine.force is None else machine.force
-    force = floats(np.full(0 if machine.bodies is None else 2, most))
-    return MissionController(pilot, floats(lost), floats(share), jam, force)
+    most_force = np.inf if machine.force is None else machine.force
+    # a servo's input is a target, which no limit of its effort cuts off
+    of_joints = [
+        x if drive.is_effort else np.inf
+        for drive, x in zip(machine.joints, machine.efforts, strict=True)
+    ]
+    force = as_floats(np.full(2, most_force) if machine.bodies is not None else np.array(of_joints))
+    return MissionController(pilot, as_floats(lost), as_floats(share), jam, force)

@@ -1,10 +1,12 @@
 """Missions from TOML files: read, checked before the flight, and made ready to fly."""
 
+import dataclasses
+import itertools
 import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime, time, timedelta
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,40 +15,70 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..algebra.compiler import quick_jit
-from ..algebra.rotation import rotation_matrix
-from ..algebra.sampled import Sampled
+from ..analysis.sensors import gravity_of
 from ..checks.errors import ModelError, SettingError, StateError, nearest_names
-from ..checks.numbers import floats
-from ..checks.schema import SHOWN, checked
-from ..control.closed_loop import inspected
-from ..control.geometric import attitude_of
+from ..checks.numbers import as_floats
+from ..checks.schema import SHOWN, validate_model
+from ..control.closed_loop import inspect_plant
 from ..control.instruments import whole_periods
-from ..control.panel import panel_motion
 from ..control.plant import Plant
-from ..environment.ephemeris import Place
-from ..environment.sun import sun_position
-from ..files.netcdf import FileError, read_toml
-from ..mechanics.forces.contact import GroundContact
+from ..io.air_entries import BatteryEntry
+from ..io.netcdf import FileError, read_toml
+from ..math.compiler import quick_jit
+from ..math.derivative import motion_along
+from ..math.rotation import rotation_matrix
+from ..math.sampled import Sampled
+from ..mechanics.forces import GroundContact
 from ..mechanics.state import State
-from ..parameters.energy import ENERGY
-from ..rotorcraft.battery import Battery
-from ..sensing.sensors import gravity_of
-from ..tracker.day import day_zone, parse_date
-from ..tracker.kinematics import Reason, panel_angles, panel_normal
-from ..tracker.pointing import why_outside
-from ..tracker.workspace import survey
-from .disturbance import MissionController
-from .effort import check_forces
-from .gauges import Gauges
-from .machine import BEYOND, Machine, controller_of, machine_of, plant_of
-from .reference import DirectionMotion, HeldPath, PanelMoves, References, WaypointPath
+from ..uav.adaptation import AdaptiveController
+from ..uav.airframe import ENERGY
+from ..uav.battery import Battery
+from ..uav.environment.calendar import day_zone, local_time, parse_date
+from ..uav.environment.ephemeris import Place
+from ..uav.environment.sun import sun_position
+from ..uav.flight_controller import BaseMotion, attitude_of, base_motion, feet_of
+from ..uav.joint_controller import JointController, read_joints
+from ..uav.panel_servo import PanelBodies, StrokeServo, inverse_dynamics, panel_bodies, panel_motion
+from ..uav.stability import MARGINAL, flight_of, make_hover, scale_pilot
+from ..uav.tracker.geometry import tracker_geometry
+from ..uav.tracker.kinematics import PairMotion, Reason, panel_angles, panel_normal
+from ..uav.tracker.workspace import survey, why_outside
+from .controller import (
+    AT_ONCE,
+    DirectionMotion,
+    HeldPath,
+    JointMoves,
+    MissionController,
+    PanelMoves,
+    Pilot,
+    References,
+    WaypointPath,
+)
+from .machine import (
+    BEYOND,
+    Machine,
+    WithoutPayload,
+    check_faults,
+    check_instruments,
+    controller_of,
+    input_names,
+    machine_of,
+    payloads_of,
+    plant_of,
+)
 from .schema import MissionFile, MoveEntry, PathEntry, SunEntry
+from .signals import Gauges
 
 LIBRARY = Path(__file__).parent / "library"
 _DEGREE = math.pi / 180
-# Times at which references are checked, and longest time of the sun between samples of it [s].
-_CHECKED, _SUN_STEP = 1001, 600.0
+# Longest time of the sun between samples of it [s].
+_SUN_STEP = 600.0
+# Factor by which small motions may grow in a second: slower growth, which drag may damp, is flown, and the
+# verdict says it. Shares of the gains' frequencies that are tried for a loop that is unstable.
+_FASTEST_GROWTH, _FACTORS = 10.0, np.geomspace(0.98, 0.02, 100)
+# Steps of a reference that count as none: in position, velocity and rates [m, m/s, rad/s], in heading
+# [degrees].
+_STEP, _STEP_ANGLE = 1e-3, 0.1
 
 
 @dataclass(frozen=True)
@@ -58,6 +90,8 @@ class Mission:
         plant: sampled plant. controller: controller with faults. references: function of t [s].
         gauges: function of a `Sample` that returns the signals.
         battery: battery that ends the flight when it is empty, or None.
+        growth: factor by which small motions about hover grow in a second; up to 1 for a stable loop.
+        folder: folder of the model's file.
     """
 
     file: MissionFile
@@ -67,6 +101,8 @@ class Mission:
     references: References
     gauges: Gauges
     battery: Battery | None
+    growth: float = 0.0
+    folder: Path = Path()
 
     @property
     def samples(self) -> int:
@@ -107,7 +143,7 @@ def load_mission(
     if "bodies" in content:
         raise FileError(
             f'{path} is a model, not a mission: a mission names it with model = "{path.name}" in its '
-            "table [machine] (docs/missions.md)."
+            "table [machine] (docs/control_and_missions.md)."
         )
     if t1 is not None:
         content["t1"] = t1
@@ -131,87 +167,167 @@ def make_mission(plain: Mapping[str, Any], folder: str | os.PathLike[str] = ".")
         SettingError: an entry is unknown, missing or out of range, or a reference is out of reach.
         ModelError, StateError: the machine's numbers make no sense.
     """
-    given = checked(MissionFile, plain, "A mission")
-    machine = machine_of(given, Path(folder))
-    plant = inspected(plant_of(given, machine))
-    panel = _moves(given, machine) if machine.bodies is not None else None
-    if given.battery is not None and given.battery.state_of_charge <= (given.battery.reserve or 0):
-        raise SettingError("'battery.state_of_charge' must be above its reserve.")
-    _check_gear(given, plant)
+    entries = validate_model(MissionFile, plain, "A mission")
+    # what the entries tell alone, before anything is compiled
+    whole_periods(entries.t1, entries.rates.control, "The time of the flight")
+    whole_periods(entries.rates.delay, entries.rates.control, "The delay of the inputs")
+    check_faults(entries)
+    check_instruments(entries)
+    _check_moves(entries)
+    battery = _make_battery(entries) if entries.machine.model is None else None
+    machine = machine_of(entries, Path(folder))
+    battery = (
+        battery if machine.model is None else _make_battery(entries, machine.model.file.battery)
+    )
+    # From here on numbers are computed; the entries by themselves are consistent.
+    plant = inspect_plant(plant_of(entries, machine))
+    panel = _make_moves(entries, machine) if machine.bodies is not None else None
+    _check_gear(entries, plant)
     mission = Mission(
-        given, machine, plant, controller_of(given, machine, plant),
-        References(_path(given.path, machine), panel), Gauges(machine, plant.system), _battery(given),
+        entries, machine, plant, controller_of(entries, machine, plant),
+        References(_make_path(entries.path, machine), panel, _joint_moves(entries, machine)),
+        Gauges(machine, plant.system, payloads_of(entries, machine.scene)), battery, folder=Path(folder),
     )  # fmt: skip
     assert mission.samples > 1
+    # Checks go from cheap to expensive: the start, thrusts along the path, the linear loop, and
+    # last the panel's workspace, which compiles the kinematics.
+    _check_start(mission)
     _check_thrust(mission)
+    mission = dataclasses.replace(mission, growth=_check_stability(mission))
     if panel is not None:
         _check_panel(mission)
-        check_forces(given, machine, mission.references)
+        check_forces(entries, machine, mission.references)
     return mission
 
 
-def _check_gear(given: MissionFile, plant: Plant) -> None:
-    """Raise `SettingError` for tolerances of a landing gear that the machine does not have."""
-    wanted = [k for k in ("touchdown", "sink") if getattr(given.tolerances, k) is not None]
-    if wanted and not any(isinstance(f, GroundContact) for f in plant.system.forces):
-        raise SettingError(
-            f"'tolerances.{wanted[0]}' needs a landing gear, which this machine does not have: add "
-            "'options.gear = {}' to [machine]."
-        )
-
-
-def _path(given: PathEntry, machine: Machine) -> HeldPath | WaypointPath:
-    """Path; by default the one that holds the place of the start."""
-    if given.waypoints is not None:
-        if (given.position, given.heading, given.acceleration) != (None, None, None):
-            raise SettingError(
-                "'path' has waypoints, and then neither position nor heading nor acceleration."
-            )
-        ts = np.array([point.t for point in given.waypoints])
-        rows = [(*point.position, _DEGREE * point.heading) for point in given.waypoints]
-        return WaypointPath(ts, np.array(rows).reshape(len(ts), 4))
-    start = machine.scene.state0.r[0] if given.position is None else given.position
-    a = (0.0, 0.0, 0.0) if given.acceleration is None else given.acceleration
-    numbers = (start, a, _DEGREE * (given.heading or 0.0))
-    return HeldPath(*(jnp.asarray(x, dtype=float) for x in numbers))
-
-
-def _moves(given: MissionFile, machine: Machine) -> PanelMoves:
-    """Moves of the panel, the first of them from its place at the start."""
-    state = machine.scene.state0
-    angles = panel_motion(state).value
+def _check_moves(mission_file: MissionFile) -> None:
+    """Raise `SettingError` for moves of the panel of two kinds, or that do not follow one another."""
     kinds = set()
-    for move in given.panel:
-        own = [name for name in ("angles", "direction", "sun") if getattr(move, name) is not None]
-        if len(own) != 1:
+    for move in mission_file.panel:
+        goals = [name for name in ("angles", "direction", "sun") if getattr(move, name) is not None]
+        # Angles turn with the base, and directions are of the world: one path between both is not defined.
+        if len(goals) != 1:
             raise SettingError(
                 "A move of the panel needs one of angles, direction and sun, but it has "
-                f"{' and '.join(own) or 'none'}."
+                f"{' and '.join(goals) or 'none'}."
             )
-        kinds.add(own[0] != "angles")
+        kinds.add(goals[0] != "angles")
     if len(kinds) == 2:
         raise SettingError(
             "The moves of the panel must all be to angles in the base's axes, or all to directions "
             "of the world and the sun."
         )
-    world = kinds == {True}
-    start = _normal(state, angles) if world else angles
-    targets = tuple(_target(move, given.t1) for move in given.panel)
+    for k, (first, second) in enumerate(itertools.pairwise(mission_file.panel), 1):
+        if second.at < first.at + first.duration - AT_ONCE:
+            raise SettingError(
+                f"The moves of the panel must follow one another, but move {k + 1} begins at t = {second.at:g} s, "
+                f"before the end of move {k} at {first.at + first.duration:g} s: list them by their times, and "
+                "give each its time."
+            )
+
+
+def _check_gear(entries: MissionFile, plant: Plant) -> None:
+    """Raise `SettingError` for tolerances of a landing gear that the machine does not have."""
+    tolerance_names = [
+        k for k in ("touchdown", "sink") if getattr(entries.tolerances, k) is not None
+    ]
+    if tolerance_names and not any(isinstance(f, GroundContact) for f in plant.system.forces):
+        raise SettingError(
+            f"'tolerances.{tolerance_names[0]}' needs a landing gear, which this machine does not have: add "
+            "'options.gear = {}' to [machine]."
+        )
+
+
+def _make_path(entry: PathEntry, machine: Machine) -> HeldPath | WaypointPath:
+    """Path; by default the one that holds the place of the start."""
+    if entry.waypoints is not None:
+        if (entry.position, entry.heading, entry.acceleration) != (None, None, None):
+            raise SettingError(
+                "'path' has waypoints, and then neither position nor heading nor acceleration."
+            )
+        ts = np.array([point.t for point in entry.waypoints])
+        rows = [(*point.position, _DEGREE * point.heading) for point in entry.waypoints]
+        return WaypointPath(ts, np.array(rows).reshape(len(ts), 4))
+    start = base_motion(machine.scene.state0)
+    r = start.r if entry.position is None else entry.position
+    a = (0.0, 0.0, 0.0) if entry.acceleration is None else entry.acceleration
+    yaw = _base_heading(start) if entry.heading is None else _DEGREE * entry.heading
+    return HeldPath(*(jnp.asarray(x, dtype=float) for x in (r, a, yaw)))
+
+
+def _base_heading(base: BaseMotion) -> float:
+    """Heading of a base [rad]."""
+    x, y = np.asarray(base.R)[:2, 0]
+    return math.atan2(y, x)
+
+
+def _check_start(mission: Mission) -> None:
+    """Raise `SettingError` for references that begin elsewhere than the machine does.
+
+    The path of a machine that stands on the ground may begin below it.
+    """
+    if mission.file.path.step:
+        return
+    state = mission.machine.scene.state0
+    base, goal = base_motion(state), _evaluate_path(mission.references.path, as_floats(np.zeros(1)))
+    r, v = np.asarray(goal.r)[0], np.asarray(goal.v)[0]
+    # A reference that begins with a step is answered by a jump of the commands, and counts as an
+    # error of the controller.
+    offset, velocity_step = r - np.asarray(base.r), np.asarray(base.v) - v
+    feet = feet_of(mission.plant.system)
+    # A machine on its feet may stand lower than its path by the springs' deflection.
+    if feet is not None and offset[2] < 0:
+        heights = np.asarray(base.r[2] + feet.places @ base.R[2] - feet.ground)
+        offset = offset * [1.0, 1.0, 0.0] if np.min(heights) < _STEP else offset
+    yaw, heading = _base_heading(base) / _DEGREE, float(goal.heading[0]) / _DEGREE
+    heading_step, omega = math.remainder(heading - yaw, 360.0), np.asarray(base.omega)
+    rates = np.zeros(2) if mission.machine.bodies is None else np.asarray(panel_motion(state).rate)
+    steps = [
+        (offset, _STEP, "m", f"the path begins at {_text(r)} m and the machine at {_text(base.r)} m"),
+        (heading_step, _STEP_ANGLE, "degrees", f"the path begins with a heading of {heading:.4g} degrees and the "
+         f"machine with {yaw:.4g} degrees"),
+        (velocity_step, _STEP, "m/s", f"the path begins with {_text(v)} m/s and the machine with {_text(base.v)} m/s"),
+        (omega, _STEP, "rad/s", f"the machine begins with angular velocities of {_text(omega)} rad/s"),
+        (rates, _STEP, "rad/s", f"the panel begins with angular rates of {_text(rates)} rad/s"),
+    ]  # fmt: skip
+    for step, most, unit, places in steps:
+        size = float(np.linalg.norm(step))
+        if size > most:
+            raise SettingError(
+                f"The reference begins with a step of {size:.4g} {unit}: {places}. Let it begin where the machine "
+                "does ('machine.options.start' moves the machine), or allow the step by "
+                "'path.step = true'."
+            )
+
+
+def _text(values: Any) -> str:
+    return f"({', '.join(f'{float(x):.4g}' for x in np.asarray(values))})"
+
+
+def _make_moves(entries: MissionFile, machine: Machine) -> PanelMoves:
+    """Moves of the panel, the first of them from its place at the start."""
+    state = machine.scene.state0
+    angles = panel_motion(state).value
+    # Moves in the world go on from the direction of the panel's normal at the start, moves of
+    # angles from the angles.
+    world = bool(entries.panel) and entries.panel[0].angles is None
+    start = _panel_normal(state, angles) if world else angles
+    targets = tuple(_move_target(move, entries.t1) for move in entries.panel)
     ats, durations = (
-        tuple(jnp.asarray(getattr(move, name)) for move in given.panel)
+        tuple(jnp.asarray(getattr(move, name)) for move in entries.panel)
         for name in ("at", "duration")
     )
-    shapes = tuple(jnp.asarray(move.shape, dtype=float) for move in given.panel)
+    shapes = tuple(jnp.asarray(move.shape, dtype=float) for move in entries.panel)
     return PanelMoves(start, targets, ats, durations, world, shapes)
 
 
 @quick_jit
-def _normal(state: State, angles: Float[Array, "2"]) -> Float[Array, "3"]:
+def _panel_normal(state: State, angles: Float[Array, "2"]) -> Float[Array, "3"]:
     """Normal of the panel in the world."""
     return rotation_matrix(state.p[0]) @ panel_normal(angles)
 
 
-def _target(move: MoveEntry, t1: float) -> Any:
+def _move_target(move: MoveEntry, t1: float) -> Any:
     if move.angles is not None:
         return _DEGREE * jnp.asarray(move.angles)
     if move.direction is not None:
@@ -220,34 +336,80 @@ def _target(move: MoveEntry, t1: float) -> Any:
             raise SettingError("A direction for the panel has zero length; give any vector to it.")
         return jnp.asarray(move.direction) / length
     assert move.sun is not None
-    return _sun(move.sun, t1)
+    return _sun_direction(move.sun, t1)
 
 
-def _sun(given: SunEntry, t1: float) -> Sampled:
+def _sun_direction(entry: SunEntry, t1: float) -> Sampled:
     """Direction to the sun, world (3,), as a function of the flight's time [s]."""
-    zone = day_zone(given.timezone, given.lon)
-    begin = datetime.combine(parse_date(given.date), time(), zone) + timedelta(hours=given.hour)
-    place = Place.degrees(given.lat, given.lon, given.altitude)
+    zone = day_zone(entry.timezone, entry.lon)
+    begin = local_time(parse_date(entry.date), entry.hour, zone)
+    place = Place.degrees(entry.lat, entry.lon, entry.altitude)
+    # A little longer than the flight, as the last samples of a chunk lie beyond its end.
     end = t1 + BEYOND
-    ts = np.linspace(0.0, end, max(8, math.ceil(end * given.speed / _SUN_STEP) + 1))
-    sun = sun_position(begin.timestamp() + given.speed * ts, place)
+    ts = np.linspace(0.0, end, max(8, math.ceil(end * entry.speed / _SUN_STEP) + 1))
+    # The sun is slow: samples ten minutes apart and a spline of fifth degree are exact to micro-radians.
+    sun = sun_position(begin.timestamp() + entry.speed * ts, place)
     down = ~np.asarray(sun.is_up) & (ts <= t1)
     if np.any(down):
         k = int(np.argmax(down))
-        when = begin + timedelta(seconds=float(given.speed * ts[k]))
+        # by way of UTC, because the clocks may change during the flight
+        when = datetime.fromtimestamp(begin.timestamp() + float(entry.speed * ts[k]), zone)
         raise SettingError(
             f"The sun is {-math.degrees(float(sun.elevation[k])):.3g} degrees below the horizon at "
-            f"{given.lat:g} degrees north, {given.lon:g} east on {when.isoformat(timespec='seconds')}, "
+            f"{entry.lat:g} degrees north, {entry.lon:g} east on {when.isoformat(timespec='seconds')}, "
             f"t = {ts[k]:.4g} s of the flight: there is nothing to point at. Is the time zone right?"
         )
     return Sampled(ts, np.asarray(sun.s_w).T)
 
 
-def _battery(given: MissionFile) -> Battery | None:
-    if given.battery is None:
+def _joint_moves(entries: MissionFile, machine: Machine) -> JointMoves | None:
+    """Moves of a model's driven joints, from their targets or from where they are at the start."""
+    if not machine.joints:
         return None
-    own = given.battery.model_dump(exclude_none=True, exclude={"state_of_charge"})
-    return Battery.of(ENERGY.replaced({f"battery.{name}": value for name, value in own.items()}))
+    system = machine.scene.system
+    forces: Any = system.forces
+    values = np.asarray(read_joints(system, machine.joints, machine.scene.state0)[0])
+    moves = []
+    for drive, value in zip(machine.joints, values, strict=True):
+        of_joint = [move for move in entries.joints if move.joint == drive.name]
+        for first, second in itertools.pairwise(of_joint):
+            if second.at < first.at + first.duration - AT_ONCE:
+                raise SettingError(
+                    f"The moves of joint '{drive.name}' must follow one another, but the one at t = {second.at:g} s "
+                    f"begins before the end of that before it, at {first.at + first.duration:g} s."
+                )
+        unit = _DEGREE if drive.kind == "angle" else 1.0
+        # A servo holds its target, from which a loaded joint differs by the load over the
+        # stiffness: the reference goes on from there without a step.
+        start = value if drive.is_effort else forces[drive.force].target
+        moves.append(
+            PanelMoves(
+                as_floats([start]),
+                tuple(as_floats([unit * move.to]) for move in of_joint),
+                tuple(jnp.asarray(move.at) for move in of_joint),
+                tuple(jnp.asarray(move.duration) for move in of_joint),
+                False,
+                tuple(jnp.asarray(move.shape, dtype=float) for move in of_joint),
+            )
+        )
+    return JointMoves(tuple(moves))
+
+
+def _make_battery(entries: MissionFile, of_model: BatteryEntry | None = None) -> Battery | None:
+    if entries.battery is None:
+        return None
+    battery_values = {} if of_model is None else of_model.model_dump(exclude_none=True)
+    battery_values |= entries.battery.model_dump(exclude_none=True, exclude={"state_of_charge"})
+    battery = Battery.of(
+        ENERGY.replaced({f"battery.{name}": value for name, value in battery_values.items()})
+    )
+    charge, reserve = entries.battery.state_of_charge, float(battery.reserve)
+    if charge <= reserve:
+        raise SettingError(
+            f"'battery.state_of_charge' must be above its reserve of {reserve:g}, but it is {charge:g}: the "
+            "battery would be empty at the start."
+        )
+    return battery
 
 
 # Compiled once for all missions of a process.
@@ -255,7 +417,7 @@ _surveyed = quick_jit(survey)
 
 
 @quick_jit
-def _along(path: HeldPath | WaypointPath, ts: Float[Array, " k"]) -> Any:
+def _evaluate_path(path: HeldPath | WaypointPath, ts: Float[Array, " k"]) -> Any:
     """Path at times ts [s]."""
     return jax.vmap(path)(ts)
 
@@ -263,13 +425,27 @@ def _along(path: HeldPath | WaypointPath, ts: Float[Array, " k"]) -> Any:
 def _check_thrust(mission: Mission) -> None:
     """Raise `SettingError` for a path whose accelerations the rotors cannot give."""
     machine, speeds = mission.machine, mission.machine.speeds
+    ts = as_floats(times_of(mission.file))
+    waypoints = _evaluate_path(mission.references.path, ts)
+    system = machine.scene.system
+    a, gravity = map(np.asarray, (waypoints.a, gravity_of(system)))
+    mass, carried = np.sum(np.asarray(system.bodies.mass)), mission.gauges.payloads
+    if carried is not None:
+        mass = mass + np.array([np.sum(np.asarray(carried.masses(float(t)))) for t in ts])
+    # Rotors push along their own axis only: a path that falls faster than gravity would need them upside
+    # down.
+    lift = (gravity - a) @ gravity
+    if np.any(lift <= 0):
+        k = int(np.argmax(lift <= 0))
+        raise SettingError(
+            f"The path needs a thrust that points downwards at t = {float(ts[k]):.4g} s, where it accelerates by "
+            f"{_text(a[k])} m/s^2: rotors cannot push down. Give it an acceleration above free fall, or more time."
+        )
     if speeds is None:
         return
-    ts = floats(np.linspace(0.0, mission.file.t1, _CHECKED))
-    wanted = _along(mission.references.path, ts)
-    system = mission.plant.system
-    a, gravity, mass = map(np.asarray, (wanted.a, gravity_of(system), system.bodies.mass))
-    needed = np.sum(mass) * np.linalg.norm(a - gravity, axis=1)
+    # Moments need a margin beyond this, which depends on gusts and errors: only what no controller
+    # could fly is refused.
+    needed = mass * np.linalg.norm(a - gravity, axis=1)
     limits = speeds.squared(machine.rotors.spin.shape[0])
     least, most = (float(machine.rotors.k_f) * float(np.sum(np.asarray(x))) for x in limits)
     beyond = (needed > most) | (needed < least)
@@ -281,6 +457,86 @@ def _check_thrust(mission: Mission) -> None:
         )
 
 
+def _check_stability(mission: Mission) -> float:
+    """Factor by which small motions about hover grow in a second, with the mission's gains, rate and delay.
+
+    It raises `SettingError` where this is more than tenfold.
+    The controllers that are told of lost rotors are checked too, as if the machine did not turn. The
+    estimator, limits and drag are left out.
+    """
+    pilots = [
+        mission.controller.pilot,
+        *(pilot_change.pilot for pilot_change in mission.controller.pilot_changes),
+    ]
+    return max(_check_pilot(mission, pilot) for pilot in pilots)
+
+
+def _check_pilot(mission: Mission, pilot: Pilot) -> float:
+    """Growth of small motions in a second with one of the controllers of `_check_stability`."""
+    machine, plant = mission.machine, mission.plant
+    pilot = pilot.pilot if isinstance(pilot, AdaptiveController) else pilot
+    system, start, observe = machine.scene.system, machine.scene.state0, None
+    if machine.believed is not None:
+        observe = WithoutPayload(system, machine.believed)
+    hover = make_hover(system, start, input_names(machine), pilot, plant.rate, observe)
+    # The machine is linearised once; delays and gains only close the loop anew.
+    make_loop = lambda delay, pilot=pilot: hover.close(pilot, delay)
+    is_stable = lambda loop: loop.compute_spectral_radius() <= 1 + MARGINAL
+    loop, period = make_loop(plant.late), 1e3 / plant.rate
+    radius = loop.compute_spectral_radius()
+    # Stability of the linear loop in hover is a necessary condition.
+    if radius <= _FASTEST_GROWTH ** (1 / plant.rate):
+        return 1.0 if radius <= 1 + MARGINAL else float(radius**plant.rate)
+    of_joints, advice = loop.compute_joint_share() > 0.5, []
+    # The message gives numbers that work, found by scaling the closed loop's frequency.
+    faster = lambda x: scale_pilot(pilot, x, of_joints)
+    factor = next((x for x in _FACTORS if is_stable(make_loop(plant.late, faster(x)))), None)
+    if factor is not None:
+        entry = _gains_entry(faster(factor), of_joints)
+        advice.append(f"with this delay, [controller] {entry} is about the fastest that is stable")
+    delay = next((d for d in range(plant.late - 1, -1, -1) if is_stable(make_loop(d))), None)
+    if delay is not None:
+        advice.append(f"with these gains, a delay of {delay * period:g} ms is stable")
+    loop_name = "panel's servo" if machine.bodies is not None else "joints"
+    loop_name = loop_name if of_joints else "position and attitude"
+    working = flight_of(pilot).working
+    if working is not None:
+        count = machine.rotors.spin.shape[0]
+        lost = [str(k + 1) for k in range(count) if k not in working]
+        loop_name += f" without rotor{'s' if len(lost) > 1 else ''} {', '.join(lost)}"
+    raise SettingError(
+        f"The closed loop of the {loop_name} is unstable, without any noise or wind: at {plant.rate:g} Hz, with "
+        f"inputs late by {plant.late * period:g} ms ({plant.late} periods), small motions about hover grow by a "
+        f"factor of {radius:.4g} in a period. "
+        f"{_make_sentence('; '.join(advice) or 'no slower gains are stable at this rate')}"
+    )
+
+
+def _gains_entry(pilot: Any, of_joints: bool) -> str:
+    """Entry of a mission's controller that gives it these gains."""
+    if of_joints and isinstance(pilot, JointController):
+        entries = []
+        for drive, is_direct, gains in zip(
+            pilot.joints, pilot.is_direct, pilot.gains.T, strict=True
+        ):
+            W, ratio, k, c = map(float, gains)
+            if not drive.is_effort:
+                continue
+            numbers = f'kind = "pd", stiffness = {k:.3g}, damping = {c:.3g}'
+            numbers = numbers if is_direct else f"frequency = {W:.3g}, damping = {ratio:.3g}"
+            entries.append(f"joints.{drive.name} = {{ {numbers} }}")
+        return ", ".join(entries)
+    gains = pilot.servo if of_joints else flight_of(pilot).gains
+    names = [field.name for field in dataclasses.fields(gains) if field.name != "bodies"]
+    numbers = ", ".join(f"{name} = {float(getattr(gains, name)):.3g}" for name in names)
+    kind = 'kind = "strokes", ' if isinstance(gains, StrokeServo) else ""
+    return f"servo = {{ {kind}{numbers} }}" if of_joints else f"gains = {{ {numbers} }}"
+
+
+def _make_sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
+
+
 def _check_panel(mission: Mission) -> None:
     """Raise `SettingError` for a panel's reference outside the workspace.
 
@@ -290,29 +546,106 @@ def _check_panel(mission: Mission) -> None:
     assert machine.bodies is not None
     assert machine.limits is not None
     gravity, panel = gravity_of(mission.plant.system), references.panel
-    ends = [t for move in mission.file.panel for t in (move.at, move.at + move.duration)]
-    every = np.linspace(0.0, mission.file.t1, _CHECKED)
-    ts = np.union1d(every, [t for t in ends if t <= mission.file.t1])
+    ts = times_of(mission.file)
 
-    def wanted(references: References, t: Any) -> Any:
+    def target_angles(references: References, t: Any) -> Any:
         at = references(t)
         if not isinstance(at.panel, DirectionMotion):
             return references.panel.value(t)  # pyright: ignore[reportOptionalMemberAccess]
+        # Directions of the world are turned into the base's axes, whose attitude follows from the
+        # thrust that the path needs.
         R = attitude_of(at.waypoint.a - gravity, at.waypoint.heading)
         return panel_angles(R.T @ at.panel.value)
 
-    angles = quick_jit(lambda r, ts: jax.vmap(lambda t: wanted(r, t))(ts))(references, floats(ts))
+    angles = quick_jit(lambda r, ts: jax.vmap(lambda t: target_angles(r, t))(ts))(
+        references, as_floats(ts)
+    )
     geometry, limits = machine.bodies.geometry, machine.limits
-    found = _surveyed(geometry, floats(np.asarray(angles).T), limits)
-    reason = np.asarray(found.reason)
+    result = _surveyed(geometry, as_floats(np.asarray(angles).T), limits)
+    reason = np.asarray(result.reason)
     if not np.any(reason):
         return
     k = int(np.argmax(reason != 0))
-    margins = jax.tree.map(lambda x: x[..., k], found.margins)
-    why = why_outside(geometry, limits, margins, Reason(int(reason[k])))
+    margins = jax.tree.map(lambda x: x[..., k], result.margins)
+    reason_text = why_outside(geometry, limits, margins, Reason(int(reason[k])))
     phi, theta = np.degrees(np.asarray(angles)[k])
     frame = "a direction of the world" if panel is not None and panel.world else "these angles"
     raise SettingError(
         f"The panel cannot follow its reference, {frame}: at t = {ts[k]:.4g} s it would have to stand at "
-        f"phi = {phi:.4g} and theta = {theta:.4g} degrees in the base's axes, and {why}"
+        f"phi = {phi:.4g} and theta = {theta:.4g} degrees in the base's axes, and {reason_text}"
     )
+
+
+# Times of a flight and of each move at which forces are checked.
+_OF_FLIGHT, _OF_MOVE = 1001, 101
+
+
+def check_forces(mission_file: MissionFile, machine: Machine, references: References) -> None:
+    """Raise `SettingError` for a reference of the panel that is beyond the actuators.
+
+    The forces are those of the inverse dynamics of the machine with its payload. The base has the
+    attitude and the acceleration that its path needs; that it turns is left out, as are friction,
+    gusts and pushes, for which a margin must be left.
+    """
+    if machine.force is None or references.panel is None:
+        return
+    ts = times_of(mission_file)
+    system, shift = machine.scene.system, machine.table.value("mount.shift")
+    bodies = panel_bodies(system, tracker_geometry(machine.table), shift)
+    forces = np.asarray(needed_forces(bodies, references, gravity_of(system), jnp.asarray(ts)))
+    beyond = np.abs(forces) > machine.force
+    if not np.any(beyond):
+        return
+    k = int(np.argmax(np.any(beyond, axis=1)))
+    slider = int(np.argmax(np.abs(forces[k])))
+    most, late = np.max(np.abs(forces)), int(np.argmax(np.max(np.abs(forces), axis=1)))
+    raise SettingError(
+        f"The panel cannot follow its reference: at t = {ts[k]:.4g} s slider {slider + 2} needs a force of "
+        f"{forces[k, slider]:.4g} N, but its actuator gives at most {machine.force:g} N either way "
+        f"('controller.force'). The largest force is {most:.4g} N, at t = {ts[late]:.4g} s: give the move "
+        "more time, or another goal."
+    )
+
+
+def times_of(mission_file: MissionFile) -> np.ndarray:
+    """Times at which references are checked (k,) [s]: of the flight, each move, and between waypoints."""
+    spans = [(0.0, mission_file.t1, _OF_FLIGHT)]
+    # Moves are short, and points spread over the flight could miss the fastest part of one.
+    spans += [(move.at, move.at + move.duration, _OF_MOVE) for move in mission_file.panel]
+    points = [point.t for point in mission_file.path.waypoints or ()]
+    spans += [(first, second, _OF_MOVE) for first, second in itertools.pairwise(points)]
+    # as many for other times, so that nothing is compiled anew
+    return np.sort(
+        np.clip(np.concatenate([np.linspace(*span) for span in spans]), 0.0, mission_file.t1)
+    )
+
+
+@quick_jit
+def needed_forces(
+    bodies: PanelBodies,
+    references: References,
+    gravity: Float[Array, "3"],
+    ts: Float[Array, " k"],
+) -> Float[Array, "k 2"]:
+    """Forces of the actuators along references at times ts [s], by `inverse_dynamics` (k, 2) [N].
+
+    Args:
+        gravity: acceleration of free fall (3,) [m/s^2].
+    """
+
+    def base_pose(t: Array) -> tuple[Array, Array]:
+        """Attitude of the base, and the acceleration of free fall less its own in its axes."""
+        at = references.path(t)
+        R = attitude_of(at.a - gravity, at.heading)
+        return R, R.T @ (gravity - at.a)
+
+    def panel_angles_at(t: Array) -> Array:
+        assert references.panel is not None
+        value = references.panel.value(t)
+        return panel_angles(base_pose(t)[0].T @ value) if references.panel.world else value
+
+    def at_one(t: Array) -> Array:
+        pair_motion = PairMotion(*motion_along(panel_angles_at, t))
+        return inverse_dynamics(bodies, pair_motion, base_pose(t)[1], jnp.zeros(3)).forces
+
+    return jax.vmap(at_one)(ts)

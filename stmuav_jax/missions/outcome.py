@@ -2,15 +2,19 @@
 
 import json
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..files.labelled import Labelled
-from ..files.loop_file import Label, labelled_loop
+from ..checks.errors import SettingError
+from ..io.netcdf import Labelled
+from ..io.run_file import Label, labelled_loop
+from ..uav.flight_identification.record import FlightRecord
+from .controller import AT_ONCE
 from .flight import MissionFlight
-from .gauges import GAUGES
 from .schema import TolerancesEntry
+from .signals import GAUGES
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -20,13 +24,18 @@ _BATTERY: dict[str, Label] = {
     "battery_current": (("time",), "A", "current of the battery"),
     "battery_voltage": (("time",), "V", "at the poles of the battery"),
 }
+# Signals with limits: name, words for a table, and what the limits are of.
+MARGINS = (
+    ("rotor_speed", "rotor speeds", "speed"),
+    ("displacement", "strokes", "displacement"),
+    ("wanted_force", "actuators' forces", "force"),
+    ("wanted_effort", "joints' efforts", "effort"),
+)
 # Round-off of speeds that are held at a limit, as a share of the range.
 AT_LIMIT = 1e-9
 _DEGREE = math.pi / 180
 # Time in flight before a touchdown [s]; what follows sooner is a rebound.
 _ALOFT = 0.1
-# Round-off of times [s].
-AT_ONCE = 1e-9
 
 
 def to_data(flight: MissionFlight) -> "xr.Dataset":
@@ -36,12 +45,12 @@ def to_data(flight: MissionFlight) -> "xr.Dataset":
 
 def labelled_flight(flight: MissionFlight) -> Labelled:
     """Labelled arrays with the content of `to_data`."""
-    machine, given = flight.mission.machine, flight.mission.file
+    machine, entries = flight.mission.machine, flight.mission.file
     count = machine.rotors.spin.shape[0]
     loop = labelled_loop(
-        flight.run, GAUGES | _BATTERY, title=given.title, ending=flight.ending,
-        mission=json.loads(given.model_dump_json()), scene=machine.scene.name,
-        watch=list(machine.scene.watch),
+        flight.run, GAUGES | _BATTERY, title=entries.title, ending=flight.ending,
+        mission=json.loads(entries.model_dump_json()), scene=machine.scene.name,
+        watch=list(machine.scene.watch), growth=flight.mission.growth,
     )  # fmt: skip
     limits: dict[str, tuple[str, Any, str]] = {}
     names: dict[str, Any] = {"rotor": (("rotor",), np.arange(1, count + 1), {})}
@@ -64,11 +73,54 @@ def labelled_flight(flight: MissionFlight) -> Labelled:
             }
         names["slider"] = (("slider",), np.array([2, 3]), {})
         names["panel_angle"] = (("panel_angle",), ["phi", "theta"], {})
-    own = {
+    if machine.joints:
+        names["driven_joint"] = (("driven_joint",), [drive.name for drive in machine.joints], {})
+        names["driven_joint_unit"] = (
+            ("driven_joint",),
+            [drive.unit for drive in machine.joints],
+            {},
+        )
+        if np.any(np.isfinite(machine.efforts)):
+            limits["lowest_effort"] = ("driven_joint", -machine.efforts, "N m or N")
+            limits["highest_effort"] = ("driven_joint", machine.efforts, "N m or N")
+    limit_variables = {
         name: ((dim,), values, {"units": unit, "description": f"limit of {dim}s"})
         for name, (dim, values, unit) in limits.items()
     }
-    return Labelled({**loop.variables, **own}, {**loop.coordinates, **names}, loop.attributes)
+    return Labelled(
+        {**loop.variables, **limit_variables}, {**loop.coordinates, **names}, loop.attributes
+    )
+
+
+def to_flight_record(flight: MissionFlight) -> FlightRecord:
+    """Record of a flight as its instruments and commands show it, for `stm.uav.identify_flight`.
+
+    A command u, from 0 to 1, stands for the speed lowest + (highest - lowest) u of a rotor.
+
+    Raises:
+        SettingError: the mission has no sensors, or its rotors have no limits.
+    """
+    rollout, speeds, rotors = (
+        flight.run.rollout,
+        flight.mission.machine.speeds,
+        flight.mission.machine.rotors,
+    )
+    if "gyroscope" not in rollout.signals:
+        raise SettingError(
+            "A log of a flight needs the mission's [sensors], whose readings it holds."
+        )
+    if speeds is None:
+        raise SettingError(
+            "A log of a flight needs limits of the rotor speeds, from which commands count."
+        )
+    count = rotors.spin.shape[0]
+    low, high = (np.sqrt(np.asarray(x)) for x in speeds.squared(count))
+    squared = np.clip(np.asarray(rollout.inputs)[:, :count], low**2, high**2)
+    signals = {name: np.asarray(value, float) for name, value in rollout.signals.items()}
+    return FlightRecord(
+        np.asarray(rollout.ts, float), (np.sqrt(squared) - low) / (high - low), signals["gyroscope"],
+        signals["accelerometer"], signals.get("battery_voltage"),
+    )  # fmt: skip
 
 
 class Measure(NamedTuple):
@@ -78,47 +130,55 @@ class Measure(NamedTuple):
     value: float
     unit: str
     allowed: float | None = None
-    kept: bool = True
+    is_met: bool = True
 
 
 def measures(data: "xr.Dataset") -> list[Measure]:
     """Largest errors, smallest margins of the limits, and the energy used, of a flight's dataset."""
-    wanted, times = _tolerances(data), _times(data)
-    off = np.linalg.norm(data.position_error.values, axis=1)
+    tolerances, times = _read_tolerances(data), _tolerance_times(data)
+    distances = np.linalg.norm(data.position_error.values, axis=1)
     tilt = data.tilt_error.values / _DEGREE
-    found = [
-        _largest(data, "position", off, "m", wanted.position, times[0]),
-        _largest(data, "tilt", tilt, "degrees", wanted.tilt, times[0]),
+    result = [
+        _largest_error(data, "position", distances, "m", tolerances.position, times[0]),
+        _largest_error(data, "tilt", tilt, "degrees", tolerances.tilt, times[0]),
     ]
     if "panel_error" in data:
         panel = data.panel_error.values / _DEGREE
-        found.append(_largest(data, "panel", panel, "degrees", wanted.panel, times[-1]))
-    for name, what, limit in (
-        ("rotor_speed", "rotor speeds", "speed"), ("displacement", "strokes", "displacement"),
-        ("wanted_force", "actuators' forces", "force"),
-    ):  # fmt: skip
+        result.append(_largest_error(data, "panel", panel, "degrees", tolerances.panel, times[-1]))
+    if "joint_error" in data:
+        for k, (name, unit) in enumerate(
+            zip(data.driven_joint.values, data.driven_joint_unit.values, strict=True)
+        ):
+            scale, unit = (_DEGREE, "degrees") if unit == "rad" else (1.0, "m")
+            error = np.abs(data.joint_error.values[:, k]) / scale
+            allowed = tolerances.joints.get(str(name))
+            result.append(_largest_error(data, str(name), error, unit, allowed, times[0]))
+    for name, quantity_label, limit in MARGINS:
         if f"lowest_{limit}" in data:
-            found.append(_margin(data, name, what, limit))
-    gear = _of_gear(data, wanted) if "gear_load" in data else []
-    return [*found, *gear, *_energy(data)]
+            result.append(_smallest_margin(data, name, quantity_label, limit))
+    gear = _of_gear(data, tolerances) if "gear_load" in data else []
+    return [*result, *gear, *_energy_measures(data)]
 
 
-def _tolerances(data: "xr.Dataset") -> TolerancesEntry:
+def _read_tolerances(data: "xr.Dataset") -> TolerancesEntry:
     return TolerancesEntry(**json.loads(data.attrs["mission"])["tolerances"])
 
 
-def _times(data: "xr.Dataset") -> tuple[float, float]:
+def _tolerance_times(data: "xr.Dataset") -> tuple[float, float]:
     """Times from which the tolerances of the base and that of the panel hold [s]."""
-    wanted = _tolerances(data)
-    return wanted.after, wanted.after if wanted.panel_after is None else wanted.panel_after
+    tolerances = _read_tolerances(data)
+    return (
+        tolerances.after,
+        tolerances.after if tolerances.panel_after is None else tolerances.panel_after,
+    )
 
 
-def _reached(data: "xr.Dataset", after: float) -> bool:
+def _has_reached(data: "xr.Dataset", after: float) -> bool:
     """True if the flight came to the time from which a tolerance holds."""
     return bool(data.time.values[-1] >= after - AT_ONCE)
 
 
-def _largest(
+def _largest_error(
     data: "xr.Dataset",
     of: str,
     values: np.ndarray,
@@ -131,18 +191,18 @@ def _largest(
     Where nothing is as late, it is that of the whole flight, and nothing is asked of it. With a landing
     gear it is that of the samples at which the ground carries nothing; there may be none.
     """
-    if not _reached(data, after):
+    if not _has_reached(data, after):
         after, allowed = 0.0, None
     since = f" from {after:g} s on" if after else ""
     late = data.time.values >= after - AT_ONCE
     if "gear_load" in data:
         late, since = late & (data.gear_load.values == 0.0), f"{since} in flight"
     value = float(np.max(values[late], initial=0.0))
-    kept = allowed is None or value <= allowed
-    return Measure(f"Largest {of} error{since}", value, unit, allowed, kept)
+    is_within_tolerance = allowed is None or value <= allowed
+    return Measure(f"Largest {of} error{since}", value, unit, allowed, is_within_tolerance)
 
 
-def _of_gear(data: "xr.Dataset", wanted: TolerancesEntry) -> list[Measure]:
+def _of_gear(data: "xr.Dataset", tolerances: TolerancesEntry) -> list[Measure]:
     """Speed of the touchdowns, which follow some time in flight, and how deep the feet sank."""
     ts, aloft = data.time.values, data.gear_load.values == 0.0
     period = float(ts[1] - ts[0]) if len(ts) > 1 else 1.0
@@ -151,23 +211,31 @@ def _of_gear(data: "xr.Dataset", wanted: TolerancesEntry) -> list[Measure]:
     count = np.cumsum(aloft)
     before = count[window - 1 : -1] - np.concatenate([[0], count[: -window - 1]])
     down = np.flatnonzero((before == window) & ~aloft[window:]) + window
-    found = []
+    result = []
     if len(down):
         fastest = float(np.max(-data.velocity.values[down - 1, 0, 2]))
-        kept = wanted.touchdown is None or fastest <= wanted.touchdown
-        found.append(Measure("Largest touchdown speed", fastest, "m/s", wanted.touchdown, kept))
+        is_within_tolerance = tolerances.touchdown is None or fastest <= tolerances.touchdown
+        result.append(
+            Measure(
+                "Largest touchdown speed", fastest, "m/s", tolerances.touchdown, is_within_tolerance
+            )
+        )
     deepest = max(float(np.max(data.gear_depth.values)), 0.0)
-    kept = wanted.sink is None or deepest <= wanted.sink
-    found.append(Measure("Deepest sink of the landing gear", deepest, "m", wanted.sink, kept))
+    is_within_tolerance = tolerances.sink is None or deepest <= tolerances.sink
+    result.append(
+        Measure(
+            "Deepest sink of the landing gear", deepest, "m", tolerances.sink, is_within_tolerance
+        )
+    )
     carried = float(data.gear_load.values[-1])
-    return [*found, Measure("Load of the landing gear at the end", carried, "N")]
+    return [*result, Measure("Load of the landing gear at the end", carried, "N")]
 
 
-def _margin(data: "xr.Dataset", name: str, what: str, limit: str) -> Measure:
+def _smallest_margin(data: "xr.Dataset", name: str, quantity_label: str, limit: str) -> Measure:
     """Smallest distance from the limits as a share of the range."""
     least = float(np.nanmin(margin_history(data, name, limit), initial=0.5))
-    name, kept = f"Smallest margin of the {what}", least >= -AT_LIMIT
-    return Measure(name, 100 * least, "% of the range", 0.0, kept)
+    name, is_within_limits = f"Smallest margin of the {quantity_label}", least >= -AT_LIMIT
+    return Measure(name, 100 * least, "% of the range", 0.0, is_within_limits)
 
 
 def margin_history(data: "xr.Dataset", name: str, limit: str) -> np.ndarray:
@@ -182,38 +250,92 @@ def margin_history(data: "xr.Dataset", name: str, limit: str) -> np.ndarray:
     for fault in json.loads(data.attrs["mission"])["faults"] if kind else ():
         if fault[kind] is not None:
             values[data.time.values >= fault["at"], fault[kind] - first] = np.nan
-    return np.minimum(values - low, high - values) / (high - low)
+    with np.errstate(invalid="ignore"):
+        # NaN where there is no limit
+        return np.minimum(values - low, high - values) / (high - low)
 
 
-def _energy(data: "xr.Dataset") -> list[Measure]:
+def _energy_measures(data: "xr.Dataset") -> list[Measure]:
     """Energies used, the powers held from sample to sample."""
     ts = data.time.values
     spent = lambda name: float(np.sum(np.diff(ts) * data[name].values[:-1])) / 3600
-    found = [
+    result = [
         Measure("Energy of the rotors, mechanical", spent("rotor_power"), "Wh"),
         Measure("Energy used, electrical", spent("electric_power"), "Wh"),
     ]
     if "actuator_power" in data:
-        found.append(Measure("Work of the actuators", 3600 * spent("actuator_power"), "J"))
+        result.append(Measure("Work of the actuators", 3600 * spent("actuator_power"), "J"))
+    if "joint_power" in data:
+        result.append(Measure("Work of the joints", 3600 * spent("joint_power"), "J"))
     if "state_of_charge" in data:
-        left = float(data.state_of_charge.values[-1])
-        found.append(Measure("Charge left", 100 * left, "%"))
-    return found
+        remaining_charge = float(data.state_of_charge.values[-1])
+        result.append(Measure("Charge left", 100 * remaining_charge, "%"))
+    return result
+
+
+def list_unreached(mission: Mapping[str, Any], end: float) -> list[str]:
+    """Entries of a mission, plain data, that a flight until a time [s] does not come to."""
+    entries = [
+        (f"waypoint {k}", point["t"], True)
+        for k, point in enumerate((mission.get("path") or {}).get("waypoints") or (), 1)
+    ]
+    entries += [
+        (f"the end of move {k} of the panel", move["at"] + move["duration"], True)
+        for k, move in enumerate(mission.get("panel") or (), 1)
+    ]
+    entries += [
+        (f"the end of a move of joint {move['joint']}", move["at"] + move["duration"], True)
+        for move in mission.get("joints") or ()
+    ]
+    for fault in mission.get("faults") or ():
+        kind = next(kind for kind in ("rotor", "slider", "sensor") if fault.get(kind) is not None)
+        entries.append((f"the fault of {kind} {fault[kind]}", fault["at"], False))
+    for payload in mission.get("payloads") or ():
+        times = {"pick-up": payload["at"] or None, "drop": payload["until"]}
+        entries += [
+            (f"the {event} of the payload of {payload['body']}", t, False)
+            for event, t in times.items()
+            if t is not None
+        ]
+    change = (mission.get("wind") or {}).get("change")
+    if change is not None:
+        entries.append(("the end of the wind's change", change["at"] + change["rise"], True))
+    # what happens at the last sample is reached, but a fault needs some time to show
+    return [
+        f"{name} at t = {t:g} s"
+        for name, t, counts in entries
+        if (t > end + AT_ONCE if counts else t >= end - AT_ONCE)
+    ]
 
 
 def verdict(data: "xr.Dataset") -> tuple[bool, str]:
-    """True if a flight did all that its mission asks for, and a sentence about it."""
-    end, t1 = float(data.time.values[-1]), json.loads(data.attrs["mission"])["t1"]
+    """True if a flight did all that its mission asks for, and a sentence about it.
+
+    It did not if it ended before a waypoint, a move of the panel, a fault or a change of the wind.
+    """
+    mission = json.loads(data.attrs["mission"])
+    end, t1 = float(data.time.values[-1]), mission["t1"]
     ending = data.attrs["ending"]
-    broken = [one.name.lower() for one in measures(data) if not one.kept]
-    words = f"It flew to t = {end:g} s of {t1:g} s"
-    words += f", and ended there: {ending}" if ending else ""
+    broken = [measure.name.lower() for measure in measures(data) if not measure.is_met]
+    sentence = f"It flew to t = {end:g} s of {t1:g} s"
+    sentence += f", and ended there: {ending}" if ending else ""
+    unreached = list_unreached(mission, end)
+    sentence += f". It ended before {', '.join(unreached)}" if unreached else ""
+    is_complete, growth = not ending and not unreached, float(data.attrs.get("growth", 0.0))
+    if growth > 1.0:
+        sentence += f". Its closed loop is unstable: small motions about hover grow {growth:.3g}-fold in a second"
+    if any(fault.get("known") for fault in mission["faults"]):
+        sentence += ". With lost rotors its closed loop was checked as if the machine did not turn"
     if broken:
-        return False, f"{words}. Not kept: {', '.join(broken)}."
-    base, panel = _times(data)
-    if not _reached(data, base):
-        return not ending, f"{words}. Limits were kept; tolerances hold from {base:g} s on."
-    if "panel_error" in data and not _reached(data, panel):
-        words = f"{words}. Tolerances and limits were kept; the panel's holds from {panel:g} s on."
-        return not ending, words
-    return not ending, f"{words}. All tolerances and limits were kept."
+        return False, f"{sentence}. Not kept: {', '.join(broken)}."
+    base, panel = _tolerance_times(data)
+    if not _has_reached(data, base):
+        return is_complete, f"{sentence}. Limits were kept; tolerances hold from {base:g} s on."
+    if "panel_error" in data and not _has_reached(data, panel):
+        sentence = (
+            f"{sentence}. Tolerances and limits were kept; the panel's holds from {panel:g} s on."
+        )
+        return is_complete, sentence
+    if not is_complete:
+        return False, f"{sentence}. Until then, tolerances and limits were kept."
+    return True, f"{sentence}. All tolerances and limits were kept."

@@ -1,29 +1,40 @@
 """Schema of a mission's file, format 1: names, types and ranges of all its entries.
 
-docs/missions.md lists them. Angles in a mission's file are in degrees, all else in SI units.
+docs/control_and_missions.md lists them. Angles in a mission's file are in degrees, all else in SI units.
 """
 
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from ..checks.schema import Count, Entries, Finite, Positive, Tuples, shown
-from ..files.model_schema import Size, Triple
-from ..montecarlo.schema import MOST_STEPS, Drawing, Factor, Name, Seed
+from ..checks.schema import (
+    Count,
+    Entries,
+    Finite,
+    Name,
+    NotNegative,
+    Positive,
+    Seed,
+    Triple,
+    Tuples,
+    format_value,
+)
+from ..io.air_entries import BatteryEntry, WindEntry
+from ..io.model_schema import Size
+from ..studies.schema import MissionStudyFile as MissionStudyFile
 
 MISSION_FORMAT = 1
 # Longest flight [s]: its samples are kept in memory.
 LONGEST = 3600.0
 
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 PanelAngles = Annotated[tuple[Finite, Finite], Tuples]
 
 
-def _format(value: int) -> int:
+def _check_format(value: int) -> int:
     if value != MISSION_FORMAT:
         raise ValueError(
-            f"is {shown(value)}, but this version reads format {MISSION_FORMAT} alone."
+            f"is {format_value(value)}, but this version reads format {MISSION_FORMAT} alone."
         )
     return value
 
@@ -45,11 +56,19 @@ class RatesEntry(Entries):
     delay: NotNegative = 0.0
 
 
+def _not_negative(value: Size | None) -> Size | None:
+    if value is not None and min(value if isinstance(value, tuple | list) else (value,)) < 0:
+        raise ValueError(
+            f"must not be negative, but it is {format_value(value)}: it is a deviation."
+        )
+    return value
+
+
 class InstrumentEntry(Entries):
     """Entry for an instrument: rate [Hz], noise and bias in its own units, delay [s]."""
 
     rate: Positive | None = None
-    noise: Size | None = None
+    noise: Annotated[Size | None, AfterValidator(_not_negative)] = None
     bias: Size | None = None
     delay: NotNegative | None = None
 
@@ -88,12 +107,33 @@ class ServoEntry(Entries):
     stiffness: Positive | None = None
 
 
+class JointServoEntry(Entries):
+    """Entry for the servo of a joint that an effort drives, see `stmuav_jax.uav.JointGains`: computed torque
+    with frequency [rad/s] and damping ratio [1], or PD with stiffness and damping in the joint's units."""
+
+    kind: Literal["computed_torque", "pd"] = "computed_torque"
+    frequency: Positive | None = None
+    damping: NotNegative | None = None
+    stiffness: Positive | None = None
+
+
 class PayloadEntry(Entries):
     """Entry for a payload: a point mass [kg] on the panel, at a position from the panel's centre of mass
     in its axes [m]."""
 
     mass: Positive
     position: Triple
+
+
+class CarriedEntry(Entries):
+    """Entry for a payload that is picked up, or dropped: a point mass [kg] on a body, at a position from its
+    centre of mass in its axes [m], from a time [s] on or until one. The controller is not told."""
+
+    body: str
+    mass: Positive
+    position: Triple = (0.0, 0.0, 0.0)
+    at: NotNegative = 0.0
+    until: Positive | None = None
 
 
 class ControllerEntry(Entries):
@@ -108,6 +148,7 @@ class ControllerEntry(Entries):
     highest: Positive | None = None
     force: Positive | None = None
     servo: ServoEntry | None = None
+    joints: dict[str, JointServoEntry] = Field(default_factory=dict)
     feedforward: bool | None = None
     payload: Literal["unknown", "estimated", "known"] = "unknown"
 
@@ -121,8 +162,12 @@ class PointEntry(Entries):
 
 
 class PathEntry(Entries):
-    """Entry for the path: a place to hold, waypoints, or a constant acceleration [m/s^2]."""
+    """Entry for the path: a place to hold, waypoints, or a constant acceleration [m/s^2].
 
+    It begins where the machine starts, or elsewhere where that is wanted, with a `step`.
+    """
+
+    step: bool = False
     position: Triple | None = None
     heading: Finite | None = None
     waypoints: Annotated[tuple[PointEntry, ...], Tuples] | None = None
@@ -157,28 +202,15 @@ class MoveEntry(Entries):
     shape: Annotated[tuple[Finite, ...], Tuples] = ()
 
 
-class ChangeEntry(Entries):
-    """Entry for a change of the wind to another velocity [m/s], over a time [s]."""
+class JointMoveEntry(Entries):
+    """Entry for a move of a driven joint of a model: to a value [degrees] or [m], begun at a time [s], done
+    after a duration [s]; its shape is as of `MoveEntry`."""
 
-    to: Triple
-    at: NotNegative
-    rise: Positive = 0.2
-
-
-class GustsEntry(Entries):
-    """Entry for Dryden gusts that pass at the steady wind's speed."""
-
-    seed: Seed = 0
-    height: Positive | None = None
-    speed_20ft: Positive | None = None
-
-
-class WindEntry(Entries):
-    """Entry for the wind: steady velocity, world [m/s], a change of it, gusts about it."""
-
-    steady: Triple = (0.0, 0.0, 0.0)
-    change: ChangeEntry | None = None
-    gusts: GustsEntry | None = None
+    joint: str
+    to: Finite
+    at: NotNegative = 0.0
+    duration: Positive = 1.0
+    shape: Annotated[tuple[Finite, ...], Tuples] = ()
 
 
 class PushEntry(Entries):
@@ -189,32 +221,35 @@ class PushEntry(Entries):
 
 
 class FaultEntry(Entries):
-    """Entry for a fault: a rotor keeps a share of its thrust, or a slider jams, from a time [s] on.
+    """Entry for a fault: a rotor keeps a share of its thrust, a slider jams, or a sensor fails, from a time [s] on.
 
-    Of a rotor that is lost altogether the controller may be told: it is `known`.
+    A rotor may have several, one after the other; each share is one of the whole thrust.
+    Of a rotor that is lost altogether the controller may be told: it is `known`. A sensor gives no readings,
+    or, with a `bias` in its units, readings with that error more, `until` a time [s] or for good.
     """
 
     rotor: Count | None = None
     share: Share | None = None
     slider: Literal[2, 3] | None = None
+    sensor: Literal["gyroscope", "accelerometer", "position", "attitude", "encoders"] | None = None
+    bias: Size | None = None
     known: bool = False
     at: NotNegative
+    until: Positive | None = None
 
 
-class BatteryEntry(Entries):
-    """Entry for the battery; what is left out is of the table `ENERGY`."""
+class FlightBatteryEntry(BatteryEntry):
+    """Entry for the battery of a flight; what is left out is the model's, else of the table `ENERGY`."""
 
     state_of_charge: Annotated[float, Field(gt=0, le=1)] = 1.0
-    capacity: Positive | None = None
-    resistance: NotNegative | None = None
-    reserve: Annotated[float, Field(ge=0, lt=1)] | None = None
 
 
 class TolerancesEntry(Entries):
     """Entry for what the verdict allows: the largest errors from a time [s] on, the largest speed at
     which a landing gear touches down [m/s], and its deepest sink into the ground [m].
 
-    The panel's may have a time of its own, `panel_after`; by default it is `after`.
+    The panel's may have a time of its own, `panel_after`; by default it is `after`. Those of joints are by
+    name, in [degrees] or [m].
     """
 
     after: NotNegative = 0.0
@@ -222,6 +257,7 @@ class TolerancesEntry(Entries):
     position: Positive | None = None
     tilt: Positive | None = None
     panel: Positive | None = None
+    joints: dict[str, Positive] = Field(default_factory=dict)
     touchdown: Positive | None = None
     sink: Positive | None = None
 
@@ -229,7 +265,7 @@ class TolerancesEntry(Entries):
 class MissionFile(Entries):
     """Entries of a mission."""
 
-    format: Annotated[int, AfterValidator(_format)]
+    format: Annotated[int, AfterValidator(_check_format)]
     name: Name
     title: str = ""
     t1: Annotated[float, Field(gt=0, le=LONGEST)]
@@ -240,23 +276,10 @@ class MissionFile(Entries):
     payload: PayloadEntry | None = None
     path: PathEntry = PathEntry()
     panel: Annotated[tuple[MoveEntry, ...], Tuples] = ()
+    joints: Annotated[tuple[JointMoveEntry, ...], Tuples] = ()
     wind: WindEntry | None = None
     push: PushEntry | None = None
     faults: Annotated[tuple[FaultEntry, ...], Tuples] = ()
-    battery: BatteryEntry | None = None
+    payloads: Annotated[tuple[CarriedEntry, ...], Tuples] = ()
+    battery: FlightBatteryEntry | None = None
     tolerances: TolerancesEntry = TolerancesEntry()
-
-
-class MissionStudyFile(Drawing):
-    """Entries of a Monte Carlo study of a mission, which is a ready one or a file beside the study's.
-
-    Its end `t1` [s] takes the place of the mission's.
-    """
-
-    kind: Literal["missions"]
-    name: Name = "missions"
-    mission: str
-    t1: Annotated[float, Field(gt=0, le=LONGEST)] | None = None
-    factors: Annotated[dict[str, Factor], Field(min_length=1, max_length=1000)]
-    samples: Count | None = None
-    chunk: Annotated[int, Field(ge=1, le=MOST_STEPS)] | None = None

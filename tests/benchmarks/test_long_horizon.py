@@ -1,8 +1,6 @@
 """The long-horizon benchmark: its measures, what it keeps of symmetric methods, its smoke test."""
 
 import json
-import runpy
-import sys
 from types import SimpleNamespace
 
 import long_horizon
@@ -58,23 +56,3 @@ def test_problems_start_consistent(make):
     found = stm.assemble(problem.system, problem.state)
     np.testing.assert_allclose(found.state.v, problem.state.v, rtol=0, atol=1e-12)
     np.testing.assert_allclose(found.state.omega, problem.state.omega, rtol=0, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_smoke(tmp_path, monkeypatch):
-    """The script at its smallest size: a complete record and its figures."""
-    arguments = ["--quick", "--results", str(tmp_path), "--figures", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", ["long_horizon.py", *arguments])
-    runpy.run_path(long_horizon.__file__, run_name="__main__")
-    found = json.loads((tmp_path / "long_horizon.json").read_text())
-    assert {"commit", "dirty", "versions", "cores", "date"} <= set(found["environment"])
-    (problem,) = found["problems"]
-    assert len(problem["runs"]) == 2
-    for row in problem["runs"]:
-        assert row["completed"]
-        assert row["residual"] <= 1e-8
-        assert row["seconds"] > 0
-    coarse, fine = problem["runs"]
-    assert fine["largest"] < coarse["largest"]
-    assert fine["evaluations"] > coarse["evaluations"]
-    assert len(list(tmp_path.glob("*.png"))) == 3

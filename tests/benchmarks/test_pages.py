@@ -1,41 +1,72 @@
-"""The pages that benchmarks write: failures with reasons, and honest words about other programs."""
+"""The pages that benchmarks write: those of the stored results, with reasons for what has no number."""
 
 import json
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 import report
-from sections import failure_page, figures, state
-from sections.tables import reference
 from sections.throughput_page import of_peer
 from shared.record import RESULTS
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
-
+DOCS = Path(__file__).parents[2] / "docs"
 NAN = float("nan")
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """The suite's page from the committed results."""
-    return report.build(RESULTS, tmp_path_factory.mktemp("docs") / "benchmarks.md").read_text()
+    """The page of the stored results, beside which they seem to be, so that its links are the same."""
+    root = tmp_path_factory.mktemp("root")
+    (root / "benchmarks").mkdir()
+    (root / "docs").mkdir()
+    (root / "benchmarks" / "results").symlink_to(RESULTS)
+    return report.build(root / "benchmarks" / "results", root / "docs" / "benchmarks.md")
 
 
-def tables(text):
+def table_rows(text):
     """Cells of all table rows of a page, without heads' rules."""
     lines = [line for line in text.splitlines() if line.startswith("|") and "---" not in line]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def test_no_page_says_what_another_program_cannot_do(page):
+def test_stored_page_is_that_of_the_stored_results(page):
+    assert report.PAGE.read_text() == page.read_text()
+
+
+def test_page_answers_in_its_first_lines_and_is_short():
+    text = report.PAGE.read_text()
+    first = text.split("\n## ")[0]
+    assert "figures/benchmarks/work_precision.png" in first
+    assert len(first.split()) <= 120
+    assert len(text.split()) <= 4000
+
+
+def test_links_to_the_page_have_their_places():
+    text = report.PAGE.read_text()
+    titles = re.findall(r"^## (.+)$", text, re.MULTILINE)
+    slugs = [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]
+    anchors = {*re.findall(r'<a id="([^"]+)">', text), *slugs}
+    for path in (*DOCS.glob("*.md"), DOCS.parent / "README.md"):
+        for anchor in re.findall(r"\(\S*benchmarks\.md#([\w-]+)\)", path.read_text()):
+            assert anchor in anchors, (path.name, anchor)
+
+
+def test_links_and_figures_of_the_page_exist():
+    links = re.findall(r"\]\(([^)#]+)\)", report.PAGE.read_text())
+    assert len(links) > 20
+    assert all((DOCS / link).exists() for link in links)
+    # every result has a link, with its runs
+    assert {Path(link).name for link in links} >= {path.name for path in RESULTS.glob("*.json")}
+
+
+def test_no_page_says_what_another_program_cannot_do():
+    page = report.PAGE.read_text()
     assert "cannot model" not in page
     # what an adapter lacks is said to be the adapter's
-    assert page.count("what the adapter lacks") == page.count("not about the programs")
-    throughput = (FOLDER.parent / "docs" / "throughput.md").read_text()
-    for text in (page, throughput):
-        assert "nan" not in [cell for row in tables(text) for cell in row]
+    assert "not in our adapter" in page
+    assert "not about the programs" in page
+    for text in (page, (DOCS / "validation.md").read_text()):
+        assert "nan" not in [cell for row in table_rows(text) for cell in row]
 
 
 def test_rows_without_an_error_say_why():
@@ -73,95 +104,13 @@ def test_flights_that_were_lost_have_no_throughput(row, cells):
     assert of_peer(row)[2:] == cells
 
 
-def test_stored_page_is_that_of_the_stored_results(page):
-    """Beyond its head, whose distances to the present commit grow with every commit."""
-    stored = report.PAGE.read_text()
-    of_stored, of_results = (text.split("## Compared with")[1] for text in (stored, page))
-    assert of_stored == of_results
-
-
-def test_state_of_the_results_names_every_result(page):
-    section = page.split("## State of the results")[1].split("\n## ")[0]
-    names = {row[0].split(",")[0] for row in tables(section)[1:]}
-    assert names == {path.stem for path in RESULTS.glob("*.json")}
-
-
-def test_state_of_a_result_that_left_the_history(monkeypatch):
-    about = {"commit": "f" * 40, "date": "2026-11-21T18:26:22+00:00"}
-    monkeypatch.setattr(state, "git", lambda *call: "12" if "--count" in call else "x")
-    monkeypatch.setattr(state, "traced", lambda _: None)
-    assert state.age(about) == ("no", "12, by date")
-    monkeypatch.setattr(state, "traced", lambda _: "a" * 40)
-    monkeypatch.setattr(state, "moved", lambda *_: 3)
-    assert state.age(about) == ("as aaaaaaaaaa, the same files", "3")
-    monkeypatch.setattr(state, "git", lambda *_: None)
-    assert state.age(about) == ("no history here", "-")
-
-
-def test_figures_name_what_they_do_not_show():
-    row = {"method": "A", "error": 1e-3, "seconds": {"median": 1.0}, "failure": ""}
-    failed = {**row, "method": "B", "error": None, "failure": "The step became too small."}
-    lacking = {"method": "C", "reason": "No ball joints."}
-    curve = {"rows": [row, failed], "unsupported": [lacking]}
-    assert figures.not_drawn(curve) == [
-        ("C", "not in our adapter: No ball joints."),
-        ("B", "The step became too small."),
+def test_least_time_is_that_of_the_last_horizon():
+    row = {"method": "MuJoCo (C), RK4", "solver": "RK4"}
+    cheapest = [
+        {**row, "horizon": 0.5, "1e-03": {"seconds": 1.0}},
+        {**row, "horizon": 1.0, "1e-03": {"seconds": None}},
     ]
-
-
-def test_reference_in_closed_form_is_called_so():
-    check = {"horizon": 1.0, "second_code": None, "other_formulation": None}
-    assert "The reference is the closed form" in reference(check, True)[0]
-    assert "tightest tolerance" in reference(check, False)[0]
-
-
-@pytest.fixture(scope="module")
-def drawn():
-    """Figures of docs/failure.md from the committed record."""
-    return failure_page.figures(json.loads((RESULTS / "failure.json").read_text()))
-
-
-def curve(ax, label):
-    """Points (k, 2) of the curves of a panel with this label."""
-    lines = [line for line in ax.lines if line.get_label() == label]
-    return np.concatenate([np.array(line.get_data()).T for line in lines])
-
-
-def test_figures_of_the_failure_page_have_units(drawn):
-    text = (FOLDER.parent / "docs" / "failure.md").read_text()
-    assert set(drawn) == set(re.findall(r"\(figures/failure/(\w+)\.png\)", text))
-    for name, figure in drawn.items():
-        whole = figure.get_supylabel()
-        for ax in figure.axes:
-            below = ax.get_subplotspec().is_last_row()
-            left = ax.get_subplotspec().is_first_col() and not whole
-            assert "[" in ax.get_xlabel() or not below, name
-            # names of runs have no unit
-            assert "[" in ax.get_ylabel() or not left or name == "collapse", name
-        assert not whole or "[" in whole
-
-
-def test_figures_of_the_failure_page_show_what_its_text_says(drawn):
-    (ax,) = drawn["violation"].axes
-    # half of the last digit of the page's table, and of the three that a curve's points have
-    for label, end in (("corrected, default tolerances", 9.8e-2), ("corrected", 2.5e-5)):
-        t, last = curve(ax, label)[-1]
-        assert t == 2.0
-        assert abs(last - end) <= 0.055 * 10.0 ** np.floor(np.log10(end))
-    (ax,) = drawn["collapse"].axes
-    times, places = curve(ax, failure_page.TIGHT).T
-    # the lower three rows are those of all four misprints
-    within = times[(places > 2.5) & (times >= 0.45) & (times <= 0.5)]
-    assert (len(times), len(within)) == (60, 4)
-    rates, _, steps, _ = drawn["stiffness"].axes
-    for ax, largest in ((rates, (56, 71, 85)), (steps, (0.72, 0.84, 0.72))):
-        for case, value in enumerate(largest, 1):
-            t, y = curve(ax, f"case {case}").T
-            assert np.max(y[t <= 0.5]) == pytest.approx(value, rel=0.01)
-    for case, close in ((1, 3), (2, 15), (3, 28)):
-        t, angle = curve(drawn["alignment"].axes[0], f"case {case}").T
-        # a rod that still comes closer at the end has not passed
-        passes = (angle < 5) & (t < 0.9995)
-        assert (np.sum(passes), len(t)) == (close, 48)
-    _, angle = curve(drawn["alignment"].axes[1], "case 2").T
-    assert np.min(angle) > 78
+    curve = {"horizons": [0.5, 1.0], "cheapest": cheapest}
+    assert report.duration(report.least_time(curve, report.MUJOCO, "1e-03")) == "not reached"
+    assert report.duration(0.0164) == "16.4 ms"
+    assert report.duration(1.21) == "1.21 s"

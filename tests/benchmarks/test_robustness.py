@@ -7,18 +7,18 @@ import pytest
 
 @pytest.mark.slow
 def test_its_study_draws_every_mass_and_inertia_and_its_flights_are_counted():
-    work = missions.work(0.1)
-    assert {"mass.panel_7", "inertia.hexacopter_1", "rotor.k_f"} <= set(work.sampling.names)
-    drawn = work.sampling.draw(0, 4000)
+    study = missions.make_study(0.1)
+    assert {"mass.panel_7", "inertia.hexacopter_1", "rotor.k_f"} <= set(study.sampling.names)
+    drawn = study.sampling.draw(0, 4000)
     assert drawn.shape == (4000, len(missions.FACTORS))
     # a normal variable truncated at four standard deviations keeps 99.9 % of its own
     assert np.std(drawn) == pytest.approx(0.05, rel=0.01)
     assert np.max(np.abs(drawn - 1.0)) <= 0.2
-    given = work.mission.file
+    given = study.evaluate.mission.file
     assert (given.tolerances.position, given.tolerances.tilt) == (0.5, 15.0)
     assert given.sensors is not None
     assert given.sensors.standing == 3.0
-    columns = {name: np.full(100, 0.1) for name in work.columns}
+    columns = {name: np.full(100, 0.1) for name in study.columns}
     columns["status"] = np.where(np.arange(100) < 98, 1, 3)
     columns["kept"] = np.where(np.arange(100) < 97, 1, 0)
     found = missions.share(columns)

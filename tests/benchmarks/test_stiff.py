@@ -1,9 +1,5 @@
 """The stiff benchmark: its scenes, its reading of the crossover, its smoke test."""
 
-import json
-import runpy
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -61,22 +57,3 @@ def test_crossover(ratios, up_to, since):
     found = stiff.crossover([scene(0.0, 0.0, 5.0), *reversed(rows)], 1e-6)
     assert (found["explicit_up_to"] or {}).get("name") == up_to
     assert (found["implicit_from"] or {}).get("name") == since
-
-
-@pytest.mark.slow
-def test_smoke(tmp_path, monkeypatch):
-    """The script at its smallest size: a complete record and its figures."""
-    arguments = ["--quick", "--results", str(tmp_path), "--figures", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", ["stiff.py", *arguments])
-    runpy.run_path(stiff.__file__, run_name="__main__")
-    record = json.loads((tmp_path / "stiff.json").read_text())
-    assert {"commit", "dirty", "versions", "cores", "date"} <= set(record["environment"])
-    soft, hard = record["scenes"]
-    # one sliding body of m = 1 kg: |eigenvalue| = sqrt(k / m) where the damping is light
-    assert soft["eigenvalue"]["start"] == pytest.approx(np.sqrt(soft["stiffness"]), rel=1e-3)
-    assert hard["eigenvalue"]["start"] > soft["eigenvalue"]["start"]
-    for found in (soft, hard):
-        assert max(found["reference"]["dopri8_apart"]) <= 1e-10
-        assert all(row["completed"] and row["error"] <= 1e-6 for row in found["runs"])
-    assert record["crossover"]["1e-06"]
-    assert len(list(tmp_path.glob("*.png"))) == 2

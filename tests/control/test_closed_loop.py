@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import stmuav_jax as stm
-from stmuav_jax.algebra.compiler import quick_jit
+from stmuav_jax.math.compiler import quick_jit
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "flight"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "analysis"))
 from mechanisms import cart_pole  # pyright: ignore[reportMissingImports]
 
-control, sensing = stm.control, stm.sensing
+control, sensing = stm.control, stm.analysis
 
 MASS, STIFFNESS, DAMPING, RATE = 2.0, 50.0, 1.5, 200.0
 GAIN = np.array([30.0, 6.0])
@@ -57,10 +57,10 @@ def wanted(t):
     return jnp.stack([0.05 * jnp.sin(3.0 * t), 0.15 * jnp.cos(3.0 * t)])
 
 
-@pytest.mark.parametrize(("late", "steps"), [(0, 1), (3, 1), (3, None)])
-def test_a_loop_is_the_exact_sampled_system(late, steps):
+@pytest.mark.parametrize("steps", [1, None])
+def test_a_loop_is_the_exact_sampled_system(steps):
     """A spring's mass under a delayed feedback, by the matrix exponential."""
-    system, start = spring_mass()
+    (system, start), late = spring_mass(), 3
     plant = control.Plant(
         system, start, rate=RATE, inputs=["effort"], delay=late / RATE, steps=steps
     )
@@ -130,7 +130,7 @@ def test_regulators_are_those_of_the_closed_form():
     """The double integrator: K = (1, sqrt 3) for unit weights; the held one by iteration."""
     A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
     names = (("x", "m"), ("v", "m/s"))
-    linear = stm.flight.Linear(A, B, np.eye(2), np.zeros((2, 1)), names, (("u", "N"),), names)
+    linear = stm.analysis.Linear(A, B, np.eye(2), np.zeros((2, 1)), names, (("u", "N"),), names)
     found = control.regulator(linear, [1.0, 1.0], [1.0])
     np.testing.assert_allclose(found.K, [[1.0, np.sqrt(3.0)]], rtol=1e-12)
     assert np.all(found.poles.real < 0)
@@ -152,10 +152,10 @@ def test_modes_that_nothing_moves_are_named():
     A[0, 2] = A[1, 3] = 1.0
     B = np.array([[0.0], [0.0], [1.0], [0.0]])
     names = tuple((n, "m") for n in ("a", "b", "a_rate", "b_rate"))
-    linear = stm.flight.Linear(A, B, np.eye(4), np.zeros((4, 1)), names, (("u", "N"),), names)
+    linear = stm.analysis.Linear(A, B, np.eye(4), np.zeros((4, 1)), names, (("u", "N"),), names)
     with pytest.raises(stm.ModelError, match=r"cannot stabilise .* b.*they do not move it"):
         control.regulator(linear, np.ones(4), [1.0])
-    both = stm.flight.Linear(
+    both = stm.analysis.Linear(
         A, np.eye(4)[:, 2:], np.eye(4), np.zeros((4, 2)), names, (("u", "N"), ("w", "N")), names
     )
     with pytest.raises(stm.ModelError, match=r"do not determine .* b.*they do not see it"):
@@ -195,7 +195,7 @@ def test_gradients_of_a_closed_loop(cart):
 
 
 def test_a_batch_is_its_single_loops(cart):
-    """`rollout` and `reset` with `step`, vmapped over starts, against one after the other."""
+    """`rollout`, vmapped over starts, against `reset` and `step` of one after the other."""
     system, _, _, feedback, _ = cart
     plant = control.Plant(system, rate=100.0)
     angles = [0.05, -0.1]
@@ -211,11 +211,9 @@ def test_a_batch_is_its_single_loops(cart):
             now = plant.step(now, feedback(now.estimate, None, None)[0])
         return now.state.r
 
-    one, many = quick_jit(flown), quick_jit(jax.vmap(flown))(stacked)
+    one, many = quick_jit(stepped), quick_jit(jax.vmap(flown))(stacked)
     for k, state in enumerate(starts):
-        np.testing.assert_allclose(many[k], one(state), atol=1e-13)
-    by_steps = quick_jit(jax.vmap(stepped))(stacked)
-    np.testing.assert_allclose(by_steps, many[:, 2], atol=1e-13)
+        np.testing.assert_allclose(many[k, 2], one(state), atol=1e-13)
 
 
 def test_sensors_read_at_their_own_rates():
@@ -271,6 +269,8 @@ def test_an_estimator_keeps_its_memory():
 
 def test_what_cannot_be_sampled_is_refused():
     system, start = spring_mass()
+    with pytest.raises(stm.SettingError, match=r"noise of the sensor .* must not be negative"):
+        control.Instrument(sensing.PositionFix("mass"), noise=[0.01, -0.01, 0.0])
     fast = control.Instrument(sensing.Encoder("rail"), rate=150.0)
     with pytest.raises(stm.SettingError, match=r"150 Hz, which is not a whole part .* 400 Hz"):
         control.Plant(system, start, inputs=["effort"], sensors=[fast])
@@ -288,7 +288,9 @@ def test_controllers_that_fail_say_when_and_where():
     """A wrong shape, a memory that grows, and a number that is not finite from a time on."""
     system, start = spring_mass()
     plant = control.Plant(system, start, rate=RATE, inputs=["effort"])
-    with pytest.raises(stm.SettingError, match=r"1 inputs.* for effort.* returned shape \(2,\)"):
+    with pytest.raises(
+        stm.SettingError, match=r"1 inputs.* effort.* shape \(2,\).*Plant\(\.\.\., inputs="
+    ):
         control.close_loop(plant, lambda e, r, m: (jnp.zeros(2), m), 0.1)
     with pytest.raises(stm.SettingError, match="must return a pair"):
         control.close_loop(plant, lambda e, r, m: jnp.zeros(1), 0.1)

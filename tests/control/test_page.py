@@ -1,4 +1,4 @@
-"""The Python of docs/control.md runs as it stands."""
+"""The Python of docs/control_and_missions.md runs as it stands."""
 
 import re
 from pathlib import Path
@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-PAGE = Path(__file__).parents[2] / "docs" / "control.md"
+PAGE = Path(__file__).parents[2] / "docs" / "control_and_missions.md"
 
 
 @pytest.mark.slow
 def test_the_page_on_closed_loops_runs(tmp_path, monkeypatch):
-    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 10
+    page, _, _ = PAGE.read_text(encoding="utf-8").partition("\n## Missions\n")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(blocks) == 5
     # a user's cart-pole, and a plain hexacopter
     assert len(blocks[0].splitlines()) < 40
     flight = next(block for block in blocks if "FlightController" in block)
@@ -21,7 +22,6 @@ def test_the_page_on_closed_loops_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec("\n".join(blocks), names)
     assert np.max(np.abs(names["run"].states.r[-1, :, 0])) < 2e-3
-    assert {path.name for path in (tmp_path / "cart").iterdir()} == {"poles.png", "steps.png"}
     end = names["flight"].states.r[-1, 0]
     np.testing.assert_allclose(end, [np.cos(4.0) - 1, np.sin(4.0), 0.8], atol=5e-3)
     assert names["sensed"].reset().estimate.state.r.shape == (1, 3)
@@ -31,9 +31,3 @@ def test_the_page_on_closed_loops_runs(tmp_path, monkeypatch):
         names["lifted"].signal("payload")[-1, 1:3], [0.02, -0.012], atol=0.01
     )
     assert names["climbs"][1] > names["climbs"][0]
-    # the arm's end, 0.5 m from its hinge
-    bob = names["raised"].states.r[-1, 0]
-    np.testing.assert_allclose(bob, 0.5 * np.array([-np.sin(2.2), 0, -np.cos(2.2)]), atol=5e-3)
-    assert names["tuned"].improvement > 0.2
-    assert names["scores"].shape == (4,)
-    assert np.all(names["scores"] < 0)

@@ -8,7 +8,7 @@ import pytest
 
 import stmuav_jax as stm
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "flight"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "analysis"))
 from mechanisms import cart_pole  # pyright: ignore[reportMissingImports]
 
 control = stm.control
@@ -22,7 +22,7 @@ def linear_of(A, B):
     states, inputs = (
         tuple((f"{name}{k}", "") for k in range(size)) for name, size in (("x", n), ("u", m))
     )
-    return stm.flight.Linear(
+    return stm.analysis.Linear(
         np.asarray(A), np.asarray(B), np.eye(n), np.zeros((n, m)), states, inputs, states
     )
 

@@ -19,24 +19,13 @@ from stmuav_jax.dynamics.choices import (
 )
 
 
-@pytest.mark.parametrize("name", get_args(SolverName))
-def test_every_solver_has_a_name(name):
-    found = stm.Method(solver=solver_named(name)).solver
-    assert found == "auto" if name == "auto" else type(found).__name__.lower() == name
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("tree", "Tree(cut=chosen, redundant=False)"),
-        ("augmented", "Augmented(solve=structured, rows=body, redundant=False)"),
-        ("augmented-dense", "Augmented(solve=dense, rows=body, redundant=False)"),
-        ("report", "Augmented(solve=dense, rows=report, redundant=False)"),
-    ],
-)
-def test_every_formulation_has_a_name(name, words):
-    assert name in get_args(FormulationName)
-    assert str(stm.Method(formulation=formulation_named(name)).formulation) == words
+def test_every_solver_and_formulation_has_a_name():
+    for name in get_args(SolverName):
+        solver = stm.Method(solver=solver_named(name)).solver
+        assert solver == "auto" if name == "auto" else type(solver).__name__.lower() == name
+    texts = ("Tree(cut=chosen, redundant=False)", "Augmented(redundant=False)")
+    for name, words in zip(get_args(FormulationName), texts, strict=True):
+        assert str(stm.Method(formulation=formulation_named(name)).formulation) == words
 
 
 def test_every_stabilisation_has_a_name():

@@ -8,8 +8,9 @@ import pytest
 from helpers import pendulum, relative_error, scene_of, state_of, swung, turn
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics import certify
-from stmuav_jax.dynamics.checks import check_method
+from stmuav_jax.dynamics import diagnostics
+from stmuav_jax.dynamics.assembly.singular import describe_driver_jump
+from stmuav_jax.dynamics.simulation import check_method
 
 SYSTEM = pendulum()
 START = swung(SYSTEM, 1.0, 0.5)
@@ -57,8 +58,11 @@ def test_bad_settings_are_refused(settings, words):
         ({"first_step": 0.0}, "first_step"),
         ({"first_step": -1e-3}, "first_step"),
         ({"first_step": np.nan}, "first_step"),
-        ({"solver": "Rodas5P"}, r"solver must be an object.*the text 'Rodas5P': write Rodas5P\(\)"),
-        ({"solver": stm.Rodas5P}, r"solver must.*the class Rodas5P: write Rodas5P\(\)"),
+        (
+            {"solver": "Kvaerno5"},
+            r"solver must be an object.*the text 'Kvaerno5': write kvaerno5\(\)",
+        ),
+        ({"solver": diffrax.Tsit5}, r"solver must.*the class Tsit5: write Tsit5\(\)"),
         (
             {"formulation": "tree"},
             r"formulation must be an object such as Tree\(\).*text 'tree': write Tree",
@@ -256,6 +260,19 @@ def test_what_a_run_holds(run):
     np.testing.assert_allclose(snapshot.reactions.force[:, 0], expected, atol=1e-9)
 
 
+def test_states_between_saved_times_are_as_accurate_as_on_them(run):
+    """A run saved rarely, between its times, against the one that saves there."""
+    rare = stm.simulate(SCENE, method=stm.Method(rtol=1e-10, atol=1e-10), ts=[0.0, 0.16, 0.4])
+    found = stm.dynamics.states_at(rare, run[0].ts)
+    for name in ("r", "p", "v", "omega"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(run[0].states, name), rtol=0, atol=1e-8
+        )
+    np.testing.assert_array_equal(found.r[8], np.asarray(rare.states.r)[1])
+    with pytest.raises(stm.SettingError, match=r"covers 0 s to 0\.4 s, but a state at 0\.6 s"):
+        stm.dynamics.states_at(rare, [0.2, 0.6])
+
+
 def test_ctrl_c_keeps_what_was_reached(run):
     def stop(fraction):
         raise KeyboardInterrupt
@@ -306,18 +323,6 @@ def test_the_failed_run_is_kept(failed):
     check_part(failed.run)
 
 
-@pytest.mark.slow
-def test_without_throw_the_failed_run_is_returned():
-    check_part(stm.simulate(bursting(), throw=False))
-
-
-def test_a_failure_names_the_end_that_was_asked_for():
-    run = stm.simulate(
-        SCENE, method=stm.Method(max_steps=2, rtol=1e-12, atol=1e-12), throw=False, t1=0.3
-    )
-    assert "s of 0.3 s:" in run.failure
-
-
 def test_without_analysis_there_is_no_snapshot(run):
     found = stm.simulate(SCENE, method=stm.Method(rtol=1e-10, atol=1e-10), analysis=False)
     np.testing.assert_allclose(found.states.r, run[0].states.r, rtol=0, atol=1e-12)
@@ -329,10 +334,9 @@ def test_without_analysis_there_is_no_snapshot(run):
         stm.simulate(with_start(r=START.r + 1e-5), analysis=False)
 
 
-@pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=str)
-def test_a_full_certificate_compares_two_formulations(run, formulation):
+def test_a_full_certificate_compares_two_formulations(run):
     assert run[0].certificate.formulation_difference is None
-    method = stm.Method(rtol=1e-10, atol=1e-10, formulation=formulation)
+    method = stm.Method(rtol=1e-10, atol=1e-10, formulation=stm.Augmented())
     found = stm.simulate(SCENE, method=method, error_estimate=False, certificate="full").certificate
     assert found.formulation_difference is not None
     assert found.formulation_difference < 1e-12
@@ -343,11 +347,11 @@ def test_a_full_certificate_compares_two_formulations(run, formulation):
 
 def test_a_full_certificate_sees_a_wrong_formulation(run, monkeypatch):
     """Accelerations that are a millionth too large are found by the other formulation."""
-    right = certify.accelerations
+    right = diagnostics.evaluate_accelerations
     wrong = lambda how, *at: jax.tree.map(
         lambda x: x * (1 + 1e-6 * isinstance(how, stm.Tree)), right(how, *at)
     )
-    monkeypatch.setattr(certify, "accelerations", wrong)
+    monkeypatch.setattr(diagnostics, "evaluate_accelerations", wrong)
     method = stm.Method(rtol=1e-10, atol=1e-10)
     found = stm.simulate(SCENE, method=method, error_estimate=False, certificate="full").certificate
     assert found.formulation_difference == pytest.approx(1e-6, rel=1e-3)
@@ -361,19 +365,10 @@ def test_a_full_certificate_needs_the_analysis():
 def test_too_few_steps():
     run = stm.simulate(SCENE, method=stm.Method(max_steps=2, rtol=1e-12, atol=1e-12), throw=False)
     assert run.certificate.result == "max_steps reached"
+    assert "s of 0.4 s:" in run.failure
     assert not run.successful
     assert run.certificate.t_end < 0.4
     assert np.all(np.isfinite(run.states.r))
-
-
-@pytest.mark.slow
-def test_an_event_ends_a_run():
-    run = stm.simulate(SCENE, method=stm.Method(event=lambda t, state: t > 0.11))
-    assert run.successful
-    assert run.certificate.result == "event occurred"
-    assert 0.11 <= run.certificate.t_end < 0.4
-    assert run.ts[-1] == run.certificate.t_end
-    assert np.all(np.diff(run.ts) > 0)
 
 
 @pytest.mark.slow
@@ -397,3 +392,41 @@ def test_a_span_of_no_length_gives_the_start():
     assert run.successful
     np.testing.assert_array_equal(run.ts, [0.0])
     np.testing.assert_array_equal(run.states.r[0], START.r)
+
+
+# --- drivers that jump
+
+
+def driven(motion):
+    """A body on a rail, moved by a driver."""
+    body = stm.Body("car", 1.0, [0.1, 0.1, 0.1])
+    rail = stm.translational("rail", "ground", "car", point=[0, 0, 0], axis=[1, 0, 0])
+    push = stm.drive("push", rail, motion, coordinate="displacement")
+    return stm.System([body], [rail, push], [])
+
+
+@pytest.mark.parametrize(
+    ("motion", "words"),
+    [
+        (lambda t: jnp.where(t > 0.3, 0.1, 0.0), "the position of the driver 'push' jumps there, from 0 to 0.1 m,"),
+        (lambda t: jnp.where(t > 0.3, 1e-6 * (t - 0.3), 0.0), "the velocity of the driver 'push' jumps there"),
+        (lambda t: jnp.where(t > 0.3, (t - 0.3) ** 2, 0.0), ""),
+        (lambda t: 0.3 * jnp.sin(50 * t) + t**2, ""),
+    ],
+)  # fmt: skip
+def test_a_driver_that_jumps_is_named(motion, words):
+    for t in (0.3, 0.3 - 1e-15, 0.3 + 1e-15):
+        found = describe_driver_jump(driven(motion), t)
+        assert found.startswith(words)
+        assert bool(found) == bool(words)
+
+
+def test_a_run_that_a_driver_stops_says_so():
+    """The message names driver and time, and what would be valid."""
+    system = driven(lambda t: jnp.where(t > 0.3, t - 0.3, 0.0))
+    words = (
+        r"stopped at t = 0\.3 s of 0\.5 s: the velocity of the driver 'push' jumps there, "
+        "from 0 to 1 m/s.*over a finite time"
+    )
+    with pytest.raises(stm.SimulationError, match=words):
+        stm.simulate(system, system.reference, t1=0.5)

@@ -1,8 +1,10 @@
 """`integrate`: under jit, vmap and differentiation, and its events; on a pendulum."""
 
+import re
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,16 +32,6 @@ def loss_of(found):
     return jnp.sum(found.states.r @ weights) + jnp.sum(found.states.omega[-1] ** 2)
 
 
-def loss(parameters, **more):
-    return loss_of(run(parameters, **more))
-
-
-@pytest.fixture(scope="module")
-def graded():
-    """Value and gradient, compiled."""
-    return jax.jit(jax.value_and_grad(loss))
-
-
 # what the flights of the batch need is some 20 step attempts for an output time
 FEW: dict[str, Any] = {"max_steps": 60}
 
@@ -47,53 +39,13 @@ FEW: dict[str, Any] = {"max_steps": 60}
 @pytest.fixture(scope="module")
 def of_batch():
     """Values and gradients of a batch, compiled."""
-    return jax.jit(jax.vmap(jax.value_and_grad(lambda x: loss(x, **FEW))))
+    return jax.jit(jax.vmap(jax.value_and_grad(lambda x: loss_of(run(x, **FEW)))))
 
 
 @pytest.fixture(scope="module")
 def batched(of_batch):
     """Values and gradients of the batch."""
     return of_batch(BATCH)
-
-
-def minimal(parameters, t, event=None):
-    """The pendulum in its angle, by SciPy; moment of inertia m l^2 + 0.02."""
-    rate, mass, gravity = parameters
-    f = lambda t, x: [x[1], -mass * gravity * LENGTH * np.sin(x[0]) / (mass * LENGTH**2 + 0.02)]
-    return solve_ivp(f, (0, t), [0.7, rate], method="DOP853", rtol=1e-13, atol=1e-14, events=event)
-
-
-def test_values_under_jit_and_vmap(graded, batched):
-    """10 times the tolerance; and the minimal-coordinate pendulum says the same."""
-    for parameters, value in zip(BATCH, batched[0], strict=True):
-        single = float(graded(parameters)[0])
-        assert float(value) == pytest.approx(single, rel=10 * RTOL)
-        ends = [np.array([0.7, 0.0]), *(minimal(parameters, float(t)).y[:, -1] for t in TS[1:])]
-        expected = sum(-LENGTH * (np.sin(a) + 2 * np.cos(a)) for a, _ in ends) + ends[-1][1] ** 2
-        assert single == pytest.approx(expected, abs=1e-8)
-
-
-def test_gradients_of_a_batch_are_those_of_its_members(graded, batched):
-    for parameters, gradient in zip(BATCH, batched[1], strict=True):
-        assert relative_error(gradient, graded(parameters)[1]) < 1e-10
-
-
-def test_a_failed_flight_is_not_a_number(of_batch, batched):
-    """Nor is its gradient, so that a sum shows it; the others are as without it."""
-    values, gradients = of_batch(BATCH.at[1, 1].set(jnp.nan))
-    assert np.isnan(values[1])
-    assert np.all(np.isnan(gradients[1]))
-    for k in (0, 2):
-        assert float(values[k]) == pytest.approx(float(batched[0][k]), rel=1e-12)
-        assert relative_error(gradients[k], batched[1][k]) < 1e-10
-
-
-def test_gradients_equal_finite_differences(graded):
-    gradient = np.asarray(graded(BATCH[0])[1])
-    for k, direction in enumerate(np.eye(3)):
-        expected = central(lambda h, d=direction: graded(BATCH[0] + h * d)[0], 1e-3)
-        assert abs(expected) > 1e-4
-        assert gradient[k] == pytest.approx(float(expected), rel=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -107,12 +59,46 @@ def forward():
     return jax.jit(lambda x, d: jax.jvp(along, (x,), (d,), has_aux=True))
 
 
-def test_forward_and_reverse_mode_agree(graded, forward):
-    value, gradient = graded(BATCH[0])
-    for k, direction in enumerate(np.eye(3)):
-        same, rate, _ = forward(BATCH[0], jnp.asarray(direction))
-        assert float(same) == pytest.approx(float(value), rel=1e-12)
-        assert float(rate) == pytest.approx(float(gradient[k]), rel=1e-9)
+def minimal(parameters, t, event=None):
+    """The pendulum in its angle, by SciPy; moment of inertia m l^2 + 0.02."""
+    rate, mass, gravity = parameters
+    f = lambda t, x: [x[1], -mass * gravity * LENGTH * np.sin(x[0]) / (mass * LENGTH**2 + 0.02)]
+    return solve_ivp(f, (0, t), [0.7, rate], method="DOP853", rtol=1e-13, atol=1e-14, events=event)
+
+
+def test_values_under_jit_and_vmap(batched):
+    """The minimal-coordinate pendulum says the same."""
+    for parameters, value in zip(BATCH, batched[0], strict=True):
+        ends = [np.array([0.7, 0.0]), *(minimal(parameters, float(t)).y[:, -1] for t in TS[1:])]
+        expected = sum(-LENGTH * (np.sin(a) + 2 * np.cos(a)) for a, _ in ends) + ends[-1][1] ** 2
+        assert float(value) == pytest.approx(expected, abs=1e-8)
+
+
+def test_a_batch_in_reverse_is_its_members_in_forward_mode(batched, forward):
+    """Values to 10 times the tolerance."""
+    for parameters, value, gradient in zip(BATCH, *batched, strict=True):
+        for k, direction in enumerate(jnp.eye(3)):
+            same, rate, _ = forward(parameters, direction)
+            assert float(value) == pytest.approx(float(same), rel=10 * RTOL)
+            assert float(rate) == pytest.approx(float(gradient[k]), rel=1e-9)
+
+
+def test_gradients_equal_finite_differences(batched, forward):
+    for k, direction in enumerate(jnp.eye(3)):
+        value = lambda h, d=direction: forward(BATCH[0] + h * d, d)[0]
+        expected = central(value, 1e-3)
+        assert abs(expected) > 1e-4
+        assert float(batched[1][0, k]) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_a_failed_flight_is_not_a_number(of_batch, batched):
+    """Nor is its gradient, so that a sum shows it; the others are as without it."""
+    values, gradients = of_batch(BATCH.at[1, 1].set(jnp.nan))
+    assert np.isnan(values[1])
+    assert np.all(np.isnan(gradients[1]))
+    for k in (0, 2):
+        assert float(values[k]) == pytest.approx(float(batched[0][k]), rel=1e-12)
+        assert relative_error(gradients[k], batched[1][k]) < 1e-10
 
 
 def test_a_flight_that_stops_on_the_way_is_not_a_number(of_batch, batched, forward):
@@ -156,16 +142,49 @@ def test_an_event_stops_at_its_time_on_the_constraint():
     assert float(found.worst.position[-1]) < 1e-14
 
 
-@pytest.mark.slow
-def test_too_few_steps_are_a_result_not_an_error():
-    found = jax.jit(lambda x: run(x, max_steps=3, adjoint=diffrax.ForwardMode()))(BATCH[0])
-    assert found.result == diffrax.RESULTS.max_steps_reached
-    assert float(found.ts[-1]) < float(TS[1])
-    assert int(found.counts.accepted[-1] + found.counts.rejected[-1]) <= 3
-
-
 def test_states_of_another_size_are_refused():
     system = pendulum()
     two = jax.tree.map(lambda x: jnp.concatenate([x, x]), system.reference)
     with pytest.raises(stm.SettingError, match=r"State.r must have shape"):
         stm.integrate(system, two, TS)
+
+
+@pytest.mark.parametrize(
+    "formulation", [stm.Tree(), pytest.param(stm.Augmented(), marks=pytest.mark.slow)], ids=str
+)
+def test_masses_that_are_none_are_flagged_and_leave_the_others_alone(formulation):
+    """A batch over a mass with 0, -1 kg and NaN: no motion there, and the others to the last bit."""
+    method = stm.Method(formulation=formulation, adjoint=diffrax.ForwardMode())
+    at = lambda mass: run((1.0, mass, 9.81), formulation=formulation, adjoint=method.adjoint)
+    batch = jax.jit(jax.vmap(at))
+    good, bad = (
+        batch(jnp.asarray([2.0, *middle, 3.0]))
+        for middle in ([0.5, 0.6, 0.7], [0.0, -1.0, float("nan")])
+    )
+    for a, b in zip(jax.tree.leaves(good), jax.tree.leaves(bad), strict=True):
+        np.testing.assert_array_equal(a[jnp.array([0, 4])], b[jnp.array([0, 4])])
+    assert np.all(good.result == diffrax.RESULTS.successful)
+    for k, mass in ((1, 0.0), (2, -1.0)):
+        member = jax.tree.map(lambda x, k=k: x[k], bad)
+        assert member.result != diffrax.RESULTS.successful
+        assert np.all(np.isnan(member.states.r[1:]))
+        assert np.all(member.ts == TS[0])
+        system = eqx.tree_at(lambda s: s.bodies.mass, pendulum(), jnp.asarray([mass]))
+        words = stm.dynamics.describe_result(system, member)
+        assert re.search(r"mass of body '\w+' must be finite and positive, but it is", words)
+        with pytest.raises(stm.ModelError, match="must be finite and positive"):
+            stm.simulate(system, swung(system, 0.7), t1=0.1)
+
+
+def test_output_times_may_go_back():
+    """To 0.5 s and back to 0.2 s and the start, as a run that goes straight there."""
+    through = jax.jit(lambda ts: run((1.0, 2.0, 9.81), ts, adjoint=diffrax.ForwardMode()))
+    back, on = (through(jnp.asarray(ts)) for ts in ([0.0, 0.5, 0.2, 0.0], [0.0, 0.2, 0.4, 0.5]))
+    assert back.result == diffrax.RESULTS.successful
+    # both within a few tolerances
+    np.testing.assert_allclose(back.states.r[1:3], on.states.r[np.array([3, 1])], atol=100 * RTOL)
+    np.testing.assert_allclose(back.states.r[3], back.states.r[0], atol=100 * RTOL)
+    with pytest.raises(
+        stm.SettingError, match="times must increase with a method that has an event"
+    ):
+        run((1.0, 2.0, 9.81), jnp.asarray([0.0, 0.5, 0.2]), event=lambda t, state: state.r[0, 2])

@@ -5,21 +5,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from linear import random_linear, textbook, textbook_smoother
+from linear import Product, random_linear, textbook, textbook_smoother
+from scipy.stats import multivariate_normal
 
 from stmuav_jax.checks.errors import ModelError, SettingError
 from stmuav_jax.estimation import sigma
-from stmuav_jax.estimation.bank import filter_bank
-from stmuav_jax.estimation.filter import EstimationError, kalman_filter
+from stmuav_jax.estimation.filter import (
+    DEFAULT,
+    AbstractFilter,
+    EstimationError,
+    GaussianFilter,
+    filter_bank,
+    kalman_filter,
+)
 from stmuav_jax.estimation.gaussians import Gaussian, gaussian
 from stmuav_jax.estimation.model import Sensor, StateSpaceModel
 from stmuav_jax.estimation.online import OnlineFilter
 from stmuav_jax.estimation.sigma import AbstractRule
 from stmuav_jax.estimation.smoother import smooth
-from stmuav_jax.estimation.update import DEFAULT, AbstractFilter, GaussianFilter, ReusingFilter
 
 CASE = random_linear()
 MEANS, COVARIANCES, LIKELIHOOD, NIS = textbook(CASE)
+SMALL = random_linear(seed=1, n=3, m=2, count=12)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return kalman_filter(CASE.model(), CASE.prior(), CASE.y, dt=1.0)
 
 
 @pytest.mark.parametrize(
@@ -46,31 +58,30 @@ def test_linear_system_is_a_kalman_filter(rule, form, tol):
 
 
 def test_fifth_degree():
-    case = random_linear(seed=1, n=3, m=2, count=50)
     fifth = GaussianFilter(sigma.Cubature5())
-    out = kalman_filter(case.model(), case.prior(), case.y, dt=1.0, method=fifth)
-    np.testing.assert_allclose(out.mean, textbook(case)[0], rtol=0, atol=1e-10)
+    out = kalman_filter(SMALL.model(), SMALL.prior(), SMALL.y, dt=1.0, method=fifth)
+    np.testing.assert_allclose(out.mean, textbook(SMALL)[0], rtol=0, atol=1e-10)
     with pytest.raises(SettingError, match="negative weights for n = 6"):
         kalman_filter(CASE.model(), CASE.prior(), CASE.y, dt=1.0, method=fifth)
 
 
-def test_invariants_and_likelihood():
+def test_invariants_and_likelihood(whole):
     """D8: symmetric exactly, no negative eigenvalue, likelihood a sum of log-densities."""
-    out = kalman_filter(CASE.model(), CASE.prior(), CASE.y, dt=1.0)
-    P = np.asarray(out.covariance)
+    P = np.asarray(whole.covariance)
     assert np.array_equal(P, np.swapaxes(P, 1, 2))
     least = np.linalg.eigvalsh(P)[:, 0]
     assert np.all(least >= -1e-14 * np.trace(P, axis1=1, axis2=2))
-    error, L = out.innovations.error, out.innovations.factor
-    density = jax.scipy.stats.multivariate_normal.logpdf
-    each = jax.vmap(lambda e, L: density(e, jnp.zeros_like(e), L @ L.T))(error, L)
-    np.testing.assert_allclose(out.log_likelihood, jnp.sum(each), rtol=1e-12)
+    error, L = np.asarray(whole.innovations.error), np.asarray(whole.innovations.factor)
+    each = [
+        multivariate_normal(cov=root @ root.T).logpdf(e) for e, root in zip(error, L, strict=True)
+    ]
+    np.testing.assert_allclose(whole.log_likelihood, np.sum(each), rtol=1e-12)
 
 
 @pytest.mark.parametrize("form", ["square_root", "covariance"])
 def test_missing_measurements(form):
     """Whole and single ones, with correlated noise; all missing is prediction only."""
-    y = CASE.y[:40].copy()
+    y = CASE.y.copy()
     y[5:9] = np.nan
     y[20, 1] = np.nan
     y[30, 0] = y[31, 2] = np.nan
@@ -84,27 +95,15 @@ def test_missing_measurements(form):
 
 def test_sequential_measurements_in_any_order():
     """Sensors of independent noise one by one: order does not matter, nor being together."""
-    H = jnp.asarray(CASE.H)
-    variances = np.array([0.3, 0.5, 0.2])
-    alone = [Sensor(lambda x, u, i=i: H[i : i + 1] @ x, [[variances[i]]]) for i in range(3)]
-    whole = Sensor(lambda x, u: H @ x, np.diag(variances))
-    model, y = CASE.model(), jnp.asarray(CASE.y[0])
-    first = jax.jit(lambda g: DEFAULT.predict(model, g))(CASE.prior())
-    together = jax.jit(lambda g: DEFAULT.update(g, y, whole, model=model)[0])(first)
-
-    @jax.jit
-    def one_by_one(state, order):
-        for i in range(3):
-            # the sensor of this turn, chosen without compiling another program
-            branches = [
-                lambda g, i=i: DEFAULT.update(g, y[i : i + 1], alone[i], model=model)[0]
-                for i in range(3)
-            ]
-            state = jax.lax.switch(order[i], branches, state)
-        return state
-
+    variances, model, y = np.array([0.3, 0.5, 0.2]), SMALL.model(), jnp.array([0.1, -0.2, 0.3])
+    H = jnp.asarray(np.random.default_rng(4).normal(size=(3, 3)))
+    update = jax.jit(lambda g, y, sensor: DEFAULT.update(g, y, sensor, model=model)[0])
+    first = jax.jit(lambda g: DEFAULT.predict(model, g))(SMALL.prior())
+    together = update(first, y, Sensor(Product(H), np.diag(variances)))
     for order in ([0, 1, 2], [2, 0, 1]):
-        state = one_by_one(first, jnp.array(order))
+        state = first
+        for i in order:
+            state = update(state, y[i : i + 1], Sensor(Product(H[i : i + 1]), [[variances[i]]]))
         np.testing.assert_allclose(state.mean, together.mean, rtol=0, atol=1e-12)
         np.testing.assert_allclose(state.covariance, together.covariance, rtol=0, atol=1e-12)
 
@@ -122,88 +121,76 @@ def pendulum():
     return model, gaussian([1.5, 0.0], 0.1 * np.eye(2)), y[:, None], dt
 
 
-@pytest.mark.parametrize(
-    ("kind", "mean", "P"),
-    [
-        (
-            GaussianFilter,
-            (1.5029754602711, -0.11622200002662),
-            (0.099604026563276, 0.00042517479266623, 0.10027379155236),
-        ),
-        (ReusingFilter, (1.5029755883481, -0.11673295239971), None),
-    ],
-)
-def test_pendulum(kind, mean, P):
-    """D4: the first step by both conventions."""
+def test_pendulum():
+    """D4: the first step."""
     model, prior, y, dt = pendulum()
-    method = kind(sigma.Unscented(1.0, 2.0, 1.0))
-    out = kalman_filter(model, prior, y, dt=dt, method=method)
-    np.testing.assert_allclose(out.mean[0], mean, rtol=0, atol=1e-10)
-    if P:
-        found = np.asarray(out.covariance[0])
-        np.testing.assert_allclose(found[[0, 0, 1], [0, 1, 1]], P, rtol=0, atol=1e-10)
+    method = GaussianFilter(sigma.Unscented(1.0, 2.0, 1.0))
+    out = kalman_filter(model, prior, y[:1], dt=dt, method=method)
+    mean, P = np.asarray(out.mean[0]), np.asarray(out.covariance[0])
+    np.testing.assert_allclose(mean, (1.5029754602711, -0.11622200002662), rtol=0, atol=1e-10)
+    expected = (0.099604026563276, 0.00042517479266623, 0.10027379155236)
+    np.testing.assert_allclose(P[[0, 0, 1], [0, 1, 1]], expected, rtol=0, atol=1e-10)
 
 
 def test_forms_agree_where_the_system_is_not_linear():
     model, prior, y, dt = pendulum()
-    for kind, rule in (
-        (GaussianFilter, sigma.Unscented(0.5, 0.0, -1.5)),
-        (ReusingFilter, sigma.Cubature5()),
-    ):
-        a = kalman_filter(model, prior, y, dt=dt, method=kind(rule))
-        b = kalman_filter(model, prior, y, dt=dt, method=kind(rule, "covariance"))
+    for rule in (sigma.Unscented(0.5, 0.0, -1.5), sigma.Cubature5()):
+        a, b = (
+            kalman_filter(model, prior, y, dt=dt, method=GaussianFilter(rule, form))
+            for form in ("square_root", "covariance")
+        )
         np.testing.assert_allclose(a.mean, b.mean, rtol=0, atol=1e-12)
         np.testing.assert_allclose(a.covariance, b.covariance, rtol=0, atol=1e-12)
 
 
-def test_smoother():
-    out = kalman_filter(CASE.model(), CASE.prior(), CASE.y, dt=1.0)
-    smoothed = smooth(CASE.model(), out)
+def test_smoother(whole):
+    smoothed = smooth(CASE.model(), whole)
     m, P = textbook_smoother(CASE, MEANS, COVARIANCES)
     np.testing.assert_allclose(smoothed.mean, m, rtol=0, atol=1e-11)
     np.testing.assert_allclose(smoothed.covariance, P, rtol=0, atol=1e-11)
     # the downdate's way, with a negative weight
-    other = smooth(CASE.model(), out, rule=sigma.Unscented(1.0, 0.0, -3.0))
+    other = smooth(CASE.model(), whole, rule=sigma.Unscented(1.0, 0.0, -3.0))
     np.testing.assert_allclose(other.covariance, P, rtol=0, atol=1e-11)
 
 
 def test_bank_is_many_single_filters():
-    case = random_linear(n=4, m=2, count=12)
-    y = case.y[:, :, None] + 0.1 * np.random.default_rng(5).normal(size=(12, 2, 5))
+    """In groups of two, of which the last is filled up, and under `vmap`."""
+    y = SMALL.y[:, :, None] + 0.1 * np.random.default_rng(5).normal(size=(12, 2, 5))
     y[3, 1, 2] = np.nan
-    model, y = case.model(), jnp.asarray(y)
-    bank = jax.jit(lambda y: filter_bank(model, case.prior(), y, dt=1.0, group=2))(y)
-    single = jax.jit(lambda y: kalman_filter(model, case.prior(), y, dt=1.0))
-    assert bank.mean.shape == (12, 4, 5)
-    for i in (0, 2, 4):
-        one = single(y[..., i])
-        np.testing.assert_allclose(bank.mean[..., i], one.mean, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(bank.factor[..., i], one.factor, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(bank.nis[..., i], one.nis, rtol=0, atol=1e-10)
-    mapped = jax.jit(jax.vmap(lambda y: single(y).mean))(jnp.moveaxis(y, -1, 0))
-    np.testing.assert_allclose(jnp.moveaxis(bank.mean, -1, 0), mapped, rtol=0, atol=1e-12)
+    model, y = SMALL.model(), jnp.asarray(y)
+    bank = filter_bank(model, SMALL.prior(), y, dt=1.0, group=2)
+    assert bank.mean.shape == (12, 3, 5)
+
+    def single(y):
+        one = kalman_filter(model, SMALL.prior(), y, dt=1.0)
+        return one.mean, one.factor, one.nis
+
+    many = jax.jit(jax.vmap(single, in_axes=-1, out_axes=-1))(y)
+    np.testing.assert_allclose(bank.mean, many[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(bank.factor, many[1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(bank.nis, many[2], rtol=0, atol=1e-10)
 
 
 def test_online_is_the_same_filter():
-    model = CASE.model()
-    out = kalman_filter(model, CASE.prior(), CASE.y[:5], t=np.arange(6) * 0.1)
-    online = OnlineFilter(model, CASE.prior())
+    model = SMALL.model()
+    out = kalman_filter(model, SMALL.prior(), SMALL.y, t=np.arange(13) * 0.1)
+    online = OnlineFilter(model, SMALL.prior())
     online.warm_up()
-    given = np.array(CASE.y)
-    found = [online.step(given[k], t=0.1 * (k + 1)) for k in range(5)]
+    given = np.array(SMALL.y)
+    found = [online.step(given[k], t=0.1 * (k + 1)) for k in range(12)]
     # what was returned before stays as it was, and so does what was given
-    for k in range(5):
+    for k in range(12):
         np.testing.assert_allclose(found[k].mean, out.mean[k], rtol=0, atol=1e-14)
         np.testing.assert_allclose(found[k].state.factor, out.factor[k], rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(given, CASE.y)
+    np.testing.assert_array_equal(given, SMALL.y)
     np.testing.assert_allclose(online.state.mean, out.mean[-1], rtol=0, atol=1e-14)
     np.testing.assert_allclose(online.nis, out.nis, rtol=1e-12)
-    with pytest.raises(SettingError, match=r"after t = 0.5 s comes 0.4 s"):
-        online.step(CASE.y[5], t=0.4)
-    with pytest.raises(ModelError, match="3 components"):
-        online.step([1.0, 2.0], t=0.6)
-    online.step(np.full(3, np.nan), t=0.6)
-    assert online.missing == 3
+    with pytest.raises(SettingError, match=r"after t = 1.2 s comes 0.4 s"):
+        online.step(SMALL.y[5], t=0.4)
+    with pytest.raises(ModelError, match="2 components"):
+        online.step([1.0, 2.0, 3.0], t=1.3)
+    online.step(np.full(2, np.nan), t=1.3)
+    assert online.missing == 2
 
 
 class Fading(AbstractFilter):
@@ -218,8 +205,8 @@ class Fading(AbstractFilter):
 
 
 def test_a_filter_of_ones_own_is_one_class():
-    """A single one, banks and the online filter take it; against the equations in NumPy."""
-    case, fading = random_linear(n=3, m=2, count=6), Fading(growth=1.3)
+    """A single one and the online filter take it; against the equations in NumPy."""
+    case, fading = SMALL, Fading(growth=1.3)
     out = kalman_filter(case.model(), case.prior(), case.y, dt=1.0, method=fading)
     m, P = case.m0, case.P0
     for y, mean, covariance in zip(case.y, out.mean, out.covariance, strict=True):
@@ -228,52 +215,18 @@ def test_a_filter_of_ones_own_is_one_class():
         m, P = m + K @ (y - case.H @ m), P - K @ case.H @ P
         np.testing.assert_allclose(mean, m, rtol=0, atol=1e-12)
         np.testing.assert_allclose(covariance, P, rtol=0, atol=1e-12)
-    y = jnp.asarray(case.y)
-    bank = filter_bank(case.model(), case.prior(), y[..., None], dt=1.0, method=fading)
-    np.testing.assert_allclose(bank.mean[..., 0], out.mean, rtol=0, atol=1e-12)
     online = OnlineFilter(case.model(), case.prior(), method=fading)
-    for k in range(6):
+    for k in range(12):
         online.step(case.y[k], t=float(k + 1))
     np.testing.assert_allclose(online.state.mean, out.mean[-1], rtol=0, atol=1e-14)
 
 
-class Watched(AbstractFilter):
-    """Kalman filter that notes how many filters it runs side by side."""
-
-    widths: list = eqx.field(static=True)
-    rule: AbstractRule = eqx.field(default_factory=sigma.Cubature)
-
-    def step(self, model, before, y, u, dt):
-        self.widths.append(before.factor.shape[2])
-        return DEFAULT.step(model, before, y, u, dt)
-
-
-@pytest.mark.parametrize(("count", "most", "width"), [(5, 4, 3), (50, 32, 25), (3, 64, 3)])
-def test_groups_of_a_bank_have_no_more_copies_than_needed(count, most, width):
-    """A group that is filled up with copies of a filter costs as much as one of other filters."""
-    case, watched = random_linear(n=2, m=1, count=3), Watched(widths=[])
-    run = lambda y: (
-        filter_bank(case.model(), case.prior(), y, dt=1.0, method=watched, group=most).mean
-    )
-    out = jax.eval_shape(run, jax.ShapeDtypeStruct((3, 1, count), float))
-    assert out.shape == (3, 2, count)
-    assert set(watched.widths) == {width}
-
-
-def test_likelihood_gradient():
-    """By R's scale, against central differences."""
-    case = random_linear(n=2, m=1, count=6)
-    F, H = jnp.asarray(case.F), jnp.asarray(case.H)
-
-    def value(scale):
-        sensor = Sensor(lambda x, u: H @ x, jnp.exp(scale) * jnp.asarray(case.R))
-        model = StateSpaceModel(lambda x, u, dt: F @ x, case.Q, sensor)
-        return kalman_filter(model, case.prior(), case.y, dt=1.0).log_likelihood
-
-    both = jax.jit(jax.value_and_grad(value))
-    step = 1e-5
-    expected = (both(0.3 + step)[0] - both(0.3 - step)[0]) / (2 * step)
-    np.testing.assert_allclose(both(0.3)[1], expected, rtol=1e-7)
+def test_an_estimate_outside_the_record_is_refused(whole):
+    count = len(CASE.y)
+    np.testing.assert_array_equal(whole.at(-count).mean, whole.mean[0])
+    for k in (count, -count - 1):
+        with pytest.raises(SettingError, match=f"no estimate {k}: the record has {count} meas"):
+            whole.at(k)
 
 
 # --- bad input
@@ -282,9 +235,7 @@ def test_likelihood_gradient():
 def test_times_and_shapes():
     model, prior = CASE.model(), CASE.prior()
     y = CASE.y[:3]
-    with pytest.raises(SettingError, match=r"after t = 1 s comes 0.5 s"):
-        kalman_filter(model, prior, y, t=[0.0, 1.0, 0.5, 2.0])
-    with pytest.raises(SettingError, match="backwards"):
+    with pytest.raises(SettingError, match="must be positive"):
         kalman_filter(model, prior, y, dt=-0.1)
     with pytest.raises(SettingError, match="either dt"):
         kalman_filter(model, prior, y)
@@ -292,8 +243,6 @@ def test_times_and_shapes():
         kalman_filter(model, prior, y[:, :2], dt=1.0)
     with pytest.raises(ModelError, match="5 x 5"):
         kalman_filter(model, gaussian(np.zeros(5), np.eye(5)), y, dt=1.0)
-    with pytest.raises(ModelError, match="T = 3"):
-        kalman_filter(model, prior, y, dt=1.0, u=np.zeros((2, 1)))
 
 
 def test_single_precision_refuses_a_small_alpha():
@@ -304,11 +253,11 @@ def test_single_precision_refuses_a_small_alpha():
     model = StateSpaceModel(lambda x, u, dt: F @ x, Q, Sensor(lambda x, u: H @ x, R))
     prior = gaussian(single(CASE.m0), P0)
     assert prior.factor.dtype == jnp.float32
-    with pytest.raises(SettingError, match=r"alpha = 0.001 cannot work in float32"):
+    with pytest.raises(SettingError, match=r"alpha = 0.001 is too small for float32"):
         kalman_filter(model, prior, CASE.y, dt=1.0, method=GaussianFilter(sigma.Unscented(1e-3)))
-    for rule in (sigma.Unscented(0.1), sigma.Cubature()):
-        out = kalman_filter(model, prior, CASE.y, dt=1.0, method=GaussianFilter(rule))
-        np.testing.assert_allclose(out.mean, MEANS, rtol=0, atol=1e-4)
+    method = GaussianFilter(sigma.Unscented(0.1))
+    out = kalman_filter(model, prior, CASE.y, dt=1.0, method=method)
+    np.testing.assert_allclose(out.mean, MEANS, rtol=0, atol=1e-4)
 
 
 def test_lost_covariance_is_flagged_not_nan():
@@ -351,15 +300,11 @@ def test_bad_covariances_are_named():
     with pytest.raises(ModelError, match=r"mean that belongs to P0 must have 4"):
         gaussian(np.zeros(3), np.eye(4))
     # inside jit nothing can be looked at: a flag
-    lost = jax.jit(lambda P: gaussian(jnp.zeros(4), P).factor)(D5)
-    model = StateSpaceModel(lambda x, u, dt: x, np.eye(4), Sensor(lambda x, u: x[:1], [[1.0]]))
-    out = kalman_filter(model, Gaussian(jnp.zeros(4), lost), np.zeros((2, 1)), dt=1.0, throw=False)
-    assert not np.any(out.ok)
+    assert np.any(np.isnan(jax.jit(lambda P: gaussian(jnp.zeros(4), P).factor)(D5)))
 
 
 def test_singular_covariance_is_allowed():
     """States that are known, and states without process noise."""
-    case = random_linear(n=4, m=2, count=20)
-    case = case._replace(Q=np.diag([0.1, 0.0, 0.2, 0.0]), P0=np.diag([1.0, 0.0, 2.0, 0.5]))
+    case = SMALL._replace(Q=np.diag([0.1, 0.0, 0.0]), P0=np.diag([1.0, 0.0, 0.5]))
     out = kalman_filter(case.model(), case.prior(), case.y, dt=1.0)
     np.testing.assert_allclose(out.mean, textbook(case)[0], rtol=0, atol=1e-11)

@@ -10,8 +10,9 @@ from rich.console import Console
 
 from stmuav_jax.dynamics import envelope, run_loads
 from stmuav_jax.dynamics.loads import COMPONENTS, JointLoads
-from stmuav_jax.figures.loads import HEADER, loads_figure, loads_table, save_loads
 from stmuav_jax.figures.plot import save_figures
+from stmuav_jax.figures.run import HEADER, SavedLoads, draw_loads, loads_figure, save_loads
+from stmuav_jax.figures.terminal import loads_table
 
 
 @pytest.fixture(scope="module")
@@ -47,35 +48,40 @@ def test_terminal_table_has_a_row_for_each_joint(short_run, loads):
     assert str(list(table.columns[4].cells)[-1]) == "0"  # a ball carries no moment
 
 
-def test_figure_shows_histories_with_units(short_run, loads, tmp_path):
+def test_figure_shows_magnitudes_with_units(short_run, loads, tmp_path):
     figure = loads_figure(short_run.scene, loads)
-    axes = np.array(figure.axes).reshape(8, 2)
-    assert [ax.get_title() for ax in axes[0]] == ["force [N]", "moment [N m]"]
-    assert axes[2, 0].get_ylabel() == "R14"
-    line = axes[2, 0].lines[3]
-    assert line.get_label() == "magnitude"
+    force, moment = figure.axes
+    assert [ax.get_ylabel() for ax in figure.axes] == ["force [N]", "moment [N m]"]
+    lines = {str(line.get_label()): line for line in force.lines}
+    assert list(lines) == list(loads.joints)
     np.testing.assert_allclose(
-        line.get_ydata(), np.linalg.norm(np.asarray(loads.force)[:, 2], axis=-1), rtol=1e-12
+        np.asarray(lines["R14"].get_ydata()),
+        np.linalg.norm(np.asarray(loads.force)[:, 2], axis=-1),
+        rtol=1e-12,
     )
+    # balls carry no moment and have no curve; a joint has one style in both panels
+    assert [line.get_label() for line in moment.lines] == list(loads.joints)[:6]
+    assert moment.lines[2].get_color() == lines["R14"].get_color()
     (path,) = save_figures({"loads": loads_figure}, tmp_path, "pdf", short_run.scene, loads)
     assert path.name == "loads.pdf"
     assert path.read_bytes().startswith(b"%PDF")
 
 
-def test_short_peaks_do_not_hide_the_usual_loads(short_run):
+def test_figure_of_short_peaks_shows_four_decades(short_run):
     t, force = np.linspace(0, 1, 200), np.zeros((200, 8, 3))
     force[:, 0, 0] = 3 * np.sin(6 * t)
-    names = tuple(joint.name for joint in short_run.scene.system.joints)
-    made = lambda: JointLoads(jnp.asarray(t), jnp.asarray(force), jnp.asarray(0 * force), names)
-    axes = np.array(loads_figure(short_run.scene, made()).axes).reshape(8, 2)
-    assert axes[0, 0].get_yscale() == "linear"
-    assert [text.get_text() for text in axes[0, 1].texts] == ["none"]
     force[100, 0, 0] = 500.0
-    figure = loads_figure(short_run.scene, made())
-    ax = figure.axes[0]
-    assert ax.get_yscale() == "symlog"
-    assert ax.get_yticks() == pytest.approx([-1000, -2, 0, 2, 1000])
-    # the usual loads take a fifth of the axis instead of a hundredth
-    low, high = (ax.transData.transform((0, y))[1] for y in (-2, 2))
-    assert (high - low) / ax.bbox.height > 0.2
+    names = tuple(joint.name for joint in short_run.scene.system.joints)
+    made = JointLoads(jnp.asarray(t), jnp.asarray(force), jnp.asarray(0 * force), names)
+    figure = loads_figure(short_run.scene, made)
+    assert figure.axes[0].get_ylim() == pytest.approx((0.1, 1000.0))
+    assert [text.get_text() for text in figure.axes[1].texts] == ["zero at every joint"]
     figure.savefig(io.BytesIO(), format="png")
+
+
+def test_figure_of_many_joints_has_those_with_the_largest_peaks():
+    t, force = np.linspace(0, 1, 5), np.ones((5, 12, 3)) * np.arange(1, 13)[:, None]
+    names = tuple(f"joint {k}" for k in range(12))
+    ax = draw_loads("", SavedLoads(t, force, 0 * force, names)).axes[0]
+    assert [line.get_label() for line in ax.lines] == list(names[4:])
+    assert ax.get_title() == "8 of 12 joints: the largest peaks"

@@ -1,7 +1,6 @@
 """Figures show what the run holds, in units, with a legend."""
 
 import io
-import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,24 +10,23 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 import stmuav_jax as stm
-from stmuav_jax.figures import drawing
-from stmuav_jax.figures.numbers import joints_of, motion_of, numbers_of
-from stmuav_jax.figures.plot import (
+from stmuav_jax.figures.plot import STYLES, figure_content, grid, look, save_figures
+from stmuav_jax.figures.run import (
     FIGURES,
-    STYLES,
+    Motion,
     balances,
-    content,
-    grid,
     joints,
-    look,
+    joints_of,
+    motion_of,
     pose,
-    save_figures,
+    positions,
 )
-from stmuav_jax.figures.report import certificate_rows
+from stmuav_jax.figures.terminal import certificate_rows, summary_rows
 from stmuav_jax.mechanics.joint_states import joint_motion
-from stmuav_jax.tracker.kinematics import panel_angles
+from stmuav_jax.uav.tracker.kinematics import panel_angles
 
 
 def test_pose_shows_the_base(short_run):
@@ -96,6 +94,7 @@ def test_angles_of_a_machine_without_a_panel_are_continuous():
 
 def test_balances_have_one_unit_on_each_axis(short_run):
     figure = balances(short_run)
+    assert figure is not None
     assert [ax.get_ylabel() for ax in figure.axes] == [
         "energy [J]", "length [m]", "energy [J]", "speed [m/s]",
     ]  # fmt: skip
@@ -108,12 +107,10 @@ def test_balances_have_one_unit_on_each_axis(short_run):
     assert violation[worst > 0] == pytest.approx(worst[worst > 0], abs=0)
 
 
-@pytest.mark.parametrize("suffix", ["png", "pdf"])
-def test_saved_figures(short_run, tmp_path, suffix):
-    paths = save_figures(FIGURES, tmp_path, suffix, short_run)
+def test_saved_figures(short_run, tmp_path):
+    paths = save_figures(FIGURES, tmp_path, "png", short_run)
     assert [p.stem for p in paths] == list(FIGURES)
-    magic = {"png": b"\x89PNG", "pdf": b"%PDF"}[suffix]
-    assert all(p.read_bytes().startswith(magic) for p in paths)
+    assert all(p.read_bytes().startswith(b"\x89PNG") for p in paths)
 
 
 def test_a_png_is_drawn_once(monkeypatch):
@@ -133,44 +130,55 @@ def test_a_png_is_drawn_once(monkeypatch):
     monkeypatch.setattr(Axes, "draw", lambda ax, renderer: (count.append(ax), draw(ax, renderer)))
     figure = curve()
     engine, dpi = figure.get_layout_engine(), figure.dpi
-    assert content(figure, "png", 150) == buffer.getvalue()
+    assert figure_content(figure, "png", 150) == buffer.getvalue()
     assert len(count) == 2
     assert figure.get_layout_engine() is engine
     assert figure.dpi == dpi
     # one without a layout engine is saved as it stands
     plain = Figure(figsize=(1.0, 1.0))
-    assert content(plain, "png", 50).startswith(b"\x89PNG")
+    assert figure_content(plain, "png", 50).startswith(b"\x89PNG")
     assert plain.get_layout_engine() is None
 
 
 def test_certificate_rows_name_quantity_and_unit(short_run):
-    rows = dict(certificate_rows(short_run))
+    rows = dict(certificate_rows(short_run.certificate))
     assert rows["Rank of the constraint Jacobian"] == "34 of 34 rows"
     assert rows["Constraint violation, lengths"].endswith(" m")
     assert rows["Constraint violation, angles"].endswith(" rad")
-    assert rows["Violation of the angles' rates"].endswith(" rad/s")
+    assert rows["Constraint violation, rates of angles"].endswith(" rad/s")
     assert " m, at the end " in rows["Estimated position error"]
     assert not any("residual" in name for name in rows)
     assert rows["Result"] == "successful at t = 0.05 s"
+    assert len(summary_rows(short_run.certificate)) == 6
 
 
-@pytest.mark.parametrize("ends_early", [False, True])
-def test_another_process_draws_the_same_figures(short_run, monkeypatch, ends_early):
-    monkeypatch.setattr(drawing, "_processors", lambda: 2)
-    monkeypatch.delitem(sys.modules, "matplotlib")
-    numbers = {"pose": numbers_of(short_run)["pose"]}
-    with drawing.drawing(True) as drawer:
-        if ends_early:
-            assert drawer.process is not None
-            drawer.process.kill()
-        drawer.ask(numbers, "png")
-        assert drawer.files() == {"pose": content(pose(short_run), "png")}
-    assert drawer.process is None or drawer.process.returncode is not None
+def test_positions_have_a_row_of_panels_for_each_body(short_run):
+    names = ("slider_2", "panel_7")
+    figure = positions(short_run, names, detail=0.02)
+    axes = np.array(figure.axes).reshape(2, 2)
+    for row, name in enumerate(names):
+        r = np.asarray(short_run.body(name).r)
+        start, whole = axes[row]
+        assert np.asarray(whole.lines[2].get_ydata()) == pytest.approx(r[:, 2])
+        assert np.asarray(start.lines[0].get_xdata())[-1] <= 0.02 + 1e-12
+    with pytest.raises(stm.StateError, match="one is 'panel'"):
+        positions(short_run, ["panel"])
 
 
-def test_no_process_is_started_without_need(monkeypatch):
-    for wanted, processors in ((False, 2), (True, 1), (True, 2)):
-        # the last time matplotlib is here already
-        monkeypatch.setattr(drawing, "_processors", lambda count=processors: count)
-        with drawing.drawing(wanted) as drawer:
-            assert drawer.process is None
+def test_panel_angles_are_continuous_beyond_a_quarter_turn():
+    """R_x(phi) R_y(theta) with theta up to 110 degrees, and a panel that also turns about its normal."""
+    angles = np.radians(np.stack([np.linspace(0, 200, 41), np.linspace(0, 110, 41)], axis=1))
+    zero = np.zeros((41, 1, 3))
+    turn = lambda axes, values: Rotation.from_euler(axes, values).as_quat(scalar_first=True)[
+        :, None
+    ]
+    motion_by = lambda p: Motion(
+        "", np.arange(41.0), ("panel",), "panel", zero, p, zero, np.zeros((1, 3)), ()
+    )
+    ((words, _, found),) = joints_of(motion_by(turn("XY", angles)))[2]
+    assert words == "panel angles [degrees]"
+    assert found == pytest.approx(np.degrees(angles))
+    turned = turn("XYZ", np.column_stack([angles, 0.3 * angles[:, 0]]))
+    ((words, labels, found),) = joints_of(motion_by(turned))[2]
+    assert (words, labels) == ("panel's normal [1]", ("x", "y", "z"))
+    assert found[:, 0] == pytest.approx(np.sin(angles[:, 1]))

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from stmuav_jax.commands.flight import _slope_table, _trim_table
+from stmuav_jax.cli.trim import slope_table, trim_table
 from stmuav_jax.figures.estimate import summary_table
-from stmuav_jax.figures.report import certificate_table
-from stmuav_jax.figures.terminal import line, row, table
-from stmuav_jax.parameters.airframe import PART_II
+from stmuav_jax.figures.terminal import add_row, certificate_table, make_table, print_line
+from stmuav_jax.uav.airframe import PART_II
 
 
 def printed(what, width=120):
@@ -23,20 +22,20 @@ def printed(what, width=120):
 
 
 def test_brackets_are_no_markup():
-    made = table("turn [rad/s]", "at [s]", title="hull[b] [mm]")
-    row(made, "[/b]", "[mrad]")
+    made = make_table("turn [rad/s]", "at [s]", title="hull[b] [mm]")
+    add_row(made, "[/b]", "[mrad]")
     words = printed(made)
     for part in ("turn [rad/s]", "at [s]", "hull[b] [mm]", "[/b]", "[mrad]"):
         assert part in words
     console = Console(width=80, file=io.StringIO(), record=True)
-    line(console, "[kg] :x: [/b]")
+    print_line(console, "[kg] :x: [/b]")
     assert console.export_text() == "[kg] :x: [/b]\n"
 
 
 def test_names_in_a_certificate_are_no_markup(monkeypatch):
     rows = [("Rank", "33 of 34 rows; dependent rows in hinge[0], [/b]")]
-    monkeypatch.setattr("stmuav_jax.figures.report.certificate_rows", lambda _: rows)
-    named: Any = SimpleNamespace(scene=SimpleNamespace(title="System of arm[b]"))
+    monkeypatch.setattr("stmuav_jax.figures.terminal.summary_rows", lambda _: rows)
+    named: Any = SimpleNamespace(scene=SimpleNamespace(title="System of arm[b]"), certificate=None)
     words = printed(inspect.unwrap(certificate_table)(named))
     assert "hinge[0], [/b]" in words
     assert "System of arm[b]" in words
@@ -44,8 +43,8 @@ def test_names_in_a_certificate_are_no_markup(monkeypatch):
 
 def test_units_of_a_trim():
     labels = [("turn_x", "degrees"), ("speed_1", "rad/s"), ("force_2", "N")]
-    words = printed(_trim_table(np.ones(3), labels))
-    slopes = printed(_slope_table("mass.panel_7", PART_II, np.ones(3), labels))
+    words = printed(trim_table(np.ones(3), labels))
+    slopes = printed(slope_table("mass.panel_7", PART_II, np.ones(3), labels))
     for _, unit in labels:
         assert unit in words
         assert f"[{unit}]" in slopes

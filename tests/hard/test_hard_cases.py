@@ -4,8 +4,6 @@ The cases and what they are compared with are those of `benchmarks/problems/hard
 """
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,6 +28,10 @@ ROUND_OFF = 1e-12
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("case", EVERY, ids=lambda case: case.name)
 def test_a_hard_case(case: Hard):
+    """The tracker for the first two of its ten minutes; `benchmarks/hard.py` goes to their end."""
+    if case.name.startswith("ten minutes"):
+        system, state, ts = case.build()
+        case = case._replace(build=lambda: (system, state, ts[: len(ts) // 5 + 1]))
     row = row_of(case)
     assert holds(row), row
     if not case.name.startswith(NOT_KNOWN_WELL):
@@ -71,24 +73,8 @@ def test_a_start_in_a_singular_posture_is_named(name, why, build):
 @pytest.mark.parametrize("what", [{"mass": 0.0}, {"inertia": (1.0, 1.0, 2.5)}])
 def test_bodies_that_cannot_exist_are_refused(what):
     given = {"mass": 1.0, "inertia": (1.0, 1.0, 1.0), **what}
-    with pytest.raises(stm.ModelError, match=r"must|No body has"):
+    with pytest.raises(stm.ModelError, match=r"must|triangle inequality"):
         stm.Body("link", given["mass"], given["inertia"])
-
-
-@pytest.mark.slow
-def test_the_page_is_made_of_the_record(tmp_path):
-    subprocess.run(
-        [sys.executable, FOLDER / "hard.py", "--quick", "--results", tmp_path, "--figures", tmp_path],
-        check=True, capture_output=True, timeout=600,
-    )  # fmt: skip
-    content = json.loads((tmp_path / "hard.json").read_text())
-    assert {"commit", "dirty", "versions", "cores", "date"} <= set(content["environment"])
-    rows = [*content["cases"], *content["tolerances"]]
-    assert len(rows) == 5
-    assert all(np.isfinite(row["reached"]) and row["result"] == "successful" for row in rows)
-    text = (tmp_path / "hard.md").read_text()
-    assert "All are reached." in text
-    assert all(row["name"] in text for row in content["cases"])
 
 
 class Falling:
@@ -152,6 +138,6 @@ def test_the_page_of_an_older_record_has_no_empty_sections():
         row.pop("peers", None)
     content.pop("starts", None)
     text = page(content)
-    assert "joints open by [m]" in text
+    assert "constraint violation [m]" in text
     assert "Other programs" not in text
     assert "singular posture" not in text.split("## All tolerances")[1]

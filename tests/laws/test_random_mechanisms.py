@@ -17,9 +17,9 @@ from helpers import inertia_of, np_rotation, random_quaternion, unit
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.certify import inspect_start
-from stmuav_jax.dynamics.tree.coordinates import read
-from stmuav_jax.dynamics.tree.projection import rows_after
+from stmuav_jax.dynamics.diagnostics import inspect_start
+from stmuav_jax.dynamics.tree.closures import rows_after
+from stmuav_jax.dynamics.tree.coordinates import read_coordinates
 
 SETS = 25  # of numbers, for each structure
 SAME, ROUND_OFF = 1e-9, 1e-15
@@ -217,7 +217,7 @@ def looked(system: stm.System, velocity: Any, both: bool = True) -> Found:
 def closing_value(system: stm.System, rest: stm.State) -> jax.Array:
     """Smallest singular value of the loops' closures in the velocities of the tree."""
     model = stm.Tree().prepare(system)
-    at = read(model.parameters, rest)
+    at = read_coordinates(model.parameters, rest)
     J = rows_after(model, jnp.zeros(()), at, jnp.zeros_like(at.u))
     return jnp.linalg.svd(J, compute_uv=False)[-1]
 
@@ -247,7 +247,7 @@ def power_missing(system: stm.System, found: Found) -> float:
 
 @pytest.mark.slow
 @settings(
-    max_examples=20, derandomize=True, deadline=None, database=None,
+    max_examples=6, derandomize=True, deadline=None, database=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large], phases=[Phase.generate],
 )  # fmt: skip
 @given(structures())
@@ -392,7 +392,7 @@ def derived(system: stm.System, state: stm.State, q: Any, step: float) -> tuple[
 
 @pytest.mark.slow
 @settings(
-    max_examples=4, derandomize=True, deadline=None, database=None,
+    max_examples=2, derandomize=True, deadline=None, database=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large], phases=[Phase.generate],
 )  # fmt: skip
 @given(floating_trees())

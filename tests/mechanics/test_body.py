@@ -3,6 +3,7 @@
 import re
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,6 +54,23 @@ def test_inertia_that_no_body_has(tensor, words):
     with pytest.raises(stm.ModelError, match=words) as error:
         body(inertia=tensor)
     assert "'wheel'" in str(error.value)
+
+
+@pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=["tree", "augmented"])
+@pytest.mark.parametrize(
+    "tensor", [np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 1.0, np.nan]), np.zeros((3, 3))]
+)
+def test_a_tensor_that_is_replaced_later_is_refused_in_the_same_words(formulation, tensor):
+    with pytest.raises(stm.ModelError) as of_body:
+        body(inertia=tensor)
+    system = stm.System([body(free=True)], [], [])
+    changed = eqx.tree_at(lambda s: s.bodies.inertia, system, jnp.asarray(tensor)[None])
+    with pytest.raises(stm.ModelError, match=re.escape(str(of_body.value))):
+        stm.dynamics.evaluate(changed, system.reference, formulation=formulation)
+    with pytest.raises(stm.ModelError, match=re.escape(str(of_body.value))):
+        stm.simulate(
+            changed, system.reference, ts=[0.0, 0.1], method=stm.Method(formulation=formulation)
+        )
 
 
 def test_the_reports_printed_tensor_is_refused_and_its_correction_accepted():

@@ -1,36 +1,32 @@
-"""Every constraint row: against the report's tables, and against automatic differentiation."""
+"""Every constraint row, and the rows of benchmarks/dense: against the report's tables, and against automatic
+differentiation."""
 
 from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dense.tables import COUNTS, KINDS, Tables, Variant, g_and_l
 from helpers import np_l, random_quaternion, relative_error, unit
+from problems.plain import PlainJoint
 from report_tables import Numbers, Posture, table_omega, table_p, value
 
-from stmuav_jax.algebra.rotation import angular_velocity, normalise
+from stmuav_jax.math.rotation import angular_velocity, normalise, rotation_matrix
 from stmuav_jax.mechanics import constraint
 
-FORMS = ("omega", "p")
-IN_TABLES = ("point", "n1", "n2", "p1", "p2", "distance", "displacement")
-ALL_ROWS = {
-    **{
-        k: constraint.PRIMITIVES[k]
-        for k in ("point", "n1", "n2", "distance", "angle", "displacement", "screw")
-    },
-    "p1": constraint.p1_all,
-    "p2": constraint.p2_all,
-}
+PRIMITIVES: Any = constraint.PRIMITIVES
+
+IN_TABLES = ("point", "n1", "n2", "distance", "displacement")
 SEEDS = range(4)
 EXACT = 1e-12
 
 
 @cache
-def rows_of(kind, form, two_of_three=False):
+def rows_of(kind) -> Any:
     """The compiled primitive."""
-    function = constraint.PRIMITIVES[kind] if two_of_three else ALL_ROWS[kind]
-    return jax.jit(partial(function, form=form))
+    return jax.jit(partial(PRIMITIVES[kind], form="omega"))
 
 
 def random_numbers(rng):
@@ -56,28 +52,27 @@ def random_posture(rng):
     return Posture(rng.normal(size=3), v, random_quaternion(rng), 2 * omega)
 
 
-def side_of(r, v, p, omega, form):
+def side_of(r, v, p, omega):
     r, v, p, omega = (jnp.asarray(x) for x in (r, v, p, omega))
-    return constraint.side(r, v, p, omega, form)
+    R = rotation_matrix(p)
+    return constraint.BodyKinematics(r, v, R, R @ omega, jnp.concatenate([v, omega]))
 
 
-def fixed_in(posture, form):
-    return side_of(posture.r, posture.v, posture.p, posture.omega, form)
+def fixed_in(posture):
+    return side_of(posture.r, posture.v, posture.p, posture.omega)
 
 
 # --- against the report's tables
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("kind", IN_TABLES)
-def test_rows_equal_the_corrected_tables(kind, form, seed):
+def test_rows_equal_the_corrected_tables(kind, seed):
     rng = np.random.default_rng(seed)
     numbers, side = random_numbers(rng)
     i, j = random_posture(rng), random_posture(rng)
-    row = rows_of(kind, form)(fixed_in(i, form), fixed_in(j, form), data_of(numbers, side))
-    table = table_omega if form == "omega" else table_p
-    linear_i, angular_i, linear_j, angular_j, gamma = table(kind, i, j, numbers)
+    row = rows_of(kind)(fixed_in(i), fixed_in(j), data_of(numbers, side))
+    linear_i, angular_i, linear_j, angular_j, gamma = table_omega(kind, i, j, numbers)
     assert relative_error(row.value, value(kind, i, j, numbers)) < EXACT
     assert relative_error(row.J_i, np.hstack([linear_i, angular_i])) < EXACT
     assert relative_error(row.J_j, np.hstack([linear_j, angular_j])) < EXACT
@@ -86,7 +81,44 @@ def test_rows_equal_the_corrected_tables(kind, form, seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("kind", IN_TABLES)
+def test_rows_of_the_dense_system_equal_the_corrected_tables(seed):
+    """Those of benchmarks/dense in pdot, all three of cross products, and the two kept by the report's rule."""
+    rng = np.random.default_rng(seed)
+    i, j = random_posture(rng), random_posture(rng)
+    if seed:
+        i.p = np.array([1.0, 0, 0, 0])
+    frames = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2)]
+    if seed:
+        # the dropped row is that of the largest world component, also at s_i = e_x, e_y, e_z
+        frames[0] = np.roll(np.eye(3), seed, axis=1)
+    points = rng.normal(size=(2, 3))
+    joints = [
+        PlainJoint(kind, kind, 0, 1, *points, *frames) for kind in ("revolute", "translational")
+    ]
+    tables = Tables(tuple(joints))
+    q = np.array([np.r_[b.r, b.p] for b in (i, j)])
+    u = np.array([np.r_[b.v, b.p_rate] for b in (i, j)])
+    G, L = g_and_l(q[:, 3:])
+    found = tables.rows(q, u, G, g_and_l(u[:, 3:]), Variant())
+    kept = tables.chosen(G @ L.transpose(0, 2, 1))
+    axes = {"point": (2, 2), "n1": (0, 1), "p1": (2, 2), "p2": (2, 2)}
+    for kind, count in zip(KINDS, COUNTS, strict=True):
+        a, b = axes[kind]
+        parts: Any = (frames[0][:, a], frames[1][:, b], *points, 1.0)
+        numbers = Numbers(*parts)
+        expected = table_p(kind, i, j, numbers)
+        got = [part[0] for part in found[kind]]
+        for mine, theirs in zip(got[:5], expected, strict=True):
+            assert relative_error(mine, theirs) < EXACT
+        assert relative_error(got[5], value(kind, i, j, numbers)) < EXACT
+        if kind in kept:
+            drop = int(np.argmax(np.abs(i.s(numbers.axis_i))))
+            assert list(kept[kind][0]) == [k for k in range(3) if k != drop]
+            assert len(kept[kind][0]) == count
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", [*IN_TABLES, "p1", "p2"])
 def test_the_two_tables_agree(kind, seed):
     """b = Phi_p L^T / 2, gamma# = gamma^(m) + sum |w|^2 Phi_p p / 4 (transcription check)."""
     rng = np.random.default_rng(50 + seed)
@@ -98,30 +130,6 @@ def test_the_two_tables_agree(kind, seed):
         assert relative_error(in_omega[column], 0.5 * in_p[column] @ np_l(body.p).T) < EXACT
         extra += 0.25 * (body.omega @ body.omega) * in_p[column] @ body.p
     assert relative_error(in_omega[4], in_p[4] + extra) < EXACT
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("kind", ["p1", "p2"])
-def test_two_of_three_rows_by_the_reports_rule(kind, seed):
-    """The row is dropped where the world component of s_i is largest, also at s_i = e_x."""
-    rng = np.random.default_rng(70 + seed)
-    numbers, side = random_numbers(rng)
-    i, j = random_posture(rng), random_posture(rng)
-    if seed < 3:
-        i.p, numbers.axis_i = np.array([1.0, 0, 0, 0]), np.eye(3)[seed]
-    data = data_of(numbers, side)
-    drop = int(np.argmax(np.abs(i.s(numbers.axis_i))))
-    keep = [k for k in range(3) if k != drop]
-    for form in FORMS:
-        sides = fixed_in(i, form), fixed_in(j, form), data
-        whole, part = rows_of(kind, form)(*sides), rows_of(kind, form, True)(*sides)
-        expected = jax.tree.map(lambda x, keep=keep: np.asarray(x)[keep], whole)
-        assert relative_error(part, expected) < EXACT
-        # the kept rows of a cross product are independent: singular values 1 and |s_k|
-        moments = np.asarray(part.J_j) if form == "omega" else None
-        if moments is not None and kind == "p2":
-            values = np.linalg.svd(moments[:, :3], compute_uv=False)
-            assert values[-1] > 1 / np.sqrt(3) - 1e-12
 
 
 # --- against automatic differentiation along smooth curves
@@ -150,32 +158,31 @@ def twice(f, t):
 
 def still(r, p):
     zero = jnp.zeros(3)
-    return side_of(r, zero, p, zero, "omega")
+    return side_of(r, zero, p, zero)
 
 
 @jax.jit
 def along_curves(coefficients, data, t):
-    """By kind: d Phi/dt, d2 Phi/dt2; and by form J u, J udot - gamma, gamma; on two curves."""
+    """By kind: d Phi/dt, d2 Phi/dt2; J u, J udot - gamma, gamma; on two curves."""
     paths = tuple(map(curve, coefficients))
 
     def phi(t):
         sides = [still(*path(t)) for path in paths]
-        return {k: rows(*sides, data, form="omega").value for k, rows in ALL_ROWS.items()}
+        return {k: rows(*sides, data, "omega").value for k, rows in PRIMITIVES.items()}
 
-    def body(path, form):
+    def body(path):
         (r, p), (v, p_rate), (a, p_second) = twice(path, t)
-        turning = p_second if form == "p" else angular_velocity(p, p_second)
-        side = side_of(r, v, p, angular_velocity(p, p_rate), form)
-        return side, jnp.concatenate([a, turning])
+        side = side_of(r, v, p, angular_velocity(p, p_rate))
+        return side, jnp.concatenate([a, angular_velocity(p, p_second)])
 
-    def left(kind, form):
-        (i, i_rate), (j, j_rate) = (body(path, form) for path in paths)
-        row = ALL_ROWS[kind](i, j, data, form=form)
+    def left(kind):
+        (i, i_rate), (j, j_rate) = map(body, paths)
+        row = constraint.PRIMITIVES[kind](i, j, data, "omega")
         speed = row.J_i @ i.velocity + row.J_j @ j.velocity
         return speed, row.J_i @ i_rate + row.J_j @ j_rate - row.gamma, row.gamma
 
     _, rate, second = twice(phi, t)
-    return rate, second, {(k, form): left(k, form) for k in ALL_ROWS for form in FORMS}
+    return rate, second, {k: left(k) for k in constraint.PRIMITIVES}
 
 
 @cache
@@ -188,11 +195,10 @@ def compared(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("kind", ALL_ROWS)
-def test_rows_are_the_derivatives_of_the_constraint(kind, form, seed):
+@pytest.mark.parametrize("kind", constraint.PRIMITIVES)
+def test_rows_are_the_derivatives_of_the_constraint(kind, seed):
     rate, second, left = compared(seed)
-    speed, minus_gamma, gamma = left[kind, form]
+    speed, minus_gamma, gamma = left[kind]
     assert relative_error(speed, rate[kind]) < EXACT
     size = np.max(np.abs(second[kind])) + np.max(np.abs(gamma))
     assert np.max(np.abs(minus_gamma - second[kind])) < EXACT * size
@@ -211,7 +217,7 @@ def test_angle_between_frames_that_share_their_axis(seed):
     x, y, z = np.eye(3)
     j.p = np.asarray(_product(i.p, np.array([np.cos(phi / 2), 0, 0, np.sin(phi / 2)])))
     data = data_of(Numbers(x, x, z, z, 1.0), y)
-    row = rows_of("angle", "omega")(fixed_in(i, "omega"), fixed_in(j, "omega"), data)
+    row = rows_of("angle")(fixed_in(i), fixed_in(j), data)
     assert float(row.value[0]) == pytest.approx(phi, abs=1e-14)
     np.testing.assert_allclose(row.J_i, [[0, 0, 0, 0, 0, -1]], atol=1e-14)
     np.testing.assert_allclose(row.J_j, [[0, 0, 0, 0, 0, 1]], atol=1e-14)
@@ -226,10 +232,11 @@ def _product(p, q):
 def test_every_primitive_says_how_many_rows_it_has():
     rng = np.random.default_rng(5)
     numbers, side = random_numbers(rng)
-    bodies = [fixed_in(random_posture(rng), "omega") for _ in range(2)]
+    bodies = [fixed_in(random_posture(rng)) for _ in range(2)]
     sides = *bodies, data_of(numbers, side)
-    assert set(constraint.ROWS) == set(constraint.PRIMITIVES)
-    for kind, count in constraint.ROWS.items():
-        row = rows_of(kind, "omega", kind in ("p1", "p2"))(*sides)
+    assert set(constraint.ROWS) == {*constraint.PRIMITIVES, *constraint.COUPLINGS}
+    for kind in constraint.PRIMITIVES:
+        count = constraint.ROWS[kind]
+        row = rows_of(kind)(*sides)
         assert row.value.shape == row.gamma.shape == row.target.shape == (count,)
         assert row.J_i.shape == row.J_j.shape == (count, 6)

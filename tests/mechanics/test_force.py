@@ -8,7 +8,7 @@ import pytest
 from helpers import np_rotation, random_quaternion, relative_error, state_of, unit
 
 import stmuav_jax as stm
-from stmuav_jax.mechanics.forces.applied import _frame
+from stmuav_jax.mechanics.forces import _check_frame
 from stmuav_jax.mechanics.load import AbstractForce, ActsOn, total_load
 
 COM = {"a": np.array([0.1, -0.2, 0.05]), "b": np.array([-0.3, 0.1, 0.2])}
@@ -325,7 +325,7 @@ def test_loads_add_up(state):
         (lambda: stm.AppliedForce("a", [np.inf, 0, 0]), "force on body 'a' must be finite"),
         (lambda: stm.AppliedMoment("a", [0, np.nan, 0]), "moment on body 'a' must be finite"),
         # by itself: the type check that the tests switch on refuses the word earlier
-        (lambda: _frame("tool"), "must be 'world' or 'body', not 'tool'"),
+        (lambda: _check_frame("tool"), "must be 'world' or 'body', not 'tool'"),
         (lambda: stm.LinearSpringDamper("a", "a", stiffness=1.0), "joins body 'a' to itself"),
         (lambda: stm.LinearSpringDamper("a", "", stiffness=1.0), "needs two bodies"),
         (lambda: stm.LinearSpringDamper("a", "b", stiffness=np.nan), "stiffness of the spring"),
@@ -385,7 +385,7 @@ def test_bad_shapes_and_points_are_refused_in_the_users_words(build):
         ),
         (lambda: stm.AppliedMoment("b", lambda t, kin, more: 0), "AppliedMoment: .* body 'b'"),
         (
-            lambda: stm.rotorcraft.AirframeDrag("a", linear=[1.0] * 3, wind=lambda: 0.0),
+            lambda: stm.uav.AirframeDrag("a", linear=[1.0] * 3, wind=lambda: 0.0),
             "wind on body 'a'",
         ),
     ],

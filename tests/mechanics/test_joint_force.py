@@ -11,7 +11,7 @@ import pytest
 from helpers import central, np_rotation, random_quaternion, state_of, turn
 
 import stmuav_jax as stm
-from stmuav_jax.mechanics.forces.ramp import ramp, ramp_area, ramp_slope
+from stmuav_jax.mechanics.joint_forces import ramp_area, ramp_slope, smooth_ramp
 
 COM = {"a": np.array([0.1, -0.2, 0.05]), "b": np.array([-0.3, 0.1, 0.2])}
 POINT = np.array([0.2, 0.3, -0.1])
@@ -170,28 +170,52 @@ def test_the_servo_follows_the_rate_of_its_target():
     )
 
 
-@pytest.mark.parametrize(("angle", "target", "lag"), [(3.0, 3.3, -0.3), (-3.0, 15.7, 2.8673706)])
-def test_an_angle_is_counted_around_its_target(angle, target, lag):
-    """Over the half turn where the joint's own angle jumps, and after turns of the target."""
+@pytest.mark.parametrize(
+    ("force", "law"),
+    [
+        (stm.mechanics.JointServo("J", stiffness=40.0, damping=3.0, target=0.1, limit=2.0),
+         lambda x, rate: -40 * (x - 0.1) - 3 * rate),
+        (stm.JointEffort("J", -3.0, limit=2.0), lambda x, rate: -3.0),
+        (stm.JointEffort("J", 1.5, limit=2.0), lambda x, rate: 1.5),
+    ],
+    ids=("servo", "effort", "effort within"),
+)  # fmt: skip
+def test_a_limit_cuts_the_effort_off_and_the_balance_of_energy_stays(force, law):
+    for x, rate in ((0.5, -0.4), (0.11, 0.2), (0.0, 0.1), (-2.0, 0.0)):
+        found = float(force.law(jnp.asarray(x), jnp.asarray(rate), T))
+        assert found == pytest.approx(np.clip(law(x, rate), -2.0, 2.0), rel=1e-13)
+        power = jax.jvp(lambda y: force.potential_energy(y, T), (x,), (rate,))[1]
+        system = stm.System(
+            [stm.Body("rod", 1.0, (1.0, 1.0, 1.0))],
+            [stm.revolute("J", "ground", "rod", point=[0, 0, 0], axis=[0, 0, 1])],
+            [force],
+        )
+        now = stm.state_from_joints(system, {"J": x}, {"J": rate})
+        load = system.forces[0].load(T, system.kinematics(now))
+        assert float(load.power) == pytest.approx(found * rate + float(power), abs=1e-12)
+    with pytest.raises(stm.ModelError, match="limit"):
+        stm.JointEffort("J", 1.0, limit=0.0)
+
+
+def test_an_angle_is_that_of_the_joint_however_far_its_target_is():
+    """-3 rad is not 3.28 rad: a servo with its target at 15.7 rad lags by 18.7 rad."""
     servo = stm.mechanics.JointServo(
-        "J", stiffness=2.0, damping=0.0, target=target, coordinate="angle"
+        "J", stiffness=2.0, damping=0.0, target=15.7, coordinate="angle"
     )
-    load = load_of(servo, turned(angle, 0.0))
-    away = (angle - target + np.pi) % (2 * np.pi) - np.pi
-    assert away == pytest.approx(-0.3 if lag < 0 else away)
-    np.testing.assert_allclose(load.moment[0], 2 * away * AXIS, atol=1e-12)
-    assert float(load.potential) == pytest.approx(away**2)
+    load = load_of(servo, turned(-3.0, 0.0))
+    np.testing.assert_allclose(load.moment[0], -2 * 18.7 * AXIS, rtol=1e-14)
+    assert float(load.potential) == pytest.approx(18.7**2)
 
 
-def test_limits_of_an_angle_may_lie_around_half_a_turn():
-    """Between 2.5 and 3.9 rad: -3 is 3.28 and free, -2 is 4.28 and beyond."""
+def test_limits_of_an_angle_may_lie_beyond_half_a_turn():
+    """Between 2.5 and 3.9 rad: -3 rad is far below, and free if it is the 3.28 rad of a turn more."""
     stop = stm.mechanics.EndStop("J", lower=2.5, upper=3.9, coordinate="angle", **STOP)
-    assert not np.any(load_of(stop, turned(-3.0, 0.5)).moment)
-    depth = 2 * np.pi - 2 - 3.9
-    expected = -50 * (depth - 0.15)
-    np.testing.assert_allclose(
-        load_of(stop, turned(-2.0, 0.0)).moment[0], -expected * AXIS, atol=1e-12
-    )
+    below = load_of(stop, turned(-3.0, 0.0)).moment[0]
+    np.testing.assert_allclose(below, -50 * (5.5 - 0.15) * AXIS, rtol=1e-12)
+    for angle, expected in ((-3.0, 0.0), (-2.0, -50 * (2 * np.pi - 2 - 3.9 - 0.15))):
+        further = stm.mechanics.with_start_angles(system_with(stop), {"J": 2 * np.pi + angle})
+        found = _load(further, T, turned(angle, 0.0)).moment[0]
+        np.testing.assert_allclose(found, -expected * AXIS, atol=1e-12)
 
 
 # --- smoothness
@@ -201,10 +225,10 @@ def test_the_ramp_is_a_line_that_starts_smoothly():
     w = jnp.asarray(0.3)
     d = jnp.linspace(-0.2, 0.6, 81)
     over = lambda f: jax.jit(jax.vmap(f, (0, None)))(d, w)
-    value = over(ramp)
+    value = over(smooth_ramp)
     assert np.all(value[d <= 0] == 0)
     np.testing.assert_allclose(value[d >= w], d[d >= w] - 0.15, atol=1e-16)
-    np.testing.assert_allclose(over(jax.grad(ramp)), over(ramp_slope), atol=1e-14)
+    np.testing.assert_allclose(over(jax.grad(smooth_ramp)), over(ramp_slope), atol=1e-14)
     np.testing.assert_allclose(over(jax.grad(ramp_area)), value, atol=1e-15)
 
 
@@ -235,7 +259,7 @@ def test_a_stop_never_pulls_and_only_takes_energy_out():
     v = jnp.asarray([-10.0, -1.0, -0.1, -1e-3, 0.0, 1e-3, 0.1, 1.0, 10.0])[None]
     parts = lambda x, v: (
         stop.law(x, v, x),
-        1e5 * ramp(x, x * 0 + w),
+        1e5 * smooth_ramp(x, x * 0 + w),
         100 * ramp_slope(x, x * 0 + w) * v,
     )
     force, spring, damper = jax.jit(jnp.vectorize(parts))(x, v)

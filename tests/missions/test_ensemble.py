@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 import stmuav_jax as stm
-from stmuav_jax.algebra import compiler, kept
-from stmuav_jax.cli import main
-from stmuav_jax.missions.ensemble import LANES, NOT_PHYSICAL
+from stmuav_jax.missions.ensemble import LANES, NOT_PHYSICAL, _narrow_limits
 
 missions = stm.missions
 MISSION = {
@@ -16,15 +14,22 @@ MISSION = {
     "machine": {"scene": "hexacopter", "options": {"drag": {}, "motor": {}}},
     "rates": {"control": 200.0},
     "sensors": {"standing": 0.5},
+    "faults": [{"sensor": "position", "at": 0.6, "until": 0.8}],
+    "payloads": [{"body": "hexacopter", "mass": 0.02, "position": [0.02, 0.0, -0.05], "until": 1.0}],
     "wind": {"steady": [3.0, 0.0, 0.0], "gusts": {}},
     "tolerances": {"position": 0.08, "tilt": 15.0},
 }  # fmt: skip
 # the machine itself, one that is a tenth heavier, and one that cannot be; the rest are in between
-SHARES = [1.0, 1.1, -1.0, *np.linspace(0.9, 1.05, 21)]
+SHARES = [1.0, 1.1, -1.0, *np.linspace(0.9, 1.05, 21), 1.0]
+# and the machine itself with a payload that is five times as heavy
+LOADS = [1.0] * 24 + [5.0]
 FACTORS = {
     "bare.mass": {"distribution": "empirical", "values": SHARES},
+    "payload_1.mass": {"distribution": "empirical", "values": LOADS},
     "rotor.k_tau": {"distribution": "constant", "value": 1.0},
 }  # fmt: skip
+HELD_STILL = {"scene": "hexacopter", "options": {"drag": {}}}
+WITH_GEAR = {"scene": "hexacopter", "options": {"drag": {}, "gear": {}}}
 TEXT = """
 kind = "missions"
 mission = "held.toml"
@@ -40,57 +45,46 @@ machine = { scene = "hexacopter" }
 """
 
 
-def study(factors=None, relative=frozenset(FACTORS), design="table", **changes):
-    """Work of a study of the mission above."""
-    sampling = stm.montecarlo.Sampling(FACTORS if factors is None else factors, 5, design)
-    mission = missions.make_mission(MISSION | changes)
-    return missions.MissionWork(mission, sampling, relative=relative, name="held")
+def make_study(mission):
+    return missions.make_mission_study(
+        mission, FACTORS, relative=frozenset(FACTORS), name="held", seed=5, design="table"
+    )
 
 
 @pytest.fixture(scope="module")
-def work():
-    return study()
+def mission():
+    return missions.make_mission(MISSION)
 
 
 @pytest.fixture(scope="module")
-def columns(work):
-    return work.run(0, 24)
+def study(mission):
+    return make_study(mission)
 
 
-# functions with executed annotations have no text, and only the slow tests run without
-@pytest.mark.slow
-def test_programs_kept_in_files_are_found_whatever_is_drawn(tmp_path, monkeypatch):
-    names = []
-
-    noted = lambda function, args, quick, key: names.append(key) or function
-    other = FACTORS | {"bare.mass": {"distribution": "empirical", "values": [1.0, 1.1]}}
-    kept.keep_programs(tmp_path / "programs")
-    try:
-        works = study(), study(other), study(sensors={"standing": 0.4})
-        monkeypatch.setattr(compiler, "_compiled", noted)
-        assert all(work._program for work in works)
-    finally:
-        kept.keep_programs(None)
-    first, same, longer = names
-    assert first is not None
-    assert first == same != longer
+@pytest.fixture(scope="module")
+def columns(study):
+    return study.compute(0, 24)
 
 
 @pytest.mark.slow
-def test_a_flight_of_the_study_is_that_of_the_mission_alone(work, columns):
+@pytest.mark.parametrize("sample", [0, 24])
+def test_a_flight_of_the_study_is_that_of_the_mission_alone(study, sample):
     """The undisturbed machine in the same gusts and noise, flown by `fly` and judged by `measures`."""
-    gusts, noise = np.random.SeedSequence((5, 0)).generate_state(2).astype(np.uint32)
+    columns = {name: values[0] for name, values in study.compute(sample, 1).items()}
+    gusts, noise = np.random.SeedSequence((5, sample)).generate_state(2).astype(np.uint32)
     alone = MISSION | {"sensors": MISSION["sensors"] | {"seed": int(noise)}}
     alone["wind"] = MISSION["wind"] | {"gusts": {"seed": int(gusts)}}
+    payload = dict(MISSION["payloads"][0])
+    alone["payloads"] = [payload | {"mass": payload["mass"] * LOADS[sample]}]
     data = missions.to_data(missions.fly(missions.make_mission(alone)))
     found = {one.name: one.value for one in missions.measures(data)}
-    assert columns["status"][0] == 1
-    assert columns["end"][0] == pytest.approx(2.0)
+    assert columns["status"] == 1
+    assert columns["end"] == pytest.approx(2.0)
     for name, value in (
-        ("Largest position error", columns["position_error"][0]),
-        ("Largest tilt error", np.degrees(columns["tilt_error"][0])),
-        ("Smallest margin of the rotor speeds", 100 * columns["rotor_margin"][0]),
-        ("Energy used, electrical", columns["energy"][0] / 3600),
+        ("Largest position error", columns["position_error"]),
+        ("Largest tilt error", np.degrees(columns["tilt_error"])),
+        ("Smallest margin of the rotor speeds", 100 * columns["rotor_margin"]),
+        ("Energy used, electrical", columns["energy"] / 3600),
     ):
         assert value == pytest.approx(found[name], rel=1e-6), name
 
@@ -117,34 +111,20 @@ def test_the_truth_is_drawn_and_the_controllers_belief_is_not(columns):
 
 
 @pytest.mark.slow
-def test_a_sample_does_not_depend_on_others_and_a_study_is_resumed(work, columns, tmp_path):
-    part = work.run(5, 14)
+def test_a_sample_does_not_depend_on_others_and_a_study_is_resumed(study, columns, tmp_path):
+    part = study.compute(5, 14)
     for name, values in part.items():
         np.testing.assert_array_equal(values, columns[name][5:19])
     store = tmp_path / "study.zarr"
-    stm.jobs.run_study(work, store, LANES)
-    stm.jobs.run_study(work, store, 24, resume=True)
-    with stm.files.open_store(store) as opened:
+    study.run(store, LANES)
+    study.run(store, 24, resume=True)
+    with stm.studies.open_store(store) as opened:
         data = opened.dataset()
     for name, values in columns.items():
         np.testing.assert_array_equal(data[name].values[:24], values)
-    again = pickle.loads(pickle.dumps(work))
-    assert again.identity == work.identity
-    assert again.columns == work.columns
-
-
-@pytest.mark.slow
-def test_the_command_flies_a_study_and_reports_it(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "held.toml").write_text(HELD)
-    (tmp_path / "study.toml").write_text(TEXT)
-    assert main(["montecarlo", "study.toml", "--figures", "svg"]) == 0
-    out = capsys.readouterr().out
-    assert "16" in out
-    assert "kept" in out
-    assert (tmp_path / "runs" / "study" / "study.zarr").is_dir()
-    assert main(["montecarlo", "study.toml", "--resume", "--figures", "none", "--lanes", "8"]) == 2
-    assert "has no --lanes" in capsys.readouterr().err
+    again = pickle.loads(pickle.dumps(study))
+    assert again.identity == study.identity
+    assert again.columns == study.columns
 
 
 @pytest.mark.parametrize(
@@ -155,18 +135,19 @@ def test_the_command_flies_a_study_and_reports_it(tmp_path, capsys, monkeypatch)
         ("mass.panel_7", True, "has no effect on this mission"),
         ("bare.inertia", False, "name one entry"),
         ("gust.height", True, "has no effect on this mission"),
+        ("payload_2.mass", True, "mean 'payload_1.mass'"),
     ],
 )
-def test_factors_that_cannot_be_drawn_are_refused(factor, relative, words):
+def test_factors_that_cannot_be_drawn_are_refused(mission, factor, relative, words):
     names = frozenset({factor}) if relative else frozenset()
     with pytest.raises(stm.SettingError, match=words):
-        study({factor: 1.0}, names, "random")
+        missions.make_mission_study(mission, {factor: 1.0}, relative=names)
 
 
 def test_studies_that_cannot_be_flown_are_refused(tmp_path):
     (tmp_path / "held.toml").write_text(HELD)
     plain = {"kind": "missions", "mission": "held.toml", "factors": {"bare.mass": 1.0}}
-    assert missions.mission_work(plain, tmp_path).mission.file.name == "held"
+    assert missions.load_mission_study(plain, tmp_path).evaluate.mission.file.name == "held"
     for change, words in (
         ({"mission_": "hover"}, "Did you mean 'mission'"),
         ({"mission": "hoover"}, "Did you mean 'hover'"),
@@ -175,7 +156,32 @@ def test_studies_that_cannot_be_flown_are_refused(tmp_path):
         ({"factors": {}}, "factors"),
         ({"t1": -1.0}, "t1"),
     ):
-        with pytest.raises((stm.SettingError, stm.files.FileError), match=words):
-            missions.mission_work(plain | change, tmp_path)
+        with pytest.raises((stm.SettingError, stm.io.FileError), match=words):
+            missions.load_mission_study(plain | change, tmp_path)
     with pytest.raises(stm.SettingError, match="has no battery"):
-        study(battery={})
+        make_study(missions.make_mission(MISSION | {"battery": {}}))
+    # what the flights of a study do not come to, and what it does not judge
+    late = r"end at t = 2 s, before "
+    for change, words in (
+        ({"faults": [{"rotor": 1, "at": 9.0, "share": 0.9}], "machine": HELD_STILL},
+         late + "the fault of rotor 1 at t = 9 s: give the study a later 't1'"),
+        ({"tolerances": {"position": 0.1, "after": 5.0}},
+         late + "the tolerances of position and tilt, which hold from t = 5 s on"),
+        ({"path": {"waypoints": [{"t": t, "position": [0.0, 0.0, t / 10]} for t in (0.0, 3.0)]}},
+         late + "waypoint 2 at t = 3 s"),
+        ({"tolerances": {"sink": 0.1}, "machine": WITH_GEAR}, "does not judge 'tolerances.sink'"),
+    ):  # fmt: skip
+        with pytest.raises(stm.SettingError, match=words):
+            make_study(missions.make_mission(MISSION | change))
+
+
+def test_margins_of_a_study_are_those_of_the_motors_that_are_drawn():
+    """The truth's motors give less than the controller believes."""
+    motor = {"motor.highest": 1500.0, "motor.lowest": 100.0}
+    table = stm.PART_II.replaced(motor)
+    scene = stm.make_scene("hexacopter", parameters=table, motor=stm.uav.Motor())
+    found = _narrow_limits(stm.uav.RotorLimits(200.0, 1900.0), scene)
+    assert found is not None
+    low, high = found.squared(6)
+    np.testing.assert_allclose(low, 200.0**2)
+    np.testing.assert_allclose(high, 1500.0**2, rtol=1e-12)

@@ -12,15 +12,21 @@ import pytest
 import xarray as xr
 
 import stmuav_jax as stm
-from stmuav_jax.checks.schema import checked
+from stmuav_jax.checks.schema import validate_model
 from stmuav_jax.missions import ensemble
-from stmuav_jax.missions.effort import _times as times_of, check_forces, needed_forces
+from stmuav_jax.missions.controller import References
 from stmuav_jax.missions.machine import machine_of
-from stmuav_jax.missions.mission import LIBRARY, _moves, _path
-from stmuav_jax.missions.reference import References
+from stmuav_jax.missions.mission import (
+    LIBRARY,
+    _make_moves,
+    _make_path,
+    check_forces,
+    needed_forces,
+    times_of,
+)
 from stmuav_jax.missions.schema import MissionFile
 
-control, missions, tracker = stm.control, stm.missions, stm.tracker
+control, missions, tracker = stm.control, stm.missions, stm.uav
 
 DEGREE = np.pi / 180
 GOAL, BEGIN, DURATION = np.array([14.3, 11.5]), 0.1, 0.3
@@ -36,9 +42,9 @@ PLAIN = {
 @pytest.fixture(scope="module")
 def asked():
     """Entries, machine and references of the mission, times, and the forces then."""
-    given = checked(MissionFile, PLAIN, "A mission")
+    given = validate_model(MissionFile, PLAIN, "A mission")
     machine = machine_of(given, LIBRARY)
-    references = References(_path(given.path, machine), _moves(given, machine))
+    references = References(_make_path(given.path, machine), _make_moves(given, machine))
     ts, gravity = times_of(given), jnp.array([0.0, 0.0, -9.81])
     needed = np.asarray(needed_forces(machine.bodies, references, gravity, jnp.asarray(ts)))
     return given, machine, references, ts, needed
@@ -59,7 +65,7 @@ def test_forces_along_a_reference_by_hand(asked):
     y = np.cross(z, [1.0, 0.0, 0.0])
     y = y / np.linalg.norm(y)
     felt_b = jnp.asarray(np.stack([np.cross(y, z), y, z]) @ felt)
-    forces = lambda x: control.inverse_dynamics(machine.bodies, x, felt_b, jnp.zeros(3)).forces
+    forces = lambda x: stm.uav.inverse_dynamics(machine.bodies, x, felt_b, jnp.zeros(3)).forces
     np.testing.assert_allclose(needed, jax.jit(jax.vmap(forces))(motion), rtol=1e-9)
 
 
@@ -98,16 +104,16 @@ def test_a_verdict_counts_the_forces_that_the_servo_asks_for():
     margin = lambda d: [m for m in missions.measures(d) if "actuators' forces" in m.name]
     assert margin(data) == []
     (kept,) = margin(data.assign(limits(10.0)))
-    assert (kept.value, kept.kept) == (pytest.approx(10.0), True)
+    assert (kept.value, kept.is_met) == (pytest.approx(10.0), True)
     (broken,) = margin(data.assign(limits(6.0)))
-    assert (broken.value, broken.kept) == (pytest.approx(-100 / 6), False)
+    assert (broken.value, broken.is_met) == (pytest.approx(-100 / 6), False)
     fine, words = missions.verdict(data.assign(limits(6.0)))
     assert not fine
     assert "smallest margin of the actuators' forces" in words
     # the servo of a jammed slider asks in vain
     content["faults"] = [{"rotor": None, "slider": 3, "at": 0.5}]
     (jammed,) = margin(data.assign(limits(6.0)).assign_attrs(mission=json.dumps(content)))
-    assert (jammed.value, jammed.kept) == (pytest.approx(12.5), True)
+    assert (jammed.value, jammed.is_met) == (pytest.approx(12.5), True)
 
 
 def test_a_study_counts_the_same_forces():
@@ -120,13 +126,14 @@ def test_a_study_counts_the_same_forces():
         "wanted_force": forces,
     }  # fmt: skip
     found: Any = SimpleNamespace(ts=ts, signals={"gauges": own}, reason=jnp.zeros(5, jnp.int8))
-    given = checked(MissionFile, PLAIN | {"t1": 1.5}, "A mission")
+    given = validate_model(MissionFile, PLAIN | {"t1": 1.5}, "A mission")
     mission: Any = SimpleNamespace(
         file=given, samples=4, plant=SimpleNamespace(rate=2.0), machine=SimpleNamespace(force=6.0)
     )
     zero, one = jnp.zeros(()), jnp.ones(())
-    begun = ensemble.Worst(zero, zero, zero, one, one, one, zero, jnp.zeros((), jnp.int8), zero)
-    joined = inspect.unwrap(ensemble._joined)
+    none_yet, reason = jnp.zeros(0), jnp.zeros((), jnp.int8)
+    begun = ensemble.Worst(zero, zero, zero, none_yet, one, one, one, one, zero, reason, zero)
+    joined = inspect.unwrap(ensemble._join_worst)
     for at, margin in ((jnp.inf, -1 / 6), (0.5, 0.125)):
         jam = SimpleNamespace(at=jnp.array([jnp.inf, at]))
         of: Any = SimpleNamespace(

@@ -1,11 +1,13 @@
-"""Missions on a hexacopter: flown, interrupted and resumed, saved, and refused before the flight."""
+"""Missions on a hexacopter: flown, interrupted, saved, and refused before the flight."""
 
 import copy
 import importlib.util
+import inspect
 import json
 import re
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -17,14 +19,14 @@ from helpers import check_same_types
 from html_pages import read
 
 import stmuav_jax as stm
-from stmuav_jax.algebra import compiler
-from stmuav_jax.cli import main
-from stmuav_jax.commands.fly import NOT_KEPT, UNFINISHED
-from stmuav_jax.figures import loop_report
-from stmuav_jax.files.netcdf import load_checkpoint, save_checkpoint, save_sealed
-from stmuav_jax.missions.flight import _chunk
-from stmuav_jax.missions.keep import load_reached, save_reached
+from stmuav_jax.cli.fly import NOT_KEPT
+from stmuav_jax.cli.main import main
+from stmuav_jax.io.netcdf import save_sealed
+from stmuav_jax.math import compiler
+from stmuav_jax.missions import mission as mission_module
+from stmuav_jax.missions.flight import _fly_chunk, describe_failure
 from stmuav_jax.missions.outcome import labelled_flight
+from stmuav_jax.missions.schema import SunEntry
 
 missions = stm.missions
 ROOT = Path(__file__).parents[2]
@@ -80,7 +82,7 @@ def plain(**changes):
 def chunks():
     """Keys of the programs that fly a chunk."""
     keys: list[Any] = list(compiler._programs)
-    return {key for key in keys if key[0] is _chunk}
+    return {key for key in keys if key[0] is _fly_chunk}
 
 
 @pytest.fixture(scope="module")
@@ -121,36 +123,26 @@ def test_a_hexacopter_flies_along_its_waypoints(flight, data):
     assert np.mean(lift) == pytest.approx(9.81 * stm.PART_II.value("bare.mass"), rel=0.1)
 
 
-def test_page_of_a_flight(flight, data, tmp_path, capsys, monkeypatch):
+def test_report_of_a_flight(flight, data, tmp_path):
     """Its verdict, what it is judged by and the mission's entries; an early end stands out."""
     save_sealed(labelled_flight(flight), tmp_path / "flight.nc")
-    assert main(["report", str(tmp_path)]) == 0
-    assert "Flight: " in capsys.readouterr().out
-    page, text = read(tmp_path / "report.html")
+    target = tmp_path / "report.html"
+    assert main(["view", str(tmp_path), "--report", str(target)]) == 0
+    page, text = read(target)
     # the mechanism; errors, margins, rotors, power; pose; inputs
     assert len(page.sources) == 7
     assert missions.verdict(data)[1] in text
     for one in missions.measures(data):
-        assert f"{one.name} {one.value:.4g}".replace("-", "\u2212") in text
+        assert f"{one.name} {one.value:.4g}" in text
     assert re.search(r"Largest position error [\d.]+ m 0.1 kept", text)
-    assert "Mission: wind.change.at 1" in text
-    assert "Mission: tolerances.tilt 15" in text
-    # a loop without a mission has what all loops have
-    loop = data.drop_attrs().assign_attrs({k: v for k, v in data.attrs.items() if k != "mission"})
-    stm.figures.write_loop_report(loop, tmp_path / "loop.html", dpi=40)
-    page, text = read(tmp_path / "loop.html")
-    assert len(page.sources) == 3
-    assert "ran to its end at t = 2.2 s" in text
-    monkeypatch.setattr(loop_report, "_pictures", lambda *_: iter(()))
-    failed = data.assign_attrs(failure="The state is not finite at t = 1 s.", ending="failed")
-    content = json.loads(data.attrs["mission"])
-    content["tolerances"]["position"] = 1e-9
-    missions.write_flight_report(
-        failed.assign_attrs(mission=json.dumps(content)), tmp_path / "failed.html"
-    )
-    text = read(tmp_path / "failed.html")[1]
-    assert "The state is not finite at t = 1 s." in text
-    assert "Not kept: largest position error" in text
+    assert "mission: wind.change.at 1" in text
+    # a loop without a mission has what all loops have, and says that it failed
+    attributes = {k: v for k, v in data.attrs.items() if k != "mission"}
+    attributes["failure"] = "The state is not finite at t = 1 s."
+    loop = data.drop_attrs().assign_attrs(attributes)
+    page, text = read(stm.figures.write_report(loop, tmp_path / "loop.html", dpi=40))
+    assert len(page.sources) == 2
+    assert "not finite at t = 1 s." in text
 
 
 def test_powers_and_the_battery_by_hand(data):
@@ -159,7 +151,7 @@ def test_powers_and_the_battery_by_hand(data):
     power = stm.PART_II.value("rotor.k_tau") * np.sum(speeds**3, axis=1)
     np.testing.assert_allclose(data.rotor_power, power, rtol=1e-12)
     np.testing.assert_allclose(data.electric_power, power / 0.8 + 10.0, rtol=1e-12)
-    table = {name: stm.parameters.ENERGY.value(f"battery.{name}") for name in (
+    table = {name: stm.uav.ENERGY.value(f"battery.{name}") for name in (
         "capacity", "resistance", "state_of_charge", "open_circuit_voltage")}  # fmt: skip
     ts = data.time.values
 
@@ -176,14 +168,14 @@ def test_powers_and_the_battery_by_hand(data):
 
 def test_a_flight_goes_on_with_the_program_of_its_first_second(flight):
     """Where it stands after a second has the shapes and types that it had at the start."""
-    mission, rows = flight.mission, flight.reached.rows
+    mission, rows = flight.mission, flight.progress.rows
     key = jax.random.key(0)
     first = jax.eval_shape(lambda: (mission.plant.reset(key), mission.controller.start()))
     later = jax.eval_shape(lambda: (rows.end, rows.memory))
     check_same_types(first, later)
 
 
-def test_an_interrupted_flight_goes_on_to_the_last_bit(flight, data, tmp_path):
+def test_an_interrupted_flight_keeps_what_was_flown(data):
     mission = missions.make_mission(plain())
 
     def stop(done):
@@ -192,27 +184,11 @@ def test_an_interrupted_flight_goes_on_to_the_last_bit(flight, data, tmp_path):
 
     part = missions.fly(mission, progress=stop)
     assert part.ending == "interrupted"
-    assert part.reached.samples == 200
-    data_so_far = missions.to_data(part)
-    kept, words = missions.verdict(data_so_far)
+    flown = missions.to_data(part)
+    kept, words = missions.verdict(flown)
     assert not kept
     assert "interrupted" in words
-    path = save_reached(mission, part.reached, tmp_path / "part.npz")
-    again = missions.to_data(missions.fly(mission, reached=load_reached(mission, path)))
-    assert again.drop_attrs().identical(data.drop_attrs())
-    other = missions.make_mission(plain(wind__gusts__seed=4))
-    with pytest.raises(stm.files.FileError, match="of another mission"):
-        load_reached(other, path)
-    head, arrays = load_checkpoint(path, "a flight")
-    save_checkpoint(path, head, arrays[:-1])
-    with pytest.raises(stm.files.FileError, match="has not the arrays of a flight"):
-        load_reached(mission, path)
-    save_checkpoint(path, {**head, "signals": 3}, arrays)
-    with pytest.raises(stm.files.FileError, match="'signals' must be a list"):
-        load_reached(mission, path)
-    path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(stm.files.FileError, match="damaged"):
-        load_reached(mission, path)
+    np.testing.assert_array_equal(flown.command.values, data.command.values[:200])
 
 
 def test_an_empty_battery_ends_the_flight_with_its_results():
@@ -227,17 +203,29 @@ def test_an_empty_battery_ends_the_flight_with_its_results():
 
 
 def test_a_rotor_that_fails_is_not_known_to_the_controller(data):
-    faults = [{"rotor": 2, "share": 0.5, "at": 1.0}]
-    found = missions.to_data(missions.fly(missions.make_mission(plain(faults=faults))))
+    # the second fault, listed first, leaves a share of the whole thrust too
+    faults = [{"rotor": 2, "share": 0.3, "at": 1.5}, {"rotor": 2, "share": 0.5, "at": 1.0}]
+    mission = missions.make_mission(plain(faults=faults))
+    flown = missions.fly(mission)
+    found = missions.to_data(flown)
     before = data.time.values < 1.0 - 1e-9
     np.testing.assert_array_equal(found.command.values[before], data.command.values[before])
     k = int(np.sum(before))
     np.testing.assert_allclose(found.command[k, 1], 0.5 * data.command[k, 1], rtol=1e-12)
+    # the pilot, at the states that were flown, asks for what the rotor gives a share of
+    pilot: Any = mission.controller.pilot
+    asked_at = jax.jit(lambda t, x: pilot(x, mission.references(t).waypoint, pilot.start())[0][1])
+    for t, share in ((0.5, 1.0), (1.25, 0.5), (1.75, 0.3)):
+        k = round(200 * t)
+        state = jax.tree.map(lambda x, k=k: jax.numpy.asarray(x[k]), flown.run.states)
+        asked = asked_at(jax.numpy.asarray(t), state)
+        np.testing.assert_allclose(found.command[k, 1], share * asked, rtol=1e-9)
     kept, words = missions.verdict(found)
     assert not kept
     assert "largest position error" in words
 
 
+@pytest.mark.slow
 def test_a_rotor_that_is_known_to_be_lost_is_flown_without(data):
     """The same path in the same gusts, with yaw given up from the fault on."""
     faults = [{"rotor": 2, "at": 1.0, "known": True}]
@@ -251,8 +239,8 @@ def test_a_rotor_that_is_known_to_be_lost_is_flown_without(data):
 
 
 def test_a_flight_is_saved_and_loaded_with_equality(flight, data, tmp_path):
-    path = stm.files.save_loop(flight.run, tmp_path / "loop.nc")
-    loaded = stm.files.load(path)
+    path = stm.io.save_loop(flight.run, tmp_path / "loop.nc")
+    loaded = stm.io.load(path)
     np.testing.assert_array_equal(loaded.position, flight.run.states.r)
     np.testing.assert_array_equal(loaded.command, flight.run.rollout.inputs)
     assert list(loaded.input_unit.values) == ["rad^2/s^2"] * 6
@@ -276,14 +264,9 @@ def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
     assert {path.name for path in folder.iterdir()} == {
         "flight.nc", "errors.svg", "margins.svg", "rotors.svg", "power.svg"
     }  # fmt: skip
-    assert isinstance(stm.files.load(folder / "flight.nc"), xr.Dataset)
+    assert isinstance(stm.io.load(folder / "flight.nc"), xr.Dataset)
     (tmp_path / "mine.toml").write_text(TEXT.replace("tilt = 15.0", "tilt = 0.1"))
     assert main(["fly", "mine.toml", "--figures", "none"]) == NOT_KEPT
-    (folder / UNFINISHED).write_bytes(b"")
-    assert main(["fly", "mine.toml"]) == 2
-    assert "--resume" in capsys.readouterr().err
-    assert main(["fly", "mine.toml", "--resume"]) == 2
-    assert "damaged" in capsys.readouterr().err
     assert main(["fly", "hoover"]) == 2
     assert "Did you mean 'hover'?" in " ".join(capsys.readouterr().err.split())
 
@@ -294,9 +277,9 @@ def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
         ({"speed": 3.0}, "A mission has no entry 'speed'"),
         ({"rates__contrl": 3.0}, "Did you mean 'control'"),
         ({"format": 2}, "reads format 1 alone"),
-        ({"t1": 0.0}, "'t1' must be finite and positive"),
+        ({"t1": 0.0}, "'t1' must be greater than 0"),
         ({"t1": 2.2013}, "whole number of control periods"),
-        ({"machine__scene": "tracker"}, "must be hexacopter or uav_tracker"),
+        ({"machine__scene": "tracker"}, "must be 'hexacopter' or 'uav_tracker'"),
         ({"machine__model": "x.toml"}, "a scene or a model's file, and not both"),
         ({"machine__options": {}}, "options.drag"),
         ({"machine__options": {"drga": {}}}, "no drga"),
@@ -312,7 +295,7 @@ def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
         ({"controller__servo": {"frequency": 9.0}}, "needs the tracker"),
         ({"panel": [{"angles": [1.0, 2.0]}]}, "needs the tracker"),
         ({"faults": [{"rotor": 7, "at": 1.0}]}, "no rotor 7"),
-        ({"faults": [{"at": 1.0}]}, "needs a rotor or a slider"),
+        ({"faults": [{"at": 1.0}]}, "one of a rotor, a slider and a sensor"),
         ({"faults": [{"rotor": 2, "share": 0.5, "at": 1.0, "known": True}]}, "must be the loss of a"),
         (
             {"faults": [{"rotor": 1, "at": 1.0, "known": True}], "controller__highest": 1300.0},
@@ -320,18 +303,151 @@ def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
         ),
         ({"wind__steady": [0.0, 0.0, 0.0]}, "must not be zero"),
         ({"tolerances__sink": 0.01}, "'tolerances.sink' needs a landing gear"),
-        ({"tolerances__touchdown": 0.0}, "'tolerances.touchdown' must be finite and positive"),
+        ({"tolerances__touchdown": 0.0}, "'tolerances.touchdown' must be greater than 0"),
         ({"sensors": {"position": {"rate": 33.0}}}, "not a whole part"),
         ({"payload": {"mass": 0.1, "position": [0.0, 0.0, 0.0]}}, r"\[payload\] needs the tracker"),
         ({"controller__payload": "known"}, r"known, but the mission has no \[payload\]"),
         ({"controller__payload": "estimated"}, "from gyroscope and accelerometer"),
-        ({"battery__state_of_charge": 0.2, "battery__reserve": 0.3}, "above its reserve"),
+        ({"battery__state_of_charge": 0.2, "battery__reserve": 0.3}, "above its reserve of 0.3"),
+        # the reserve of the table, which is used where none is given
+        ({"battery__state_of_charge": 0.1}, "above its reserve of 0.2, but it is 0.1"),
+        ({"controller__highest": 2500.0, "machine__options__motor": {}},
+         "'controller.highest' is 2500 rad/s, but the motors turn no faster than 1900 rad/s"),
+        ({"controller__lowest": 50.0, "machine__options__motor": {}},
+         "'controller.lowest' is 50 rad/s, but the motors turn no more slowly than 200 rad/s"),
+        ({"controller__highest": 2500.0}, "the motors turn no faster than 1900 rad/s"),
+        ({"faults": [{"rotor": 1, "at": 1.0, "share": 0.5}, {"rotor": 1, "at": 1.0}]},
+         "Rotor 1 has two faults at t = 1 s"),
+        ({"faults": [{"rotor": 1, "at": 1.0, "known": True}, {"rotor": 1, "at": 1.5, "share": 0.5}]},
+         "Rotor 1 is lost from t = 1 s on, so that its fault at t = 1.5 s has no effect"),
+        ({"faults": [{"slider": 2, "at": 1.5}, {"slider": 2, "at": 1.0}]},
+         "Slider 2 is jammed from t = 1 s on"),
+        ({"path": {"acceleration": [0.0, 0.0, -12.0]}}, "thrust that points downwards at t = 0 s"),
+        ({"path": {"position": [5.0, 0.0, 0.0]}}, "begins with a step of 5 m: the path begins at"),
+        ({"path": {"heading": 170.0}}, "begins with a step of 170 degrees"),
+        ({"path__waypoints": [{"t": t, "position": [0.0, 3.0, 0.0]} for t in (0.0, 2.0)]},
+         r"begins with a step of 3 m: the path begins at \(0, 3, 0\) m"),
+        ({"path": {}, "machine__options__start": {"vx": 2.0}}, "begins with a step of 2 m/s"),
+        ({"path": {}, "machine__options__start": {"r": 0.3}}, "begins with a step of 0.3 rad/s"),
+        ({"sensors": {"gyroscope": {"rate": 100.0}}},
+         "'sensors.gyroscope' must read at every control period, at 200 Hz, and without delay"),
+        ({"sensors": {"accelerometer": {"delay": 0.02}}}, "at 200 Hz, late by 0.02 s: leave"),
+        ({"sensors": {"attitude": {"delay": 0.012}}}, "'sensors.attitude.delay' must be a whole number"),
+        ({"sensors": {"gyroscope": {"noise": -1e-3}}}, "noise' must not be negative, but it is -0.001"),
+        ({"rates__delay": 0.1}, "closed loop of the position and attitude is unstable"),
     ],
     ids=lambda x: "" if isinstance(x, str) else None,
 )  # fmt: skip
 def test_missions_that_cannot_be_flown_are_refused(changes, words):
     with pytest.raises((stm.SettingError, stm.ModelError), match=words):
         missions.make_mission(plain(**changes))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sensors": {"gyroscope": {"rate": 100.0}}}, {"sensors": {"encoders": {"rate": 33.0}}},
+        {"battery__state_of_charge": 0.1}, {"faults": [{"at": 1.0}]}, {"t1": 2.2013},
+        {"rates__delay": 0.0013}, {"machine__scene": "uav_tracker", "panel": [{"at": 1.0}]},
+    ],
+)  # fmt: skip
+def test_what_the_entries_tell_alone_is_refused_before_a_machine_is_made(changes, monkeypatch):
+    monkeypatch.setattr(mission_module, "machine_of", lambda *_: pytest.fail("a machine was made"))
+    with pytest.raises(stm.SettingError):
+        missions.make_mission(plain(**changes))
+
+
+@pytest.mark.parametrize(
+    ("moves", "words"),
+    [
+        ([{"angles": [0.0, 0.0], "at": 3.0}, {"angles": [5.0, 0.0], "at": 1.0}],
+         "move 2 begins at t = 1 s, before the end of move 1 at 4 s"),
+        ([{"angles": [0.0, 0.0], "at": 0.5, "duration": 2.0}, {"angles": [5.0, 0.0], "at": 1.0}],
+         "move 2 begins at t = 1 s, before the end of move 1 at 2.5 s"),
+    ],
+)  # fmt: skip
+def test_moves_of_the_panel_follow_one_another(moves, words):
+    uav = {"format": 1, "name": "a", "t1": 5.0, "machine": {"scene": "uav_tracker"}}
+    with pytest.raises(stm.SettingError, match=words):
+        missions.make_mission(uav | {"panel": moves})
+
+
+def test_a_local_time_that_no_clock_shows_is_refused():
+    sun = {"lat": 52.5, "lon": 13.4, "date": "2024-03-31", "timezone": "Europe/Berlin"}
+    with pytest.raises(stm.SettingError, match="no time 2024-03-31 02:30:00 in Europe/Berlin"):
+        mission_module._sun_direction(SunEntry(hour=2.5, **sun), 1.0)
+    with pytest.raises(stm.SettingError, match=r"below the horizon .* 2024-03-31T03:30:00\+02:00"):
+        mission_module._sun_direction(SunEntry(hour=3.5, **sun), 1.0)
+
+
+def test_a_path_may_begin_elsewhere_where_a_step_is_wanted():
+    step = {"position": [1.0, 0.0, 0.0], "heading": 90.0, "step": True}
+    path: Any = missions.make_mission(plain(path=step)).references.path
+    np.testing.assert_allclose(path.r, [1.0, 0.0, 0.0])
+    # held where it starts, the machine keeps its heading
+    turned = missions.make_mission(plain(path={}, machine__options__start={"yaw": 0.7}))
+    path = turned.references.path
+    assert float(path.heading) == pytest.approx(0.7, rel=1e-12)
+
+
+def test_the_verdict_names_what_a_flight_did_not_come_to(data):
+    """Of a flight of 2.2 s: waypoints, faults, moves of the panel and a change of the wind after it."""
+    content = json.loads(data.attrs["mission"])
+    content["path"]["waypoints"][2]["t"] = 6.0
+    content["faults"] = [
+        {"rotor": 1, "slider": None, "at": 50.0},
+        {"rotor": 2, "slider": None, "at": 2.2},
+    ]
+    content["wind"]["change"] = {"to": [2.0, 0.0, 0.0], "at": 2.1, "rise": 0.2}
+    content["panel"] = [{"at": 1.0, "duration": 1.2}, {"at": 30.0, "duration": 1.0}]
+    kept, words = missions.verdict(data.assign_attrs(mission=json.dumps(content)))
+    assert not kept
+    assert words == (
+        "It flew to t = 2.2 s of 2.2 s. It ended before waypoint 3 at t = 6 s, the end of move 2 of the "
+        "panel at t = 31 s, the fault of rotor 1 at t = 50 s, the fault of rotor 2 at t = 2.2 s, the end of "
+        "the wind's change at t = 2.3 s. Until then, tolerances and limits were kept."
+    )
+
+
+def test_the_verdict_says_that_a_loop_is_unstable_that_was_flown(data):
+    assert float(data.attrs["growth"]) == 1.0
+    kept, words = missions.verdict(data.assign_attrs(growth=2.5))
+    assert kept
+    assert "closed loop is unstable: small motions about hover grow 2.5-fold in a second." in words
+
+
+def test_a_failed_flight_names_the_first_limit_that_it_left():
+    """Of a made-up record: slider 3 leaves its stroke, then the base falls over, then numbers end."""
+    limits = SimpleNamespace(lower=np.full(2, -0.02), upper=np.full(2, 0.03))
+    machine = SimpleNamespace(limits=limits, force=9.0)
+    ts = np.arange(6) * 0.01
+    strokes = np.zeros((6, 2))
+    strokes[3:, 1] = -0.025
+    signals = {
+        "displacement": strokes, "wanted_force": np.zeros((6, 2)),
+        "tilt_error": np.where(ts > 0.035, 2.0, 0.1),
+    }  # fmt: skip
+    mission: Any = SimpleNamespace(machine=machine)
+    rows: Any = SimpleNamespace(ts=ts, signals=signals)
+    certificate = SimpleNamespace(t_end=0.05)
+    failure = "Number 3 of the estimate was not finite."
+    run: Any = SimpleNamespace(failure=failure, ts=ts, certificate=certificate)
+    describe = inspect.unwrap(describe_failure)
+    assert describe(mission, rows, run) == (
+        "The flight got out of control: at t = 0.03 s slider 3 left its stroke of -0.02 to 0.03 m, and "
+        "after t = 0.05 s its motion had diverged: its numbers were no longer finite."
+    )
+    signals["wanted_force"][1, 0] = -9.5
+    assert "at t = 0.01 s the servo asked slider 2 for more than 9 N" in describe(
+        mission, rows, run
+    )
+    calm: Any = SimpleNamespace(ts=ts[:3], signals={name: x[:1] for name, x in signals.items()})
+    # rows that end before the numbers do: the battery could not give the fourth
+    assert "at t = 0.03 s it asked its battery for more than that can give" in describe(
+        mission, calm, run
+    )
+    certificate.t_end = 0.02
+    assert describe(mission, calm, run) == run.failure
 
 
 def test_the_table_of_flights_is_that_of_its_script(data):
@@ -341,7 +457,7 @@ def test_the_table_of_flights_is_that_of_its_script(data):
     assert spec.loader is not None
     table = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(table)
-    page = (ROOT / "docs" / "missions.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "control_and_missions.md").read_text(encoding="utf-8")
     rows = table.rows_of(page)
     assert sorted(rows) == sorted(table.ORDER) == sorted(missions.mission_names())
     assert table.with_rows(page, rows) == page

@@ -11,7 +11,7 @@ import stmuav_jax as stm
 missions = stm.missions
 
 # Time flown in the tests [s]; the missions themselves last 60 s.
-FLOWN = 20.0
+FLOWN = 8.0
 
 
 def flown(end, **tolerances):
@@ -60,9 +60,12 @@ def test_a_flight_that_ends_before_a_tolerance_holds_is_not_judged_by_it():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["case-1", "case-2", "case-3"])
+@pytest.mark.parametrize("name", ["case-2", "case-3"])
 def test_the_reports_cases_on_sensors_from_the_start_on(name):
-    """5 cm and 2 degrees from t = 0 and 0.4 degrees of the panel from 2 s on, as the files ask."""
+    """5 cm and 2 degrees from t = 0 and 0.4 degrees of the panel from 2 s on, as the files ask.
+
+    Case 1 is flown by the command in test_ready_missions.py.
+    """
     mission = missions.load_mission(name, t1=FLOWN)
     asked = mission.file.tolerances
     assert (asked.after, asked.panel_after) == (0.0, 2.0)

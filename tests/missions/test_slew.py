@@ -1,4 +1,4 @@
-"""The slew of 30 degrees in one second with a payload: what feedforward and adaptation are worth.
+"""The slew of 30 degrees in one second with a payload: what feedforward and adaptation are worth together.
 
 Instruments are noisy, and their noise alone turns the base by some 0.4 degrees. What the slew does is
 the rotation against the same flight, with the same noise, in which the panel stands still.
@@ -12,20 +12,18 @@ import numpy as np
 import pytest
 
 import stmuav_jax as stm
-from stmuav_jax.algebra.compiler import quick_jit
-from stmuav_jax.algebra.rotation import conjugate, product, to_rotation_vector
-from stmuav_jax.flight.mass_properties import centre_of_mass
+from stmuav_jax.analysis.mass_properties import centre_of_mass
+from stmuav_jax.math.compiler import quick_jit
+from stmuav_jax.math.rotation import conjugate, product, to_rotation_vector
+from stmuav_jax.missions.controller import PanelMoves, References
 from stmuav_jax.missions.mission import LIBRARY
-from stmuav_jax.missions.reference import PanelMoves, References
 
 control, missions = stm.control, stm.missions
 
 PLAIN = tomllib.loads((LIBRARY / "slew-30.toml").read_text(encoding="utf-8"))
 CONTROLLERS = {
     "neither": {"payload": "unknown", "feedforward": False},
-    "feedforward": {"payload": "unknown"},
     "adapted": {"payload": "estimated"},
-    "known": {"payload": "known"},
 }
 # beginning of the slew, time before it for the mean attitude, end of what is looked at, and time from
 # which the position counts [s]
@@ -90,17 +88,14 @@ def flights():
 def test_adaptation_halves_what_a_slew_does_to_the_attitude(flights):
     largest = {name: numbers[0] for name, numbers in flights[1].items()}
     assert largest["adapted"] <= 0.5 * largest["neither"]
-    assert largest["adapted"] <= largest["feedforward"]
-    assert largest["adapted"] <= largest["known"] + 0.03
 
 
 @pytest.mark.slow
 def test_adaptation_carries_the_payload(flights):
     """A payload that is not known lets the machine sink by 0.3 / 7.4 of 9.81 / 9 m, and lean."""
     largest = {name: numbers[2] for name, numbers in flights[1].items()}
-    assert largest["feedforward"] > 0.04
+    assert largest["neither"] > 0.04
     assert largest["adapted"] < 0.02
-    assert largest["adapted"] < largest["known"] + 0.005
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import stmuav_jax as stm
-from stmuav_jax.files import scene_from_mujoco
+from stmuav_jax.io import scene_from_mujoco
 
 GYMNASIUM = (
     "ant", "half_cheetah", "hopper", "humanoid", "inverted_double_pendulum", "pusher_v5", "reacher",
@@ -92,7 +92,7 @@ def robot(name: str, loop: Loop | None = None) -> Robot:
     """Robot of a file; with a loop the file's posture is another, that it is not singular."""
     mujoco: Any = pytest.importorskip("mujoco")
     path = path_of(name)
-    importer = importlib.import_module("stmuav_jax.files.mujoco_import")
+    importer = importlib.import_module("stmuav_jax.io.mujoco_import")
     spec = importer._without_meshes(mujoco.MjSpec.from_file(str(path)))
     # MuJoCo keeps the inertia of bodies that only slide from when it compiles, armature included
     for joint in spec.joints:

@@ -71,6 +71,6 @@ def test_rows_are_chosen_by_data() -> None:
     system, how = bricard(), stm.Tree(redundant=True)
     model = how.prepare(system)
     x = how.to_vector(model, system.reference)
-    at_step = jax.jit(lambda x: how.at_step(model, jnp.zeros(()), x).kept)
+    at_step = jax.jit(lambda x: how.at_step(model, jnp.zeros(()), x).step_rows)
     kept = np.asarray(at_step(x))
     assert kept.sum() == len(kept) - 1

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from stmuav_jax.algebra.compiler import outer_jit
-from stmuav_jax.algebra.rotation import from_rotation_vector, product
-from stmuav_jax.algebra.space import Vector
-from stmuav_jax.algebra.stacked import transposed_multiply
 from stmuav_jax.estimation import sigma
-from stmuav_jax.estimation.bank import filter_bank
 from stmuav_jax.estimation.consistency import autocorrelation, chi2_interval, mean_interval, nees
+from stmuav_jax.estimation.filter import filter_bank
 from stmuav_jax.estimation.gaussians import gaussian
-from stmuav_jax.quadrotor.attitude import attitude_model
+from stmuav_jax.math.compiler import outer_jit
+from stmuav_jax.math.rotation import from_rotation_vector, product
+from stmuav_jax.math.space import Vector
+from stmuav_jax.math.stacked import transposed_multiply
+from stmuav_jax.uav.quadrotor.model import attitude_model
 
 # --- D2: weights
 

@@ -20,7 +20,7 @@ from jax import Array
 from problems.conservative import FAST, MASS, SLOW, top
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration.problem import begin, prepare
+from stmuav_jax.dynamics.integration.problem import begin_integration, prepare_problem
 
 TIMES = np.array([0.0, 0.1, 0.2])  # s
 ENERGY = 5435.696790865547  # J, fast, at the start
@@ -88,8 +88,8 @@ def by_fixed_steps(omega: tuple[float, float, float], solver: Any) -> Steps:
     """(t1 [s], count) -> centre of mass at t1 by that many equal steps, one compilation."""
     system, state = top(omega)
     method = stm.Method(solver=solver, adjoint=diffrax.ForwardMode(), steps="state")
-    problem = prepare(system, method)
-    y0 = begin(problem, jnp.zeros(()), state).y
+    problem = prepare_problem(system, method)
+    y0 = begin_integration(problem, jnp.zeros(()), state).y
 
     @eqx.filter_jit
     def end(t1: Array, step: Array) -> Array:

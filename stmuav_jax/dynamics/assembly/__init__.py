@@ -1,1 +1,1 @@
-"""Consistent initial states, rank of the constraints, and prescribed motion. Floor 6."""
+"""Consistent initial states, rank of the constraints, and prescribed motion."""

@@ -1,7 +1,7 @@
-"""Consistent initial conditions: assembly of positions, projection of velocities, rank of rows."""
+"""Consistent initial conditions: assembly of positions, projection of velocities."""
 
-from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -10,18 +10,17 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from ...algebra import lapack
-from ...algebra.compiler import kept_jit
-from ...algebra.rotation import conjugate, normalise, product, to_rotation_vector
-from ...checks.errors import ModelError, StateError, concrete
+from ...checks.errors import ModelError, StateError, closest_name, has_values
 from ...checks.shapes import Numbers
-from ...mechanics.joint import CATALOGUE, drive
-from ...mechanics.joint_coordinate import coordinate, free_coordinates
+from ...math import lapack
+from ...math.compiler import is_transformed, kept_jit
+from ...math.rotation import normalise
+from ...mechanics.joint import CATALOGUE, drive, free_coordinates
+from ...mechanics.joint_states import evaluate_coordinate
 from ...mechanics.state import State
 from ...mechanics.system import System, check_state
-from ..formulations.augmented import Augmented, AugmentedModel, displace
-from ..formulations.constraints import Equations
-from .joint_drivers import UniformMotion
+from ..formulations.augmented import AugmentedModel, evaluate_equations, move_bodies, prepare_rows
+from .closing import UniformMotion, close_loops, displacement_between, nearest_step
 
 Held = Literal["position", "orientation", "all"]
 
@@ -50,7 +49,7 @@ def assemble(
     hold: Mapping[str, Held] | None = None,
     hold_joints: tuple[str, ...] = (),
     tolerance: float = 1e-11,
-    near: State | None = None,
+    start: State | None = None,
     max_steps: int = 64,
     throw: bool = True,
 ) -> Assembly:
@@ -70,7 +69,7 @@ def assemble(
         hold: fixed coordinates by body: its "position", its "orientation" or "all".
         hold_joints: joints whose angle or displacement keeps its value; both of a cylindrical one.
         tolerance: bound of the position residuals [m].
-        near: posture at which the method starts, if several close; by default the guess.
+        start: posture at which the method starts, if several close; by default the guess.
         throw: raise an error without convergence, if values are concrete (not inside `jit`).
 
     Raises:
@@ -82,15 +81,18 @@ def assemble(
     _check_guess(system, guess)
     free = _free_coordinates(system, hold or {})
     normal = State(guess.r, jax.vmap(normalise)(guess.p), guess.v, guess.omega)
-    locked = _lock(system, normal, hold_joints)
+    # A held joint becomes a driven one, and the equations need no case for it.
+    locked = _lock_joints(system, normal, hold_joints)
     time = jnp.asarray(t, dtype=guess.r.dtype)
-    near = normal if near is None else near
-    state, residuals = _assembled(locked, time, normal, near, jnp.asarray(free), max_steps)
+    start = normal if start is None else start
+    state, residuals = _solve(locked, time, normal, start, jnp.asarray(free), max_steps, tolerance)
     worst = jnp.max(residuals, initial=0.0)
     converged = jnp.isfinite(worst) & (worst <= tolerance)
-    moved = jnp.max(jnp.sqrt(jnp.sum((jax.lax.stop_gradient(state.r) - guess.r) ** 2, axis=1)))
-    result = Assembly(state, converged, residuals[: len(system.joints)], moved)
-    if throw and concrete(result) and not bool(converged):
+    displacement = jnp.max(
+        jnp.sqrt(jnp.sum((jax.lax.stop_gradient(state.r) - guess.r) ** 2, axis=1))
+    )
+    result = Assembly(state, converged, residuals[: len(system.joints)], displacement)
+    if throw and has_values(result) and not bool(converged):
         names = [joint.name for joint in locked.joints]
         k = int(np.nanargmax(np.where(np.isfinite(residuals), residuals, np.inf)))
         raise StateError(
@@ -102,27 +104,48 @@ def assemble(
     return result
 
 
-@kept_jit
-def _assembled(
+def _solve(
     system: System,
     t: Float[Array, ""],
     guess: State,
-    near: State,
+    start_posture: State,
+    free: Bool[Array, " k"],
+    max_steps: int,
+    tolerance: float,
+) -> tuple[State, Float[Array, " joints"]]:
+    """Assembled state and residuals as of `_assemble_state`."""
+    arguments = (system, t, guess, start_posture, free, max_steps)
+    if system.joints and not is_transformed(arguments):
+        # The method of Gauss and Newton needs no second derivatives, which take most of the time of
+        # compiling.
+        closing = close_loops(system, guess, start_posture, {}, {}, t, free, max_steps)
+        if bool(closing.is_nearest) and bool(jnp.all(closing.residuals <= tolerance)):
+            return closing.state, closing.residuals
+    return _assemble_state(*arguments)
+
+
+@kept_jit
+def _assemble_state(
+    system: System,
+    t: Float[Array, ""],
+    guess: State,
+    start_posture: State,
     free: Bool[Array, " k"],
     max_steps: int,
 ) -> tuple[State, Float[Array, " joints"]]:
     """Assembled state and the largest position residual of each joint."""
-    model = Augmented().prepare(system)
-    state = velocities(model, t, _positions(model, t, guess, near, free, max_steps), free)
-    kin = system.kinematics(state)
-    value = jnp.abs(model.constraints.scales() * model.constraints.equations(t, kin).value)
+    model = prepare_rows(system)
+    state = project_velocities(
+        model, t, _solve_positions(model, t, guess, start_posture, free, max_steps), free
+    )
+    value = jnp.abs(model.constraints.scales() * evaluate_equations(model, t, state).value)
     owner = np.array(model.constraints.owner, dtype=int)
     belongs = np.eye(len(system.joints))[owner].reshape(owner.size, len(system.joints))
     return state, jnp.max(value[:, None] * belongs, axis=0, initial=0.0)
 
 
 def _check_guess(system: System, guess: State) -> None:
-    if not concrete(guess):
+    if not has_values(guess):
         return
     for k, name in enumerate(system.names):
         parts = [np.asarray(x)[k] for x in (guess.r, guess.p, guess.v, guess.omega)]
@@ -136,16 +159,17 @@ def _free_coordinates(system: System, hold: Mapping[str, Held]) -> np.ndarray:
     """Mask of the 6 n coordinates that may move."""
     free = np.ones((system.n_bodies, 6), dtype=bool)
     columns = {"position": slice(0, 3), "orientation": slice(3, 6), "all": slice(0, 6)}
-    for name, what in hold.items():
-        if what not in columns:
+    for name, held_part in hold.items():
+        if held_part not in columns:
             raise ModelError(
-                f"What to hold of body '{name}' must be one of {', '.join(columns)}, not '{what}'."
+                f"The fixed coordinates of body '{name}' must be one of {', '.join(columns)}, not '{held_part}'."
+                f"{closest_name(str(held_part), columns)}"
             )
-        free[system.index(name), columns[what]] = False
+        free[system.index(name), columns[held_part]] = False
     return free.reshape(-1)
 
 
-def _lock(system: System, state: State, names: tuple[str, ...]) -> System:
+def _lock_joints(system: System, state: State, names: tuple[str, ...]) -> System:
     """System with the coordinates of the named joints locked at their present values."""
     if not names:
         return system
@@ -162,19 +186,24 @@ def _lock(system: System, state: State, names: tuple[str, ...]) -> System:
                 f"Joint '{name}' cannot be held: no drivers prescribe all coordinates of a {joint.kind} "
                 "joint. Hold its bodies, or other joints."
             )
-        for which in free[-max(len(motions), 1) :]:
-            value = coordinate(kin, joint, which).value
+        for coordinate_name in free[-max(len(motions), 1) :]:
+            value = evaluate_coordinate(kin, joint, coordinate_name).value
             locks.append(
-                drive(f"hold {name}", joint, UniformMotion(value, zero, zero), coordinate=which)
+                drive(
+                    f"hold {name}",
+                    joint,
+                    UniformMotion(value, zero, zero),
+                    coordinate=coordinate_name,
+                )
             )
     return eqx.tree_at(lambda s: s.joints, system, (*system.joints, *locks))
 
 
-def _positions(
+def _solve_positions(
     model: AugmentedModel,
     t: Float[Array, ""],
     guess: State,
-    near: State,
+    start_posture: State,
     free: Bool[Array, " k"],
     max_steps: int,
 ) -> State:
@@ -184,19 +213,18 @@ def _positions(
         return guess
     bodies = model.system.bodies
 
-    def moved(step: Array, base: State) -> State:
-        r, p = displace(base.r, base.p, step.reshape(-1, 6))
+    def displace_bodies(step: Array, base: State) -> State:
+        r, p = move_bodies(base.r, base.p, step.reshape(-1, 6))
         return State(r, p, guess.v, guess.omega)
 
-    def residual(unknown: Array, args: tuple[AugmentedModel, State]) -> Array:
+    def stationarity_residual(unknown: Array, args: tuple[AugmentedModel, State]) -> Array:
         step, multipliers = unknown[:-m], unknown[-m:]
         within, base = args
-        phi = lambda s: (
-            within.constraints.equations(t, within.system.kinematics(moved(s, base))).value
-        )
+        phi = lambda s: evaluate_equations(within, t, displace_bodies(s, base)).value
         value, pull = jax.vjp(phi, step)
         by_body = step.reshape(-1, 6)
         mass = within.system.bodies
+        # Nearest in the mass metric: the result does not depend on units, and heavy bodies move least.
         weighed = jnp.concatenate(
             [
                 mass.mass[:, None] * by_body[:, :3],
@@ -209,25 +237,30 @@ def _positions(
 
     # one scale for the gradient rows gives both parts the unit of a length
     size = jnp.sum(bodies.mass)
-    turned = jax.vmap(lambda a, b: to_rotation_vector(product(conjugate(b), a)))
-    away = lambda a, b: jnp.concatenate([a.r - b.r, turned(a.p, b.p)], axis=1).reshape(-1)
     start = jnp.concatenate(
-        [away(*jax.lax.stop_gradient((near, guess))), jnp.zeros(m, guess.r.dtype)]
+        [
+            # Start of the iteration only: of several branches Newton's method finds the one nearby.
+            displacement_between(*jax.lax.stop_gradient((start_posture, guess))),
+            jnp.zeros(m, guess.r.dtype),
+        ]
     )
     solver = optx.Newton(rtol=1e-12, atol=1e-13, linear_solver=lapack.PseudoinverseSolver(1e-11))
+    # Derivatives of the solution by the implicit function theorem, not through the iterations.
     adjoint = optx.ImplicitAdjoint(linear_solver=lapack.PseudoinverseSolver(1e-11))
-    how: Any = {"adjoint": adjoint, "max_steps": max_steps, "throw": False}
-    solution = optx.root_find(residual, solver, start, args=(model, guess), **how)
-    return moved(solution.value[:-m], guess)
+    solver_options: Any = {"adjoint": adjoint, "max_steps": max_steps, "throw": False}
+    solution = optx.root_find(
+        stationarity_residual, solver, start, args=(model, guess), **solver_options
+    )
+    return displace_bodies(solution.value[:-m], guess)
 
 
-def velocities(
+def project_velocities(
     model: AugmentedModel, t: Float[Array, ""], state: State, free: Bool[Array, " k"]
 ) -> State:
     """Velocities with J qdot = target that are nearest in the mass metric."""
     if not model.constraints.n_rows:
         return state
-    eq = model.constraints.equations(t, model.system.kinematics(state))
+    eq = evaluate_equations(model, t, state)
     u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
     step = nearest_step(model, eq, free)
     # the second pass removes the round-off of the first
@@ -235,109 +268,3 @@ def velocities(
         u = u + step(eq.target - eq.matrix @ u)
     u = u.reshape(-1, 6)
     return State(state.r, state.p, u[:, :3], u[:, 3:])
-
-
-def nearest_step(
-    model: AugmentedModel, eq: Equations, free: Bool[Array, " k"]
-) -> Callable[[Float[Array, " m"]], Float[Array, " k"]]:
-    """Function of numbers b (m,) that returns the smallest x in the mass metric with J x = b."""
-    weighed = model.weigh(eq.J * free.reshape(-1, 6)).reshape(eq.matrix.shape) * free
-    inverse = lapack.pseudoinverse(weighed @ (eq.matrix * free).T, 1e-11)
-    return lambda b: weighed.T @ (inverse @ b)
-
-
-class Rank(NamedTuple):
-    """Rank of the constraint Jacobian at one posture.
-
-    Attributes:
-        rows: number of constraint rows. rank: number of independent rows.
-        dof: degrees of freedom, 6 n - rank.
-        smallest_singular_value: smallest non-zero singular value of the velocity Jacobian.
-        redundant: names of joints that own a dependent row, by pivoting.
-    """
-
-    rows: int
-    rank: int
-    dof: int
-    smallest_singular_value: float
-    redundant: tuple[str, ...]
-
-
-def rank(system: System, state: State, t: float = 0.0) -> Rank:
-    """Rank and redundant rows of the constraint Jacobian in (v, omega'), for concrete values."""
-    return rank_of(system, Augmented().prepare(system), state, t)
-
-
-def rank_of(
-    system: System,
-    model: AugmentedModel,
-    state: State,
-    t: float = 0.0,
-    matrix: np.ndarray | None = None,
-    *,
-    tolerance: float = 1e-9,
-) -> Rank:
-    """Rank as by `rank`, for a prepared model and with the constraint Jacobian if it is known.
-
-    Singular values below `tolerance` times the largest count as zero.
-    """
-    owner, columns = model.constraints.owner, 6 * system.n_bodies
-    if not owner:
-        return Rank(0, 0, columns, float("inf"), ())
-    matrix = jacobian(model, state, t) if matrix is None else matrix
-    values = np.linalg.svd(matrix, compute_uv=False)
-    count = int(np.sum(values > tolerance * values[0]))
-    names: tuple[str, ...] = ()
-    if count < len(owner):
-        dependent = _dependent_rows(matrix, count)
-        names = tuple(dict.fromkeys(system.joints[owner[k]].name for k in dependent))
-    return Rank(len(owner), count, columns - count, float(values[count - 1]), names)
-
-
-def ranks(
-    system: System, states: State, t: float = 0.0, *, tolerance: float = 1e-9
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rank, and the smallest non-zero singular value, of the constraint Jacobian at k postures.
-
-    Args:
-        states: states (k, n, .). tolerance: values below it times the largest count as zero.
-
-    Returns:
-        Integers (k,) and values (k,), for the unscaled Jacobian in (v, omega').
-    """
-    model = Augmented().prepare(system)
-    values = np.asarray(singular_values(model, states, jnp.asarray(t, dtype=states.r.dtype)))
-    count = np.sum(values > tolerance * values[:, :1], axis=1)
-    return count, np.take_along_axis(values, count[:, None] - 1, axis=1)[:, 0]
-
-
-@kept_jit
-def singular_values(
-    model: AugmentedModel, states: State, t: Float[Array, ""]
-) -> Float[Array, "k m"]:
-    """Singular values of the unscaled constraint Jacobian at states (k, n, .), the largest first."""
-    matrices = jax.vmap(lambda state: _jacobian(model, state, t))(states)
-    return jax.vmap(lapack.singular_values)(matrices)
-
-
-def _dependent_rows(J: np.ndarray, count: int) -> list[int]:
-    """Rows that Gram-Schmidt orthogonalisation with row pivoting leaves after `count` rows."""
-    rest = J.copy()
-    order = list(range(len(J)))
-    for k in range(count):
-        sizes = np.linalg.norm(rest[order[k:]], axis=1)
-        pick = k + int(np.argmax(sizes))
-        order[k], order[pick] = order[pick], order[k]
-        direction = rest[order[k]] / np.linalg.norm(rest[order[k]])
-        rest = rest - np.outer(rest @ direction, direction)
-    return sorted(order[count:])
-
-
-def jacobian(model: AugmentedModel, state: State, t: float = 0.0) -> np.ndarray:
-    """Constraint Jacobian in (v, omega') as a NumPy matrix (m, 6 n)."""
-    return np.asarray(_jacobian(model, state, jnp.asarray(t, dtype=state.r.dtype)))
-
-
-@kept_jit
-def _jacobian(model: AugmentedModel, state: State, t: Float[Array, ""]) -> Float[Array, "m k"]:
-    return model.constraints.equations(t, model.system.kinematics(state)).matrix

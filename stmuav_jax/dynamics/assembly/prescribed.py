@@ -17,16 +17,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ...algebra import lapack
-from ...algebra.compiler import kept_jit
-from ...algebra.derivative import held_constant
-from ...checks.errors import ModelError, StateError, concrete
-from ...checks.reason import AbstractReason, first_reason
-from ...mechanics.joint import Motion, drive
-from ...mechanics.joint_coordinate import choose
+from ...checks.errors import AbstractReason, ModelError, StateError, first_reason, has_values
+from ...math import lapack
+from ...math.compiler import kept_jit
+from ...math.derivative import held_constant
+from ...mechanics.joint import Motion, choose_coordinate, drive
 from ...mechanics.state import State
 from ...mechanics.system import System, check_state
-from ..formulations.augmented import Augmented, AugmentedModel, displace
+from ..formulations.augmented import (
+    Augmented,
+    AugmentedModel,
+    evaluate_equations,
+    move_bodies,
+    prepare_rows,
+)
 from ..formulations.stabilisation import Unstabilised
 
 _MOST_STEPS = 30
@@ -67,7 +71,7 @@ class KinematicPath(eqx.Module):
     singular_value_ratio: Float[Array, " k"]
 
 
-def driven(system: System, motions: Mapping[str, Motion]) -> System:
+def add_drivers(system: System, motions: Mapping[str, Motion]) -> System:
     """System with a driver in each of the named joints, called "drive <joint>".
 
     Args:
@@ -80,8 +84,8 @@ def driven(system: System, motions: Mapping[str, Motion]) -> System:
     drivers = []
     for name, motion in motions.items():
         joint = system.joints[system.joint_index(name)]
-        which = choose(joint, None, f"The driver in joint '{name}'")
-        drivers.append(drive(f"drive {name}", joint, motion, coordinate=which))
+        coordinate = choose_coordinate(joint, None, f"The driver in joint '{name}'")
+        drivers.append(drive(f"drive {name}", joint, motion, coordinate=coordinate))
     return eqx.tree_at(lambda s: s.joints, system, (*system.joints, *drivers))
 
 
@@ -114,38 +118,38 @@ def kinematic_path(
         StateError: the path stops; says at which time and why.
     """
     check_state(system, guess)
-    held = {system.index(name) for name in hold}
-    free = tuple(6 * b + k for b in range(system.n_bodies) if b not in held for k in range(6))
+    held_bodies = {system.index(name) for name in hold}
+    free = tuple(
+        6 * b + k for b in range(system.n_bodies) if b not in held_bodies for k in range(6)
+    )
     times = jnp.asarray(ts, dtype=guess.r.dtype)
-    path = _path(system, guess, times, free, jnp.asarray(tolerance), jnp.asarray(max_change))
-    if throw and concrete(path):
-        _check(system, path, guess, free)
+    path = _follow_path(system, guess, times, free, jnp.asarray(tolerance), jnp.asarray(max_change))
+    if throw and has_values(path):
+        _check_path(system, path, guess, free)
     return path
 
 
-def _check(system: System, path: KinematicPath, guess: State, free: tuple[int, ...]) -> None:
+def _check_path(system: System, path: KinematicPath, guess: State, free: tuple[int, ...]) -> None:
     bad = np.flatnonzero(np.asarray(path.reason))
     if not len(bad):
         return
     k, code = int(bad[0]), PathReason(int(path.reason[bad[0]]))
     if code is PathReason.SINGULAR and k == 0:
-        model = Augmented().prepare(system)
-        J = model.constraints.equations(path.ts[0], system.kinematics(guess)).matrix[
-            :, np.array(free)
-        ]
+        model = prepare_rows(system)
+        J = evaluate_equations(model, path.ts[0], guess).matrix[:, np.array(free)]
         rank = int(np.linalg.matrix_rank(np.asarray(J), tol=_SINGULAR))
-        left = len(free) - rank
+        freedom_count = len(free) - rank
         raise ModelError(
-            f"The motion is not determined: {left} degree(s) of freedom are left. Give as many "
+            f"The motion is not determined: {freedom_count} degree(s) of freedom are left. Give as many "
             "drivers as there are (stmuav_jax.driven), or hold a body."
         )
-    why = {
+    explanation = {
         PathReason.NOT_CONVERGED: "no posture satisfies the joints and drivers near the one before",
         PathReason.SINGULAR: "the mechanism is in a singular posture",
         PathReason.BRANCH: "the posture found belongs to another branch",
     }[code]
     raise StateError(
-        f"The path stops at t = {float(path.ts[k]):.6g} s: {why} (largest residual "
+        f"The path stops at t = {float(path.ts[k]):.6g} s: {explanation} (largest residual "
         f"{float(path.residual[k]):.3g}, smallest singular value {float(path.singular_value_ratio[k]):.3g} of the "
         "largest). Take closer times, another path, or throw=False to keep what was reached."
     )
@@ -163,108 +167,117 @@ class _At(NamedTuple):
 
 
 @kept_jit
-def _path(
+def _follow_path(
     system: System, guess: State, ts: Any, free: tuple[int, ...], tolerance: Any, max_change: Any
 ) -> KinematicPath:
-    model = Augmented().prepare(system)
+    model = prepare_rows(system)
     n = system.n_bodies
     columns = np.array(free)
 
-    def spread(x: Array) -> Array:
+    def spread_columns(x: Array) -> Array:
         return jnp.zeros(6 * n, x.dtype).at[columns].set(x).reshape(n, 6)
 
     def next_one(at: _At, t: Array) -> tuple[_At, Any]:
         h = t - at.t
-        ahead = h * at.rate + 0.5 * h**2 * at.acceleration
-        r, p = displace(at.state.r, at.state.p, ahead)
-        found, moved, residual = _closed(
+        # Extrapolation by the known rates keeps the start of Newton's method on the branch, with an error of
+        # third order.
+        extrapolation = h * at.rate + 0.5 * h**2 * at.acceleration
+        r, p = move_bodies(at.state.r, at.state.p, extrapolation)
+        posture, largest_change, residual = _close_posture(
             model, t, State(r, p, at.rate[:, :3], at.rate[:, 3:]), columns, tolerance
         )
-        now, smallest, sign = _rates(model, t, found, columns, spread)
+        now, smallest, sign = _solve_rates(model, t, posture, columns, spread_columns)
         reason = first_reason(
             (at.lost, PathReason.AFTER_FAILURE),
             (~(residual <= tolerance), PathReason.NOT_CONVERGED),
             (~(smallest > _SINGULAR), PathReason.SINGULAR),
-            ((moved > max_change) | (sign * at.sign < 0), PathReason.BRANCH),
+            # Branches meet where the determinant changes its sign; a change between two times is a step across.
+            ((largest_change > max_change) | (sign * at.sign < 0), PathReason.BRANCH),
         )
-        fine = reason == 0
-        keep = lambda x, y: jax.tree.map(lambda a, b: jnp.where(fine, a, b), x, y)
+        is_accepted = reason == 0
+        keep = lambda x, y: jax.tree.map(lambda a, b: jnp.where(is_accepted, a, b), x, y)
         state, rate, acceleration = keep(now, (at.state, at.rate, at.acceleration))
-        hide = lambda x: jnp.where(fine, x, jnp.nan)
+        hide = lambda x: jnp.where(is_accepted, x, jnp.nan)
         out = (jax.tree.map(hide, (now[0], now[2])), reason, residual, smallest)
-        after = _At(state, rate, acceleration, t, jnp.where(fine, sign, at.sign), ~fine)
+        after = _At(
+            state, rate, acceleration, t, jnp.where(is_accepted, sign, at.sign), ~is_accepted
+        )
         return after, out
 
     none = jnp.zeros((n, 6), guess.r.dtype)
     first = _At(guess, none, none, ts[0], jnp.zeros(()), jnp.asarray(False))
-    _, (found, reason, residual, smallest) = jax.lax.scan(next_one, first, ts)
-    states, rates = found
+    _, (path_motion, reason, residual, smallest) = jax.lax.scan(next_one, first, ts)
+    states, rates = path_motion
     return KinematicPath(ts, states, rates[..., :3], rates[..., 3:], reason, residual, smallest)
 
 
-def _closed(
+def _close_posture(
     model: AugmentedModel, t: Array, start: State, columns: np.ndarray, tolerance: Any
 ) -> tuple[State, Array, Array]:
     """Nearest posture that satisfies all rows, the largest displacement, the largest residual."""
     n = start.r.shape[0]
 
-    def look(model: AugmentedModel, t: Array, state: State) -> tuple[Array, Array]:
-        eq = model.constraints.equations(t, model.system.kinematics(state))
+    def evaluate_rows(model: AugmentedModel, t: Array, state: State) -> tuple[Array, Array]:
+        eq = evaluate_equations(model, t, state)
         return eq.value, eq.matrix[:, columns]
 
-    def step(value: Array, J: Array) -> Array:
-        return jnp.zeros(6 * n, value.dtype).at[columns].set(_solve(J, -value)).reshape(n, 6)
+    def solve_step(value: Array, J: Array) -> Array:
+        return jnp.zeros(6 * n, value.dtype).at[columns].set(_solve_rows(J, -value)).reshape(n, 6)
 
-    def move(state: State, by: Array) -> State:
-        r, p = displace(state.r, state.p, by)
+    def move_posture(state: State, by: Array) -> State:
+        r, p = move_bodies(state.r, state.p, by)
         return State(r, p, state.v, state.omega)
 
-    def size(model: AugmentedModel, value: Array) -> Array:
+    def largest_residual(model: AugmentedModel, value: Array) -> Array:
         return jnp.max(jnp.abs(model.constraints.scales() * value), initial=0.0)
 
     fixed, t_fixed, begin = held_constant((model, t, start))
     # stopped once more on the results: a driver's function may hold traced numbers of its own
-    still = lambda state: jax.lax.stop_gradient(look(fixed, t_fixed, state))
+    constant_rows = lambda state: jax.lax.stop_gradient(evaluate_rows(fixed, t_fixed, state))
 
-    def more(now: tuple[State, Array, Array]) -> Array:
+    def is_open(now: tuple[State, Array, Array]) -> Array:
         return (now[2] < _MOST_STEPS) & (now[1] > tolerance)
 
-    def again(now: tuple[State, Array, Array]) -> tuple[State, Array, Array]:
-        by = step(*still(now[0]))
+    def newton_step(now: tuple[State, Array, Array]) -> tuple[State, Array, Array]:
+        by = solve_step(*constant_rows(now[0]))
         by = by * jnp.minimum(1.0, _LONGEST_STEP / jnp.maximum(jnp.max(jnp.abs(by)), 1e-300))
-        new = move(now[0], by)
-        return new, size(fixed, still(new)[0]), now[2] + 1
+        new = move_posture(now[0], by)
+        return new, largest_residual(fixed, constant_rows(new)[0]), now[2] + 1
 
-    worst = size(fixed, still(begin)[0])
-    state, _, _ = jax.lax.while_loop(more, again, (begin, worst, jnp.asarray(0)))
+    worst = largest_residual(fixed, constant_rows(begin)[0])
+    state, _, _ = jax.lax.while_loop(is_open, newton_step, (begin, worst, jnp.asarray(0)))
     # one more step, with the derivatives that the iteration does not propagate
-    value, J = look(model, t, state)
-    state = move(state, step(value, jax.lax.stop_gradient(J)))
-    residual = size(model, look(model, t, state)[0])
-    away = jnp.abs(state.r - start.r)
-    turned = 2 * jnp.sqrt(jnp.maximum(0.0, 2 * (1 - jnp.abs(jnp.sum(state.p * start.p, axis=1)))))
-    moved = jnp.maximum(jnp.max(away), jnp.max(turned))
-    return state, moved, residual
+    value, J = evaluate_rows(model, t, state)
+    state = move_posture(state, solve_step(value, jax.lax.stop_gradient(J)))
+    residual = largest_residual(model, evaluate_rows(model, t, state)[0])
+    translations = jnp.abs(state.r - start.r)
+    rotation_angles = 2 * jnp.sqrt(
+        jnp.maximum(0.0, 2 * (1 - jnp.abs(jnp.sum(state.p * start.p, axis=1))))
+    )
+    largest_change = jnp.maximum(jnp.max(translations), jnp.max(rotation_angles))
+    return state, largest_change, residual
 
 
-def _solve(J: Float[Array, "m k"], b: Float[Array, " m"]) -> Float[Array, " k"]:
+def _solve_rows(J: Float[Array, "m k"], b: Float[Array, " m"]) -> Float[Array, " k"]:
     """Least-squares solution of J x = b, of minimum norm if J does not determine it."""
     return lapack.pseudoinverse(J, 1e-12) @ b
 
 
-def _rates(
+def _solve_rates(
     model: AugmentedModel, t: Array, state: State, columns: np.ndarray, spread: Any
 ) -> tuple[tuple[State, Array, Array], Array, Array]:
     """State with velocities, rates and accelerations; smallest singular value; sign of det J."""
 
-    def level(state: State) -> Any:
-        eq = model.constraints.equations(t, model.system.kinematics(state))
+    def evaluate_level(state: State) -> Any:
+        eq = evaluate_equations(model, t, state)
         return eq, eq.matrix[:, columns]
 
-    eq, J = level(state)
-    u = spread(_solve(J, eq.target))
+    eq, J = evaluate_level(state)
+    # Positions, velocities and accelerations share one Jacobian: J u = target, J a = gamma.
+    u = spread(_solve_rows(J, eq.target))
     moving = State(state.r, state.p, u[:, :3], u[:, 3:])
-    a = spread(_solve(J, level(moving)[0].gamma))
+    a = spread(_solve_rows(J, evaluate_level(moving)[0].gamma))
+    # A check needs no derivative, and that of equal singular values does not exist.
     values = lapack.singular_values(jax.lax.stop_gradient(J))
     enough = J.shape[0] >= J.shape[1]
     smallest = values[-1] / values[0] if enough else jnp.zeros(())
@@ -290,12 +303,13 @@ def driver_efforts(system: System, states: State, ts: Float[Array, " k"]) -> dic
     drivers = {j.name: k for k, j in enumerate(system.joints) if j.kind.startswith("drive_")}
     if not drivers:
         raise ModelError("The system has no drivers: add them with stmuav_jax.driven.")
+    # Efforts of drivers are multipliers, which the joint-coordinate formulation eliminates.
     formulation = Augmented()
     model = formulation.prepare(system)
     owner = list(model.constraints.owner)
 
-    def one(state: State, t: Array) -> Array:
+    def multipliers_at(state: State, t: Array) -> Array:
         return formulation.accelerations(model, t, state, Unstabilised()).multipliers
 
-    found = jax.vmap(one)(states, jnp.asarray(ts, dtype=states.r.dtype))
-    return {name: found[:, owner.index(k)] for name, k in drivers.items()}
+    multipliers = jax.vmap(multipliers_at)(states, jnp.asarray(ts, dtype=states.r.dtype))
+    return {name: multipliers[:, owner.index(k)] for name, k in drivers.items()}

@@ -1,1 +1,1 @@
-"""Equations of motion: the base class, maximal coordinates, stabilisation, reactions. Floor 4."""
+"""Equations of motion: the base class, maximal coordinates, stabilisation, reactions."""

@@ -1,37 +1,32 @@
-"""Maximal coordinates with Lagrange multipliers, solved as one dense system or by structure.
+"""Maximal coordinates with Lagrange multipliers, solved by the structure of the equations.
 
-Source: report Part I, Eq. 4.19 (Part II, Eq. 4.23 and 4.27), corrected: with b bodies and m
-rows, unknowns qddot (7 b) and -lambda (m),
+With m constraint rows B in (v, omega'), W = diag(1/m_i, J'_i^-1) and g6 = (f_i, n'_i - omega' x J' omega'),
 
-    [ M      B^T ] [ qddot   ]   [ g - c1  ]
-    [ P      0   ] [ -lambda ] = [   -c2   ]        solve="dense"
-    [ Phi_q  0   ]               [ gamma^m ]
+    (B W B^T) lambda = gamma# - B W g6,  (vdot, omega'dot) = W (g6 + B^T lambda).
 
-or, with W = diag(1/m_i, J'_i^-1) and g6 = (f_i, n'_i - omega' x J' omega'),
-
-    (B W B^T) lambda = gamma# - B W g6,  (vdot, omega'dot) = W (g6 + B^T lambda)
-                                                          solve="structured"
+Source: report Part I, Eq. 4.19 (Part II, Eq. 4.23 and 4.27), corrected, without its Euler parameters.
 """
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from ...algebra import lapack
-from ...algebra.linalg import Factor, MinimumNorm, factorise, product_transposed, solve_general
-from ...algebra.rotation import (
-    euler_parameter_rate,
-    from_rotation_vector,
-    matrix_l,
-    normalise,
-    product,
-)
 from ...checks.numbers import as_jax, as_numpy
+from ...math import lapack
+from ...math.linalg import (
+    Factor,
+    Scaled,
+    factor_redundant,
+    factorise_scaled,
+    share_multipliers,
+)
+from ...math.native.program import native
+from ...math.rotation import euler_parameter_rate, from_rotation_vector, normalise, product
 from ...mechanics.load import Load, total_load
 from ...mechanics.state import Kinematics, State
 from ...mechanics.system import System
@@ -42,19 +37,26 @@ from .base import (
     Flows,
     Reactions,
     Residuals,
+    joint_reactions,
     residuals_of,
 )
-from .constraints import Constraints, Equations, RowChoice, constraints
-from .reactions import joint_reactions
+from .constraints import Constraints, Equations, group_constraints
+from .independence import find_independent_rows, turn_rows
 from .stabilisation import AbstractStabilisation
 
 
 class AugmentedModel(AbstractModel):
-    """System prepared for maximal coordinates."""
+    """System prepared for maximal coordinates.
+
+    Attributes:
+        row_mask: mask of the rows that the equations hold, if others depend on them in every posture, with
+            those of points in the axes of body i; else None. See `independence`.
+    """
 
     system: System
     constraints: Constraints
     inverse_inertia: Float[Array, "n 3 3"]
+    row_mask: Bool[Array, " m"] | None = None
 
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
         """Sum of the loads of all force elements."""
@@ -62,7 +64,9 @@ class AugmentedModel(AbstractModel):
 
     def weigh(self, rows: Float[Array, "m n 6"]) -> Float[Array, "m n 6"]:
         """Product rows @ W, with W the inverse of the block-diagonal mass matrix."""
-        linear = rows[..., :3] / self.system.bodies.mass[:, None]
+        # The mass matrix is block diagonal in (v, omega') with constant blocks: its inverse is found once and
+        # applied body by body.
+        linear = rows[..., :3] / self.system.bodies.mass[None, :, None]
         angular = jnp.einsum("mna,nab->mnb", rows[..., 3:], self.inverse_inertia)
         return jnp.concatenate([linear, angular], axis=-1)
 
@@ -71,29 +75,26 @@ class Augmented(AbstractFormulation):
     """Formulation of the report: coordinates of all bodies and one multiplier per constraint row.
 
     Args:
-        solve: "structured" (default) or "dense", the report's single large system.
-        rows: "body" (default) or "report", the report's cross products with two of three
-            rows chosen at every evaluation.
-        redundant: allow dependent rows; the multipliers then have minimum norm.
-        rcond: with `redundant`, singular values below rcond times the largest count as zero.
+        redundant: allow rows to become dependent in some postures. Rows that depend on others in
+            every posture are left out by `prepare` in any case. The multipliers of `accelerations`
+            have minimum norm.
+        rcond: with `redundant`, singular values of the scaled system below rcond times the largest
+            count as zero.
     """
 
-    solve: Literal["structured", "dense"] = eqx.field(static=True, default="structured")
-    rows: RowChoice = eqx.field(static=True, default="body")
     redundant: bool = eqx.field(static=True, default=False)
     rcond: float = eqx.field(static=True, default=1e-11)
 
     def __str__(self) -> str:
-        return f"Augmented(solve={self.solve}, rows={self.rows}, redundant={self.redundant})"
+        return f"Augmented(redundant={self.redundant})"
 
     def allowing_dependent_rows(self) -> "Augmented":
         return self if self.redundant else dataclasses.replace(self, redundant=True)
 
     def prepare(self, system: System) -> AugmentedModel:
-        inertia = as_numpy(system.bodies.inertia)
-        # NumPy's compiles nothing
-        invert = np.linalg.inv if isinstance(inertia, np.ndarray) else lapack.inverse
-        return AugmentedModel(system, constraints(system, self.rows), as_jax(invert(inertia)))
+        row_mask = find_independent_rows(system).rows
+        row_mask = None if row_mask is None else as_jax(row_mask)
+        return dataclasses.replace(prepare_rows(system), row_mask=row_mask)
 
     def to_vector(self, model: AugmentedModel, state: State) -> Float[Array, " k"]:
         return jnp.concatenate([x.reshape(-1) for x in (state.r, state.p, state.v, state.omega)])
@@ -114,7 +115,7 @@ class Augmented(AbstractFormulation):
     ) -> Accelerations:
         kin = model.system.kinematics(state)
         load = model.load(t, kin)
-        return self._accelerate(model, t, state.p, kin, load, stabilisation)[0]
+        return self._solve_accelerations(model, t, kin, load, stabilisation, shared=True)[0]
 
     def reactions(
         self, model: AugmentedModel, t: Float[Array, ""], state: State, result: Accelerations
@@ -131,7 +132,9 @@ class Augmented(AbstractFormulation):
         state = self.to_state(model, x)
         kin = model.system.kinematics(state)
         load = model.load(t, kin)
-        result, target = self._accelerate(model, t, state.p, kin, load, stabilisation)
+        result, target = self._solve_accelerations(model, t, kin, load, stabilisation)
+        # Angular velocities are the velocities, and not the rates of Euler parameters: the norm constraint
+        # then needs no multiplier, and the system has 34 rows instead of 83.
         p_rate = jax.vmap(euler_parameter_rate)(state.p, state.omega)
         p_rate = stabilisation.held_norms(p_rate.T, state.p.T).T
         rates = State(r=state.v, p=p_rate, v=result.v_rate, omega=result.omega_rate)
@@ -143,77 +146,71 @@ class Augmented(AbstractFormulation):
         )
         return self.to_vector(model, rates), flows
 
-    def _accelerate(
+    def _solve_accelerations(
         self,
         model: AugmentedModel,
         t: Float[Array, ""],
-        p: Float[Array, "n 4"],
         kin: Kinematics,
         load: Load,
         stabilisation: AbstractStabilisation,
+        *,
+        shared: bool = False,
     ) -> tuple[Accelerations, Float[Array, " m"]]:
+        """Accelerations and targets; the multipliers are those of all rows if they are `shared`."""
         inertia, omega = model.system.bodies.inertia, kin.omega[:-1]
         spin = jnp.einsum("nab,nb->na", inertia, omega)
         moment = load.moment[:-1] - jnp.cross(omega, spin)
-        if self.solve == "dense":
-            return self._dense(model, t, p, kin, load.force[:-1], moment, stabilisation)
+        # Accelerations without constraints plus a correction by the multipliers (Gauss's principle): only the
+        # m x m system is solved.
         free_v = load.force[:-1] / model.system.bodies.mass[:, None]
         free_omega = jnp.einsum("nab,nb->na", model.inverse_inertia, moment)
         if not model.constraints.n_rows:
             none = jnp.zeros((0,), kin.r.dtype)
             return Accelerations(free_v, free_omega, none), none
-        eq = model.constraints.equations(t, kin)
+        # All rows are evaluated even if some are left out, since their residuals are monitored along the run.
+        every = model.constraints.equations(t, kin)
+        eq = held_equations(model, every, kin)
         velocity = jnp.concatenate([kin.v[:-1], omega], axis=1).reshape(-1)
         free = jnp.concatenate([free_v, free_omega], axis=1)
         weighed = model.weigh(eq.J).reshape(eq.matrix.shape)
-        factor = self._factor(eq, weighed)
-        gamma = _corrected(eq, velocity, stabilisation)
+        factor = self._factor_rows(model, eq, weighed)
+        gamma = stabilisation.held_rows(eq.gamma, eq.value, eq.matrix @ velocity - eq.target)
         multipliers = factor.solve(gamma - eq.matrix @ free.reshape(-1))
         total = free + (weighed.T @ multipliers).reshape(-1, 6)
-        return Accelerations(total[:, :3], total[:, 3:], multipliers), eq.target
+        accelerations = Accelerations(total[:, :3], total[:, 3:], multipliers)
+        if shared and (self.redundant or model.row_mask is not None):
+            accelerations = self._share_multipliers(
+                model, every, kin, weighed, factor, accelerations
+            )
+        return accelerations, eq.target
 
-    def _factor(self, eq: Equations, weighed: Float[Array, "m k"]) -> Factor | MinimumNorm:
-        S = product_transposed(weighed, eq.matrix)
-        return factorise(S, redundant=self.redundant, rcond=self.rcond)
-
-    def _dense(
+    def _share_multipliers(
         self,
         model: AugmentedModel,
-        t: Float[Array, ""],
-        p: Float[Array, "n 4"],
+        every: Equations,
         kin: Kinematics,
-        force: Float[Array, "n 3"],
-        moment: Float[Array, "n 3"],
-        stabilisation: AbstractStabilisation,
-    ) -> tuple[Accelerations, Float[Array, " m"]]:
-        """Accelerations and targets by the report's system, assembled and solved as a whole."""
-        n, m = model.system.n_bodies, model.constraints.n_rows
-        eq = model.constraints.equations(t, kin, p)
-        omega = kin.omega[:-1]
-        p_rate = jax.vmap(euler_parameter_rate)(p, omega)
-        L = jax.vmap(matrix_l)(p)
-        K = jnp.zeros((7 * n + m, 7 * n + m), kin.r.dtype)
-        B = jnp.concatenate([eq.J[..., :3], 0.5 * jnp.einsum("mnp,nap->mna", eq.J[..., 3:], L)], -1)
-        turning = 2 * jnp.einsum("nab,nbp->nap", model.system.bodies.inertia, L)
-        for k in range(n):
-            row, column = 6 * k, 7 * k
-            K = K.at[row : row + 3, column : column + 3].set(
-                model.system.bodies.mass[k] * jnp.eye(3)
-            )
-            K = K.at[row + 3 : row + 6, column + 3 : column + 7].set(turning[k])
-            K = K.at[6 * n + k, column + 3 : column + 7].set(p[k])
-        K = K.at[: 6 * n, 7 * n :].set(B.reshape(m, 6 * n).T)
-        K = K.at[7 * n :, : 7 * n].set(eq.matrix)
-        velocity = jnp.concatenate([kin.v[:-1], p_rate], axis=1).reshape(-1)
-        right = [
-            jnp.concatenate([force, moment], axis=1).reshape(-1),
-            -jnp.sum(p_rate**2, axis=1),
-            _corrected(eq, velocity, stabilisation),
-        ]
-        x = solve_general(K, jnp.concatenate(right), redundant=self.redundant, rcond=self.rcond)
-        q = x[: 7 * n].reshape(n, 7)
-        omega_rate = 2 * jnp.einsum("nap,np->na", L, q[:, 3:])
-        return Accelerations(q[:, :3], omega_rate, -x[7 * n :]), eq.target
+        weighed: Float[Array, "m k"],
+        factor: Factor | Scaled,
+        accelerations: Accelerations,
+    ) -> Accelerations:
+        """Accelerations with multipliers of minimum norm in all rows, from those of the rows held."""
+        matrix = turned_equations(model, every, kin).matrix
+        shares = share_multipliers(weighed @ matrix.T, factor, accelerations.multipliers)
+        return dataclasses.replace(accelerations, multipliers=turned_back(model, shares, kin))
+
+    def _factor_rows(
+        self, model: AugmentedModel, eq: Equations, weighed: Float[Array, "m k"]
+    ) -> Factor | Scaled:
+        # J M^-1 J^T is symmetric positive definite for independent rows, which Cholesky's method uses and
+        # checks.
+        S = weighed @ eq.matrix.T
+        if model.row_mask is not None:
+            S = S + jnp.diag(1.0 - model.row_mask)
+        if self.redundant:
+            return factorise_scaled(S, redundant=True, rcond=self.rcond)
+        factor = factor_redundant(S, redundant=False, rcond=0.0)
+        assert isinstance(factor, Factor)
+        return factor
 
     def at_step(
         self, model: AugmentedModel, t: Float[Array, ""], x: Float[Array, " k"]
@@ -230,25 +227,31 @@ class Augmented(AbstractFormulation):
         if not model.constraints.n_rows:
             x = self.to_vector(model, state)
             return x, self.residuals(model, t, x)
-        first = model.constraints.equations(t, model.system.kinematics(state))
+        equations = lambda at: model.constraints.equations(t, model.system.kinematics(at))
+        held_at = lambda at: held_equations(model, equations(at), model.system.kinematics(at))
+        # One factorisation at the unprojected state serves all iterations: after a step the violation is of
+        # the size of the tolerance.
+        first = held_at(state)
         weighed = model.weigh(first.J).reshape(first.matrix.shape)
-        factor = self._factor(first, weighed)
+        factor = self._factor_rows(model, first, weighed)
 
-        def closer(_: Any, posture: tuple[Array, Array]) -> tuple[Array, Array]:
+        def newton_step(_: Any, posture: tuple[Array, Array]) -> tuple[Array, Array]:
             at = State(posture[0], posture[1], state.v, state.omega)
-            value = model.constraints.equations(t, model.system.kinematics(at)).value
-            step = -(weighed.T @ factor.solve(value)).reshape(-1, 6)
-            return displace(posture[0], posture[1], step)
+            step = -(weighed.T @ factor.solve(held_at(at).value)).reshape(-1, 6)
+            return move_bodies(posture[0], posture[1], step)
 
-        r, p = jax.lax.fori_loop(0, iterations, closer, (state.r, state.p))
+        r, p = jax.lax.fori_loop(0, iterations, newton_step, (state.r, state.p))
         at = State(r, p, state.v, state.omega)
-        eq = model.constraints.equations(t, model.system.kinematics(at))
+        eq = equations(at)
+        held_eq = held_equations(model, eq, model.system.kinematics(at))
         u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
+        # The velocity constraints are linear; the second pass removes the error of a factor that belongs to
+        # the unprojected posture.
         for _ in range(2):
-            u = u - weighed.T @ factor.solve(eq.matrix @ u - eq.target)
-        left = _left(model, eq, p, u)
+            u = u - weighed.T @ factor.solve(held_eq.matrix @ u - held_eq.target)
+        residuals = _compute_residuals(model, eq, p, u)
         u = u.reshape(-1, 6)
-        return self.to_vector(model, State(r, p, u[:, :3], u[:, 3:])), left
+        return self.to_vector(model, State(r, p, u[:, :3], u[:, 3:])), residuals
 
     def residuals(
         self, model: AugmentedModel, t: Float[Array, ""], x: Float[Array, " k"]
@@ -256,26 +259,62 @@ class Augmented(AbstractFormulation):
         state = self.to_state(model, x)
         u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
         eq = model.constraints.equations(t, model.system.kinematics(state))
-        return _left(model, eq, state.p, u)
+        return _compute_residuals(model, eq, state.p, u)
 
 
-def _left(
+def _compute_residuals(
     model: AugmentedModel, eq: Equations, p: Float[Array, "n 4"], u: Float[Array, " k"]
 ) -> Residuals:
     norm = jnp.max(jnp.abs(jnp.sum(p**2, axis=1) - 1))
     return residuals_of(model.constraints, eq.value, eq.matrix @ u - eq.target, norm)
 
 
-def displace(
+@native
+def evaluate_equations(model: AugmentedModel, t: Float[Array, ""], state: State) -> Equations:
+    """Equations of all rows at a time [s] and state."""
+    return model.constraints.equations(t, model.system.kinematics(state))
+
+
+def prepare_rows(system: System) -> AugmentedModel:
+    """System prepared for its constraint rows, of which none is left out of the equations."""
+    inertia = as_numpy(system.bodies.inertia)
+    # NumPy's compiles nothing
+    invert = np.linalg.inv if isinstance(inertia, np.ndarray) else lapack.inverse
+    return AugmentedModel(system, group_constraints(system), as_jax(invert(inertia)))
+
+
+def turned_equations(model: AugmentedModel, eq: Equations, kin: Kinematics) -> Equations:
+    """Equations with the rows of points in the axes of body i, where some rows are left out."""
+    if model.row_mask is None:
+        return eq
+    R = jnp.moveaxis(kin.R_wb, 0, -1)
+    rotate_rows = lambda x: turn_rows(model.constraints, R, x)
+    return Equations(rotate_rows(eq.value), eq.target, rotate_rows(eq.J), rotate_rows(eq.gamma))
+
+
+def held_equations(model: AugmentedModel, eq: Equations, kin: Kinematics) -> Equations:
+    """`turned_equations` with zeros in the place of rows that are left out."""
+    row_mask = model.row_mask
+    if row_mask is None:
+        return eq
+    mask_rows = lambda x: jnp.where(row_mask.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0)
+    return jax.tree.map(mask_rows, turned_equations(model, eq, kin))
+
+
+def turned_back(
+    model: AugmentedModel, multipliers: Float[Array, " m"], kin: Kinematics
+) -> Float[Array, " m"]:
+    """Multipliers of the rows as they are, from those of `turned_equations`."""
+    if model.row_mask is None:
+        return multipliers
+    return turn_rows(model.constraints, jnp.moveaxis(kin.R_wb, 0, -1), multipliers, back=True)
+
+
+def move_bodies(
     r: Float[Array, "n 3"], p: Float[Array, "n 4"], step: Float[Array, "n 6"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 4"]]:
     """Displace bodies by world translations [m] and body-frame rotation vectors [rad]."""
-    turned = jax.vmap(lambda a, s: normalise(product(a, from_rotation_vector(s))))(p, step[:, 3:])
-    return r + step[:, :3], turned
-
-
-def _corrected(
-    eq: Equations, velocity: Float[Array, " k"], stabilisation: AbstractStabilisation
-) -> Float[Array, " m"]:
-    """Right-hand side gamma with the terms of the stabilisation."""
-    return stabilisation.held_rows(eq.gamma, eq.value, eq.matrix @ velocity - eq.target)
+    orientations = jax.vmap(lambda a, s: normalise(product(a, from_rotation_vector(s))))(
+        p, step[:, 3:]
+    )
+    return r + step[:, :3], orientations

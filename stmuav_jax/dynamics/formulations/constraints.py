@@ -5,7 +5,7 @@ the number of kinds of primitives, not with the number of joints.
 """
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,13 +13,33 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...checks.numbers import as_numpy, stacked
-from ...mechanics.constraint import ANGULAR, PRIMITIVES, ROWS, BodyKinematics, Data, Form, Row, side
-from ...mechanics.joint import Motion
+from ...checks.numbers import as_numpy, stack_arrays
+from ...mechanics.constraint import (
+    ANGULAR,
+    COUPLINGS,
+    PRIMITIVES,
+    ROWS,
+    BodyKinematics,
+    Data,
+    Form,
+    Row,
+    couple,
+)
+from ...mechanics.joint import CATALOGUE, READING, Joint, Motion
 from ...mechanics.state import Kinematics
 from ...mechanics.system import System
 
-RowChoice = Literal["body", "report"]
+
+class Mates(eqx.Module):
+    """Mates of a group of couplings: bodies, joints, stacked parameters, and numbers (k,) as in `Mate`."""
+
+    i: tuple[int, ...] = eqx.field(static=True)
+    j: tuple[int, ...] = eqx.field(static=True)
+    joints: tuple[int, ...] = eqx.field(static=True)
+    data: Data
+    ratio: Float[Array | np.ndarray, " k"]
+    offset: Float[Array | np.ndarray, " k"]
+    period: Float[Array | np.ndarray, " k"]
 
 
 class ConstraintGroup(eqx.Module):
@@ -31,6 +51,14 @@ class ConstraintGroup(eqx.Module):
     joints: tuple[int, ...] = eqx.field(static=True)
     data: Data
     motions: tuple[Motion, ...]
+    mates: Mates | None = None
+
+    @property
+    def ends(self) -> tuple[tuple[int, ...], ...]:
+        """Bodies i, bodies j, and those of the mates, as the blocks of a `Row`."""
+        return (
+            (self.i, self.j) if self.mates is None else (self.i, self.j, self.mates.i, self.mates.j)
+        )
 
     def rows(self, sides: BodyKinematics, t: Float[Array, "*s"], form: Form) -> Row:
         """Rows of the group: value, target, gamma (c, k, *s); J_i, J_j (c, 6 or 7, k, *s).
@@ -39,55 +67,74 @@ class ConstraintGroup(eqx.Module):
             sides: kinematics of all bodies and ground, with the body axis behind the components.
             t: time [s]; the axes of a batch of states, if any, come last everywhere.
         """
-        i, j = at_bodies(sides, self.i), at_bodies(sides, self.j)
+        i, j, *mate_ends = (at_bodies(sides, end) for end in self.ends)
+        if self.mates is not None:
+            dependent, mate = COUPLINGS[self.kind]
+            batch = (1,) * (sides.r.ndim - 2)
+            column = lambda x: jnp.asarray(x).reshape(-1, *batch)
+            return couple(
+                PRIMITIVES[dependent](i, j, self.data, form),
+                PRIMITIVES[mate](mate_ends[0], mate_ends[1], self.mates.data, form),
+                column(self.mates.ratio),
+                column(self.mates.offset),
+                column(self.mates.period),
+            )
         rows = PRIMITIVES[self.kind](i, j, self.data, form)
-        return _driven(rows, self.motions, t, wrap=self.kind == "angle") if self.motions else rows
+        return (
+            _subtract_motions(rows, self.motions, t, wrap=self.kind == "angle")
+            if self.motions
+            else rows
+        )
 
 
 def at_bodies(sides: BodyKinematics, index: Sequence[int]) -> BodyKinematics:
     """Kinematics of the bodies with the given indices."""
-    vectors, matrices = ("r", "v", "omega_w", "velocity"), ("R_wb", "turn", "rest")
     places = np.array(index)
-    picked = {
-        name: getattr(sides, name)
-        .at[(slice(None),) * axis + (places,)]
+    pick = lambda x, axis: (
+        x.at[(slice(None),) * axis + (places,)]
         .get(mode="promise_in_bounds", wrap_negative_indices=False)
-        for names, axis in ((vectors, 1), (matrices, 2))
-        for name in names
-    }
-    return BodyKinematics(**picked)
+    )  # fmt: skip
+    r, v, omega_w, velocity = (
+        pick(x, 1) for x in (sides.r, sides.v, sides.omega_w, sides.velocity)
+    )
+    return BodyKinematics(r, v, pick(sides.R_wb, 2), omega_w, velocity)
 
 
 def kinematic_sides(kin: Kinematics) -> BodyKinematics:
     """Kinematics of all bodies and ground for form "omega", with the body axis last."""
     R = jnp.moveaxis(kin.R_wb, 0, -1)
     velocity = jnp.concatenate([kin.v, kin.omega], axis=1).T
-    return BodyKinematics(kin.r.T, kin.v.T, R, kin.omega_w.T, R, R, velocity)
+    return BodyKinematics(kin.r.T, kin.v.T, R, kin.omega_w.T, velocity)
 
 
-def sides_in_p(kin: Kinematics, p: Float[Array, "n 4"]) -> BodyKinematics:
-    """Kinematics of all bodies and ground for form "p", in the rates of the Euler parameters."""
-    unit = jnp.array([[1.0, 0.0, 0.0, 0.0]], p.dtype)
-    one = lambda r, v, p, omega: side(r, v, p, omega, "p")
-    return jax.vmap(one, out_axes=-1)(kin.r, kin.v, jnp.concatenate([p, unit]), kin.omega)
-
-
-def _driven(rows: Row, motions: tuple[Motion, ...], t: Float[Array, "*s"], *, wrap: bool) -> Row:
+def _subtract_motions(
+    rows: Row, motions: tuple[Motion, ...], t: Float[Array, "*s"], *, wrap: bool
+) -> Row:
     """Subtract each row's prescribed motion, with its first and second derivatives."""
 
-    def derivatives(motion: Motion, at: Array) -> tuple[Array, Array, Array]:
+    def motion_derivatives(motion: Motion, at: Array) -> tuple[Array, Array, Array]:
         f = lambda time: jnp.asarray(motion(time), dtype=time.dtype)
+        # Both derivatives of a driver's motion come from JAX, so that a user gives the motion alone and
+        # cannot give inconsistent rates.
         first = lambda time: jax.jvp(f, (time,), (jnp.ones_like(time),))[1]
         return f(at), *jax.jvp(first, (at,), (jnp.ones_like(at),))
 
-    def each(motion: Motion) -> tuple[Array, ...]:
-        return jax.vmap(lambda at: derivatives(motion, at))(t) if t.ndim else derivatives(motion, t)
+    def evaluate_motion(motion: Motion) -> tuple[Array, ...]:
+        return (
+            jax.vmap(lambda at: motion_derivatives(motion, at))(t)
+            if t.ndim
+            else motion_derivatives(motion, t)
+        )
 
-    value, rate, second = (jnp.stack(x)[None] for x in zip(*map(each, motions), strict=True))
-    off = rows.value - value
+    value, rate, second = (
+        jnp.stack(x)[None] for x in zip(*map(evaluate_motion, motions), strict=True)
+    )
+    deviation = rows.value - value
     if wrap:
-        off = jnp.arctan2(jnp.sin(off), jnp.cos(off))
-    return Row(off, rows.target + rate, rows.J_i, rows.J_j, rows.gamma + second)
+        # A prescribed angle may run on beyond half a turn, while the angle between two bodies is known up to
+        # whole turns only.
+        deviation = jnp.arctan2(jnp.sin(deviation), jnp.cos(deviation))
+    return Row(deviation, rows.target + rate, rows.J_i, rows.J_j, rows.gamma + second)
 
 
 class Equations(eqx.Module):
@@ -96,13 +143,13 @@ class Equations(eqx.Module):
     Attributes:
         value: constraint functions Phi (m,).
         target: right-hand side of J qdot = target (m,); zero except for drivers.
-        J: Jacobian (m, n, 6) in (v, omega') for form "omega", (m, n, 7) in (v, pdot) for "p".
+        J: Jacobian (m, n, 6) in (v, omega').
         gamma: right-hand side of J qddot = gamma (m,).
     """
 
     value: Float[Array, " m"]
     target: Float[Array, " m"]
-    J: Float[Array, "m n w"]
+    J: Float[Array, "m n 6"]
     gamma: Float[Array, " m"]
 
     @property
@@ -136,6 +183,8 @@ class Constraints(eqx.Module):
         """
         if not self.groups:
             return jnp.zeros((0,))
+        # A distance row is a difference of squares: its derivative by the length is 2 l, which turns its
+        # residual into a length.
         lengths = [(g.kind, jnp.repeat(g.data.length, ROWS[g.kind], axis=0)) for g in self.groups]
         return jnp.concatenate(
             [0.5 / x if kind == "distance" else jnp.ones_like(x) for kind, x in lengths]
@@ -147,63 +196,75 @@ class Constraints(eqx.Module):
         kinds = [np.full(len(g.i) * ROWS[g.kind], g.kind in ANGULAR) for g in self.groups]
         return np.concatenate([np.zeros(0, bool), *kinds])
 
-    def equations(
-        self, t: Float[Array, ""], kin: Kinematics, p: Float[Array, "n 4"] | None = None
-    ) -> Equations:
-        """Constraint functions, targets, Jacobian and gamma at time t [s].
-
-        They are in form "omega", or in form "p" if the bodies' Euler parameters p are given.
-        """
-        n = self.n_bodies
-        form: Form = "omega" if p is None else "p"
-        sides = kinematic_sides(kin) if p is None else sides_in_p(kin, p)
-        width = 6 if p is None else 7
-        parts = [(group, group.rows(sides, t, form)) for group in self.groups]
+    def equations(self, t: Float[Array, ""], kin: Kinematics) -> Equations:
+        """Constraint functions, targets, Jacobian and gamma at time t [s]."""
+        n, sides = self.n_bodies, kinematic_sides(kin)
+        parts = [(group, group.rows(sides, t, "omega")) for group in self.groups]
         if not parts:
             none = jnp.zeros((0,), kin.r.dtype)
-            return Equations(none, none, jnp.zeros((0, n, width), kin.r.dtype), none)
+            return Equations(none, none, jnp.zeros((0, n, 6), kin.r.dtype), none)
 
-        def flat(name: str) -> Array:
+        def flatten_rows(name: str) -> Array:
             return jnp.concatenate([getattr(rows, name).T.reshape(-1) for _, rows in parts])
 
         blocks = []
         for group, rows in parts:
             # products with 0 and 1 fuse where a scatter would not; ground has no column
-            at_i = np.eye(n + 1)[list(group.i)][:, None, :n, None]
-            at_j = np.eye(n + 1)[list(group.j)][:, None, :n, None]
-            J_i, J_j = (jnp.moveaxis(J, -1, 0)[:, :, None, :] for J in (rows.J_i, rows.J_j))
-            block = at_i * J_i + at_j * J_j
-            blocks.append(block.reshape(-1, n, width))
-        return Equations(flat("value"), flat("target"), jnp.concatenate(blocks), flat("gamma"))
+            at = [np.eye(n + 1)[list(end)][:, None, :n, None] for end in group.ends]
+            J = [jnp.moveaxis(J, -1, 0)[:, :, None, :] for J in rows.blocks]
+            block = sum(place * part for place, part in zip(at, J, strict=True))
+            blocks.append(jnp.reshape(block, (-1, n, 6)))
+        return Equations(
+            flatten_rows("value"),
+            flatten_rows("target"),
+            jnp.concatenate(blocks),
+            flatten_rows("gamma"),
+        )
 
 
-def constraints(
-    system: System, rows: RowChoice = "body", joints: Sequence[int] | None = None
-) -> Constraints:
-    """Group the rows of all joints of a system, or of the joints with given indices, by kind.
-
-    `rows="report"` expresses parallel axes by cross products with two of three rows kept by the
-    report's rule; "body" by the equivalent perpendicularity to two axes fixed in body i.
-    """
+def group_constraints(system: System, joints: Sequence[int] | None = None) -> Constraints:
+    """Group the rows of all joints of a system, or of the joints with given indices, by kind."""
     ground = system.n_bodies
     place = {name: k for k, name in enumerate(system.names)}
     centres = as_numpy(system.bodies.com)
     com = [*centres, np.zeros(3, centres.dtype)]
-    found: dict[str, list[tuple[int, int, int, Data, Motion | None]]] = {}
+    # Rows are grouped by kind over all joints: a mechanism of any size compiles as many evaluations as
+    # there are kinds.
+    names = [joint.name for joint in system.joints]
+
+    def entry_of(joint: Joint, term: Any) -> tuple[int, int, int, Data]:
+        i, j = place.get(joint.body_i, ground), place.get(joint.body_j, ground)
+        return i, j, names.index(joint.name), joint.data(term, com[i], com[j])
+
+    entries_by_kind: dict[str, list[Any]] = {}
     for number, joint in enumerate(map(as_numpy, system.joints)):
         if joints is not None and number not in joints:
             continue
-        i, j = place.get(joint.body_i, ground), place.get(joint.body_j, ground)
-        for term in joint.terms(rows):
-            entry = (i, j, number, joint.data(term, com[i], com[j]), joint.motion)
-            found.setdefault(term.kind, []).append(entry)
+        for term in CATALOGUE[joint.kind].terms:
+            entries_by_kind.setdefault(term.kind, []).append((*entry_of(joint, term), joint))
     groups = []
     owner: list[int] = []
-    for kind in (k for k in PRIMITIVES if k in found):
-        i, j, numbers, data, motions = zip(*found[kind], strict=True)
-        joined = jax.tree.map(lambda *x: stacked(x, axis=-1), *data)
-        groups.append(
-            ConstraintGroup(kind, i, j, numbers, joined, tuple(m for m in motions if m is not None))
-        )
+    join = lambda data: jax.tree.map(lambda *x: stack_arrays(x, axis=-1), *data)
+    for kind in (k for k in (*PRIMITIVES, *COUPLINGS) if k in entries_by_kind):
+        i, j, numbers, data, joints_of_kind = zip(*entries_by_kind[kind], strict=True)
+        motions = tuple(joint.motion for joint in joints_of_kind if joint.motion is not None)
+        mates = None
+        if kind in COUPLINGS:
+            term = READING[COUPLINGS[kind][1]]
+            of = [joint.mate for joint in joints_of_kind]
+            first, second, places, mate_data = zip(
+                *(entry_of(mate.joint, term) for mate in of), strict=True
+            )
+            column = lambda name, of=of: stack_arrays([getattr(mate, name) for mate in of])
+            mates = Mates(
+                first,
+                second,
+                places,
+                join(mate_data),
+                column("ratio"),
+                column("offset"),
+                column("period"),
+            )
+        groups.append(ConstraintGroup(kind, i, j, numbers, join(data), motions, mates))
         owner += [number for number in numbers for _ in range(ROWS[kind])]
     return Constraints(tuple(groups), tuple(owner), system.n_bodies)

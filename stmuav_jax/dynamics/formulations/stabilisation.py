@@ -1,4 +1,4 @@
-"""Stabilisation of differentiated constraints against drift: none, feedback, or projection.
+"""Stabilisation of the constraints: none, Baumgarte's feedback, or projection after each step.
 
 A stabilisation is defined by three methods. A formulation calls the first two at every evaluation,
 so that one stabilisation serves all formulations; the integration calls the third once.
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...checks.errors import SettingError, concrete
+from ...checks.errors import SettingError, has_values
 from ...checks.shapes import Numbers
 
 
@@ -78,7 +78,7 @@ class Baumgarte(AbstractStabilisation):
     def __init__(self, alpha: Numbers = 10.0, beta: Numbers = 10.0, norm: Numbers = 10.0) -> None:
         gains = {"alpha": alpha, "beta": beta, "norm": norm}
         for name, value in gains.items():
-            if concrete(value) and not (np.isfinite(value) and value >= 0):  # pyright: ignore
+            if has_values(value) and not (np.isfinite(value) and value >= 0):  # pyright: ignore
                 raise SettingError(
                     f"The Baumgarte gain {name} must be finite and not negative, but it is {value} 1/s."
                 )

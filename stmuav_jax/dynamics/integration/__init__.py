@@ -1,1 +1,1 @@
-"""Integration in time of any formulation, on top of diffrax. Floor 5."""
+"""Integration in time of any formulation, on top of diffrax."""

@@ -20,6 +20,8 @@ Source: E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006),
 (adjoint equations of Runge-Kutta methods).
 """
 
+import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -29,20 +31,196 @@ import jax.numpy as jnp
 from equinox.internal import nondifferentiable_backward
 from jaxtyping import Array, Bool, Float, Int
 
-from ...checks.errors import SettingError
-from .explicit import NonDenseRungeKutta, coefficients
-from .problem import Counts, IntegrationState, Problem, SegmentEnd, landing
-from .record import (
-    MORE,
-    Now,
-    RecordedPieces,
-    RecordRoom,
-    Steps,
-    Windows,
-    again,
-    in_pieces,
-    piece_of,
-)
+from ..method import DiscreteAdjoint
+from .problem import Counts, IntegrationState, Problem, SegmentEnd, read_end
+from .solvers import NonDenseRungeKutta, butcher_coefficients
+
+MORE = diffrax.RESULTS.max_steps_reached
+
+# An integration to one output time has as many windows as the steps that it may take at most, as long
+# as the windows of all output times record no more than `ROOM` numbers; otherwise it has pieces, of
+# at least `WINDOWS` windows each.
+WINDOWS, ROOM = 256, 10_000_000
+
+
+class RecordRoom(NamedTuple):
+    """Room for the record of an integration to one output time.
+
+    Attributes:
+        steps: step attempts of a window.
+        windows: windows of a piece. pieces: largest number of pieces.
+    """
+
+    steps: int
+    windows: int
+    pieces: int
+
+    @classmethod
+    def of(cls, steps: int, max_steps: int, segments: int, numbers: int) -> "RecordRoom":
+        """Room for all of max_steps attempts, in each of the segments, of a state of so many numbers."""
+        needed = -(-max_steps // steps)
+        # Arrays of a compiled program have fixed sizes, set aside for the largest number of steps
+        # that a run may take, whether it takes them or not: hence the bound in numbers.
+        windows = max(WINDOWS, ROOM // (segments * (steps + numbers)))
+        if needed <= windows:
+            return cls(steps, needed, 1)
+        # one window less: an earlier piece, integrated again, ends by a step cut short
+        return cls(steps, windows, -(-needed // (windows - 1)))
+
+
+class Steps(NamedTuple):
+    """Record of accepted steps from ts[i], ys[i] to ts[i + 1], the first `accepted` of n rows."""
+
+    accepted: Int[Array, ""]
+    ts: Float[Array, " n+1"]
+    ys: Float[Array, "n k"]
+    slopes: Float[Array, "n s k"]
+    end: Float[Array, " k"]
+
+
+class Windows(NamedTuple):
+    """Record of a piece of an integration in windows of at most n step attempts each.
+
+    Attributes:
+        number: number of windows.
+        starts: y at the start of each window (w, k).
+        accepted: number of accepted steps of each window (w,).
+        ts: times of these steps (w, n + 1) [s].
+        last: steps of the last window.
+    """
+
+    number: Int[Array, ""]
+    starts: Float[Array, "w k"]
+    accepted: Int[Array, " w"]
+    ts: Float[Array, "w n+1"]
+    last: Steps
+
+
+class Now(NamedTuple):
+    """Integration at the start of a window."""
+
+    t: Float[Array, ""]
+    y: Float[Array, " k"]
+    solver_state: Any
+    controller_state: Any
+
+
+class RecordedPieces(NamedTuple):
+    """Record of an integration: number of pieces, their starts (if there may be many), the last one."""
+
+    number: Int[Array, ""]
+    starts: Now | None
+    last: Windows
+
+
+def _empty_rows(tree: Any, *rows: int) -> Any:
+    """Zeros of the shapes of a pytree, this many rows of each."""
+    return jax.tree.map(lambda x: jnp.zeros((*rows, *x.shape), x.dtype), tree)
+
+
+def _repeat_parts(
+    run: Callable[[Now], tuple[SegmentEnd, Any]],
+    begin: Now,
+    room: int,
+    most: int,
+    row: Callable[[Now, Any], Any],
+    is_requested: Bool[Array, ""] | bool = True,
+) -> tuple[SegmentEnd, Array, Any, Any]:
+    """Integrate part by part, until one does not say `MORE`: end, number, a row of each, last record."""
+
+    def integrate_part(now: Now) -> tuple[SegmentEnd, Any, Any]:
+        end, record = run(now)
+        return end, row(now, record), record
+
+    def is_unfinished(at: tuple[Any, ...]) -> Any:
+        number, _, result, *_ = at
+        return is_requested & ((number == 0) | ((result == MORE) & (number < most)))
+
+    def next_part(at: tuple[Any, ...]) -> tuple[Any, ...]:
+        number, now, _, (accepted, rejected), rows, _ = at
+        end, new, record = integrate_part(now)
+        rows = jax.tree.map(lambda rows, x: rows.at[number].set(x), rows, new)
+        counts = (accepted + end.accepted, rejected + end.rejected)
+        now = Now(end.t, end.y, end.solver_state, end.controller_state)
+        return number + 1, now, end.result, counts, rows, record
+
+    # The shapes of the record are found by tracing, which runs nothing.
+    _, rows, record = eqx.filter_eval_shape(integrate_part, begin)
+    none, success = jnp.zeros((), int), diffrax.RESULTS.successful
+    state = (none, begin, success, (none, none), _empty_rows(rows, room), _empty_rows(record))
+    number, now, result, counts, rows, record = jax.lax.while_loop(is_unfinished, next_part, state)
+    accepted, rejected = counts
+    states = (now.solver_state, now.controller_state)
+    end = SegmentEnd(now.t, now.y, *states, accepted, rejected, result)
+    return end, number, rows, record
+
+
+def in_pieces(
+    problem: Problem, begin: Now, t1: Float[Array, ""], room: RecordRoom
+) -> tuple[SegmentEnd, RecordedPieces]:
+    """Integrate to t1 [s] piece by piece, each one window shorter than there is room for."""
+    run = lambda now: piece_of(problem, now, t1, room, room.windows - 1)
+    end, number, starts, last = _repeat_parts(
+        run, begin, room.pieces, room.pieces, lambda now, _: now
+    )
+    return end, RecordedPieces(number, starts, last)
+
+
+def piece_of(
+    problem: Problem,
+    begin: Now,
+    t1: Float[Array, ""],
+    room: RecordRoom,
+    most: int,
+    is_recorded: Bool[Array, ""] | bool = True,
+) -> tuple[SegmentEnd, Windows]:
+    """Integrate towards t1 [s] by at most so many windows, with a record, if it is wanted at all."""
+    run = lambda now: _integrate_window(problem, now, t1, room.steps)
+    row = lambda now, steps: (now.y, steps.accepted, steps.ts)
+    end, number, rows, last = _repeat_parts(run, begin, room.windows, most, row, is_recorded)
+    ys, step_counts, ts = rows
+    return end, Windows(number, ys, step_counts, ts, last)
+
+
+def _make_carry(now: Now, step: Float[Array, ""]) -> IntegrationState:
+    """State of an integration that has taken no steps yet, the first of which is `step` [s]."""
+    none, success = jnp.zeros((), int), diffrax.RESULTS.successful
+    counts, states = Counts(none, none, none), (now.solver_state, now.controller_state)
+    return IntegrationState(now.t, now.y, step, *states, counts, success)
+
+
+def _integrate_window(
+    problem: Problem, begin: Now, t1: Float[Array, ""], attempt_limit: int
+) -> tuple[SegmentEnd, Steps]:
+    """Take at most `attempt_limit` step attempts towards t1 [s], with a record of the accepted ones."""
+    # Dense output is used as a record: it has the start and the slopes of every accepted step, and
+    # diffrax fills it as it goes.
+    carry = _make_carry(begin, begin.controller_state[0])
+    solution = problem.solve(carry, t1, diffrax.ForwardMode(), max_steps=attempt_limit, dense=True)
+    interpolation: Any = solution.interpolation
+    inner = interpolation.infos["inner"]
+    end = read_end(solution)
+    return end, Steps(end.accepted, interpolation.ts, inner["y0"], inner["slopes"], end.y)
+
+
+def repeat_window(problem: Problem, windows: Windows, number: Any) -> Steps:
+    """Steps of a window before the last, computed again from its start."""
+    # their lengths are known and none is rejected: no bounds are needed
+    solver = dataclasses.replace(problem.solver(), projection_limit=None, guard=None)
+    term, ts = diffrax.ODETerm(problem.field), windows.ts[number]
+    memory = solver.init(term, ts[0], ts[1], windows.starts[number], problem.model)
+
+    def repeat_step(at: tuple[Any, ...]) -> tuple[Any, ...]:
+        i, y, ys, slopes = at
+        end, _, info, *_ = problem.take_step(ts[i], ts[i + 1], y, memory, solver)
+        return i + 1, end, ys.at[i].set(y), slopes.at[i].set(info["inner"]["slopes"])
+
+    step_count, last = windows.accepted[number], windows.last
+    rows = (jnp.zeros_like(last.ys), jnp.zeros_like(last.slopes))
+    begin = (jnp.zeros((), int), windows.starts[number], *rows)
+    _, end, ys, slopes = jax.lax.while_loop(lambda at: at[0] < step_count, repeat_step, begin)
+    return Steps(step_count, ts, ys, slopes, end)
+
 
 TWICE = (
     "Second derivatives of stmuav_jax.integrate by reverse mode over reverse mode are not available: "
@@ -58,62 +236,39 @@ KEPT = 1024
 CHECKPOINTS = 4096
 
 
-class DiscreteAdjoint(diffrax.AbstractAdjoint):
-    """Discrete adjoint: reverse-mode derivatives of the accepted steps as they were taken.
-
-    In `integrate` an explicit method without an event is differentiated as the module describes.
-    With implicit methods, events, and in `diffrax.diffeqsolve` itself, the adjoint is diffrax's
-    `RecursiveCheckpointAdjoint` with `recorded_steps` checkpoints, which takes adaptive steps again.
-
-    Attributes:
-        recorded_steps: number of step attempts recorded at a time; None for 1,024, or 4,096 checkpoints, divided
-            among the output times, at least 64 for each.
-
-    Raises:
-        SettingError: `recorded_steps` is less than one.
-    """
-
-    recorded_steps: int | None = None
-
-    def __check_init__(self) -> None:
-        if self.recorded_steps is not None and self.recorded_steps < 1:
-            raise SettingError(
-                f"A DiscreteAdjoint keeps at least one step attempt, not {self.recorded_steps}."
-            )
-
-    def of(self, problem: Problem, segments: int) -> "diffrax.AbstractAdjoint | RecordRoom":
-        """Adjoint for a problem with this number of output times, or the room for its record."""
-        segments, most = max(segments, 1), problem.method.max_steps
-        explicit = isinstance(problem.solver().solver, NonDenseRungeKutta)
-        own = max((KEPT if explicit else CHECKPOINTS) // segments, 64)
-        kept = min(most, own if self.recorded_steps is None else self.recorded_steps)
-        if explicit:
-            return RecordRoom.of(kept, most, segments, problem.n_state + problem.n_internal)
-        return diffrax.RecursiveCheckpointAdjoint(checkpoints=kept)
-
-    def loop(self, **how: Any) -> Any:
-        """Loop of `diffrax.diffeqsolve`, see there."""
-        return diffrax.RecursiveCheckpointAdjoint(checkpoints=self.recorded_steps).loop(**how)
+def room_of(
+    adjoint: DiscreteAdjoint, problem: Problem, segments: int
+) -> "diffrax.AbstractAdjoint | RecordRoom":
+    """Adjoint for a problem with this number of output times, or the room for its record."""
+    segments, most = max(segments, 1), problem.method.max_steps
+    explicit = isinstance(problem.solver().solver, NonDenseRungeKutta)
+    steps = adjoint.recorded_steps or max((KEPT if explicit else CHECKPOINTS) // segments, 64)
+    if explicit:
+        return RecordRoom.of(min(most, steps), most, segments, problem.n_state + problem.n_internal)
+    return diffrax.RecursiveCheckpointAdjoint(checkpoints=min(most, steps))
 
 
-def recorded(
+def integrate_recorded(
     problem: Problem, carry: IntegrationState, t1: Float[Array, ""], room: RecordRoom
 ) -> SegmentEnd:
     """Integrate to t1 [s] with the discrete adjoint, which has this room for its record."""
+    # Derivatives are with respect to the model's numbers, the start and the times. All else, such
+    # as tolerances, is passed apart and made constant, so that no derivative is computed that
+    # nobody reads.
     bare = eqx.tree_at(lambda p: p.model, problem, None)
     start = _Start(problem.model, carry.y, carry.t, t1)
     memory = (carry.step, carry.solver_state, carry.controller_state)
-    found = _recorded(start, _still(bare), _still(memory), room)
-    y = found.y
+    end = _integrate_recorded(start, _stop_gradients(bare), _stop_gradients(memory), room)
+    y = end.y
     # the time reached depends on t1 only
-    found, stop = _still(found._replace(y=None)), jax.lax.stop_gradient
-    return found._replace(y=y, t=found.t + (t1 - stop(t1)))
+    end, stop = _stop_gradients(end._replace(y=None)), jax.lax.stop_gradient
+    return end._replace(y=y, t=end.t + (t1 - stop(t1)))
 
 
-def _still(tree: Any) -> Any:
+def _stop_gradients(tree: Any) -> Any:
     """Pytree with all arrays, also booleans with tangents in a loop, made constants."""
-    still = lambda x: jax.lax.stop_gradient(x.astype(float)).astype(x.dtype)
-    return jax.tree.map(lambda x: still(x) if eqx.is_array(x) else x, tree)
+    constant_of = lambda x: jax.lax.stop_gradient(x.astype(float)).astype(x.dtype)
+    return jax.tree.map(lambda x: constant_of(x) if eqx.is_array(x) else x, tree)
 
 
 class _Start(NamedTuple):
@@ -125,44 +280,47 @@ class _Start(NamedTuple):
     t1: Float[Array, ""]
 
 
-def _begun(start: _Start, problem: Problem, memory: Any) -> tuple[Problem, IntegrationState]:
+def _restore_start(
+    start: _Start, problem: Problem, memory: Any
+) -> tuple[Problem, IntegrationState]:
     problem = eqx.tree_at(lambda p: p.model, problem, start.model, is_leaf=lambda x: x is None)
-    none = jnp.zeros((), int)
-    step, solver_state, controller_state = memory
-    counts, fine = Counts(none, none, none), diffrax.RESULTS.successful
-    carry = IntegrationState(start.t0, start.y, step, solver_state, controller_state, counts, fine)
-    return problem, carry
+    step, *states = memory
+    return problem, _make_carry(Now(start.t0, start.y, *states), step)
 
 
 @eqx.filter_custom_vjp
-def _recorded(start: _Start, problem: Problem, memory: Any, room: RecordRoom) -> SegmentEnd:
+def _integrate_recorded(
+    start: _Start, problem: Problem, memory: Any, room: RecordRoom
+) -> SegmentEnd:
     del room
-    problem, carry = _begun(start, problem, memory)
-    return landing(problem.solve(carry, start.t1, diffrax.ForwardMode()))
+    problem, carry = _restore_start(start, problem, memory)
+    return read_end(problem.solve(carry, start.t1, diffrax.ForwardMode()))
 
 
-@_recorded.def_fwd
-def _forward(
+@_integrate_recorded.def_fwd
+def _record_pieces(
     perturbed: Any, start: _Start, problem: Problem, memory: Any, room: RecordRoom
 ) -> tuple[SegmentEnd, RecordedPieces]:
     """Integrate piece by piece, with a record of their starts and of the last one's windows."""
     del perturbed
-    problem, carry = _begun(start, problem, memory)
+    problem, carry = _restore_start(start, problem, memory)
     begin = Now(carry.t, carry.y, carry.solver_state, carry.controller_state)
     if room.pieces == 1:
         end, windows = piece_of(problem, begin, start.t1, room, room.windows)
-        found = RecordedPieces(windows.number, None, windows)
+        pieces = RecordedPieces(windows.number, None, windows)
     else:
-        end, found = in_pieces(problem, begin, start.t1, room)
+        end, pieces = in_pieces(problem, begin, start.t1, room)
+    # Windows end where there is room, not where the run's own limit is: that is applied to the
+    # sum.
     over = end.accepted + end.rejected > problem.method.max_steps
     end = end._replace(result=diffrax.RESULTS.where(over, MORE, end.result))
-    return end, found
+    return end, pieces
 
 
-@_recorded.def_bwd
-def _backward(
+@_integrate_recorded.def_bwd
+def _propagate_cotangents(
     pieces: RecordedPieces,
-    wanted: SegmentEnd,
+    cotangent: SegmentEnd,
     perturbed: Any,
     start: _Start,
     problem: Problem,
@@ -174,7 +332,9 @@ def _backward(
     arrays, rest = eqx.partition(start.model, perturbed.model)
     field = lambda t, y, args: problem.field(t, y, eqx.combine(args, rest))
     end = pieces.last.last.end
-    last = jnp.zeros_like(end) if wanted.y is None else wanted.y
+    last = jnp.zeros_like(end) if cotangent.y is None else cotangent.y
+    # A run that failed has NaN values; without this its derivatives could be finite where a
+    # cotangent is zero.
     last = jnp.where(jnp.isnan(end), jnp.nan, last)
     whole = eqx.tree_at(lambda p: p.model, problem, start.model, is_leaf=lambda x: x is None)
     # NaN also where there is no step to traverse
@@ -183,8 +343,8 @@ def _backward(
 
     def back_piece(at: tuple[Any, ...]) -> tuple[Any, ...]:
         number, by_end, by_model = at
-        windows, fine = _piece_again(whole, pieces, number, room)
-        by_end = jnp.where(fine, by_end, jnp.nan)
+        windows, reaches_end = _piece_again(whole, pieces, number, room)
+        by_end = jnp.where(reaches_end, by_end, jnp.nan)
         return number - 1, *_through_windows(whole, windows, arrays, rest, (by_end, by_model))
 
     if pieces.starts is None:
@@ -195,12 +355,13 @@ def _backward(
         )
     by_t0, by_t1 = None, None
     if perturbed.t0:
+        # A later start removes motion at its beginning, a later end adds motion at its end.
         by_t0 = -jnp.vdot(first, field(start.t0, start.y, arrays))
     if perturbed.t1:
         by_t1 = jnp.vdot(last, field(start.t1, end, arrays))
     none = jax.tree.map(lambda _: None, rest)
-    found = _Start(eqx.combine(by_model, none), first, by_t0, by_t1)  # pyright: ignore
-    return nondifferentiable_backward(found, msg=TWICE)
+    derivatives = _Start(eqx.combine(by_model, none), first, by_t0, by_t1)  # pyright: ignore
+    return nondifferentiable_backward(derivatives, msg=TWICE)
 
 
 def _piece_again(
@@ -210,12 +371,12 @@ def _piece_again(
     final = number == pieces.number - 1
     now, later = (jax.tree.map(lambda x, k=k: x[k], pieces.starts) for k in (number, number + 1))
 
-    def integrated() -> tuple[Windows, Bool[Array, ""]]:
+    def integrate_again() -> tuple[Windows, Bool[Array, ""]]:
         # the condition is for batches, in which both branches are carried out
         end, windows = piece_of(problem, now, later.t, room, room.windows, ~final)
         return windows, end.result == diffrax.RESULTS.successful
 
-    return jax.lax.cond(final, lambda: (pieces.last, jnp.array(True)), integrated)
+    return jax.lax.cond(final, lambda: (pieces.last, jnp.array(True)), integrate_again)
 
 
 def _through_windows(
@@ -227,16 +388,19 @@ def _through_windows(
         number, by_end, by_model = at
         final = number == windows.number - 1
         steps = windows.last
+        # The last window is still recorded, so that most runs, which have one, repeat nothing.
         if len(windows.starts) > 1:
-            steps = jax.lax.cond(final, lambda: steps, lambda: again(problem, windows, number))
+            steps = jax.lax.cond(
+                final, lambda: steps, lambda: repeat_window(problem, windows, number)
+            )
 
-        def back(at: tuple[Any, ...]) -> tuple[Any, ...]:
+        def back_step(at: tuple[Any, ...]) -> tuple[Any, ...]:
             i, by_end, by_model = at
             by_start, more = _step_back(problem, arrays, rest, steps, i, by_end)
             return i - 1, by_start, jax.tree.map(jnp.add, by_model, more)
 
-        begin = (steps.taken - 1, by_end, by_model)
-        _, by_start, by_model = jax.lax.while_loop(lambda at: at[0] >= 0, back, begin)
+        begin = (steps.accepted - 1, by_end, by_model)
+        _, by_start, by_model = jax.lax.while_loop(lambda at: at[0] >= 0, back_step, begin)
         return number - 1, by_start, by_model
 
     begin = (windows.number - 1, *at_end)
@@ -248,10 +412,12 @@ def _step_back(
 ) -> tuple[Array, Any]:
     """Derivatives with respect to the start of step i and the model, from those of its end."""
     solver = problem.solver()
-    A, b, _, c = coefficients(solver.solver.method)  # pyright: ignore
+    A, b, _, c = butcher_coefficients(solver.solver.method)  # pyright: ignore
     t, y, slopes = steps.ts[i], steps.ys[i], steps.slopes[i]
     t1 = steps.ts[i + 1]
     h = t1 - t
+    # The projection comes after the stages, so that in reverse it is first. Its derivative is at
+    # the end of the unprojected step, which follows from the recorded slopes and is not stored.
     by_model = jax.tree.map(jnp.zeros_like, arrays)
     # choices made at the start of the step have no derivative and are no parameters of the model
     numbers, others = eqx.partition(
@@ -266,9 +432,11 @@ def _step_back(
         _, pull = jax.vjp(project, y1, arrays)
         by_end, by_model = pull(by_end)
 
-    def stage(now: tuple[Any, Any], at: tuple[Any, ...]) -> tuple[Any, None]:
+    def back_stage(now: tuple[Any, Any], at: tuple[Any, ...]) -> tuple[Any, None]:
         by_slopes, by_model = now
         row, column, weight, share, number = at
+        # Stages are put together again from their slopes: memory for slopes alone, and no
+        # evaluation but the one that is differentiated.
         y_i = y + h * jnp.sum(row[:, None] * slopes, axis=0)
         field = lambda y, args: problem.field(t + share * h, y, eqx.combine(args, rest))
         _, pull = jax.vjp(field, y_i, arrays)
@@ -278,5 +446,5 @@ def _step_back(
 
     table = (*(jnp.asarray(x) for x in (A, A.T, b, c)), jnp.arange(len(b)))
     begin = (jnp.zeros_like(slopes), by_model)
-    (by_slopes, by_model), _ = jax.lax.scan(stage, begin, table, reverse=True)
+    (by_slopes, by_model), _ = jax.lax.scan(back_stage, begin, table, reverse=True)
     return by_end + jnp.sum(by_slopes, axis=0), by_model

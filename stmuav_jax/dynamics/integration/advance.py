@@ -1,8 +1,12 @@
-"""Integration from output time to output time, through events and jumps of the forces.
+"""Integration from output time to output time, through events and jumps of the forces, in chunks.
 
 Steps end at the output times, without interpolation, because diffrax's dense output is of lower
 order than its steps. Work and impulse are integrated beside the state for the energy and momentum
 balances; they do not enter the control of the step size.
+
+A run that starts at a zero of its event function, such as the next arc of a bouncing ball, starts
+after that event and not before it. An event function that becomes NaN ends the run with the
+result `diffrax.RESULTS.nonfinite`.
 """
 
 from typing import Any
@@ -11,16 +15,94 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from equinox.internal import nextafter, prevbefore
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from ...checks.numbers import as_floats
+from ...math.compiler import cached_program
+from ...math.newton import EventBisection
 from ...mechanics.state import State
 from ..formulations.base import Residuals
-from .adjoint import DiscreteAdjoint, recorded
-from .events import to_event
-from .problem import Counts, IntegrationState, Problem, SegmentEnd, landing
-from .record import RecordRoom
-from .step_bound import EVERY
+from ..method import DiscreteAdjoint
+from .adjoint import RecordRoom, integrate_recorded, room_of
+from .problem import (
+    Counts,
+    IntegrationState,
+    Problem,
+    SegmentEnd,
+    compiled_begin,
+    continue_from,
+    read_end,
+)
+from .stepping import EVERY
+
+# A run starts at its event if the event function is zero within this many tolerances, in seconds,
+# after or before the start.
+_NEAR = 1e3
+
+
+def to_event(
+    problem: Problem,
+    carry: IntegrationState,
+    t1: Float[Array, ""],
+    adjoint: diffrax.AbstractAdjoint,
+) -> SegmentEnd:
+    """Integrate from the carry to t1 [s], or to an event before it."""
+    method = problem.method
+    assert method.event is not None
+    condition = method.event
+
+    def condition_value(t: Any, y: Any, args: Any, **_: Any) -> Array:
+        state = method.formulation.to_state(args, y[: problem.n_state])
+        return jnp.asarray(condition(t, state))
+
+    kind = jax.eval_shape(lambda: condition_value(carry.t, carry.y, problem.model)).dtype
+    if kind == jnp.bool_:
+        event = diffrax.Event(condition_value)
+    else:
+        start, sign = _at_start(problem, carry, condition_value)
+
+        def crossing_value(t: Any, y: Any, args: Any, **_: Any) -> Array:
+            now = condition_value(t, y, args)
+            # A NaN compares as false both ways and would hide the crossing; it has an event of its
+            # own, which ends the run with another result.
+            now = jnp.where(jnp.isnan(now), 1.0, now)
+            return jnp.where(start & (t <= carry.t), sign, now)
+
+        lost = lambda t, y, args, **_: jnp.isnan(condition_value(t, y, args))
+        finder = EventBisection()  # pyright: ignore[reportCallIssue]
+        # in this order: if the first is true, the second is ignored
+        event = diffrax.Event((lost, crossing_value), finder, (None, method.direction))
+    solution = problem.solve(carry, t1, adjoint, event=event)
+    end = read_end(solution)
+    occurred = end.result == diffrax.RESULTS.event_occurred
+    if kind != jnp.bool_:
+        bad = occurred & solution.event_mask[0]  # pyright: ignore[reportOptionalSubscript]
+        nonfinite: Any = diffrax.RESULTS.nonfinite
+        result = diffrax.RESULTS.where(bad, nonfinite, end.result)
+        end, occurred = end._replace(result=result), occurred & ~bad
+    # The event's time comes from interpolation, the state at it from steps. Without an event there is no
+    # way to go again; a branch instead would, in a batch, mix up what the members' steps leave for derivatives.
+    restarted = read_end(problem.solve(carry, jnp.where(occurred, end.t, carry.t), adjoint))
+    restarted = restarted._replace(result=end.result)
+    return jax.tree.map(lambda a, b: jnp.where(occurred, a, b), restarted, end)
+
+
+def _at_start(
+    problem: Problem, carry: IntegrationState, value: Any
+) -> tuple[Bool[Array, ""], Float[Array, ""]]:
+    """True if the run starts at its event, and the event function right after the start."""
+    # The start's slope is found by a midpoint step of the motion: the event function has no
+    # derivative in time of its own, and may be of any form.
+    carry_t, y, model = jax.lax.stop_gradient((carry.t, carry.y, problem.model))
+    h = jnp.asarray(problem.method.first_step, y.dtype)
+    half = y + h / 2 * problem.field(carry_t, y, model)
+    after = y + h * problem.field(carry_t + h / 2, half, model)
+    first, second = value(carry_t, y, model), value(carry_t + h, after, model)
+    tolerance = _NEAR * jnp.maximum(problem.method.rtol, problem.method.atol)
+    at_event = jnp.abs(first) <= jnp.abs(second - first) * jnp.minimum(tolerance / h, 1.0)
+    return (carry.counts.accepted == 0) & at_event, jax.lax.stop_gradient(second)
 
 
 class Trajectory(eqx.Module):
@@ -49,7 +131,7 @@ class Trajectory(eqx.Module):
     result: diffrax.RESULTS
 
 
-def _to(
+def _integrate_to(
     problem: Problem,
     carry: IntegrationState,
     t1: Float[Array, ""],
@@ -57,33 +139,40 @@ def _to(
 ) -> SegmentEnd:
     """Integrate from the carry to t1 [s], or to an event before it."""
     if isinstance(adjoint, RecordRoom):
-        return recorded(problem, carry, t1, adjoint)
+        return integrate_recorded(problem, carry, t1, adjoint)
     if problem.method.event is not None:
         return to_event(problem, carry, t1, adjoint)
-    return landing(problem.solve(carry, t1, adjoint))
+    return read_end(problem.solve(carry, t1, adjoint))
 
 
-def advance(
+def integrate_times(
     problem: Problem, carry: IntegrationState, ts: Float[Array, " k"]
 ) -> tuple[IntegrationState, Trajectory]:
     """Integrate to each of the times ts [s] in turn; after a failure or an event, stay there."""
     jumps = problem.method.jump_ts
     if jumps is None:
         # the first output time is the start, which takes no steps
-        end, rows = _through(problem, carry, ts, ts.shape[0] - 1)
-        return end, _trajectory(problem, end, rows)
+        end, rows = _integrate_segments(problem, carry, ts, ts.shape[0] - 1)
+        return end, _make_trajectory(problem, end, rows)
     # merge the times of jumps into the output times; outputs come first at equal times
     merged = jnp.concatenate([ts, jnp.asarray(jumps)])
+    # Jumps are integrated to like output times, whose rows are dropped afterwards: steps then end
+    # at both, in one loop.
     order = jnp.argsort(merged)
-    end, rows = _through(problem, carry, (merged[order], order >= ts.shape[0]), len(merged) - 1)
+    end, rows = _integrate_segments(
+        problem, carry, (merged[order], order >= ts.shape[0]), len(merged) - 1
+    )
     rows = jax.tree.map(lambda x: x[jnp.argsort(order)[: ts.shape[0]]], rows)
     # an output time at a jump is reached just before it
-    reached = jnp.where(rows[0] == prevbefore(ts), ts, rows[0])
-    return end, _trajectory(problem, end, (reached, *rows[1:]))
+    times = jnp.where(rows[0] == prevbefore(ts), ts, rows[0])
+    return end, _make_trajectory(problem, end, (times, *rows[1:]))
 
 
-def _past(carry: IntegrationState, jump: Float[Array, ""]) -> IntegrationState:
+def _pass_jump(carry: IntegrationState, jump: Float[Array, ""]) -> IntegrationState:
     """Carry right after a jump, if it has reached the jump."""
+    # The step before a jump ends at the last number before it and the next begins at the first
+    # after it: a force that compares t with the jump is then evaluated on the right side in every
+    # stage.
     at = (carry.t == prevbefore(jump)) | (carry.t == jump)
     at = at & (carry.result == diffrax.RESULTS.successful)
     carry = eqx.tree_at(lambda c: c.t, carry, jnp.where(at, nextafter(jump), carry.t))
@@ -93,55 +182,120 @@ def _past(carry: IntegrationState, jump: Float[Array, ""]) -> IntegrationState:
     return eqx.tree_at(lambda c: c.solver_state, carry, (inner, worst, *modes))
 
 
-def _through(
+def _integrate_segments(
     problem: Problem, carry: IntegrationState, ts: Any, segments: int
 ) -> tuple[IntegrationState, tuple[Any, ...]]:
     """Integrate through times [s], or pairs of a time and True if it is that of a jump."""
     adjoint: Any = problem.method.adjoint
     if isinstance(adjoint, DiscreteAdjoint):
-        adjoint = adjoint.of(problem, segments)
+        adjoint = room_of(adjoint, problem, segments)
     jumps = problem.method.jump_ts
     last = None if jumps is None else jnp.max(jnp.where(ts[1], -jnp.inf, ts[0]))
 
     def to_next(carry: IntegrationState, t1: Any) -> tuple[IntegrationState, Any]:
-        fine = carry.result == diffrax.RESULTS.successful
+        success = carry.result == diffrax.RESULTS.successful
         goal, jumping = (t1, False) if jumps is None else t1
         if jumps is not None:
             t1 = jnp.where(jnp.any(goal == jumps), prevbefore(goal), goal)
+            # Jumps after the last output time are not gone to, and a time that was passed already
+            # is not gone back to.
             t1 = jnp.where((jumping & (goal > last)) | (t1 < carry.t), carry.t, t1)
-        found = _to(problem, carry, jnp.where(fine, t1, carry.t), adjoint)
-        counts = Counts(
-            carry.counts.accepted + found.accepted,
-            carry.counts.rejected + found.rejected,
-            found.controller_state[2],
-        )
-        after = IntegrationState(
-            t=found.t,
-            y=found.y,
-            step=found.controller_state[0],
-            solver_state=found.solver_state,
-            controller_state=found.controller_state,
-            counts=counts,
-            result=diffrax.RESULTS.where(fine, found.result, carry.result),
-        )
-        row = (after.t, after.y, counts, after.worst)
+        end = _integrate_to(problem, carry, jnp.where(success, t1, carry.t), adjoint)
+        after = continue_from(carry, end)
+        row = (after.t, after.y, after.counts, after.worst)
         if jumps is not None:
-            after = jax.lax.cond(jumping, lambda: _past(after, goal), lambda: after)
+            after = jax.lax.cond(jumping, lambda: _pass_jump(after, goal), lambda: after)
         return after, row
 
     return jax.lax.scan(to_next, carry, ts)
 
 
-def _trajectory(problem: Problem, end: IntegrationState, rows: tuple[Any, ...]) -> Trajectory:
+def _make_trajectory(problem: Problem, end: IntegrationState, rows: tuple[Any, ...]) -> Trajectory:
     """Trajectory from the rows (time, y, counts, residuals) at the output times."""
-    reached, ys, counts, worst = rows
+    times, ys, counts, worst = rows
     first = problem.n_state
     n = first + problem.n_internal
     to_state = lambda y: problem.method.formulation.to_state(problem.model, y[:first])
-    work, impulse = jnp.zeros_like(reached), jnp.zeros((ys.shape[0], 6), ys.dtype)
+    work, impulse = jnp.zeros_like(times), jnp.zeros((ys.shape[0], 6), ys.dtype)
     if problem.method.balances:
         work = ys[:, n]
         impulse = ys[:, n + 1 :] if problem.floating else impulse
     states = jax.vmap(to_state)(ys)
-    own = ys[:, first:n]
-    return Trajectory(reached, states, work, impulse, own, counts, worst, end.result)
+    internal = ys[:, first:n]
+    return Trajectory(times, states, work, impulse, internal, counts, worst, end.result)
+
+
+# Number of output times for one call of the compiled program, between two signs of progress.
+CHUNK = 16
+
+
+class March:
+    """Integration of one problem, in chunks of output times.
+
+    Args:
+        problem: prepared model and method. Problems that differ in numbers only, such as
+            tolerances, share their program.
+        t0: initial time [s].
+        state0: initial state.
+
+    Attributes:
+        parts: trajectories reached so far, as NumPy arrays, one for every call of `to`.
+    """
+
+    def __init__(self, problem: Problem, t0: float, state0: State) -> None:
+        self.problem = problem
+        self.carry: Any = compiled_begin(problem, as_floats(t0), state0)
+        chunk = as_floats(np.full(CHUNK, float(t0)))
+        self.program = cached_program(integrate_times, problem, self.carry, chunk)
+        self.parts: list[Trajectory] = []
+
+    def to(self, times: np.ndarray) -> Trajectory:
+        """Continue to each of the times (k,) [s], or to an earlier event or failure.
+
+        Returns this part of the trajectory.
+        """
+        trajectories = []
+        for start in range(0, len(times), CHUNK):
+            part = times[start : start + CHUNK]
+            # The program has a fixed number of output times; the rest repeats the last one, to
+            # which no step is taken.
+            chunk = np.append(part, np.full(CHUNK - len(part), part[-1]))
+            self.carry, trajectory = self.program(self.problem, self.carry, as_floats(chunk))
+            trajectories.append(_cut_trajectory(trajectory, len(part)))
+            if not self.going:
+                break
+        self.parts.append(_join_trajectories(trajectories))
+        return self.parts[-1]
+
+    @property
+    def going(self) -> bool:
+        """True if neither an event nor a failure has ended the integration."""
+        return same_result(self.carry.result, diffrax.RESULTS.successful)
+
+    def trajectory(self) -> Trajectory:
+        """Trajectory of all parts, without repeats of the last state after an event or failure."""
+        joined = _join_trajectories(self.parts)
+        fresh = np.append(True, np.diff(joined.ts) > 0)
+        count = len(joined.ts) if np.all(fresh) else int(np.argmin(fresh))
+        return _cut_trajectory(joined, max(count, 1))
+
+
+def same_result(a: Any, b: Any) -> bool:
+    """Test whether two known results are the same, by their numbers, which compiles nothing."""
+    return int(jax.tree.leaves(a)[0]) == int(jax.tree.leaves(b)[0])
+
+
+def _read_result(trajectory: Trajectory) -> Any:
+    return trajectory.result
+
+
+def _join_trajectories(parts: list[Trajectory]) -> Trajectory:
+    bare = [eqx.tree_at(_read_result, part, None) for part in parts]
+    joined = jax.tree.map(lambda *x: np.concatenate(x), *bare)
+    return eqx.tree_at(_read_result, joined, parts[-1].result, is_leaf=lambda x: x is None)
+
+
+def _cut_trajectory(trajectory: Trajectory, count: int) -> Trajectory:
+    bare = eqx.tree_at(_read_result, trajectory, None)
+    bare = jax.tree.map(lambda x: np.asarray(x)[:count], bare)
+    return eqx.tree_at(_read_result, bare, trajectory.result, is_leaf=lambda x: x is None)

@@ -1,39 +1,125 @@
-"""Problem of an integration: a prepared model and a method, in the terms of diffrax."""
+"""Problem of an integration: a prepared model and a method, in the terms of diffrax.
+
+A force written as `lambda t, kin: jnp.stack([a * jnp.sin(t), 0.0, 0.0])` hides the number a from
+JAX's rules for reverse mode. `prepare_problem` replaces such a function by a `Closure`, a callable with
+these numbers as leaves, like an `equinox.Module` written for the purpose.
+"""
 
 import dataclasses
-from collections.abc import Callable
+import functools
+import types
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from ...algebra.compiler import MOST_PROGRAMS, kept_jit
 from ...checks.errors import SettingError
-from ...checks.numbers import floats
-from ...checks.shapes import Numbers
-from ...mechanics.internal import internal_count, internal_rates, internal_states, with_internal
+from ...checks.numbers import as_floats
+from ...math.compiler import MOST_PROGRAMS, kept_jit
+from ...math.native.program import native
+from ...mechanics.body import has_positive_masses
+from ...mechanics.internal import internal_count, internal_rates, internal_starts, with_internal
 from ...mechanics.state import State
 from ...mechanics.system import System
+from ..choices import FIRST_STEP
 from ..formulations.base import AbstractFormulation, AbstractModel, Residuals
-from ..formulations.stabilisation import AbstractStabilisation
-from .closed_over import opened
-from .esdirk import NonDenseESDIRK
-from .explicit import NonDenseRungeKutta
-from .rosenbrock import Rodas5P
-from .step_bound import Guard, guard
+from ..formulations.constraints import group_constraints
+from ..formulations.independence import longest_arm, open_limit
+from ..method import Method
+from .solvers import NonDenseESDIRK, NonDenseRungeKutta
 from .stepping import (
+    Guard,
     ProjectedSolver,
     ProjectionLimit,
     StepSizeMemory,
     error_norm,
+    make_guard,
     own_iterations,
     stage_loop,
 )
+
+
+class _Same:
+    """Wrapper that equals itself alone, for objects beside numbers that a function closes over."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+
+class Closure(eqx.Module):
+    """Function whose leaves are the numbers that it closes over or has as defaults.
+
+    Attributes:
+        values: numbers by place in the function's closure, or under "defaults" and "keywords".
+        function: code, globals, closure and defaults of the function.
+    """
+
+    values: dict[str, Any]
+    function: _Same = eqx.field(static=True)
+
+    def __call__(self, *args: Any, **more: Any) -> Any:
+        code, names, cells, defaults, by_name = self.function.value
+        at = self.values
+        places = enumerate(cells)
+        # A new function with other cells and the same code: the user's own function object is
+        # never changed, which another thread may be calling.
+        closure = tuple(types.CellType(at[str(k)]) if str(k) in at else c for k, c in places)
+        function = types.FunctionType(
+            code, names, code.co_name, at.get("defaults", defaults), closure
+        )
+        function.__kwdefaults__ = at.get("keywords", by_name)
+        return function(*args, **more)
+
+
+def convert_closures(tree: Any) -> Any:
+    """Pytree whose functions that close over tracers are replaced by `Closure`s."""
+    return jax.tree.map(lambda leaf: _convert_leaf(leaf, ()), tree)
+
+
+def _convert_leaf(leaf: Any, above: tuple[int, ...]) -> Any:
+    """Leaf, or its `Closure`; `above` are functions that close over it, maybe itself."""
+    # A recursive function closes over itself: followed without end otherwise.
+    if id(leaf) in above:
+        return leaf
+    above = (*above, id(leaf))
+    if isinstance(leaf, functools.partial):
+        inner = jax.tree.map(
+            lambda x: _convert_leaf(x, above), (leaf.func, leaf.args, leaf.keywords)
+        )
+        return eqx.Partial(inner[0], *inner[1], **inner[2]) if _has_tracers(inner) else leaf
+    if not isinstance(leaf, types.FunctionType):
+        return leaf
+    cells = leaf.__closure__ or ()
+    contents = {str(k): _cell_contents(c) for k, c in enumerate(cells)}
+    contents |= {"defaults": leaf.__defaults__, "keywords": leaf.__kwdefaults__}
+    opened_contents = {
+        k: jax.tree.map(lambda x: _convert_leaf(x, above), v) for k, v in contents.items()
+    }
+    # Functions over known numbers stay as they are: they compare equal from call to call, so that
+    # programs are found again.
+    values = {k: v for k, v in opened_contents.items() if _has_tracers(v)}
+    if not values:
+        return leaf
+    rest = (leaf.__code__, leaf.__globals__, cells, leaf.__defaults__, leaf.__kwdefaults__)
+    return Closure(values, _Same(rest))
+
+
+def _cell_contents(cell: Any) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # not assigned yet
+        return None
+
+
+def _has_tracers(tree: Any) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
 
 # Step size control. In comparison with diffrax's defaults (0, 1, 0, 0.9, 10), measured on the
 # tracker and the UAV: as many or a few fewer step attempts, a third to half as many of them
@@ -46,29 +132,11 @@ CONTROL: dict[str, Any] = {
     "factormax": 5.0,
 }
 
+# Result of a run that was not started, as a mass or a tensor of inertia is not positive or not finite.
+MASSES_REFUSED = diffrax.RESULTS.nonfinite_input
+
 # Fields of a method that become arrays, so that other values need no other compilation.
 NUMBERS = ("rtol", "atol", "first_step", "max_step")
-
-Event = Callable[[Float[Array, ""], State], Array]
-
-
-class AbstractMethod(eqx.Module):
-    """Fields of a method that integration uses; `Method` has their meanings and defaults."""
-
-    formulation: eqx.AbstractVar[AbstractFormulation]
-    solver: eqx.AbstractVar[diffrax.AbstractSolver | Literal["auto"]]
-    rtol: eqx.AbstractVar[float | Float[Array, ""]]
-    atol: eqx.AbstractVar[float | Float[Array, ""]]
-    stabilisation: eqx.AbstractVar[AbstractStabilisation]
-    first_step: eqx.AbstractVar[float | Float[Array, ""]]
-    max_steps: eqx.AbstractVar[int]
-    adjoint: eqx.AbstractVar[diffrax.AbstractAdjoint]
-    event: eqx.AbstractVar[Event | None]
-    direction: eqx.AbstractVar[bool | None]
-    jump_ts: eqx.AbstractVar[Numbers | None]
-    balances: eqx.AbstractVar[bool]
-    steps: eqx.AbstractVar[Literal["sensitivities", "state"]]
-    max_step: eqx.AbstractVar[float | Float[Array, ""]]
 
 
 class Counts(eqx.Module):
@@ -114,29 +182,29 @@ class SegmentEnd(NamedTuple):
     result: diffrax.RESULTS
 
 
-# These functions are jitted in order to be traced once only; otherwise the same equations
-# would be traced again at every place where diffrax calls them.
-@eqx.filter_jit
-def _derivative(formulation: AbstractFormulation, *args: Any) -> Any:
+# These functions are traced once only, where otherwise the same equations would be traced again at
+# every place where diffrax calls them, and are machine code of their own on a CPU.
+@native
+def _get_derivative(formulation: AbstractFormulation, *args: Any) -> Any:
     return formulation.derivative(*args)
 
 
-@eqx.filter_jit
-def _project(formulation: AbstractFormulation, *args: Any) -> Any:
+@native
+def _get_projection(formulation: AbstractFormulation, *args: Any) -> Any:
     return formulation.project(*args)
 
 
-@eqx.filter_jit
+@native
 def _at_step(formulation: AbstractFormulation, *args: Any) -> Any:
     return formulation.at_step(*args)
 
 
-@eqx.filter_jit
-def _residuals(formulation: AbstractFormulation, *args: Any) -> Any:
+@native
+def _get_residuals(formulation: AbstractFormulation, *args: Any) -> Any:
     return formulation.residuals(*args)
 
 
-@eqx.filter_jit
+@native
 def _internal_rates(formulation: AbstractFormulation, model: Any, t: Any, x: Any) -> Any:
     system: System = model.system
     return internal_rates(system, t, system.kinematics(formulation.to_state(model, x)))
@@ -155,19 +223,21 @@ class Problem(eqx.Module):
     """
 
     model: AbstractModel
-    method: AbstractMethod
+    method: Method
     floating: bool = eqx.field(static=True)
     n_state: int = eqx.field(static=True)
     n_internal: int = eqx.field(static=True)
 
     def field(self, t: Any, y: Any, args: Any) -> Float[Array, " k"]:
         """Right-hand side y': rates of x and of internal states, flows of energy and momentum."""
-        how, formulation = self.method.stabilisation, self.method.formulation
+        stabilisation, formulation = self.method.stabilisation, self.method.formulation
         t, x = jnp.asarray(t, y.dtype), y[: self.n_state]
         if self.n_internal:
             z = y[self.n_state : self.n_state + self.n_internal]
             args = at_internal(args, z)
-        rate, flows = _derivative(formulation, args, t, x, how)
+        # Flows of energy and momentum come with the derivative, since loads are computed there
+        # anyway; without balances nothing reads them, and they are dropped.
+        rate, flows = _get_derivative(formulation, args, t, x, stabilisation)
         parts = [rate]
         if self.n_internal:
             parts.append(_internal_rates(formulation, args, t, x))
@@ -188,34 +258,51 @@ class Problem(eqx.Module):
         iterations = self.method.stabilisation.iterations_after_step()
         formulation, n = self.method.formulation, self.n_state
 
-        def project(t: Any, y: Any, args: Any) -> Any:
-            x, left = _project(formulation, args, jnp.asarray(t, y.dtype), y[:n], iterations)
-            return jnp.concatenate([x, y[n:]]), jax.lax.stop_gradient(left)
+        def project_vector(t: Any, y: Any, args: Any) -> Any:
+            x, remaining = _get_projection(
+                formulation, args, jnp.asarray(t, y.dtype), y[:n], iterations
+            )
+            return jnp.concatenate([x, y[n:]]), jax.lax.stop_gradient(remaining)
 
-        def residuals(t: Any, y: Any, args: Any) -> Residuals:
-            now = _residuals(formulation, args, jnp.asarray(t, y.dtype), y[:n])
+        def vector_residuals(t: Any, y: Any, args: Any) -> Residuals:
+            now = _get_residuals(formulation, args, jnp.asarray(t, y.dtype), y[:n])
             return jax.lax.stop_gradient(now)
 
         inner: Any = self.method.solver
+        # Dense output costs stages and memory, which only events need: output times end steps
+        # here.
         if isinstance(inner, diffrax.AbstractERK) and self.method.event is None:
             inner = NonDenseRungeKutta(inner)
         if self.method.event is None and own_iterations(inner):
             size = n + self.n_internal
-            own: Any = inner
-            inner = NonDenseESDIRK(own, self.method.rtol, self.method.atol, size)
-        if isinstance(inner, Rodas5P):
-            inner = Rodas5P(n + self.n_internal)
+            esdirk: Any = inner
+            inner = NonDenseESDIRK(esdirk, self.method.rtol, self.method.atol, size)
         inner = stage_loop(inner, self.method.adjoint)
-        held = project if iterations else None
-        far = ProjectionLimit(self.method.rtol, self.method.atol, n) if held is not None else None
-        return ProjectedSolver(inner, held, residuals, self.at_step, far, self._guard())
+        projection = project_vector if iterations else None
+        # An error estimate is that of the step before its projection. Without this limit a step
+        # from which Newton goes to another branch would be accepted.
+        limit = ProjectionLimit(self.method.rtol, self.method.atol, n) if iterations else None
+        return ProjectedSolver(
+            inner, projection, vector_residuals, self.at_step, limit, self._make_guard()
+        )
 
-    def _guard(self) -> Guard | None:
+    def _make_guard(self) -> Guard | None:
         if self.method.steps == "state":
             return None
         tolerance = jnp.maximum(self.method.rtol, self.method.atol)
         solver: Any = self.method.solver
-        return guard(solver, tolerance, self.n_state + self.n_internal)
+        return make_guard(solver, tolerance, self.n_state + self.n_internal)
+
+    def take_step(
+        self, t0: Any, t1: Any, y: Float[Array, " k"], solver_state: Any, solver: Any = None
+    ) -> tuple[Any, Any, Any, Any, diffrax.RESULTS]:
+        """Step from y at t0 to t1 [s]: its end, error estimate, stages, the solver's state, and result.
+
+        Args:
+            solver: that of the problem by default.
+        """
+        solver, term = self.solver() if solver is None else solver, diffrax.ODETerm(self.field)
+        return solver.step(term, t0, t1, y, self.model, solver_state, True)
 
     def controller(self, step: Float[Array, ""]) -> StepSizeMemory:
         """Step size controller by the local error of the state, with the first step [s]."""
@@ -223,12 +310,27 @@ class Problem(eqx.Module):
             controller=diffrax.PIDController(
                 rtol=self.method.rtol,
                 atol=self.method.atol,
+                # Work and impulse are quadratures of the motion: their errors follow its own, and
+                # must not choose its steps.
                 norm=error_norm(self.n_state + self.n_internal),
                 **CONTROL,
             ),
             step=step,
             longest=jnp.asarray(self.method.max_step, step.dtype),
+            unit=jnp.minimum(self.method.first_step / FIRST_STEP, 1.0),
         )
+
+    def is_open(self, worst: Residuals) -> Bool[Array, "*k"]:
+        """True where joints have come open: residuals exceed what size and tolerance allow."""
+        if not self.model.system.joints:
+            return jnp.zeros(jnp.shape(worst.position), bool)
+        # The same gap is large in a small mechanism and round-off in a large one: it is compared
+        # with the longest arm.
+        arm = longest_arm(self.model.system, group_constraints(self.model.system))
+        projected = self.method.stabilisation.iterations_after_step() > 0
+        tolerance = jnp.maximum(self.method.rtol, self.method.atol)
+        limit = open_limit(tolerance, projected=projected)
+        return ~(jnp.maximum(worst.position / arm, worst.angle) <= limit)
 
     def solve(
         self,
@@ -262,7 +364,7 @@ class Problem(eqx.Module):
         )
 
 
-def landing(solution: diffrax.Solution) -> SegmentEnd:
+def read_end(solution: diffrax.Solution) -> SegmentEnd:
     """End of a solution by diffrax."""
     assert solution.ts is not None
     assert solution.ys is not None
@@ -271,13 +373,26 @@ def landing(solution: diffrax.Solution) -> SegmentEnd:
     return SegmentEnd(solution.ts[0], solution.ys[0], *states, *steps, solution.result)
 
 
+def continue_from(carry: IntegrationState, end: SegmentEnd) -> IntegrationState:
+    """State of an integration at the end of a segment that began with the carry; a failure stays."""
+    counts = Counts(
+        carry.counts.accepted + end.accepted,
+        carry.counts.rejected + end.rejected,
+        end.controller_state[2],
+    )
+    success = carry.result == diffrax.RESULTS.successful
+    result = diffrax.RESULTS.where(success, end.result, carry.result)
+    step, memory = end.controller_state[0], (end.solver_state, end.controller_state)
+    return IntegrationState(end.t, end.y, step, *memory, counts, result)
+
+
 def _as_arrays(event: Any) -> Any:
     """Event with its numbers as arrays, so that other numbers need no other compilation."""
     number = lambda x: isinstance(x, float | np.floating | np.ndarray)
-    return jax.tree.map(lambda x: floats(x) if number(x) else x, event)
+    return jax.tree.map(lambda x: as_floats(x) if number(x) else x, event)
 
 
-def prepare(system: System, method: AbstractMethod) -> Problem:
+def prepare_problem(system: System, method: Method) -> Problem:
     """Prepare a problem: all that does not depend on the state.
 
     Raises:
@@ -288,12 +403,14 @@ def prepare(system: System, method: AbstractMethod) -> Problem:
             'The solver "auto" is for simulate, which sees the values of the start. Elsewhere give '
             "Method(solver=choose_solver(system, state))."
         )
-    numbers = {k: floats(getattr(method, k)) for k in NUMBERS}
+    # Tolerances are arrays of the problem, so that a second run at others uses the first one's
+    # program.
+    numbers = {k: as_floats(getattr(method, k)) for k in NUMBERS}
     if method.jump_ts is not None:
-        numbers["jump_ts"] = floats(method.jump_ts)
+        numbers["jump_ts"] = as_floats(method.jump_ts)
     method = dataclasses.replace(method, **numbers)
     # numbers that functions close over become leaves, so that they can be differentiated
-    system, method = opened((system, method))
+    system, method = convert_closures((system, method))
     method = eqx.tree_at(
         lambda m: m.event, method, _as_arrays(method.event), is_leaf=lambda x: x is None
     )
@@ -318,19 +435,34 @@ def _traced_size(structure: Any, leaves: tuple[Any, ...]) -> int:
     return eqx.filter_eval_shape(formulation.to_vector, model, state).shape[0]
 
 
-def begin(problem: Problem, t0: Float[Array, ""], state0: State) -> IntegrationState:
+def fit_first_step(problem: Problem, span: Any) -> Problem:
+    """Problem whose first step is at most a hundredth of the run's time [s], in any unit of time."""
+    first = as_floats(problem.method.first_step)
+    share = jax.lax.stop_gradient(jnp.abs(span)) / 100
+    step = jnp.where((share > 0) & (share < first), share, first)
+    return eqx.tree_at(lambda problem: problem.method.first_step, problem, step)
+
+
+def begin_integration(problem: Problem, t0: Float[Array, ""], state0: State) -> IntegrationState:
     """Initial carry of an integration at t0 [s]."""
     x = problem.method.formulation.to_vector(problem.model, state0)
     extra = (7 if problem.floating else 1) if problem.method.balances else 0
-    own = [internal_states(problem.model.system)] if problem.n_internal else []
-    y = jnp.concatenate([x, *own, jnp.zeros(extra, x.dtype)])
+    system = problem.model.system
+    internal = [internal_starts(system, system.kinematics(state0))] if problem.n_internal else []
+    y = jnp.concatenate([x, *internal, jnp.zeros(extra, x.dtype)])
     step = jnp.asarray(problem.method.first_step, dtype=y.dtype)
+    # diffrax makes these states itself at the start of a solve. They are made here, since an
+    # integration in chunks hands them on and a loop needs their structure beforehand.
     solver, controller = problem.solver(), problem.controller(step).wrap(1)
     terms = diffrax.ODETerm(problem.field)
     solver_state = solver.init(terms, t0, t0 + step, y, problem.model)
     _, controller_state = controller.init(
         terms, t0, t0 + step, y, None, problem.model, solver.func, solver.error_order(terms)
     )
+    # a run without positive masses takes no step: with negative ones it may look plausible
+    refused: Any = MASSES_REFUSED
+    positive = has_positive_masses(system.bodies)
+    result = diffrax.RESULTS.where(positive, diffrax.RESULTS.successful, refused)
     # as arrays, so that the initial and the later controller states have the same structure
     controller_state = jax.tree.map(jnp.asarray, controller_state)
     none = jnp.zeros((), int)
@@ -341,9 +473,9 @@ def begin(problem: Problem, t0: Float[Array, ""], state0: State) -> IntegrationS
         solver_state,
         controller_state,
         Counts(none, none, none),
-        diffrax.RESULTS.successful,
+        result,
     )
 
 
 # Eager calls of this do not compile again for a system of the same structure.
-compiled_begin = kept_jit(begin)
+compiled_begin = kept_jit(begin_integration)

@@ -1,1 +1,1 @@
-"""Independent coordinates and velocities of mechanisms, and the motion in them. Floor 6."""
+"""Independent coordinates and velocities of mechanisms, and the motion in them."""

@@ -4,7 +4,7 @@ A point of a state space is a posture and motion of a mechanism that satisfy its
 are vectors
 
     v = (dq, du, dz):   independent coordinates (dof,), their velocities (dof,), and actuator states
-                        of the forces (m,),
+                        of the forces (m,); turns that forces count belong to the coordinates,
 
 such that dq/dt = u: the dq of a rotation is a rotation vector in body axes, and its u the angular
 velocity in these axes. Trim, linearisation, shooting and filters use mechanisms by this interface.
@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ...algebra.derivative import value_and_jacobian
-from ...algebra.space import AbstractSpace, Point
-from ...checks.errors import StateError, concrete, named_places
+from ...checks.errors import StateError, has_values, named_places
+from ...math.derivative import value_and_jacobian
+from ...math.space import AbstractSpace, Point
 from ...mechanics.state import State
 from ...mechanics.system import System
 
@@ -49,8 +49,17 @@ class AbstractStateSpace(AbstractSpace):
         """Positions and velocities of all bodies (n, .), on the constraints at time t [s]."""
 
     @abstractmethod
-    def from_state(self, state: State) -> Point:
-        """Point that belongs to a state of all bodies on the joints."""
+    def from_state(self, state: State, internal: Float[Array, " m"] | None = None) -> Point:
+        """Point that belongs to a state of all bodies on the joints.
+
+        Args:
+            internal: internal states of the forces (m,), as a run or a plant has them, which also say
+                the whole turns of hinges; by default those that the system's forces hold.
+        """
+
+    @abstractmethod
+    def internal_at(self, x: Point) -> Float[Array, " m"]:
+        """Internal states of the forces at a point (m,), with the turns of hinges counted."""
 
     @abstractmethod
     def rates(self, x: Point, t: Time = 0.0, system: System | None = None) -> Float[Array, " size"]:
@@ -79,14 +88,14 @@ def error_rates(
     v: Float[Array, " size"],
     t: Time = 0.0,
     system: System | None = None,
-    still: System | None = None,
+    reference_system: System | None = None,
 ) -> Float[Array, " size"]:
     """Rate dv/dt of the error v between a motion from retract(x, v) and the motion from x.
 
     Args:
-        system: system with the forces of the first motion. still: that of the motion from x.
+        system: system with the forces of the first motion. reference_system: that of the motion from x.
     """
-    return _departure(space, x, v, space.rates(x, t, still), t, system)
+    return _departure_rate(space, x, v, space.rates(x, t, reference_system), t, system)
 
 
 def error_rate_columns(
@@ -105,11 +114,13 @@ def error_rate_columns(
         count: number of z.
     """
     size = space.size
+    # Errors and inputs are differentiated in one pass: both motions have the same rates at the
+    # origin.
     origin = jnp.zeros(size + count)
     rates = lambda z: space.rates(space.retract(x, z[:size]), t, system(z[size:]))
     rate, columns = value_and_jacobian(rates, origin)
-    apart = lambda z, rate_y: _apart(space, x, z[:size], rate_y, rate)
-    push = lambda e, column: jax.jvp(apart, (origin, rate), (e, column))[1]
+    error_rate = lambda z, rate_y: _separation_rate(space, x, z[:size], rate_y, rate)
+    push = lambda e, column: jax.jvp(error_rate, (origin, rate), (e, column))[1]
     return jax.vmap(push, in_axes=(0, -1), out_axes=-1)(jnp.eye(size + count), columns)
 
 
@@ -125,10 +136,10 @@ def motion_rates(
     Args:
         system: system with the forces of the motion.
     """
-    return _departure(space, x, v, jnp.zeros_like(v), t, system)
+    return _departure_rate(space, x, v, jnp.zeros_like(v), t, system)
 
 
-def _departure(
+def _departure_rate(
     space: AbstractStateSpace,
     x: Point,
     v: Float[Array, " size"],
@@ -137,10 +148,10 @@ def _departure(
     system: System | None,
 ) -> Float[Array, " size"]:
     """Rate dv/dt of the error v relative to a reference point x that moves at rate_x."""
-    return _apart(space, x, v, space.rates(space.retract(x, v), t, system), rate_x)
+    return _separation_rate(space, x, v, space.rates(space.retract(x, v), t, system), rate_x)
 
 
-def _apart(
+def _separation_rate(
     space: AbstractStateSpace,
     x: Point,
     v: Float[Array, " size"],
@@ -148,13 +159,15 @@ def _apart(
     rate_x: Float[Array, " size"],
 ) -> Float[Array, " size"]:
     """Rate dv/dt of the error v between points that move at rate_y and rate_x."""
+    # Errors are in a flat space, points on a curved one: the rate of an error is the derivative of
+    # a difference of two moving points, which is exact for rotations too.
     y = space.retract(x, v)
 
-    def apart(s: Float[Array, ""]) -> Float[Array, " size"]:
+    def separate(s: Float[Array, ""]) -> Float[Array, " size"]:
         return space.difference(space.retract(y, s * rate_y), space.retract(x, s * rate_x))
 
     zero = jnp.zeros((), rate_y.dtype)
-    return jax.jvp(apart, (zero,), (jnp.ones_like(zero),))[1]
+    return jax.jvp(separate, (zero,), (jnp.ones_like(zero),))[1]
 
 
 def check_regular(space: AbstractStateSpace, x: Point, t: Time = 0.0) -> None:
@@ -162,24 +175,24 @@ def check_regular(space: AbstractStateSpace, x: Point, t: Time = 0.0) -> None:
 
     Traced values are not checked.
     """
-    found = space.conditioning(x, t)
-    if concrete(found) and not float(found) > SINGULAR:
-        own = ", ".join(name for name, _ in space.names[: space.dof])
+    conditioning = space.conditioning(x, t)
+    if has_values(conditioning) and not float(conditioning) > SINGULAR:
+        independent_names = ", ".join(name for name, _ in space.names[: space.dof])
         raise StateError(
-            f"The posture is singular for the independent coordinates {own}: they do not determine "
-            f"the others there (conditioning {float(found):.2g}, at least {SINGULAR:.0e} is wanted). "
+            f"The posture is singular for the independent coordinates {independent_names}: they do not determine "
+            f"the others there (conditioning {float(conditioning):.2g}, at least {SINGULAR:.0e} is required). "
             "Choose others, by the names in TreeSpace(system, state, independent=...), or another posture."
         )
 
 
-def places_of(space: AbstractStateSpace, names: Any, what: str) -> tuple[int, ...]:
+def places_of(space: AbstractStateSpace, names: Any, subject: str) -> tuple[int, ...]:
     """Indices of the named components of an error.
 
     Args:
-        what: subject of the error's sentence, such as "The free states".
+        subject: subject of the error's sentence, such as "The free states".
 
     Raises:
         SettingError: `names` is not a list of names, or has an unknown or a repeated name.
     """
-    known = [name for name, _ in space.names]
-    return named_places(names, known, what, "state")
+    state_names = [name for name, _ in space.names]
+    return named_places(names, state_names, subject, "state")

@@ -9,35 +9,140 @@ analysis of constrained dynamic systems, J. Mechanical Design 104 (1982) 247-255
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
-from ...algebra.compiler import kept_jit
 from ...checks.errors import ModelError
+from ...math.compiler import kept_jit
 from ...mechanics.state import State
 from ..formulations.constraints import Constraints
-from ..tree.closures import closure_rows
-from ..tree.coordinates import TreeCoordinates, moved, read
-from ..tree.frames import columns
-from ..tree.motion import motion
+from ..formulations.independence import DEPENDENT, longest_arm, row_scales
+from ..tree.closures import TreeModel, closure_rows
+from ..tree.coordinates import TreeCoordinates, read_coordinates, retract_coordinates
+from ..tree.motion import compute_motion
 from ..tree.parameters import TreeParameters
-from ..tree.projection import TreeModel
+from ..tree.topology import SpanningTree, motion_columns
 
-# Singular values below this fraction of the largest count as zero.
-RANK_TOLERANCE = 1e-9
-# Loops count as closed if their residuals, lengths [m] or cosines, are below this.
+BASE = (
+    *((f"r_{k}", "m") for k in "xyz"),
+    *((f"theta_{k}", "rad") for k in "xyz"),
+    *((f"v_{k}", "m/s") for k in "xyz"),
+    *((f"omega_{k}", "rad/s") for k in "xyz"),
+)
+
+
+def velocity_names(tree: SpanningTree) -> tuple[tuple[str, str], ...]:
+    """Name and unit of every velocity of the spanning tree, as those of its coordinate.
+
+    The names are `joint.angle`, `joint.displacement`, `joint.angle_1` and `joint.angle_2` of a universal
+    joint, `joint.rotation_x` of a spherical one, `body.displacement_x` of a free body.
+    """
+    name_units: list[tuple[str, str]] = []
+    owners = [
+        tree.joints[s.joint] if s.joint is not None else tree.bodies[s.body] for s in tree.steps
+    ]
+    labels = [
+        [
+            (owner, name.replace(" vector", "").replace(", ", "_"), unit)
+            for name, unit in coordinates
+        ]
+        for owner, coordinates in zip(
+            owners, (s.motion.coordinates for s in tree.steps), strict=True
+        )
+    ]
+    every = [(owner, name) for step in labels for owner, name, _ in step]
+    occurrences: dict[tuple[str, str], int] = {}
+    for step in labels:
+        for owner, name, unit in step:
+            occurrences[owner, name] = occurrences.get((owner, name), 0) + 1
+            number = f"_{occurrences[owner, name]}" if every.count((owner, name)) > 1 else ""
+            name_units.append((f"{owner}.{name}{number}", unit))
+    return tuple(name_units)
+
+
+def signs_of(tree: SpanningTree) -> list[float]:
+    """Signs of the tree's velocities: -1 for scalar motions of joints passed from j to i."""
+    backward = {link.joint for link in tree.links if not link.forward}
+    signs = []
+    for f in motion_columns(tree).frame:
+        step = tree.steps[f - 1]
+        signs.append(-1.0 if step.joint in backward and not step.motion.velocities else 1.0)
+    return signs
+
+
+# The independent coordinates are followed in parts of at most `_LONGEST` [rad], [m], with
+# `_STEPS_EACH` steps of Newton's method each, so that it stays on its branch; at most `_MOST_PARTS`
+# are gone. From there at most `_MOST_STEPS` more are made: steps below `_ROUND_OFF` that no longer
+# halve end it.
+_LONGEST, _STEPS_EACH, _MOST_PARTS = 0.1, 3, 1000
+_MOST_STEPS, _ROUND_OFF = 30, 1e-8
+
+Step = Callable[[TreeCoordinates], tuple[TreeCoordinates, Float[Array, ""]]]
+
+
+def closed_from(
+    tree: SpanningTree, at: TreeCoordinates, displacement: Float[Array, " n"], step: Step
+) -> tuple[TreeCoordinates, Bool[Array, ""]]:
+    """Coordinates with closed loops, and whether Newton's method has come to rest there.
+
+    Derivatives of the first and second order are those of the implicit function.
+
+    Args:
+        at: independent coordinates as wanted, dependent ones as they last were.
+        displacement: how far the independent ones have moved since (n,), in the tree's velocities.
+        step: Newton's, of the dependent coordinates; and its largest component.
+    """
+    constant = jax.lax.stop_gradient
+    displacement = constant(displacement)
+    # The independent coordinates are approached in short parts: Newton's method from far away may land on
+    # another branch of the mechanism.
+    parts = jnp.ceil(jnp.max(jnp.abs(displacement), initial=0.0) / _LONGEST)
+    part = displacement / jnp.maximum(parts, 1.0)
+    # farther away, and where the distance is no number, nothing is followed and nothing found
+    is_near = parts <= _MOST_PARTS
+    on_the_way = jnp.where(is_near, _STEPS_EACH * parts, 0.0)
+
+    def is_unfinished(carry: Any) -> Array:
+        _, size, before, k = carry
+        stalled = (size < _ROUND_OFF) & ~(size < 0.5 * before)
+        unfinished = (size > 0) & ~stalled & (k < on_the_way + _MOST_STEPS)
+        return is_near & ((k < on_the_way) | unfinished)
+
+    def step_once(carry: Any) -> Any:
+        now, size, _, k = carry
+        onwards = (k < on_the_way) & (jnp.mod(k, _STEPS_EACH) == 0)
+        after, new = step(retract_coordinates(tree, now, jnp.where(onwards, part, 0.0)))
+        return after, new, size, k + 1
+
+    start = retract_coordinates(tree, constant(at), -displacement)
+    # with the axes of a stack from the first on: JAX goes through the loop until they do not change
+    endless, none = parts + jnp.inf, 0.0 * parts
+    closed_coordinates = jax.lax.while_loop(
+        is_unfinished, step_once, (start, endless, endless, none)
+    )[0]
+    # the values found, with the derivatives of the given ones; of two steps more, the
+    # derivatives are right up to the third
+    # The search has no derivative. The two steps that follow carry it, each of which doubles the order up
+    # to which it is right.
+    at = jax.tree.map(lambda a, b: b + (a - constant(a)), at, constant(closed_coordinates))
+    at, sizes = jax.lax.scan(lambda now, _: step(now), at, length=2)
+    return at, is_near & (constant(sizes[-1]) <= _ROUND_OFF)
+
+
+# Loops count as closed if their residuals, cosines or lengths over the longest arm, are below this.
 CLOSED = 1e-9
-# Distance along the mechanism's motions at which a posture has its neighbours [rad], [m].
+# Distance along the mechanism's motions at which a posture has its neighbours, as an angle [rad].
 APART = 1e-2
 # Displacement for differences [rad], [m], and the share of the rows' size that is more than their round-off.
 _SHORT, _GAINED = 1e-4, 1e-5
-# Weight of the columns of spherical joints, which makes them dependent before angles and
-# displacements: a component of a rotation is a poor coordinate.
-_SPHERICAL = 100.0
+# Weights of the columns of spherical joints and of displacements, the latter per longest arm, which make
+# them dependent before angles: a component of a rotation is a poor coordinate.
+_SPHERICAL, _SLIDING = 100.0, 10.0
 
 
 class Selection(NamedTuple):
@@ -49,7 +154,7 @@ class Selection(NamedTuple):
 
 
 def rank_of_rows(J: np.ndarray, size: float = 0.0) -> int:
-    """Rank of a matrix: the number of singular values above `RANK_TOLERANCE` times the largest.
+    """Rank of a matrix: the number of singular values above `DEPENDENT` times the largest.
 
     Args:
         size: size of such matrices, in comparison with which all singular values may be zero.
@@ -57,45 +162,49 @@ def rank_of_rows(J: np.ndarray, size: float = 0.0) -> int:
     if not J.size:
         return 0
     values = np.linalg.svd(J, compute_uv=False)
-    return int(np.sum(values > RANK_TOLERANCE * max(values[0], size))) if values[0] > 0 else 0
+    return int(np.sum(values > DEPENDENT * max(values[0], size))) if values[0] > 0 else 0
 
 
-def _pivots(matrix: np.ndarray) -> np.ndarray:
+def _pivot_order(matrix: np.ndarray) -> np.ndarray:
     """Order in which QR factorisation with pivoting takes the columns."""
     _, order = scipy.linalg.qr(matrix, mode="r", pivoting=True)  # pyright: ignore[reportAssignmentType]
     return order
 
 
-def select(
-    J: np.ndarray, spherical: np.ndarray, wanted: tuple[int, ...], names: tuple[str, ...]
+def select_velocities(
+    J: np.ndarray, weights: np.ndarray, required: tuple[int, ...], names: tuple[str, ...]
 ) -> Selection:
     """Independent and dependent velocities, and independent rows, of J (m, n).
 
     Args:
-        spherical: (n,), true for velocities of spherical joints.
-        wanted: indices of velocities that must be independent. names: names of all velocities.
+        weights: preference (n,) of each velocity for being a dependent one.
+        required: indices of velocities that must be independent. names: names of all velocities.
 
     Raises:
         ModelError: the wanted velocities are not independent of each other.
     """
     n = J.shape[1]
     rank = rank_of_rows(J)
-    if len(wanted) > n - rank:
-        listed = ", ".join(names[k] for k in wanted)
+    if len(required) > n - rank:
+        listed = ", ".join(names[k] for k in required)
         raise ModelError(
-            f"The mechanism has {n - rank} independent velocities in its joints, but {len(wanted)} "
-            f"are wanted: {listed}."
+            f"The mechanism has {n - rank} independent velocities in its joints, but {len(required)} "
+            f"were chosen: {listed}."
         )
-    others = np.array([k for k in range(n) if k not in wanted], dtype=int)
-    weighted = J[:, others] * np.where(spherical[others], _SPHERICAL, 1.0)
+    others = np.array([k for k in range(n) if k not in required], dtype=int)
+    # Pivoting takes the largest columns as dependent first; the weights make it prefer coordinates that
+    # are poor independent ones.
+    weighted = J[:, others] * weights[others]
     if not rank:
         return Selection(tuple(range(n)), (), ())
-    order = _pivots(weighted)
+    # QR factorisation with column pivoting finds the set of dependent velocities that the rows determine
+    # best (R. A. Wehage, E. J. Haug 1982).
+    order = _pivot_order(weighted)
     dependent = np.sort(others[order[:rank]])
-    rows = np.sort(_pivots(J[:, dependent].T)[:rank])
+    rows = np.sort(_pivot_order(J[:, dependent].T)[:rank])
     values = np.linalg.svd(J[np.ix_(rows, dependent)], compute_uv=False)
-    if values[-1] <= RANK_TOLERANCE * np.linalg.norm(J, 2):
-        listed = ", ".join(names[k] for k in wanted)
+    if values[-1] <= DEPENDENT * np.linalg.norm(J, 2):
+        listed = ", ".join(names[k] for k in required)
         raise ModelError(f"The velocities {listed} depend on each other in this posture.")
     independent = tuple(k for k in range(n) if k not in dependent)
     return Selection(independent, tuple(map(int, dependent)), tuple(map(int, rows)))
@@ -112,39 +221,41 @@ def ranks_nearby(
     Args:
         value_and_rows: constraint values (m,) and rows (m, n) after a displacement (n,).
     """
-    ahead, back = (value_and_rows(APART * sign * _mixed(J.shape[1], 0))[1] for sign in (1, -1))
+    rows_ahead, rows_behind = (
+        value_and_rows(APART * sign * _mixed_direction(J.shape[1], 0))[1] for sign in (1, -1)
+    )
     # rows may vanish altogether in the posture itself
-    size = max(float(np.linalg.norm(x, 2)) for x in (J, ahead, back)) if J.size else 0.0
+    size = max(float(np.linalg.norm(x, 2)) for x in (J, rows_ahead, rows_behind)) if J.size else 0.0
     rank = rank_of_rows(J, size)
     U, _, Vt = np.linalg.svd(J)
     free = Vt[rank:]
     best = rank
     if len(free) and rank < len(J):
-        step = _mixed(len(free), 0) @ free
-        ahead, back = (value_and_rows(_SHORT * sign * step)[1] for sign in (1, -1))
-        gains = U[:, rank:].T @ (ahead - back) @ free.T / (2 * _SHORT)
+        step = _mixed_direction(len(free), 0) @ free
+        rows_ahead, rows_behind = (value_and_rows(_SHORT * sign * step)[1] for sign in (1, -1))
+        gains = U[:, rank:].T @ (rows_ahead - rows_behind) @ free.T / (2 * _SHORT)
         best += int(np.sum(np.linalg.svd(gains, compute_uv=False) > _GAINED * size))
     for seed in range(3):
-        step = APART * _mixed(len(free), seed) @ free
+        step = APART * _mixed_direction(len(free), seed) @ free
         for _ in range(30):
-            value, there = value_and_rows(step)
+            value, rows = value_and_rows(step)
             if np.max(np.abs(value), initial=0.0) < 1e-14:
                 break
-            step = step - np.linalg.pinv(there, rcond=1e-6) @ value
-        value, there = value_and_rows(step)
+            step = step - np.linalg.pinv(rows, rcond=1e-6) @ value
+        value, rows = value_and_rows(step)
         if np.max(np.abs(value), initial=0.0) < 1e-10:
-            best = max(best, rank_of_rows(there, size))
+            best = max(best, rank_of_rows(rows, size))
     return rank, best
 
 
-def _mixed(count: int, seed: int) -> np.ndarray:
+def _mixed_direction(count: int, seed: int) -> np.ndarray:
     """Direction (count,) without any pattern."""
     weights = np.random.default_rng(seed).standard_normal(count)
     return weights / max(np.linalg.norm(weights), 1e-300)
 
 
 # operation by operation it is a hundred small programs
-compiled_read = kept_jit(read)
+compiled_read = kept_jit(read_coordinates)
 
 
 @kept_jit
@@ -152,35 +263,46 @@ def _rows_after(
     parameters: TreeParameters, constraints: Constraints, t: Array, at: TreeCoordinates, by: Array
 ) -> tuple[Array, Array]:
     """Values (m,) and columns (m, n) of the rows after a displacement."""
-    moving = motion(parameters, moved(parameters.tree, at, by))
-    found = closure_rows(parameters, constraints, t, moving)
-    return found.value, found.J
+    moving = compute_motion(parameters, retract_coordinates(parameters.tree, at, by))
+    rows = closure_rows(parameters, constraints, t, moving)
+    return rows.value, rows.J
 
 
-def chosen(
-    model: TreeModel, state: State, t: float, wanted: tuple[int, ...], names: tuple[str, ...]
+def choose_velocities(
+    model: TreeModel, state: State, t: float, required: tuple[int, ...], names: tuple[str, ...]
 ) -> Selection:
     """Select the velocities at a posture; raises `ModelError` if the posture is singular."""
     tree, parameters = model.parameters.tree, model.parameters
-    count = len(columns(tree).frame)
+    count = len(motion_columns(tree).frame)
     if not model.constraints.groups:
         return Selection(tuple(range(count)), (), ())
     at, time = compiled_read(parameters, state), jnp.asarray(t, dtype=float)
     rows = lambda by: _rows_after(parameters, model.constraints, time, at, jnp.asarray(by))
     after = lambda by: tuple(map(np.asarray, rows(by)))
     value, J = after(np.zeros(count))
+    arm = float(longest_arm(model.system, model.constraints))
+    rates = np.where(motion_columns(tree).angular > 0, 1.0, arm)
+    size = np.asarray(row_scales(model.constraints, arm))
+
+    def after_unit(by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values and rows without units after a displacement without units."""
+        residuals, matrix = after(by * rates)
+        return residuals * size, matrix * size[:, None] * rates
+
     joints = ", ".join(tree.joints[k] for k in tree.cut)
-    if np.max(np.abs(value), initial=0.0) > CLOSED:
+    if np.max(np.abs(value * size), initial=0.0) > CLOSED:
         raise ModelError(
             f"The loops closed by {joints} are open by {np.max(np.abs(value)):.3g} at the given "
             "state: find a consistent one with stmuav_jax.assemble(system, state)."
         )
-    here, nearby = ranks_nearby(J, after)  # pyright: ignore[reportArgumentType]
-    if nearby > here:
+    present_rank, nearby_rank = ranks_nearby(J * size[:, None] * rates, after_unit)
+    if nearby_rank > present_rank:
         raise ModelError(
             f"The given posture is singular: the loops closed by {joints} leave "
-            f"{count - here} independent velocities there, but {count - nearby} in the "
+            f"{count - present_rank} independent velocities there, but {count - nearby_rank} in the "
             "postures around. Choose the coordinates at another posture of the same mechanism."
         )
-    spherical = np.array([not tree.steps[f - 1].motion.flat for f in columns(tree).frame])
-    return select(J, spherical, wanted, names)
+    spherical = np.array([not tree.steps[f - 1].motion.flat for f in motion_columns(tree).frame])
+    sliding = motion_columns(tree).angular <= 0
+    weights = np.where(spherical, _SPHERICAL, np.where(sliding, _SLIDING, 1.0))
+    return select_velocities(J * size[:, None] * rates, weights, required, names)

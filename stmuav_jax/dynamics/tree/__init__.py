@@ -1,1 +1,1 @@
-"""Equations of motion in the relative coordinates of a spanning tree. Floor 5."""
+"""Equations of motion in the relative coordinates of a spanning tree."""

@@ -10,59 +10,220 @@ form) and the loads, J from the loop-closing joints' primitives and the axes S_k
 floats, all are written in the base's axes and do not depend on the position of the base.
 
 Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 6 (composite inertias)
-and ch. 8 (closed loops). Derivation: docs/dynamics.md.
+and ch. 8 (closed loops). Derivation: docs/theory.md.
 """
 
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from ...algebra import lapack
-from ...algebra.compiler import kept_jit
-from ...algebra.linalg import solve_saddle
-from ...algebra.rotation import conjugate, cross, product, rotation_matrix
-from ...algebra.stacked import apply, apply_transposed
+from ...checks.numbers import as_jax
+from ...math import lapack
+from ...math.compiler import kept_jit
+from ...math.derivative import directional_derivative
+from ...math.linalg import solve_saddle
+from ...math.rotation import conjugate, cross, product, rotation_matrix
+from ...math.stacked import apply_matrix, apply_transposed, sum_columns
 from ...mechanics.constraint import ROWS
-from ...mechanics.load import total_load
-from ...mechanics.state import State
+from ...mechanics.load import Load, total_load
+from ...mechanics.state import Kinematics, State
 from ...mechanics.system import System
-from ..formulations.base import AbstractFormulation, Accelerations, Flows, Residuals
-from ..formulations.constraints import constraints
-from ..formulations.reactions import Reactions, joint_reactions
+from ..formulations.base import (
+    AbstractFormulation,
+    Accelerations,
+    Flows,
+    Reactions,
+    Residuals,
+    joint_points,
+    joint_reactions,
+)
+from ..formulations.constraints import Constraints, group_constraints
+from ..formulations.independence import find_independent_rows, turn_rows
 from ..formulations.stabilisation import AbstractStabilisation
-from .closures import Placed, Rows, closure_rows, in_world, kinematics
+from .closures import (
+    Placed,
+    Rows,
+    TreeModel,
+    all_columns,
+    close_loops,
+    closure_rows,
+    compute_residuals,
+    held_rows,
+    in_world,
+    interpolate_posture,
+    make_kinematics,
+    measure_nearness,
+    row_frames,
+    step_rows,
+    turned_rows,
+    way_along,
+)
 from .coordinates import (
     TreeCoordinates,
-    filled,
-    join,
-    moved,
-    normalised,
-    rates,
-    read,
-    split,
+    coordinate_rates,
+    fill_coordinates,
+    join_coordinates,
+    normalise_vectors,
+    read_coordinates,
+    retract_coordinates,
+    split_vector,
     with_unit_vectors,
 )
-from .derivatives import forward_dynamics
-from .elimination import has_small_blocks
 from .motion import (
+    BranchElimination,
     TreeMotion,
-    bias,
+    bias_force,
     bias_of_base,
     body_accelerations,
-    inertia,
+    composite_inertia,
+    compute_motion,
+    eliminate_branches,
+    first_solution,
+    further_solution,
+    has_small_blocks,
     mass_matrix,
-    motion,
+    needed_wrenches,
     wrenches_by_frame,
 )
-from .parameters import TreeParameters, euler_parameters, tree_parameters
-from .projection import TreeModel, all_columns, closed, left
-from .reactions import tree_reactions
-from .singular import interpolated, kept_rows, nearness
-from .topology import spanning_tree
+from .parameters import TreeParameters, by_frame, euler_parameters, tree_parameters
+from .topology import (
+    SpanningTree,
+    backward_pass,
+    forward_pass,
+    motion_columns,
+    pick_entries,
+    spanning_tree,
+)
+
+
+def tree_reactions(
+    system: System,
+    tree: SpanningTree,
+    kin: Kinematics,
+    load: Load,
+    rates: Accelerations,
+    cut: Reactions,
+) -> Reactions:
+    """Reactions at all joints, from those of the loop-closing joints.
+
+    A joint of the tree transmits the wrench that the bodies behind it need for their
+    accelerations beyond the loads and the reactions of loop-closing joints.
+
+    Args:
+        load: sum of the loads of all force elements.
+        cut: reactions at the loop-closing joints, with zeros for the joints of the tree.
+    """
+    n = system.n_bodies
+    bodies = system.bodies
+    origin = kin.r[:1]
+    R, omega = kin.R_wb[:-1], kin.omega[:-1]
+    spin = jnp.einsum("nab,nb->na", bodies.inertia, omega)
+    turning = jnp.einsum("nab,nb->na", bodies.inertia, rates.omega_rate) + jnp.cross(omega, spin)
+    # Newton and Euler for each body give the wrench that its joints have to transmit in sum; in a tree
+    # the sums over the bodies behind a joint determine each joint by itself.
+    force = bodies.mass[:, None] * rates.v_rate - load.force[:-1]
+    moment = jnp.einsum("nab,nb->na", R, turning - load.moment[:-1])
+    # Moments are taken about the first body rather than about the world's origin: far from the origin
+    # they would be differences of large numbers.
+    moment = moment + jnp.cross(kin.r[:-1] - origin, force)
+    points = joint_points(system, kin)[0] if system.joints else jnp.zeros((0, 3))
+    about = cut.moment + jnp.cross(points - origin, cut.force)
+    # Loop-closing joints act on their two bodies with opposite signs; their multipliers are known, and
+    # their wrenches count as loads on the tree.
+    ends = np.zeros((n + 1, len(system.joints)))
+    names = list(kin.names)
+    for k, joint in enumerate(system.joints):
+        ends[names.index(joint.body_j), k] += 1.0
+        ends[names.index(joint.body_i), k] -= 1.0
+    force, moment = force - ends[:n] @ cut.force, moment - ends[:n] @ about
+    behind = np.zeros((len(system.joints), n))
+    for joint, sign, below in tree.behind():
+        behind[joint, list(below)] = sign
+    force, moment = behind @ force, behind @ moment
+    moment = moment - jnp.cross(points - origin, force)
+    return Reactions(cut.force + force, cut.moment + moment)
+
+
+Solution = tuple[Float[Array, "l *s"], Float[Array, "m *s"]]
+
+
+@eqx.filter_custom_jvp
+def forward_dynamics(
+    parameters: TreeParameters,
+    constraints: Constraints,
+    moving: TreeMotion,
+    load: Float[Array, "6 F *s"],
+    rows: Rows | None,
+) -> Solution:
+    """Accelerations (l,), in the order of `mass_matrix`, and multipliers (m,).
+
+    Args:
+        load: wrenches on the frames, see `wrenches_by_frame`.
+        rows: constraint rows of the loop closures; None without any.
+    """
+    return first_solution(parameters.tree, _eliminate_loads(parameters, moving, load, rows))
+
+
+@forward_dynamics.def_jvp
+def _forward_dynamics_jvp(primals: Any, tangents: Any) -> tuple[Solution, Solution]:
+    parameters, _, moving, load, rows = primals
+    # The derivative is not taken through the elimination: the tangents of the residuals M x + h - J^T y
+    # and gamma - J x cost one pass over the tree, and the blocks that solve for them exist already.
+    elimination = _eliminate_loads(parameters, moving, load, rows)
+    x, y = first_solution(parameters.tree, elimination)
+    residual = lambda *setting: inverse_dynamics_residual(*setting, x, y)  # pyright: ignore[reportCallIssue]
+    _, residual_tangents = directional_derivative(residual, primals, tangents)
+    return (x, y), further_solution(parameters.tree, elimination, *residual_tangents)
+
+
+def _eliminate_loads(
+    parameters: TreeParameters, moving: TreeMotion, load: Float[Array, "6 F *s"], rows: Rows | None
+) -> BranchElimination:
+    tree = parameters.tree
+    total = composite_inertia(parameters, moving, load)
+    h = bias_force(tree, moving.S, total)
+    if rows is None:
+        J = jnp.zeros((0, *moving.S.shape[1:]), h.dtype)
+        return eliminate_branches(tree, moving.S, total, J, h[:0], h)
+    return eliminate_branches(tree, moving.S, total, rows.J, rows.gamma, h, rows.row_mask)
+
+
+def inverse_dynamics_residual(
+    parameters: TreeParameters,
+    constraints: Constraints,
+    moving: TreeMotion,
+    load: Float[Array, "6 F *s"],
+    rows: Rows | None,
+    x: Float[Array, "l *s"],
+    y: Float[Array, "m *s"],
+) -> Solution:
+    """Residuals M x + h - J^T y (l,) and gamma - J x (m,), from the frames' accelerations."""
+    tree = parameters.tree
+    base = 6 * tree.floating
+    root = jnp.zeros((6, 1, *x.shape[1:]), x.dtype)
+    joint_part = forward_pass(tree, root, by_frame(tree, moving.S * x[None, base:]))
+    A = moving.A + joint_part
+    if base:
+        A = A + x[:6, None]
+    wrench = needed_wrenches(parameters, moving, A) - load
+    # on the base the wrenches of a joint on its two bodies cancel, whether it is closed or not
+    on_base = jnp.sum(wrench, axis=1)
+    row_residual = y
+    if rows is not None:
+        row_residual = rows.gamma
+        for frame, W in zip(row_frames(tree, constraints), rows.wrenches, strict=True):
+            holds = np.eye(wrench.shape[1])[frame]
+            wrench = wrench - sum_columns(W * y[None], holds)
+            row_residual = row_residual - jnp.sum(W * pick_entries(joint_part, frame, 1), axis=0)
+    joint_part = jnp.sum(
+        moving.S * pick_entries(backward_pass(tree, wrench), motion_columns(tree).frame, 1), axis=0
+    )
+    return (jnp.concatenate([on_base, joint_part]) if base else joint_part), row_residual
 
 
 class Loads(NamedTuple):
@@ -79,11 +240,11 @@ class Loads(NamedTuple):
 class Solved(NamedTuple):
     """Solution of the equations of motion: accelerations `rate` and multipliers of the `rows`.
 
-    `moving` and `placed` are the motion in frame 0 and that of the bodies in the world.
+    `moving` and `placement` are the motion in frame 0 and that of the bodies in the world.
     """
 
     moving: TreeMotion
-    placed: Placed
+    placement: Placed
     rows: Rows | None
     loads: Loads
     rate: Float[Array, "k"]
@@ -94,12 +255,15 @@ class Tree(AbstractFormulation):
     """Formulation in relative coordinates of a spanning tree; only loop closures have multipliers.
 
     The multipliers belong to the loop closures' rows in the axes of frame 0; the reactions at
-    all joints follow from them and from the bodies' accelerations.
+    all joints follow from them and from the bodies' accelerations. Rows that depend on others in every
+    posture, as in planar loops, are left out by `prepare`; the multipliers of `accelerations` are
+    those of minimum norm in all rows.
 
     Args:
         cut: names of joints that close loops; by default those with the fewest rows. See
             `spanning_tree` for the tree that results.
-        redundant: allow dependent rows; multipliers are then those of minimum norm.
+        redundant: allow rows to become dependent in some postures, and choose the rows anew for
+            every step.
     """
 
     cut: tuple[str, ...] = eqx.field(static=True, default=())
@@ -114,20 +278,28 @@ class Tree(AbstractFormulation):
     def prepare(self, system: System) -> TreeModel:
         tree = spanning_tree(system, self.cut)
         parameters = tree_parameters(system, tree)
+        # The inverse mass matrix of a single rigid body is a constant in its own axes, and is found once per
+        # model.
         alone = tree.floating and not tree.steps
         inverse = _inverse_of_base(parameters) if alone else None
-        return TreeModel(system, parameters, constraints(system, joints=tree.cut), inverse)
+        # Rows that repeat others in every posture are found from the joints' geometry before any number is
+        # traced: a mask keeps the shapes.
+        row_mask = find_independent_rows(system, tree.cut).rows
+        row_mask = None if row_mask is None else as_jax(row_mask)
+        return TreeModel(
+            system, parameters, group_constraints(system, joints=tree.cut), inverse, row_mask
+        )
 
     def to_vector(self, model: TreeModel, state: State) -> Float[Array, " k"]:
-        return join(read(model.parameters, state))
+        return join_coordinates(read_coordinates(model.parameters, state))
 
     def to_state(self, model: TreeModel, x: Float[Array, " k"]) -> State:
-        at = split(model.parameters.tree, x)
-        placed = in_world(model.parameters, at, motion(model.parameters, at))
+        at = split_vector(model.parameters.tree, x)
+        placement = in_world(model.parameters, at, compute_motion(model.parameters, at))
         p = euler_parameters(model.parameters, at.q, at.u)[:, :-1]
         p = product(at.p, p) if model.parameters.tree.floating else p
         bodies = lambda x: x[:, :-1].T
-        return State(bodies(placed.r), p.T, bodies(placed.v), bodies(placed.omega))
+        return State(bodies(placement.r), p.T, bodies(placement.v), bodies(placement.omega))
 
     def accelerations(
         self,
@@ -136,10 +308,13 @@ class Tree(AbstractFormulation):
         state: State,
         stabilisation: AbstractStabilisation,
     ) -> Accelerations:
-        at = read(model.parameters, state)
-        solved = self._solve(model, t, at, stabilisation, dependent="minimum norm")
+        at = read_coordinates(model.parameters, state)
+        solved = self._solve_coordinates(model, t, at, stabilisation, shared=True)
         v_rate, omega_rate = body_accelerations(model.parameters, at, solved.moving, solved.rate)
-        return Accelerations(v_rate.T, omega_rate.T, solved.multipliers)
+        multipliers = solved.multipliers
+        if model.row_mask is not None:
+            multipliers = turn_rows(model.constraints, solved.moving.R, multipliers, back=True)
+        return Accelerations(v_rate.T, omega_rate.T, multipliers)
 
     def derivative(
         self,
@@ -148,18 +323,21 @@ class Tree(AbstractFormulation):
         x: Float[Array, " k"],
         stabilisation: AbstractStabilisation,
     ) -> tuple[Float[Array, " k"], Flows]:
-        tree, how = model.parameters.tree, stabilisation
-        at = split(tree, x)
-        solved = self._solve(model, t, at, how)
-        u_rate, driven = solved.rate, _driven(solved)
-        if self._passes(model):
-            u_rate, driven = self._through(model, t, x, how)
-        rate = with_unit_vectors(tree, rates(tree, at, u_rate), how.held_norms, at)
-        load, placed = solved.loads, solved.placed
-        moment = cross(placed.r, load.force) + apply(placed.R_wb, load.moment)
+        tree, scheme = model.parameters.tree, stabilisation
+        at = split_vector(tree, x)
+        solved = self._solve_coordinates(model, t, at, scheme)
+        u_rate, driven = solved.rate, _driver_power(solved)
+        # Only a formulation that allows dependent rows pays for postures beside the present one.
+        if self._may_interpolate(model):
+            u_rate, driven = self._solve_interpolated(model, t, x, scheme)
+        rate = with_unit_vectors(tree, coordinate_rates(tree, at, u_rate), scheme.held_norms, at)
+        load, placement = solved.loads, solved.placement
+        # Flows of energy and momentum are integrated beside the state, so that the balances of a run's
+        # accuracy report have the error of the integrator and not that of a quadrature afterwards.
+        moment = cross(placement.r, load.force) + apply_matrix(placement.R_wb, load.moment)
         power = load.power if solved.rows is None else load.power + driven
         flows = Flows(power, jnp.sum(load.force[:, :-1], 1), jnp.sum(moment[:, :-1], 1))
-        return join(rate), flows
+        return join_coordinates(rate), flows
 
     def reactions(
         self, model: TreeModel, t: Float[Array, ""], state: State, result: Accelerations
@@ -170,50 +348,60 @@ class Tree(AbstractFormulation):
         load = total_load(system.forces, t, kin)
         return tree_reactions(system, tree, kin, load, result, cut)
 
-    def _solve(
+    def _solve_coordinates(
         self,
         model: TreeModel,
         t: Float[Array, ""],
         at: TreeCoordinates,
-        how: AbstractStabilisation,
+        stabilisation: AbstractStabilisation,
         *,
-        dependent: Literal["fast", "minimum norm"] = "fast",
+        shared: bool = False,
     ) -> Solved:
+        """Solution at given coordinates; the multipliers are those of all rows if they are `shared`."""
         tree = model.parameters.tree
-        moving = motion(model.parameters, at)
-        placed = in_world(model.parameters, at, moving)
-        load = _loads(model.system, t, placed)
-        force, moment = load.force[:, :-1], apply(moving.R[:, :, :-1], load.moment[:, :-1])
+        moving = compute_motion(model.parameters, at)
+        placement = in_world(model.parameters, at, moving)
+        load = _sum_loads(model.system, t, placement)
+        force, moment = load.force[:, :-1], apply_matrix(moving.R[:, :, :-1], load.moment[:, :-1])
         if tree.floating:
             force = apply_transposed(rotation_matrix(at.p), force)
         wrench = wrenches_by_frame(tree, moving, force, moment)
+        # A free rigid body needs no solve.
         if model.inverse is not None:
-            rate = -apply(model.inverse, bias_of_base(model.parameters, moving, wrench))
-            return Solved(moving, placed, None, load, rate, rate[:0])
+            rate = -apply_matrix(model.inverse, bias_of_base(model.parameters, moving, wrench))
+            return Solved(moving, placement, None, load, rate, rate[:0])
         rows = None
         if model.constraints.groups:
             rows = closure_rows(model.parameters, model.constraints, t, moving)
-            off = jnp.sum(rows.J * at.u, axis=1) - rows.target
-            rows = rows._replace(gamma=how.held_rows(rows.gamma, rows.value, off))
-        if self._small(model):
+            rate_residuals = jnp.sum(rows.J * at.u[None], axis=1) - rows.target
+            rows = rows._replace(
+                gamma=stabilisation.held_rows(rows.gamma, rows.value, rate_residuals)
+            )
+        shared = shared and rows is not None and (self.redundant or model.row_mask is not None)
+        if rows is not None:
+            rows = (turned_rows if shared else held_rows)(model, moving, rows)
+        # Blocks of at most six rows are solved in closed form: a call of a library costs more than their
+        # arithmetic, and closed forms fuse with what is around them.
+        if self._is_small(model) and not shared:
             rate, multipliers = forward_dynamics(
                 model.parameters, model.constraints, moving, wrench, rows
             )
-            return Solved(moving, placed, rows, load, rate, multipliers)
-        total = inertia(model.parameters, moving, wrench)
-        h = bias(tree, moving.S, total)
+            return Solved(moving, placement, rows, load, rate, multipliers)
+        total = composite_inertia(model.parameters, moving, wrench)
+        h = bias_force(tree, moving.S, total)
         J, gamma = (jnp.zeros((0, len(at.u))), h[:0]) if rows is None else (rows.J, rows.gamma)
         rate, multipliers = solve_saddle(
             mass_matrix(tree, moving.S, total),
             all_columns(tree, J),
             -h,
             gamma,
-            redundant=dependent if self.redundant else False,
-            kept=model.kept,
+            redundant=self.redundant and ("minimum norm" if shared else "fast"),
+            row_mask=model.active_rows,
+            shared=shared,
         )
-        return Solved(moving, placed, rows, load, rate, multipliers)
+        return Solved(moving, placement, rows, load, rate, multipliers)
 
-    def _small(self, model: TreeModel) -> bool:
+    def _is_small(self, model: TreeModel) -> bool:
         """True if the equations are solved branch by branch."""
         rows = sum(ROWS[group.kind] * len(group.i) for group in model.constraints.groups)
         return not self.redundant and has_small_blocks(model.parameters.tree, rows)
@@ -224,35 +412,35 @@ class Tree(AbstractFormulation):
         A row that depends on others where the constraints hold need not do so at the stages of
         a step, where they are slightly violated; kept, it would get an arbitrary multiplier.
         """
-        if not self._passes(model):
+        if not self._may_interpolate(model):
             return model
-        kept = kept_rows(model, t, jax.lax.stop_gradient(split(model.parameters.tree, x)))
-        return eqx.tree_at(lambda m: m.kept, model, kept, is_leaf=lambda x: x is None)
+        rows = step_rows(model, t, jax.lax.stop_gradient(split_vector(model.parameters.tree, x)))
+        return eqx.tree_at(lambda m: m.step_rows, model, rows, is_leaf=lambda x: x is None)
 
-    def _through(
+    def _solve_interpolated(
         self,
         model: TreeModel,
         t: Float[Array, ""],
         x: Float[Array, " k"],
-        how: AbstractStabilisation,
+        stabilisation: AbstractStabilisation,
     ) -> tuple[Float[Array, " u"], Float[Array, ""]]:
         """Accelerations and the power of drivers, also near and in singular postures."""
-        model = self.at_step(model, t, x) if model.kept is None else model
-        at = split(model.parameters.tree, x)
-        singular = nearness(model, t, at)
+        model = self.at_step(model, t, x) if model.step_rows is None else model
+        at = split_vector(model.parameters.tree, x)
+        singular = measure_nearness(model, t, at)
 
-        def one(by: Float[Array, " u"]) -> tuple[Float[Array, " u"], Float[Array, ""]]:
-            closed_there = lambda: closed(
-                model, t, moved(model.parameters.tree, at, by), 3, self._small
+        def solve_displaced(by: Float[Array, " u"]) -> tuple[Float[Array, " u"], Float[Array, ""]]:
+            closed_there = lambda: close_loops(
+                model, t, retract_coordinates(model.parameters.tree, at, by), 3, self._is_small
             )[0]
-            found = self._solve(
-                model, t, jax.lax.cond(singular.near, closed_there, lambda: at), how
+            solution = self._solve_coordinates(
+                model, t, jax.lax.cond(singular.is_near, closed_there, lambda: at), stabilisation
             )
-            return found.rate, _driven(found)
+            return solution.rate, _driver_power(solution)
 
-        return interpolated(singular, at.u, one, power=3)
+        return interpolate_posture(singular, way_along(model, at.u), solve_displaced, power=3)
 
-    def _passes(self, model: TreeModel) -> bool:
+    def _may_interpolate(self, model: TreeModel) -> bool:
         """True if there are loop closures and their rows may depend on each other."""
         return self.redundant and bool(model.constraints.groups)
 
@@ -260,45 +448,51 @@ class Tree(AbstractFormulation):
         self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"], iterations: int
     ) -> tuple[Float[Array, " k"], Residuals]:
         tree = model.parameters.tree
-        at = normalised(tree, split(tree, x))
+        at = normalise_vectors(tree, split_vector(tree, x))
         if not model.constraints.groups:
-            return join(at), left(model, at, None)
-        if not self._passes(model):
-            at, rows = closed(model, t, at, iterations, self._small)
-            return join(at), left(model, at, rows)
-        model = self.at_step(model, t, x) if model.kept is None else model
+            return join_coordinates(at), compute_residuals(model, at, None)
+        if not self._may_interpolate(model):
+            at, rows = close_loops(model, t, at, iterations, self._is_small)
+            return join_coordinates(at), compute_residuals(model, at, rows)
+        model = self.at_step(model, t, x) if model.step_rows is None else model
 
-        def one(by: Float[Array, " u"]) -> TreeCoordinates:
-            start = moved(tree, at, by)
-            end, _ = closed(model, t, start, iterations, self._small)
+        # The interpolated quantity is the displacement to the constraints, which stays small and smooth
+        # through a singular posture, unlike the coordinates themselves.
+        def closure_change(by: Float[Array, " u"]) -> TreeCoordinates:
+            start = retract_coordinates(tree, at, by)
+            end, _ = close_loops(model, t, start, iterations, self._is_small)
             return jax.tree.map(jnp.subtract, end, start)
 
-        moves = interpolated(nearness(model, t, at), at.u, one, power=2)
+        moves = interpolate_posture(
+            measure_nearness(model, t, at), way_along(model, at.u), closure_change, power=2
+        )
         end = jax.tree.map(jnp.add, at, moves)
-        end = normalised(tree, end)
-        return join(end), self.residuals(model, t, join(end))
+        end = normalise_vectors(tree, end)
+        return join_coordinates(end), self.residuals(model, t, join_coordinates(end))
 
     def residuals(self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"]) -> Residuals:
-        at = split(model.parameters.tree, x)
+        at = split_vector(model.parameters.tree, x)
         if not model.constraints.groups:
-            return left(model, at, None)
-        rows = closure_rows(model.parameters, model.constraints, t, motion(model.parameters, at))
-        return left(model, at, rows)
+            return compute_residuals(model, at, None)
+        rows = closure_rows(
+            model.parameters, model.constraints, t, compute_motion(model.parameters, at)
+        )
+        return compute_residuals(model, at, rows)
 
 
-def _driven(found: Solved) -> Float[Array, "*s"]:
+def _driver_power(solution: Solved) -> Float[Array, "*s"]:
     """Power of the drivers among the loop closures [W]."""
-    rows = found.rows
-    return jnp.zeros(()) if rows is None else jnp.sum(found.multipliers * rows.target, axis=0)
+    rows = solution.rows
+    return jnp.zeros(()) if rows is None else jnp.sum(solution.multipliers * rows.target, axis=0)
 
 
 @kept_jit
 def _inverse_of_base(parameters: TreeParameters) -> Float[Array, "6 6"]:
     """Inverse mass matrix of a floating base whose only joints are welds."""
     tree = parameters.tree
-    at = filled(tree, jnp.zeros)
-    moving = motion(parameters, at._replace(p=at.p.at[0].set(1.0)))
-    total = inertia(parameters, moving, jnp.zeros_like(moving.V))
+    at = fill_coordinates(tree, jnp.zeros)
+    moving = compute_motion(parameters, at._replace(p=at.p.at[0].set(1.0)))
+    total = composite_inertia(parameters, moving, jnp.zeros_like(moving.V))
     return lapack.inverse(mass_matrix(tree, moving.S, total))
 
 
@@ -311,14 +505,16 @@ def _closure_reactions(
         return joint_reactions(system, model.constraints, t, state, multipliers)
     r, p = state.r[tree.root], state.p[tree.root]
     R_w0 = rotation_matrix(p)
-    own = jax.vmap(product, in_axes=(None, 0))(conjugate(p), state.p)
-    seen = State((state.r - r) @ R_w0, own, state.v @ R_w0, state.omega)
-    found = joint_reactions(system, model.constraints, t, seen, multipliers)
-    return Reactions(found.force @ R_w0.T, found.moment @ R_w0.T)
+    # Multipliers of a floating machine belong to rows in the base's axes: the bodies are placed relative
+    # to it, and the wrenches are turned back.
+    relative_parameters = jax.vmap(product, in_axes=(None, 0))(conjugate(p), state.p)
+    relative_state = State((state.r - r) @ R_w0, relative_parameters, state.v @ R_w0, state.omega)
+    reactions = joint_reactions(system, model.constraints, t, relative_state, multipliers)
+    return Reactions(reactions.force @ R_w0.T, reactions.moment @ R_w0.T)
 
 
-def _loads(system: System, t: Float[Array, ""], placed: Placed) -> Loads:
+def _sum_loads(system: System, t: Float[Array, ""], placement: Placed) -> Loads:
     """Sum of the loads of all force elements."""
-    kin = kinematics(system, placed)
+    kin = make_kinematics(system, placement)
     load = total_load(system.forces, t, kin)
     return Loads(load.force.T, load.moment.T, load.power)

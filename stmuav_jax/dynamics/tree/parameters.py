@@ -1,4 +1,4 @@
-"""Parameters of a spanning tree: its constant rotations, positions, masses and inertias.
+"""Parameters of a spanning tree, the poses of its frames, and the spatial axes of its velocities.
 
 Spatial vectors are (angular, linear), in the axes of frame 0 and about its origin. Frame 0 has the
 axes of the world and its origin at a joint with ground or, if the system floats, the axes of the
@@ -9,13 +9,13 @@ Velocities then add from the root outwards, and inertias and wrenches from the t
 without any transformation. Frames of equal depth are evaluated together.
 
 Arrays have their components first, then the frames (or bodies), then the axes of a batch of
-states, if any (`stmuav_jax.algebra.stacked`).
+states, if any (`stmuav_jax.math.stacked`).
 
 Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 2, 5 and 6.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,14 +23,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...algebra.compiler import kept_jit
-from ...algebra.rotation import conjugate, from_matrix, product
-from ...algebra.stacked import dot
-from ...checks.numbers import as_jax, as_numpy, floats, stacked
-from ...mechanics.motions.base import CYCLIC, ColumnParts
+from ...checks.numbers import as_floats, as_jax, as_numpy, stack_arrays
+from ...math.compiler import kept_jit
+from ...math.derivative import directional_derivative
+from ...math.rotation import conjugate, cross, from_matrix, product
+from ...math.stacked import apply_matrix, dot_product, multiply_matrices
+from ...mechanics.motions import CYCLIC, ColumnParts
 from ...mechanics.system import System
-from .frames import MotionGroup, aligned, columns, levels, motion_groups, pick, support
-from .topology import Link, SpanningTree
+from .topology import (
+    Link,
+    MotionGroup,
+    SpanningTree,
+    align_axes,
+    find_supported,
+    forward_pass,
+    motion_columns,
+    motion_groups,
+    pick_entries,
+    sum_entries,
+    tree_levels,
+)
 
 _EYE = np.eye(3)
 
@@ -70,74 +82,78 @@ class TreeParameters(eqx.Module):
 def tree_parameters(system: System, tree: SpanningTree) -> TreeParameters:
     """Parameters of a tree, from the joints and bodies of its system."""
     # concrete numbers are handled by NumPy: a hundred small operations, none to compile
+    # The parameters do not depend on the forces, whose inputs may be traced: without them everything else
+    # stays known numbers.
     system = eqx.tree_at(lambda s: s.forces, system, ())
     system = as_numpy(system)
     com_ref = [*system.bodies.com, np.zeros(3)]
     K: list[Any] = []
     k: list[Any] = []
     B: dict[int, Any] = {tree.root: _EYE}
-    com: dict[int, Any] = {tree.root: np.zeros(3) if tree.floating else -_origin(system, tree)}
+    # A tree on ground has its origin at a joint with ground rather than at the world's: a mechanism
+    # kilometres away would lose digits otherwise.
+    com: dict[int, Any] = {tree.root: np.zeros(3) if tree.floating else -_tree_origin(system, tree)}
     by_link = {link.child: link for link in tree.links}
     for link in tree.links:
-        frame_i, point_i, frame_j, point_j = _sides(system, link)
+        frame_i, point_i, frame_j, point_j = _joint_sides(system, link)
         at = com[link.parent] + B[link.parent] @ (point_i - com_ref[link.parent])
         start = B[link.parent] @ frame_i
         steps = [s for s in tree.steps if s.body == link.child]
-        last = _columns(steps[-1].axis) if steps else _EYE
+        last = _unit_columns(steps[-1].axis) if steps else _EYE
         # a weld has no frame of its own: its body is fixed to the parent's frame
         B[link.child] = (frame_j @ last).T if steps else start @ frame_j.T
         arm = B[link.child] @ (com_ref[link.child] - point_j)
         com[link.child] = arm if steps else at + arm
     for step in tree.steps:
         link = by_link[step.body]
-        frame_i, point_i, *_ = _sides(system, link)
+        frame_i, point_i, *_ = _joint_sides(system, link)
         if step.first:
-            K.append(B[link.parent] @ frame_i @ _columns(step.axis))
+            K.append(B[link.parent] @ frame_i @ _unit_columns(step.axis))
             k.append(com[link.parent] + B[link.parent] @ (point_i - com_ref[link.parent]))
         else:
             assert step.before is not None
-            K.append(_columns(step.before).T @ _columns(step.axis))
+            K.append(_unit_columns(step.before).T @ _unit_columns(step.axis))
             k.append(np.zeros(3))
     ground = system.n_bodies
     B.setdefault(ground, _EYE)
     com.setdefault(ground, np.zeros(3))
     axes = [B[b] for b in range(ground + 1)]
     mass, centre, inertia = _by_frame(system, tree, axes, com)
-    stacked_K, stacked_B = _stack(K, (3, 3)), _stack(axes, (3, 3))
+    stacked_K, stacked_B = _stack_last(K, (3, 3)), _stack_last(axes, (3, 3))
     p = as_jax(system.reference.p)
     K_p, B_p = _constant_euler_parameters(tree, stacked_K, stacked_B, p)
     return TreeParameters(
         tree,
         stacked_K,
-        _stack(k, (3,)),
+        _stack_last(k, (3,)),
         stacked_B,
-        _stack([com[b] for b in range(ground + 1)], (3,)),
+        _stack_last([com[b] for b in range(ground + 1)], (3,)),
         mass,
         centre,
         inertia,
-        as_jax(as_numpy(mass) @ support(tree).T.astype(float)),
+        as_jax(as_numpy(mass) @ find_supported(tree).T.astype(float)),
         K_p,
         B_p,
-        _pitches(system, tree),
+        _step_pitches(system, tree),
     )
 
 
-def _origin(system: System, tree: SpanningTree) -> Any:
+def _tree_origin(system: System, tree: SpanningTree) -> Any:
     """Point of the world (3,) [m] where a tree that stands on ground has the origin of frame 0."""
     for link in tree.links:
         if link.parent == tree.root and link.joint is not None:
-            point = _sides(system, link)[1]
+            point = _joint_sides(system, link)[1]
             # the motion does not depend on it, and neither do derivatives
             return point if isinstance(point, np.ndarray) else jax.lax.stop_gradient(point)
     return np.zeros(3)
 
 
-def _pitches(system: System, tree: SpanningTree) -> Float[Array, "f"] | None:
-    if not np.any(columns(tree).pitched):
+def _step_pitches(system: System, tree: SpanningTree) -> Float[Array, "f"] | None:
+    if not np.any(motion_columns(tree).pitched):
         return None
     joints = [None if step.joint is None else system.joints[step.joint] for step in tree.steps]
     zero = np.zeros(())
-    return _stack([j.length if j is not None and j.pitched else zero for j in joints], ())
+    return _stack_last([j.length if j is not None and j.pitched else zero for j in joints], ())
 
 
 def _by_frame(
@@ -145,22 +161,27 @@ def _by_frame(
 ) -> tuple[Float[Array, "F"], Float[Array, "3 F"], Float[Array, "3 3 F"]]:
     """Mass, centre of mass and inertia of the bodies fixed to each frame; zeros without any."""
     bodies = system.bodies
-    found: list[tuple[Any, Any, Any]] = []
+    frame_inertias: list[tuple[Any, Any, Any]] = []
     for frame in range(len(tree.steps) + 1):
-        own = [b for b in range(system.n_bodies) if tree.frame[b] == frame]
-        if not own:
-            found.append((np.zeros(()), np.zeros(3), np.zeros((3, 3))))
+        frame_bodies = [b for b in range(system.n_bodies) if tree.frame[b] == frame]
+        if not frame_bodies:
+            frame_inertias.append((np.zeros(()), np.zeros(3), np.zeros((3, 3))))
             continue
-        mass = sum(bodies.mass[b] for b in own)
-        centre = sum(bodies.mass[b] * com[b] for b in own) / mass
+        # Welded bodies are one rigid body once and for all, so that they cost nothing in the passes.
+        mass = sum(bodies.mass[b] for b in frame_bodies)
+        centre = sum(bodies.mass[b] * com[b] for b in frame_bodies) / mass
         inertia: Any = 0.0
-        for b in own:
+        for b in frame_bodies:
             arm = com[b] - centre
             square = (arm @ arm) * _EYE - arm[:, None] * arm[None]
             inertia = inertia + axes[b] @ bodies.inertia[b] @ axes[b].T + bodies.mass[b] * square
-        found.append((mass, centre, inertia))
-    masses, centres, tensors = zip(*found, strict=True)
-    return _stack(list(masses), ()), _stack(list(centres), (3,)), _stack(list(tensors), (3, 3))
+        frame_inertias.append((mass, centre, inertia))
+    masses, centres, tensors = zip(*frame_inertias, strict=True)
+    return (
+        _stack_last(list(masses), ()),
+        _stack_last(list(centres), (3,)),
+        _stack_last(list(tensors), (3, 3)),
+    )
 
 
 @kept_jit
@@ -172,25 +193,31 @@ def _constant_euler_parameters(
     K_p = columns_of(K) if K.shape[2] else jnp.zeros((4, 0), K.dtype)
     B_p = columns_of(B)
     # all coordinates are zero at the reference posture
-    turned = jnp.zeros((4, len(tree.steps)), K.dtype).at[0].set(1.0)
-    found = product(pick(_frames(tree, K_p, turned), np.array(tree.frame), 1), B_p)
+    step_parameters = jnp.zeros((4, len(tree.steps)), K.dtype).at[0].set(1.0)
+    body_parameters = product(
+        pick_entries(_compose_frames(tree, K_p, step_parameters), np.array(tree.frame), 1), B_p
+    )
     unit = jnp.array([[1.0, 0.0, 0.0, 0.0]], p.dtype)
     reference = jnp.concatenate([p, unit]).T
     if tree.floating:
         reference = product(conjugate(p[tree.root])[:, None], reference)
-    return K_p, jnp.where(dot(found, reference) < 0, -B_p, B_p)
+    # p and -p are one rotation; the sign of the reference is kept, so that saved Euler parameters are
+    # continuous with those of the start.
+    return K_p, jnp.where(dot_product(body_parameters, reference)[None] < 0, -B_p, B_p)
 
 
-def _frames(
-    tree: SpanningTree, K_p: Float[Array, "4 f *s"], turned: Float[Array, "4 f *s"]
+def _compose_frames(
+    tree: SpanningTree, K_p: Float[Array, "4 f *s"], step_parameters: Float[Array, "4 f *s"]
 ) -> Float[Array, "4 f+1 *s"]:
     """Euler parameters of all frames relative to frame 0, from those of their steps."""
-    own = product(K_p, turned)
-    unit = jnp.zeros((4, 1, *own.shape[2:]), own.dtype).at[0].set(1.0)
+    relative_parameters = product(K_p, step_parameters)
+    unit = (
+        jnp.zeros((4, 1, *relative_parameters.shape[2:]), relative_parameters.dtype).at[0].set(1.0)
+    )
     parts = [unit]
-    for level in levels(tree):
+    for level in tree_levels(tree):
         at = slice(level.frames.start - 1, level.frames.stop - 1)
-        parts.append(product(pick(parts[-1], level.parents, 1), own[:, at]))
+        parts.append(product(pick_entries(parts[-1], level.parents, 1), relative_parameters[:, at]))
     return jnp.concatenate(parts, axis=1)
 
 
@@ -205,56 +232,62 @@ def euler_parameters(
     """
     tree = parameters.tree
     groups = motion_groups(tree)
-    turned = [
-        group.motion.euler_parameters(own, shares(parameters, group, u.ndim - 1))
-        for group, own in zip(groups, q, strict=True)
+    step_parameters = [
+        group.motion.euler_parameters(positions, column_shares(parameters, group, u.ndim - 1))
+        for group, positions in zip(groups, q, strict=True)
     ]
-    turned = by_step(groups, turned, 1) if groups else jnp.zeros((4, 0, *u.shape[1:]), u.dtype)
-    frames = _frames(tree, parameters.K_p, turned)
-    return product(pick(frames, np.array(tree.frame), 1), parameters.B_p)
+    step_parameters = (
+        by_step(groups, step_parameters, 1) if groups else jnp.zeros((4, 0, *u.shape[1:]), u.dtype)
+    )
+    frames = _compose_frames(tree, parameters.K_p, step_parameters)
+    return product(pick_entries(frames, np.array(tree.frame), 1), parameters.B_p)
 
 
 def by_step(groups: tuple[MotionGroup, ...], parts: Sequence[Array], axis: int) -> Array:
     """Concatenate the arrays of all groups in the order of the tree's steps along an axis."""
     if len(groups) == 1:
         return parts[0]
+    # The inverse permutation brings groups of one class back into the order of the steps, by a constant
+    # index.
     order = np.argsort(np.concatenate([group.steps for group in groups]))
-    return pick(jnp.concatenate(parts, axis=axis), order, axis)
+    return pick_entries(jnp.concatenate(parts, axis=axis), order, axis)
 
 
-def shares(parameters: TreeParameters, group: MotionGroup, batch: int) -> ColumnParts:
+def column_shares(parameters: TreeParameters, group: MotionGroup, batch: int) -> ColumnParts:
     """Angular and linear parts of a group's columns, shaped as its velocities.
 
     Args:
         batch: number of axes of a batch of states.
     """
-    table = columns(parameters.tree)
+    table = motion_columns(parameters.tree)
     shape = lambda x: np.moveaxis(
         x[group.velocities].reshape(len(group.steps), *group.motion.velocities), 0, -1
     )
     angular, linear, pitched = (shape(x) for x in (table.angular, table.linear, table.pitched))
     axes = angular.ndim + batch
     if not np.any(pitched):
-        return ColumnParts(aligned(angular, axes), aligned(linear, axes), pitched)
+        return ColumnParts(align_axes(angular, axes), align_axes(linear, axes), pitched)
     assert parameters.pitch is not None
-    pitch = pick(parameters.pitch, group.steps, 0)
-    own = jnp.where(aligned(pitched, pitched.ndim + pitch.ndim - 1) > 0, pitch, linear)
+    pitch = pick_entries(parameters.pitch, group.steps, 0)
+    linear_share = jnp.where(align_axes(pitched, pitched.ndim + pitch.ndim - 1) > 0, pitch, linear)
     return ColumnParts(
-        aligned(angular, axes), own.reshape(*own.shape, *(1,) * (axes - own.ndim)), pitched
+        align_axes(angular, axes),
+        linear_share.reshape(*linear_share.shape, *(1,) * (axes - linear_share.ndim)),
+        pitched,
     )
 
 
-def _stack(rows: list[Any], shape: tuple[int, ...]) -> Array:
+def _stack_last(rows: list[Any], shape: tuple[int, ...]) -> Array:
     if not rows:
-        return floats(np.zeros((*shape, 0)))
-    return stacked(rows, axis=-1)
+        return as_floats(np.zeros((*shape, 0)))
+    return stack_arrays(rows, axis=-1)
 
 
-def _columns(axis: int) -> np.ndarray:
+def _unit_columns(axis: int) -> np.ndarray:
     return _EYE[:, CYCLIC[axis]]
 
 
-def _sides(system: System, link: Link) -> tuple[Any, Any, Any, Any]:
+def _joint_sides(system: System, link: Link) -> tuple[Any, Any, Any, Any]:
     """Joint frame and point on the parent body, then on the child body."""
     if link.joint is None:
         # the free motion of a body is the motion of its centre of mass and of its own axes
@@ -263,3 +296,151 @@ def _sides(system: System, link: Link) -> tuple[Any, Any, Any, Any]:
     sides = ((joint.frame_i, joint.point_i), (joint.frame_j, joint.point_j))
     front, behind = sides if link.forward else sides[::-1]
     return *front, *behind
+
+
+class Pose(NamedTuple):
+    """Axes (3, 3, f + 1, *s) and origins (3, f + 1, *s) [m] of all frames, frame 0 first."""
+
+    E: Float[Array, "3 3 f *s"]
+    o: Float[Array, "3 f *s"]
+
+
+@eqx.filter_custom_jvp
+def place(parameters: TreeParameters, q: tuple[Float[Array, "..."], ...]) -> Pose:
+    """Poses of all frames of a tree with at least one step, at positions q by class of motion."""
+    return _compose_poses(parameters, q)
+
+
+@place.def_jvp
+def _place_jvp(primals: Any, tangents: Any) -> tuple[Pose, Pose]:
+    """Derivative of `place`: dE = w x E, do = v + w x o, with (w, v) = sum S_k du_k."""
+    parameters, _ = primals
+    tree, groups = parameters.tree, motion_groups(parameters.tree)
+    change, q_dot = tangents
+    of_groups = zip(groups, q_dot, strict=True)
+    flat = all(dot is None or group.motion.flat for group, dot in of_groups)
+    if not flat or change.K is not None or change.pitch is not None:
+        # a change of K need not be a rotation, nor are the rates of q velocities
+        return directional_derivative(_compose_poses, primals, tangents)
+    pose = place(*primals)
+    zero = lambda group: jnp.zeros(
+        (*group.motion.velocities, len(group.steps), *pose.o.shape[2:]), pose.o.dtype
+    )
+    parts = tuple(
+        zero(group) if dot is None else dot for group, dot in zip(groups, q_dot, strict=True)
+    )
+    relative_twists = by_frame(
+        tree, spatial_axes(parameters, pose) * from_groups(tree, parts)[None]
+    )
+    if change.k is not None:
+        parent = np.array([step.parent for step in tree.steps])
+        offset_change = apply_matrix(pick_entries(pose.E, parent, 2), change.k)
+        relative_twists = relative_twists + jnp.concatenate(
+            [jnp.zeros_like(offset_change), offset_change]
+        )
+    V = forward_pass(tree, jnp.zeros_like(relative_twists[:, :1]), relative_twists)
+    w = V[:3]
+    return pose, Pose(cross(w[:, None], pose.E), V[3:] + cross(w, pose.o))
+
+
+def _compose_poses(parameters: TreeParameters, q: tuple[Float[Array, "..."], ...]) -> Pose:
+    X, d = relative_poses(parameters, q)
+    origin = root_pose(d.shape[2:], d.dtype)
+    E, o = [origin.E], [origin.o]
+    for level in tree_levels(parameters.tree):
+        at = slice(level.frames.start - 1, level.frames.stop - 1)
+        if level.frames.start == 1:
+            # frame 0 is the identity
+            E.append(X[:, :, at])
+            o.append(d[:, at])
+            continue
+        before = pick_entries(E[-1], level.parents, 2)
+        o.append(pick_entries(o[-1], level.parents, 1) + apply_matrix(before, d[:, at]))
+        E.append(multiply_matrices(before, X[:, :, at]))
+    return Pose(jnp.concatenate(E, axis=2), jnp.concatenate(o, axis=1))
+
+
+def root_pose(batch: tuple[int, ...], dtype: Any) -> Pose:
+    """Pose of frame 0 alone, for a batch of states."""
+    unit = jnp.broadcast_to(align_axes(_EYE[:, :, None], 3 + len(batch)), (3, 3, 1, *batch))
+    return Pose(unit, jnp.zeros((3, 1, *batch), dtype))
+
+
+def relative_poses(
+    parameters: TreeParameters, q: tuple[Float[Array, "..."], ...]
+) -> tuple[Float[Array, "3 3 f *s"], Float[Array, "3 f *s"]]:
+    """Rotations and positions [m] of all frames in their parents."""
+    groups = motion_groups(parameters.tree)
+    relative_poses = []
+    for group, positions in zip(groups, q, strict=True):
+        K, k = (
+            pick_entries(parameters.K, group.steps, 2),
+            pick_entries(parameters.k, group.steps, 1),
+        )
+        of_batch = positions.shape[len(group.motion.positions) + 1 :]
+        X, d = group.motion.relative(
+            positions, K, k, column_shares(parameters, group, len(of_batch))
+        )
+        spread = lambda x, n, of_batch=of_batch: jnp.broadcast_to(x, (*x.shape[:n], *of_batch))
+        relative_poses.append((spread(X, 3), spread(d, 2)))
+    X, d = zip(*relative_poses, strict=True)
+    return by_step(groups, X, 2), by_step(groups, d, 1)
+
+
+def spatial_axes(parameters: TreeParameters, pose: Pose) -> Float[Array, "6 m *s"]:
+    """Spatial axes (angular, linear) of all velocities of the tree's steps."""
+    table = motion_columns(parameters.tree)
+    frame, column = table.frame, table.axis
+    if np.all(column == 2) and np.array_equal(frame, np.arange(1, len(frame) + 1)):
+        a, o = pose.E[:, 2, 1:], pose.o[:, 1:]
+    else:
+        a, o = pose.E[:, column, frame], pick_entries(pose.o, frame, 1)
+    angular = align_axes(table.angular, a.ndim - 1)[None]
+    linear = align_axes(table.linear, a.ndim - 1)[None]
+    if np.any(table.pitched):
+        assert parameters.pitch is not None
+        pitch = pick_entries(parameters.pitch, frame - 1, 0)
+        pitch = pitch.reshape(*pitch.shape, *(1,) * (a.ndim - 1 - pitch.ndim))
+        linear = linear + (align_axes(table.pitched, a.ndim - 1) * pitch)[None]
+    return jnp.concatenate([angular * a, angular * cross(o, a) + linear * a])
+
+
+def by_frame(tree: SpanningTree, rows: Float[Array, "6 m *s"]) -> Float[Array, "6 f *s"]:
+    """Sums of the columns of each frame over its velocities."""
+    frame = motion_columns(tree).frame
+    count = len(tree.steps)
+    if len(frame) == count:
+        return rows
+    return sum_entries(
+        rows, [[int(k) for k in np.flatnonzero(frame == f + 1)] for f in range(count)]
+    )
+
+
+def by_group(tree: SpanningTree, u: Float[Array, "m *s"]) -> tuple[Array, ...]:
+    """Velocities of every class of motion, each of shape (*velocities of one frame, k, *s)."""
+    velocity_groups = []
+    for group in motion_groups(tree):
+        velocities = pick_entries(u, group.velocities, 0)
+        shape = group.motion.velocities
+        if shape:
+            velocities = velocities.reshape(len(group.steps), *shape, *u.shape[1:])
+            velocities = jnp.moveaxis(velocities, 0, len(shape))
+        velocity_groups.append(velocities)
+    return tuple(velocity_groups)
+
+
+def from_groups(tree: SpanningTree, parts: tuple[Array, ...]) -> Float[Array, "m *s"]:
+    """Flat vector of the velocities of all classes of motion; the inverse of `by_group`."""
+    groups, flat_parts = motion_groups(tree), []
+    for group, part in zip(groups, parts, strict=True):
+        wide = len(group.motion.velocities)
+        if wide:
+            part = jnp.moveaxis(part, wide, 0)
+            part = part.reshape(len(group.velocities), *part.shape[wide + 1 :])
+        flat_parts.append(part)
+    if len(flat_parts) == 1:
+        return flat_parts[0]
+    if not flat_parts:
+        return jnp.zeros((0,))
+    order = np.argsort(np.concatenate([group.velocities for group in groups]))
+    return pick_entries(jnp.concatenate(flat_parts), order, 0)

@@ -2,22 +2,31 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import parallelogram, state_of
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.certify import inspect_start
+from stmuav_jax.dynamics.diagnostics import inspect_start
 
 ALONG = (9.81, 0.0, 0.0)  # m/s^2, along the rods
 
 
+class Ramp(eqx.Module):
+    """Force along z that grows at a rate [N/s]."""
+
+    rise: Any
+
+    def __call__(self, t, kinematics):
+        return self.rise * t * jnp.array([0.0, 0.0, 1.0])
+
+
 def flat(rate=0.0, coupler=0.0, *, gravity=(0.0, 0.0, -9.81), pushes=(0.0, 0.0)):
     """The parallelogram in line, its crank and coupler turning, pushed up ever harder [N/s]."""
-    ramp = lambda rise: lambda t, _: rise * t * jnp.array([0.0, 0.0, 1.0])
     forces = [
-        stm.AppliedForce(body, ramp(jnp.asarray(rise)), frame="world")
+        stm.AppliedForce(body, Ramp(jnp.asarray(rise)), frame="world")
         for body, rise in zip(("crank", "coupler"), pushes, strict=True)
     ]
     system = parallelogram(0.0, gravity=gravity, forces=tuple(forces))
@@ -27,34 +36,39 @@ def flat(rate=0.0, coupler=0.0, *, gravity=(0.0, 0.0, -9.81), pushes=(0.0, 0.0))
     return system, state_of(rest.r, rest.p, v, omega)
 
 
-@pytest.mark.parametrize(
-    "how",
-    [{}, {"method": stm.Method(formulation=stm.Augmented())}, {"analysis": False, "throw": False},
-     {"method": stm.Method(stabilisation=stm.Baumgarte(10.0, 10.0, 10.0))}],
-    ids=["default", "augmented", "without analysis", "Baumgarte"],
-)  # fmt: skip
-def test_a_start_at_rest_in_a_singular_posture_is_refused(how):
+def test_a_start_at_rest_in_a_singular_posture_is_refused():
     """Before anything is integrated, by the same words whatever the method."""
-    with pytest.raises(stm.StateError, match=r"^The start is a singular posture of ") as refused:
-        stm.simulate(*flat(), t1=0.2, **how)
-    words = str(refused.value)
+    messages = set()
+    ways: tuple[dict[str, Any], ...] = (
+        {},
+        {"method": stm.Method(formulation=stm.Augmented())},
+        {"analysis": False, "throw": False},
+        {"method": stm.Method(stabilisation=stm.Baumgarte(10.0, 10.0, 10.0))},
+    )
+    for how in ways:
+        with pytest.raises(
+            stm.StateError, match=r"^The start is a singular posture of "
+        ) as refused:
+            stm.simulate(*flat(), t1=0.2, **how)
+        messages.add(str(refused.value))
+    (words,) = messages
     assert all(f"{joint} (at 0 rad)" in words for joint in "ABCD")
     assert "branches of the motion meet there, and nothing says which one it follows" in words
     assert "Start beside that posture" in words
     # as slow as round-off is no velocity
-    with pytest.raises(stm.StateError, match="up to 1e-06 rad/s count"):
-        stm.simulate(*flat(1e-7), t1=0.2, **how)
+    with pytest.raises(stm.StateError, match="velocities up to 1e-06 rad/s"):
+        stm.simulate(*flat(1e-7), t1=0.2)
 
 
-@pytest.mark.parametrize("size", [1e-4, 1.0, 1e5])
-def test_singular_postures_of_any_size_are_found(size):
-    start = lambda angle: parallelogram(angle, size=size)
-    with pytest.raises(stm.StateError, match="singular posture"):
-        inspect_start(start(0.0), start(0.0).reference, 0.0, stm.Tree())
-    for angle in (0.3, 1e-3):
-        *_, found = inspect_start(start(angle), start(angle).reference, 0.0, stm.Tree())
-        assert found.branches == ""
-        assert not found.followed
+def test_singular_postures_of_any_size_are_found():
+    for size in (1e-4, 1.0, 1e5):
+        start = lambda angle, size=size: parallelogram(angle, size=size)
+        with pytest.raises(stm.StateError, match="singular posture"):
+            inspect_start(start(0.0), start(0.0).reference, 0.0, stm.Tree())
+        for angle in (0.3, 1e-3):
+            *_, found = inspect_start(start(angle), start(angle).reference, 0.0, stm.Tree())
+            assert found.branches == ""
+            assert not found.followed
 
 
 def test_a_structure_that_can_only_shake_is_refused_where_it_is_pushed():
@@ -90,12 +104,14 @@ def test_runs_through_and_from_a_singular_start():
     still = stm.simulate(*flat(gravity=ALONG), **how)
     assert still.certificate.error_words == ""
     assert np.max(np.abs(still.states.omega)) < 1e-9
-    # a push in the middle moves the cranks alike; one on a crank alone fits no branch
-    moved = stm.simulate(*flat(gravity=ALONG, pushes=(0.0, 5.0)), **how)
-    words = moved.certificate.error_words
-    assert words.startswith("The start is a singular posture of ")
-    assert "branch that this run follows" in words
-    with pytest.raises(
-        stm.SimulationError, match=r"s: the start is a singular posture of .*: branches"
-    ):
-        stm.simulate(*flat(gravity=ALONG, pushes=(5.0, 0.0)), **how)
+    # a push in the middle, or on a crank alone, moves the cranks alike: one of two branches, which is said
+    for pushes in ((0.0, 5.0), (5.0, 0.0)):
+        moved = stm.simulate(*flat(gravity=ALONG, pushes=pushes), **how)
+        words = moved.certificate.error_words
+        assert words.startswith("The start is a singular posture of ")
+        assert "branch that this run follows" in words
+        turned = np.asarray(moved.states.omega)[:, :, 1]
+        assert np.all(turned[1:, 0] < -1e-3)
+        np.testing.assert_allclose(turned[:, 2], turned[:, 0], atol=1e-12)
+        assert np.max(np.abs(turned[:, 1])) < 1e-12
+        assert moved.certificate.position_violation < 1e-12

@@ -1,5 +1,6 @@
 """What holds the constraints: a stabilisation of one's own is one class, for every formulation."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -29,13 +30,9 @@ class Damped(AbstractStabilisation):
         return 2
 
 
-@pytest.mark.parametrize(
-    "formulation",
-    [pytest.param(stm.Tree(), marks=pytest.mark.slow), stm.Augmented()],
-    ids=["tree", "augmented"],
-)
+@pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=["tree", "augmented"])
 def test_a_users_stabilisation_acts_in_every_formulation(formulation):
-    """Off the constraints J a = gamma - 8 (J u - target), and steps end on the constraints."""
+    """Off the constraints J a = gamma - 8 (J u - target)."""
     system = four_bar(redundant=False)
     state = four_bar_state(system, 2.0)
     model, rows = formulation.prepare(system), stm.Augmented().prepare(system)
@@ -54,10 +51,6 @@ def test_a_users_stabilisation_acts_in_every_formulation(formulation):
     miss, feedback = off(x.at[-2:].add(0.1))
     assert np.max(np.abs(feedback)) > 0.1
     assert relative_error(miss, feedback) < 1e-9
-    method = stm.Method(formulation=formulation, stabilisation=Damped())
-    run = stm.simulate(scene_of(system, state), method=method, ts=[0.0, 0.1], **BARE)
-    assert run.settings["stabilisation"] == "Damped"
-    assert run.certificate.position_violation < 1e-13
 
 
 def test_the_three_that_there_are():
@@ -74,9 +67,12 @@ def test_the_three_that_there_are():
     assert [how.iterations_after_step() for how in ways] == [0, 0, 4]
 
 
-def test_steps_without_projection_are_left_as_they_end():
+def test_steps_end_on_the_constraints_with_projection_alone():
     system = pendulum()
     scene = scene_of(system, swung(system, 1.0, 0.5), t1=0.2, save_every=0.1)
     how = stm.Method(formulation=stm.Augmented(), stabilisation=stm.Unstabilised(), rtol=1e-5)
     left = stm.simulate(scene, method=how, **BARE).certificate
     assert left.position_violation > 1e-12
+    run = stm.simulate(scene, method=dataclasses.replace(how, stabilisation=Damped()), **BARE)
+    assert run.settings["stabilisation"] == "Damped"
+    assert run.certificate.position_violation < 1e-13

@@ -1,19 +1,23 @@
-"""Diagonally implicit steps with one Jacobian for many steps, and factorisations in loops."""
+"""Implicit steps with one Jacobian for many, lean explicit ones, factorisations in loops, and what is stiff."""
 
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
-from jax.test_util import check_grads
+import scipy.integrate
+from helpers import pendulum, relative_error, swung
 
 import stmuav_jax as stm
-from stmuav_jax.algebra import linalg, loops
-from stmuav_jax.dynamics.integration import esdirk
-from stmuav_jax.dynamics.integration.esdirk import NonDenseESDIRK
+from stmuav_jax.dynamics.integration import solvers
+from stmuav_jax.dynamics.integration.solvers import (
+    NonDenseESDIRK,
+    NonDenseRungeKutta,
+    butcher_coefficients,
+)
 from stmuav_jax.dynamics.integration.stepping import own_iterations
 
 FORWARD = diffrax.ForwardMode()
@@ -56,13 +60,11 @@ def final(solution: diffrax.Solution) -> np.ndarray:
     return np.asarray(solution.ys[-1])
 
 
-@pytest.mark.parametrize("native", [False, True])
-def test_differences_give_the_jacobian(native, monkeypatch):
-    """Columns side by side, or one by one in a native loop; integrals beside the state have none."""
-    monkeypatch.setattr(esdirk, "native_loops", lambda: native)
+def test_differences_give_the_jacobian():
+    """Columns side by side; integrals beside the state have none."""
     wider = lambda t, y: jnp.append(field(t, y, 2.0), y[0] ** 2)
     y = jnp.array([0.7, -0.4, 3.0])
-    found = esdirk._differences(wider, 0.2, y, 2)
+    found = solvers._difference_jacobian(wider, 0.2, y, 2)
     exact = jax.jacfwd(lambda y: wider(0.2, y))(y)
     # the step of a difference is the root of the round-off
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-7)
@@ -91,9 +93,22 @@ def test_a_jacobian_that_no_longer_fits_is_computed_again():
     start, rate = jnp.array([2.0, 0.0]), 1e4
     own = NonDenseESDIRK(diffrax.Kvaerno5(), 1e-7, 1e-7, 2)
     found = adaptive(own, van_der_pol, start, 2.0, 1e-7, rate)
-    exact = adaptive(stm.Rodas5P(), van_der_pol, start, 2.0, 1e-10, rate)
+    exact = scipy.integrate.solve_ivp(
+        lambda t, y: [y[1], rate * ((1 - y[0] ** 2) * y[1] - y[0])], (0, 2), start, "Radau", rtol=1e-10, atol=1e-10,
+        jac=lambda t, y: np.array([[0.0, 1.0], [rate * (-2 * y[0] * y[1] - 1), rate * (1 - y[0] ** 2)]]),
+    )  # fmt: skip
     assert found.stats["num_steps"] < 2000
-    np.testing.assert_allclose(final(found)[0], final(exact)[0], atol=2e-5)
+    np.testing.assert_allclose(final(found)[0], exact.y[0, -1], atol=2e-5)
+
+
+@pytest.mark.parametrize("rate", [1e3, 1e8])
+def test_stiffness_costs_no_steps_and_no_accuracy(rate):
+    """Prothero and Robinson: y' = -lambda (y - cos t) - sin t; explicit steps would be at most 5 / lambda."""
+    stiff = lambda t, y, args: -args * (y - jnp.cos(t)) - jnp.sin(t)
+    own = NonDenseESDIRK(diffrax.Kvaerno5(), 1e-6, 1e-6, 1)
+    run = adaptive(own, stiff, jnp.array([1.0]), 10.0, 1e-6, jnp.asarray(rate))
+    assert run.stats["num_steps"] < 100
+    assert abs(final(run)[0] - np.cos(10.0)) < 1e-5
 
 
 def test_many_side_by_side_are_those_one_by_one():
@@ -109,59 +124,69 @@ def test_another_root_finder_is_left_to_diffrax():
     assert not own_iterations(diffrax.Dopri8())
 
 
-# --- factorisations
+# --- explicit
 
 
-@pytest.fixture(params=["LAPACK", "loops"])
-def native(request, monkeypatch):
-    monkeypatch.setattr(linalg, "native_loops", lambda: request.param == "loops")
-    jax.clear_caches()
-    yield request.param
-    jax.clear_caches()
+def test_stages_that_only_serve_interpolation_are_left_out():
+    assert len(butcher_coefficients(diffrax.Dopri8())[3]) == 13
+    assert len(butcher_coefficients(diffrax.Tsit5())[3]) == 7
 
 
-def test_factorisations_against_scipy(native):
-    rng = np.random.default_rng(1)
-    for k in (1, 4, 9):
-        A, b = rng.normal(size=(k, k)), rng.normal(size=k)
-        A[0, 0] = 0.0 if k > 1 else 1.0  # needs a pivot
-        S = A @ A.T + np.eye(k)
-        expected = scipy.linalg.lu_solve(scipy.linalg.lu_factor(A), b)
-        np.testing.assert_allclose(
-            linalg.inverted(jnp.asarray(A)).solve(jnp.asarray(b)), expected, rtol=1e-10
-        )
-        L = np.asarray(linalg.cholesky(jnp.asarray(S)))
-        np.testing.assert_allclose(L, scipy.linalg.cholesky(S, lower=True), atol=1e-13)
-        for transpose in (False, True):
-            x = linalg.solve_lower(jnp.asarray(L), jnp.asarray(A), transpose=transpose)
-            expected = scipy.linalg.solve_triangular(L, A, lower=True, trans=int(transpose))
-            np.testing.assert_allclose(x, expected, atol=1e-12)
-        product = linalg.product_transposed(jnp.asarray(S), jnp.asarray(A))
-        np.testing.assert_allclose(product, S @ A.T, atol=1e-12)
+@pytest.mark.parametrize("method", [diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Dopri5()])
+def test_lean_steps_are_those_of_the_method(method):
+    term, start = diffrax.ODETerm(field), jnp.array([1.0, 0.5])
+    state = method.init(term, 0.0, 0.3, start, 1.0)
+    one = method.step(term, 0.0, 0.3, start, 1.0, state, True)
+    two = NonDenseRungeKutta(method).step(term, 0.0, 0.3, start, 1.0, None, True)
+    assert relative_error(two[0], one[0]) < 1e-15
+    np.testing.assert_allclose(two[1], one[1], rtol=0, atol=1e-15)
 
 
-def test_singular_matrices_give_no_finite_solution(native):
-    ones = jnp.ones((3, 3))
-    assert not np.any(np.isfinite(linalg.inverted(ones).solve(jnp.arange(3.0))))
-    assert np.all(np.isnan(linalg.factorise(-ones, redundant=False, rcond=0.0).solve(ones[0])))
+# --- stiff scenes
 
 
-def test_derivatives_of_the_factorisations(native):
-    rng = np.random.default_rng(2)
-    A, b = rng.normal(size=(4, 4)), rng.normal(size=4)
-
-    def solutions(A, b):
-        S = linalg.product_transposed(A, A) + jnp.eye(4)
-        found = linalg.factorise(S, redundant=False, rcond=0.0).solve(b)
-        return linalg.inverted(A).solve(b), found, linalg.cholesky(S)
-
-    check_grads(jax.jit(solutions), (A, b), order=1, rtol=1e-5, atol=1e-5)
-
-
-def test_loops_over_a_batch():
-    rng = np.random.default_rng(3)
-    A = rng.normal(size=(5, 6, 6))
-    S = A @ np.swapaxes(A, 1, 2) + np.eye(6)
-    np.testing.assert_allclose(
-        jax.vmap(loops.cholesky)(jnp.asarray(S)), np.linalg.cholesky(S), atol=1e-13
+@pytest.fixture(scope="module")
+def rail():
+    """A slider on a rail with a servo of 1e6 N/m that follows a sine."""
+    body = stm.Body("cart", 1.0, (0.1, 0.1, 0.1))
+    joint = stm.translational("rail", "ground", "cart", axis=(0, 0, 1))
+    servo = stm.mechanics.JointServo(
+        "rail", stiffness=1e6, damping=2e5, target=lambda t: 0.1 * jnp.sin(3 * t)
     )
+    return stm.System([body], [joint], [stm.Gravity(), servo])
+
+
+def test_the_spectrum_of_a_servo(rail):
+    """m x'' + c x' + k x = 0: the roots of m s^2 + c s + k."""
+    values = stm.dynamics.spectrum(rail, rail.reference)
+    expected = np.roots([1.0, 2e5, 1e6])
+    np.testing.assert_allclose(values[:2], expected, rtol=1e-8)
+
+
+def test_the_spectrum_of_a_pendulum_hanging():
+    system = pendulum()
+    values = stm.dynamics.spectrum(system, swung(system, 0.0))
+    assert np.max(np.abs(np.real(values))) < 1e-6
+    assert np.min(np.abs(values)) < 1e-6 or len(values) == 2
+
+
+def test_auto_takes_the_implicit_method_where_it_pays(rail):
+    assert isinstance(stm.dynamics.choose_solver(rail, rail.reference), diffrax.Kvaerno5)
+    soft = eqx.tree_at(
+        lambda s: (s.forces[1].stiffness, s.forces[1].damping),
+        rail,
+        (jnp.asarray(10.0), jnp.asarray(1.0)),
+    )
+    assert isinstance(stm.dynamics.choose_solver(soft, soft.reference), diffrax.Dopri8)
+
+
+def test_a_stiff_servo_in_few_steps(rail):
+    start = rail.reference
+    cart = stm.State(start.r, start.p, start.v.at[0, 2].set(0.3), start.omega)
+    scene = stm.Scene("rail", "A stiff servo", rail, cart, t1=1.0, save_every=0.5)
+    run = stm.simulate(scene, method=stm.Method(solver="auto", rtol=1e-6, atol=1e-6))
+    assert run.settings["solver"] == "Kvaerno5"
+    assert run.certificate.accepted_steps < 200
+    # the servo holds its target but for the lag of a weight of 9.81 N
+    lag = run.states.r[-1, 0, 2] - 0.1 * np.sin(3.0)
+    assert abs(lag + 9.81 / 1e6) < 2e-6

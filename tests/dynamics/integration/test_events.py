@@ -1,10 +1,13 @@
 """Events: direction, restarts at the event, other thresholds, values that are not numbers; jumps."""
 
+import dataclasses
+
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import stmuav_jax as stm
 
@@ -33,7 +36,7 @@ def test_bouncing_ball():
     def fall(t, z, v, plane):
         compiled.append(1)
         start = stm.State(at.r.at[0, 2].set(z), at.p, at.v.at[0, 2].set(v), at.omega)
-        method = stm.Method(adjoint=diffrax.ForwardMode(), event=plane, direction=False)
+        method = dataclasses.replace(AHEAD, solver=diffrax.Tsit5(), event=plane, direction=False)
         return stm.integrate(system, start, jnp.stack([t, t + 3.0]), method)
 
     t, z, v = jnp.zeros(()), jnp.ones(()), jnp.zeros(())
@@ -67,3 +70,44 @@ def test_known_jumps():
     np.testing.assert_array_equal(path.ts, ts)
     np.testing.assert_allclose(path.states.r[:, 0, 0], [0, 0.75, 1.875, 2.115, 3.75], atol=1e-8)
     assert int(path.counts.rejected[-1]) == 0
+
+
+HEIGHTS = jnp.array([1.0, 3.0, 10.0, 200.0, 0.0, 2e3])
+RAIL = stm.translational("rail", "ground", "ball", axis=(0, 0, 1))
+BALL = stm.System([stm.Body("ball", 1.0, [0.1, 0.2, 0.3])], [RAIL], [stm.Gravity()])
+
+
+def land(h, adjoint):
+    """Time at which a ball lands on a rail from a height, and its path; NaN above 1 km."""
+    at, ts = BALL.reference, jnp.array([0.0, 1.0, 5.0])
+    height = lambda t, s: jnp.where(s.r[0, 2] > 1e3, jnp.nan, s.r[0, 2])
+    method = stm.Method(solver=diffrax.Tsit5(), event=height, direction=False, adjoint=adjoint)
+    start = stm.State(at.r.at[0, 2].set(h), at.p, at.v, at.omega)
+    path = stm.integrate(BALL, start, ts, method)
+    return path.ts[-1], (path.ts, path.states.r[:, 0, 2], path.result)
+
+
+def test_each_of_a_batch_ends_at_its_own_event():
+    """Balls from heights whose events lie in different intervals, or do not come at all.
+
+    One falls from its event, which is no event; one is no number. Times are exact to the last digits.
+    """
+    heights = np.asarray(HEIGHTS)[:5]
+    ts, z, result = jax.jit(jax.vmap(lambda h: land(h, stm.Method().adjoint)))(HEIGHTS)[1]
+    exact = np.array([*np.sqrt(2 * heights[:3] / PULL), 5.0, 5.0])
+    np.testing.assert_allclose(ts[:5, -1], exact, rtol=1e-13)
+    np.testing.assert_allclose(z[:5, -1], heights - 0.5 * PULL * exact**2, atol=1e-11)
+    of = diffrax.RESULTS
+    expected = [of.event_occurred] * 3 + [of.successful] * 2 + [of.nonfinite]
+    assert [int(k) for k in result._value] == [int(one._value) for one in expected]
+    assert ts[5, -1] == 0.0
+    assert np.isnan(z[5, -1])
+
+
+@pytest.mark.slow
+def test_a_batch_of_events_has_the_derivatives_of_its_times():
+    """Those of sqrt(2 h / g), and of an event that does not come."""
+    heights = HEIGHTS[:4]
+    slope = jax.jit(jax.vmap(jax.grad(lambda h: land(h, stm.Method().adjoint)[0])))(heights)
+    known = [*(1 / np.sqrt(2 * np.asarray(heights[:3]) * PULL)), 0.0]
+    np.testing.assert_allclose(slope, known, rtol=1e-9, atol=1e-12)

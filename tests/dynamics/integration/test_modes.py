@@ -12,9 +12,9 @@ from helpers import pendulum
 from scipy.linalg import expm
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration.step_bound import (
+from stmuav_jax.dynamics.integration.stepping import (
     Guard,
-    radius,
+    accuracy_radius,
     spectral_radius,
     stability_function,
 )
@@ -72,21 +72,12 @@ def of_pendulum(damping, stiffness):
 x_of_bob = lambda state: state.r[0, 0]
 
 
-def test_hanging_pendulum_backwards():
-    """1e-6, also where the derivative is a thousandth of what it was half a swing before."""
-    found = slopes(hung(0.0), stm.Method(), x_of_bob, ahead=False)
-    np.testing.assert_allclose(found, of_pendulum(0.0, 0.0), rtol=1e-6)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("damping", [0.0, 0.7])
-@pytest.mark.parametrize("name", ["Dopri8", "Tsit5", "Rodas5P"])
-def test_hanging_pendulum_forwards(name, damping):
-    """With a spring in its hinge, and with and without a damper."""
-    solver = {"Dopri8": diffrax.Dopri8(), "Tsit5": diffrax.Tsit5(), "Rodas5P": stm.Rodas5P()}[name]
-    method = stm.Method(solver=solver, adjoint=diffrax.ForwardMode())
-    found = slopes(hung(damping, 5.0), method, x_of_bob, ahead=True)
-    np.testing.assert_allclose(found, of_pendulum(damping, 5.0), rtol=1e-6)
+def test_hanging_pendulum_forwards_by_an_implicit_method():
+    """With a spring and a damper in its hinge; the double pendulum below goes backwards, without."""
+    method = stm.Method(solver=stm.dynamics.kvaerno5(), adjoint=diffrax.ForwardMode())
+    found = slopes(hung(0.7, 5.0), method, x_of_bob, ahead=True)
+    np.testing.assert_allclose(found, of_pendulum(0.7, 5.0), rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -141,15 +132,13 @@ def test_steps_for_the_state_alone():
     assert int(free.counts.at_growth_limit[-1]) == int(free.counts.accepted[-1])
 
 
-@pytest.mark.parametrize(
-    "solver", [diffrax.Dopri8(), diffrax.Tsit5(), stm.dynamics.kvaerno5(), stm.Rodas5P()]
-)
+@pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5(), stm.dynamics.kvaerno5()])
 def test_radius_keeps_the_error_of_a_step_below_its_share(solver):
     R = stability_function(solver)
     assert R is not None
     order = solver.order(diffrax.ODETerm(lambda t, y, args: y))
     for rtol in (1e-4, 1e-7):
-        r = float(radius(solver, order, rtol))
+        r = float(accuracy_radius(solver, order, rtol))
         for way in (1j, complex(-1.0), np.exp(2.3j)):
             assert abs(R(r * way) - np.exp(r * way)) <= 1.01 * r * rtol / 500
 
@@ -169,6 +158,6 @@ def test_modes_of_a_matrix():
         y = jnp.zeros(9)
         modes = guard.begin(0.0, y)
         field = lambda t, y, A=matrix: jnp.asarray(A) @ y
-        found = guard.looked(field, waited, y, 1e-3, modes)
+        found = guard.update_modes(field, waited, y, 1e-3, modes)
         assert float(0.4 / found.longest) == pytest.approx(fastest, rel=0.06)
         assert int(found.age) == 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration.closed_over import Closure, opened
+from stmuav_jax.dynamics.integration.problem import Closure, convert_closures
 
 
 @eqx.filter_custom_vjp
@@ -70,7 +70,9 @@ def of_itself(a):
     "make", [of_lambda, of_default, of_keyword, of_inner, of_pytree, of_partial, of_itself]
 )
 def test_differentiated(make):
-    value, slope = jax.jit(jax.value_and_grad(lambda a: applied(opened(make(a)), 3.0)))(2.0)
+    value, slope = jax.jit(jax.value_and_grad(lambda a: applied(convert_closures(make(a)), 3.0)))(
+        2.0
+    )
     assert (float(value), float(slope)) == (6.0, 3.0)
 
 
@@ -96,8 +98,8 @@ def test_a_force_written_as_a_lambda():
 
 def test_nothing_to_open_stays_as_it_is():
     function = of_lambda(2.0)
-    assert opened(function) is function
-    assert opened({"f": function, "x": 1.0}) == {"f": function, "x": 1.0}
+    assert convert_closures(function) is function
+    assert convert_closures({"f": function, "x": 1.0}) == {"f": function, "x": 1.0}
     kinds = []
-    jax.jit(lambda a: kinds.append(type(opened(of_lambda(a)))))(1.0)
+    jax.jit(lambda a: kinds.append(type(convert_closures(of_lambda(a)))))(1.0)
     assert kinds == [Closure]

@@ -7,35 +7,31 @@ import pytest
 from helpers import forked
 
 import stmuav_jax as stm
-from stmuav_jax.algebra.linalg import right_inverse, solve_saddle
-from stmuav_jax.dynamics.tree.coordinates import split
-from stmuav_jax.dynamics.tree.elimination import (
+from stmuav_jax.dynamics.tree.coordinates import split_vector
+from stmuav_jax.dynamics.tree.motion import (
     branch_columns,
+    composite_inertia,
+    compute_motion,
     eliminate_branches,
     first_solution,
     has_small_blocks,
+    mass_matrix,
     right_inverse_branches,
+    wrenches_by_frame,
 )
-from stmuav_jax.dynamics.tree.frames import columns, support
-from stmuav_jax.dynamics.tree.motion import inertia, mass_matrix, motion, wrenches_by_frame
-
-SYSTEMS = {
-    "uav": lambda: stm.make_scene("uav_tracker", 2).system,
-    "tracker": lambda: stm.make_scene("tracker", 1).system,
-    "forked, floating": lambda: forked(True),
-    "forked, on ground": lambda: forked(False),
-}
+from stmuav_jax.dynamics.tree.topology import find_supported, motion_columns
+from stmuav_jax.math.linalg import right_inverse, solve_saddle
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_same_as_dense(name):
-    system = SYSTEMS[name]()
+@pytest.mark.parametrize("floating", [True, False])
+def test_same_as_dense(floating):
+    system = forked(floating)
     model = stm.Tree().prepare(system)
     parameters, tree = model.parameters, model.parameters.tree
     rng = np.random.default_rng(3)
     x = stm.Tree().to_vector(model, system.reference)
     x = x + 0.3 * rng.normal(size=x.shape)
-    wide = len(columns(tree).frame)
+    wide = len(motion_columns(tree).frame)
     J = jnp.asarray(rng.normal(size=(3, wide)))
     gamma = jnp.asarray(rng.normal(size=3))
     loads = jnp.asarray(rng.normal(size=(2, 3, system.n_bodies)))
@@ -45,8 +41,8 @@ def test_same_as_dense(name):
 
     @jax.jit
     def both(x):
-        moving = motion(parameters, split(tree, x))
-        total = inertia(parameters, moving, wrenches_by_frame(tree, moving, *loads))
+        moving = compute_motion(parameters, split_vector(tree, x))
+        total = composite_inertia(parameters, moving, wrenches_by_frame(tree, moving, *loads))
         M = mass_matrix(tree, moving.S, total)
         all_J = jnp.concatenate([jnp.zeros((3, base)), J], axis=1)
         by_branch = lambda J, gamma: eliminate_branches(tree, moving.S, total, J, gamma, h)
@@ -68,7 +64,7 @@ def test_same_as_dense(name):
 
 def test_branches_share_no_frame():
     tree = stm.Tree().prepare(forked(False)).parameters.tree
-    frame, table, supported = columns(tree).frame, branch_columns(tree), support(tree)
+    frame, table, supported = motion_columns(tree).frame, branch_columns(tree), find_supported(tree)
     own = [{int(frame[k]) for k in row if k < len(frame)} for row in table]
     assert sorted(map(len, own)) == [1, 3]
     for f in own[0]:

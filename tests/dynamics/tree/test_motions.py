@@ -10,12 +10,17 @@ import pytest
 from helpers import inertia_of, random_quaternion, relative_error
 
 import stmuav_jax as stm
-from stmuav_jax.algebra.stacked import apply, apply_transposed, multiply
 from stmuav_jax.dynamics.formulations.stabilisation import Unstabilised
-from stmuav_jax.mechanics.joint import CATALOGUE
-from stmuav_jax.mechanics.joint_kind import Freedom, JointKind, Term, X, Y, Z
-from stmuav_jax.mechanics.motions.axial import PRISMATIC, REVOLUTE, SCREW
-from stmuav_jax.mechanics.motions.base import AbstractRelativeMotion, MotionColumn, RelativePose
+from stmuav_jax.math.stacked import apply_matrix, apply_transposed, multiply_matrices
+from stmuav_jax.mechanics.joint import CATALOGUE, Freedom, JointKind, Term, X, Y, Z
+from stmuav_jax.mechanics.motions import (
+    PRISMATIC,
+    REVOLUTE,
+    SCREW,
+    AbstractRelativeMotion,
+    MotionColumn,
+    RelativePose,
+)
 
 SAME = 1e-11
 
@@ -53,7 +58,7 @@ class Planar(AbstractRelativeMotion):
         return jnp.stack([q[0], q[1], jnp.zeros_like(q[0])])
 
     def relative(self, q, K, k, shares):
-        return multiply(K, self._rotation(q[2])), k + apply(K, self._flat(q))
+        return multiply_matrices(K, self._rotation(q[2])), k + apply_matrix(K, self._flat(q))
 
     def _turned(self, angle):
         none = jnp.zeros_like(angle)
@@ -62,12 +67,12 @@ class Planar(AbstractRelativeMotion):
     def euler_parameters(self, q, shares):
         return self._turned(q[2])
 
-    def read(self, seen, shares):
-        angle = jnp.arctan2(seen.rotation[1, 0], seen.rotation[0, 0])
-        return jnp.stack([*seen.offset[:2], angle]), self._rotation(angle), seen.offset
+    def read(self, frames, shares):
+        angle = jnp.arctan2(frames.rotation[1, 0], frames.rotation[0, 0])
+        return jnp.stack([*frames.offset[:2], angle]), self._rotation(angle), frames.offset
 
     def rates(self, q, u):
-        return apply(self._rotation(q[2]), self._flat(u)).at[2].set(u[2])
+        return apply_matrix(self._rotation(q[2]), self._flat(u)).at[2].set(u[2])
 
     def retract(self, q, step):
         return q + self.rates(q, step)

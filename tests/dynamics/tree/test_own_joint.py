@@ -9,12 +9,9 @@ import pytest
 from helpers import inertia_of, random_quaternion
 
 import stmuav_jax as stm
-from stmuav_jax.mechanics.joint import CATALOGUE
-from stmuav_jax.mechanics.joint_kind import Freedom, JointKind, Term, X, Y, Z
+from stmuav_jax.mechanics.joint import CATALOGUE, Freedom, JointKind, Term, X, Y, Z
 from stmuav_jax.mechanics.joint_states import coordinates_of
-from stmuav_jax.mechanics.motions.axial import PRISMATIC, REVOLUTE
-from stmuav_jax.mechanics.motions.sequence import references
-from stmuav_jax.mechanics.motions.spherical import SPHERICAL
+from stmuav_jax.mechanics.motions import PRISMATIC, REVOLUTE, SPHERICAL, reference_directions
 
 ALONG_X, ALONG_Y = Freedom(PRISMATIC, X, " along x"), Freedom(PRISMATIC, Y, " along y")
 PLANE = (Term("n1", X, Z), Term("n1", Y, Z), Term("n2", Z))
@@ -78,7 +75,7 @@ def test_coordinates_come_back_in_both_directions(star):
 )
 def test_sequences_that_cannot_be_read_are_refused(motions, words):
     with pytest.raises(stm.ModelError, match=f"Joint 'own' has .*{words}"):
-        references(motions, "Joint 'own'")
+        reference_directions(motions, "Joint 'own'")
 
 
 def test_a_joint_that_would_be_held_in_part_is_refused(star):

@@ -5,7 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from stmuav_jax.dynamics.tree.singular import Nearness, interpolated
+from stmuav_jax.dynamics.tree.closures import Nearness, interpolate_posture
+
+# displacement between the postures [rad]
+APART = 0.06
 
 
 def posture(near, smallest=1e-6):
@@ -19,8 +22,8 @@ def removable(by):
 
 @pytest.fixture(scope="module")
 def found():
-    near = jax.jit(lambda at, u: interpolated(at, u, removable, power=3))
-    return lambda flag: near(posture(flag), jnp.array([3.0, 1.0]))
+    near = jax.jit(lambda at, way: interpolate_posture(at, way, removable, power=3))
+    return lambda flag: near(posture(flag), jnp.array([APART, APART / 3]))
 
 
 def test_a_removable_singularity_is_bridged(found):
@@ -36,8 +39,8 @@ def test_elsewhere_nothing_is_interpolated(found):
 
 def test_its_derivative_is_bridged_too():
     """d/da of sin(a x) / x at x = 0 is one."""
-    f = lambda a: interpolated(
-        posture(True), jnp.array([2.0]), lambda by: jnp.sin(a * by[0]) / by[0], power=3
+    f = lambda a: interpolate_posture(
+        posture(True), jnp.array([APART]), lambda by: jnp.sin(a * by[0]) / by[0], power=3
     )
     value, rate = jax.jvp(f, (1.5,), (1.0,))
     assert float(value) == pytest.approx(1.5, rel=1e-13)
@@ -48,10 +51,10 @@ def test_its_derivative_is_bridged_too():
 def test_what_is_not_smooth_is_left_as_it_is():
     """A pole does not go away: the run's step control has to see that."""
     f = lambda by: 1 / by[0] + jnp.abs(by[0])
-    assert not np.isfinite(interpolated(posture(True), jnp.array([1.0]), f, power=3))
+    assert not np.isfinite(interpolate_posture(posture(True), jnp.array([APART]), f, power=3))
     # that of a linkage which misses the singular posture narrowly
     near_miss = lambda by: 1 / jnp.sqrt(by[0] ** 2 + 1e-4)
-    found = interpolated(posture(True), jnp.array([1.0]), near_miss, power=3)
+    found = interpolate_posture(posture(True), jnp.array([APART]), near_miss, power=3)
     assert float(found) == pytest.approx(100.0, rel=1e-15)
 
 
@@ -59,7 +62,7 @@ def test_the_equations_serve_where_round_off_is_less_than_the_interpolations_err
     """exp(10 x) is interpolated to 1e-7 or so: too little where round-off leaves 1e-12."""
     f = lambda by: 1e-3 * jnp.exp(10 * by[0])
     of = lambda smallest: float(
-        interpolated(posture(True, smallest), jnp.array([1.0]), f, power=3) - 1e-3
+        interpolate_posture(posture(True, smallest), jnp.array([APART]), f, power=3) - 1e-3
     )
     assert of(0.1) == 0.0
     assert 0.0 < abs(of(1e-3)) < 1e-6

@@ -1,0 +1,201 @@
+"""Machine code of the equations against XLA's: operations, times by lanes, compilation, differences.
+
+    taskset -c 1 python benchmarks/machine_code.py
+
+uav_tracker case 2 by spanning-tree coordinates: right-hand side, projection, and flights of one second
+at 1e-9 by lanes. Both kinds of code are measured in one process, in seconds of the processor; states are
+of a motion near the start, flights agree to their tolerance. The figure stands in docs/theory.md.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import montecarlo
+import numpy as np
+from jax.extend import core
+from matplotlib.figure import Figure
+from shared.clock import compiled, timed
+from shared.command import benchmark
+from shared.pages import save
+
+import stmuav_jax as stm
+from stmuav_jax.dynamics.integration.problem import (
+    _get_derivative,
+    _get_projection,
+    prepare_problem,
+)
+from stmuav_jax.math.native import llvm
+from stmuav_jax.math.native.graph import _MOVES, make_graph
+
+
+@dataclass(frozen=True)
+class Size:
+    """lanes: states at once; passes: evaluations in a row; flights, their lanes, and settings."""
+
+    lanes: tuple[int, ...] = (1, 4, 16, 64, 1024)
+    passes: int = 1000
+    flights: montecarlo.Size = montecarlo.FULL
+    flying: tuple[int, ...] = (1, 64)
+    tolerance: float = 1e-9
+    repeats: int = 3
+
+
+QUICK = Size((1, 3), 3, montecarlo.ONE, (1,), 1e-6, 1)
+
+
+def functions(scene: stm.Scene) -> tuple[dict[str, Callable[..., Any]], Any, jax.Array]:
+    """Functions of the prepared model and a vector of the state; the model and the start."""
+    method = stm.Method()
+    problem = prepare_problem(scene.system, method)
+    formulation, steady = method.formulation, method.stabilisation
+    time_zero, iterations = jnp.zeros(()), steady.iterations_after_step()
+    rate = lambda model, x: _get_derivative(formulation, model, time_zero, x, steady)[0]
+    project = lambda model, x: _get_projection(formulation, model, time_zero, x, iterations)[0]
+    start = formulation.to_vector(problem.model, scene.state0)
+    return {"right-hand side": rate, "projection": project}, problem.model, start
+
+
+def count_traced(jaxpr: Any) -> int:
+    """Operations on single numbers of a traced function, without moves of numbers."""
+    total = 0
+    for equation in jaxpr.eqns:
+        name, shapes = equation.primitive.name, [math.prod(v.aval.shape) for v in equation.outvars]
+        inner = list(core.jaxprs_in_params(equation.params))
+        if inner:
+            total += equation.params.get("length", 1) * sum(map(count_traced, inner))
+        elif name == "dot_general":
+            (axes, _), _ = equation.params["dimension_numbers"]
+            terms = math.prod(equation.invars[0].aval.shape[k] for k in axes)
+            total += (2 * terms - 1) * shapes[0]
+        elif name.startswith("reduce_"):
+            total += math.prod(equation.invars[0].aval.shape) - shapes[0]
+        elif name not in _MOVES and name not in ("gather", "scatter", "split", "pad", "iota"):
+            total += sum(shapes)
+    return total
+
+
+def count_operations(function: Callable[..., Any], model: Any, x: jax.Array) -> dict[str, int]:
+    """Operations on single numbers as traced, and those of the scalar program."""
+    arrays, rest = eqx.partition(model, eqx.is_array)
+    leaves, tree = jax.tree.flatten(arrays)
+    flat = lambda x, *numbers: function(eqx.combine(jax.tree.unflatten(tree, numbers), rest), x)
+    stm.math.use_native_code(False)
+    traced = jax.make_jaxpr(flat)(x, *leaves)
+    stm.math.use_native_code(True)
+    graph, outputs = make_graph(traced, llvm.MOST_NODES)
+    graph, _ = llvm.fuse(graph, [n for out in outputs for n in out.ravel().tolist()])
+    kept = sum(op not in ("input", "constant") for op in graph.ops)
+    return {"traced": count_traced(traced.jaxpr), "left": kept}
+
+
+def evaluated(
+    function: Callable[..., Any], model: Any, starts: jax.Array, size: Size
+) -> dict[str, Any]:
+    """Microseconds per state of evaluations in a row, seconds to compile, and the last values."""
+    one = len(starts) == 1
+    passes = max(1, size.passes // len(starts))
+
+    def chain(start: jax.Array) -> Any:
+        value = lambda x: function(model, x)
+        evaluate = value if one else jax.vmap(value)
+
+        def step(_: Any, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            rate = evaluate(now[0])
+            # each evaluation needs the one before
+            return now[0] + 1e-12 * rate, rate
+
+        return jax.lax.fori_loop(0, passes, step, (start, start))[1]
+
+    argument = starts[0] if one else starts
+    program, seconds = compiled(chain, argument, clock=time.process_time)
+    cost, last = timed(program, argument, repeats=size.repeats)
+    best = 1e6 * cost.processor.best / (passes * len(starts))
+    return {"us_per_state": best, "compile_seconds": seconds, "last": np.asarray(last)}
+
+
+def both(measured: Callable[[], dict[str, Any]], key: str) -> dict[str, Any]:
+    """A measurement by machine code and by XLA, and the largest difference relative to the largest value."""
+    found = {}
+    for on in (True, False):
+        stm.math.use_native_code(on)
+        found[on] = measured()
+    stm.math.use_native_code(True)
+    ours, theirs = (found[on].pop(key) for on in (True, False))
+    apart = float(np.max(np.abs(ours - theirs)) / np.max(np.abs(theirs)))
+    return {"machine_code": found[True], "xla": found[False], "difference": apart}
+
+
+def fly(size: Size, lanes: int) -> dict[str, Any]:
+    """Flights per second and seconds to compile, with the positions at the end."""
+    count = min(size.flights.flights, 32 if lanes == 1 else 256)
+    begun = time.process_time()
+    bare = montecarlo.Bare(replace(size.flights, flights=count), size.tolerance, lanes)
+    seconds = time.process_time() - begun
+    cost, _ = timed(bare.fly, count, repeats=size.repeats)
+    ends = bare.ends(min(count, size.flights.checked))
+    return {
+        "flights_per_second": count / cost.processor.best, "compile_seconds": seconds, "ends": ends,
+    }  # fmt: skip
+
+
+def record(size: Size) -> Iterator[dict[str, Any]]:
+    """A row for each function and number of lanes, then flights."""
+    scene = stm.make_scene(size.flights.scene, size.flights.case)
+    made, model, start = functions(scene)
+    rng = np.random.default_rng(1)
+    rows: list[dict[str, Any]] = []
+    content = {
+        "what": "machine code of the equations against XLA's", "vector_width": llvm.vector_width(),
+        "operations": {k: count_operations(f, model, start) for k, f in made.items()}, "rows": rows,
+        "flights": [],
+    }  # fmt: skip
+    for name, function in made.items():
+        for lanes in size.lanes:
+            starts = start + 1e-2 * rng.normal(size=(lanes, len(start)))
+            timed = lambda f=function, s=starts: evaluated(f, model, s, size)
+            rows.append({"function": name, "lanes": lanes, **both(timed, "last")})
+            print(rows[-1], flush=True)
+        yield content
+    for lanes in size.flying:
+        row = {"lanes": lanes, **both(lambda k=lanes: fly(size, k), "ends")}
+        content["flights"].append(row)
+        print(row, flush=True)
+        yield content
+
+
+def show(path: Path, folder: Path) -> Path:
+    """Draw operations before and after, and time per state against lanes."""
+    content = json.loads(path.read_text())
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1, 2))
+    operations = content["operations"]
+    places = np.arange(len(operations))
+    for k, (key, label) in enumerate((("traced", "as traced"), ("left", "machine code"))):
+        left.bar(places + 0.4 * k, [o[key] for o in operations.values()], 0.4, label=label)
+    left.set_xticks(places + 0.2, list(operations))
+    left.set_ylabel("operations of one evaluation")
+    rows = [row for row in content["rows"] if row["function"] == "right-hand side"]
+    for key, label in (("xla", "XLA"), ("machine_code", "machine code")):
+        times = [row[key]["us_per_state"] for row in rows]
+        right.loglog([row["lanes"] for row in rows], times, "o-", label=label)
+    right.set_xticks([row["lanes"] for row in rows], [str(row["lanes"]) for row in rows])
+    right.set_xticks([], minor=True)
+    right.set_xlabel("states at once")
+    right.set_ylabel("time per right-hand side [us]")
+    left.margins(y=0.35)
+    left.legend(frameon=False, loc="upper right")
+    right.legend(frameon=False, loc="center right")
+    (picture,) = save({"machine_code": figure}, folder)
+    return picture
+
+
+if __name__ == "__main__":
+    benchmark("machine_code", __doc__, record, (Size(), QUICK), show)

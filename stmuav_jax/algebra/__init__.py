@@ -1,5 +1,0 @@
-"""Rotations, linear solves, derivatives, root finding, and the compiler. Floor 1."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

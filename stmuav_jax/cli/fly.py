@@ -1,0 +1,121 @@
+"""Command `stmuav fly`: a closed-loop flight from a mission's file, with its verdict."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from ..checks.errors import SimulationError
+from ..figures.terminal import add_row, make_table, print_line
+from .options import END, Cache, Figures, default_text, shared_option
+from .output import print_paths, results_folder
+
+if TYPE_CHECKING:
+    from ..missions.flight import MissionFlight
+    from ..missions.mission import Mission
+
+
+@dataclasses.dataclass
+class Fly:
+    """Fly a mission under control; write flight.nc and figures.
+
+    A mission is a TOML file (docs/control_and_missions.md) or a ready one: hover, case-1 to case-3,
+    sun-slew, sun-day, waypoints, wind-step, gusts, rotor-weak, rotor-lost, rotor-lost-known,
+    slider-jammed, slew-30, battery, takeoff-and-land.
+    Example: stmuav fly case-1 --t1 5. Exit code: 0 all tolerances and limits were kept; 1 the flight
+    failed; 2 wrong input; 3 flown, but not as the mission asks."""
+
+    mission: tyro.conf.Positional[str]
+    """TOML file, or the name of a ready mission."""
+    t1: Annotated[float | None, END, shared_option("t1"), default_text("the mission's")] = None
+    true_states: bool = False
+    """Give the controller the true states in place of estimates from the mission's sensors."""
+    log: bool = False
+    """Write log.csv too, the flight as its instruments and commands show it, which `identify` takes."""
+    out: Annotated[Path | None, shared_option("out"), default_text("runs/MISSION")] = None
+    figures: Figures = "png"
+    cache: Cache = True
+
+
+# Exit code of a flight that was flown, but not as the mission asks.
+NOT_KEPT = 3
+
+
+def run_fly(command: Fly) -> int:
+    """Run the command; return the exit code."""
+    from ..io.netcdf import save_sealed
+    from ..missions.mission import load_mission
+    from ..missions.outcome import labelled_flight, verdict
+
+    # All checks of a mission happen here, before the compilation.
+    mission = load_mission(command.mission, t1=command.t1, true_states=command.true_states)
+    folder = results_folder(command.out, mission.file.name)
+    flight = _fly_with_progress(mission)
+    arrays = labelled_flight(flight)
+    data, paths = arrays.dataset(), [save_sealed(arrays, folder / "flight.nc")]
+    if command.log:
+        from ..io.flight_log import save_flight_record
+        from ..missions.outcome import to_flight_record
+
+        paths.append(save_flight_record(to_flight_record(flight), folder / "log.csv"))
+    if command.figures != "none":
+        # matplotlib is slow to import: only where figures are drawn
+        from ..figures.plot import save_figures
+        from ..missions.figures import flight_figures
+
+        paths += save_figures(flight_figures(data), folder, command.figures)
+    out = Console()
+    _print_flight(out, data, flight)
+    if flight.ending == "interrupted":
+        print_line(out, f"Interrupted at t = {flight.run.certificate.t_end:g} s.")
+    print_paths(out, paths)
+    if flight.ending == "interrupted":
+        return 130
+    is_success, sentence = verdict(data)
+    print_line(out, sentence)
+    if flight.ending == "failed":
+        raise SimulationError(f"{flight.run.failure} Results up to there are in {folder}.")
+    # A script tells a flight that failed its aims from one that could not be computed.
+    return 0 if is_success else NOT_KEPT
+
+
+def _fly_with_progress(mission: "Mission") -> "MissionFlight":
+    """Flight with a progress bar on stderr."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from ..missions.flight import fly
+
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(f"{mission.file.name}: compiling", total=1.0)
+
+        def report_share(share: float) -> None:
+            t = share * mission.file.t1
+            progress_text = f"{mission.file.name}: {t:.0f} s of {mission.file.t1:g} s"
+            bar.update(task, completed=share, description=progress_text)
+
+        return fly(mission, progress=report_share)
+
+
+def _print_flight(out: Console, data: Any, flight: "MissionFlight") -> None:
+    from ..missions.outcome import measures
+
+    measure_table = make_table("quantity", "value", "allowed", title=data.attrs["title"] or None)
+    for measure in measures(data):
+        allowed = "-" if measure.allowed is None else f"{measure.allowed:g}"
+        mark = "" if measure.is_met else "  (not kept)"
+        add_row(
+            measure_table, measure.name, f"{measure.value:.4g} {measure.unit}", f"{allowed}{mark}"
+        )
+    certificate = flight.run.certificate
+    seconds = f"{certificate.compile_seconds:.1f} s, {certificate.run_seconds:.1f} s"
+    add_row(
+        measure_table,
+        "Constraint violation, lengths",
+        f"{certificate.position_violation:.2g} m",
+        "-",
+    )
+    add_row(measure_table, "Time to compile, to run", seconds, "-")
+    out.print(measure_table)

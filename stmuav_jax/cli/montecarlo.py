@@ -1,0 +1,198 @@
+"""Command `stmuav montecarlo`: Monte Carlo studies, their summaries and figures."""
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from ..checks.errors import SettingError
+from .options import SEED, Cache, Figures, Resume, count_range, default_text, shared_option
+from .output import print_paths, results_folder
+
+if TYPE_CHECKING:
+    from ..studies.study import Study, StudyOutcome
+
+
+@dataclasses.dataclass
+class Montecarlo:
+    """Fly a study: a TOML file, or the name of a ready one; write a store, a summary and figures.
+
+    Example: stmuav montecarlo collapse --samples 256; stmuav montecarlo study.toml --resume --figures none. The ready
+    studies are collapse, hover, case_1 to case_3 and estimate_1 to estimate_8. With --figures none only the store is
+    written.
+    """
+
+    study: tyro.conf.Positional[str]
+    """TOML file (docs/studies.md), or the name of a ready study."""
+    samples: Annotated[int | None, count_range("samples", 1e9), default_text("the study's")] = None
+    """Number of samples. A larger number extends a finished store."""
+    seed: Annotated[int | None, SEED, shared_option("seed"), default_text("the study's")] = None
+    resume: Resume = False
+    chunk: Annotated[
+        int | None,
+        count_range("samples written together", 1e9),
+        default_text("some seconds' worth"),
+    ] = None
+    """Number of samples that are written together."""
+    devices: Annotated[int | None, count_range("devices", 256), default_text("all")] = None
+    """Number of cores or GPUs to use; no result depends on it."""
+    lanes: Annotated[int | None, count_range("lanes", 1e6), default_text("16")] = None
+    """Number of flights that a device computes together, a multiple of 8; part of the study."""
+    scheduler: Annotated[str | None, default_text("none")] = None
+    """Address of a Dask scheduler, such as tcp://10.0.0.1:8786."""
+    workers: Annotated[int | None, count_range("workers", 256), default_text("none")] = None
+    """Number of processes of a Dask cluster that is started here."""
+    params: Annotated[Path | None, shared_option("params"), default_text("the scene's table")] = (
+        None
+    )
+    out: Annotated[Path | None, shared_option("out"), default_text("runs/STUDY")] = None
+    figures: Figures = "png"
+    cache: Cache = True
+
+
+def count_cores() -> int:
+    """Number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def plain_of(command: Montecarlo) -> dict[str, Any]:
+    """Plain data of the study, with the changes by the options."""
+    from ..studies.examples import READY, ready
+    from ..studies.study_file import load_study
+
+    if command.study in READY:
+        plain = ready(command.study)
+    elif command.study.endswith(".toml") or os.sep in command.study:
+        plain = load_study(command.study)
+    else:
+        plain = ready(command.study)
+    if command.seed is not None:
+        plain["seed"] = command.seed
+    return plain
+
+
+def _load_table(command: Montecarlo, plain: Mapping[str, Any]) -> Any:
+    from ..io.netcdf import load_parameters
+    from ..uav.scenes.registry import SCENES
+
+    if command.params is None:
+        return None
+    if plain.get("scene") not in SCENES:
+        raise SettingError("--params replaces values of a scene's table; this study has no scene.")
+    return load_parameters(command.params, SCENES[plain["scene"]].parameters)
+
+
+def _make_study(command: Montecarlo) -> "Study":
+    """Study of the command; errors name the file."""
+    import jax
+
+    from ..studies.examples import READY
+    from ..studies.study_file import make_study
+
+    plain = plain_of(command)
+    devices = command.devices
+    if command.scheduler is None and command.workers is None and jax.default_backend() == "cpu":
+        # All cores of a CPU, unless a cluster's workers choose for themselves.
+        devices = devices or count_cores()
+    settings = {"lanes": command.lanes, "devices": devices}
+    try:
+        if plain.get("kind") != "missions":
+            return make_study(plain, _load_table(command, plain), **settings)
+        from ..missions.ensemble import load_mission_study
+
+        if command.params is not None:
+            raise SettingError("A study of a mission has no --params: its file has the parameters.")
+        return load_mission_study(plain, Path(command.study).parent, **settings)
+    # A message about an entry helps only with the file's name.
+    except SettingError as error:
+        if command.study in READY:
+            raise
+        raise SettingError(f"{command.study}: {error}") from None
+
+
+def run_montecarlo(command: Montecarlo) -> int:
+    """Run the command; return the exit code."""
+    if command.scheduler is not None and command.workers is not None:
+        raise SettingError("Give --scheduler or --workers, not both.")
+    from ..studies.schema import check_count
+
+    for name in ("samples", "chunk", "workers"):
+        if (value := getattr(command, name)) is not None:
+            check_count(value, f"--{name}")
+    study = _make_study(command)
+    folder = results_folder(command.out, study.name)
+    outcome = _run_with_progress(command, study, folder / "study.zarr")
+    out = Console()
+    out.print(outcome.describe(), highlight=False, markup=False, emoji=False)
+    paths = [folder / "study.zarr"]
+    if command.figures != "none" or not outcome.interrupted:
+        paths += report_study(folder / "study.zarr", folder, command.figures, out)
+    print_paths(out, paths)
+    # The exit code of a shell for a command that Ctrl-C has ended.
+    return 130 if outcome.interrupted else 0
+
+
+def _run_with_progress(command: Montecarlo, study: "Study", store: Path) -> "StudyOutcome":
+    """Compute the missing samples of the store, with a progress bar on stderr."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )  # fmt: skip
+
+    from ..studies.study import StudyProgress
+
+    columns = (
+        TextColumn("samples"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("samples", total=None)
+
+        def show_state(progress: StudyProgress) -> None:
+            if progress.note:
+                bar.console.print(progress.note, highlight=False, markup=False, emoji=False)
+            else:
+                bar.update(task, total=progress.total, completed=progress.completed)
+
+        return study.run(
+            store, command.samples, chunk=command.chunk, resume=command.resume, progress=show_state,
+            scheduler=command.scheduler, workers=command.workers,
+        )  # fmt: skip
+
+
+def report_study(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]:
+    """Verify the store, write its summary and its figures if there are to be any, and print a table."""
+    from ..figures.study_data import (
+        analyse,
+        save_summary,
+        study_data,
+        summary_lines,
+        summary_table,
+    )
+    from ..studies.store import open_store
+
+    with open_store(store) as opened:
+        # A summary of damaged data would look like any other.
+        opened.verify()
+        data = study_data(opened.dataset())
+        analysis = analyse(data)
+        paths = []
+        if figures != "none":
+            from ..figures.plot import save_figures
+            from ..figures.study import study_figures
+
+            paths.append(save_summary(data, analysis, folder / "summary.json"))
+            figure_by_name = {name: figure for name, _, figure in study_figures(data, analysis)}
+            paths += save_figures(figure_by_name, folder / "figures", figures, dpi=160)
+    out.print(summary_table(analysis), markup=False, emoji=False)
+    for line in summary_lines(analysis):
+        out.print(line, highlight=False, markup=False, emoji=False)
+    return paths

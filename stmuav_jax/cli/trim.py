@@ -1,0 +1,538 @@
+"""Command `stmuav trim`: a steady motion of the UAV or of any mechanism, and the linear model about it."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from ..checks.errors import ModelError, SettingError
+from ..figures.terminal import add_row, make_table, print_line
+from .models.point import inputs_named, scalars_by_name, starting_point
+from .models.postures import PostureSettings, write_path, write_survey
+from .options import (
+    ANGLE,
+    FORCE,
+    SPEED,
+    TURN,
+    Cache,
+    Number,
+    default_text,
+    shared_option,
+)
+from .output import print_paths, results_folder
+from .scene_options import command_or_scene
+from .simulate import chosen_scene
+
+if TYPE_CHECKING:
+    from ..analysis.equilibrium import FlightCondition, Trim
+    from ..analysis.linear import Linear
+    from ..dynamics.simulation import Scene
+    from ..dynamics.statespace.tree import TreeSpace
+    from ..mechanics.inputs import Inputs
+    from ..mechanics.parameters import Parameters
+    from ..mechanics.system import System
+    from ..uav.flight import FlightTrim
+
+_ROTOR = Number("speed of the rotors", "rad/s", 0.0, 1e5)
+_ROUND_OFF = 1e-12  # numbers of a trim below it are round-off, in the units of the table
+
+
+@dataclasses.dataclass
+class FlightSettings:
+    """Options of a steady flight."""
+
+    climb: Annotated[float, SPEED, shared_option("climb")] = 0.0
+    speed: Annotated[float, SPEED, shared_option("speed")] = 0.0
+    course: Annotated[float, ANGLE, shared_option("course")] = 0.0
+    turn: Annotated[float, TURN, shared_option("turn")] = 0.0
+    yaw: Annotated[float, ANGLE, shared_option("yaw")] = 0.0
+
+
+@dataclasses.dataclass
+class SteadyFlight(FlightSettings):
+    """A steady flight of the UAV with its tracker."""
+
+    phi: Annotated[float | None, ANGLE, default_text("the initial one")] = None
+    """First angle of the panel [degrees]."""
+    theta: Annotated[float | None, ANGLE, default_text("the initial one")] = None
+    """Second angle of the panel [degrees]."""
+    sun: Annotated[
+        tuple[float, float] | None,
+        ANGLE,
+        shared_option("sun"),
+        default_text("panel at --phi and --theta"),
+    ] = None
+
+
+@dataclasses.dataclass
+class LinearSettings:
+    """Options of a linear model."""
+
+    linear: Literal["none", "trim", "start"] = "none"
+    """Also linearise about the trim; or, instead of a trim, about a scene's start."""
+    outputs: Annotated[tuple[str, ...], default_text("all states")] = ()
+    """States that the linear model measures, such as omega_x or hinge.angle."""
+
+
+# Its options stand beside the command's own, without a prefix.
+_Flight = Annotated[SteadyFlight, tyro.conf.arg(name="")]
+_Linear = Annotated[LinearSettings, tyro.conf.arg(name="")]
+
+
+@dataclasses.dataclass
+class TrimCommand:
+    """Find attitude, rotor speeds and actuator forces of a steady flight; write trim.json.
+
+    With --linear also the modes, and A, B, C, D with names to linear.npz.
+
+    Example: stmuav trim --phi 10 --theta -5 --by mass.panel_7 geometry.rods; stmuav trim --sun 150 60 --linear trim.
+    Another mechanism is trimmed by `stmuav trim model.toml`, or by a scene's name; `stmuav trim model.toml --help`
+    describes that.
+    """
+
+    flight: _Flight = dataclasses.field(default_factory=SteadyFlight)
+    highest: Annotated[float | None, _ROTOR, default_text("none")] = None
+    """Largest speed of the rotors [rad/s]."""
+    lowest: Annotated[float, _ROTOR] = 0.0
+    """Smallest speed of the rotors [rad/s], with --highest."""
+    force: Annotated[float | None, FORCE, default_text("none")] = None
+    """Largest force of the actuators, either way [N]."""
+    by: tuple[str, ...] = ()
+    """Parameters by which the trim is differentiated, such as mass.panel_7."""
+    model: _Linear = dataclasses.field(default_factory=LinearSettings)
+    params: Annotated[Path | None, shared_option("params"), default_text("the report's values")] = (
+        None
+    )
+    out: Annotated[Path | None, shared_option("out"), default_text("runs/trim")] = None
+    cache: Cache = True
+
+
+@dataclasses.dataclass
+class TrimSettings(LinearSettings, FlightSettings, PostureSettings):
+    """Options of a steady motion of any mechanism."""
+
+    inputs: Annotated[tuple[str, ...], shared_option("inputs"), default_text("all")] = ()
+    free: Annotated[tuple[str, ...], default_text("none")] = ()
+    """States that may differ from the start, such as hinge.angle."""
+    accelerations: Annotated[tuple[str, ...], default_text("zero")] = ()
+    """Wanted rates of velocities, such as rail.displacement_rate=2 [m/s^2, rad/s^2]."""
+    out: Annotated[Path | None, shared_option("out"), default_text("runs/trim_SCENE")] = None
+
+
+ABOUT = """Find the inputs, and states if wanted, of a steady motion of any mechanism; write trim.json.
+
+With --linear also the modes, and A, B, C, D with names to linear.npz. With --path or --survey instead of a trim:
+the inputs along a path of joints, or a map of postures.
+
+Example: stmuav trim model.toml --coordinates hinge=0 --free rail.displacement; stmuav trim model.toml --linear start
+--outputs hinge.angle; stmuav trim model.toml --path motion.csv. Without a scene or a model's file the command
+trims the UAV with its tracker: stmuav trim --help. A mechanism with a floating base hovers, climbs or turns: its
+attitude is found too.
+"""
+
+trim_options = command_or_scene(TrimCommand, "TrimScene", TrimSettings, ABOUT)
+
+
+def flight_of(settings: FlightSettings, angles: Any = None, sun: Any = None) -> "FlightCondition":
+    """Flight condition of the options, with the panel at angles (2,) [rad] or at the sun (3,)."""
+    from ..analysis.equilibrium import climb, cruise, steady_turn
+    from ..checks.numbers import as_floats
+
+    course, yaw = math.radians(settings.course), math.radians(settings.yaw)
+    if settings.turn:
+        flight = steady_turn(settings.speed, math.radians(settings.turn), angles, course, yaw)
+    else:
+        flight = cruise(settings.speed, course, angles, yaw, sun=sun)
+    # Climb and cruise are conditions of one velocity each, and add.
+    up = climb(settings.climb, angles, yaw, sun=sun)
+    return flight._replace(v=as_floats(np.asarray(flight.v) + np.asarray(up.v)))
+
+
+def trim_space(space: "TreeSpace", x: Any, settings: TrimSettings, t: float) -> "Trim":
+    """Trim from a point, of a floating base as a steady flight.
+
+    Raises:
+        SettingError: nothing may be chosen, an unknown name, or a flight of what does not float.
+        StateError: there is no trim.
+    """
+    from ..analysis.equilibrium import trim, trim_condition
+    from ..dynamics.tree.topology import spanning_tree
+
+    inputs, values = inputs_named(space, settings.inputs, x, t)
+    if not len(inputs) and not settings.free:
+        states = ", ".join(name for name, _ in space.names[: space.dof])
+        raise SettingError(
+            "This mechanism has no inputs that a trim could choose: name states that it may change "
+            f"with --free, among {states}."
+        )
+    flying = (settings.climb, settings.speed, settings.turn, settings.yaw)
+    if not spanning_tree(space.system).floating:
+        if any(flying):
+            raise SettingError("--climb, --speed, --turn and --yaw are for a floating base.")
+        target = _target_accelerations(space, settings)
+        return trim(
+            space, at=x, free=settings.free, inputs=inputs, values=values, accelerations=target, t=t,
+        )  # fmt: skip
+    if settings.accelerations:
+        raise SettingError("--accelerations are for mechanisms on the ground; others fly steadily.")
+    return trim_condition(
+        space, flight_of(settings), at=x, free=settings.free, inputs=inputs, values=values
+    )
+
+
+def _target_accelerations(space: "TreeSpace", settings: TrimSettings) -> np.ndarray:
+    from ..checks.errors import named_places
+
+    acceleration_by_name = scalars_by_name(settings.accelerations, "--accelerations")
+    names = [name for name, _ in space.names[space.dof : 2 * space.dof]]
+    target = np.zeros(space.dof)
+    places = named_places(list(acceleration_by_name), names, "The wanted accelerations", "velocity")
+    target[list(places)] = list(acceleration_by_name.values())
+    return target
+
+
+class RotorSpeed(NamedTuple):
+    """Speed of a rotor [rad/s] with its thrust [N], and its share of the highest speed; None without limit."""
+
+    speed: float
+    thrust: float
+    share: float | None
+
+
+def _rotor_table(rotors: Mapping[str, RotorSpeed]) -> Table:
+    heads = ("rotor", "speed [rad/s]", "per minute", "thrust [N]", "of the highest speed")
+    rotor_table = make_table(*heads, title="Rotors", right=1)
+    for name, (speed, thrust, share) in rotors.items():
+        place = name.removeprefix("speed_squared_")
+        percent = "-" if share is None else f"{100 * share:.1f} %"
+        add_row(
+            rotor_table,
+            place,
+            f"{speed:.6g}",
+            f"{speed * 30 / math.pi:,.0f}",
+            f"{thrust:.4g}",
+            percent,
+        )
+    return rotor_table
+
+
+def rotor_speeds(
+    system: "System", inputs: "Inputs", values: Sequence[float]
+) -> dict[str, RotorSpeed]:
+    """Speeds of the rotors whose squares are inputs, by the name of the input; none of a negative square."""
+    from ..uav.motor import MotorRotors
+
+    rotors = {}
+    for entry, squared in zip(inputs.entries, values, strict=True):
+        # A trim without limits may ask for thrust downwards, which no speed of the rotor gives.
+        if not entry.field.endswith("speed_squared") or squared < 0:
+            continue
+        force: Any = system.forces[entry.force]
+        limits = force.limits if isinstance(force, MotorRotors) else None
+        thrust = float(force.rotors.k_f) * squared
+        highest = None if limits is None else float(np.asarray(limits.highest)[entry.place])
+        speed = math.sqrt(squared)
+        rotors[entry.name] = RotorSpeed(speed, thrust, None if highest is None else speed / highest)
+    return rotors
+
+
+def _list_changes(space: "TreeSpace", x: Any, trim_result: "Trim") -> dict[str, tuple[float, str]]:
+    """States that differ from the start, by how much, with their units."""
+    departure = np.asarray(space.difference(trim_result.point, x))
+    # The search moves every state by round-off; only what the trim has chosen is listed.
+    named = zip(space.names, departure, strict=True)
+    return {name: (float(v), unit) for (name, unit), v in named if abs(v) > 1e-12}
+
+
+def modes_table(modes: Sequence[Any]) -> Table:
+    """Table of the modes other than those of a free rigid body, whose eigenvalues are zero."""
+    from ..analysis.linear import AT_ZERO
+
+    mode_table = make_table(
+        "s [1/s]", "doubles or halves in [s]", "states that take part", title="Modes"
+    )
+    for mode in modes:
+        # Round-off splits the multiple eigenvalue at zero into a small circle, whose numbers mean nothing.
+        if abs(mode.eigenvalue) < AT_ZERO:
+            continue
+        s = f"{mode.eigenvalue.real:.4g}"
+        if abs(mode.eigenvalue.imag) > 1e-9 * abs(mode.eigenvalue):
+            s += f" {'+' if mode.eigenvalue.imag > 0 else '-'} {abs(mode.eigenvalue.imag):.4g} i"
+        time = "neither"
+        if math.isfinite(mode.doubling_time):
+            time = f"{'doubles' if mode.doubling_time > 0 else 'halves'} in {abs(mode.doubling_time):.4g}"
+        parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in mode.states[:3])
+        add_row(mode_table, s, time, parts or mode.refusal)
+    return mode_table
+
+
+def count_modes_at_zero(modes: Sequence[Any]) -> str:
+    """Sentence on the modes that `modes_table` leaves out; empty if there are none."""
+    from ..analysis.linear import AT_ZERO
+
+    count = sum(abs(mode.eigenvalue) < AT_ZERO for mode in modes)
+    if not count:
+        return ""
+    return (
+        f"Not listed: {count} of {len(modes)} modes with |s| below {AT_ZERO:g} 1/s, those of a free rigid "
+        "body or slower ones."
+    )
+
+
+def write_trim(
+    out: Console, result: "Trim | FlightTrim", content: dict[str, Any], folder: Path
+) -> None:
+    """Write trim.json: the content, with what all trims have, and the versions."""
+    from ..io.netcdf import list_versions, write_atomically
+
+    content |= {
+        "residual": float(result.residual),
+        "conditioning": float(result.conditioning),
+        "versions": list_versions(),
+    }
+    print_paths(
+        out, [write_atomically(folder / "trim.json", json.dumps(content, indent=2).encode())]
+    )
+
+
+def run_trim(command: Any) -> int:
+    """Find the trim, print it and write trim.json, and the linear model if asked; return the exit code."""
+    return _run_uav(command) if isinstance(command, TrimCommand) else _run_scene(command)
+
+
+def _run_scene(command: Any) -> int:
+    scene, settings = chosen_scene(command), command.settings
+    if settings.path is not None or settings.survey:
+        return _run_postures(scene, settings)
+    space, x = starting_point(scene, settings)
+    folder, title = results_folder(settings.out, f"trim_{scene.name}"), scene.title or scene.name
+    inputs, values = None, None
+    if settings.linear != "start":
+        trim_result = trim_space(space, x, settings, scene.t0)
+        _write_scene_trim(space, x, trim_result, folder, title)
+        x, inputs, values = trim_result.point, trim_result.inputs, trim_result.values
+    if settings.linear == "none":
+        return 0
+    notes = ["States: " + ", ".join(f"{name} [{unit}]" for name, unit in space.names) + "."]
+    if settings.linear == "start":
+        inputs, values = inputs_named(space, settings.inputs, x, scene.t0)
+        # Without equilibrium the model is of the difference of two motions, not of a motion about a point.
+        notes.append("About the start: departures from the motion that begins there.")
+    _write_linear(space, x, inputs, values, settings, notes, folder, scene.t0)
+    return 0
+
+
+def _run_postures(scene: "Scene", settings: TrimSettings) -> int:
+    if settings.path is not None and settings.survey:
+        raise SettingError("Give --path or --survey, not both.")
+    trim_options = (settings.free, settings.accelerations, settings.outputs)
+    flying = (settings.climb, settings.speed, settings.turn, settings.yaw)
+    if settings.linear != "none" or any(trim_options) or any(flying):
+        raise SettingError(
+            "--path and --survey go without a linear model, --free, --accelerations, and the options of a flight."
+        )
+    write = write_survey if settings.survey else write_path
+    folder = results_folder(settings.out, f"trim_{scene.name}")
+    write(scene, settings, folder)
+    return 0
+
+
+def _write_scene_trim(
+    space: "TreeSpace", x: Any, trim_result: "Trim", folder: Path, title: str
+) -> None:
+    """Print a trim of any mechanism and write it to trim.json."""
+    changes = _list_changes(space, x, trim_result)
+    names = trim_result.inputs.names
+    values = [float(v) for v in np.asarray(trim_result.values)]
+    unknown_table = make_table("unknown", "value", "unit", title=f"Trim: {title}")
+    cell = lambda value: f"{value:.6g}" if abs(value) > _ROUND_OFF else "0"
+    rotors = rotor_speeds(space.system, trim_result.inputs, values)
+    for (name, unit), value in zip(names, values, strict=True):
+        # A squared speed tells a reader little: the rotors' table has speeds and thrusts.
+        if name not in rotors:
+            add_row(unknown_table, f"input {name}", cell(value), unit)
+    for name, (value, unit) in changes.items():
+        # States of the motors are the speeds that the rotors' table lists already.
+        if not rotors or ": speed of rotor " not in name:
+            add_row(unknown_table, f"change of {name}", cell(value), unit)
+    out = Console()
+    if unknown_table.row_count:
+        out.print(unknown_table)
+    if rotors:
+        out.print(_rotor_table(rotors))
+    print_line(out, f"Residual acceleration: {float(trim_result.residual):.1e} m/s^2 or rad/s^2.")
+    for note in trim_result.notes:
+        print_line(out, f"Note: {note}")
+    content = {
+        "inputs": {name: v for (name, _), v in zip(names, values, strict=True)},
+        "rotors": {name: rotor._asdict() for name, rotor in rotors.items()},
+        "changes": {name: value for name, (value, _) in changes.items()},
+        "units": dict(names) | {name: unit for name, (_, unit) in changes.items()},
+        "notes": list(trim_result.notes),
+    }
+    write_trim(out, trim_result, content, folder)
+
+
+# --- the UAV with its tracker, whose trim observes limits
+
+
+def table_of(params: Path | None) -> "Parameters":
+    """Parameter table of the report's Part II, with the user's values."""
+    from ..io.netcdf import load_parameters
+    from ..uav.airframe import PART_II
+
+    return load_parameters(params, PART_II)
+
+
+def wanted_of(settings: SteadyFlight, values: "Parameters") -> Any:
+    """The flight condition that the options describe."""
+    from ..uav.tracker.geometry import initial_angles
+
+    if settings.sun is not None and (settings.phi is not None or settings.theta is not None):
+        raise SettingError("Give --sun or --phi and --theta, not both.")
+    if settings.sun is not None:
+        if settings.turn:
+            raise SettingError(
+                "--sun is for straight flights, since in a turn the panel would have to move: give "
+                "--phi and --theta with --turn."
+            )
+        azimuth, height = (math.radians(x) for x in settings.sun)
+        level = math.cos(height)
+        sun = [level * math.sin(azimuth), level * math.cos(azimuth), math.sin(height)]
+        return flight_of(settings, sun=sun)
+    first = np.asarray(initial_angles(values))
+    option_angles = (settings.phi, settings.theta)
+    angles = [
+        a if x is None else math.radians(x) for a, x in zip(first, option_angles, strict=True)
+    ]
+    return flight_of(settings, angles)
+
+
+def _trim_limits(command: TrimCommand) -> Any:
+    from ..uav.allocation import RotorLimits
+    from ..uav.flight import TrimLimits
+
+    rotors = None if command.highest is None else RotorLimits(command.lowest, command.highest)
+    if rotors is None and command.lowest:
+        raise SettingError("--lowest is for rotors with a limit: give --highest too.")
+    return TrimLimits(rotors, math.inf if command.force is None else command.force)
+
+
+def _solve_uav(
+    command: TrimCommand, parameters: "Parameters", limits: Any
+) -> tuple[Any, Any, dict[str, np.ndarray]]:
+    """The UAV, its trim, and the derivatives of the trim's values by parameters of the table, by name."""
+    from ..checks.numbers import as_floats
+    from ..uav.flight import TrimReason, trim_flight, trim_slopes
+    from ..uav.scenes.uav_tracker import make_uav
+
+    target, uav = wanted_of(command.flight, parameters), make_uav(parameters)
+    # Parameters to be differentiated by are traced, so that the whole construction of the UAV is part of
+    # the derivative.
+    values = {name: as_floats(parameters.value(name)) for name in command.by}
+    if values:
+        build = lambda values: make_uav(parameters.replaced(values))
+        trim_result, slopes = trim_slopes(build, values, target, limits)
+        if trim_result.reason == TrimReason.VALID:
+            return uav, trim_result, {k: np.asarray(v) for k, v in slopes.items()}
+    return uav, trim_flight(uav, target, limits), {}
+
+
+def _run_uav(command: TrimCommand) -> int:
+    is_linear = command.model.linear == "trim"
+    if command.model.linear == "start":
+        raise SettingError("--linear start is for a scene or a model's file: name one after trim.")
+    if is_linear and command.flight.turn:
+        raise ModelError(
+            "A turn has no constant matrices in the world's axes: linearise a straight flight."
+        )
+    parameters = table_of(command.params)
+    uav, trim_result, slopes = _solve_uav(command, parameters, _trim_limits(command))
+    unknowns, labels = np.asarray(trim_result.vector), trim_result.names
+    out = Console()
+    out.print(trim_table(unknowns, labels))
+    degrees = [math.degrees(float(a)) for a in np.asarray(trim_result.angles)]
+    angles = ", ".join(f"{a:.4f}" for a in degrees)
+    print_line(
+        out,
+        f"Panel angles {angles} degrees. Residual acceleration: {float(trim_result.residual):.1e} m/s^2 or rad/s^2; "
+        f"{trim_result.null_space_dimension} dimensions of choice among the rotors' speeds, taken nearest each other.",
+    )
+    content = {
+        "values": {name: float(v) for (name, _), v in zip(labels, unknowns, strict=True)},
+        "units": dict(labels),
+        "panel_angles_deg": degrees,
+    }
+    if slopes:
+        content["sensitivities"] = {k: v.tolist() for k, v in slopes.items()}
+        for name, slope in slopes.items():
+            out.print(slope_table(name, parameters, slope, labels))
+    folder = results_folder(command.out, "trim")
+    write_trim(out, trim_result, content, folder)
+    if is_linear:
+        notes = ["The other modes are those of a free rigid body, at zero."]
+        _write_linear(
+            uav.space, trim_result.point, uav.inputs, trim_result.values, command.model, notes, folder
+        )  # fmt: skip
+    return 0
+
+
+def trim_table(unknowns: Any, labels: Sequence[tuple[str, str]]) -> Table:
+    unknown_table = make_table("unknown", "value", "unit", title="Trim")
+    for (name, unit), value in zip(labels, unknowns, strict=True):
+        add_row(unknown_table, name, f"{value:.6g}" if abs(value) > 1e-12 else "0", unit)
+    return unknown_table
+
+
+def slope_table(
+    name: str, parameters: "Parameters", slope: np.ndarray, labels: Sequence[tuple[str, str]]
+) -> Table:
+    """Table of derivatives by one parameter; of an array by its first three entries."""
+    unit = parameters[name].unit
+    flat = slope.reshape(len(labels), -1)
+    entries = list(np.ndindex(slope.shape[1:]))
+    heads = [name + (str(list(entry)) if entry else "") for entry in entries]
+    title = "Sensitivity" + (f", 3 of {len(heads)} entries; all in trim.json" if heads[3:] else "")
+    sensitivity_table = make_table("by", *(f"{head} [{unit}]" for head in heads[:3]), title=title)
+    for (label, label_unit), values in zip(labels, flat, strict=True):
+        add_row(sensitivity_table, f"{label} [{label_unit}]", *(f"{x:.5g}" for x in values[:3]))
+    return sensitivity_table
+
+
+# --- the linear model
+
+
+def _write_linear(
+    space: "TreeSpace", x: Any, inputs: Any, values: Any, settings: LinearSettings,
+    notes: Sequence[str], folder: Path, t: float = 0.0,
+) -> None:  # fmt: skip
+    """Linearise about a point, print the modes and write linear.npz."""
+    from ..analysis.linear import linearize
+    from ..figures.tuning import save_linear
+
+    outputs = list(settings.outputs) or None
+    linear = linearize(space, x, inputs, values, outputs=outputs, t=t)
+    out, modes = Console(), linear.modes()
+    out.print(modes_table(modes))
+    for sentence in (count_modes_at_zero(modes), *notes, measures_of(linear)):
+        if sentence:
+            print_line(out, sentence)
+    print_paths(out, [save_linear(linear, folder / "linear.npz")])
+
+
+def measures_of(linear: "Linear") -> str:
+    """Sentence on the modes that inputs move and outputs show."""
+    observability_text = f"of observability {np.min(linear.observability()):.2g}"
+    if not linear.B.shape[1]:
+        return f"There are no inputs. Least measure {observability_text} (1: seen fully, 0: not at all)."
+    return (
+        f"Least measure of controllability {np.min(linear.controllability()):.2g}, {observability_text}, of all modes "
+        "(1 is full, 0 is none)."
+    )

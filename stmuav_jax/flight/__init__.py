@@ -1,5 +1,0 @@
-"""Trim, linearisation, shooting, tuning and identification. Floor 9."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

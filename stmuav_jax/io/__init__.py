@@ -1,0 +1,5 @@
+"""Runs, models and tables as files: NetCDF, TOML, URDF, MJCF."""
+
+from ..checks.namespace import attach_names
+
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

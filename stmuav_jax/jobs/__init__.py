@@ -1,5 +1,0 @@
-"""Studies on many processes, interrupted and resumed. Floor 14."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

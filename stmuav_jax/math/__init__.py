@@ -1,0 +1,5 @@
+"""Rotations, linear solves, derivatives, root finding, and the compiler."""
+
+from ..checks.namespace import attach_names
+
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

@@ -1,0 +1,265 @@
+"""Factorisations by LAPACK that never wait for each other.
+
+On a CPU, JAX spreads LAPACK's calls for a large batch of matrices over the threads of a pool, and the
+call itself waits on a thread of the same pool until they have ended. Where as many such calls run at
+once as the pool has threads (two, on a machine with two cores), each waits for threads that the others
+hold: the program then stands still for ever, without an error. Here a batch that JAX would spread is
+factorised in blocks that are too small for it, one after the other, so that no call waits. Without
+`vmap`, and for small batches, the programs are those of `jax.numpy.linalg`.
+
+The rest of the package takes its factorisations from here; a test looks for others.
+
+Source: `GetLapackBatchChunkSize` and `ParallelBatchMap` in jaxlib/cpu/lapack_kernels.cc of JAX 0.10,
+where batches of less than 2e5 operations stay on one thread.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial, wraps
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Complex, Float
+
+from ..checks.shapes import Matrix, Vector
+
+# Operations of a block, by the counts below. JAX spreads batches from 200,000 on.
+_MOST_WORK = 100_000
+
+
+def _in_blocks(operations: int) -> Callable[[Callable[[Array], Any]], Callable[[Array], Any]]:
+    """Decorator: a factorisation of stacks (*s, m, n), block by block where a stack is large.
+
+    Args:
+        operations: of one matrix, in units of m n min(m, n); at least what JAX counts.
+    """
+
+    def decorate_factorisation(factorise: Callable[[Array], Any]) -> Callable[[Array], Any]:
+        @jax.custom_batching.custom_vmap
+        def call(A: Array) -> Any:
+            *stack, m, n = A.shape
+            most = max(1, _MOST_WORK // max(1, operations * m * n * min(m, n)))
+            if math.prod(stack) <= most:
+                return factorise(A)
+            blocks = partial(_one_by_one, factorise, most)
+            return jax.lax.platform_dependent(A, cpu=blocks, default=factorise)
+
+        @call.def_vmap
+        def stacked(axis_size: int, in_batched: Any, A: Array) -> tuple[Any, Any]:
+            del axis_size, in_batched
+            factors = call(A)
+            return factors, jax.tree.map(lambda _: True, factors)
+
+        return wraps(factorise)(call)
+
+    return decorate_factorisation
+
+
+def _one_by_one(factorise: Callable[[Array], Any], most: int, A: Array) -> Any:
+    """Factorisations of a stack (*s, m, n), `most` matrices at a time."""
+    *stack, m, n = A.shape
+    count = math.prod(stack)
+    # a divisor of the count needs no filling up
+    size = next((k for k in range(most, most // 2, -1) if count % k == 0), most)
+    rows = -(-count // size)
+    matrices = _transpose_each(A.reshape(count, m, n))
+    if rows * size > count:
+        # the last block is filled up with identities, which every factorisation takes
+        filled = jnp.broadcast_to(jnp.eye(n, m, dtype=A.dtype), (rows * size - count, n, m))
+        matrices = jnp.concatenate([matrices, filled])
+    # LAPACK's matrices lie column by column, those that a loop reads and writes row by row: turned
+    # before and after, a matrix passes through the loop without a copy
+    block = lambda B: jax.tree.map(_transpose_each, factorise(_transpose_each(B)))
+    factors = jax.lax.map(block, matrices.reshape(rows, size, n, m))
+    whole = lambda x: _transpose_each(x.reshape(-1, *x.shape[2:])[:count])
+    return jax.tree.map(lambda x: whole(x).reshape(*stack, *whole(x).shape[1:]), factors)
+
+
+def _transpose_each(X: Array) -> Array:
+    """Transposes (k, n, m) of matrices (k, m, n); vectors (k, n) stay."""
+    return jnp.swapaxes(X, 1, 2) if X.ndim == 3 else X
+
+
+@_in_blocks(operations=1)
+def _factor_lu(A: Array) -> tuple[Array, Array, Array]:
+    lu, pivots, order = jax.lax.linalg.lu(A)
+    return lu, pivots, order
+
+
+@_in_blocks(operations=1)
+def factor_cholesky(S: Array) -> Array:
+    """Lower Cholesky factor (n, n) of a symmetric matrix, NaN if not positive definite; no derivative."""
+    return jax.lax.linalg.cholesky(S, symmetrize_input=False)
+
+
+@_in_blocks(operations=4)
+def factor_qr(A: Array) -> tuple[Array, Array]:
+    """Factors Q (m, k), R (k, n) of A = Q R, with k = min(m, n) orthonormal columns; no derivative."""
+    Q, R = jnp.linalg.qr(A)
+    return Q, R
+
+
+@_in_blocks(operations=4)
+def _factor_upper(A: Array) -> Array:
+    return jnp.linalg.qr(A, mode="r")
+
+
+@_in_blocks(operations=10)
+def factor_svd(A: Array) -> tuple[Array, Array, Array]:
+    """Factors U (m, k), s (k,), V^T (k, n) of A = U diag(s) V^T, k = min(m, n); no derivative."""
+    U, values, V_t = jnp.linalg.svd(A, full_matrices=False)
+    return U, values, V_t
+
+
+@_in_blocks(operations=10)
+def _singular_values(A: Array) -> Array:
+    return jnp.linalg.svd(A, compute_uv=False)
+
+
+@_in_blocks(operations=30)
+def compute_eigenvalues(A: Array) -> Complex[Array, "*s n"]:
+    """Eigenvalues (n,) of a general matrix; no derivative."""
+    return jnp.linalg.eigvals(A)
+
+
+def solve(A: Matrix, b: Float[Array, "n *r"]) -> Float[Array, "n *r"]:
+    """Solution x of A x = b for a general square matrix, by LU factorisation with pivots.
+
+    Derivatives of any order, in both modes, follow from A x = b. A singular matrix gives numbers that
+    are not finite, and raises no error.
+
+    Args:
+        A: matrix (n, n). b: right-hand side (n,), or several of them as columns (n, r).
+
+    Returns:
+        Solution of the shape of b.
+    """
+    lu, _, order = _factor_lu(jax.lax.stop_gradient(A))
+    forward_solve = lambda _, b: _solve_factored(lu, order, b)
+    transpose_solve = lambda _, b: _solve_transposed(lu, order, b)
+    columns = b[:, None] if b.ndim == 1 else b
+    x = jax.lax.custom_linear_solve(lambda x: A @ x, columns, forward_solve, transpose_solve)
+    return x[:, 0] if b.ndim == 1 else x
+
+
+_unit_lower = partial(
+    jax.lax.linalg.triangular_solve, left_side=True, lower=True, unit_diagonal=True
+)
+_upper_solve = partial(jax.lax.linalg.triangular_solve, left_side=True, lower=False)
+
+
+def _solve_factored(lu: Matrix, order: Array, b: Matrix) -> Matrix:
+    """Solution of A x = b from P A = L U, with the rows of P in `order`."""
+    return _upper_solve(lu, _unit_lower(lu, b[order]))
+
+
+def _solve_transposed(lu: Matrix, order: Array, b: Matrix) -> Matrix:
+    """Solution of A^T x = b from P A = L U, with the rows of P in `order`."""
+    x = _unit_lower(lu, _upper_solve(lu, b, transpose_a=True), transpose_a=True)
+    return x[jnp.argsort(order)]
+
+
+def inverse(A: Float[Array, "*s n n"]) -> Float[Array, "*s n n"]:
+    """Inverses (*s, n, n) of general square matrices (*s, n, n), with the derivatives of `solve`.
+
+    A singular matrix gives numbers that are not finite, and raises no error.
+    """
+    invert = lambda A: solve(A, jnp.eye(A.shape[-1], dtype=A.dtype))
+    return jnp.vectorize(invert, signature="(n,n)->(n,n)")(A)
+
+
+def sign_of_determinant(A: Matrix) -> Float[Array, ""]:
+    """Sign of det A: -1, 0 or 1; it has no derivative."""
+    lu, pivots, _ = _factor_lu(jax.lax.stop_gradient(A))
+    swaps = jnp.sum(pivots != jnp.arange(len(pivots)))
+    return jnp.prod(jnp.sign(jnp.diagonal(lu))) * jnp.where(swaps % 2, -1.0, 1.0)
+
+
+@jax.custom_jvp
+def upper_factor(A: Matrix) -> Matrix:
+    """Upper triangular R (k, n) with R^T R = A^T A, k = min(m, n), of A (m, n); signs are any.
+
+    Derivatives exist for m >= n and full rank.
+    """
+    return _factor_upper(A)
+
+
+@upper_factor.defjvp
+def _upper_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matrix, Matrix]:
+    """R' = X R: with S = R^-T A^T A' R^-1, X is S above the diagonal plus what is below, mirrored."""
+    (A,), (rate,) = primals, tangents
+    R = upper_factor(A)
+    right = lambda B: _upper_solve(R, B.T, transpose_a=True).T
+    S = right(A).T @ right(rate)
+    return R, (jnp.triu(S) + jnp.tril(S, -1).T) @ R
+
+
+@jax.custom_jvp
+def singular_values(A: Matrix) -> Vector:
+    """Singular values (k,) of a matrix (m, n), k = min(m, n), the largest first.
+
+    Derivatives exist where the values are distinct.
+    """
+    return _singular_values(A)
+
+
+@singular_values.defjvp
+def _values_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Vector, Vector]:
+    U, values, V_t = factor_svd(primals[0])
+    return values, jnp.sum(U * (tangents[0] @ V_t.T), axis=0)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def pseudoinverse(A: Matrix, rcond: float) -> Matrix:
+    """Moore-Penrose inverse (n, m) of a matrix (m, n).
+
+    Singular values up to `rcond` times the largest count as zero.
+
+    Derivatives exist where the rank stays the same. Source: G. H. Golub, V. Pereyra, The
+    differentiation of pseudo-inverses, SIAM Journal on Numerical Analysis 10 (1973), eq. 4.12.
+    """
+    U, values, V_t = factor_svd(A)
+    counts = values > rcond * jnp.max(values, initial=0.0)
+    shares = jnp.where(counts, 1 / jnp.where(counts, values, 1.0), 0.0)
+    return (V_t.T * shares[None]) @ U.T
+
+
+@pseudoinverse.defjvp
+def _pseudoinverse_jvp(
+    rcond: float, primals: tuple[Matrix], tangents: tuple[Matrix]
+) -> tuple[Matrix, Matrix]:
+    (A,), (rate,) = primals, tangents
+    P = pseudoinverse(A, rcond)
+    left_null_part, right_null_part = rate.T - (rate.T @ A) @ P, rate.T - P @ (A @ rate.T)
+    return P, -P @ rate @ P + P @ (P.T @ left_null_part) + right_null_part @ (P.T @ P)
+
+
+class PseudoinverseSolver(lx.AbstractLinearSolver):
+    """Solver of lineax by `pseudoinverse`, for operators between vectors.
+
+    Attributes:
+        rcond: singular values up to this fraction of the largest count as zero.
+    """
+
+    rcond: float
+
+    def init(self, operator: Any, options: dict[str, Any]) -> Matrix:
+        del options
+        return pseudoinverse(operator.as_matrix(), self.rcond)
+
+    def compute(self, state: Matrix, vector: Vector, options: dict[str, Any]) -> Any:
+        del options
+        return state @ vector, lx.RESULTS.successful, {}
+
+    def transpose(self, state: Matrix, options: dict[str, Any]) -> tuple[Matrix, dict[str, Any]]:
+        del options
+        return state.T, {}
+
+    def conj(self, state: Matrix, options: dict[str, Any]) -> tuple[Matrix, dict[str, Any]]:
+        del options
+        return state, {}
+
+    def assume_full_rank(self) -> bool:
+        return False

@@ -1,0 +1,292 @@
+"""Linear solvers of constrained dynamics, for small full matrices, symmetric or general."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..checks.shapes import Matrix, Vector
+from ..math import lapack
+from .stacked import transposed_multiply
+
+# Weight w of the proximal term relative to rows of unit size, and number of iterations. The error
+# that remains along a singular value s is (w / (w + s))^steps. In a singular posture of a mechanism
+# s goes through zero, and accelerations are wrong while s < w: a smaller w shortens that time. It
+# only has to exceed the round-off of the matrix, as rows that are always dependent are left out.
+_PROXIMAL_WEIGHT = 1e-15
+_PROXIMAL_STEPS = 4
+
+
+# Number of multiplications above which a matrix product is left to a library.
+_LARGE = 10_000
+
+
+class Factor(eqx.Module):
+    """Cholesky factorisation of a symmetric positive definite matrix S, for many right-hand sides.
+
+    Rows of mixed units (m and rad) do no harm: the relative round-off of Cholesky's method does not
+    depend on a scaling of rows and columns.
+    """
+
+    lower: Matrix
+
+    def solve(self, b: Float[Array, "m *r"]) -> Float[Array, "m *r"]:
+        """Solution x of S x = b, shape (m,) or (m, r)."""
+        y = solve_lower(self.lower, b[:, None] if b.ndim == 1 else b)
+        x = solve_lower(self.lower, y, transpose=True)
+        return x[:, 0] if b.ndim == 1 else x
+
+
+class MinimumNorm(eqx.Module):
+    """Pseudoinverse of a symmetric matrix S, singular or not.
+
+    S is not scaled: that would change which solution has minimum norm.
+    """
+
+    inverse: Matrix
+
+    def solve(self, b: Float[Array, "m *r"]) -> Float[Array, "m *r"]:
+        """Minimum-norm solution x of S x = b, shape (m,) or (m, r)."""
+        return self.inverse @ b
+
+
+class Scaled(eqx.Module):
+    """Factorisation of a symmetric matrix S scaled to a unit diagonal, so that units do not matter.
+
+    If S is singular, the solution has minimum norm in the scaled unknowns.
+    """
+
+    factor: Factor | MinimumNorm
+    scale: Vector
+
+    def solve(self, b: Float[Array, "m *r"]) -> Float[Array, "m *r"]:
+        """Solution x of S x = b, shape (m,) or (m, r)."""
+        scale = self.scale.reshape(-1, *(1,) * (b.ndim - 1))
+        return scale * self.factor.solve(scale * b)
+
+
+class Proximal(eqx.Module):
+    """Proximal solver of a positive semi-definite matrix S: x <- x + (S + w I)^-1 (b - S x).
+
+    The iteration starts from x = 0 and is much cheaper than a singular value decomposition. For b
+    in the range of S, S x equals b; x is determined up to the null space of S only, in which it
+    carries round-off divided by w.
+
+    Source: J. Carpentier, R. Budhiraja, N. Mansard, Proximal and sparse resolution of
+    constrained dynamic equations, Robotics: Science and Systems (2021).
+    """
+
+    matrix: Matrix
+    lower: Matrix
+    scale: Vector
+
+    def solve(self, b: Float[Array, "m *r"]) -> Float[Array, "m *r"]:
+        """Solution x of S x = b, shape (m,) or (m, r)."""
+        scale = self.scale[:, None]
+        B = scale * (b[:, None] if b.ndim == 1 else b)
+        x = jnp.zeros_like(B)
+        for _ in range(_PROXIMAL_STEPS):
+            y = solve_lower(self.lower, B - self.matrix @ x)
+            x = x + solve_lower(self.lower, y, transpose=True)
+        x = scale * x
+        return x[:, 0] if b.ndim == 1 else x
+
+
+@jax.custom_jvp
+def factor_cholesky(S: Matrix) -> Matrix:
+    """Lower Cholesky factor of a symmetric positive definite matrix; NaN for any other."""
+    return lapack.factor_cholesky(S)
+
+
+@factor_cholesky.defjvp
+def _cholesky_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matrix, Matrix]:
+    """Derivative L' = L F, with F the lower half of L^-1 S' L^-T and half its diagonal."""
+    L = factor_cholesky(*primals)
+    middle = solve_lower(L, solve_lower(L, tangents[0]).T)
+    return L, L @ (jnp.tril(middle) - 0.5 * jnp.diag(jnp.diagonal(middle)))
+
+
+def solve_lower(L: Matrix, B: Matrix, *, transpose: bool = False) -> Matrix:
+    """Solution L^-1 B, or L^-T B, for a lower triangular matrix L."""
+    options: dict[str, bool] = {"left_side": True, "lower": True, "transpose_a": transpose}
+    return jax.lax.linalg.triangular_solve(L, B, **options)
+
+
+class Inverse(eqx.Module):
+    """Inverse of a general square matrix A, for many solutions x of A x = b.
+
+    It is a constant for differentiation; derivatives of a solution follow from A x = b.
+    """
+
+    matrix: Matrix
+    inverse: Matrix
+
+    def solve(self, b: Vector) -> Vector:
+        """Solution x of A x = b, shape (k,); not finite if A is singular."""
+        multiply = lambda x: self.matrix @ x
+        forward_solve, transpose_solve = (
+            lambda _, b: self.inverse @ b,
+            lambda _, b: self.inverse.T @ b,
+        )
+        return jax.lax.custom_linear_solve(multiply, b, forward_solve, transpose_solve)
+
+
+def invert_matrix(A: Matrix) -> Inverse:
+    """Invert a general square matrix, shape (k, k), by LU factorisation with partial pivoting."""
+    return Inverse(A, lapack.inverse(jax.lax.stop_gradient(A)))
+
+
+def _scale_diagonal(S: Matrix) -> tuple[Matrix, Vector]:
+    """Matrix S scaled to a unit diagonal, and its scale factors."""
+    diagonal = jnp.diagonal(S)
+    # A unit diagonal removes the units of the rows (m, rad) and is within a factor m of the best diagonal
+    # scaling (van der Sluis 1969). Rows that are left out have a zero diagonal and stay as they are.
+    scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    return scale[:, None] * S * scale[None, :], scale
+
+
+def factor_redundant(S: Matrix, *, redundant: bool, rcond: float) -> Factor | MinimumNorm:
+    """Factorise a symmetric positive (semi-)definite matrix, shape (m, m).
+
+    `redundant=False` uses Cholesky's method; a singular S gives NaN, never a wrong number.
+    `redundant=True` uses a singular value decomposition, in which values below `rcond` times the
+    largest count as zero.
+    """
+    if redundant:
+        return MinimumNorm(lapack.pseudoinverse(S, rcond))
+    return Factor(factor_cholesky(S))
+
+
+def factorise_scaled(S: Matrix, *, redundant: bool, rcond: float) -> Scaled:
+    """`factor_redundant` of S scaled to a unit diagonal; `rcond` is relative to that matrix."""
+    scaled, scale = _scale_diagonal(S)
+    return Scaled(factor_redundant(scaled, redundant=redundant, rcond=rcond), scale)
+
+
+def share_multipliers(
+    S: Matrix, factor: Factor | Scaled, multipliers: Vector, rcond: float = 1e-11
+) -> Vector:
+    """Multipliers y (m,) of all rows, of minimum norm, with the effect of those of a set of rows.
+
+    All rows are J = C J_0 of the set's J_0, and C^T y are the multipliers of the set.
+
+    Args:
+        S: products J_0 W J^T (m, m) of the set with all rows, zero in rows outside of the set.
+        factor: factorisation of J_0 W J_0^T, with ones on the diagonal for rows outside of the set.
+        multipliers: those of the set (m,), zero for rows outside of it.
+    """
+    return lapack.pseudoinverse(factor.solve(S), rcond) @ multipliers
+
+
+def factor_proximal(S: Matrix) -> Proximal:
+    """Factorise a positive semi-definite matrix for `Proximal`, shape (m, m)."""
+    scaled, scale = _scale_diagonal(S)
+    # The weight makes S positive definite for Cholesky's method; the iterations of `solve` remove its
+    # effect in the range of S.
+    weight = _PROXIMAL_WEIGHT * jnp.eye(S.shape[0], dtype=S.dtype)
+    return Proximal(scaled, factor_cholesky(scaled + weight), scale)
+
+
+Redundant = Literal[False, "fast", "minimum norm"]
+
+
+def _factor_schur(S: Matrix, redundant: Redundant) -> Factor | Proximal | Scaled:
+    if redundant == "fast":
+        return factor_proximal(S)
+    if redundant:
+        return factorise_scaled(S, redundant=True, rcond=1e-11)
+    return Factor(factor_cholesky(S))
+
+
+def independent_rows(S: Matrix, tolerance: float | Float[Array, ""]) -> Bool[Array, " m"]:
+    """Mask of rows of J that form a basis of its row space, from S = J J^T, shape (m,).
+
+    Cholesky's method with pivoting adds the row that is farthest from the space of the rows before
+    it, until the square of this distance is below `tolerance`. The result has no derivative.
+
+    Source: N. J. Higham, Accuracy and Stability of Numerical Algorithms (2002), ch. 10.3.
+    """
+
+    def has_pivot(now: tuple[Matrix, Array]) -> Array:
+        return jnp.max(jnp.diagonal(now[0])) > tolerance
+
+    def take_row(now: tuple[Matrix, Array]) -> tuple[Matrix, Array]:
+        rest, chosen = now
+        row = jnp.argmax(jnp.diagonal(rest))
+        column = rest[row]
+        rest = rest - column[:, None] * (column / column[row])
+        chosen = chosen.at[row].set(True)
+        # rows already taken have no distance left, apart from round-off
+        keep = ~chosen
+        return jnp.where(keep[:, None] & keep, rest, 0.0), chosen
+
+    # Which rows are independent is a choice and no function that could be differentiated; the equations
+    # that hold them are.
+    start = (jax.lax.stop_gradient(S), jnp.zeros(S.shape[0], bool))
+    return jax.lax.while_loop(has_pivot, take_row, start)[1]
+
+
+def _gram_matrix(Y: Matrix) -> Matrix:
+    """Gram matrix Y^T Y; small ones by sums, which fuse and avoid the cost of a library call."""
+    k, m = Y.shape
+    return Y.T @ Y if k * m * m > _LARGE else transposed_multiply(Y, Y)
+
+
+def solve_saddle(
+    M: Matrix,
+    J: Matrix,
+    f: Vector,
+    g: Vector,
+    *,
+    redundant: Redundant,
+    row_mask: Bool[Array, " m"] | None = None,
+    shared: bool = False,
+) -> tuple[Vector, Vector]:
+    """Solution x (k,), y (m,) of M x - J^T y = f, J x = g, with M symmetric positive definite.
+
+    If rows of J are dependent, `redundant` determines the choice of y; x does not depend on it.
+    With `row_mask` the other rows are left out, and their y is zero; if `shared`, y is then that of minimum
+    norm in all rows with the same effect.
+    """
+    L = factor_cholesky(M)
+    if not J.shape[0]:
+        # Without rows the forward and backward substitutions alone give the accelerations.
+        y = solve_lower(L, f[:, None])
+        return solve_lower(L, y, transpose=True)[:, 0], g
+    # One substitution serves the forces and all rows: Y^T Y is then J M^-1 J^T without an inverse of M.
+    Y = solve_lower(L, jnp.concatenate([f[:, None], J.T], axis=1))
+    y, all_Y = Y[:, 0], Y[:, 1:]
+    Y = all_Y
+    if row_mask is not None:
+        Y, g = jnp.where(row_mask[None], Y, 0.0), jnp.where(row_mask, g, 0.0)
+    factor = _factor_schur(_with_ones(_gram_matrix(Y), row_mask), redundant)
+    multipliers = factor.solve(g - jnp.sum(Y * y[:, None], axis=0))
+    x = y + jnp.sum(Y * multipliers[None], axis=1)
+    if shared:
+        assert not isinstance(factor, Proximal)
+        multipliers = share_multipliers(Y.T @ all_Y, factor, multipliers)
+    return solve_lower(L, x[:, None], transpose=True)[:, 0], multipliers
+
+
+def _with_ones(S: Matrix, row_mask: Bool[Array, " m"] | None) -> Matrix:
+    """Add ones to the diagonal of S in the rows left out, which are zero otherwise."""
+    return S if row_mask is None else S + jnp.diag(1.0 - row_mask)
+
+
+def right_inverse(
+    M: Matrix, J: Matrix, *, redundant: bool, row_mask: Bool[Array, " m"] | None = None
+) -> Matrix:
+    """Right inverse G = M^-1 J^T (J M^-1 J^T)^-1: x = G b solves J x = b with minimum x^T M x.
+
+    With `row_mask` it is the inverse for these rows; columns of the others are zero.
+    """
+    L = factor_cholesky(M)
+    Y = solve_lower(L, J.T)
+    if row_mask is not None:
+        Y = jnp.where(row_mask, Y, 0.0)
+    S = _with_ones(_gram_matrix(Y), row_mask)
+    return solve_lower(
+        L, _factor_schur(S, "fast" if redundant else False).solve(Y.T).T, transpose=True
+    )

@@ -1,0 +1,437 @@
+"""JAX primitive whose definition is a function of small arrays, and whose lowering is machine code.
+
+`native(function)` behaves as `eqx.filter_jit(function)` does within a larger program: it is traced
+once for each structure of its arguments. On a CPU, where the function has a scalar program, XLA then
+calls the machine code of it; everywhere else, and under transformations that are not known here, the
+traced function itself is used. Its derivatives are programs of the same kind, made from the derivatives
+of the traced function, so both modes and all orders exist.
+"""
+
+import math
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from functools import wraps
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.core as jax_core
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+from jax.interpreters import ad, batching, mlir
+from jaxlib.mlir import ir
+
+from . import llvm
+from .graph import NotScalarError, make_graph
+
+native_p = core.Primitive("native")
+native_p.multiple_results = True
+
+_DTYPES = {"float64": "f8", "bool": "b1", "int32": "i4", "int64": "i8"}
+
+
+class Program:
+    """A traced function of arrays, its machine code, and its derivatives.
+
+    Attributes:
+        jaxpr: traced function, whose constants are known.
+    """
+
+    def __init__(self, jaxpr: Any) -> None:
+        self.jaxpr = jaxpr
+        self._derived: dict[Any, Program] = {}
+        self._lock = threading.RLock()
+        self._graph: Any = None
+        self._reason: str | None = None
+
+    @property
+    def inputs(self) -> Sequence[Any]:
+        return self.jaxpr.in_avals
+
+    @property
+    def outputs(self) -> Sequence[Any]:
+        return self.jaxpr.out_avals
+
+    def evaluate(self, *args: Any) -> list[Any]:
+        """The function itself."""
+        return jax_core.eval_jaxpr(self.jaxpr.jaxpr, self.jaxpr.consts, *args)
+
+    def graph(self) -> Any:
+        """Scalar program and its outputs, or None where there is none."""
+        with self._lock:
+            # A program without a graph is tried once: its reason is remembered, since tracing the
+            # attempt takes as long as a success.
+            if self._graph is None and self._reason is None:
+                try:
+                    self._graph = make_graph(self.jaxpr, llvm.MOST_NODES)
+                except NotScalarError as error:
+                    self._reason = str(error)
+            return self._graph
+
+    def derived(self, key: Any, make: Callable[[], "Program"]) -> "Program":
+        with self._lock:
+            if key not in self._derived:
+                self._derived[key] = make()
+            return self._derived[key]
+
+    def push_forward(self, tangent_mask: tuple[bool, ...]) -> "Program":
+        """Program of (arguments, tangents of those that move) for the tangents of the results."""
+
+        def make() -> Program:
+            count = len(self.inputs)
+
+            # The derivative is taken of the traced function and traced itself, and then made a
+            # program like any other: rules of machine code for derivatives are not needed, and
+            # zeros of tangents vanish in its graph.
+            def tangents(*args: Any) -> list[Any]:
+                primals, rest = args[:count], iter(args[count:])
+                seeds = [
+                    next(rest) if move else _zero_tangent(aval)
+                    for move, aval in zip(tangent_mask, self.inputs, strict=True)
+                ]
+                _, out = jax.jvp(lambda *x: self.evaluate(*x), primals, tuple(seeds))
+                return [t for t in out if t.dtype != jax.dtypes.float0]
+
+            avals = [
+                *self.inputs,
+                *(a for a, move in zip(self.inputs, tangent_mask, strict=True) if move),
+            ]
+            return Program(_trace(tangents, avals))
+
+        return self.derived(("forward", tangent_mask), make)
+
+    def pull_back(
+        self, known_mask: tuple[bool, ...], cotangent_mask: tuple[bool, ...]
+    ) -> "Program":
+        """Program of (known arguments, cotangents of wanted results) for those of the unknown ones."""
+
+        def make() -> Program:
+            known_avals = [a for a, k in zip(self.inputs, known_mask, strict=True) if k]
+            unknown = [a for a, k in zip(self.inputs, known_mask, strict=True) if not k]
+            results = [a for a, w in zip(self.outputs, cotangent_mask, strict=True) if w]
+
+            def cotangents(*args: Any) -> list[Any]:
+                fixed, seeds = args[: len(known_avals)], iter(args[len(known_avals) :])
+
+                # JAX transposes only programs that are linear in the unknown operands; those that
+                # are known are closed over, and become inputs of the transposed program.
+                def linear(*moving: Any) -> list[Any]:
+                    values, moves = iter(fixed), iter(moving)
+                    whole = [next(values) if k else next(moves) for k in known_mask]
+                    return self.evaluate(*whole)
+
+                shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in unknown]
+                full = [
+                    next(seeds) if w else jnp.zeros(a.shape, a.dtype)
+                    for w, a in zip(cotangent_mask, self.outputs, strict=True)
+                ]
+                return list(jax.linear_transpose(linear, *shapes)(full))
+
+            return Program(_trace(cotangents, [*known_avals, *results]))
+
+        return self.derived(("back", known_mask, cotangent_mask), make)
+
+
+def _zero_tangent(aval: Any) -> Any:
+    if jnp.issubdtype(aval.dtype, jnp.floating):
+        return jnp.zeros(aval.shape, aval.dtype)
+    return np.zeros(aval.shape, jax.dtypes.float0)
+
+
+def _trace(function: Callable[..., Any], avals: Sequence[Any]) -> Any:
+    """Jaxpr of a function of arrays."""
+    shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
+    return jax.make_jaxpr(function)(*shapes)
+
+
+# --- the primitive: operands and results have `lead` dimensions of a batch in front, those of an
+# operand all 1 or all those of the batch
+
+
+@native_p.def_abstract_eval
+def _abstract(*avals: Any, program: Program, lead: tuple[int, ...]) -> Any:
+    return [jax_core.ShapedArray((*lead, *out.shape), out.dtype) for out in program.outputs]
+
+
+def _apply(*operands: Any, program: Program, lead: tuple[int, ...]) -> list[Any]:
+    """The function itself over the batch."""
+    function: Any = program.evaluate
+    # An operand that is the same for the whole batch, such as masses in a batch over states, has
+    # batch dimensions of 1: it is neither copied into rows nor batched over.
+    shared = [math.prod(x.shape[: len(lead)]) == 1 and math.prod(lead) != 1 for x in operands]
+    operands = tuple(
+        x.reshape(x.shape[len(lead) :]) if s else x for x, s in zip(operands, shared, strict=True)
+    )
+    axes = [None if s else 0 for s in shared]
+    # XLA's version is batched once for each dimension of the batch, which gives the shapes that
+    # machine code has by counting rows.
+    for _ in lead:
+        function = jax.vmap(function, in_axes=axes) if any(a == 0 for a in axes) else function
+    if lead and not any(a == 0 for a in axes):
+        return [jnp.broadcast_to(x, (*lead, *x.shape)) for x in function(*operands)]
+    return function(*operands)
+
+
+@native_p.def_impl
+def _run(*operands: Any, program: Program, lead: tuple[int, ...]) -> Any:
+    return _jitted(program, lead)(*operands)
+
+
+def _jitted(program: Program, lead: tuple[int, ...]) -> Any:
+    def make() -> Any:
+        return jax.jit(lambda *x: native_p.bind(*x, program=program, lead=lead))
+
+    return program.derived(("jit", lead), make)  # pyright: ignore[reportArgumentType]
+
+
+def _batched(operands: Any, dims: Any, *, program: Program, lead: tuple[int, ...]) -> Any:
+    size = next(x.shape[d] for x, d in zip(operands, dims, strict=True) if d is not None)
+    whole = (size, *lead)
+    batched_operands = []
+    for x, d in zip(operands, dims, strict=True):
+        if d is None:
+            # An operand without the new dimension stays shared if it was, else it is spread: rows
+            # of one operand have one stride.
+            full = math.prod(x.shape[: len(lead)]) != 1
+            x = jnp.broadcast_to(x, (size, *x.shape)) if full else x[None]
+        else:
+            x = jnp.moveaxis(x, d, 0)
+            core_shape = x.shape[1 + len(lead) :]
+            x = jnp.broadcast_to(x, (*whole, *core_shape))
+        batched_operands.append(x)
+    results = native_p.bind(*batched_operands, program=program, lead=whole)
+    return results, [0] * len(results)
+
+
+batching.primitive_batchers[native_p] = _batched
+
+
+def _jvp(primals: Any, tangents: Any, *, program: Program, lead: tuple[int, ...]) -> Any:
+    results = native_p.bind(*primals, program=program, lead=lead)
+    # A program for each set of operands that move: zero tangents are known, and a derivative with
+    # respect to a state alone does not compute those by masses.
+    tangent_mask = tuple(not isinstance(t, ad.Zero) for t in tangents)
+    forward = program.push_forward(tangent_mask)
+    tangent_operands = [
+        jnp.broadcast_to(t, x.shape)
+        for t, x, m in zip(tangents, primals, tangent_mask, strict=True)
+        if m
+    ]
+    moves = iter(native_p.bind(*primals, *tangent_operands, program=forward, lead=lead))
+    out = [
+        next(moves)
+        if jnp.issubdtype(aval.dtype, jnp.floating)
+        else ad.Zero(jax.typeof(result).to_tangent_aval())
+        for aval, result in zip(program.outputs, results, strict=True)
+    ]
+    return results, out
+
+
+ad.primitive_jvps[native_p] = _jvp
+
+
+def _transpose(cotangents: Any, *operands: Any, program: Program, lead: tuple[int, ...]) -> Any:
+    known_mask = tuple(not ad.is_undefined_primal(x) for x in operands)
+    cotangent_mask = tuple(not isinstance(c, ad.Zero) for c in cotangents)
+    back = program.pull_back(known_mask, cotangent_mask)
+    known_operands = [x for x, k in zip(operands, known_mask, strict=True) if k]
+    seeds = [c for c, w in zip(cotangents, cotangent_mask, strict=True) if w]
+    # the batch may be that of an unknown operand or of the cotangents
+    results = iter(native_p.bind(*known_operands, *seeds, program=back, lead=lead))
+    out = []
+    for x, k in zip(operands, known_mask, strict=True):
+        if k:
+            out.append(None)
+            continue
+        result = next(results)
+        if math.prod(x.aval.shape[: len(lead)]) == 1 and math.prod(lead) != 1:
+            result = result.sum(tuple(range(len(lead)))).reshape(x.aval.shape)
+        out.append(result)
+    return out
+
+
+ad.primitive_transposes[native_p] = _transpose
+
+
+_lower_function = mlir.lower_fun(_apply, multiple_results=True)
+mlir.register_lowering(native_p, _lower_function)
+
+
+def _lower_native(context: Any, *operands: Any, program: Program, lead: tuple[int, ...]) -> Any:
+    # Whether there is machine code is decided when a program is lowered for a platform, not when
+    # it is traced: one traced program may go to a CPU and to a GPU.
+    name = _target(program, lead, context.avals_in) if is_on() else None
+    if name is None:
+        return _lower_function(context, *operands, program=program, lead=lead)
+    results: Any = jax.ffi.ffi_lowering(name)(context, *operands)
+    # JAX marks the typed interface by an attribute that StableHLO does not know, and which is lost where an
+    # operation stands in a function of its own, as within jax.checkpoint: StableHLO's own mark stays.
+    operation = results[0].owner
+    attributes = operation.attributes
+    if "mhlo.backend_config" in attributes:
+        attributes["api_version"] = ir.IntegerAttr.get(ir.IntegerType.get_signless(32), 4)
+        attributes["backend_config"] = attributes["mhlo.backend_config"]
+        del attributes["mhlo.backend_config"]
+    return results
+
+
+mlir.register_lowering(native_p, _lower_native, platform="cpu")
+
+
+def _target(program: Program, lead: tuple[int, ...], avals: Sequence[Any]) -> str | None:
+    """Name of a program's machine code for operands of these shapes; None where there is none."""
+    rows = math.prod(lead)
+    if rows == 0 or not any(math.prod(a.shape) for a in program.outputs):
+        return None
+    shared = tuple(rows != 1 and math.prod(a.shape[: len(lead)]) == 1 for a in avals)
+    graph: Any = program.graph()
+    if graph is None:
+        return None
+
+    def make() -> Any:
+        buffers = [
+            llvm.Buffer(math.prod(a.shape), _DTYPES[str(a.dtype)], s)
+            for a, s in zip(program.inputs, shared, strict=True)
+        ]
+        results = [llvm.Buffer(math.prod(a.shape), _DTYPES[str(a.dtype)]) for a in program.outputs]
+        try:
+            code = llvm.write(
+                graph[0], graph[1], buffers, results, llvm.vector_width() if rows > 1 else 1
+            )
+            return llvm.register(code)
+        except NotScalarError:
+            return None
+
+    return program.derived(("target", shared, rows > 1, llvm.settings), make)  # pyright: ignore
+
+
+class _Switch:
+    on = os.environ.get("STMUAV_NATIVE_CODE", "1") != "0"
+
+
+def use_native_code(on: bool) -> None:
+    """Let programs that are traced from now on use machine code of their own (the default), or not.
+
+    LLVM makes it on CPUs for functions of small arrays, such as the equations of a mechanism; where
+    llvmlite is not installed, and on all other devices, XLA compiles them. The environment variable
+    STMUAV_NATIVE_CODE=0 turns it off from the start.
+    """
+    _Switch.on = bool(on)
+
+
+def is_on() -> bool:
+    """True if programs that are lowered now get machine code of their own."""
+    disabled = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
+    return _Switch.on and not disabled and llvm.available()
+
+
+def describe_code() -> str:
+    """Compiler of the equations: LLVM with its version for machine code, or XLA."""
+    return f"LLVM {llvm.describe_target()[0]}" if is_on() else "XLA"
+
+
+def targets_in(jaxpr: Any) -> set[str]:
+    """Names of all machine code that a jaxpr calls on a CPU."""
+    names: set[str] = set()
+    for equation in jaxpr.eqns:
+        if equation.primitive is native_p and is_on():
+            avals = [v.aval for v in equation.invars]
+            name = _target(equation.params["program"], equation.params["lead"], avals)
+            names |= {name} if name else set()
+        for inner in core.jaxprs_in_params(equation.params):
+            names |= targets_in(inner)
+    return names
+
+
+# Structures of arguments for which a function keeps its program.
+MOST_PROGRAMS = 64
+
+_ALLOWED = tuple(np.dtype(name) for name in _DTYPES)
+
+
+def native(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Function that is one operation of the programs around it, as machine code where that exists.
+
+    Args:
+        function: pure function of pytrees; arrays are traced, all else must be hashable.
+    """
+    jitted: Any = eqx.filter_jit(function)
+    programs: OrderedDict[Any, tuple[Program, Any] | None] = OrderedDict()
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        if not is_on():
+            return jitted(*args)
+        leaves, structure = jax.tree.flatten(args)
+        places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
+        arrays = [leaves[k] for k in places]
+        if any(a.dtype not in _ALLOWED for a in arrays):
+            return jitted(*args)
+        chosen = set(places)
+        static = tuple((k, leaf) for k, leaf in enumerate(leaves) if k not in chosen)
+        # The key holds the structure and what is not an array, by value; numbers in arrays are
+        # operands, so that other numbers find the same program.
+        key = (structure, static, tuple((a.shape, str(a.dtype)) for a in arrays))
+        # a function of the user's may be of a kind that cannot be found again
+        if not all(isinstance(leaf, Hashable) for _, leaf in static):
+            return function(*args)
+        if key not in programs:
+            programs[key] = _make(function, structure, static, places, arrays)
+            # A program holds its jaxpr, derivatives and graph. A process that makes many
+            # structures, as a test suite does, would keep them all; the oldest go first.
+            while len(programs) > MOST_PROGRAMS:
+                programs.popitem(last=False)
+        entry = programs[key]
+        # XLA compiles it as it would without this module; the graph is tried here, so that what
+        # has none is not wrapped in a primitive that hides it from XLA's fusion.
+        if entry is None or entry[0].graph() is None:
+            return jitted(*args)
+        program, result = entry
+        return result(native_p.bind(*arrays, program=program, lead=()))
+
+    return call
+
+
+@native
+def evaluate(function: Callable[..., Any], *args: Any) -> Any:
+    """Value of a function that is itself a pytree, such as a controller, by `native`."""
+    return function(*args)
+
+
+def _make(
+    function: Any, structure: Any, static: Any, places: Any, arrays: Any
+) -> tuple[Program, Any] | None:
+    """Program of a function for arguments of one structure, and what puts its results together."""
+    form: list[Any] = []
+
+    def flat(*traced_arrays: Any) -> list[Any]:
+        leaves: list[Any] = [None] * (len(static) + len(traced_arrays))
+        for k, leaf in static:
+            leaves[k] = leaf
+        for k, array in zip(places, traced_arrays, strict=True):
+            leaves[k] = array
+        out = function(*jax.tree.unflatten(structure, leaves))
+        # Results may have leaves that are no arrays, such as None or a name: these are known when
+        # the function is traced, and are put back in their places afterwards.
+        outputs, tree = jax.tree.flatten(out)
+        traced = [k for k, x in enumerate(outputs) if eqx.is_array(x)]
+        form[:] = [tree, traced, [None if eqx.is_array(x) else x for x in outputs]]
+        return [outputs[k] for k in traced]
+
+    jaxpr = _trace(flat, [jax.typeof(a) for a in arrays])
+    if any(isinstance(c, jax_core.Tracer) for c in jaxpr.consts):
+        # a number that the function closes over is being traced, and may be another one next time
+        return None
+    program = Program(jaxpr)
+    tree, traced, rest = form
+
+    def result(values: Sequence[Any]) -> Any:
+        whole = list(rest)
+        for k, value in zip(traced, values, strict=True):
+            whole[k] = value
+        return jax.tree.unflatten(tree, whole)
+
+    return program, result

@@ -1,0 +1,233 @@
+"""Signals of a mission's flight: errors from the reference, speeds, strokes, powers."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..analysis.sensors import gravity_of
+from ..checks.numbers import as_floats
+from ..control.closed_loop import Sample
+from ..math.rotation import rotation_matrix
+from ..mechanics.forces import GroundContact
+from ..mechanics.internal import internal_names
+from ..mechanics.joint_forces import JointServo
+from ..mechanics.state import State
+from ..mechanics.system import System
+from ..uav.adaptation import AdaptiveMemory
+from ..uav.airframe import ENERGY
+from ..uav.joint_controller import DrivenJoint, joint_errors, read_joints
+from ..uav.motion_estimator import MotionEstimate
+from ..uav.panel_servo import PanelBodies, panel_motion
+from ..uav.rotor import drag_power
+from ..uav.tracker.kinematics import PairMotion, panel_normal, stroke_motion
+from .controller import MissionReference, wanted_panel
+from .machine import Machine
+from .payloads import Payloads
+
+_AXES, _ROTORS = ("time", "axis"), ("time", "rotor")
+_JOINTS = ("time", "driven_joint")
+_ANGLES, _SLIDERS, _TIME = ("time", "panel_angle"), ("time", "slider"), ("time",)
+# Dimensions, unit and description of each signal.
+GAUGES: dict[str, tuple[tuple[str, ...], str, str]] = {
+    "wanted_position": (_AXES, "m", "reference of the base, world axes"),
+    "position_error": (_AXES, "m", "of the base from its reference, world axes"),
+    "wanted_heading": (_TIME, "rad", "reference of the base's yaw"),
+    "heading_error": (_TIME, "rad", "of the base's yaw from its reference"),
+    "tilt_error": (_TIME, "rad", "angle of the base's z axis from the thrust that the path needs"),
+    "rotor_speed": (
+        _ROTORS,
+        "rad/s",
+        "speeds of the rotors, as commanded before the delay if motors have no lag",
+    ),
+    "gyroscope": (_AXES, "rad/s", "readings of the base's gyroscope, its axes"),
+    "accelerometer": (_AXES, "m/s^2", "readings of the base's accelerometer, its axes"),
+    "rotor_power": (_TIME, "W", "mechanical power of all rotors"),
+    "electric_power": (_TIME, "W", "of motors, actuators and joints that push, and electronics"),
+    "estimated_position": (_AXES, "m", "of the base, by the estimator"),
+    "panel_angles": (_ANGLES, "rad", "of the panel in the base's axes"),
+    "wanted_panel_angles": (_ANGLES, "rad", "reference of the panel, at the base's true attitude"),
+    "panel_error": (_TIME, "rad", "angle of the panel's normal from its reference"),
+    "displacement": (_SLIDERS, "m", "of the sliders from the initial posture"),
+    "wanted_force": (_SLIDERS, "N", "that the servo asks of the actuators, before their limits"),
+    "actuator_power": (_TIME, "W", "mechanical power of both actuators"),
+    "joint_position": (_JOINTS, "rad or m", "coordinates of driven joints"),
+    "wanted_joint_position": (_JOINTS, "rad or m", "reference of the driven joints"),
+    "joint_error": (_JOINTS, "rad or m", "of the driven joints from their reference"),
+    "wanted_effort": (_JOINTS, "N m or N", "efforts in joints, before their limits"),
+    "joint_power": (_TIME, "W", "mechanical power of the efforts in joints, within their limits"),
+    "gear_load": (_TIME, "N", "of the ground on all feet of the landing gear, upwards"),
+    "gear_depth": (_TIME, "m", "of the lowest foot below the ground's height, negative in flight"),
+    "payload_mass": (_TIME, "kg", "mass of the payload, estimated"),
+    "payload_mass_deviation": (_TIME, "kg", "standard deviation of payload_mass"),
+    "payload_moment": (_AXES, "kg m", "first moment of the payload, estimated; its carrier's axes"),
+    "payload_moment_deviation": (_AXES, "kg m", "standard deviation of payload_moment"),
+    "centre_of_mass": (_AXES, "m", "of all bodies from the base's, base axes"),
+    "believed_centre_of_mass": (_AXES, "m", "centre of mass that was fed forward"),
+}
+
+
+class Gauges(eqx.Module):
+    """Function of a `Sample` that returns the signals of `GAUGES` that a machine has.
+
+    Attributes:
+        k_tau: drag torque coefficient of the rotors [N m s^2/rad^2]. rotors: their number.
+        bodies: of the tracker, and home: strokes at the start (2,) [m]; None without a tracker.
+        gravity: acceleration of free fall (3,) [m/s^2].
+        efficiency: of the motors [1]. other: power of everything else [W].
+        mass: of the bodies (n,) [kg], at the start. payloads: those that are picked up or dropped, or None.
+        base: name of the base. places: places of the rotor speeds among the states of force elements; none without lag.
+        grounded: system of a machine with a landing gear, else None.
+        jointed: system of a machine with driven joints, else None. joints: these.
+        efforts: largest efforts of the joints (n,).
+    """
+
+    k_tau: Float[Array, ""]
+    bodies: PanelBodies | None
+    home: Float[Array, "2"] | None
+    gravity: Float[Array, "3"]
+    efficiency: Float[Array, ""]
+    other: Float[Array, ""]
+    grounded: System | None
+    jointed: System | None
+    efforts: Float[Array, " n"]
+    mass: Float[Array, " n"]
+    payloads: Payloads | None
+    base: str = eqx.field(static=True)
+    places: tuple[int, ...] = eqx.field(static=True)
+    rotors: int = eqx.field(static=True)
+    joints: tuple[DrivenJoint, ...] = eqx.field(static=True)
+
+    def __init__(self, machine: Machine, system: System, payloads: Payloads | None = None) -> None:
+        self.payloads = payloads
+        self.k_tau, self.bodies = machine.rotors.k_tau, machine.bodies
+        self.home = None if machine.limits is None else machine.limits.home
+        self.gravity, self.mass = gravity_of(system), system.bodies.mass
+        self.efficiency = jnp.asarray(ENERGY.value("rotor.efficiency"), dtype=float)
+        self.other = jnp.asarray(ENERGY.value("other.power"), dtype=float)
+        self.base, names = system.names[0], internal_names(system)
+        self.places = tuple(k for k, name in enumerate(names) if ": speed of rotor " in name)
+        self.rotors = machine.rotors.spin.shape[0]
+        has_gear = any(isinstance(force, GroundContact) for force in system.forces)
+        self.grounded = system if has_gear else None
+        self.jointed, self.joints = system if machine.joints else None, machine.joints
+        self.efforts = as_floats(machine.efforts)
+
+    def __call__(self, sample: Sample) -> dict[str, Any]:
+        """Signals by name."""
+        state, targets = sample.state, sample.reference.waypoint
+        R = rotation_matrix(state.p[0])
+        yaw = jnp.arctan2(R[1, 0], R[0, 0]) - targets.heading
+        if self.places:
+            squared = sample.internal[jnp.array(self.places)] ** 2
+        else:
+            squared = sample.held_inputs[: self.rotors]
+        power = jnp.sum(drag_power(squared, self.k_tau))
+        result = {
+            "wanted_position": targets.r,
+            "position_error": state.r[0] - targets.r,
+            "wanted_heading": targets.heading,
+            "heading_error": jnp.arctan2(jnp.sin(yaw), jnp.cos(yaw)),
+            "tilt_error": _angle_between(R[:, 2], targets.a - self.gravity),
+            "rotor_speed": jnp.sqrt(squared),
+            "rotor_power": power,
+        }
+        if isinstance(sample.estimate, MotionEstimate):
+            result["estimated_position"] = sample.estimate.state.r[0]
+            for kind in ("gyroscope", "accelerometer"):
+                result[kind] = sample.readings[f"{kind} {self.base}"].value
+        if self.grounded is not None:
+            result |= gear_signals(self.grounded, state)
+        flight = getattr(sample.memory, "flight", None)
+        if isinstance(flight, AdaptiveMemory):
+            result |= self._payload_signals(sample.t, state, flight)
+        pushing = jnp.zeros(())
+        if self.bodies is not None:
+            panel_signals = self._panel_signals(
+                state, sample.reference, sample.held_inputs[self.rotors :]
+            )
+            panel_signals["wanted_force"] = sample.memory.commanded
+            # each actuator of its own: what one brakes does not drive the other
+            pushing = jnp.sum(jnp.maximum(panel_signals.pop("powers"), 0.0))
+            result |= panel_signals
+        if self.jointed is not None:
+            joint_signals, powers = self._joint_signals(self.jointed, sample)
+            pushing = pushing + jnp.sum(jnp.maximum(powers, 0.0))
+            result |= joint_signals | {"joint_power": jnp.sum(powers)}
+        return result | {"electric_power": power / self.efficiency + pushing + self.other}
+
+    def _payload_signals(
+        self, t: Float[Array, ""], state: State, memory: AdaptiveMemory
+    ) -> dict[str, Any]:
+        spread = jnp.sqrt(jnp.diagonal(memory.payload.covariance))
+        mass = self.mass if self.payloads is None else self.payloads.masses_of_all(self.mass, t)
+        centre = mass @ (state.r - state.r[0]) / jnp.sum(mass)
+        return {
+            "payload_mass": memory.payload.mean[3],
+            "payload_mass_deviation": spread[3],
+            "payload_moment": memory.payload.mean[4:7],
+            "payload_moment_deviation": spread[4:7],
+            "centre_of_mass": rotation_matrix(state.p[0]).T @ centre,
+            "believed_centre_of_mass": memory.centre,
+        }
+
+    def _joint_signals(
+        self, system: System, sample: Sample
+    ) -> tuple[dict[str, Any], Float[Array, " n"]]:
+        """Signals of the driven joints, and the powers of their efforts (n,) [W]."""
+        values, rates = read_joints(system, self.joints, sample.state)
+        targets, commands = sample.reference.joints.value, sample.held_inputs[self.rotors :]
+        efforts = []
+        for k, drive in enumerate(self.joints):
+            force = system.forces[drive.force]
+            if isinstance(force, JointServo):
+                lag = values[k] - commands[k]
+                efforts.append(-force.stiffness * lag - force.damping * rates[k])
+            else:
+                efforts.append(sample.memory.commanded[k])
+        demanded_efforts = jnp.stack(efforts)
+        signals = {
+            "joint_position": values,
+            "wanted_joint_position": targets,
+            "joint_error": joint_errors(self.joints, values, targets),
+            "wanted_effort": demanded_efforts,
+        }
+        return signals, jnp.clip(demanded_efforts, -self.efforts, self.efforts) * rates
+
+    def _panel_signals(
+        self, state: State, reference: MissionReference, forces: Float[Array, "2"]
+    ) -> dict[str, Any]:
+        assert self.bodies is not None
+        assert self.home is not None
+        angles, targets = panel_motion(state), wanted_panel(reference, state)
+        slider_motion = stroke_motion(self.bodies.geometry, angles)
+        target = reference.panel
+        if isinstance(target, PairMotion):
+            error = _angle_between(panel_normal(angles.value), panel_normal(target.value))
+        else:
+            assert target is not None
+            error = _angle_between(rotation_matrix(state.p[-1])[:, 2], target.value)
+        return {
+            "panel_angles": angles.value,
+            "wanted_panel_angles": targets.value,
+            "panel_error": error,
+            "displacement": slider_motion.value - self.home,
+            "actuator_power": forces @ slider_motion.rate,
+            "powers": forces * slider_motion.rate,
+        }
+
+
+def gear_signals(system: System, state: State) -> dict[str, Any]:
+    """Load on a landing gear [N] and depth of its lowest foot [m]."""
+    kin = system.kinematics(state)
+    contacts = [force for force in system.forces if isinstance(force, GroundContact)]
+    loads = [jnp.sum(force.normal_forces(kin)) for force in contacts]
+    depths = [jnp.max(force.depths(kin)) for force in contacts]
+    return {"gear_load": sum(loads), "gear_depth": jnp.max(jnp.stack(depths))}
+
+
+def _angle_between(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
+    """Angle between two directions of any length [rad]."""
+    across = jnp.cross(a, b)
+    return jnp.arctan2(jnp.sqrt(jnp.sum(across * across)), jnp.sum(a * b))

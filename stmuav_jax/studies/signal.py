@@ -1,0 +1,187 @@
+"""Signals of a run by name: scalar functions of time and state, from which quantities are made."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..analysis.sensors import Output, joint_outputs
+from ..checks.errors import SettingError, nearest_names
+from ..checks.schema import SHOWN, quote_name
+from ..dynamics.evaluation import energy
+from ..dynamics.formulations.base import Reactions
+from ..dynamics.integration.problem import Problem, at_internal
+from ..math.derivative import safe_norm
+from ..math.rotation import rotation_matrix
+from ..mechanics.state import State
+from ..mechanics.system import System
+from ..uav.tracker.kinematics import panel_angles
+
+PANEL, SLIDERS = "panel_7", ("slider_2", "slider_3")
+
+
+class RunPoint:
+    """State of a run at one time, with values that several signals need, each computed once.
+
+    Args:
+        problem: prepared problem.
+        t: time [s].
+        y: integrated vector (n,).
+        direction: unit vector that the panel should face, world (3,).
+    """
+
+    def __init__(self, problem: Problem, t: Array, y: Array, direction: Array) -> None:
+        self.problem, self.t, self.y, self.direction = problem, t, y, direction
+
+    @cached_property
+    def model(self) -> Any:
+        """Model of the problem with the present internal states of forces."""
+        problem = self.problem
+        if not problem.n_internal:
+            return problem.model
+        internal = self.y[problem.n_state : problem.n_state + problem.n_internal]
+        return at_internal(problem.model, internal)
+
+    @property
+    def system(self) -> System:
+        return self.model.system
+
+    @cached_property
+    def state(self) -> State:
+        """State of all bodies."""
+        x = self.y[: self.problem.n_state]
+        return self.problem.method.formulation.to_state(self.model, x)
+
+    @cached_property
+    def R_wb(self) -> Float[Array, "3 3"]:
+        """Attitude of the base; the world's axes where the mechanism stands on the ground."""
+        return rotation_matrix(self.state.p[0]) if self.system.floating else jnp.eye(3)
+
+    @cached_property
+    def normal_w(self) -> Float[Array, "3"]:
+        """Normal of the panel, world."""
+        return rotation_matrix(self.state.p[self.system.index(PANEL)])[:, 2]
+
+    @cached_property
+    def angles(self) -> Float[Array, "2"]:
+        """Panel angles (phi, theta) relative to the base [rad]."""
+        return panel_angles(self.R_wb.T @ self.normal_w)
+
+    @cached_property
+    def reactions(self) -> Reactions:
+        """Reactions at all joints."""
+        method = self.problem.method
+        result = method.formulation.accelerations(
+            self.model, self.t, self.state, method.stabilisation
+        )
+        return method.formulation.reactions(self.model, self.t, self.state, result)
+
+    def stroke(self, name: str) -> Float[Array, ""]:
+        """Height of a slider above its place in the reference posture, base axes [m]."""
+        k, now, reference = self.system.index(name), self.state, self.system.reference
+        base = (now.r[0], reference.r[0]) if self.system.floating else (jnp.zeros(3), jnp.zeros(3))
+        return (self.R_wb.T @ (now.r[k] - base[0]))[2] - (reference.r[k] - base[1])[2]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Scalar signal of a run.
+
+    Attributes:
+        of: function from a point of a run to the signal's value.
+        unit: SI unit.
+        label: description for tables and figures.
+        smooth: true if its rate is computed too; reactions are evaluated within steps instead.
+    """
+
+    of: Callable[[RunPoint], Array]
+    unit: str
+    label: str
+    smooth: bool = True
+
+
+def angle_between(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
+    """Angle between two vectors [rad], exact near 0 and pi, with derivatives set to zero there."""
+    return jnp.arctan2(safe_norm(jnp.cross(a, b)), a @ b)
+
+
+_UP = (0.0, 0.0, 1.0)
+
+_BASE = {
+    "x": Signal(lambda v: v.state.r[0, 0], "m", "base, x"),
+    "y": Signal(lambda v: v.state.r[0, 1], "m", "base, y"),
+    "z": Signal(lambda v: v.state.r[0, 2], "m", "base, height"),
+    "distance": Signal(lambda v: safe_norm(v.state.r[0]), "m", "base, distance from the origin"),
+    "speed": Signal(lambda v: safe_norm(v.state.v[0]), "m/s", "base, speed"),
+    "spin": Signal(lambda v: safe_norm(v.state.omega[0]), "rad/s", "base, angular velocity"),
+    "tilt": Signal(
+        lambda v: angle_between(v.R_wb[:, 2], jnp.array(_UP, v.y.dtype)), "rad", "base, tilt"
+    ),
+}
+_PANEL = {
+    "phi": Signal(lambda v: v.angles[0], "rad", "panel, phi in the base"),
+    "theta": Signal(lambda v: v.angles[1], "rad", "panel, theta in the base"),
+    "panel_tilt": Signal(
+        lambda v: angle_between(v.normal_w, jnp.array(_UP, v.y.dtype)), "rad", "panel, tilt"
+    ),
+    "pointing": Signal(
+        lambda v: angle_between(v.normal_w, v.direction), "rad", "panel, pointing error"
+    ),
+    "panel_spin": Signal(
+        lambda v: safe_norm(v.state.omega[v.system.index(PANEL)]),
+        "rad/s",
+        "panel, angular velocity",
+    ),
+    "stroke_2": Signal(lambda v: v.stroke(SLIDERS[0]), "m", "slider 2, stroke"),
+    "stroke_3": Signal(lambda v: v.stroke(SLIDERS[1]), "m", "slider 3, stroke"),
+}
+_ANY = {
+    "energy": Signal(lambda v: energy(v.system, v.state, v.t).total, "J", "energy"),
+    "kinetic": Signal(lambda v: energy(v.system, v.state, v.t).kinetic, "J", "kinetic energy"),
+}
+
+
+def _at_joint(kind: str, k: int) -> Callable[[RunPoint], Array]:
+    return lambda v: safe_norm(getattr(v.reactions, kind)[k])
+
+
+def _joint_signal(output: Output) -> Signal:
+    return Signal(lambda v: output.of(v.system, v.state), output.unit, output.label)
+
+
+def list_signals(system: System) -> dict[str, Signal]:
+    """Signals of a system, by name."""
+    result = dict(_ANY)
+    result |= {name: _joint_signal(output) for name, output in joint_outputs(system).items()}
+    if system.floating:
+        result |= _BASE
+    if PANEL in system.names:
+        result |= _PANEL
+    for k, joint in enumerate(system.joints):
+        name = joint.name
+        # A reaction depends on accelerations, whose rate would be a third derivative: its extremes are found
+        # by samples.
+        result[f"force.{name}"] = Signal(
+            _at_joint("force", k), "N", f"joint {name}, reaction force", smooth=False
+        )
+        result[f"moment.{name}"] = Signal(
+            _at_joint("moment", k), "N m", f"joint {name}, reaction moment", smooth=False
+        )
+    return result
+
+
+def find_signal(system: System, name: str) -> Signal:
+    """Signal of a system by its name.
+
+    Raises:
+        SettingError: the system has no such signal.
+    """
+    available_signals = list_signals(system)
+    if name not in available_signals:
+        raise SettingError(
+            f"There is no signal {quote_name(name)}.{nearest_names(name[:SHOWN], available_signals)}"
+        )
+    return available_signals[name]

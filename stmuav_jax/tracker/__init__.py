@@ -1,5 +1,0 @@
-"""Solar tracker: geometry, kinematics, bodies, workspace, a day of pointing. Floor 8."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

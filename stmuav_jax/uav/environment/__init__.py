@@ -1,0 +1,1 @@
+"""Sun, irradiance and wind."""

@@ -1,0 +1,1 @@
+"""Identification of a multirotor from the record of a flight."""

@@ -1,0 +1,1324 @@
+"""Identification of a multirotor from the record of a flight, in stages that refuse what is not excited.
+
+About the centre of mass c, with lagged commands s and thrust shapes T_i(s_i) (see `record`), rotors at
+(x_i, y_i) with spin e_i, rates (p, q, r), arms l and velocity v,
+
+    p' =  B_x sum (y_i - c_y) T_i / l_x + d_x p + h_x q r + m_x v_y + moments that nobody knows,
+    q' = -B_y sum (x_i - c_x) T_i / l_y + d_y q + h_y p r + m_y v_x + ...,
+    r' = -B_z sum e_i T_i - S sum e_i s_i' + d_z r + h_z p q + ...,
+
+and an accelerometer at b from the centre of mass reads
+
+    a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + forces that nobody knows.
+
+The velocity v is not logged. By v' = f + g - w x v, with gravity g in body axes by the gyroscope,
+
+    f_x' - r f_y = -D_x (f_x + g_x - q v_z),   f_y' + r f_x = -D_y (f_y + g_y + p v_z),
+    f_z' = sum T_i' k/m - D_z (f_z + g_z + q v_x - p v_y)
+
+where the drag tells v once D is roughly known. Both fits are by prediction errors, so the unknown moments
+and forces may be coloured and fed back.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import optimize, stats
+from scipy.constants import g as GRAVITY
+
+from ...analysis.fit_statistics import compare_estimates, compute_autocorrelation
+from ...checks.errors import SettingError
+from .combinations import describe_combinations
+from .prediction_error import (
+    PredictionErrorFit,
+    Regression,
+    fit_prediction_error,
+)
+from .record import (
+    FlightRecord,
+    RotorLayout,
+    apply_filter,
+    compute_rotor_states,
+    compute_thrust_shape,
+    filter_columns,
+    low_pass,
+    observe_motion,
+)
+
+AXES = ("roll", "pitch", "yaw")
+# Rate of the regressions for specific force, for screening and for variants [Hz]. That of the angular motion is
+# the grid's: the commands follow every sample, and errors of averages would not be independent of them.
+_FORCE_RATE = 100.0
+# Memories of the coloured forces and moments, block of scores, and stretch after the start that is left out [s].
+_MEMORY, _MOMENT_MEMORY, _BLOCK, _SETTLING = 0.25, 0.15, 1.0, 0.3
+# Bounds of lag and delay, and their starts [s].
+_BOUNDS, _START = ((0.0005, 0.5), (0.0, 0.05)), (0.05, 0.004)
+# Shortest window, and most of them.
+_WINDOW, _WINDOWS = 6.0, 5
+# Effect of the commands over the prediction errors from which an axis is excited.
+_EXCITED = 2.0
+# Relative deviation up to which an effectiveness is determined.
+_DETERMINED = 0.1
+# Deviations up to which the IMU's position [m], and the drag as a share of it, are determined.
+_IMU_DETERMINED, _DRAG_DETERMINED = 0.005, 0.5
+# Deviation of the voltage's exponent up to which it is determined, and range of the voltage from which it is sought.
+_EXPONENT_DETERMINED, _STEADY = 0.25, 0.01
+# Deviation of the curve's quadratic part up to which it is determined, as a share of the slope.
+_CURVE_DETERMINED = 0.15
+# Step of the polygon for what is not known of the velocity along z [s].
+_CLIMB = 3.0
+# Time in which the integral of the forces' relations forgets [s].
+_LEAK = 1.0
+# Columns of the forces' regression before those of the thrust: lever, drag, turning constants.
+_FORCE = 10
+# Time of a battery's sag, and lag whose change of the response stands for a second one [s].
+_SLOW, _SECOND_LAG = 3.0, 0.005
+# Pace of the observer of a variant.
+_OTHER_PACE = 2.0
+# Drag over mass with which the observer starts [1/s], and most passes until its drag is that of the fit.
+_DRAG, _PASSES = 0.4, 6
+# Radii of gyration of multirotors over their mean arms.
+_GYRATION = (0.1, 5.0)
+# Level of the verdict and of variants that the record rejects.
+_LEVEL = 0.01
+# Lowest rates of commands and IMU [Hz], and shortest flight [s].
+_SLOWEST, _SHORTEST = 50.0, 10.0
+
+
+class ParameterEstimate(NamedTuple):
+    """Estimate of one quantity, with what its deviation is made of.
+
+    Attributes:
+        name: of the quantity. unit: of the value and the deviations. value: estimate.
+        deviation: standard deviation, the root of the squares of blocks, windows and variants.
+        white: deviation for white prediction errors. blocks: by sums of scores over blocks.
+        windows: scatter between windows beyond their deviations; zero where they agree.
+        variants: difference of variants of the model beyond what chance explains.
+        window_values: estimate in each window (w,). window_deviations: their deviations (w,).
+        window_p_value: p-value of their agreement.
+    """
+
+    name: str
+    unit: str
+    value: float
+    deviation: float
+    white: float
+    blocks: float
+    windows: float
+    variants: float
+    window_values: Float[np.ndarray, " w"]
+    window_deviations: Float[np.ndarray, " w"]
+    window_p_value: float
+
+
+class FlightVerdict(NamedTuple):
+    """Verdict on an identification.
+
+    Attributes:
+        status: "consistent"; "inconsistent": a test speaks against the model; "undecided": nothing was
+            identified.
+        p_values: p-value of every test by its name.
+        explanation: sentences on what was found.
+    """
+
+    status: Literal["consistent", "inconsistent", "undecided"]
+    p_values: dict[str, float]
+    explanation: str
+
+
+class FlightIdentification(NamedTuple):
+    """Multirotor that a flight identifies.
+
+    Attributes:
+        estimates: by their names; those that the flight does not determine are not among them.
+        refusals: sentence of each stage that was refused, by the stage's name.
+        verdict: on the model and the deviations.
+        layout: rotors that were assumed.
+        rotation: fit behind the effectiveness, None if no axis is determined. translation: that behind the rest.
+        hover: mean command of the rotors.
+    """
+
+    estimates: dict[str, ParameterEstimate]
+    refusals: dict[str, str]
+    verdict: FlightVerdict
+    layout: RotorLayout
+    rotation: PredictionErrorFit | None
+    translation: PredictionErrorFit
+    hover: float
+
+    def correct_voltage(self, record: FlightRecord) -> FlightRecord:
+        """The identified record with commands as the motors feel them, where the voltage's exponent is determined."""
+        exponent = self.estimates.get("voltage_exponent")
+        return record.correct_voltage(0.0 if exponent is None else exponent.value)
+
+    def describe(self) -> str:
+        """Table of the estimates, the refusals and the verdict."""
+        rows: list[tuple[str, ...]] = [
+            ("quantity", "value", "deviation", "blocks", "windows", "variants", "white", "unit")
+        ]
+        for e in self.estimates.values():
+            parts = (e.deviation, e.blocks, e.windows, e.variants, e.white)
+            rows.append((e.name, f"{e.value:.4g}", *(f"{x:.2g}" for x in parts), e.unit))
+        widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+        lines = [
+            "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        ]
+        return "\n".join([*lines, "", *self.refusals.values(), self.verdict.explanation])
+
+
+class _Signals(NamedTuple):
+    """Record with what all regressions need: force at the centre of mass, velocity and gravity in body axes."""
+
+    record: FlightRecord
+    layout: RotorLayout
+    force: np.ndarray
+    velocity: np.ndarray
+    gravity: np.ndarray
+
+
+class _Variant(NamedTuple):
+    """Settings of a fit."""
+
+    rate: float = np.inf
+    memory: float = _MEMORY
+    factor: float | None = None
+
+
+def _sample_step(record: FlightRecord, rate: float) -> int:
+    return max(round(1 / (record.dt * rate)), 1)
+
+
+def _rotation_regression(
+    signals: _Signals, axes: Sequence[int], variant: _Variant, *, free: bool = False
+) -> Callable[[np.ndarray], Regression]:
+    """Regression of angular accelerations as a function of (lag, delay).
+
+    The output is the change of the gyroscope's reading over a step of the grid. Regressors go through
+    its filter; those that were measured themselves enter from before the step.
+    """
+    record, layout = signals.record, signals.layout
+    dt, n = record.dt, _sample_step(record, variant.rate)
+    # Filters of the record start at zero: rows before they have settled would be fitted to a
+    # transient that the vehicle did not make.
+    first = round(_SETTLING / dt)
+    box = np.ones(n) / n
+    boxes = np.convolve(box, box)
+    # The angular acceleration is never formed by a derivative, which would amplify noise: the
+    # regression is of the rate's change over a step, with all else integrated over the same step.
+    change = np.zeros(n + 1)
+    change[[0, -1]] = 1, -1
+    w = record.gyroscope
+    y = filter_columns(np.convolve(box, change) / (n * dt), [1.0], w)[first::n]
+    b, a = low_pass(record.cutoffs[0], dt)
+    # integrals over a step by the trapezoidal rule, and of a derivative exactly
+    integral, derivative = (
+        np.convolve(b, np.convolve(boxes, x)) for x in ([0.5, 0.5], [1 / dt, -1 / dt])
+    )
+    through = lambda numerator, x: apply_filter(numerator, a, x)[first::n]
+    measured = []
+    for axis in axes:
+        # Regressors that were measured have noise of their own. From before the step it is not
+        # correlated with that of the output, which would bias their coefficients.
+        i, j = [k for k in range(3) if k != axis]
+        product = filter_columns(np.convolve(boxes, [0.5, 0.5]), [1.0], w[:, i] * w[:, j])
+        columns = [w[:, axis]] + ([signals.velocity[:, 1 - axis]] if axis < 2 else [])
+        # the newest sample is that before the step of the output
+        older = filter_columns(np.append(np.zeros(n), boxes), [1.0], np.stack(columns, axis=1))
+        measured.append(np.column_stack([older[:, 0], product, older[:, 1:]])[first::n])
+    factor = layout.thrust_model_factor if variant.factor is None else variant.factor
+    levers = layout.positions - layout.centre
+
+    def build(lags: np.ndarray) -> Regression:
+        s = compute_rotor_states(record.commands, dt, *lags)
+        T = compute_thrust_shape(s, factor)
+        parts = []
+        for axis, columns in zip(axes, measured, strict=True):
+            if axis == 2:
+                spin = -layout.spin
+                rotors = np.stack(
+                    [through(integral, T @ spin), through(derivative, s @ spin)], axis=1
+                )
+            # Motors that differ have a coefficient each; equal ones share one, and the centre of
+            # mass is then the only other unknown of the moment.
+            elif free:
+                rotors = through(integral, T)
+            else:
+                sign = 1 if axis == 0 else -1
+                moment = T @ levers[:, 1 - axis] / layout.arms[axis]
+                rotors = sign * through(integral, np.stack([moment, -np.sum(T, axis=1)], axis=1))
+            parts.append(np.hstack([rotors, columns]))
+        X = np.zeros((len(y), len(axes), sum(part.shape[1] for part in parts)))
+        place = 0
+        for c, part in enumerate(parts):
+            X[:, c, place : place + part.shape[1]] = part
+            place += part.shape[1]
+        return Regression(y[:, list(axes)], X, n * dt)
+
+    return build
+
+
+def _lever_columns(record: FlightRecord) -> np.ndarray:
+    """Accelerations (k, 3, 3) at unit distances from the centre of mass, as the accelerometer reads them.
+
+    The gyroscope goes from its own filter to that of the accelerometer.
+    """
+    (bg, ag), (bf, af) = (low_pass(cutoff, record.dt) for cutoff in record.cutoffs)
+    # the numerators of two-pole filters have the same zeros, so their quotient is a number
+    b, a = (ag * (bf[0] / bg[0]), af) if len(bg) == len(bf) else (np.convolve(bf, ag), af)
+    w = record.gyroscope
+    # The accelerometer is off the centre of mass by an unknown lever: angular accelerations and
+    # squares of rates appear in its reading, in proportion to it.
+    dw = np.gradient(apply_filter(b, a, w), record.dt, axis=0)
+    S = apply_filter(b, a, np.einsum("ki,kj->kij", w, w).reshape(-1, 9)).reshape(-1, 3, 3)
+    S -= np.eye(3) * np.trace(S, axis1=1, axis2=2)[:, None, None]
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        S[:, j, i] += dw[:, k]
+        S[:, i, j] -= dw[:, k]
+    return S
+
+
+def _integrate_relation(record: FlightRecord, n: int, values: np.ndarray) -> np.ndarray:
+    """Leaky integral of a relation of the forces, at every nth sample by means over the steps.
+
+    The noise of a derivative has no constant part, which A(z) cannot describe; that of this integral has one.
+    """
+    # The integral forgets, since a bias that turns with the body would otherwise grow without
+    # bound in it.
+    pole, share = np.exp(-record.dt / _LEAK), record.dt / n
+    return filter_columns(np.full(n, share), [1.0, -pole], values)[
+        round(_SETTLING / record.dt) :: n
+    ]
+
+
+def _thrust_columns(record: FlightRecord, n: int, thrust: np.ndarray) -> np.ndarray:
+    """Terms that thrusts (k, m) over mass add to the relation of the forces along z, as the accelerometer reads it."""
+    b, a = low_pass(record.cutoffs[1], record.dt)
+    difference = np.array([1.0, -1.0]) / record.dt
+    return _integrate_relation(record, n, apply_filter(np.convolve(b, difference), a, thrust))
+
+
+def _force_regression(
+    signals: _Signals, variant: _Variant, *, curve: bool, voltage: np.ndarray | None = None
+) -> Callable[[np.ndarray], Regression]:
+    """Regression of the specific force as a function of (lag, delay) of the thrust.
+
+    Outputs are the two relations of the horizontal forces, then the force along z. Logarithms of the voltage (k,)
+    add a column for its exponent after those of the curve.
+    """
+    record, layout = signals.record, signals.layout
+    dt, n = record.dt, _sample_step(record, variant.rate)
+    b, a = low_pass(record.cutoffs[1], dt)
+    turning = apply_filter(b, a, record.gyroscope[:, 2])
+
+    def relate(f: np.ndarray) -> np.ndarray:
+        # Horizontal forces turn with the vehicle's heading, which no sensor here measures: their
+        # rates in turning axes need the yaw rate alone.
+        rate = turning.reshape(-1, *(1,) * (f.ndim - 2))
+        change = np.concatenate([np.zeros_like(f[:1]), np.diff(f, axis=0)]) / dt
+        change[:, 0] -= rate * f[:, 1]
+        change[:, 1] += rate * f[:, 0]
+        return change
+
+    sampled = lambda x: _integrate_relation(record, n, x)
+    y = sampled(relate(record.accelerometer))
+    nodes = max(round((record.ts[-1] - record.ts[0]) / _CLIMB), 2)
+    columns = np.zeros((len(record.ts), 3, _FORCE + nodes))
+    columns[:, :, :3] = relate(_lever_columns(record))
+    (p, q, _), v = record.gyroscope.T, signals.velocity
+    coupling = np.stack([q * v[:, 2], -p * v[:, 2], p * v[:, 1] - q * v[:, 0]], axis=1)
+    # the force within a step of the output follows from those before it, whose noise is not that of the output
+    force = filter_columns(np.r_[np.zeros(n), 2.0, np.zeros(n - 1), -1.0], [1.0], signals.force)
+    acceleration = force + apply_filter(b, a, signals.gravity - coupling)
+    acceleration -= np.mean(acceleration[2 * n :], axis=0)
+    for axis in range(3):
+        columns[:, axis, 3 + axis] = -acceleration[:, axis]
+    # biases of the accelerometer and the mean velocity, which nothing tells, turn with the body
+    rates = apply_filter(b, a, record.gyroscope)
+    for column, (axis, rate) in enumerate(((0, 2), (1, 2), (2, 0), (2, 1))):
+        columns[:, axis, 6 + column] = rates[:, rate]
+    # so does the velocity along z, which nothing tells either: a polygon over the flight
+    places = np.linspace(record.ts[0], record.ts[-1], nodes)
+    for j, node in enumerate(np.eye(nodes)):
+        share = np.interp(record.ts, places, node)
+        columns[:, 0, _FORCE + j], columns[:, 1, _FORCE + j] = (
+            share * rates[:, 1],
+            -share * rates[:, 0],
+        )
+    measured = sampled(columns.reshape(len(record.ts), -1)).reshape(-1, 3, _FORCE + nodes)
+    factor = layout.thrust_model_factor if variant.factor is None else variant.factor
+
+    def build(lags: np.ndarray) -> Regression:
+        s = compute_rotor_states(record.commands, dt, *lags)
+        if curve:
+            parts = [s, s**2]
+            if voltage is not None:
+                change = compute_rotor_states(record.commands * voltage[:, None], dt, *lags)
+                parts.append((1 - factor + 2 * factor * s) * change)
+            thrust = np.stack([np.sum(part, axis=1) for part in parts], axis=1)
+        else:
+            thrust = np.sum(compute_thrust_shape(s, factor), axis=1)[:, None]
+        m = thrust.shape[1]
+        X = np.zeros((len(y), 3, _FORCE + m + nodes))
+        X[:, :, :_FORCE], X[:, :, _FORCE + m :] = measured[:, :, :_FORCE], measured[:, :, _FORCE:]
+        X[:, 2, _FORCE : _FORCE + m] = _thrust_columns(record, n, thrust)
+        return Regression(y, X, n * dt)
+
+    return build
+
+
+def _identify_voltage(
+    record: FlightRecord,
+    layout: RotorLayout,
+    estimates: dict[str, ParameterEstimate],
+    refusals: dict[str, str],
+) -> tuple[FlightRecord, FlightRecord | None]:
+    """Record with commands as the motors feel them, and that for an exponent larger by its deviation.
+
+    The second is None where the voltage is not known, or its exponent not determined.
+    """
+    voltage = record.voltage
+    if voltage is None:
+        return record, None
+    bare = record._replace(voltage=None)
+    if not np.min(voltage) > 0.5 * np.median(voltage):
+        raise SettingError(
+            f"The battery's voltage falls to {np.min(voltage):.3g} V where {np.median(voltage):.3g} V is usual; "
+            "positive voltages throughout, or none, would be valid."
+        )
+    if np.ptp(voltage) < _STEADY * np.mean(voltage):
+        refusals["voltage"] = (
+            f"The voltage's part in the thrust is not determined: it changes by {np.ptp(voltage):.2g} V; "
+            f"{100 * _STEADY:g} % of it or more would be valid."
+        )
+        return bare, None
+    logarithm = np.log(voltage / np.mean(voltage))
+    signals, *_ = _observe_signals(bare, layout)
+    factor, exponent, e = layout.thrust_model_factor, 0.0, None
+    for _ in range(_PASSES):
+        felt = record.correct_voltage(exponent)
+        hover = float(np.mean(felt.commands))
+        per_shape = 1 - factor + 2 * factor * hover
+        step = lambda z, h=hover, k=per_shape: (
+            z[_FORCE + 2] * k / (z[_FORCE] + 2 * h * z[_FORCE + 1])
+        )
+        fit, other = [
+            fit_prediction_error(
+                _force_regression(
+                    signals._replace(record=felt), _Variant(_FORCE_RATE), curve=True, voltage=logarithm
+                ),
+                np.array(_START), _BOUNDS, memory,
+            )
+            for memory in (_MEMORY, 2 * _MEMORY)
+        ]  # fmt: skip
+        base = exponent
+        e = _Evaluation(fit, [other], _window_count(record)).estimate(
+            "exponent of the voltage", "1", lambda z, b=base, f=step: b + f(z)
+        )
+        exponent = e.value
+        if not e.deviation <= _EXPONENT_DETERMINED or abs(exponent - base) < 0.1 * e.deviation:
+            break
+    assert e is not None
+    if not e.deviation <= _EXPONENT_DETERMINED:
+        level = np.log(np.maximum(np.mean(record.commands, axis=1), 1e-3))
+        alike = float(
+            np.corrcoef(filter_columns([1.0], [1.0, -0.99], level - np.mean(level)), logarithm)[
+                0, 1
+            ]
+        )
+        refusals["voltage"] = (
+            f"The voltage's part in the thrust is not determined: its exponent has a deviation of {e.deviation:.2g}; "
+            f"{_EXPONENT_DETERMINED:g} or less would be valid. Commands and voltage change together (correlation "
+            f"{alike:.2f}); quick manoeuvres in thrust at several voltages would separate them."
+        )
+        return bare, None
+    estimates["voltage_exponent"] = e
+    return record.correct_voltage(e.value), record.correct_voltage(e.value + e.deviation)
+
+
+def _observe_signals(
+    record: FlightRecord, layout: RotorLayout
+) -> tuple[_Signals, _Signals, _Signals]:
+    """Signals by an observer whose drag and lever are those of a fit with its result, and by two others.
+
+    One is faster, the other has a drag that is larger by its standard deviation.
+    """
+    drag, levers = np.full(2, _DRAG), _lever_columns(record)
+
+    def observe(imu: np.ndarray, drag: np.ndarray, pace: float = 1.0) -> _Signals:
+        force = record.accelerometer - levers @ imu
+        return _Signals(record, layout, force, *observe_motion(record, force, drag, pace))
+
+    # Drag and lever are found from the velocity, which is observed with drag and lever: a few
+    # passes agree, since either depends little on the other.
+    imu, fit = np.zeros(3), None
+    for _ in range(_PASSES):
+        build = _force_regression(observe(imu, drag), _Variant(_FORCE_RATE), curve=False)
+        fit = fit_prediction_error(build, np.array(_START), _BOUNDS, _MEMORY)
+        previous, drag = drag, np.maximum(fit.values[3:5], 0.1 * _DRAG)
+        imu = fit.values[:3]
+        if np.all(np.abs(drag - previous) < 0.02 * drag):
+            break
+    assert fit is not None
+    signals = observe(imu, drag)
+    spread = np.sqrt(np.diag(fit.compute_covariance(_BLOCK))[3:5])
+    return signals, observe(imu, drag, _OTHER_PACE), observe(imu, drag + spread)
+
+
+def _window_count(record: FlightRecord) -> int:
+    return int(np.clip((record.ts[-1] - record.ts[0]) // _WINDOW, 2, _WINDOWS))
+
+
+class _Evaluation:
+    """Fit with its covariance, its windows and its variants, for estimates of functions of its values.
+
+    Further fits may have one of their assumptions shifted by a standard deviation each.
+    """
+
+    def __init__(
+        self,
+        fit: PredictionErrorFit,
+        variants: Sequence[PredictionErrorFit],
+        windows: int,
+        shifted: Sequence[PredictionErrorFit] = (),
+    ) -> None:
+        self.fit, self.shifted = fit, shifted
+        # Scores are summed over blocks longer than the disturbances' correlation: their scatter
+        # needs no model of it.
+        self.covariance = fit.compute_covariance(_BLOCK)
+        self.white = fit.white_covariance
+        # effectiveness may drift, as a battery sags, but not the lag of motors
+        self.windows = fit.fit_windows(windows, self.covariance, common_lags=True)
+        self.lag_windows = fit.fit_windows(windows, self.covariance)
+        self.variants = [(v, v.compute_covariance(_BLOCK)) for v in variants]
+
+    def estimate(
+        self, name: str, unit: str, quantity: Callable[..., float], *others: float
+    ) -> ParameterEstimate:
+        """Estimate of quantity(values), or of quantity(values, other) with other settings of variants."""
+        values = self.fit.values
+        of = lambda z: quantity(z, *others[:1])
+        G = _difference_gradient(of, values, self.white)
+        value = float(of(values))
+        variance = lambda V: float(max(G @ V @ G, 0.0))
+        blocks, white = variance(self.covariance), variance(self.white)
+        is_of_lags = np.any(G[len(G) - self.fit.lag_count :] != 0)
+        # Each window has its own estimate. Scatter beyond the windows' own deviations is what the
+        # model leaves out, such as a sagging battery.
+        changes, covariances = self.lag_windows if is_of_lags else self.windows
+        window_values = value + changes @ G
+        spread = np.array([variance(V) for V in covariances])
+        scatter, p_value = 0.0, 1.0
+        # a lag at its bound has no deviation
+        if np.all(spread > 0):
+            scatter, p_value = compare_estimates(window_values, np.diag(spread), _LEVEL)
+        excess = []
+        for k, (fit, V) in enumerate(self.variants):
+            of_variant = lambda z, k=k: quantity(z, *others[k + 1 : k + 2])
+            H = _difference_gradient(of_variant, fit.values, fit.white_covariance)
+            difference = float(of_variant(fit.values)) - value
+            # the difference of two estimates of the same quantity has at least this variance
+            # Of two estimates from one record the less efficient one has the larger variance, and
+            # their difference has the excess (Hausman): only a larger difference speaks against
+            # the model.
+            chance = abs(float(H @ V @ H) - blocks)
+            excess.append(max(difference**2 - chance, 0.0))
+        variants = float(np.mean(excess)) if excess else 0.0
+        # what an error of the observer's drag or of the voltage's exponent, of one deviation, changes
+        variants += sum((float(of(fit.values)) - value) ** 2 for fit in self.shifted)
+        deviation = np.sqrt(blocks + scatter**2 + variants)
+        return ParameterEstimate(
+            name, unit, value, float(deviation), np.sqrt(white), np.sqrt(blocks), scatter,
+            np.sqrt(variants), window_values, np.sqrt(spread), p_value,
+        )  # fmt: skip
+
+
+def _difference_gradient(
+    function: Callable[[np.ndarray], float], x: np.ndarray, V: np.ndarray
+) -> np.ndarray:
+    """Gradient by central differences of a hundredth of a deviation."""
+    G = np.zeros(len(x))
+    for k, h in enumerate(0.01 * np.sqrt(np.diag(V))):
+        if h > 0:
+            e = np.where(np.arange(len(x)) == k, h, 0.0)
+            G[k] = (function(x + e) - function(x - e)) / (2 * h)
+    return G
+
+
+def identify_flight(
+    record: FlightRecord,
+    layout: RotorLayout,
+    *,
+    progress: Callable[[float], object] | None = None,
+) -> FlightIdentification:
+    """Identify lag, thrust, effectiveness, IMU position, drag and centre of mass from a flight.
+
+    Deviations have three independent parts: sums of scores over blocks of one second, scatter between
+    windows, and variants of the model. Without a mass only ratios are determined.
+
+    Args:
+        record: flight of 10 s or more, at 100 Hz or more.
+        layout: rotors in the order of the commands; the centre of mass counts from their origin.
+        progress: function that is called with the completed fraction after each stage.
+
+    Raises:
+        SettingError: the record is too short or too slow, has another number of rotors, or its motors
+            respond in another order than the layout says.
+
+    Source: the module's equations; L. Ljung, System Identification (1999), ch. 7 and 13.4.
+    """
+    report = progress or (lambda share: None)
+    _check_record(record, layout)
+    refusals: dict[str, str] = {}
+    estimates: dict[str, ParameterEstimate] = {}
+    record, further = _identify_voltage(record, layout, estimates, refusals)
+    report(0.1)
+    # Forces come first: they give the lever of the IMU and the drag, without which the moments'
+    # regression lacks the velocity.
+    signals, faster, shifted = _observe_signals(record, layout)
+    other = [] if further is None else [signals._replace(record=further)]
+    report(0.2)
+    hover = float(np.mean(record.commands))
+    translation = _identify_translation(
+        signals, faster, [shifted, *other], hover, estimates, refusals
+    )
+    report(0.35)
+    axes = _screen_axes(signals, refusals)
+    excited = list(axes)
+    report(0.4)
+    rotation = _identify_rotation(signals, faster, other, axes, hover, estimates, refusals)
+    _name_combinations(signals, excited, estimates, refusals)
+    report(0.8)
+    if {"roll", "pitch"} <= set(estimates):
+        _identify_free_centre(signals, estimates)
+    report(1.0)
+    _check_size(layout, estimates)
+    if layout.mass is not None:
+        _scale_by_mass(layout, estimates, refusals)
+    else:
+        refusals["mass"] = (
+            "Masses, forces and inertias: the log determines ratios only; give the mass for SI values."
+        )
+    verdict = _judge_estimates(signals, rotation, translation.fit, estimates)
+    fits = (rotation.fit if rotation else None, translation.fit)
+    return FlightIdentification(estimates, refusals, verdict, layout, *fits, hover)
+
+
+def explain_rotation(
+    record: FlightRecord, result: FlightIdentification
+) -> tuple[
+    Float[np.ndarray, " k"], Float[np.ndarray, "k 2"], Float[np.ndarray, "k 2"], Float[np.ndarray, "k 2"]
+]:  # fmt: skip
+    """Rotation about roll and pitch at 100 Hz, with what a result explains of it except for the centre of mass.
+
+    Args:
+        record: the record that was identified. result: identifies roll and pitch.
+
+    Returns:
+        Times [s], rates [rad/s], explained angular accelerations over the steps before [rad/s^2], and their
+        changes by c_y and c_x, which count from the rotors' centre [rad/(s^2 m)].
+    """
+    assert result.rotation is not None
+    record = result.correct_voltage(record)
+    layout, theta = result.layout, result.rotation.values
+    drag, imu = result.translation.values[3:5], result.translation.values[:3]
+    force = record.accelerometer - _lever_columns(record) @ imu
+    drag = np.maximum(drag, 0.1 * _DRAG)
+    signals = _Signals(record, layout, force, *observe_motion(record, force, drag))
+    n, first = _sample_step(record, _FORCE_RATE), round(_SETTLING / record.dt)
+    build = _rotation_regression(signals, [0, 1], _Variant(_FORCE_RATE))
+    X = build(result.rotation.lags).X
+    weights = theta[:10] * [1, 0, 1, 1, 1, 1, 0, 1, 1, 1]
+    slopes = [X[:, c, 5 * c + 1] * theta[5 * c] / layout.arms[c] for c in range(2)]
+    rates = filter_columns(np.full(n, 1 / n), [1.0], record.gyroscope[:, :2])[first::n]
+    return record.ts[first::n], rates, X @ weights, np.stack(slopes, axis=1)
+
+
+def _check_record(record: FlightRecord, layout: RotorLayout) -> None:
+    count = record.commands.shape[1]
+    if count != len(layout.positions):
+        raise SettingError(
+            f"The record has commands of {count} rotors, but the layout has {len(layout.positions)}."
+        )
+    length, rate = float(record.ts[-1] - record.ts[0]), 1 / record.dt
+    if length < _SHORTEST:
+        raise SettingError(
+            f"The flight is {length:.3g} s long; {_SHORTEST:g} s or more would be valid."
+        )
+    if rate < 0.99 * _FORCE_RATE:
+        raise SettingError(
+            f"The record has {rate:.3g} samples a second; {_FORCE_RATE:g} or more would be valid."
+        )
+    changes = np.sum(np.any(np.diff(record.commands, axis=0) != 0, axis=1)) / length
+    if changes < _SLOWEST:
+        raise SettingError(
+            f"The commands change {changes:.3g} times a second, which is slower than the lag of motors; "
+            f"{_SLOWEST:g} or more would be valid (a high-rate logging profile)."
+        )
+    for name in ("commands", "gyroscope", "accelerometer"):
+        if not np.all(np.isfinite(getattr(record, name))):
+            raise SettingError(f"The {name} of the record must be finite numbers throughout.")
+    for name, columns in (
+        ("command of motor", record.commands),
+        ("gyroscope's axis", record.gyroscope),
+        ("accelerometer's axis", record.accelerometer),
+    ):
+        constant = np.flatnonzero(np.ptp(columns, axis=0) == 0)
+        if len(constant):
+            label = constant[0] + 1 if name.endswith("motor") else "xyz"[constant[0]]
+            raise SettingError(
+                f"The {name} {label} is {columns[0, constant[0]]:g} throughout the flight; values that change would "
+                "be valid."
+            )
+
+
+def _channel_effect(fit: PredictionErrorFit, channel: int, columns: slice) -> float:
+    """Standard deviation of what columns contribute to a channel, in those of the errors."""
+    return float(np.std(fit.slopes[:, channel, columns] @ fit.values[columns]))
+
+
+def _screen_axes(signals: _Signals, refusals: dict[str, str]) -> list[int]:
+    """Axes that the commands excite, with the order of the motors checked."""
+    layout = signals.layout
+    count = len(layout.positions)
+    axes, responses, yaw = [], {}, 0.0
+    for axis, name in enumerate(AXES):
+        free = axis < 2
+        # Each motor is free here, so that an order of the motors other than the layout's shows in
+        # the signs of their responses instead of in a poor fit.
+        build = _rotation_regression(signals, [axis], _Variant(_FORCE_RATE), free=free)
+        fit = fit_prediction_error(build, np.array(_START), _BOUNDS, _MEMORY)
+        effect = _channel_effect(fit, 0, slice(0, count if free else 2))
+        if effect < _EXCITED:
+            refusals[name] = (
+                f"{name.capitalize()} is not excited: the commands cause {effect:.2g} times what nobody "
+                f"commands; {_EXCITED:g} times or more would be valid (a manoeuvre about this axis)."
+            )
+            continue
+        axes.append(axis)
+        if free:
+            response = fit.values[:count] * (1 if axis == 0 else -1)
+            responses[axis] = (response - np.mean(response)) / np.std(response)
+        else:
+            yaw = fit.values[0]
+    _check_order(layout, responses)
+    if yaw < 0:
+        raise SettingError(
+            "The rotors turn the body about yaw in the sense of their spin, where the opposite sense would be "
+            "valid: are the signs of spin, or the gyroscope's axes, exchanged?"
+        )
+    return axes
+
+
+def _name_combinations(
+    signals: _Signals,
+    excited: list[int],
+    estimates: dict[str, ParameterEstimate],
+    refusals: dict[str, str],
+) -> None:
+    """Add which combinations of the motors' responses about roll and pitch an axis that is not excited still tells.
+
+    They have no values: without excitation the controller's own relation of rates and commands biases the fit.
+    """
+    layout, count = signals.layout, len(signals.layout.positions)
+    lag = estimates.get("lag", estimates.get("thrust_lag"))
+    lags = np.array([_START[0] if lag is None else lag.value, _START[1]])
+    shape = compute_thrust_shape(signals.record.commands, layout.thrust_model_factor)
+    for axis in {0, 1} - set(excited):
+        build = _rotation_regression(signals, [axis], _Variant(_FORCE_RATE), free=True)
+        regression = build(lags)
+        fit = fit_prediction_error(lambda _, same=regression: same, np.zeros(0), (), _MEMORY)
+        # a vehicle whose radius of gyration is its arm has this effectiveness
+        usual = GRAVITY / (count * float(np.mean(shape)) * layout.arms[axis])
+        sentence = describe_combinations(
+            [f"motor {k + 1}" for k in range(count)], "", fit.values[:count],
+            fit.compute_covariance(_BLOCK)[:count, :count], np.full(count, _DETERMINED * usual),
+        )  # fmt: skip
+        refusals[AXES[axis]] += sentence.replace("Only", "Of the motors' responses only")
+
+
+def _check_order(layout: RotorLayout, responses: dict[int, np.ndarray]) -> None:
+    """Refuse motors whose responses about roll and pitch are those of other places."""
+    levers = layout.positions - layout.centre
+    # what motor i does at the place of rotor j
+    match = np.zeros((len(levers), len(levers)))
+    for axis, response in responses.items():
+        match += np.outer(response, levers[:, 1 - axis] / np.std(levers[:, 1 - axis]))
+    if not responses:
+        return
+    # All orders are compared at once by the assignment problem; the layout's own order is refused
+    # only if another is clearly better.
+    best = optimize.linear_sum_assignment(-match)[1]
+    count = len(levers)
+    score, best_score = np.trace(match), np.sum(match[np.arange(count), best])
+    most = count * len(responses)
+    if score > 0.7 * most or score > best_score - 0.2 * most:
+        return
+    names = " and ".join(AXES[axis] for axis in responses)
+    if len(responses) < 2 or best_score < 0.7 * most:
+        hint = "are the order of the motors or the axes of the gyroscope others?"
+    else:
+        hint = (
+            f"motors 1 to {count} respond as rotors {' '.join(str(k + 1) for k in best)} of the layout "
+            "would; that order would be valid, or other axes of the gyroscope."
+        )
+    raise SettingError(
+        f"The motors' responses about {names} are not those of the rotors' positions: {hint}"
+    )
+
+
+def _identify_rotation(
+    signals: _Signals,
+    faster: _Signals,
+    shifted: Sequence[_Signals],
+    axes: list[int],
+    hover: float,
+    estimates: dict[str, ParameterEstimate],
+    refusals: dict[str, str],
+) -> _Evaluation | None:
+    """Estimates of the angular motion about the axes that are excited and determined."""
+    layout = signals.layout
+    factor = layout.thrust_model_factor
+    other_factor = 0.5 if factor > 0.75 else 1.0
+    # An axis that is not determined is left out and the others are fitted again: its noise would
+    # spoil the lag that all of them share.
+    while axes:
+        fit = _fit_rotation(signals, axes, _Variant(memory=_MOMENT_MEMORY), np.array(_START))
+        variants, factors = [], []
+        for other, variant in (
+            (signals, _Variant(_FORCE_RATE)),
+            (signals, _Variant(memory=2 * _MOMENT_MEMORY)),
+            (faster, _Variant(memory=_MOMENT_MEMORY)),
+            (signals, _Variant(memory=_MOMENT_MEMORY, factor=other_factor)),
+        ):
+            result = _fit_rotation(other, axes, variant, fit.lags)
+            if variant.factor is None or not _is_rejected(result, fit):
+                variants.append(result)
+                factors.append(factor if variant.factor is None else variant.factor)
+        further = [
+            _fit_rotation(other, axes, _Variant(memory=_MOMENT_MEMORY), fit.lags)
+            for other in shifted
+        ]
+        evaluation = _Evaluation(fit, variants, _window_count(signals.record), further)
+        # a thrust shape with another factor has another slope at hover
+        # Effectiveness of two thrust shapes is compared at the hover, where the record is: its
+        # number at the command 1 differs by the shape alone.
+        slope = lambda f: (1 - f + 2 * f * hover) / (1 - factor + 2 * factor * hover)
+        slopes = [slope(f) for f in (factor, *factors)]
+        new = {
+            "lag": evaluation.estimate("lag", "s", lambda z: z[-2]),
+            "delay": _add_resolution(
+                evaluation.estimate("delay", "s", lambda z: z[-1]), signals.record.dt
+            ),
+        }
+        places = {axis: 5 * k for k, axis in enumerate(axes)}
+        for axis, k in places.items():
+            name = AXES[axis]
+            new[name] = evaluation.estimate(
+                f"{name} effectiveness", "rad/s^2", lambda z, f, k=k: z[k] * f, *slopes
+            )
+            new[f"{name}_over_lag"] = evaluation.estimate(
+                f"{name} effectiveness over lag",
+                "rad/s^3",
+                lambda z, f, k=k: z[k] * f / z[-2],
+                *slopes,
+            )
+            if axis == 2:
+                new["spin_up"] = evaluation.estimate(
+                    "yaw by spin-up", "rad/s", lambda z, k=k: z[k + 1]
+                )
+                continue
+            new[f"{name}_speed"] = evaluation.estimate(
+                f"{name} by horizontal speed", "rad/(m s)", lambda z, k=k: z[k + 4]
+            )
+            other, letter = 1 - axis, "xy"[1 - axis]
+            new[f"centre_{letter}"] = evaluation.estimate(
+                f"centre of mass {letter}, equal motors",
+                "m",
+                lambda z, k=k, axis=axis, other=other: (
+                    layout.centre[other] + z[k + 1] / z[k] * layout.arms[axis]
+                ),
+            )
+        if {0, 1} <= set(axes):
+            new["inertia_ratio"] = evaluation.estimate(
+                "inertia ratio Jy / Jx",
+                "1",
+                lambda z: z[0] / z[5] * layout.arms[1] / layout.arms[0],
+            )
+        doubtful = {axis: new[AXES[axis]] for axis in axes}
+        doubtful = {
+            axis: abs(e.deviation / e.value)
+            for axis, e in doubtful.items()
+            if not e.deviation <= _DETERMINED * e.value
+        }
+        if not doubtful:
+            if not fit.free[-2]:
+                new = {
+                    name: e for name, e in new.items() if name != "lag" and "over_lag" not in name
+                }
+                refusals["lag"] = (
+                    f"The lag is not determined: it ends at the bound of {1e3 * fit.values[-2]:g} ms; rotor speeds "
+                    "that were measured have none."
+                )
+            estimates |= new
+            return evaluation
+        for axis, relative in doubtful.items():
+            refusals[AXES[axis]] = (
+                f"{AXES[axis].capitalize()} effectiveness is not determined: its deviation is "
+                f"{100 * relative:.0f} % of it; {100 * _DETERMINED:.0f} % or less would be valid."
+            )
+            ratio = new[f"{AXES[axis]}_over_lag"]
+            if ratio.deviation <= _DETERMINED * ratio.value:
+                refusals[AXES[axis]] += (
+                    f" Only its ratio to the lag is determined: {ratio.value:.4g} +- {ratio.deviation:.2g} rad/s^3."
+                )
+        axes = [axis for axis in axes if axis not in doubtful]
+    return None
+
+
+def _fit_rotation(
+    signals: _Signals, axes: list[int], variant: _Variant, start: np.ndarray
+) -> PredictionErrorFit:
+    build = _rotation_regression(signals, axes, variant)
+    return fit_prediction_error(build, start, _BOUNDS, variant.memory)
+
+
+def _add_resolution(delay: ParameterEstimate, dt: float) -> ParameterEstimate:
+    """Estimate whose deviation allows for commands that change at an unknown time of a step of the grid."""
+    # Standard deviation of a uniform distribution over a step.
+    resolution = dt / 12**0.5
+    parts = (np.hypot(x, resolution) for x in (delay.deviation, delay.variants))
+    return delay._replace(**dict(zip(("deviation", "variants"), map(float, parts), strict=True)))
+
+
+def _is_rejected(variant: PredictionErrorFit, main: PredictionErrorFit) -> bool:
+    """Test whether the record tells that a variant, on the same grid, is worse than the main fit."""
+    # A variant that the record itself rejects says nothing about the uncertainty of the one that
+    # fits.
+    difference = len(main.errors) * 2 * float(np.sum(np.log(variant.sigma / main.sigma)))
+    return bool(difference > stats.chi2.isf(_LEVEL, 1) * main.errors.shape[1])
+
+
+def _identify_translation(
+    signals: _Signals,
+    faster: _Signals,
+    shifted: Sequence[_Signals],
+    hover: float,
+    estimates: dict[str, ParameterEstimate],
+    refusals: dict[str, str],
+) -> _Evaluation:
+    """Estimates of thrust, drag and the IMU's position from the specific force."""
+    windows = _window_count(signals.record)
+
+    start = np.array(_START)
+
+    def run(setting: tuple[_Signals, _Variant], *, curve: bool) -> PredictionErrorFit:
+        nonlocal start
+        build = _force_regression(*setting, curve=curve)
+        fit = fit_prediction_error(build, start, _BOUNDS, setting[1].memory)
+        start = fit.lags
+        return fit
+
+    settings = (
+        (signals, _Variant(_FORCE_RATE)),
+        (faster, _Variant(_FORCE_RATE)),
+        (signals, _Variant(_FORCE_RATE, memory=2 * _MEMORY)),
+        *((other, _Variant(_FORCE_RATE)) for other in shifted),
+    )
+    main, *others = [run(setting, curve=False) for setting in settings]
+    evaluation = _Evaluation(main, others[:2], windows, others[2:])
+    thrust = evaluation.estimate("thrust of a rotor over mass", "m/s^2", lambda z: z[_FORCE])
+    effect = _channel_effect(main, 2, slice(_FORCE, _FORCE + 1))
+    if effect >= _EXCITED / 4 and thrust.deviation <= _DETERMINED * thrust.value:
+        estimates["thrust"] = thrust
+        if main.free[-2]:
+            estimates["thrust_lag"] = evaluation.estimate("lag of thrust", "s", lambda z: z[-2])
+        curves = [run(setting, curve=True) for setting in settings]
+        _identify_curve(
+            signals,
+            _Evaluation(curves[0], curves[1:3], windows, curves[3:]),
+            hover,
+            estimates,
+            refusals,
+        )
+    else:
+        refusals["thrust"] = (
+            f"The thrust curve is not excited: collective commands cause {effect:.2g} times what nobody "
+            f"commands, and the slope's deviation is {100 * thrust.deviation / abs(thrust.value):.0f} % of it; "
+            f"{_EXCITED / 4:g} times or more and {100 * _DETERMINED:.0f} % or less would be valid."
+        )
+    for k, letter in enumerate("xyz"):
+        position = evaluation.estimate(
+            f"IMU from centre of mass, {letter}", "m", lambda z, k=k: z[k]
+        )
+        if position.deviation > _IMU_DETERMINED:
+            refusals[f"imu_{letter}"] = (
+                f"The IMU's position along {letter} is not determined: its deviation is "
+                f"{1e3 * position.deviation:.2g} mm; {1e3 * _IMU_DETERMINED:g} mm or less would be valid."
+            )
+        else:
+            estimates[f"imu_{letter}"] = position
+    for k, letter in enumerate("xyz"):
+        drag = evaluation.estimate(f"drag over mass, {letter}", "1/s", lambda z, k=k: z[3 + k])
+        if drag.deviation > _DRAG_DETERMINED * abs(drag.value):
+            refusals[f"drag_{letter}"] = (
+                f"The drag along {letter} is not determined: it is {drag.value:.2g} 1/s with a deviation of "
+                f"{drag.deviation:.2g} 1/s."
+            )
+        else:
+            estimates[f"drag_{letter}"] = drag
+    return evaluation
+
+
+def _identify_curve(
+    signals: _Signals,
+    evaluation: _Evaluation,
+    hover: float,
+    estimates: dict[str, ParameterEstimate],
+    refusals: dict[str, str],
+) -> None:
+    """Estimates of the curve T/m = c0 + c1 s + c2 s^2 of one rotor.
+
+    The offset, which follows from the mean specific force, contains the accelerometer's bias along z.
+    """
+    record = signals.record
+    slope = estimates["thrust"].value
+    s = compute_rotor_states(record.commands, record.dt, *evaluation.fit.lags)
+    # The integral relation has no constant part: the offset of the curve follows from the mean
+    # force, once its slope is known.
+    level = float(np.mean(record.accelerometer[:, 2])) / s.shape[1]
+    first, second = float(np.mean(s)), float(np.mean(s**2))
+    curve = [
+        evaluation.estimate(f"thrust over mass, {name}", "m/s^2", quantity)
+        for name, quantity in (
+            ("offset", lambda z: level - z[_FORCE] * first - z[_FORCE + 1] * second),
+            ("linear", lambda z: z[_FORCE]),
+            ("quadratic", lambda z: z[_FORCE + 1]),
+        )
+    ]
+    if curve[2].deviation > _CURVE_DETERMINED * slope:
+        refusals["curve"] = (
+            f"The curvature of the thrust is not determined: its deviation is {curve[2].deviation:.2g} m/s^2 "
+            f"at a slope of {slope:.2g} m/s^2 by the square of the command."
+        )
+        place = slice(_FORCE, _FORCE + 2)
+        refusals["curve"] += describe_combinations(
+            ["the linear part", "the quadratic part"], "m/s^2", evaluation.fit.values[place],
+            evaluation.covariance[place, place], _CURVE_DETERMINED * slope * np.array([2 * hover, 1.0]),
+        )  # fmt: skip
+        return
+    estimates |= dict(
+        zip(("thrust_offset", "thrust_linear", "thrust_quadratic"), curve, strict=True)
+    )
+    estimates["thrust_slope"] = evaluation.estimate(
+        "thrust over mass by the square of the command at hover",
+        "m/s^2",
+        lambda z: z[_FORCE + 1] + z[_FORCE] / (2 * hover),
+    )
+
+
+def _fit_free_motors(
+    signals: _Signals, variant: _Variant, lags: np.ndarray | None = None
+) -> PredictionErrorFit:
+    """Fit in which each motor has a strength of its own about each axis; with `lags`, about which each has its own.
+
+    The columns of the strengths come first about each axis; those of the changes of the lag are the last.
+    """
+    build = _rotation_regression(signals, [0, 1], variant, free=True)
+    if lags is None:
+        return fit_prediction_error(build, np.array(_START), _BOUNDS, variant.memory)
+    # To first order a lag of its own adds the derivative of the response by the lag: one more
+    # linear column for each motor instead of a nonlinear unknown.
+    step = np.array([0.02 * lags[0], 0.0])
+    regression = build(lags)
+    change = (build(lags + step).X - build(lags - step).X)[:, :, _strengths(signals.layout)]
+    X = np.concatenate([regression.X, change / (2 * step[0])], axis=2)
+    return fit_prediction_error(lambda _: regression._replace(X=X), np.zeros(0), (), variant.memory)
+
+
+def _strengths(layout: RotorLayout) -> np.ndarray:
+    """Columns of the motors' strengths about roll, then pitch."""
+    n = len(layout.positions)
+    return np.r_[0:n, n + 3 : 2 * n + 3]
+
+
+def _identify_free_centre(signals: _Signals, estimates: dict[str, ParameterEstimate]) -> None:
+    """Centre of mass with a strength and a lag of its own for each motor.
+
+    The responses of motor i are k_i (y_i - c_y) about roll and -k_i (x_i - c_x) rho about pitch; their
+    ratios do not contain k_i. Where the 2 n responses contradict these n + 3 unknowns, motors differ in yet
+    another way, and the misfit widens the deviations. Windows give the scatter.
+    """
+    layout = signals.layout
+    n, places = len(layout.positions), _strengths(layout)
+    factor = layout.thrust_model_factor
+    common = _fit_free_motors(signals, _Variant(memory=_MOMENT_MEMORY))
+    fit, *variants = [
+        _fit_free_motors(signals, variant, common.lags)
+        for variant in (
+            _Variant(memory=_MOMENT_MEMORY),
+            _Variant(_FORCE_RATE),
+            _Variant(memory=_MOMENT_MEMORY, factor=0.5 if factor > 0.75 else 1.0),
+        )
+    ]
+    evaluation = _Evaluation(fit, [common, *variants], _window_count(signals.record))
+    levers = layout.positions - layout.centre
+    mean = np.mean(np.abs(fit.values[:n])) / layout.arms[0]
+
+    def model(u: np.ndarray) -> np.ndarray:
+        strength, rho, c = u[:n], u[n], u[n + 1 :]
+        return np.append(strength * (levers[:, 1] - c[1]), -strength * rho * (levers[:, 0] - c[0]))
+
+    def solve(responses: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        # Responses are correlated, and weighted by their covariance: the fit is then the maximum
+        # of likelihood, and its cost is a chi-squared.
+        L = np.linalg.cholesky(np.linalg.inv(V)).T
+        sizes = np.append(np.full(n, mean), [1.0, *layout.arms[::-1]])
+        result = optimize.least_squares(
+            lambda u: L @ (model(u) - responses), sizes * np.r_[np.ones(n + 1), 0, 0], x_scale=sizes
+        )
+        C = np.linalg.inv(result.jac.T @ result.jac)
+        return result.x[n + 1 :], C[n + 1 :, n + 1 :], 2 * float(result.cost)
+
+    responses = fit.values[places]
+    block = np.ix_(places, places)
+    c, V, Q = solve(responses, evaluation.covariance[block])
+    if n > 3 and stats.chi2.sf(Q, n - 3) < _LEVEL:
+        V = V * Q / (n - 3)
+    _, V_white, _ = solve(responses, evaluation.white[block])
+    parts = [
+        solve(responses + change[places], V_w[block])
+        for change, V_w in zip(*evaluation.windows, strict=True)
+    ]
+    others = [solve(z.values[places], V_z[block]) for z, V_z in evaluation.variants]
+    for k, letter in enumerate("xy"):
+        values = np.array([part[0][k] for part in parts])
+        variances = np.array([part[1][k, k] for part in parts])
+        scatter, p_value = compare_estimates(values, np.diag(variances), _LEVEL)
+        blocks = float(np.sqrt(V[k, k]))
+        excess = [max((x[k] - c[k]) ** 2 - abs(W[k, k] - V[k, k]), 0.0) for x, W, _ in others]
+        spread = float(np.sqrt(np.mean(excess)))
+        estimates[f"free_centre_{letter}"] = ParameterEstimate(
+            f"centre of mass {letter}, motors free", "m", float(layout.centre[k] + c[k]),
+            float(np.linalg.norm([blocks, scatter, spread])), float(np.sqrt(V_white[k, k])), blocks,
+            scatter, spread,
+            layout.centre[k] + values, np.sqrt(variances), p_value,
+        )  # fmt: skip
+
+
+def _check_size(layout: RotorLayout, estimates: dict[str, ParameterEstimate]) -> None:
+    """Refuse arms that no radius of gyration fits, J / m = (T / m) l / B."""
+    for axis, arm in enumerate(layout.arms):
+        if "thrust" in estimates and AXES[axis] in estimates:
+            ratio = estimates["thrust"].value * arm / estimates[AXES[axis]].value
+            share = float(np.sqrt(ratio)) / arm
+            if not _GYRATION[0] < share < _GYRATION[1]:
+                raise SettingError(
+                    f"The radius of gyration about {AXES[axis]} would be {share:.2g} of the mean arm of {arm:.3g} m; "
+                    f"{_GYRATION[0]:g} to {_GYRATION[1]:g} of it would be valid: are the positions in m?"
+                )
+
+
+def _scale_by_mass(
+    layout: RotorLayout,
+    estimates: dict[str, ParameterEstimate],
+    refusals: dict[str, str],
+) -> None:
+    """Thrust and moments of inertia in SI units, which scale with the mass and the arms."""
+    if layout.mass is None:
+        return
+    if "thrust" not in estimates:
+        for axis, letter in ((0, "x"), (1, "y")):
+            if AXES[axis] in estimates:
+                B, arm = estimates[AXES[axis]], layout.arms[axis]
+                refusals[f"inertia_{letter}"] = (
+                    f"J{letter} and the thrust of a rotor at the command 1 are not determined; only their ratio is: "
+                    f"thrust / J{letter} = {B.value / arm:.4g} +- {B.deviation / arm:.2g} N/(kg m^2)."
+                )
+        return
+    # the slope of the curve where that is determined, else that of the layout's shape
+    thrust = estimates.get("thrust_slope", estimates["thrust"])
+    force = _scale_estimate(thrust, layout.mass, "thrust of a rotor", "N")
+    estimates["force"] = force
+    for axis, letter in ((0, "x"), (1, "y")):
+        if AXES[axis] in estimates:
+            B = estimates[AXES[axis]]
+            value = force.value * layout.arms[axis] / B.value
+            parts = {
+                part: float(
+                    np.hypot(getattr(B, part) / B.value, getattr(force, part) / force.value) * value
+                )
+                for part in ("deviation", "white", "blocks", "windows", "variants")
+            }
+            estimates[f"inertia_{letter}"] = B._replace(
+                name=f"moment of inertia J{letter}", unit="kg m^2", value=value, **parts,
+                window_values=value * B.value / B.window_values,
+                window_deviations=value * B.window_deviations / B.value,
+            )  # fmt: skip
+
+
+def _scale_estimate(e: ParameterEstimate, scale: float, name: str, unit: str) -> ParameterEstimate:
+    """Estimate of a multiple of a quantity."""
+    parts = (
+        "value",
+        "deviation",
+        "white",
+        "blocks",
+        "windows",
+        "variants",
+        "window_values",
+        "window_deviations",
+    )
+    return e._replace(name=name, unit=unit, **{part: getattr(e, part) * scale for part in parts})
+
+
+def _judge_estimates(
+    signals: _Signals,
+    rotation: _Evaluation | None,
+    translation: PredictionErrorFit,
+    estimates: dict[str, ParameterEstimate],
+) -> FlightVerdict:
+    """Verdict by windows, further terms of the model, whiteness, and windows that are left out."""
+    p_values: dict[str, float] = {}
+    sentences: list[str] = []
+    if rotation is not None:
+        keys = [name for name in ("lag", *AXES, "centre_x", "centre_y") if name in estimates]
+        least = min(keys, key=lambda name: estimates[name].window_p_value)
+        # The smallest of several p-values is small by chance: Bonferroni's factor allows for their
+        # number.
+        p_values["windows"] = min(1.0, len(keys) * estimates[least].window_p_value)
+        if p_values["windows"] < _LEVEL:
+            sentences.append(
+                f"Windows disagree most about the {estimates[least].name}; its deviation contains the scatter."
+            )
+        tests = _test_terms(signals, rotation.fit, translation, estimates)
+        for name, (p_value, sentence) in tests.items():
+            p_values[name] = p_value
+            if p_value < _LEVEL:
+                sentences.append(sentence)
+        p_values["whiteness"] = _test_whiteness(rotation.fit)
+        if p_values["whiteness"] < _LEVEL / 6:
+            sentences.append("Prediction errors are correlated in time; blocks allow for it.")
+        growth = _predict_left_out(rotation)
+        sentences.append(
+            f"A window that is left out is predicted with errors at most {100 * growth:.2g} % larger than in "
+            "the fit."
+        )
+    significant = [name for name, p in p_values.items() if p < _LEVEL / 6]
+    if rotation is not None and not rotation.fit.is_converged:
+        significant.append("search")
+        sentences.append("The search for lag and effectiveness did not converge.")
+    if not p_values:
+        status = "undecided"
+        sentences = ["Undecided: no axis of the angular motion is identified, so no test is made."]
+    elif significant:
+        status = "inconsistent"
+        sentences.insert(
+            0, f"Inconsistent: {', '.join(significant)} (family-wise level {_LEVEL:g})."
+        )
+    else:
+        status = "consistent"
+        sentences.insert(0, f"Consistent: none of {len(p_values)} tests speaks against the model.")
+    return FlightVerdict(status, p_values, " ".join(sentences))
+
+
+def _test_terms(
+    signals: _Signals,
+    rotation: PredictionErrorFit,
+    translation: PredictionErrorFit,
+    estimates: dict[str, ParameterEstimate],
+) -> dict[str, tuple[float, str]]:
+    """P-values of further terms of the thrust, each with the sentence that it stands for.
+
+    A second lag and a battery's sag have a known sign, and the thrust tells them as well as the moments do.
+    """
+    record, layout = signals.record, signals.layout
+    axes = [axis for axis, name in enumerate(AXES) if name in estimates]
+    dt, factor = record.dt, layout.thrust_model_factor
+    levers = layout.positions - layout.centre
+    sides = np.column_stack(
+        [levers[:, 1] / layout.arms[0], -levers[:, 0] / layout.arms[1], -layout.spin]
+    )
+    b, a = low_pass(record.cutoffs[0], dt)
+    b = np.convolve(b, [0.5, 0.5])
+    effectiveness = np.array([estimates[AXES[axis]].value for axis in axes])
+    time = ((record.ts - record.ts[0]) / (record.ts[-1] - record.ts[0]) - 0.5)[:, None]
+    keep = np.exp(-dt / _SLOW)
+
+    def change(name: str, lags: np.ndarray) -> np.ndarray:
+        """Change of the thrusts' shapes by a term."""
+        s = compute_rotor_states(record.commands, dt, *lags)
+        T = compute_thrust_shape(s, factor)
+        if name == "curve":
+            return s
+        if name == "trend":
+            return T * time
+        if name == "lag":
+            # A term of the size of its first-order effect is tested, not fitted: a score test
+            # needs the main fit only.
+            lagged = compute_rotor_states(s, dt, _SECOND_LAG, 0.0)
+            return compute_thrust_shape(lagged, factor) - T
+        total = np.sum(T, axis=1, keepdims=True)
+        return -T * filter_columns([1 - keep], [1.0, -keep], total / np.mean(total) - 1)
+
+    def test(name: str) -> tuple[float, float, float]:
+        """Share of a term by the moments, its variance and p-value: what is wrong is wrong about all axes alike."""
+        terms = apply_filter(b, a, change(name, rotation.lags) @ (sides[:, axes] * effectiveness))
+        share, V, p = rotation.test_columns(terms[round(_SETTLING / dt) :, :, None], _BLOCK)
+        return float(share[0]), float(V[0, 0]), p
+
+    results = {}
+    for name, sentence in (
+        ("trend", "Effectiveness changes by {:.0f} % through the flight."),
+        ("curve", "Thrust has a linear part of {:.0f} % of the slope beside the assumed curve."),
+    ):
+        share, _, p = test(name)
+        results[name] = (p, sentence.format(100 * share))
+    n = _sample_step(record, _FORCE_RATE)
+    for name, sentence in (
+        ("lag", "Thrust responds to commands as if by a second lag behind the first."),
+        (
+            "sag",
+            "Thrust falls by {:.2g} % with 1 % of collective within seconds, as a battery sags.",
+        ),
+    ):
+        thrust = translation.values[_FORCE] * np.sum(change(name, translation.lags), axis=1)
+        column = np.zeros((len(translation.noise), 3, 1))
+        column[:, 2] = _thrust_columns(record, n, thrust[:, None])
+        by_force, V, _ = translation.test_columns(column, _BLOCK)
+        by_moments, variance, _ = test(name)
+        # Forces and moments estimate the same quantity independently: weighted together they
+        # detect a smaller one than either does.
+        weights = np.array([1 / V[0, 0], 1 / variance])
+        share = float(weights @ [by_force[0], by_moments] / np.sum(weights))
+        p = float(stats.norm.sf(share * np.sqrt(np.sum(weights))))
+        results[name] = (p, sentence.format(share))
+    return results
+
+
+def _test_whiteness(fit: PredictionErrorFit) -> float:
+    """P-value of Ljung and Box's test of the prediction errors, of the channel that is least white."""
+    measured = np.ones(fit.errors.shape, bool)
+    lags = len(fit.denominators[0]) + 19
+    Q = np.sum(compute_autocorrelation(fit.errors, measured, lags) ** 2, axis=0)
+    return float(min(1.0, np.min(stats.chi2.sf(Q, 20)) * fit.errors.shape[1]))
+
+
+def _predict_left_out(evaluation: _Evaluation) -> float:
+    """Largest relative growth of the errors in a window that the fit does not use."""
+    fit = evaluation.fit
+    k = len(fit.errors)
+    windows = np.array_split(np.arange(k), len(evaluation.windows[0]))
+    J, e = fit.slopes[:, :, fit.free], fit.errors
+    information = [np.einsum("kci,kcj->ij", J[rows], J[rows]) for rows in windows]
+    scores = [np.einsum("kci,kc->i", J[rows], e[rows]) for rows in windows]
+    growth = []
+    for rows, M, g in zip(windows, information, scores, strict=True):
+        # The fit without a window is one linear step from the whole one, whose slopes are at hand:
+        # no window needs a fit of its own.
+        rest = np.linalg.lstsq(sum(information) - M, sum(scores) - g, rcond=None)[0]
+        outside = e[rows] - J[rows] @ rest
+        growth.append(np.sqrt(np.sum(outside**2) / np.sum(e[rows] ** 2)) - 1)
+    return float(max(growth))

@@ -1,0 +1,1 @@
+"""Part III of the report: the quadrotor's models, its eight cases, their assessment."""

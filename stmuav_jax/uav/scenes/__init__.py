@@ -1,0 +1,1 @@
+"""Scenes of the report, each modelling only what it needs."""

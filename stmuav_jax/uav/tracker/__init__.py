@@ -1,0 +1,1 @@
+"""Solar tracker: geometry, kinematics, bodies, workspace, a day of pointing."""

@@ -1,0 +1,65 @@
+"""Motions by machine code of the equations against those by XLA."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from parallel_robots import slider_crank
+
+import stmuav_jax as stm
+from stmuav_jax.math.native import llvm
+from stmuav_jax.math.native.program import evaluate
+
+pytestmark = pytest.mark.skipif(not llvm.available(), reason="llvmlite is not installed")
+
+
+@pytest.fixture
+def machine_code():
+    """Turns machine code on or off for the time of a test."""
+    yield stm.math.use_native_code
+    stm.math.use_native_code(True)
+
+
+@pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=["tree", "augmented"])
+def test_a_slider_crank_and_its_derivatives_are_those_by_xla(formulation, machine_code):
+    system = slider_crank(0.8, "O")
+    method = stm.Method(formulation=formulation, rtol=1e-10, atol=1e-10)
+    ts = jnp.linspace(0.0, 0.3, 4)
+
+    def move(state):
+        return stm.integrate(system, state, ts, method=method).states
+
+    def height(state):
+        return jnp.sum(move(state).r[-1])
+
+    results = []
+    for on in (False, True):
+        machine_code(on)
+        results.append((move(system.reference), jax.grad(height)(system.reference)))
+    for mine, others in zip(*(jax.tree.leaves(r) for r in results), strict=True):
+        np.testing.assert_allclose(mine, others, rtol=0, atol=1e-9)
+
+
+def test_a_number_of_the_state_that_is_not_finite_is_seen_wherever_xla_sees_it(machine_code):
+    system, formulation = slider_crank(0.8, "O"), stm.Tree()
+    model = formulation.prepare(system)
+    x = formulation.to_vector(model, system.reference)
+    places = jnp.eye(len(x), dtype=bool)
+    states = jnp.concatenate([jnp.where(places, bad, x) for bad in (jnp.nan, jnp.inf, -jnp.inf)])
+
+    def rates(x):
+        return evaluate(formulation.derivative, model, jnp.zeros(()), x, stm.Unstabilised())[0]
+
+    found = {}
+    for on in (False, True):
+        machine_code(on)
+        found[on] = np.isfinite(jax.jit(jax.vmap(lambda x: rates(x)))(states))
+    assert not found[True].all(axis=1).any()
+    assert not (found[True] & ~found[False]).any()
+
+
+def test_a_run_says_what_compiled_its_equations(machine_code):
+    for on, name in ((False, "XLA"), (True, "LLVM")):
+        machine_code(on)
+        run = stm.simulate(stm.make_scene("spin"), t1=0.01, analysis=False, error_estimate=False)
+        assert run.settings["equations_compiled_by"].split()[0] == name

@@ -1,0 +1,208 @@
+"""The two linear solves against NumPy, and their gradients against finite differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from helpers import central
+from jax.test_util import check_grads
+
+from stmuav_jax.math import lapack, linalg
+from stmuav_jax.math.linalg import (
+    factor_proximal,
+    factor_redundant,
+    independent_rows,
+    right_inverse,
+    solve_saddle,
+)
+
+N = 7
+
+
+@pytest.fixture(scope="module")
+def rng():
+    return np.random.default_rng(1)
+
+
+def definite(rng, spread=1.0):
+    B = rng.normal(size=(N, 2 * N)) * np.logspace(0, spread, N)[:, None]
+    return B @ B.T
+
+
+def deficient(rng, rank=5):
+    B = rng.normal(size=(N, rank))
+    return B @ B.T
+
+
+@pytest.mark.parametrize("spread", [0, 6])
+def test_cholesky(rng, spread):
+    """Rows of mixed units, up to a condition of 1e14, are solved to round-off of the scaled."""
+    S, b = definite(rng, spread), rng.normal(size=N)
+    x = factor_redundant(jnp.asarray(S), redundant=False, rcond=1e-11).solve(jnp.asarray(b))
+    scale = 1 / np.sqrt(np.diag(S))
+    expected = scale * np.linalg.solve(scale[:, None] * S * scale, scale * b)
+    np.testing.assert_allclose(x, expected, rtol=1e-11)
+
+
+def test_one_factor_serves_many_right_hand_sides(rng):
+    S = definite(rng)
+    factor = factor_redundant(jnp.asarray(S), redundant=False, rcond=1e-11)
+    for _ in range(3):
+        b = rng.normal(size=N)
+        np.testing.assert_allclose(S @ np.asarray(factor.solve(jnp.asarray(b))), b, atol=1e-11)
+
+
+def test_singular_cholesky_is_nan_and_never_a_number():
+    S = jnp.diag(jnp.asarray([1.0, 2.0, 0.0]))
+    x = factor_redundant(S, redundant=False, rcond=1e-11).solve(jnp.ones(3))
+    assert not np.any(np.isfinite(np.asarray(x)[2]))
+
+
+@pytest.mark.parametrize("rank", [3, 6, 7])
+def test_svd_gives_the_minimum_norm(rng, rank):
+    S, b = deficient(rng, rank), rng.normal(size=N)
+    x = factor_redundant(jnp.asarray(S), redundant=True, rcond=1e-11).solve(jnp.asarray(b))
+    expected = np.linalg.lstsq(S, b, rcond=1e-11)[0]
+    np.testing.assert_allclose(x, expected, rtol=1e-9, atol=1e-10 * np.max(np.abs(expected)))
+
+
+def test_rcond_is_relative_to_the_largest_value():
+    S = jnp.diag(jnp.asarray([100.0, 1.0, 1e-6]))
+    cut = factor_redundant(S, redundant=True, rcond=1e-7).solve(jnp.ones(3))
+    kept = factor_redundant(S, redundant=True, rcond=1e-9).solve(jnp.ones(3))
+    np.testing.assert_allclose(cut, [0.01, 1, 0], rtol=1e-12)
+    np.testing.assert_allclose(kept, [0.01, 1, 1e6], rtol=1e-9)
+
+
+@pytest.mark.parametrize("redundant", [False, True])
+@pytest.mark.parametrize("which", ["symmetric", "general"])
+def test_gradients(rng, redundant, which):
+    """Along matrices of one rank: there, the minimum-norm solution is differentiable."""
+    rank = 4 if redundant else 2 * N
+    B, B1 = rng.normal(size=(2, N, rank))
+    C = B if which == "symmetric" else rng.normal(size=(N, rank))
+    C1 = B1 if which == "symmetric" else rng.normal(size=(N, rank))
+    b, b1, w = rng.normal(size=(3, N))
+
+    def solution(t):
+        S = (B + t * B1) @ (C + t * C1).T
+        if which == "symmetric":
+            return factor_redundant(S, redundant=redundant, rcond=1e-11).solve(b + t * b1)
+        vector = b + t * b1
+        return lapack.pseudoinverse(S, 1e-11) @ vector if redundant else lapack.solve(S, vector)
+
+    solution = jax.jit(solution)
+    rate = jax.jvp(solution, (0.0,), (1.0,))[1]
+    expected = central(lambda t: solution(t), 1e-4)
+    np.testing.assert_allclose(rate, expected, rtol=1e-6, atol=1e-7 * np.max(np.abs(expected)))
+    gradient = jax.grad(lambda t: w @ solution(t))(0.0)
+    assert float(gradient) == pytest.approx(float(w @ rate), rel=1e-9)
+
+
+@pytest.mark.parametrize("rank", [3, 6, 7])
+def test_proximal_solves_dependent_rows(rng, rank):
+    """B^T x, the effect of x, is determined even where x is not."""
+    B = rng.normal(size=(N, rank)) * np.logspace(0, 3, N)[:, None]
+    S = B @ B.T
+    b = S @ rng.normal(size=N)
+    x = np.asarray(factor_proximal(jnp.asarray(S)).solve(jnp.asarray(b)))
+    effect, expected = B.T @ x, B.T @ (np.linalg.pinv(S, rcond=1e-13) @ b)
+    np.testing.assert_allclose(effect, expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("redundant", [False, "fast", "minimum norm"])
+def test_saddle(rng, redundant):
+    """Against the whole matrix, solved by NumPy."""
+    M, J = definite(rng), rng.normal(size=(3, N))
+    if redundant:
+        J = np.vstack([J, J[0] + 2 * J[1]])
+    f, g = rng.normal(size=N), J @ rng.normal(size=N)
+    args = (jnp.asarray(a) for a in (M, J, f, g))
+    x, y = solve_saddle(*args, redundant=redundant)
+    K = np.block([[M, -J.T], [J, np.zeros((len(J), len(J)))]])
+    expected = np.linalg.lstsq(K, np.concatenate([f, g]), rcond=1e-11)[0]
+    np.testing.assert_allclose(x, expected[:N], rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(J.T @ y, J.T @ expected[N:], rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("redundant", [False, True])
+def test_right_inverse_is_the_smallest_in_the_metric(rng, redundant):
+    M, J = definite(rng), rng.normal(size=(3, N))
+    if redundant:
+        J = np.vstack([J, J[0] - J[2]])
+    b = J @ rng.normal(size=N)
+    x = np.asarray(right_inverse(jnp.asarray(M), jnp.asarray(J), redundant=redundant)) @ b
+    np.testing.assert_allclose(J @ x, b, rtol=1e-8, atol=1e-9)
+    # M x lies in the range of J^T
+    rest = M @ x - J.T @ np.linalg.lstsq(J.T, M @ x, rcond=1e-11)[0]
+    assert np.max(np.abs(rest)) < 1e-8 * np.max(np.abs(M @ x))
+
+
+@pytest.mark.parametrize("rank", [2, 4, 6])
+def test_independent_rows_span_all(rng, rank):
+    """As many as the rank, spanning the same space; also of dependent rows off by 1e-8."""
+    J = rng.normal(size=(N, rank)) @ rng.normal(size=(rank, 2 * N))
+    off = J + 1e-8 * rng.normal(size=J.shape)
+    for rows in (J, off):
+        kept = np.asarray(jax.jit(independent_rows)(jnp.asarray(rows @ rows.T), 1e-12))
+        assert kept.sum() == rank
+        assert np.linalg.matrix_rank(rows[kept], tol=1e-6) == rank
+    assert not np.any(independent_rows(jnp.zeros((3, 3)), 1e-12))
+
+
+def test_rows_left_out_have_no_effect(rng):
+    """With `kept`, M x - J^T y = f and J x = g of these rows only, whatever the others want."""
+    M, J, f = definite(rng), rng.normal(size=(3, N)), rng.normal(size=N)
+    wrong = np.vstack([J, J[0] + 1e-9 * rng.normal(size=N)])
+    g = rng.normal(size=3)
+    kept = jnp.array([True, True, True, False])
+    x, y = solve_saddle(
+        *(jnp.asarray(a) for a in (M, wrong, f, np.append(g, 7.0))), redundant="fast", row_mask=kept
+    )
+    expected, multipliers = solve_saddle(*(jnp.asarray(a) for a in (M, J, f, g)), redundant=False)
+    np.testing.assert_allclose(x, expected, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(y, np.append(multipliers, 0.0), rtol=1e-8, atol=1e-10)
+    G = right_inverse(jnp.asarray(M), jnp.asarray(wrong), redundant=True, row_mask=kept)
+    np.testing.assert_allclose(J @ np.asarray(G), np.eye(3, 4), atol=1e-10)
+
+
+# --- factorisations
+
+
+def test_factorisations_against_scipy():
+    rng = np.random.default_rng(1)
+    for k in (1, 4, 9):
+        A, b = rng.normal(size=(k, k)), rng.normal(size=k)
+        A[0, 0] = 0.0 if k > 1 else 1.0  # needs a pivot
+        S = A @ A.T + np.eye(k)
+        expected = scipy.linalg.lu_solve(scipy.linalg.lu_factor(A), b)
+        np.testing.assert_allclose(
+            linalg.invert_matrix(jnp.asarray(A)).solve(jnp.asarray(b)), expected, rtol=1e-10
+        )
+        L = np.asarray(linalg.factor_cholesky(jnp.asarray(S)))
+        np.testing.assert_allclose(L, scipy.linalg.cholesky(S, lower=True), atol=1e-13)
+        for transpose in (False, True):
+            x = linalg.solve_lower(jnp.asarray(L), jnp.asarray(A), transpose=transpose)
+            expected = scipy.linalg.solve_triangular(L, A, lower=True, trans=int(transpose))
+            np.testing.assert_allclose(x, expected, atol=1e-12)
+
+
+def test_singular_matrices_give_no_finite_solution():
+    ones = jnp.ones((3, 3))
+    assert not np.any(np.isfinite(linalg.invert_matrix(ones).solve(jnp.arange(3.0))))
+    assert np.all(
+        np.isnan(linalg.factor_redundant(-ones, redundant=False, rcond=0.0).solve(ones[0]))
+    )
+
+
+def test_derivatives_of_the_factorisations():
+    rng = np.random.default_rng(2)
+    A, b = rng.normal(size=(4, 4)), rng.normal(size=4)
+
+    def solutions(A, b):
+        S = A @ A.T + jnp.eye(4)
+        found = linalg.factor_redundant(S, redundant=False, rcond=0.0).solve(b)
+        return linalg.invert_matrix(A).solve(b), found, linalg.factor_cholesky(S)
+
+    check_grads(jax.jit(solutions), (A, b), order=1, rtol=1e-5, atol=1e-5)

@@ -1,0 +1,293 @@
+"""Machine code of small functions against XLA's, in values, derivatives, batches and bits."""
+
+import threading
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from stmuav_jax.math.native import llvm, program
+from stmuav_jax.math.native.graph import Graph, NotScalarError, make_graph
+from stmuav_jax.math.native.program import evaluate, native, use_native_code
+
+pytestmark = pytest.mark.skipif(not llvm.available(), reason="llvmlite is not installed")
+
+
+@pytest.fixture(autouse=True)
+def machine_code():
+    """Machine code for the time of a test, also where the environment turns it off."""
+    before = program._Switch.on
+    use_native_code(True)
+    yield
+    use_native_code(before)
+
+
+X = np.linspace(0.2, 0.9, 6).reshape(2, 3)
+SPD = np.array([[4.0, 1.0, 0.5], [1.0, 3.0, 0.2], [0.5, 0.2, 2.0]])
+
+
+def elementary(x):
+    """Every function of numbers, each where it is smooth."""
+    angle = jnp.concatenate([x, 40.0 * x, -7.0 * x])
+    return (
+        jnp.sin(angle) + jnp.cos(angle) * jnp.tan(0.1 * angle),
+        jnp.exp(x) + jnp.log(x) + jnp.log1p(x) + jnp.expm1(x) + x**2.5 + x**-3 + jnp.cbrt(x),
+        jnp.arcsin(x) + jnp.arccos(x) + jnp.arctan(x) + jnp.arctan2(x, 1.0 - x),
+        jnp.sinh(x) + jnp.cosh(x) + jnp.tanh(x) + jax.nn.sigmoid(x) + jax.lax.rsqrt(x),
+        jnp.abs(x - 0.5) + jnp.sign(x - 0.5) + jnp.maximum(x, 0.4) + jnp.minimum(x, x[0, 0]),
+        jnp.floor(3 * x) + jnp.ceil(3 * x) + jnp.round(3 * x) + jnp.clip(x, 0.3, 0.7) + x % 0.3,
+        jax.scipy.special.erf(x),
+    )
+
+
+def indexed(x):
+    """Entries that move: slices, gathers, scatters, pads, sums."""
+    order = jnp.array([2, 0, 1])
+    y = jnp.pad(x[:, order], ((1, 0), (0, 2))).at[0, 1].add(x[1, 2]).at[:, 4].set(x[0, 0])
+    rolled = jnp.roll(y, 1, axis=1)[::-1]
+    return (
+        y @ rolled.T,
+        jnp.cumsum(x, axis=1),
+        jnp.einsum("ij,kj->ik", x, x),
+        y.max(axis=0),
+        jnp.diag(x[0]),
+    )
+
+
+def solved(x):
+    """Linear solves by Cholesky's and triangular factors."""
+    matrix = jnp.asarray(SPD) + jnp.outer(x[0], x[0])
+    factor = jnp.linalg.cholesky(matrix)
+    inner = jax.scipy.linalg.solve_triangular(factor, x.T, lower=True)
+    return jax.scipy.linalg.solve_triangular(factor.T, inner), jax.scipy.linalg.cho_solve(
+        (factor, True), x[1]
+    )
+
+
+def chosen(x):
+    """Choices that are known and choices that are computed, and a loop of known length."""
+    large = x.sum() > 2.0
+    either = jax.lax.cond(large, jnp.sin, jnp.cos, x)
+    step = lambda c, row: (c + row, jnp.where(row > 0.5, c, row))
+    return (
+        either,
+        jax.lax.scan(step, jnp.zeros(3), x),
+        large,
+        jnp.sum(x > 0.5),
+        jnp.isfinite(x).all(),
+    )
+
+
+FUNCTIONS = (elementary, indexed, solved, chosen)
+
+
+@cache
+def compiled(function):
+    return jax.jit(native(function)), jax.jit(function)
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_values_and_derivatives_are_those_of_xla(function):
+    ours, theirs = compiled(function)
+    for x in (X, X[::-1] * 0.7):
+        for a, b in zip(jax.tree.leaves(ours(x)), jax.tree.leaves(theirs(x)), strict=True):
+            assert a.dtype == b.dtype
+            np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
+    total = lambda f: (
+        lambda x: sum(jnp.sum(jnp.cos(v)) for v in jax.tree.leaves(f(x)) if v.dtype == float)
+    )
+    for derivative in (jax.grad, jax.jacfwd, lambda f: jax.jacfwd(jax.grad(f))):
+        a = jax.jit(derivative(total(native(function))))(X)
+        b = jax.jit(derivative(total(function)))(X)
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
+
+
+def test_a_rows_bits_do_not_depend_on_its_batch():
+    """Alone, in batches of any size and place, and in batches of batches."""
+    function = lambda x, y: native(lambda a, b: elementary(a * b)[0] / (1.0 + a.sum()))(x, y)
+    rows = X + np.linspace(0.0, 0.05, 21)[:, None, None]
+    shared = X.T[:1, :1]
+    every = np.asarray(jax.jit(jax.vmap(function, (0, None)))(rows, shared))
+    for start, stop in ((0, 1), (3, 8), (5, 21), (20, 21), (0, 9)):
+        part = jax.jit(jax.vmap(function, (0, None)))(rows[start:stop], shared)
+        np.testing.assert_array_equal(part, every[start:stop])
+    np.testing.assert_array_equal(jax.jit(function)(rows[7], shared), every[7])
+    nested = jax.vmap(jax.vmap(function, (0, None)), (0, None))
+    np.testing.assert_array_equal(
+        jax.jit(nested)(rows.reshape(3, 7, 2, 3), shared), every.reshape(3, 7, 6, 3)
+    )
+    both = jax.vmap(jax.vmap(function, (0, None)), (None, 0))
+    grid = jax.jit(both)(rows, np.stack([shared, 1.1 * shared]))
+    np.testing.assert_array_equal(grid[0], every)
+
+
+def test_a_number_that_is_not_finite_comes_through_products_with_zero():
+    weights = jnp.array([0.0, 1.0, 2.0])
+
+    def function(x):
+        return jnp.sum(x[0] * weights), x[1, 1] * x[1, 2]
+
+    ours = jax.jit(native(function))
+    for k in np.ndindex(2, 3):
+        for bad in (np.nan, np.inf):
+            x = X.copy()
+            x[k] = bad
+            for a, b in zip(ours(x), function(x), strict=True):
+                assert np.isfinite(b) or not np.isfinite(a)
+    assert np.isfinite(ours(X)[0])
+    # a function that looks for them keeps its own answer
+    guarded = lambda x: jnp.where(jnp.isfinite(x), x, 0.0) @ weights
+    assert jax.jit(native(guarded))(np.array([np.nan, 1.0, 2.0])) == 5.0
+
+
+def test_sines_of_large_angles_are_right_and_beyond_the_range_of_the_reduction_nan(monkeypatch):
+    for fused, far in ((llvm.has_fused(), None), (False, llvm._FAR)):
+        monkeypatch.setattr(llvm, "has_fused", lambda fused=fused: fused)
+        far = (llvm._FAR_FUSED if fused else llvm._FAR) if far is None else far
+        x = far * np.array([0.9, -0.3, 1e-3, 1.1, -1e3])
+        sine, cosine = jax.jit(native(lambda x: (jnp.sin(x), jnp.cos(x))))(x)
+        np.testing.assert_allclose(sine[:3], np.sin(x[:3]), rtol=0, atol=1e-14)
+        np.testing.assert_allclose(cosine[:3], np.cos(x[:3]), rtol=0, atol=1e-14)
+        assert np.isnan(sine[3:]).all()
+        assert np.isnan(cosine[3:]).all()
+
+
+def test_derivatives_by_entries_that_are_zero_or_one_are_exact():
+    matrix = np.eye(3)
+    function = lambda m: jnp.sum(jnp.sin(m @ jnp.arange(3.0)))
+    np.testing.assert_allclose(
+        jax.grad(native(function))(matrix), jax.grad(function)(matrix), rtol=1e-14
+    )
+
+
+def test_what_has_no_scalar_form_is_left_to_xla():
+    loop = lambda x: jax.lax.while_loop(
+        lambda c: c[0] < x.sum(), lambda c: (c[0] + 1, c[1] * 1.1), (0.0, x)
+    )
+    picked = lambda x, k: x[k]
+    np.testing.assert_array_equal(jax.jit(native(loop))(X)[1], loop(X)[1])
+    np.testing.assert_array_equal(jax.jit(native(picked))(X, 1), X[1])
+    trace = jax.make_jaxpr(picked)(X, 1)
+    with pytest.raises(NotScalarError, match="computed"):
+        make_graph(trace, 1000)
+    with pytest.raises(NotScalarError, match="more than 10"):
+        make_graph(jax.make_jaxpr(elementary)(X), 10)
+
+
+def test_without_it_the_function_is_compiled_by_xla():
+    use_native_code(False)
+    try:
+        text = jax.jit(native(elementary)).lower(X).as_text()
+        assert "stmuav_" not in text
+    finally:
+        use_native_code(True)
+    assert "stmuav_" in jax.jit(native(elementary)).lower(X).as_text()
+
+
+def test_equal_programs_are_compiled_once_and_called_from_any_thread():
+    before = len(llvm._targets)
+    functions = [jax.jit(native(lambda x: jnp.sin(x) @ x.T)) for _ in range(4)]
+    results: list = []
+    work = lambda f: results.extend(np.asarray(f(X)) for _ in range(20))
+    threads = [threading.Thread(target=work, args=(f,)) for f in functions]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all((r == results[0]).all() for r in results)
+    assert len(results) == 80
+    assert len(llvm._targets) - before == 1
+
+
+def test_code_that_is_damaged_in_its_folder_is_made_again(tmp_path):
+    path = tmp_path / "x.o"
+    llvm._write(path, b"content")
+    assert llvm._read(path) == b"content"
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    assert llvm._read(path) is None
+
+
+def test_long_programs_are_cut_into_parts(monkeypatch):
+    monkeypatch.setattr(llvm, "CHUNK", 7)
+    a = jax.jit(native(lambda x: solved(x)))(X)
+    for u, v in zip(a, solved(X), strict=True):
+        np.testing.assert_allclose(u, v, rtol=1e-13)
+
+
+def test_code_for_other_processors_can_be_made():
+    """NEON's vectors of two, on a processor that is not this one; the code is not run."""
+    import llvmlite.binding as binding
+
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    graph, outputs = make_graph(jax.make_jaxpr(elementary)(X), 10_000)
+    results = [llvm.Buffer(o.size, "f8") for o in outputs]
+    code = llvm.write(graph, outputs, [llvm.Buffer(6, "f8")], results, 2)
+    module = binding.parse_assembly(code.text)
+    for triple, processor in (
+        ("aarch64-unknown-linux-gnu", "neoverse-n1"),
+        ("arm64-apple-darwin", "apple-m1"),
+    ):
+        module.triple = triple
+        machine = binding.Target.from_triple(triple).create_target_machine(cpu=processor, opt=1)
+        assert len(machine.emit_object(module)) > 1000
+
+
+def test_graph_keeps_one_of_equal_operations():
+    graph = Graph(100)
+    a, b = (graph.node("input", 0, k, "f") for k in range(2))
+    assert graph.add(a, b) == graph.add(b, a)
+    assert graph.mul(a, graph.constant(1.0)) == a
+    assert graph.sub(a, graph.neg(b)) == graph.add(a, b)
+    assert program.is_on()
+
+
+def test_truth_values_and_integers():
+    """Choices between known and computed truth values, their order, and sums of integers."""
+
+    def function(x, y):
+        large = x > 0.5
+        return (
+            jnp.where(large, y, False), jnp.where(large, True, y), jnp.where(large, y, True),
+            jnp.where(large, False, y), jnp.where(large, True, False) & y, jnp.max(large), jnp.min(y),
+            large < y, large == y, jnp.maximum(large, y), jnp.where(large, 1, 2) + jnp.int32(3),
+        )  # fmt: skip
+
+    x, y = np.array([0.1, 0.6, 0.9, 0.3]), np.array([True, False, True, False])
+    ours = jax.jit(native(function))
+    assert "stmuav_" in ours.lower(x, y).as_text()
+    for a, b in zip(ours(x, y), function(x, y), strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert a.dtype == b.dtype
+    # double precision rounds the quotient of integers
+    divided = jax.jit(native(lambda n: n // 3))
+    assert "stmuav_" not in divided.lower(7).as_text()
+    assert divided(7) == 2
+
+
+def test_a_quotient_is_rounded_once_where_its_divisor_has_one_use():
+    a, b = np.arange(1.0, 7.0), np.array([3.0, 7.0, 49.0, 5.0, 6.0, 10.0])
+    np.testing.assert_array_equal(jax.jit(native(lambda a, b: jnp.floor(a / b)))(a * b, b), a)
+
+
+def test_functions_within_functions_are_one_program():
+    inner = native(lambda a, b: jnp.sin(a) @ b)
+    batched = lambda x, y: jnp.sum(jax.vmap(lambda row: inner(row, y))(x)) + inner(x[0], y[0])
+    plain = lambda x, y: jnp.sum(jnp.sin(x) @ y) + jnp.sin(x[0]) @ y[0]
+    y = np.linspace(0.2, 0.7, 9).reshape(3, 3)
+    ours = jax.jit(native(batched))
+    assert ours.lower(X, y).as_text().count("custom_call @stmuav_") == 1
+    np.testing.assert_allclose(ours(X, y), plain(X, y), rtol=1e-14)
+    np.testing.assert_allclose(jax.hessian(ours)(X, y), jax.hessian(plain)(X, y), atol=1e-14)
+
+
+def test_a_function_that_cannot_be_found_again_is_evaluated_as_it_is():
+    class Sine:
+        __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+        def __call__(self, x):
+            return jnp.sin(x)
+
+    np.testing.assert_array_equal(jax.jit(lambda x: evaluate(Sine(), x))(X), jnp.sin(X))

@@ -1,0 +1,153 @@
+"""Rotors and actuators against the report's formulas and hand-made sums."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import stmuav_jax as stm
+from stmuav_jax import PART_II, Body, ModelError, SettingError, State, System
+from stmuav_jax.uav import LinearActuator, Rotors, hover_speed_squared
+
+T = jnp.asarray(0.0)
+
+
+def hexacopter_rotors(u):
+    return Rotors(
+        "hull",
+        arms=PART_II.value("rotor.arms"),
+        spin=PART_II.value("rotor.spin"),
+        k_f=PART_II.value("rotor.k_f"),
+        k_tau=PART_II.value("rotor.k_tau"),
+        speed_squared=u,
+    )
+
+
+def test_hover_speed_of_the_seven_body_uav():
+    """7.3653 kg at 9.81 m/s^2 over six rotors: 12.04 N and 1356.3 rad/s each."""
+    mass = sum(PART_II.value(key) for key in PART_II if key.startswith("mass."))
+    u = hover_speed_squared(mass, PART_II.value("gravity"), PART_II.value("rotor.k_f"), 6)
+    assert np.sqrt(np.asarray(u)) == pytest.approx(np.full(6, 1356.3), abs=0.05)
+    assert PART_II.value("rotor.k_f") * np.asarray(u) == pytest.approx(np.full(6, 12.04), abs=0.005)
+
+
+def test_wrench_is_the_reports_sum_rotor_by_rotor():
+    """Eq. 4.24, corrected: f = sum k_f u z, tau = sum (k_f a x z - k_tau s z) u."""
+    u = jnp.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 3e5
+    wrench = hexacopter_rotors(u).wrench(u, jnp.zeros(3))
+    z = np.array([0.0, 0.0, 1.0])
+    k_f, k_tau = PART_II.value("rotor.k_f"), PART_II.value("rotor.k_tau")
+    force, moment = np.zeros(3), np.zeros(3)
+    for a, s, each in zip(
+        PART_II.value("rotor.arms"), PART_II.value("rotor.spin"), np.asarray(u), strict=True
+    ):
+        force += k_f * each * z
+        moment += k_f * each * np.cross(a, z) - k_tau * s * each * z
+    assert np.asarray(wrench[:3]) == pytest.approx(force, rel=1e-14)
+    assert np.asarray(wrench[3:]) == pytest.approx(moment, rel=1e-12)
+
+
+def test_wrench_map_has_the_signs_of_the_idealised_mixing():
+    """The corrected Eq. 4.9 has rotor 1 at -30 degrees; Table 5.2 turns that by 15 degrees."""
+    arms = np.asarray(PART_II.value("rotor.arms"))
+    radius = arms[:, :2] - arms[:, :2].mean(axis=0)
+    angles = np.degrees(np.arctan2(radius[:, 1], radius[:, 0]))
+    steps = (angles - angles[0] + 180) % 360 - 180
+    assert np.hypot(*radius.T) == pytest.approx(np.full(6, 0.350), abs=1e-5)
+    assert angles[0] == pytest.approx(-15, abs=0.01)
+    assert steps == pytest.approx([0, -60, -120, 180, 120, 60], abs=0.01) or steps[3] == (
+        pytest.approx(-180, abs=0.01)
+    )
+
+
+def test_rotors_need_one_arm_per_spin():
+    with pytest.raises(ModelError, match="one arm"):
+        Rotors(
+            "hull", arms=[[1.0, 0, 0]], spin=[1.0, -1.0], k_f=1, k_tau=1, speed_squared=[1.0, 1.0]
+        )
+
+
+@pytest.mark.parametrize("name", ["k_f", "k_tau"])
+@pytest.mark.parametrize(("value", "words"), [(-6e-6, "not be negative"), (np.nan, "be finite")])
+def test_coefficients_below_zero_are_refused(name, value, words):
+    """Not as a rotor that would have to push downwards, where a trim is sought."""
+    given = {"k_f": 1.0, "k_tau": 1.0} | {name: value}
+    with pytest.raises(
+        ModelError, match=f"coefficient {name} of the rotors of body 'hull'.*{words}"
+    ):
+        Rotors("hull", arms=[[1.0, 0, 0]], spin=[1.0], speed_squared=[1.0], **given)
+
+
+def two_bodies():
+    hull = Body("hull", 2.0, [0.1, 0.1, 0.1], free=True)
+    slider = Body("slider", 0.2, [1e-4, 1e-4, 1e-4], position=(0.1, 0.02, 0.05), free=True)
+    system = System([hull, slider])
+    rng = np.random.default_rng(3)
+    p = rng.normal(size=4)
+    p = jnp.asarray(p / np.linalg.norm(p))
+    state = State(
+        jnp.asarray(rng.normal(size=(2, 3))),
+        jnp.stack([p, p]),
+        jnp.asarray(rng.normal(size=(2, 3))),
+        jnp.asarray(rng.normal(size=(2, 3))),
+    )
+    return system.kinematics(state)
+
+
+@pytest.mark.parametrize("couple", ["consistent", "printed"])
+def test_actuator_pair_leaves_momentum_alone_only_if_consistent(couple):
+    kin = two_bodies()
+    load = LinearActuator(
+        "hull", "slider", axis_point=(0.11, 0.0, 0.06), force=3.0, couple=couple
+    ).load(T, kin)
+    moment = jnp.cross(kin.r, load.force) + jnp.einsum("nab,nb->na", kin.R_wb, load.moment)
+    assert np.abs(load.force.sum(axis=0)).max() < 1e-15
+    net = np.abs(moment.sum(axis=0)).max()
+    assert net < 1e-14 if couple == "consistent" else net > 1e-3
+
+
+def test_actuator_power_is_force_times_sliding_rate():
+    kin = two_bodies()
+    load = LinearActuator("hull", "slider", axis_point=(0.11, 0.0, 0.06), force=3.0).load(T, kin)
+    by_hand = jnp.sum(load.force * kin.v) + jnp.sum(load.moment * kin.omega)
+    assert float(load.power) == pytest.approx(float(by_hand), rel=1e-13)
+
+
+def test_unknown_couple_is_refused():
+    with pytest.raises(SettingError, match="'consistent' or 'printed'"):
+        LinearActuator("a", "b", axis_point=(0, 0, 0), force=1.0, couple="other")
+
+
+@pytest.mark.parametrize(
+    ("number", "coaxial"), [(4, None), (6, None), (8, None), (3, 0.08), (4, 0.1)]
+)
+@pytest.mark.parametrize("layout", ["x", "plus"])
+def test_equal_speeds_of_a_layout_neither_tilt_nor_turn(number, coaxial, layout):
+    """All rotors stand on a circle, forward lies on an arm or midway between two, and every moment balances."""
+    arms, spin = stm.uav.rotor_layout(number, 0.3, layout=layout, coaxial=coaxial, height=0.05)
+    rotors = stm.uav.Rotors(
+        "frame", arms=arms, spin=spin, k_f=1e-5, k_tau=2e-7, speed_squared=np.ones(len(spin))
+    )
+    B = np.asarray(stm.uav.wrench_map(rotors, np.zeros(3)))
+    np.testing.assert_allclose(B.sum(axis=1), [len(spin) * 1e-5, 0, 0, 0], atol=1e-18)
+    np.testing.assert_allclose(np.linalg.norm(arms[:, :2], axis=1), 0.3)
+    nearest = np.min(np.abs(np.arctan2(arms[:, 1], arms[:, 0])))
+    assert nearest == pytest.approx(np.pi / number if layout == "x" else 0.0)
+    if coaxial is not None:
+        np.testing.assert_allclose(arms[::2, 2] - arms[1::2, 2], coaxial)
+        np.testing.assert_array_equal(spin[::2], -spin[1::2])
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"number": 2}, "even, and at least 4"),
+        ({"number": 5}, "even, and at least 4"),
+        ({"number": 2, "coaxial": 0.1}, "at least 3 of coaxial rotors"),
+        ({"number": 4, "radius": -1.0}, "The radius of the rotors' arms"),
+        ({"number": 4, "layout": "h"}, "must be 'x' or 'plus', not 'h'"),
+        ({"number": 4, "coaxial": -0.1}, "The distance between coaxial rotors"),
+    ],
+)
+def test_layouts_that_do_not_balance_are_refused(settings, words):
+    with pytest.raises(stm.ModelError, match=words):
+        stm.uav.rotor_layout(**({"radius": 0.3} | settings))
