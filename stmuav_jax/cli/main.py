@@ -5,13 +5,10 @@ The modules of a command are imported when it runs.
 
 import contextlib
 import dataclasses
-import gc
 import hashlib
 import os
-import signal
 import stat
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Union
@@ -29,7 +26,7 @@ from .fly import Fly, run_fly
 from .identify import identify_options, run_identify
 from .montecarlo import Montecarlo, run_montecarlo
 from .options import check_options, check_words
-from .output import INTERRUPTED, explain_error, show_activity
+from .output import explain_error, show_activity
 from .simulate import run_simulate, simulate_class
 from .sun import SunDay, run_sun
 from .trim import run_trim, trim_options
@@ -62,10 +59,6 @@ class Command(NamedTuple):
 
 # Columns of a terminal below which tables hold one letter a line; shells say 0 for a width unknown.
 _NARROWEST = 60
-# Thresholds of Python's garbage collector.
-_GARBAGE = (50_000, 20, 20)
-# Time after which Ctrl-C comes again [s].
-_LATER = 0.02
 
 COMMANDS = {
     "list": Command(List, run_list),
@@ -203,38 +196,12 @@ def _run_command(name: str, options: Any, keep_programs: bool) -> int:
         return command.run(options)
 
 
-def _repeat_interrupt(unraisable: Any) -> None:
-    """Let Ctrl-C come again where Python would print and forget it, as in callbacks of weak references."""
-    if issubclass(unraisable.exc_type, KeyboardInterrupt):
-        threading.Timer(_LATER, signal.raise_signal, [signal.SIGINT]).start()
-    else:
-        sys.__unraisablehook__(unraisable)
-
-
-def run_process() -> int:
-    """Entry point of a process that is one command and nothing else; the exit code as of `main`.
-
-    Only such a process keeps its programs: in others a part of the package may have been replaced.
-    """
-    # tracing makes millions of objects, through which Python would look for cycles after every 700
-    gc.set_threshold(*_GARBAGE)
-    sys.unraisablehook = _repeat_interrupt
-    code = main(keep_programs=True)
-    if code == INTERRUPTED:
-        # XLA's threads may still run the interrupted program, and Python's own end would take from under
-        # them what they use.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    return code
-
-
 def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False) -> int:
     """Run a command; the exit code: 0, 1 for a failed run, 2 for bad input, 130 for Ctrl-C.
 
     Args:
         arguments: words after `stmuav`, by default those of the process.
-        keep_programs: keep programs for later processes with the same words, as `run_process` does.
+        keep_programs: keep programs for later processes with the same words, as `__main__.run_process` does.
     """
     columns = os.environ.get("COLUMNS", "")
     if columns.isdecimal() and int(columns) < _NARROWEST:
@@ -253,7 +220,3 @@ def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False)
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 2
     except (Exception, KeyboardInterrupt) as error:
         return explain_error(error, debug)
-
-
-if __name__ == "__main__":
-    sys.exit(run_process())

@@ -125,10 +125,11 @@ class CorrectedLevenbergMarquardt(eqx.Module):
         has_settled = bool(np.all(np.abs(best) <= self.atol + self.rtol * np.abs(x)))
         has_settled &= loss - after <= self.atol**2 + self.rtol * loss
         # Nothing is left to gain beyond round-off: of the loss, or of residuals of large weights, where a step
-        # gains nothing though even an undamped one would gain next to nothing (Bates and Watts' relative offset).
+        # gains nothing though even an undamped one would gain next to nothing (Bates and Watts' relative offset,
+        # over directions that change the residuals by more than round-off).
         flat = predicted <= 4 * np.finfo(float).eps * before
         if not (is_accepted or flat):
-            gradient_share = np.linalg.qr(J)[0].T @ r
+            gradient_share = scipy.linalg.orth(J).T @ r
             flat = bool(gradient_share @ gradient_share <= self.rtol * before)
         return Attempt(
             values=_unflatten_tree(values, x + best) if is_accepted else values,

@@ -133,7 +133,7 @@ def test_a_command_has_the_numbers_of_its_own_sources(tmp_path):
             end = run.position.values[-1]
         return end, len(list((tmp_path / "stmuav_jax").glob("programs/*")))
 
-    command = "-m", "stmuav_jax.cli.main"
+    command = "-m", "stmuav_jax"
     moon, count = fall("-c", PATCHED)
     assert count == 0
     (earth, count), (again, same) = fall(*command), fall(*command)

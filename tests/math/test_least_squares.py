@@ -131,3 +131,14 @@ def test_residuals_of_large_weights_have_round_off():
         assert found.steps < 15
         losses.append(found.loss)
     np.testing.assert_allclose(losses, losses[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("slope", "is_last"), [(1e-11, True), (1e-3, False)])
+def test_a_direction_that_changes_nothing_but_round_off(slope, is_last):
+    """A step gains nothing at the minimum: the search ends unless a direction that matters has a gradient."""
+    J = np.array([[1e5, 0.0], [0.0, slope], [0.0, 0.0]])
+    r = np.array([1e-6, 0.1, 1.0])
+    noisy = lambda values: 1.0001 * r
+    attempt = CorrectedLevenbergMarquardt().attempt(noisy, jnp.zeros(2), (r, J), 1e-6)
+    assert not attempt.is_accepted
+    assert attempt.is_last == is_last
