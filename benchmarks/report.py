@@ -32,6 +32,7 @@ DEFAULT = "stmuav_jax, Dopri8"
 PINOCCHIO = "Pinocchio in C++, Boost rkf78"
 MUJOCO = "MuJoCo, RK4"
 EXUDYN = "Exudyn, generalised-alpha"
+HEYOKA = "heyoka, Taylor series"
 DENSE = "the report's dense system in NumPy, DOP853"
 # Row of a table -> method and solver in the results.
 PROGRAMS = {
@@ -45,17 +46,19 @@ PROGRAMS = {
     "MuJoCo, implicitfast": ("MuJoCo (C), RK4", "implicitfast"),
     "MJX on a CPU, RK4": ("MuJoCo MJX (CPU), RK4", "RK4"),
     EXUDYN: ("Exudyn, generalised-alpha", "generalised-alpha"),
+    HEYOKA: ("heyoka, Taylor series", "taylor"),
     DENSE: ("NumPy, the report's dense system", "DOP853"),
     "the report's dense system in NumPy, RK45": ("NumPy, the report's dense system", "RK45"),
 }
 # Method in the results -> row of a table without a choice of solver.
 LABELS = {method: name for name, (method, _) in reversed(PROGRAMS.items())}
-# The five curves: colour, dash and marker.
+# The curves: colour, dash and marker.
 CURVES = {
     DEFAULT: ("#0072B2", "-", "o"),
     PINOCCHIO: ("#D55E00", "-", "s"),
     MUJOCO: ("#009E73", "-", "^"),
     EXUDYN: ("#CC79A7", "-", "D"),
+    HEYOKA: ("#56B4E9", "-", "P"),
     DENSE: ("#666666", "-", "v"),
 }
 # Loops, stiffness, mass ratios, impacts and long times among the hard cases.

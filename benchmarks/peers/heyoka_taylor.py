@@ -18,7 +18,7 @@ from problems.plain import start, starts
 from problems.tree import coordinates
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at, tolerances
-from peers.pinocchio_model import WIDTH, LinkModel, generalised, linked, why_no_joint_forces
+from peers.pinocchio_model import WIDTH, generalised, linked, why_no_joint_forces
 from stmuav_jax import Scene, State
 
 # Coordinates of a link; their rates are as wide as `WIDTH`, of free links and balls (velocity,)
@@ -151,7 +151,12 @@ class Equations:
             ahead = motions[link.parent] if link.parent >= 0 else GROUND
             R, x = ahead.R @ link.placement.R, ahead.point(link.placement.x)
             now = Motion(
-                R, x, ahead.omega, ahead.turn_bias, ahead.point_bias(link.placement.x), [*ahead.axes]
+                R,
+                x,
+                ahead.omega,
+                ahead.turn_bias,
+                ahead.point_bias(link.placement.x),
+                [*ahead.axes],
             )
             columns = range(first, first + WIDTH[link.kind])
             if link.kind == "slide":

@@ -1,5 +1,6 @@
 """Our methods behind the same adapter as the peers, and compilation timed apart from running."""
 
+from functools import partial
 from typing import Any
 
 import diffrax
@@ -35,10 +36,17 @@ def outcome(path: stm.dynamics.Trajectory, fine: Any, solver: Any) -> Outcome:
 
 
 class Ours(Peer):
-    """One formulation with one solver; compiled once for all tolerances and horizons."""
+    """One formulation with one solver; compiled once for all tolerances and horizons.
 
-    def __init__(self, formulation: Any, solver: Any, tolerances: tuple[float, ...]) -> None:
-        self.formulation, self.solver = formulation, solver
+    Args:
+        known: the system's numbers are known when it is compiled: rows of planar loops that depend on
+            others in every posture are then left out.
+    """
+
+    def __init__(
+        self, formulation: Any, solver: Any, tolerances: tuple[float, ...], *, known: bool = False
+    ) -> None:
+        self.formulation, self.solver, self.known = formulation, solver, known
         self.solver_name = type(solver).__name__
         self.name = f"stmuav-jax, {label(formulation)}"
         self._settings = [Setting(self.solver_name, tolerance=x) for x in tolerances]
@@ -53,10 +61,14 @@ class Ours(Peer):
     def prepare(self, scene: stm.Scene, times: np.ndarray, setting: Setting) -> Prepared:
         ts = jnp.asarray([scene.t0, *times], float)
         tolerance = jnp.asarray(setting.tolerance, float)
-        arguments = (scene.system, scene.state0, ts, tolerance)
+        arguments = (scene.state0, ts, tolerance)
+        if not self.known:
+            arguments = (scene.system, *arguments)
         key = scene.name
         if key not in self._kept:
             of = trajectory(self.formulation, self.solver)
+            if self.known:
+                of = partial(of, scene.system)
 
             def watched(*arguments: Any) -> Any:
                 """The trajectory, and whether it reached the end, found out in the program."""
@@ -74,10 +86,10 @@ class Ours(Peer):
 
 
 def explicit(tolerances: tuple[float, ...], *, redundant: bool = False) -> list[Ours]:
-    """Both formulations with both explicit solvers."""
+    """Both formulations with both explicit solvers; `redundant` for planar loops."""
     return [
-        Ours(formulation, solver, tolerances)
-        for formulation in (stm.Tree(redundant=redundant), stm.Augmented(redundant=redundant))
+        Ours(formulation, solver, tolerances, known=redundant)
+        for formulation in (stm.Tree(), stm.Augmented())
         for solver in (diffrax.Dopri8(), diffrax.Tsit5())
     ]
 

@@ -14,9 +14,11 @@ from dense.system import Dense
 from helpers import evaluated
 from peers import (
     PEERS,
+    HeyokaTaylor,
     MujocoC,
     PinocchioCpp,
     exudyn_peer,
+    heyoka_taylor,
     mujoco_c,
     pinocchio_cpp,
     pinocchio_python,
@@ -39,7 +41,10 @@ CASES = {
     "MujocoC": (Setting("RK4", step=1e-4), 1e-6, 3e-3),
     "MujocoMjx": (Setting("RK4", step=1e-3), 1e-3, None),
     "ExudynPeer": (Setting("generalised-alpha", step=1e-4), 1e-6, 1e-11),
+    "HeyokaTaylor": (Setting("taylor", tolerance=1e-12), 1e-11, 1e-11),
 }
+# peers whose models take long to compile
+SLOW = ("MujocoMjx", "HeyokaTaylor")
 
 
 def of_pinocchio_cpp(scene):
@@ -92,10 +97,24 @@ def of_exudyn(scene):
     return mechanism.stored(sensors)[:, 0, 1:]
 
 
+def of_heyoka(scene):
+    equations = heyoka_taylor.Equations(scene)
+    variables, rates = zip(*equations.system(), strict=True)
+    a = np.array(rates[-equations.first[-1] :])
+    points = []
+    for k, x in equations.links.bodies:
+        columns = equations.motions[k].jacobians(x).items()
+        points += list(
+            sum((moved * a[i] for i, (moved, _) in columns), equations.motions[k].point_bias(x))
+        )
+    program = equations.hy.cfunc(points, variables, compact_mode=True)
+    return program(equations.start(start(scene)), time=scene.t0).reshape(-1, 3)
+
+
 # Each program's accelerations of the centres of mass at the start, world (n, 3) [m/s^2].
 ACCELERATIONS = {
     "PinocchioCpp": of_pinocchio_cpp, "PinocchioPython": of_pinocchio, "ScipyDense": of_dense,
-    "MujocoC": of_mujoco, "ExudynPeer": of_exudyn,
+    "MujocoC": of_mujoco, "ExudynPeer": of_exudyn, "HeyokaTaylor": of_heyoka,
 }  # fmt: skip
 
 
@@ -121,13 +140,15 @@ def ready(peer):
     return one
 
 
-def some(*, slow):
-    """The peers as parameters; those in `slow` only with -m slow."""
+def some(peers=PEERS):
+    """Peers as parameters; those that are slow only with -m slow."""
     return [
-        pytest.param(p, id=p.__name__, marks=[pytest.mark.slow] if p.__name__ in slow else [])
-        for p in PEERS
-        if slow or CASES[p.__name__][2] is not None
+        pytest.param(p, id=p.__name__, marks=[pytest.mark.slow] if p.__name__ in SLOW else [])
+        for p in peers
     ]
+
+
+TOLD = [p for p in PEERS if CASES[p.__name__][2] is not None]
 
 
 def test_every_peer_has_a_case_and_settings_from_coarse_to_fine():
@@ -138,7 +159,7 @@ def test_every_peer_has_a_case_and_settings_from_coarse_to_fine():
             assert size == sorted(size, reverse=True)
 
 
-@pytest.mark.parametrize("peer", some(slow=()))
+@pytest.mark.parametrize("peer", some(TOLD))
 def test_accelerations_at_the_start(peer, scene):
     one, expected = (
         ready(peer),
@@ -149,7 +170,7 @@ def test_accelerations_at_the_start(peer, scene):
     assert np.abs(difference).max() <= CASES[peer.__name__][2]
 
 
-@pytest.mark.parametrize("peer", some(slow=("MujocoMjx",)))
+@pytest.mark.parametrize("peer", some())
 def test_motion(peer, scene):
     one, (setting, allowed, _) = ready(peer), CASES[peer.__name__]
     outcome = one.prepare(scene, TIMES, setting).run()
@@ -159,7 +180,7 @@ def test_motion(peer, scene):
         assert outcome.residual <= allowed
 
 
-@pytest.mark.parametrize("peer", some(slow=()))
+@pytest.mark.parametrize("peer", some(TOLD))
 def test_scene_without_joints(peer):
     scene = stm.make_scene("hexacopter")
     one, expected = (
@@ -170,7 +191,7 @@ def test_scene_without_joints(peer):
     np.testing.assert_allclose(ACCELERATIONS[peer.__name__](scene), expected, atol=1e-11)
 
 
-@pytest.mark.parametrize("peer", [PinocchioCpp, MujocoC])
+@pytest.mark.parametrize("peer", some([PinocchioCpp, MujocoC, HeyokaTaylor]))
 def test_throughput_ends_where_single_runs_do(peer, scene):
     one, setting = ready(peer), CASES[peer.__name__][0]
     # the same mechanism, thrown upwards at several speeds
@@ -208,7 +229,9 @@ def test_tree_coordinates_of_a_moved_mechanism(scene):
 
 # Problem -> which peers' accelerations are compared, with the error allowed, relative to the
 # largest acceleration. MuJoCo's loop constraints are soft.
-EXACT = {"PinocchioCpp": 1e-9, "PinocchioPython": 1e-9, "ScipyDense": 1e-9, "ExudynPeer": 1e-9}
+EXACT = dict.fromkeys(
+    ("PinocchioCpp", "PinocchioPython", "ScipyDense", "ExudynPeer", "HeyokaTaylor"), 1e-9
+)
 MORE = {
     "heavy_top": {**EXACT, "MujocoC": 1e-9},
     "servo": {**EXACT, "MujocoC": 1e-3},

@@ -1,7 +1,8 @@
 """Machine code of small functions against XLA's, in values, derivatives, batches and bits."""
 
+import re
 import threading
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -291,3 +292,57 @@ def test_a_function_that_cannot_be_found_again_is_evaluated_as_it_is():
             return jnp.sin(x)
 
     np.testing.assert_array_equal(jax.jit(lambda x: evaluate(Sine(), x))(X), jnp.sin(X))
+
+
+def test_numbers_of_one_argument_are_handed_over_together():
+    """Joined where a batch shares them; those that nothing reads, whole numbers and truths are apart."""
+    numbers = {f"{k}": jnp.linspace(0.1, 1.0, k + 1) for k in range(8)}
+    numbers |= {"whole": jnp.array([3, 4]), "truth": jnp.array(True), "unread": jnp.ones(50)}
+
+    def function(numbers, x):
+        total = sum(numbers[f"{k}"][-1] * numbers[f"{k}"][0] * x for k in range(8))
+        return jnp.where(numbers["truth"], total + numbers["whole"][1], 0.0)
+
+    ours, rows = jax.jit(native(function)), jnp.asarray(X)
+    np.testing.assert_allclose(ours(numbers, X), function(numbers, rows), rtol=1e-14)
+    call = re.findall(r"custom_call @stmuav_\w+\(([^)]*)\)", ours.lower(numbers, X).as_text())
+    assert [len(operands.split(",")) for operands in call] == [4]
+    each = {"in_axes": ({**dict.fromkeys(numbers), "3": 0}, 0)}
+    batched = {**numbers, "3": numbers["3"] * jnp.ones((2, 1))}
+    pairs = [jax.vmap(f, **each)(batched, rows) for f in (native(function), function)]
+    np.testing.assert_allclose(*pairs, rtol=1e-14)
+
+
+A, C = np.tril(np.arange(1.0, 17.0).reshape(4, 4), -1) / 40, np.linspace(0.0, 1.0, 4)
+
+
+@partial(native, tables=(A, C))
+def stages(scale, t, y, x, row, weight):
+    """Rows of a Runge-Kutta step."""
+    return jnp.sin(scale["a"] * (y + row @ x)) + (t + weight) * scale["b"]
+
+
+def test_loops_are_one_call():
+    """Rows that follow from those before, their derivatives, and batches."""
+
+    def by_rows(scale, t, y, x):
+        for k in range(4):
+            x = x.at[k].set(jnp.sin(scale["a"] * (y + A[k] @ x)) + (t + C[k]) * scale["b"])
+        return x
+
+    scale, y, x = {"a": 1.3, "b": jnp.array([0.1, 0.7])}, jnp.array([0.4, -2.0]), jnp.zeros((4, 2))
+    scale = jax.tree.map(jnp.asarray, scale)
+    arguments = scale, 0.3, y, x
+    np.testing.assert_allclose(
+        jax.jit(stages)(*arguments), jax.jit(by_rows)(*arguments), atol=1e-15
+    )
+    text = jax.jit(stages).lower(*arguments).as_text()
+    assert (text.count("custom_call"), text.count("while")) == (1, 0)
+    for derivative in (jax.jacfwd, jax.jacrev, lambda f, at: jax.jacfwd(jax.jacrev(f, at), at)):
+        of = lambda f, d=derivative: jax.tree.leaves(jax.jit(d(f, (0, 2)))(*arguments))
+        for ours, theirs in zip(of(stages), of(by_rows), strict=True):
+            np.testing.assert_allclose(ours, theirs, atol=1e-14)
+    many = (None, 0, 0, None)
+    ts, ys = jnp.linspace(0, 1, 5), y + jnp.linspace(0, 1, 5)[:, None]
+    ours, theirs = (jax.vmap(f, many)(scale, ts, ys, x) for f in (stages, by_rows))
+    np.testing.assert_allclose(ours, theirs, atol=1e-15)

@@ -16,6 +16,8 @@ Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II (1996),
 Newton iterations, when they end, and when the Jacobian is computed again).
 """
 
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -28,6 +30,7 @@ from jaxtyping import Array, Bool, Float
 from ...checks.shapes import StateVector
 from ...math.derivative import directional_derivative
 from ...math.linalg import invert_matrix
+from ...math.native.program import native
 
 
 class RecordedStep(diffrax.LocalLinearInterpolation):
@@ -92,6 +95,22 @@ class AbstractNonDense(diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
 
+@cache
+def _stage_loop(kind: type[diffrax.AbstractERK]) -> Callable[..., Float[Array, "s k"]]:
+    """Loop over the stages of a method, (terms, args, t, h, y, zeros (s, k)) -> their slopes."""
+    A, _, _, c = butcher_coefficients(kind)
+
+    # A loop has the equations of motion once in the program; unrolled, it would compile a copy for each
+    # stage.
+    @partial(native, tables=(A, c))
+    def evaluate_slope(
+        terms: Any, args: Any, t: Any, h: Any, y: Any, slopes: Any, row: Any, weight: Any
+    ) -> StateVector:
+        return terms.vf(t + weight * h, y + h * jnp.sum(row[:, None] * slopes, axis=0), args)
+
+    return evaluate_slope
+
+
 class NonDenseRungeKutta(AbstractNonDense):
     """Explicit Runge-Kutta method of diffrax without its dense output.
 
@@ -119,23 +138,10 @@ class NonDenseRungeKutta(AbstractNonDense):
         made_jump: Any,
     ) -> tuple[StateVector, StateVector, Any, None, diffrax.RESULTS]:
         del solver_state, made_jump
-        A, b, b_error, c = butcher_coefficients(self.method)
+        _, b, b_error, c = butcher_coefficients(self.method)
         h = terms.contr(t0, t1)
-
-        def evaluate_stage(
-            slopes: Float[Array, "s k"], at: tuple[Any, Any, Any]
-        ) -> tuple[Any, None]:
-            row, weight, number = at
-            y = y0 + h * jnp.sum(row[:, None] * slopes, axis=0)
-            slope = terms.vf(t0 + weight * h, y, args)
-            return jax.lax.dynamic_update_index_in_dim(slopes, slope, number, 0), None
-
-        stages = len(c)
-        start = jnp.zeros((stages, y0.shape[0]), y0.dtype)
-        table = (jnp.asarray(A), jnp.asarray(c), jnp.arange(stages))
-        # A loop over the stages has the equations of motion once in the program; unrolled, it would
-        # compile a copy for each stage.
-        slopes, _ = jax.lax.scan(evaluate_stage, start, table)
+        start = jnp.zeros((len(c), y0.shape[0]), y0.dtype)
+        slopes = _stage_loop(type(self.method))(terms, args, t0, h, y0, start)
         y1 = y0 + h * jnp.sum(b[:, None] * slopes, axis=0)
         error = h * jnp.sum(b_error[:, None] * slopes, axis=0)
         dense_info = {"y0": y0, "y1": y1, "slopes": slopes}
@@ -143,7 +149,7 @@ class NonDenseRungeKutta(AbstractNonDense):
 
 
 def butcher_coefficients(
-    method: diffrax.AbstractERK,
+    method: diffrax.AbstractERK | type[diffrax.AbstractERK],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Butcher coefficients A (s, s), b, those of the error, and c (s,).
 

@@ -307,6 +307,19 @@ def fuse(graph: Graph, outputs: Sequence[int]) -> tuple[Graph, list[int]]:
 
 
 @dataclass(frozen=True)
+class Loop:
+    """Passes of a program, each of which makes a row of one array that it reads.
+
+    Attributes:
+        rows: argument that is the array; the result begins as it. tables: arguments by number, and their
+            values in each pass.
+    """
+
+    rows: int
+    tables: dict[int, np.ndarray]
+
+
+@dataclass(frozen=True)
 class Code:
     """Text of a program in LLVM's language, and its number of operations."""
 
@@ -320,19 +333,36 @@ def write(
     arguments: Sequence[Buffer],
     results: Sequence[Buffer],
     width: int,
+    places: dict[int, tuple[int, int]] | None = None,
+    loop: Loop | None = None,
 ) -> Code:
-    """Program of a graph for buffers of these kinds."""
+    """Program of a graph for buffers of these kinds.
+
+    Args:
+        places: buffer and first entry there of each operand; by default each has its own.
+        loop: loop around the program, for a width of 1.
+    """
     flat = [n for out in outputs for n in out.ravel().tolist()]
     # Fusion is decided here, in the graph, and not by LLVM's fast-math flags, which would choose
     # differently for one row and for a vector of rows: a row's bits would depend on its batch.
     graph, flat = fuse(graph, flat)
     order = [n for n in range(len(graph.ops))]
+    for node in order if places is not None else ():
+        if graph.ops[node] == "input":
+            number, entry, kind = graph.args[node]
+            buffer, first = places[number]
+            graph.args[node] = (buffer, first + entry, kind)
     operations = sum(graph.ops[n] not in ("input", "constant") for n in order)
     names: set[str] = set()
     parts = [
         _functions(graph, order, flat, arguments, results, w, names) for w in sorted({1, width})
     ]
-    handler = _handler(arguments, results, width)
+    if loop is None:
+        body = _repeat_rows(arguments, results, width)
+    else:
+        names.update(_tables(loop))
+        body = _repeat_passes(arguments, results, loop)
+    handler = _handler(body)
     attributes = (
         'attributes #0 = { nounwind "prefer-vector-width"="512" "min-legal-vector-width"="512" }\n'
         "attributes #1 = { nounwind willreturn memory(none) }\n"
@@ -493,20 +523,73 @@ _METADATA_TYPE, _METADATA, _VERSION, _TRAITS = 8, 24, 24, 32
 API_VERSION = (0, 3)
 
 
-def _handler(arguments: Sequence[Buffer], results: Sequence[Buffer], width: int) -> str:
-    """Function that XLA calls: it finds the buffers and the number of rows, and goes through the rows."""
+def _find_buffers(arguments: Sequence[int], results: int) -> list[str]:
+    """Instructions that find the data of arguments, by the numbers that they have here, and of results."""
     lines = []
-    for letter, offset, buffers in (("x", _ARGUMENTS, arguments), ("y", _RESULTS, results)):
+    for letter, offset, numbers in (("x", _ARGUMENTS, arguments), ("y", _RESULTS, range(results))):
         lines.append(f"  %{letter}list.at = getelementptr i8, ptr %frame, i64 {offset}")
         lines.append(f"  %{letter}list = load ptr, ptr %{letter}list.at")
-        for k in range(len(buffers)):
+        for place, k in enumerate(numbers):
             at = f"{letter}{k}"
             lines += [
-                f"  %{at}.slot = getelementptr ptr, ptr %{letter}list, i64 {k}",
+                f"  %{at}.slot = getelementptr ptr, ptr %{letter}list, i64 {place}",
                 f"  %{at}.buffer = load ptr, ptr %{at}.slot",
                 f"  %{at}.data = getelementptr i8, ptr %{at}.buffer, i64 {_DATA}",
                 f"  %{at}.base = load ptr, ptr %{at}.data",
             ]
+    return lines
+
+
+def _repeat_passes(arguments: Sequence[Buffer], results: Sequence[Buffer], loop: Loop) -> str:
+    """Instructions that go through the passes of a loop."""
+    (row,) = results
+    count = len(next(iter(loop.tables.values())))
+    given = [k for k in range(len(arguments)) if k not in loop.tables]
+    lines = _find_buffers(given, 1)
+    args = []
+    for k in range(len(arguments)):
+        if k in loop.tables:
+            args.append(f"ptr %x{k}.row")
+            continue
+        # what has been made so far is read from the result
+        args.append("ptr %y0.base" if k == loop.rows else f"ptr %x{k}.base")
+    at_row = "\n".join(
+        f"  %x{k}.row = getelementptr [{arguments[k].size} x double], ptr @table{k}, i64 %pass"
+        for k in loop.tables
+    )
+    load, total = "\n".join(lines), 8 * arguments[loop.rows].size
+    return f"""
+{load}
+  %row = alloca double, i64 {row.size}
+  call void @llvm.memcpy.p0.p0.i64(ptr %y0.base, ptr %x{loop.rows}.base, i64 {total}, i1 false)
+  br label %again
+again:
+  %pass = phi i64 [0, %run], [%pass.next, %again]
+{at_row}
+  call void @rows1({", ".join(args)}, ptr %row)
+  %into = getelementptr [{row.size} x double], ptr %y0.base, i64 %pass
+  call void @llvm.memcpy.p0.p0.i64(ptr %into, ptr %row, i64 {8 * row.size}, i1 false)
+  %pass.next = add i64 %pass, 1
+  %more = icmp slt i64 %pass.next, {count}
+  br i1 %more, label %again, label %done
+done:
+  ret ptr null
+"""
+
+
+def _tables(loop: Loop) -> list[str]:
+    """Constants of a loop, and the declaration of what copies its rows."""
+    lines = ["declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)"]
+    for k, table in loop.tables.items():
+        values = np.ravel(np.asarray(table, float)).tolist()
+        numbers = ", ".join(f"double {_bits(value)}" for value in values)
+        lines.append(f"@table{k} = private constant [{len(values)} x double] [{numbers}]")
+    return lines
+
+
+def _repeat_rows(arguments: Sequence[Buffer], results: Sequence[Buffer], width: int) -> str:
+    """Instructions that go through the rows of a batch."""
+    lines = _find_buffers(range(len(arguments)), len(results))
     # XLA gives sizes and not counts of rows: dimensions of a batch may be several, and their
     # product is what is needed.
     # the number of rows is that of the first result with entries
@@ -534,7 +617,6 @@ def _handler(arguments: Sequence[Buffer], results: Sequence[Buffer], width: int)
         return "\n".join(offsets)
 
     load = "\n".join(lines)
-    version = API_VERSION[0] | API_VERSION[1] << 32
     # Batches are done in whole vectors. The last one is moved back to end with the batch and does
     # some rows twice, with equal bits, instead of a remainder row by row, whose instructions would
     # take longer and could round differently.
@@ -558,6 +640,26 @@ again:
         if width > 1
         else "  br label %singly\n"
     )
+    return f"""
+{load}
+{blocks}singly:
+  br label %single
+single:
+  %one = phi i64 [0, %singly], [%one.next, %do]
+  %left = icmp slt i64 %one, %rows
+  br i1 %left, label %do, label %done
+do:
+{call(1, "%one")}
+  %one.next = add i64 %one, 1
+  br label %single
+done:
+  ret ptr null
+"""
+
+
+def _handler(body: str) -> str:
+    """Function that XLA calls: it tells its version, or goes on to what it is for."""
+    version = API_VERSION[0] | API_VERSION[1] << 32
     return f"""
 define internal i64 @entries(ptr %buffer) {{
   %rank.at = getelementptr i8, ptr %buffer, i64 {_RANK}
@@ -598,20 +700,7 @@ tell:
   store i32 0, ptr %traits.at
   ret ptr null
 run:
-{load}
-{blocks}singly:
-  br label %single
-single:
-  %one = phi i64 [0, %singly], [%one.next, %do]
-  %left = icmp slt i64 %one, %rows
-  br i1 %left, label %do, label %done
-do:
-{call(1, "%one")}
-  %one.next = add i64 %one, 1
-  br label %single
-done:
-  ret ptr null
-}}
+{body}}}
 """
 
 

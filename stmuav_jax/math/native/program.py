@@ -13,7 +13,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from functools import wraps
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -23,6 +23,7 @@ import numpy as np
 from jax.extend import core
 from jax.interpreters import ad, batching, mlir
 from jaxlib.mlir import ir
+from jaxtyping import Array
 
 from . import llvm
 from .graph import NotScalarError, make_graph
@@ -33,15 +34,30 @@ native_p.multiple_results = True
 _DTYPES = {"float64": "f8", "bool": "b1", "int32": "i4", "int64": "i8"}
 
 
+class Layout(NamedTuple):
+    """Buffers in which machine code finds its operands.
+
+    Attributes:
+        packs: operands of each buffer; one alone has its own shape and type. places: buffer and first
+            entry there, of every operand that is needed. buffers: kinds of the buffers.
+    """
+
+    packs: tuple[tuple[int, ...], ...]
+    places: dict[int, tuple[int, int]]
+    buffers: tuple[llvm.Buffer, ...]
+
+
 class Program:
     """A traced function of arrays, its machine code, and its derivatives.
 
     Attributes:
-        jaxpr: traced function, whose constants are known.
+        jaxpr: traced function, whose constants are known. groups: number of the argument to which each
+            operand belongs.
     """
 
-    def __init__(self, jaxpr: Any) -> None:
+    def __init__(self, jaxpr: Any, groups: Sequence[int] | None = None) -> None:
         self.jaxpr = jaxpr
+        self.groups = tuple(groups or [0] * len(jaxpr.in_avals))
         self._derived: dict[Any, Program] = {}
         self._lock = threading.RLock()
         self._graph: Any = None
@@ -71,6 +87,42 @@ class Program:
                     self._reason = str(error)
             return self._graph
 
+    def write(self, shared: tuple[bool, ...], rows: int) -> llvm.Code:
+        """Machine code for a batch of this size.
+
+        Raises:
+            NotScalarError: an operation has none.
+        """
+        graph: Any = self.graph()
+        layout, width = self.layout(shared, rows), llvm.vector_width() if rows > 1 else 1
+        return llvm.write(*graph, layout.buffers, self._results(), width, layout.places)
+
+    def _results(self) -> list[llvm.Buffer]:
+        return [llvm.Buffer(math.prod(a.shape), _DTYPES[str(a.dtype)]) for a in self.outputs]
+
+    def layout(self, shared: tuple[bool, ...], rows: int) -> Layout:
+        """Buffers of operands for a batch of this size; None of them is shared where it is 1."""
+        graph: Any = self.graph()
+        nodes = graph[0].needed([n for out in graph[1] for n in out.ravel().tolist()])
+        used = {graph[0].args[n][0] for n in nodes if graph[0].ops[n] == "input"}
+        # XLA hands over every operand at a cost of some ten nanoseconds, and a model has dozens of them.
+        # Numbers of one argument go together: where a loop does not change them, XLA joins them once.
+        members: dict[Any, list[int]] = {}
+        for k in sorted(used):
+            joined = str(self.inputs[k].dtype) == "float64" and (shared[k] or rows == 1)
+            members.setdefault(("joined", self.groups[k]) if joined else k, []).append(k)
+        packs = tuple(tuple(pack) for pack in members.values())
+        places: dict[int, tuple[int, int]] = {}
+        buffers = []
+        for number, pack in enumerate(packs):
+            size = 0
+            for k in pack:
+                places[k] = (number, size)
+                size += math.prod(self.inputs[k].shape)
+            dtype = _DTYPES[str(self.inputs[pack[0]].dtype)]
+            buffers.append(llvm.Buffer(size, dtype, shared[pack[0]]))
+        return Layout(packs, places, tuple(buffers))
+
     def derived(self, key: Any, make: Callable[[], "Program"]) -> "Program":
         with self._lock:
             if key not in self._derived:
@@ -99,7 +151,8 @@ class Program:
                 *self.inputs,
                 *(a for a, move in zip(self.inputs, tangent_mask, strict=True) if move),
             ]
-            return Program(_trace(tangents, avals))
+            moving = [max(self.groups, default=0) + 1] * (len(avals) - count)
+            return Program(_trace(tangents, avals), [*self.groups, *moving])
 
         return self.derived(("forward", tangent_mask), make)
 
@@ -130,9 +183,45 @@ class Program:
                 ]
                 return list(jax.linear_transpose(linear, *shapes)(full))
 
-            return Program(_trace(cotangents, [*known_avals, *results]))
+            groups = [g for g, k in zip(self.groups, known_mask, strict=True) if k]
+            groups += [max(self.groups, default=0) + 1] * len(results)
+            return Program(_trace(cotangents, [*known_avals, *results]), groups)
 
         return self.derived(("back", known_mask, cotangent_mask), make)
+
+
+class Recursion(Program):
+    """A traced loop over rows of tables, each pass of which adds a row to the last operand.
+
+    Machine code has the loop, too. A batch, and derivatives, are those of the loop itself.
+
+    Attributes:
+        body: one pass; its last operands are rows of the tables.
+    """
+
+    def __init__(
+        self, jaxpr: Any, groups: Sequence[int], body: Program, tables: Sequence[np.ndarray]
+    ) -> None:
+        super().__init__(jaxpr, groups)
+        self.body, self.tables = body, tables
+
+    def graph(self) -> Any:
+        return self.body.graph()
+
+    def layout(self, shared: tuple[bool, ...], rows: int) -> Layout:
+        del shared, rows
+        return self.body.layout((False,) * len(self.body.inputs), 1)
+
+    def write(self, shared: tuple[bool, ...], rows: int) -> llvm.Code:
+        layout, first = self.layout(shared, rows), len(self.inputs)
+        buffers = {k: number for k, (number, _) in layout.places.items()}
+        tables = {
+            buffers[first + k]: table for k, table in enumerate(self.tables) if first + k in buffers
+        }
+        if first - 1 not in buffers or not tables:
+            raise NotScalarError("a loop whose passes do not depend on each other")
+        loop, graph = llvm.Loop(buffers[first - 1], tables), cast(Any, self.graph())
+        return llvm.write(*graph, layout.buffers, self.body._results(), 1, layout.places, loop)
 
 
 def _zero_tangent(aval: Any) -> Any:
@@ -210,6 +299,10 @@ batching.primitive_batchers[native_p] = _batched
 
 
 def _jvp(primals: Any, tangents: Any, *, program: Program, lead: tuple[int, ...]) -> Any:
+    if isinstance(program, Recursion):
+        tangents = [ad.instantiate_zeros(t) for t in tangents]
+        of = lambda *operands: _apply(*operands, program=program, lead=lead)
+        return jax.jvp(of, tuple(primals), tuple(tangents))
     results = native_p.bind(*primals, program=program, lead=lead)
     # A program for each set of operands that move: zero tangents are known, and a derivative with
     # respect to a state alone does not compute those by masses.
@@ -266,7 +359,17 @@ def _lower_native(context: Any, *operands: Any, program: Program, lead: tuple[in
     name = _target(program, lead, context.avals_in) if is_on() else None
     if name is None:
         return _lower_function(context, *operands, program=program, lead=lead)
-    results: Any = jax.ffi.ffi_lowering(name)(context, *operands)
+    layout = program.layout(_find_shared(lead, context.avals_in), math.prod(lead))
+    join = lambda *xs: [
+        xs[pack[0]] if len(pack) == 1 else jnp.concatenate([xs[k].reshape(-1) for k in pack])
+        for pack in layout.packs
+        if pack[0] < len(xs)
+    ]
+    avals = [
+        jax_core.ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(join, *context.avals_in)
+    ]
+    joined = mlir.lower_fun(join)(context.replace(avals_out=avals), *operands)
+    results: Any = jax.ffi.ffi_lowering(name)(context.replace(avals_in=avals), *joined)
     # JAX marks the typed interface by an attribute that StableHLO does not know, and which is lost where an
     # operation stands in a function of its own, as within jax.checkpoint: StableHLO's own mark stays.
     operation = results[0].owner
@@ -281,27 +384,25 @@ def _lower_native(context: Any, *operands: Any, program: Program, lead: tuple[in
 mlir.register_lowering(native_p, _lower_native, platform="cpu")
 
 
+def _find_shared(lead: tuple[int, ...], avals: Sequence[Any]) -> tuple[bool, ...]:
+    """True for operands that are the same for a whole batch of several rows."""
+    return tuple(math.prod(lead) != 1 and math.prod(a.shape[: len(lead)]) == 1 for a in avals)
+
+
 def _target(program: Program, lead: tuple[int, ...], avals: Sequence[Any]) -> str | None:
     """Name of a program's machine code for operands of these shapes; None where there is none."""
     rows = math.prod(lead)
     if rows == 0 or not any(math.prod(a.shape) for a in program.outputs):
         return None
-    shared = tuple(rows != 1 and math.prod(a.shape[: len(lead)]) == 1 for a in avals)
-    graph: Any = program.graph()
-    if graph is None:
+    if rows > 1 and isinstance(program, Recursion):
+        return None
+    shared = _find_shared(lead, avals)
+    if program.graph() is None:
         return None
 
     def make() -> Any:
-        buffers = [
-            llvm.Buffer(math.prod(a.shape), _DTYPES[str(a.dtype)], s)
-            for a, s in zip(program.inputs, shared, strict=True)
-        ]
-        results = [llvm.Buffer(math.prod(a.shape), _DTYPES[str(a.dtype)]) for a in program.outputs]
         try:
-            code = llvm.write(
-                graph[0], graph[1], buffers, results, llvm.vector_width() if rows > 1 else 1
-            )
-            return llvm.register(code)
+            return llvm.register(program.write(shared, rows))
         except NotScalarError:
             return None
 
@@ -310,6 +411,15 @@ def _target(program: Program, lead: tuple[int, ...], avals: Sequence[Any]) -> st
 
 class _Switch:
     on = os.environ.get("STMUAV_NATIVE_CODE", "1") != "0"
+
+
+class _Tracing(threading.local):
+    """Number of functions of the kind that are being traced, one within the other."""
+
+    depth = 0
+
+
+_tracing = _Tracing()
 
 
 def use_native_code(on: bool) -> None:
@@ -352,12 +462,19 @@ MOST_PROGRAMS = 64
 _ALLOWED = tuple(np.dtype(name) for name in _DTYPES)
 
 
-def native(function: Callable[..., Any]) -> Callable[..., Any]:
+def native(
+    function: Callable[..., Any], *, tables: Sequence[np.ndarray] | None = None
+) -> Callable[..., Any]:
     """Function that is one operation of the programs around it, as machine code where that exists.
 
     Args:
         function: pure function of pytrees; arrays are traced, all else must be hashable.
+        tables: with arrays (s, .), the operation is a loop, x[i] = function(*args, x, *(table[i] for each)) for
+            all i, for an array x (s, k) that is the last argument. Batches of it are left to XLA.
     """
+    body = function
+    if tables is not None:
+        function = _make_loop(function, tables)
     jitted: Any = eqx.filter_jit(function)
     programs: OrderedDict[Any, tuple[Program, Any] | None] = OrderedDict()
 
@@ -379,15 +496,22 @@ def native(function: Callable[..., Any]) -> Callable[..., Any]:
         if not all(isinstance(leaf, Hashable) for _, leaf in static):
             return function(*args)
         if key not in programs:
-            programs[key] = _make(function, structure, static, places, arrays)
+            owners = [k for k, arg in enumerate(args) for _ in jax.tree.leaves(arg)]
+            groups = [owners[k] for k in places]
+            programs[key] = _make(function, structure, static, places, arrays, groups)
+            entry = programs[key]
+            if tables is not None and entry is not None:
+                programs[key] = _with_body(body, tables, args, groups, entry)
             # A program holds its jaxpr, derivatives and graph. A process that makes many
             # structures, as a test suite does, would keep them all; the oldest go first.
             while len(programs) > MOST_PROGRAMS:
                 programs.popitem(last=False)
         entry = programs[key]
         # XLA compiles it as it would without this module; the graph is tried here, so that what
-        # has none is not wrapped in a primitive that hides it from XLA's fusion.
-        if entry is None or entry[0].graph() is None:
+        # has none is not wrapped in a primitive that hides it from XLA's fusion. Within another
+        # function of the kind it becomes a part of that one's graph, or is traced again where that
+        # one has none.
+        if entry is None or (not _tracing.depth and entry[0].graph() is None):
             return jitted(*args)
         program, result = entry
         return result(native_p.bind(*arrays, program=program, lead=()))
@@ -401,8 +525,37 @@ def evaluate(function: Callable[..., Any], *args: Any) -> Any:
     return function(*args)
 
 
+def _make_loop(function: Callable[..., Any], tables: Sequence[np.ndarray]) -> Callable[..., Any]:
+    """Loop over rows of tables in which a function makes one row after the other."""
+    evaluate_row = native(function)
+
+    def fill_rows(*args: Any) -> Array:
+        def add_row(x: Array, at: tuple[Any, ...]) -> tuple[Array, None]:
+            number, *row = at
+            value = evaluate_row(*args[:-1], x, *row)
+            return jax.lax.dynamic_update_index_in_dim(x, value, number, 0), None
+
+        return jax.lax.scan(add_row, args[-1], (np.arange(len(tables[0])), *tables))[0]
+
+    return fill_rows
+
+
+def _with_body(
+    function: Any, tables: Sequence[np.ndarray], args: Any, groups: Sequence[int], entry: Any
+) -> tuple[Program, Any] | None:
+    """The entry with a program that has the loop's body."""
+    whole, result = entry
+    leaves, structure = jax.tree.flatten((*args, *(table[0] for table in tables)))
+    places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
+    static = tuple((k, leaf) for k, leaf in enumerate(leaves) if k not in set(places))
+    # each table is an argument of its own
+    more = [len(args) + k for k in range(len(tables))]
+    made = _make(function, structure, static, places, [leaves[k] for k in places], [*groups, *more])
+    return None if made is None else (Recursion(whole.jaxpr, groups, made[0], tables), result)
+
+
 def _make(
-    function: Any, structure: Any, static: Any, places: Any, arrays: Any
+    function: Any, structure: Any, static: Any, places: Any, arrays: Any, groups: Any
 ) -> tuple[Program, Any] | None:
     """Program of a function for arguments of one structure, and what puts its results together."""
     form: list[Any] = []
@@ -421,11 +574,15 @@ def _make(
         form[:] = [tree, traced, [None if eqx.is_array(x) else x for x in outputs]]
         return [outputs[k] for k in traced]
 
-    jaxpr = _trace(flat, [jax.typeof(a) for a in arrays])
+    _tracing.depth += 1
+    try:
+        jaxpr = _trace(flat, [jax.typeof(a) for a in arrays])
+    finally:
+        _tracing.depth -= 1
     if any(isinstance(c, jax_core.Tracer) for c in jaxpr.consts):
         # a number that the function closes over is being traced, and may be another one next time
         return None
-    program = Program(jaxpr)
+    program = Program(jaxpr, groups)
     tree, traced, rest = form
 
     def result(values: Sequence[Any]) -> Any:
