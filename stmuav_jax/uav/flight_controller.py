@@ -569,7 +569,7 @@ class UavController(eqx.Module):
     angular momentum of the moving tracker are fed forward to the rotors, as is the moment that its servo takes.
 
     Attributes:
-        system: machine whose masses the controller believes.
+        system: machine whose masses the controller uses.
         flight: controller of the rotors. servo: servo of the panel.
         feedforward: false for a controller that takes the tracker for a rigid part in the reference
             posture.
