@@ -134,7 +134,7 @@ def test_report_of_a_flight(flight, data, tmp_path):
     assert missions.verdict(data)[1] in text
     for one in missions.measures(data):
         assert f"{one.name} {one.value:.4g}" in text
-    assert re.search(r"Largest position error [\d.]+ m 0.1 kept", text)
+    assert re.search(r"Largest position error [\d.]+ m 0.1 met", text)
     assert "mission: wind.change.at 1" in text
     # a loop without a mission has what all loops have, and says that it failed
     attributes = {k: v for k, v in data.attrs.items() if k != "mission"}
