@@ -343,7 +343,7 @@ def _speed_limits(mission_file: MissionFile, motors: RotorLimits | None) -> Roto
 
 
 def _add_pushes(scene: Scene, entries: MissionFile) -> Scene:
-    """Scene whose own actuators have plain forces, and others with sinusoidal ones if wanted."""
+    """Scene whose own actuators have plain forces, and others with sinusoidal ones on request."""
     forces, actuators = list(scene.system.forces), []
     for k, force in enumerate(forces):
         if isinstance(force, LinearActuator):
