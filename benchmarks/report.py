@@ -70,8 +70,8 @@ COMMANDS = ("simulate", "fly", "trim", "sun", "estimate", "montecarlo")
 COMPILED = {
     "uav_tracker 2, Dopri8": "flight of the UAV, Dopri8",
     "uav_tracker 2, Kvaerno5": "flight of the UAV, Kvaerno5",
-    "forward (jacfwd), 20 parameters": "its derivatives by 20 parameters, forward",
-    "reverse (grad), 20 parameters": "its gradient by 20 parameters, reverse",
+    "forward (jacfwd), 20 parameters": "its derivatives with respect to 20 parameters, forward",
+    "reverse (grad), 20 parameters": "its gradient with respect to 20 parameters, reverse",
     "trim": "trim",
 }
 
@@ -280,7 +280,9 @@ def hard_errors(content: Row) -> str:
         if peer["error"] is not None:
             return power(peer["error"])
         return (
-            "not in our adapter" if "not written" in peer["reason"] else peer["reason"].rstrip(".")
+            "not in our adapter"
+            if "not supported" in peer["reason"]
+            else peer["reason"].rstrip(".")
         )
 
     cases = [row for row in content["cases"] if row["name"] in HARD]

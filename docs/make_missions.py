@@ -42,7 +42,7 @@ ROUND_OFF = 1e-9
 
 
 def shown(measure: stm.missions.Measure) -> str:
-    """Value of a measure with its unit, and whether its tolerance was not kept."""
+    """Value of a measure with its unit, and whether its tolerance was not met."""
     value, unit = measure.value, measure.unit
     if unit in ("m", "degrees") and value < ROUND_OFF:
         words = "round-off"
@@ -52,7 +52,7 @@ def shown(measure: stm.missions.Measure) -> str:
         words = f"{value:.2g} deg" if value < 100 else f"{value:.0f} deg"
     else:
         words = "0 %, at a limit" if abs(value) < 1e-6 else f"{value:.0f} %"
-    return words if measure.is_met else f"{words}, not kept"
+    return words if measure.is_met else f"{words}, not met"
 
 
 def row(name: str, data: object) -> str:
@@ -65,7 +65,7 @@ def row(name: str, data: object) -> str:
         own = [one for one in found if one.name.startswith(begins)]
         cells.append(shown(own[0]) if own else "")
     falls = found[0].value > FALLS
-    judged = "kept" if kept else "it falls" if falls else ending or "not kept"
+    judged = "met" if kept else "it falls" if falls else ending or "not met"
     cells = [] if falls else cells
     told = " | ".join(cells) if cells else "| | | |"
     return f"| `{name}` | {end:g} s | {told} | {judged} |\n"

@@ -10,7 +10,7 @@ ROOT = Path(stmuav_jax.__file__).parent
 # Each folder may import those before it.
 FOLDERS = [
     "checks", "math", "mechanics", "estimation", "dynamics", "analysis", "control", "uav", "io",
-    "studies", "figures", "missions", "cli",
+    "studies", "figures", "missions", "cli", "__main__",
 ]  # fmt: skip
 TREES = {path: ast.parse(path.read_text()) for path in sorted(ROOT.rglob("*.py"))}
 

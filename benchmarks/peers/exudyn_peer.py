@@ -170,7 +170,7 @@ class ExudynPeer(Peer):
         model = plain(scene)
         slides = {frozenset((j.i, j.j)) for j in model.joints if j.kind == "translational"}
         if any(frozenset((a.base, a.slider)) not in slides for a in model.actuators):
-            return "An actuator on a body that does not slide on its base is not written."
+            return "An actuator on a body that does not slide on its base is not supported by our adapters."
         return ""
 
     def settings(self, scene: Scene | None = None) -> list[Setting]:

@@ -84,7 +84,7 @@ def _torques(links: LinkModel) -> list[tuple[int, float]]:
         link = links.links[k]
         along, whole = float(link.placement.R[:, 2] @ moment), np.linalg.norm(moment)
         if (link.kind, link.parent) != ("turn", -1) or abs(along) < 0.999999 * whole:
-            said = "A world moment that is not along a hinge on ground is not written."
+            said = "A world moment that is not along a hinge on ground is not supported by our adapters."
             raise UnsupportedError(said)
         found.append((k, along))
     return found

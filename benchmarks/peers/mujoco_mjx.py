@@ -19,11 +19,11 @@ class MujocoMjx(Peer):
     name = "MuJoCo MJX (CPU), RK4"
     packages = (("mujoco.mjx", "mujoco-mjx"),)
     caveats = (
-        "It leaves out the velocity term of loop constraints.",
+        "The velocity term of loop constraints is missing.",
         "Loop constraints are soft; the hardest admitted setting is used.",
         "Actuator forces are held at their mean over each step.",
     )
-    how = "The model of MuJoCo (C); one iteration of Newton's method, which equalities alone need."
+    how = "The model of MuJoCo (C); one Newton iteration, enough for equalities alone."
 
     def __init__(self) -> None:
         self._programs: dict[str, tuple[Any, float]] = {}

@@ -132,7 +132,7 @@ class PinocchioCpp(Peer):
         "rows; g++ -O3 -march=native, header templates; controlled steps with absolute and relative "
         "tolerance equal."
     )
-    caveats = ("Its compile time is the C++ compiler's, once for all scenes.",)
+    caveats = ("Compiled once by the C++ compiler for all scenes.",)
     repeats = 5
 
     def missing(self) -> str:

@@ -126,7 +126,7 @@ class PinocchioPython(Peer):
 
     name = "Pinocchio (Python), SciPy DOP853"
     packages = (("pinocchio", "pin"), ("scipy", "scipy"))
-    caveats = ("Loads are written as joint forces; those of springs by joint Jacobians.",)
+    caveats = ("Loads are applied as joint forces, spring forces through joint Jacobians.",)
     how = (
         "ABA, or constraintDynamics with rigid 3-D point constraints without proximal term (in "
         "planar mechanisms, where a third of the rows is dependent, with mu = 1e-9), called from "

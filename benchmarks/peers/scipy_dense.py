@@ -83,7 +83,7 @@ class ScipyDense(Peer):
     )
     caveats = (
         "Planar loops of spatial joints, whose rows are dependent: least squares by numpy.linalg.lstsq.",
-        "Not stabilised: violations of the constraints stay and grow.",
+        "Not stabilised: constraint violations persist and grow.",
     )
 
     def version(self) -> str:

@@ -59,12 +59,12 @@ def crank_off(run: Any) -> float:
 
 LOOP_CASES: tuple[Hard, ...] = (
     Hard("redundant loops, Bricard", "one of 30 rows depends on the others wherever the loop closes",
-         "its one coordinate, in SciPy at 1e-12", 1e-6, "m", cube, cube_off),
+         "equation of its one coordinate, SciPy at 1e-12", 1e-6, "m", cube, cube_off),
     Hard("redundant loops, four-bars", "four loops with twelve dependent rows, through postures in line",
          "closed form", 1e-4, "m", *four_bars(LOOPS)),
     Hard("dead points", "a free slider-crank turns from one dead point through the others",
-         "the crank's angle alone, in SciPy at 1e-12", 1e-5, "m", free_crank, crank_off),
-    Hard("2,000 s of a pendulum", "845 swings add their errors up, rtol 1e-11",
+         "equation of the crank's angle, SciPy at 1e-12", 1e-5, "m", free_crank, crank_off),
+    Hard("2,000 s of a pendulum", "errors accumulate over 845 swings, rtol 1e-11",
          "closed form (elliptic functions)", 1e-3, "m", *swinging(1.0, 2000.0 * np.sqrt(G)),
          method={"rtol": 1e-11, "atol": 1e-11}),
 )  # fmt: skip
@@ -84,8 +84,8 @@ def in_line(centre: float) -> stm.System:
 
 
 STARTS: tuple[tuple[str, str, Callable[[], stm.System]], ...] = (
-    ("folded four-bar", "its last rod is heavy beyond its foot: no branch balances",
+    ("folded four-bar", "its last rod's weight acts beyond its foot: no branch is in equilibrium",
      lambda: in_line(0.5)),
-    ("four-bar in line", "its rods fall as one parallelogram, or as crossed ones: both keep the "
-     "joints together", lambda: in_line(1.5)),
+    ("four-bar in line", "its rods can fall as a parallelogram or crossed: both satisfy the "
+     "constraints", lambda: in_line(1.5)),
 )  # fmt: skip

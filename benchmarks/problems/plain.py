@@ -142,7 +142,9 @@ def plain(scene: Scene, *, any_couple: bool = False) -> Plain:
     joints = []
     for joint in system.joints:
         if joint.kind not in ROWS:
-            raise UnsupportedError(f"A joint of kind {joint.kind} is not written in our adapters.")
+            raise UnsupportedError(
+                f"A joint of kind {joint.kind} is not supported by our adapters."
+            )
         i, j = index[joint.body_i], index[joint.body_j]
         points = np.asarray(joint.point_i) - com[i], np.asarray(joint.point_j) - com[j]
         frames = np.asarray(joint.frame_i), np.asarray(joint.frame_j)
@@ -191,20 +193,28 @@ def _load(
             joints = scene.system.joints
             number = next(k for k, joint in enumerate(joints) if joint.name == force.joint)
             if joints[number].kind != "translational":
-                raise UnsupportedError("A servo in a joint that turns is not written.")
+                raise UnsupportedError(
+                    "A servo in a joint that turns is not supported by our adapters."
+                )
             if callable(force.target):
-                raise UnsupportedError("A servo with a moving target is not written.")
+                raise UnsupportedError(
+                    "A servo with a moving target is not supported by our adapters."
+                )
             numbers = float(force.stiffness), float(force.damping), float(force.target)
             return "servos", Servo(number, *numbers)
     kind = type(force).__name__
-    raise UnsupportedError(f"A force of kind {kind}, as used here, is not written.")
+    raise UnsupportedError(
+        f"A force of kind {kind}, as used here, is not supported by our adapters."
+    )
 
 
 def _sinus(value: object) -> Sinus:
     if isinstance(value, Sine):
         return Sinus(np.asarray(value.amplitude), float(value.angular_frequency), 0.0)
     if callable(value):
-        raise UnsupportedError("A force that is a function of the state is not written.")
+        raise UnsupportedError(
+            "A force that is a function of the state is not supported by our adapters."
+        )
     return Sinus(np.asarray(value, dtype=float), 0.0, 0.5 * np.pi)
 
 

@@ -21,8 +21,8 @@ from stmuav_jax.uav.rotor import Rotors
 
 DIFFERENCES = (4e-3, 2e-3, 1e-3)
 PARAMETERS = (
-    "seven masses, the base's first velocity and angular velocity (three each), six squared "
-    "rotor speeds, gravity; relative changes, but m/s and rad/s"
+    "seven masses, the base's initial velocity [m/s] and angular velocity [rad/s] (three each), six "
+    "squared rotor speeds and gravity; changes of the others are relative"
 )
 
 

@@ -205,7 +205,7 @@ def batch(size: Size, others: list[Peer]) -> dict[str, Any]:
     best = max(rows, key=lambda row: row["per_second"])["block"]
     rows += [runs.row(count, min(best, count)) for count in counts if count != middle]
     first, *_ = runs.given(min(size.peer_trajectories, max(counts)), runs.tolerance)
-    said = "A batch of trajectories is not written in our adapter."
+    said = "A batch of trajectories is not supported by our adapter."
     for peer in others:
         given = (runs.scene, first, size.horizons[-1])
         found = throughput(peer, given, runs.exact, size.batch_error, PATIENCE)

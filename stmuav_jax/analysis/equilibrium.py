@@ -5,7 +5,7 @@ and the internal states of force elements. The equations are
 
     du/dt (z) = a,   dz_f/dt (z) = 0,   g(z) = 0,
 
-with the wanted accelerations a of the independent velocities, zero for an equilibrium, and further
+with the target accelerations a of the independent velocities, zero for an equilibrium, and further
 conditions g on the motion of the bodies. Where there are more unknowns than equations, the solution
 is the one nearest to the start, in the unknowns' sizes; it satisfies z - z_0 = J^T lambda beside the
 equations. Derivatives are those of the implicit function: with r(z, q) = 0, dz/dq = -r_z^-1 r_q.
@@ -68,7 +68,7 @@ class Trim(eqx.Module):
     Attributes:
         point: point of the state space.
         values: values of the inputs (m,).
-        residual: largest difference from the wanted accelerations [m/s^2] or [rad/s^2].
+        residual: largest difference from the target accelerations [m/s^2] or [rad/s^2].
         conditioning: smallest over largest singular value of the Jacobian with scaled unknowns;
             near zero, other trims lie near. A ratio does not show inputs that all lose their hold
             together: see `notes`.
@@ -182,7 +182,7 @@ class _Problem(eqx.Module):
         return point, self.values + (D * u if D.ndim == 1 else D @ u)
 
     def equations(self, z: Float[Array, " k"]) -> Float[Array, " e"]:
-        """Accelerations less those wanted, the rates of the forces' states, and the conditions."""
+        """Accelerations less their targets, the rates of the forces' states, and the conditions."""
         x, values = self.at(z)
         system = self.inputs.applied(self.space.system, values)
         # Only accelerations and states of forces are equations: velocities are what the flight
@@ -277,7 +277,7 @@ def trim(
         free: names of states that may be changed.
         inputs: inputs that may be chosen; default all of the system. Others stay as they are.
         values: inputs at the start of the search (m,); default those that the system has.
-        accelerations: wanted rates of the independent velocities (dof,); default zero.
+        accelerations: target rates of the independent velocities (dof,); default zero.
         conditions: function of positions and velocities of all bodies -> further residuals (c,), to
             be met by free states; a module or function made once, since it is compiled in.
         sizes: changes of the unknowns that count as equally far from the start, free states first,
@@ -328,7 +328,7 @@ def _solve_trim(
     start_values = inputs.values(space.system) if values is None else values
     start_values = check_numbers(start_values, (m,), "The vector of the inputs to start from", "")
     target = jnp.zeros(space.dof) if accelerations is None else accelerations
-    target = check_numbers(target, (space.dof,), "The vector of wanted accelerations", "")
+    target = check_numbers(target, (space.dof,), "The vector of target accelerations", "")
     if directions is None:
         columns = jnp.ones(m)
         # Unknowns are scaled to their sizes: squared rotor speeds of 1e6 and angles of 0.1 in one system
@@ -444,7 +444,7 @@ def steady_turn(
 
 
 def turn_acceleration(condition: FlightCondition) -> Float[Array, "3"]:
-    """Acceleration of the base, world (3,) [m/s^2]: that of the turn, and what is wanted beside it."""
+    """Acceleration of the base, world (3,) [m/s^2]: that of the turn plus that of the condition."""
     x, y, _ = condition.v
     return condition.rate * jnp.stack([-y, x, jnp.zeros_like(x)]) + condition.acceleration
 

@@ -113,7 +113,7 @@ class Identified:
             sizes, with an unknown start.
         reduced_chi_square: the sum of squares over (numbers in the record less p); near
             one if sigma is right.
-        verdict: whether values and deviations can be believed; `verdict.words` says it in sentences.
+        verdict: whether values and deviations are valid; `verdict.explanation` has the reasons.
         residuals: residuals over sigma (k, m), NaN where the record is missing.
         start: the motion's start by the whole record; None where it was taken as exact.
         search: the least-squares search.
@@ -672,7 +672,7 @@ def identify(
     report: Callable[[Search], None] | None = None,
     resume: Search | None = None,
 ) -> Identified:
-    """Identify parameters by least squares from a record, with a verdict whether to believe them.
+    """Identify parameters by least squares from a record, with a verdict on their validity.
 
     Standard deviations are those of white residuals if the residuals are white, enlarged by the root of the
     reduced chi-squared where that is larger than chance allows, and else by blocks of residuals; where

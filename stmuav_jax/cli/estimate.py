@@ -65,8 +65,8 @@ def run_estimate(command: Any) -> int:
     table = load_parameters(command.params, PART_III)
     names = ("report", "consistent") if command.tuning == "both" else (command.tuning,)
     # The filter's model may differ from the truth, as it always does in practice.
-    believed = load_parameters(command.filter_params, table)
-    case_table, paths, verdicts = _estimate_cases(command, names, table, believed)
+    filter_table = load_parameters(command.filter_params, table)
+    case_table, paths, verdicts = _estimate_cases(command, names, table, filter_table)
     out = Console()
     out.print(case_table)
     for line in verdict_lines(verdicts):
@@ -80,7 +80,7 @@ def run_estimate(command: Any) -> int:
 
 
 def _estimate_cases(
-    command: Estimate, names: tuple, table: Any, believed: Any
+    command: Estimate, names: tuple, table: Any, filter_table: Any
 ) -> tuple[Table, list[Path], dict[str, Any]]:
     from ..figures.estimate import CASE_FIGURES, labelled_case, summary_table
     from ..figures.plot import save_figures
@@ -103,9 +103,9 @@ def _estimate_cases(
             if key not in tuning_by_key:
                 kind = kinds[name]
                 tuning_by_key[key] = (
-                    report_tuning(kind, parameters=believed)
+                    report_tuning(kind, parameters=filter_table)
                     if name == "report"
-                    else consistent_tuning(case, kind, parameters=believed)
+                    else consistent_tuning(case, kind, parameters=filter_table)
                 )
             tunings.append(tuning_by_key[key])
         study = study_case(

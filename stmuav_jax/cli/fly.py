@@ -24,7 +24,7 @@ class Fly:
     A mission is a TOML file (docs/control_and_missions.md) or a ready one: hover, case-1 to case-3,
     sun-slew, sun-day, waypoints, wind-step, gusts, rotor-weak, rotor-lost, rotor-lost-known,
     slider-jammed, slew-30, battery, takeoff-and-land.
-    Example: stmuav fly case-1 --t1 5. Exit code: 0 all tolerances and limits were kept; 1 the flight
+    Example: stmuav fly case-1 --t1 5. Exit code: 0 all tolerances and limits were met; 1 the flight
     failed; 2 wrong input; 3 flown, but not as the mission asks."""
 
     mission: tyro.conf.Positional[str]
@@ -105,7 +105,7 @@ def _print_flight(out: Console, data: Any, flight: "MissionFlight") -> None:
     measure_table = make_table("quantity", "value", "allowed", title=data.attrs["title"] or None)
     for measure in measures(data):
         allowed = "-" if measure.allowed is None else f"{measure.allowed:g}"
-        mark = "" if measure.is_met else "  (not kept)"
+        mark = "" if measure.is_met else "  (not met)"
         add_row(
             measure_table, measure.name, f"{measure.value:.4g} {measure.unit}", f"{allowed}{mark}"
         )

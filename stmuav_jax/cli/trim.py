@@ -126,7 +126,7 @@ class TrimSettings(LinearSettings, FlightSettings, PostureSettings):
     out: Annotated[Path | None, shared_option("out"), default_text("runs/trim_SCENE")] = None
 
 
-ABOUT = """Find the inputs, and states if wanted, of a steady motion of any mechanism; write trim.json.
+ABOUT = """Find the inputs, and optionally states, of a steady motion of any mechanism; write trim.json.
 
 With --linear also the modes, and A, B, C, D with names to linear.npz. With --path or --survey instead of a trim:
 the inputs along a path of joints, or a map of postures.
@@ -193,7 +193,7 @@ def _target_accelerations(space: "TreeSpace", settings: TrimSettings) -> np.ndar
     acceleration_by_name = scalars_by_name(settings.accelerations, "--accelerations")
     names = [name for name, _ in space.names[space.dof : 2 * space.dof]]
     target = np.zeros(space.dof)
-    places = named_places(list(acceleration_by_name), names, "The wanted accelerations", "velocity")
+    places = named_places(list(acceleration_by_name), names, "The target accelerations", "velocity")
     target[list(places)] = list(acceleration_by_name.values())
     return target
 
@@ -391,7 +391,7 @@ def table_of(params: Path | None) -> "Parameters":
     return load_parameters(params, PART_II)
 
 
-def wanted_of(settings: SteadyFlight, values: "Parameters") -> Any:
+def compute_flight_target(settings: SteadyFlight, values: "Parameters") -> Any:
     """The flight condition that the options describe."""
     from ..uav.tracker.geometry import initial_angles
 
@@ -433,7 +433,7 @@ def _solve_uav(
     from ..uav.flight import TrimReason, trim_flight, trim_slopes
     from ..uav.scenes.uav_tracker import make_uav
 
-    target, uav = wanted_of(command.flight, parameters), make_uav(parameters)
+    target, uav = compute_flight_target(command.flight, parameters), make_uav(parameters)
     # Parameters to be differentiated by are traced, so that the whole construction of the UAV is part of
     # the derivative.
     values = {name: as_floats(parameters.value(name)) for name in command.by}

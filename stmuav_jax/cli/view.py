@@ -206,7 +206,7 @@ def _mission_content(data: "xr.Dataset") -> dict[str, Any]:
     failure = data.attrs.get("failure", "")
     rows = [
         (measure.name, f"{measure.value:.4g} {measure.unit}", "" if measure.allowed is None else f"{measure.allowed:g}",
-         "" if measure.allowed is None else "kept" if measure.is_met else "not kept")
+         "" if measure.allowed is None else "met" if measure.is_met else "not met")
         for measure in measures(data)
     ]  # fmt: skip
     figures += [(name.capitalize(), figure) for name, figure in flight_figures(data).items()]

@@ -98,7 +98,9 @@ def content_of(
         "reactions": encode_array(run["reaction_force"].values)
         if "reaction_force" in run
         else None,
-        "wanted": encode_array(run["wanted_position"].values) if "wanted_position" in run else None,
+        "reference": encode_array(run["reference_position"].values)
+        if "reference_position" in run
+        else None,
         "rotors": _rotor_data(run),
         "sun": None if towards is None else towards.tolist(),
         "watch": watched_bodies(run),

@@ -35,6 +35,16 @@ FORMAT_VERSION = 2
 LOOP_FORMAT, LOOP_VERSION = "stmuav_jax closed loop", 1
 # Version of each format that this package reads.
 _READ = {FORMAT: FORMAT_VERSION, LOOP_FORMAT: LOOP_VERSION}
+# Signals of missions by their names in files of version 0.3.0 and before, which have the same content.
+_FORMER_NAMES = {
+    "wanted_force": "commanded_force",
+    "wanted_effort": "commanded_effort",
+    "wanted_position": "reference_position",
+    "wanted_heading": "reference_heading",
+    "wanted_panel_angles": "reference_panel_angles",
+    "wanted_joint_position": "reference_joint_position",
+    "believed_centre_of_mass": "estimated_centre_of_mass",
+}
 
 _PACKAGES = ("stmuav-jax", "jax", "jaxlib", "diffrax", "equinox", "lineax", "numpy", "xarray")
 
@@ -304,7 +314,7 @@ def load(path: str | os.PathLike[str]) -> "xr.Dataset":
         raise FileError(
             f"{source} has format version {version}; this package reads version {supported_version}."
         )
-    return run_data
+    return run_data.rename({old: new for old, new in _FORMER_NAMES.items() if old in run_data})
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:

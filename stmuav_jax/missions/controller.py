@@ -317,11 +317,15 @@ def _command_pilot(pilot: Any, estimate: Any, reference: MissionReference, memor
         assert reference.joints is not None
         return pilot(estimate, JointReference(reference.waypoint, reference.joints), memory)
     state = getattr(estimate, "state", estimate)
-    return pilot(estimate, UavReference(reference.waypoint, wanted_panel(reference, state)), memory)
+    return pilot(
+        estimate,
+        UavReference(reference.waypoint, compute_panel_reference(reference, state)),
+        memory,
+    )
 
 
-def wanted_panel(reference: MissionReference, state: State) -> PairMotion:
-    """Wanted motion of the panel angles, at the base's attitude in a state."""
+def compute_panel_reference(reference: MissionReference, state: State) -> PairMotion:
+    """Reference motion of the panel angles, at the base's attitude in a state."""
     panel_reference = reference.panel
     assert panel_reference is not None
     return (

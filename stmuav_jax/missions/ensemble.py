@@ -1,7 +1,7 @@
 """Monte Carlo study of a mission: it is flown by many machines, each in its own gusts and noise.
 
-The truth is drawn: parameters of the machine, gusts, noise of the sensors. What controller and
-estimator believe stays that of the mission's file. Flights go side by side in one compiled program,
+The truth is drawn: parameters of the machine, gusts, noise of the sensors. Controller and
+estimator use the numbers of the mission's file. Flights go side by side in one compiled program,
 which keeps of each its largest errors and smallest margins.
 """
 
@@ -65,7 +65,7 @@ _QUANTITIES: dict[str, tuple[str, str]] = {
     "force_margin": ("1", "smallest margin of the actuators' forces, share of the range"),
     "effort_margin": ("1", "smallest margin of the joints' efforts, share of the range"),
     "energy": ("J", "electrical energy used"),
-    "kept": ("1", "whether all tolerances and limits were kept"),
+    "kept": ("1", "whether all tolerances and limits were met"),
 }
 
 
@@ -309,7 +309,9 @@ def _join_worst(mission: Mission, of: _Nominal, worst: Worst, chunk_rollout: Rol
     if mission.machine.force is not None:
         top, jam = of.controller.force, of.controller.jam
         counted = flight_mask[:, None] & (True if jam is None else ts[:, None] < jam.at)
-        forces = jnp.minimum(forces, _smallest_margin(gauges["wanted_force"], -top, top, counted))
+        forces = jnp.minimum(
+            forces, _smallest_margin(gauges["commanded_force"], -top, top, counted)
+        )
     efforts, joints = worst.efforts, worst.joints
     if "joint_error" in gauges:
         counted = base[:, None]
@@ -319,7 +321,7 @@ def _join_worst(mission: Mission, of: _Nominal, worst: Worst, chunk_rollout: Rol
         is_limited = np.isfinite(mission.machine.efforts)
         counted = flight_mask[:, None] & is_limited
         efforts = jnp.minimum(
-            efforts, _smallest_margin(gauges["wanted_effort"], -top, top, counted)
+            efforts, _smallest_margin(gauges["commanded_effort"], -top, top, counted)
         )
     panel_error = worst.panel
     if "panel_error" in gauges:

@@ -37,8 +37,8 @@ def flight_errors(data: xr.Dataset) -> Figure:
 def flight_panel(data: xr.Dataset) -> Figure:
     """Figure of the panel angles against their reference, and of the angle between both normals."""
     figure, axes = grid(2, 1, 5.0)
-    both = np.concatenate([data.panel_angles.values, data.wanted_panel_angles.values], axis=1)
-    labels = ("phi", "theta", "phi wanted", "theta wanted")
+    both = np.concatenate([data.panel_angles.values, data.reference_panel_angles.values], axis=1)
+    labels = ("phi", "theta", "phi reference", "theta reference")
     plot_histories(axes[0, 0], data.time.values, both / _DEGREE, labels)
     _label_axes(axes[0, 0], "panel angles [degrees]")
     plot_histories(
@@ -84,8 +84,8 @@ def flight_strokes(data: xr.Dataset) -> Figure:
 def flight_forces(data: xr.Dataset) -> Figure:
     """Figure of the forces that the servo asks of the tracker's actuators, with their limits."""
     figure, axes = grid(1, 1, 3.4)
-    _plot_many(axes[0, 0], data, "wanted_force", "force", "slider")
-    _label_axes(axes[0, 0], "force wanted [N]")
+    _plot_many(axes[0, 0], data, "commanded_force", "force", "slider")
+    _label_axes(axes[0, 0], "commanded force [N]")
     return _add_title(figure, data)
 
 
@@ -95,8 +95,10 @@ def flight_joints(data: xr.Dataset) -> Figure:
     scale, unit = np.where(turning, _DEGREE, 1.0), "degrees" if np.all(turning) else "degrees or m"
     figure, axes = grid(2, 1, 5.0)
     names = [str(name) for name in data.driven_joint.values]
-    both = np.concatenate([data.joint_position.values, data.wanted_joint_position.values], axis=1)
-    labels = (*names, *(f"{name} wanted" for name in names))
+    both = np.concatenate(
+        [data.joint_position.values, data.reference_joint_position.values], axis=1
+    )
+    labels = (*names, *(f"{name} reference" for name in names))
     plot_histories(axes[0, 0], data.time.values, both / np.tile(scale, 2), labels)
     _label_axes(axes[0, 0], f"joints [{unit}]")
     plot_histories(axes[1, 0], data.time.values, data.joint_error.values / scale, tuple(names))
@@ -153,7 +155,7 @@ _NEEDED = {
     "joints": "joint_error",
     "panel": "panel_error",
     "strokes": "displacement",
-    "forces": "wanted_force",
+    "forces": "commanded_force",
 }
 
 

@@ -129,7 +129,7 @@ def describe_failure(mission: Mission, rows: Rollout, run: LoopRun) -> str:
         )
     if machine.force is not None:
         note_first(
-            np.abs(signals["wanted_force"]) > machine.force,
+            np.abs(signals["commanded_force"]) > machine.force,
             lambda k: f"the servo asked slider {k[1] + 2} for more than {machine.force:g} N",
         )
     note_first(signals["tilt_error"] > np.pi / 2, lambda k: "the base was upside down")

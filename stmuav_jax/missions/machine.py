@@ -77,7 +77,7 @@ def table_carrying(table: Parameters, bodies: PanelBodies) -> Parameters:
 
 
 class WithoutPayload(eqx.Module):
-    """Function of a plant's true state that returns that of the machine which its controller believes.
+    """Function of a plant's true state that returns that of the controller's nominal model.
 
     The panel's row is where the panel's own centre of mass is, not where that of panel and payload is.
 
@@ -128,8 +128,8 @@ class Machine(NamedTuple):
         scene: its scene. rotors: the rotors or motors. table: its parameters.
         bodies: bodies of the tracker, and limits: of its workspace; None without a tracker.
         speeds: limits of the rotor speeds, or None.
-        believed: system without the payload, of which the controller does not know; None where it is
-            that of the scene. `bodies` are those that the controller believes.
+        nominal: system of the controller's model, without the unknown payload; None where it is
+            that of the scene. `bodies` are those of the controller's model.
         force: largest force of each of the tracker's actuators, either way [N]; None for no limit.
         model: the model's file; None for a ready scene. joints: its driven joints.
     """
@@ -140,7 +140,7 @@ class Machine(NamedTuple):
     bodies: PanelBodies | None
     limits: Limits | None
     speeds: RotorLimits | None
-    believed: System | None = None
+    nominal: System | None = None
     force: float | None = None
     model: ParametricModel | None = None
     joints: tuple[DrivenJoint, ...] = ()
@@ -204,7 +204,7 @@ def _add_payload(empty: Machine, entries: MissionFile) -> Machine:
     if entries.controller.payload == "known":
         return loaded._replace(bodies=bodies)
     # A controller that does not know of the payload flies by the model of the empty machine.
-    return loaded._replace(believed=empty.scene.system)
+    return loaded._replace(nominal=empty.scene.system)
 
 
 def scene_of(
@@ -343,7 +343,7 @@ def _speed_limits(mission_file: MissionFile, motors: RotorLimits | None) -> Roto
 
 
 def _add_pushes(scene: Scene, entries: MissionFile) -> Scene:
-    """Scene whose own actuators have plain forces, and others with sinusoidal ones if wanted."""
+    """Scene whose own actuators have plain forces, and others with sinusoidal ones on request."""
     forces, actuators = list(scene.system.forces), []
     for k, force in enumerate(forces):
         if isinstance(force, LinearActuator):
@@ -371,12 +371,12 @@ def plant_of(mission_file: MissionFile, machine: Machine) -> Plant:
             moves although it is to stand first.
     """
     system, rate = machine.scene.system, mission_file.rates.control
-    # The controller's numbers are those it believes, and only the plant has the true ones.
-    believed_system = system if machine.believed is None else machine.believed
+    # The controller uses its own numbers; only the plant has the true ones.
+    nominal_system = system if machine.nominal is None else machine.nominal
     names = input_names(machine)
     count, mass = (
         machine.rotors.spin.shape[0],
-        float(np.sum(np.asarray(believed_system.bodies.mass))),
+        float(np.sum(np.asarray(nominal_system.bodies.mass))),
     )
     hover = hover_speed_squared(mass, gravity_of(system), machine.rotors.k_f, count)
     rest = (
@@ -395,10 +395,10 @@ def plant_of(mission_file: MissionFile, machine: Machine) -> Plant:
     if mission_file.sensors is None:
         # True states are those of the true machine; a controller without the payload has to get
         # those of its own model.
-        observe = None if machine.believed is None else WithoutPayload(system, believed_system)
+        observe = None if machine.nominal is None else WithoutPayload(system, nominal_system)
         observe = observe if payloads is None else Unloaded(payloads, observe)
         return Plant(scene, observe=observe, **settings)
-    chain = None if machine.model is None or not system.joints else JointChain(believed_system)
+    chain = None if machine.model is None or not system.joints else JointChain(nominal_system)
     instruments = _make_instruments(mission_file.sensors, machine, chain, mission_file.faults)
     estimator_settings: dict[str, Any] = {"tracker": machine.bodies}
     if chain is not None:
@@ -533,7 +533,7 @@ def _make_pilot(
 ) -> Pilot:
     """Controller of a machine that knows of lost rotors."""
     entry = entries.controller
-    system = machine.scene.system if machine.believed is None else machine.believed
+    system = machine.scene.system if machine.nominal is None else machine.nominal
     gains = FlightGains(**entry.gains.model_dump(exclude_none=True))
     # The same flight controller under all of them: joints and panel only add what they need from
     # the rotors.

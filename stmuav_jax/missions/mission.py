@@ -476,8 +476,8 @@ def _check_pilot(mission: Mission, pilot: Pilot) -> float:
     machine, plant = mission.machine, mission.plant
     pilot = pilot.pilot if isinstance(pilot, AdaptiveController) else pilot
     system, start, observe = machine.scene.system, machine.scene.state0, None
-    if machine.believed is not None:
-        observe = WithoutPayload(system, machine.believed)
+    if machine.nominal is not None:
+        observe = WithoutPayload(system, machine.nominal)
     hover = make_hover(system, start, input_names(machine), pilot, plant.rate, observe)
     # The machine is linearised once; delays and gains only close the loop anew.
     make_loop = lambda delay, pilot=pilot: hover.close(pilot, delay)

@@ -28,8 +28,8 @@ _BATTERY: dict[str, Label] = {
 MARGINS = (
     ("rotor_speed", "rotor speeds", "speed"),
     ("displacement", "strokes", "displacement"),
-    ("wanted_force", "actuators' forces", "force"),
-    ("wanted_effort", "joints' efforts", "effort"),
+    ("commanded_force", "actuators' forces", "force"),
+    ("commanded_effort", "joints' efforts", "effort"),
 )
 # Round-off of speeds that are held at a limit, as a share of the range.
 AT_LIMIT = 1e-9
@@ -246,7 +246,7 @@ def margin_history(data: "xr.Dataset", name: str, limit: str) -> np.ndarray:
     low, high = data[f"lowest_{limit}"].values, data[f"highest_{limit}"].values
     values = np.array(data[name].values)
     # a rotor that has failed is within no limits, and the servo of a jammed slider asks in vain
-    kind, first = {"rotor_speed": ("rotor", 1), "wanted_force": ("slider", 2)}.get(name, ("", 0))
+    kind, first = {"rotor_speed": ("rotor", 1), "commanded_force": ("slider", 2)}.get(name, ("", 0))
     for fault in json.loads(data.attrs["mission"])["faults"] if kind else ():
         if fault[kind] is not None:
             values[data.time.values >= fault["at"], fault[kind] - first] = np.nan
@@ -327,15 +327,15 @@ def verdict(data: "xr.Dataset") -> tuple[bool, str]:
     if any(fault.get("known") for fault in mission["faults"]):
         sentence += ". With lost rotors its closed loop was checked as if the machine did not turn"
     if broken:
-        return False, f"{sentence}. Not kept: {', '.join(broken)}."
+        return False, f"{sentence}. Not met: {', '.join(broken)}."
     base, panel = _tolerance_times(data)
     if not _has_reached(data, base):
-        return is_complete, f"{sentence}. Limits were kept; tolerances hold from {base:g} s on."
+        return is_complete, f"{sentence}. Limits were met; tolerances hold from {base:g} s on."
     if "panel_error" in data and not _has_reached(data, panel):
         sentence = (
-            f"{sentence}. Tolerances and limits were kept; the panel's holds from {panel:g} s on."
+            f"{sentence}. Tolerances and limits were met; the panel's holds from {panel:g} s on."
         )
         return is_complete, sentence
     if not is_complete:
-        return False, f"{sentence}. Until then, tolerances and limits were kept."
-    return True, f"{sentence}. All tolerances and limits were kept."
+        return False, f"{sentence}. Until then, tolerances and limits were met."
+    return True, f"{sentence}. All tolerances and limits were met."

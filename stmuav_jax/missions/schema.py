@@ -164,7 +164,7 @@ class PointEntry(Entries):
 class PathEntry(Entries):
     """Entry for the path: a place to hold, waypoints, or a constant acceleration [m/s^2].
 
-    It begins where the machine starts, or elsewhere where that is wanted, with a `step`.
+    It begins where the machine starts, or elsewhere with a `step`.
     """
 
     step: bool = False

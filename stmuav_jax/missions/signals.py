@@ -22,7 +22,7 @@ from ..uav.motion_estimator import MotionEstimate
 from ..uav.panel_servo import PanelBodies, panel_motion
 from ..uav.rotor import drag_power
 from ..uav.tracker.kinematics import PairMotion, panel_normal, stroke_motion
-from .controller import MissionReference, wanted_panel
+from .controller import MissionReference, compute_panel_reference
 from .machine import Machine
 from .payloads import Payloads
 
@@ -31,9 +31,9 @@ _JOINTS = ("time", "driven_joint")
 _ANGLES, _SLIDERS, _TIME = ("time", "panel_angle"), ("time", "slider"), ("time",)
 # Dimensions, unit and description of each signal.
 GAUGES: dict[str, tuple[tuple[str, ...], str, str]] = {
-    "wanted_position": (_AXES, "m", "reference of the base, world axes"),
+    "reference_position": (_AXES, "m", "reference of the base, world axes"),
     "position_error": (_AXES, "m", "of the base from its reference, world axes"),
-    "wanted_heading": (_TIME, "rad", "reference of the base's yaw"),
+    "reference_heading": (_TIME, "rad", "reference of the base's yaw"),
     "heading_error": (_TIME, "rad", "of the base's yaw from its reference"),
     "tilt_error": (_TIME, "rad", "angle of the base's z axis from the thrust that the path needs"),
     "rotor_speed": (
@@ -47,15 +47,19 @@ GAUGES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "electric_power": (_TIME, "W", "of motors, actuators and joints that push, and electronics"),
     "estimated_position": (_AXES, "m", "of the base, by the estimator"),
     "panel_angles": (_ANGLES, "rad", "of the panel in the base's axes"),
-    "wanted_panel_angles": (_ANGLES, "rad", "reference of the panel, at the base's true attitude"),
+    "reference_panel_angles": (
+        _ANGLES,
+        "rad",
+        "reference of the panel, at the base's true attitude",
+    ),
     "panel_error": (_TIME, "rad", "angle of the panel's normal from its reference"),
     "displacement": (_SLIDERS, "m", "of the sliders from the initial posture"),
-    "wanted_force": (_SLIDERS, "N", "that the servo asks of the actuators, before their limits"),
+    "commanded_force": (_SLIDERS, "N", "that the servo asks of the actuators, before their limits"),
     "actuator_power": (_TIME, "W", "mechanical power of both actuators"),
     "joint_position": (_JOINTS, "rad or m", "coordinates of driven joints"),
-    "wanted_joint_position": (_JOINTS, "rad or m", "reference of the driven joints"),
+    "reference_joint_position": (_JOINTS, "rad or m", "reference of the driven joints"),
     "joint_error": (_JOINTS, "rad or m", "of the driven joints from their reference"),
-    "wanted_effort": (_JOINTS, "N m or N", "efforts in joints, before their limits"),
+    "commanded_effort": (_JOINTS, "N m or N", "efforts in joints, before their limits"),
     "joint_power": (_TIME, "W", "mechanical power of the efforts in joints, within their limits"),
     "gear_load": (_TIME, "N", "of the ground on all feet of the landing gear, upwards"),
     "gear_depth": (_TIME, "m", "of the lowest foot below the ground's height, negative in flight"),
@@ -64,7 +68,7 @@ GAUGES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "payload_moment": (_AXES, "kg m", "first moment of the payload, estimated; its carrier's axes"),
     "payload_moment_deviation": (_AXES, "kg m", "standard deviation of payload_moment"),
     "centre_of_mass": (_AXES, "m", "of all bodies from the base's, base axes"),
-    "believed_centre_of_mass": (_AXES, "m", "centre of mass that was fed forward"),
+    "estimated_centre_of_mass": (_AXES, "m", "centre of mass that was fed forward"),
 }
 
 
@@ -125,9 +129,9 @@ class Gauges(eqx.Module):
             squared = sample.held_inputs[: self.rotors]
         power = jnp.sum(drag_power(squared, self.k_tau))
         result = {
-            "wanted_position": targets.r,
+            "reference_position": targets.r,
             "position_error": state.r[0] - targets.r,
-            "wanted_heading": targets.heading,
+            "reference_heading": targets.heading,
             "heading_error": jnp.arctan2(jnp.sin(yaw), jnp.cos(yaw)),
             "tilt_error": _angle_between(R[:, 2], targets.a - self.gravity),
             "rotor_speed": jnp.sqrt(squared),
@@ -147,7 +151,7 @@ class Gauges(eqx.Module):
             panel_signals = self._panel_signals(
                 state, sample.reference, sample.held_inputs[self.rotors :]
             )
-            panel_signals["wanted_force"] = sample.memory.commanded
+            panel_signals["commanded_force"] = sample.memory.commanded
             # each actuator of its own: what one brakes does not drive the other
             pushing = jnp.sum(jnp.maximum(panel_signals.pop("powers"), 0.0))
             result |= panel_signals
@@ -169,7 +173,7 @@ class Gauges(eqx.Module):
             "payload_moment": memory.payload.mean[4:7],
             "payload_moment_deviation": spread[4:7],
             "centre_of_mass": rotation_matrix(state.p[0]).T @ centre,
-            "believed_centre_of_mass": memory.centre,
+            "estimated_centre_of_mass": memory.centre,
         }
 
     def _joint_signals(
@@ -189,9 +193,9 @@ class Gauges(eqx.Module):
         demanded_efforts = jnp.stack(efforts)
         signals = {
             "joint_position": values,
-            "wanted_joint_position": targets,
+            "reference_joint_position": targets,
             "joint_error": joint_errors(self.joints, values, targets),
-            "wanted_effort": demanded_efforts,
+            "commanded_effort": demanded_efforts,
         }
         return signals, jnp.clip(demanded_efforts, -self.efforts, self.efforts) * rates
 
@@ -200,7 +204,7 @@ class Gauges(eqx.Module):
     ) -> dict[str, Any]:
         assert self.bodies is not None
         assert self.home is not None
-        angles, targets = panel_motion(state), wanted_panel(reference, state)
+        angles, targets = panel_motion(state), compute_panel_reference(reference, state)
         slider_motion = stroke_motion(self.bodies.geometry, angles)
         target = reference.panel
         if isinstance(target, PairMotion):
@@ -210,7 +214,7 @@ class Gauges(eqx.Module):
             error = _angle_between(rotation_matrix(state.p[-1])[:, 2], target.value)
         return {
             "panel_angles": angles.value,
-            "wanted_panel_angles": targets.value,
+            "reference_panel_angles": targets.value,
             "panel_error": error,
             "displacement": slider_motion.value - self.home,
             "actuator_power": forces @ slider_motion.rate,

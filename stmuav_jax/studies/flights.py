@@ -324,7 +324,7 @@ class FlightEvaluation(AbstractBatch):
 
 
 def _orient_signal(quantity: Quantity, g: Any) -> Any:
-    """Monitored signal, whose maximum or rise above zero is the wanted quantity."""
+    """Monitored signal, whose maximum or rise above zero is the quantity."""
     if quantity.take == "smallest":
         return -g
     if quantity.take == "when_above":

@@ -306,7 +306,7 @@ class Store:
         ones. `dataset(...).load()` reads all of them; `load` verifies them too.
 
         Args:
-            columns: names of the wanted columns; default all.
+            columns: names of the columns to read; default all.
         """
         chosen = self._choose_columns(columns)
         others = [name for name in self.columns if name not in chosen]

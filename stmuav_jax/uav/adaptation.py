@@ -71,7 +71,7 @@ class Carrier(NamedTuple):
 
 
 class Payload(NamedTuple):
-    """Payload as a change of the machine that a controller believes in.
+    """Payload as a change of the machine in a controller's model.
 
     Attributes:
         mass: dm [kg].
@@ -448,7 +448,7 @@ class AdaptiveController(eqx.Module):
     allocation, and to the servo of a panel.
 
     Args:
-        pilot: controller of the rotors, or of a UAV with its tracker; it believes the machine without
+        pilot: controller of the rotors, or of a UAV with its tracker, for the machine without
             payload.
         filter: filter of the payload, for the same machine.
 

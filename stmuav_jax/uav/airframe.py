@@ -153,7 +153,7 @@ _AIR = {
     # a start at the origin stands on it, its feet at the depth zero
     "gear.ground": Parameter(-0.2, "m", _CHOICE + ", at the feet of a start at the origin"),
     "gear.stiffness": Parameter(2e4, "N/m", _CHOICE + ", 0.9 mm under the weight of the UAV"),
-    "gear.damping": Parameter(150.0, "N s/m", _CHOICE + ", some 40 % of the critical"),
+    "gear.damping": Parameter(150.0, "N s/m", _CHOICE + ", about 40 % of critical damping"),
     "gear.width": Parameter(1e-3, "m", _CHOICE),
     "gear.friction": Parameter(0.6, "1", _CHOICE),
     "gear.slip_speed": Parameter(0.02, "m/s", _CHOICE),
@@ -238,10 +238,10 @@ ENERGY = Parameters("ENERGY", {
     "battery.open_circuit_voltage": Parameter(
         (19.62, 21.66, 22.14, 22.38, 22.8, 23.22, 24.12, 24.66, 25.2), "V",
         _CHOICE + ", six lithium-polymer cells in series"),
-    "battery.reserve": Parameter(0.2, "1", _CHOICE + ", share of the charge that stays"),
+    "battery.reserve": Parameter(0.2, "1", _CHOICE + ", fraction of the charge that is not used"),
     # a square plate of the panel's mass and moment J_zz has sides of 0.128 m
     "cells.area": Parameter(0.0169, "m^2", "0.13 m by 0.13 m, after the panel's inertia (report Part II, Table 5.3)"),
     "cells.efficiency": Parameter(0.2, "1", _CHOICE + ", crystalline silicon"),
-    "cells.converter_efficiency": Parameter(0.95, "1", _CHOICE + ", tracker of the maximum power point"),
+    "cells.converter_efficiency": Parameter(0.95, "1", _CHOICE + ", maximum power point tracker"),
 })
 # fmt: on

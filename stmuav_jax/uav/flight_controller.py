@@ -314,7 +314,7 @@ class FlightController(eqx.Module):
     """Controller of the rotors: position and heading of the machine's base follow a `Waypoint`.
 
     The estimate is a `State` of all bodies, a `MotionEstimate`, or the `BaseMotion` of the base; the
-    reference is a `Waypoint`, the memory a `FlightMemory`. While the rotors cannot give the wanted wrench, and
+    reference is a `Waypoint`, the memory a `FlightMemory`. While the rotors cannot give the target wrench, and
     while a foot of the base's landing gear (`GroundContact`) is below the ground's height by the estimate, the
     integral of the position error stands still.
 
@@ -466,7 +466,7 @@ def within_limits(
     """Squared rotor speeds within limits, and whether they give the wrench.
 
     Minimum-norm speeds where these are within the limits. Otherwise, in this order: the largest
-    share of the tilting moment that some thrust allows, the thrust nearest to the wanted one, and
+    share of the tilting moment that some thrust allows, the thrust nearest to the target, and
     the largest share of the turning moment. Other speeds than those of minimum norm, which might give
     the wrench, are not searched for.
 
@@ -553,8 +553,8 @@ class UavReference(NamedTuple):
     """Reference of a `UavController`.
 
     Attributes:
-        waypoint: wanted motion of the base.
-        panel: wanted panel angles in the base's axes, with rates and accelerations; or the
+        waypoint: target motion of the base.
+        panel: target panel angles in the base's axes, with rates and accelerations; or the
             direction (3,) in the world that the panel is to face.
     """
 
@@ -569,7 +569,7 @@ class UavController(eqx.Module):
     angular momentum of the moving tracker are fed forward to the rotors, as is the moment that its servo takes.
 
     Attributes:
-        system: machine whose masses the controller believes.
+        system: machine whose masses the controller uses.
         flight: controller of the rotors. servo: servo of the panel.
         feedforward: false for a controller that takes the tracker for a rigid part in the reference
             posture.

@@ -161,7 +161,7 @@ class JointController(eqx.Module):
     first, then efforts and targets in the order of `joints`.
 
     Args:
-        system: machine whose masses the controller believes; of its forces, drag and the lag of motors are
+        system: machine whose masses the controller uses; of its forces, drag and the lag of motors are
             left out.
         flight: controller of the rotors.
         gains: gains of joints with an effort, by name; of others `JointGains()`.
@@ -210,10 +210,10 @@ class JointController(eqx.Module):
             if k not in places and not isinstance(force, AirframeDrag)
         ]
         forces += [JointEffort(drive.joint, 0.0, coordinate=drive.kind) for drive in joints]
-        believed = dataclasses.replace(system, forces=tuple(forces))
-        self.model = Tree().prepare(believed)
+        nominal = dataclasses.replace(system, forces=tuple(forces))
+        self.model = Tree().prepare(nominal)
         count, rotors = len(joints), flight.wrenches.shape[1]
-        every = inputs_of(believed).entries
+        every = inputs_of(nominal).entries
         squared = [entry for entry in every if entry.field.endswith("speed_squared")]
         last = [entry for entry in every if entry.force >= len(forces) - count]
         assert (len(squared), len(last)) == (rotors, count)

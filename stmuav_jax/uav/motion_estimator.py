@@ -108,8 +108,8 @@ class MotionEstimator(eqx.Module):
     """Estimator of pose, velocity and the biases of its sensors, and of the tracker's panel angles.
 
     It is a function (readings, inputs, memory) -> (`MotionEstimate`, memory) for a `Plant` with the
-    same instruments. Their noise, rates and delays are those that the estimator believes; their
-    biases it does not know. A fix's own bias cannot be told from the motion, and stays in it.
+    same instruments. The estimator uses their noise, rates and delays; their
+    biases are unknown to it. A fix's own bias cannot be told from the motion, and stays in it.
 
     A reading of NaN is missing, and counted: a fix or encoder is left out, gyroscope and accelerometer keep
     their last reading, whose error grows by `turning_change` and `force_change`. A fix too far from

@@ -98,7 +98,7 @@ def inverse_dynamics(
     """Actuator forces for a motion of the panel on a base at rest.
 
     Args:
-        angles: angles, rates and wanted accelerations.
+        angles: angles, rates and target accelerations.
         gravity_b: acceleration of free fall, base axes (3,) [m/s^2]; less that of the base.
         about: point of the base for the moment (3,) [m].
     """

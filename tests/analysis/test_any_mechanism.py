@@ -102,7 +102,7 @@ def test_what_a_trim_refuses(cart):
     none = stm.trim(space, at=x, free=["rail.displacement"], accelerations=[0.0, 1.0], throw=False)
     assert not bool(none.converged)
     assert np.isnan(none.values).all()
-    with pytest.raises(stm.ModelError, match="wanted accelerations must be numbers of shape"):
+    with pytest.raises(stm.ModelError, match="target accelerations must be numbers of shape"):
         stm.trim(space, at=x, free=["hinge.angle"], accelerations=[0.0])
 
 

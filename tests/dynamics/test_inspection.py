@@ -36,7 +36,9 @@ def test_a_parallelogram_near_and_in_its_singular_posture():
     assert float(near.value.split()[4]) == pytest.approx(0.01, rel=0.06)
     flat = stm.check(parallelogram(0.0))
     assert flat.worst == "fault"
-    assert "nothing says which one it follows" in by_name(flat)["singular posture at rest"].value
+    assert (
+        "nothing determines which one it follows" in by_name(flat)["singular posture at rest"].value
+    )
     assert by_name(flat)["singular posture"].value == "rank 16 here, more beside it"
     assert by_name(flat)["degrees of freedom"].value.startswith("2 ")
     # cranks that turn against each other are the other branch's motion; equal rates are this one's,

@@ -86,7 +86,9 @@ class Falling:
         return self.reason
 
     def unsupported(self, scene: stm.Scene) -> str:
-        return "" if len(scene.system.names) == 1 else "Two bodies are not written."
+        return (
+            "" if len(scene.system.names) == 1 else "Two bodies are not supported by our adapters."
+        )
 
     def settings(self, scene: stm.Scene | None = None) -> list[Setting]:
         return [Setting("coarse", step=0.5), Setting("fine", step=0.25), Setting("odd", step=0.3)]
@@ -114,8 +116,8 @@ def test_other_programs_run_at_their_finest_setting_that_fits():
     assert row["error"] == pytest.approx(0.25)
     assert (row["seconds"], row["setting"]["solver"], row["reason"]) == (2.0, "fine", "")
     assert result_of(row) == "0.25, 2 s (step 0.25 s)"
-    assert beside(case(2), peer)["reason"] == "Two bodies are not written."
-    assert result_of(beside(case(2), peer)) == "Two bodies are not written."
+    assert beside(case(2), peer)["reason"] == "Two bodies are not supported by our adapters."
+    assert result_of(beside(case(2), peer)) == "Two bodies are not supported by our adapters."
     lost = row | {
         "reason": "It diverged.",
         "setting": {"solver": "", "tolerance": 1e-12, "step": None},

@@ -17,12 +17,15 @@ from stmuav_jax.figures.day import load_attitude
 from stmuav_jax.figures.filter_record import load_record
 from stmuav_jax.io.model_file import load_model
 from stmuav_jax.io.netcdf import (
+    LOOP_FORMAT,
+    LOOP_VERSION,
     FileError,
     Labelled,
     _make_seal,
     load,
     load_checkpoint,
     load_parameters,
+    save_sealed,
     write_atomically,
 )
 from stmuav_jax.io.run_file import save, save_certificate, to_dataset
@@ -87,6 +90,13 @@ def test_xarray_reads_what_labelled_arrays_hold(checksums):
         io.BytesIO(arrays.netcdf(checksums=checksums)), engine="h5netcdf"
     ) as found:
         xr.testing.assert_identical(found.load(), arrays.dataset())
+
+
+def test_signals_of_an_older_flight_have_the_present_names(tmp_path):
+    signals = {"wanted_force": (("time",), np.arange(3.0), {"units": "N"})}
+    about = {"format": LOOP_FORMAT, "format_version": LOOP_VERSION}
+    path = save_sealed(Labelled(signals, {}, about), tmp_path / "flight.nc")
+    assert load(path).commanded_force.values.tolist() == [0.0, 1.0, 2.0]
 
 
 def test_truncated_files_are_refused(short_run, tmp_path):

@@ -159,7 +159,7 @@ def test_a_failed_flight_has_its_numbers_until_the_failure(flights, tmp_path, ca
     kept, words = missions.verdict(data)
     assert not kept
     assert "ended there: failed" in words
-    assert "Not kept: smallest margin of the strokes" in words
+    assert "Not met: smallest margin of the strokes" in words
     # the command prints the verdict before the reason
     monkeypatch.setattr("stmuav_jax.missions.flight.fly", lambda *args, **named: wild)
     (tmp_path / "late.toml").write_text(

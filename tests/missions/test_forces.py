@@ -96,7 +96,7 @@ def test_a_verdict_counts_the_forces_that_the_servo_asks_for():
         {
             "position_error": (("time", "axis"), np.zeros((4, 3))), "tilt_error": one(0.0),
             "panel_error": one(0.0), "rotor_power": one(1.0), "electric_power": one(1.0),
-            "wanted_force": (("time", "slider"), forces),
+            "commanded_force": (("time", "slider"), forces),
         },
         {"time": ts}, {"mission": json.dumps(content), "ending": ""},
     )  # fmt: skip
@@ -123,7 +123,7 @@ def test_a_study_counts_the_same_forces():
     none = jnp.zeros(5)
     own = {
         "position_error": jnp.zeros((5, 3)), "tilt_error": none, "electric_power": none,
-        "wanted_force": forces,
+        "commanded_force": forces,
     }  # fmt: skip
     found: Any = SimpleNamespace(ts=ts, signals={"gauges": own}, reason=jnp.zeros(5, jnp.int8))
     given = validate_model(MissionFile, PLAIN | {"t1": 1.5}, "A mission")
@@ -153,12 +153,12 @@ def test_actuators_give_no_more_than_their_limit(asked):
     own = {"push": push, "controller": {"force": LIMIT}, "path": {"acceleration": [0.0, 0.0, 1.0]}}
     mission = missions.make_mission(PLAIN | own)
     data = missions.to_data(missions.fly(mission))
-    wanted, given = data.wanted_force.values, data.command.values[:, 6:]
+    wanted, given = data.commanded_force.values, data.command.values[:, 6:]
     np.testing.assert_array_equal(given, np.clip(wanted, -LIMIT, LIMIT))
     assert np.max(np.abs(wanted)) > LIMIT
     kept, words = missions.verdict(data)
     assert not kept
-    assert words.endswith("Not kept: smallest margin of the actuators' forces.")
+    assert words.endswith("Not met: smallest margin of the actuators' forces.")
     # until the limit is met, the servo asks for what the reference needs less what pushes
     ts = data.time.values
     met = int(np.argmax(np.any(np.abs(wanted) > LIMIT, axis=1)))

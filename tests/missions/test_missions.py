@@ -115,7 +115,7 @@ def test_a_hexacopter_flies_along_its_waypoints(flight, data):
     assert kept
     assert "tolerances hold from 5 s on" in words
     # by hand: the error, and the thrust that the weight needs on the average
-    off = np.linalg.norm(data.position.values[:, 0] - data.wanted_position.values, axis=1)
+    off = np.linalg.norm(data.position.values[:, 0] - data.reference_position.values, axis=1)
     assert missions.measures(data)[0].value == pytest.approx(np.max(off), rel=1e-12)
     assert np.max(off) > 1e-4
     squared = data.rotor_speed.values**2
@@ -134,7 +134,7 @@ def test_report_of_a_flight(flight, data, tmp_path):
     assert missions.verdict(data)[1] in text
     for one in missions.measures(data):
         assert f"{one.name} {one.value:.4g}" in text
-    assert re.search(r"Largest position error [\d.]+ m 0.1 kept", text)
+    assert re.search(r"Largest position error [\d.]+ m 0.1 met", text)
     assert "mission: wind.change.at 1" in text
     # a loop without a mission has what all loops have, and says that it failed
     attributes = {k: v for k, v in data.attrs.items() if k != "mission"}
@@ -405,7 +405,7 @@ def test_the_verdict_names_what_a_flight_did_not_come_to(data):
     assert words == (
         "It flew to t = 2.2 s of 2.2 s. It ended before waypoint 3 at t = 6 s, the end of move 2 of the "
         "panel at t = 31 s, the fault of rotor 1 at t = 50 s, the fault of rotor 2 at t = 2.2 s, the end of "
-        "the wind's change at t = 2.3 s. Until then, tolerances and limits were kept."
+        "the wind's change at t = 2.3 s. Until then, tolerances and limits were met."
     )
 
 
@@ -424,7 +424,7 @@ def test_a_failed_flight_names_the_first_limit_that_it_left():
     strokes = np.zeros((6, 2))
     strokes[3:, 1] = -0.025
     signals = {
-        "displacement": strokes, "wanted_force": np.zeros((6, 2)),
+        "displacement": strokes, "commanded_force": np.zeros((6, 2)),
         "tilt_error": np.where(ts > 0.035, 2.0, 0.1),
     }  # fmt: skip
     mission: Any = SimpleNamespace(machine=machine)
@@ -437,7 +437,7 @@ def test_a_failed_flight_names_the_first_limit_that_it_left():
         "The flight got out of control: at t = 0.03 s slider 3 left its stroke of -0.02 to 0.03 m, and "
         "after t = 0.05 s its motion had diverged: its numbers were no longer finite."
     )
-    signals["wanted_force"][1, 0] = -9.5
+    signals["commanded_force"][1, 0] = -9.5
     assert "at t = 0.01 s the servo asked slider 2 for more than 9 N" in describe(
         mission, rows, run
     )
@@ -467,10 +467,10 @@ def test_the_table_of_flights_is_that_of_its_script(data):
     assert cells[:2] == ["`gusts`", "2.2 s"]
     assert cells[2] == f"{100 * largest:.2g} cm"
     assert cells[4::2] == ["", ""]
-    assert cells[-1] == "kept"
+    assert cells[-1] == "met"
     changed = table.with_rows(page, rows | {"gusts": own})
     assert table.rows_of(changed) == rows | {"gusts": own}
     fallen = data.assign(position_error=1000.0 * data.position_error)
     assert table.row("gusts", fallen).endswith("| | | | | | it falls |\n")
     off = data.assign(position_error=2.0 * data.position_error / largest * 0.1)
-    assert "| 20 cm, not kept |" in table.row("gusts", off)
+    assert "| 20 cm, not met |" in table.row("gusts", off)

@@ -106,11 +106,11 @@ def test_an_own_machine_flies_in_gusts_and_moves_its_gimbal(flight, data):
         np.degrees(np.max(np.abs(data.joint_error.values[late, 1])))
     )
     assert (pitch.unit, pitch.allowed) == ("degrees", 0.5)
-    effort = data.wanted_effort.values
+    effort = data.commanded_effort.values
     margin = measures["Smallest margin of the joints' efforts"].value
     assert margin == pytest.approx(100 * np.min((2.0 - np.abs(effort[:, 1])) / 4.0))
     # the servo's law, and that the gusts are the mission's and the battery the model's
-    lag = (data.joint_position - data.wanted_joint_position).values[:, 0]
+    lag = (data.joint_position - data.reference_joint_position).values[:, 0]
     rate = data.joint_position.differentiate("time").values[:, 0]
     np.testing.assert_allclose(effort[5:-5, 0], (-8.0 * lag - 0.2 * rate)[5:-5], atol=0.01)
     assert np.std(np.diff(flight.mission.plant.system.forces[3].wind.values, axis=0)) > 0

@@ -93,7 +93,7 @@ def test_case_1_is_flown_by_the_command(tmp_path, capsys):
     assert main(["fly", "case-1", "--t1", "8", "--out", str(tmp_path)]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "Largest panel error" in shown
-    assert "All tolerances and limits were kept." in shown
+    assert "All tolerances and limits were met." in shown
     assert (tmp_path / "panel.png").exists()
     page = tmp_path / "report.html"
     assert main(["view", str(tmp_path), "--report", str(page)]) == 0

@@ -64,7 +64,7 @@ def assemble(
     The function may be jitted, vmapped and differentiated (implicit function theorem).
 
     Args:
-        guess: state near the wanted one.
+        guess: state near the solution sought.
         t: time of the drivers [s].
         hold: fixed coordinates by body: its "position", its "orientation" or "all".
         hold_joints: joints whose angle or displacement keeps its value; both of a cylindrical one.

@@ -149,8 +149,8 @@ def branches_meet(system: System, start: State, names: tuple[str, ...]) -> str:
     """Text on a start in a singular posture of some joints, from which several motions lead."""
     return (
         f"the start is a singular posture of {format_joints(system, start, names)}: "
-        "branches of the motion meet there, and nothing says which one it follows. Start "
-        "beside that posture, on the branch that is meant, or with velocities along it"
+        "branches of the motion meet there, and nothing determines which one it follows. "
+        "Start near that posture, on the intended branch, or with velocities along it"
     )
 
 

@@ -93,7 +93,7 @@ def closed_from(
     Derivatives of the first and second order are those of the implicit function.
 
     Args:
-        at: independent coordinates as wanted, dependent ones as they last were.
+        at: target independent coordinates; dependent ones as they last were.
         displacement: how far the independent ones have moved since (n,), in the tree's velocities.
         step: Newton's, of the dependent coordinates; and its largest component.
     """
@@ -181,7 +181,7 @@ def select_velocities(
         required: indices of velocities that must be independent. names: names of all velocities.
 
     Raises:
-        ModelError: the wanted velocities are not independent of each other.
+        ModelError: the chosen velocities are not independent of each other.
     """
     n = J.shape[1]
     rank = rank_of_rows(J)

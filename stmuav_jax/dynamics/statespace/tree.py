@@ -138,7 +138,7 @@ class TreeSpace(AbstractStateSpace):
         t: time of the drivers [s].
 
     Raises:
-        ModelError: the posture is singular, or the wanted coordinates are not independent there.
+        ModelError: the posture is singular, or the chosen coordinates are not independent there.
         SettingError: the state does not fit the system, or a name is unknown.
     """
 

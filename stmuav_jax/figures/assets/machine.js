@@ -4,7 +4,7 @@
 const L = library;
 const PALETTE = ['#0072b2', '#e69f00', '#009e73', '#d55e00', '#56b4e9', '#cc79a7', '#f0e442'];
 const COLOURS = { base: '#8b929c', panel: '#1d3f72', cells: '#8fb4e8', joint: '#69717d', ground: '#7a7f87',
-  thrust: '#009e73', reaction: '#d55e00', sun: '#e8b100', normal: '#56b4e9', rotor: '#5b626c', wanted: '#cc79a7' };
+  thrust: '#009e73', reaction: '#d55e00', sun: '#e8b100', normal: '#56b4e9', rotor: '#5b626c', reference: '#cc79a7' };
 // Rotors are drawn turning so many times slower, as the eye and the screen could not follow.
 const ROTOR_SLOWNESS = 40;
 const UP = new L.Vector3(0, 0, 1);
@@ -248,7 +248,7 @@ class Machine {
       const geometry = add(points, this.colours.get(name));
       this.moving.push(([k]) => geometry.setDrawRange(0, k + 1));
     }
-    if (run.wanted) add(decoded(run.wanted, Float32Array), COLOURS.wanted);
+    if (run.reference) add(decoded(run.reference, Float32Array), COLOURS.reference);
   }
 
   update(t) {

@@ -313,7 +313,7 @@ function legend() {
     if (m.largestThrust) chip(COLOURS.thrust, `thrust${of}: 0.1 m is ${short(0.1 / m.thrustScale)} N`);
     if (m.typicalReaction) chip(COLOURS.reaction, `reaction force${of}: 0.1 m is ${short(0.4 * m.typicalReaction / m.size)} N`);
   });
-  if (machines.some((m) => m.run.wanted)) chip(COLOURS.wanted, 'way that is wanted');
+  if (machines.some((m) => m.run.reference)) chip(COLOURS.reference, 'reference path');
   if (machines.some((m) => m.run.sun)) chip(COLOURS.sun, 'sun ray');
   if (machines.some((m) => m.parts.sun.length)) chip(COLOURS.normal, 'panel normal');
   make('p', element('legend'), { textContent: `Grid of ${[...new Set(floorOf.map((f) => short(f.step)))].join(' and ')} m. `
@@ -337,14 +337,14 @@ window.matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () 
 });
 
 // Address such as page.html#t=0.5&view=top&show=reactions,names&play=1.
-const wanted = new URLSearchParams(location.hash.slice(1));
-for (const name of (wanted.get('show') || '').split(',').filter(Boolean)) {
+const address = new URLSearchParams(location.hash.slice(1));
+for (const name of (address.get('show') || '').split(',').filter(Boolean)) {
   const box = element('shown').querySelector(`[name=${CSS.escape(name)}]`);
   if (box && !box.checked) box.click();
 }
-if (VIEWS[wanted.get('view')]) { element('camera').value = wanted.get('view'); look(wanted.get('view')); }
-if (wanted.has('t')) seek(wanted.get('t'));
-if (wanted.has('play')) play(true);
+if (VIEWS[address.get('view')]) { element('camera').value = address.get('view'); look(address.get('view')); }
+if (address.has('t')) seek(address.get('t'));
+if (address.has('play')) play(true);
 requestAnimationFrame(frame);
 
 // For tests and for those who embed the page: poses as they are drawn, in the run's own axes.

@@ -53,8 +53,8 @@ def test_a_start_at_rest_in_a_singular_posture_is_refused():
         messages.add(str(refused.value))
     (words,) = messages
     assert all(f"{joint} (at 0 rad)" in words for joint in "ABCD")
-    assert "branches of the motion meet there, and nothing says which one it follows" in words
-    assert "Start beside that posture" in words
+    assert "branches of the motion meet there, and nothing determines which one it follows" in words
+    assert "Start near that posture" in words
     # as slow as round-off is no velocity
     with pytest.raises(stm.StateError, match="velocities up to 1e-06 rad/s"):
         stm.simulate(*flat(1e-7), t1=0.2)
