@@ -505,14 +505,26 @@ def _run_filter(
     now = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), u)
     check_functions(model, prior, now, y.shape[1])
 
-    def advance(*args: Any) -> tuple[Gaussian, Innovation]:
-        # each operation of a bank is one over all its filters
-        return method.step(*args) if prior.factor.ndim > 2 else evaluate(method.step, *args)
+    def advance(before: Gaussian, y: Array, u: Inputs, dt: Array) -> tuple[Gaussian, Innovation]:
+        if prior.factor.ndim == 2:
+            return evaluate(method.step, model, before, y, u, dt)
+        # Machine code takes the filters of a bank one by one, in the lanes of the processor's vectors; compiled
+        # by XLA, each operation is one over all of them.
+        has_lanes = jax.tree.map(lambda a: jnp.ndim(a) == 2, u)
+        one = lambda tree, lanes: jax.tree.map(
+            lambda a, lane: a[..., 0] if lane else a, tree, lanes
+        )
+        first = one((before, y), jax.tree.map(lambda _: True, (before, y)))
+        if not evaluate.has_code(method.step, model, *first, one(u, has_lanes), dt):  # pyright: ignore
+            return method.step(model, before, y, u, dt)
+        axes = (-1, -1, jax.tree.map(lambda lane: -1 if lane else None, has_lanes))
+        step = lambda before, y, u: evaluate(method.step, model, before, y, u, dt)
+        return jax.vmap(step, in_axes=axes, out_axes=-1)(before, y, u)
 
     def filter_step(carry: tuple, now: tuple) -> tuple:
         before, running = carry
         y, u, dt = now
-        after, innovation = advance(model, before, y, u, dt)
+        after, innovation = advance(before, y, u, dt)
         # traced times are checked here: they may go backwards, or be NaN
         ok = running & is_finite(after) & (dt >= 0)
         of_batch = lambda x: ok.reshape((1,) * (jnp.ndim(x) - ok.ndim) + ok.shape)

@@ -307,9 +307,9 @@ def test_numbers_of_one_argument_are_handed_over_together():
     np.testing.assert_allclose(ours(numbers, X), function(numbers, rows), rtol=1e-14)
     call = re.findall(r"custom_call @stmuav_\w+\(([^)]*)\)", ours.lower(numbers, X).as_text())
     assert [len(operands.split(",")) for operands in call] == [4]
-    each = {"in_axes": ({**dict.fromkeys(numbers), "3": 0}, 0)}
+    each = ({**dict.fromkeys(numbers), "3": 0}, 0)
     batched = {**numbers, "3": numbers["3"] * jnp.ones((2, 1))}
-    pairs = [jax.vmap(f, **each)(batched, rows) for f in (native(function), function)]
+    pairs = [jax.vmap(f, each)(batched, rows) for f in (native(function), function)]
     np.testing.assert_allclose(*pairs, rtol=1e-14)
 
 

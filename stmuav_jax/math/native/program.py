@@ -95,7 +95,7 @@ class Program:
         """
         graph: Any = self.graph()
         layout, width = self.layout(shared, rows), llvm.vector_width() if rows > 1 else 1
-        return llvm.write(*graph, layout.buffers, self._results(), width, layout.places)
+        return llvm.write(graph[0], graph[1], layout.buffers, self._results(), width, layout.places)
 
     def _results(self) -> list[llvm.Buffer]:
         return [llvm.Buffer(math.prod(a.shape), _DTYPES[str(a.dtype)]) for a in self.outputs]
@@ -221,7 +221,9 @@ class Recursion(Program):
         if first - 1 not in buffers or not tables:
             raise NotScalarError("a loop whose passes do not depend on each other")
         loop, graph = llvm.Loop(buffers[first - 1], tables), cast(Any, self.graph())
-        return llvm.write(*graph, layout.buffers, self.body._results(), 1, layout.places, loop)
+        return llvm.write(
+            graph[0], graph[1], layout.buffers, self.body._results(), 1, layout.places, loop
+        )
 
 
 def _zero_tangent(aval: Any) -> Any:
@@ -478,30 +480,27 @@ def native(
     jitted: Any = eqx.filter_jit(function)
     programs: OrderedDict[Any, tuple[Program, Any] | None] = OrderedDict()
 
-    @wraps(function)
-    def call(*args: Any) -> Any:
+    def find(args: Any) -> tuple[tuple[Program, Any], list[Any]] | None:
+        """Program, what puts its results together, and its operands; None where XLA compiles the function."""
         if not is_on():
-            return jitted(*args)
+            return None
         leaves, structure = jax.tree.flatten(args)
         places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
         arrays = [leaves[k] for k in places]
-        if any(a.dtype not in _ALLOWED for a in arrays):
-            return jitted(*args)
         chosen = set(places)
         static = tuple((k, leaf) for k, leaf in enumerate(leaves) if k not in chosen)
+        if not can_be_found(args) or any(a.dtype not in _ALLOWED for a in arrays):
+            return None
         # The key holds the structure and what is not an array, by value; numbers in arrays are
         # operands, so that other numbers find the same program.
         key = (structure, static, tuple((a.shape, str(a.dtype)) for a in arrays))
-        # a function of the user's may be of a kind that cannot be found again
-        if not all(isinstance(leaf, Hashable) for _, leaf in static):
-            return function(*args)
         if key not in programs:
             owners = [k for k, arg in enumerate(args) for _ in jax.tree.leaves(arg)]
             groups = [owners[k] for k in places]
-            programs[key] = _make(function, structure, static, places, arrays, groups)
-            entry = programs[key]
+            entry = _make(function, structure, static, places, arrays, groups)
             if tables is not None and entry is not None:
-                programs[key] = _with_body(body, tables, args, groups, entry)
+                entry = _with_body(body, tables, args, groups, entry)
+            programs[key] = entry
             # A program holds its jaxpr, derivatives and graph. A process that makes many
             # structures, as a test suite does, would keep them all; the oldest go first.
             while len(programs) > MOST_PROGRAMS:
@@ -512,10 +511,23 @@ def native(
         # function of the kind it becomes a part of that one's graph, or is traced again where that
         # one has none.
         if entry is None or (not _tracing.depth and entry[0].graph() is None):
-            return jitted(*args)
-        program, result = entry
+            return None
+        return entry, arrays
+
+    def can_be_found(args: Any) -> bool:
+        """False for a function of the user's that is of a kind which no program is found by."""
+        leaves = jax.tree.leaves(args)
+        return all(eqx.is_array(leaf) or isinstance(leaf, Hashable) for leaf in leaves)
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        found = find(args)
+        if found is None:
+            return jitted(*args) if not is_on() or can_be_found(args) else function(*args)
+        (program, result), arrays = found
         return result(native_p.bind(*arrays, program=program, lead=()))
 
+    call.has_code = lambda *args: find(args) is not None  # pyright: ignore[reportAttributeAccessIssue]
     return call
 
 
