@@ -347,11 +347,12 @@ def write(
     # differently for one row and for a vector of rows: a row's bits would depend on its batch.
     graph, flat = fuse(graph, flat)
     order = [n for n in range(len(graph.ops))]
-    for node in order if places is not None else ():
-        if graph.ops[node] == "input":
-            number, entry, kind = graph.args[node]
-            buffer, first = places[number]
-            graph.args[node] = (buffer, first + entry, kind)
+    if places is not None:
+        for node in order:
+            if graph.ops[node] == "input":
+                number, entry, kind = graph.args[node]
+                buffer, first = places[number]
+                graph.args[node] = (buffer, first + entry, kind)
     operations = sum(graph.ops[n] not in ("input", "constant") for n in order)
     names: set[str] = set()
     parts = [
