@@ -317,9 +317,9 @@ A, C = np.tril(np.arange(1.0, 17.0).reshape(4, 4), -1) / 40, np.linspace(0.0, 1.
 
 
 @partial(native, tables=(A, C))
-def stages(scale, t, y, x, row, weight):
+def stages(scale, t, y, total, node):
     """Rows of a Runge-Kutta step."""
-    return jnp.sin(scale["a"] * (y + row @ x)) + (t + weight) * scale["b"]
+    return jnp.sin(scale["a"] * (y + total)) + (t + node) * scale["b"]
 
 
 def test_loops_are_one_call():

@@ -100,13 +100,11 @@ def _stage_loop(kind: type[diffrax.AbstractERK]) -> Callable[..., Float[Array, "
     """Loop over the stages of a method, (terms, args, t, h, y, zeros (s, k)) -> their slopes."""
     A, _, _, c = butcher_coefficients(kind)
 
-    # A loop has the equations of motion once in the program; unrolled, it would compile a copy for each
-    # stage.
     @partial(native, tables=(A, c))
     def evaluate_slope(
-        terms: Any, args: Any, t: Any, h: Any, y: Any, slopes: Any, row: Any, weight: Any
+        terms: Any, args: Any, t: Any, h: Any, y: Any, total: Any, node: Any
     ) -> StateVector:
-        return terms.vf(t + weight * h, y + h * jnp.sum(row[:, None] * slopes, axis=0), args)
+        return terms.vf(t + node * h, y + h * total, args)
 
     return evaluate_slope
 

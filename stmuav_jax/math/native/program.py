@@ -471,12 +471,14 @@ def native(
 
     Args:
         function: pure function of pytrees; arrays are traced, all else must be hashable.
-        tables: with arrays (s, .), the operation is a loop, x[i] = function(*args, x, *(table[i] for each)) for
-            all i, for an array x (s, k) that is the last argument. Batches of it are left to XLA.
+        tables: with arrays A (s, s), whose entries on and above the diagonal are zero, and others (s, .), the
+            operation is a loop, x[i] = function(*args, A[i] @ x, *(table[i] for the others)) for all i, for an array
+            x (s, k) of zeros that is the last argument. Batches of it are left to XLA.
     """
     body = function
     if tables is not None:
-        function = _make_loop(function, tables)
+        body = _sum_rows(function, len(tables))
+        function = _make_loop(function, body, tables)
     jitted: Any = eqx.filter_jit(function)
     programs: OrderedDict[Any, tuple[Program, Any] | None] = OrderedDict()
 
@@ -527,7 +529,11 @@ def native(
         (program, result), arrays = found
         return result(native_p.bind(*arrays, program=program, lead=()))
 
-    call.has_code = lambda *args: find(args) is not None  # pyright: ignore[reportAttributeAccessIssue]
+    def has_code(*args: Any) -> bool:
+        found = find(args)
+        return found is not None and found[0][0].graph() is not None
+
+    call.has_code = has_code  # pyright: ignore[reportAttributeAccessIssue]
     return call
 
 
@@ -537,17 +543,42 @@ def evaluate(function: Callable[..., Any], *args: Any) -> Any:
     return function(*args)
 
 
-def _make_loop(function: Callable[..., Any], tables: Sequence[np.ndarray]) -> Callable[..., Any]:
+def _sum_rows(function: Callable[..., Any], count: int) -> Callable[..., Any]:
+    """Pass of a loop, of all its rows x and a row of each of `count` tables."""
+
+    def evaluate_row(*args: Any) -> Array:
+        *first, x = args[:-count]
+        weights, *others = args[-count:]
+        return function(*first, jnp.sum(weights[:, None] * x, axis=0), *others)
+
+    return evaluate_row
+
+
+def _make_loop(
+    function: Callable[..., Any], evaluate_row: Callable[..., Any], tables: Sequence[np.ndarray]
+) -> Callable[..., Any]:
     """Loop over rows of tables in which a function makes one row after the other."""
-    evaluate_row = native(function)
+    weights, *others = tables
+    by_code = native(evaluate_row)
 
     def fill_rows(*args: Any) -> Array:
-        def add_row(x: Array, at: tuple[Any, ...]) -> tuple[Array, None]:
-            number, *row = at
-            value = evaluate_row(*args[:-1], x, *row)
-            return jax.lax.dynamic_update_index_in_dim(x, value, number, 0), None
+        *first, x = args
+        # Machine code is compiled once however often it is called, and a batch need not copy all rows to
+        # change one. XLA would compile a copy of the function for every pass.
+        if not by_code.has_code(*args, *(table[0] for table in tables)):
 
-        return jax.lax.scan(add_row, args[-1], (np.arange(len(tables[0])), *tables))[0]
+            def add_row(x: Array, at: tuple[Any, ...]) -> tuple[Array, None]:
+                number, *row = at
+                value = evaluate_row(*first, x, *row)
+                return jax.lax.dynamic_update_index_in_dim(x, value, number, 0), None
+
+            return jax.lax.scan(add_row, x, (np.arange(len(weights)), *tables))[0]
+        rows: list[Array] = []
+        for i, row in enumerate(weights):
+            terms = [float(row[j]) * rows[j] for j in range(i) if row[j] != 0]
+            total = sum(terms[1:], terms[0]) if terms else jnp.zeros_like(x[0])
+            rows.append(function(*first, total, *(table[i] for table in others)))
+        return jnp.stack(rows)
 
     return fill_rows
 
