@@ -98,9 +98,7 @@ class Linear:
         modes = []
         for k in map(int, np.argsort(-np.real(values))):
             s = complex(values[k])
-            shares, uncertainty, determined = _compute_participation(
-                A, values, k, rows[:, k], columns[:, k]
-            )
+            shares, determined = _compute_participation(A, values, k, rows[:, k], columns[:, k])
             # equal shares, as of an angle and its rate, keep the order of the states
             order = np.argsort(-np.round(shares, 9), kind="stable")[:3]
             top = [(self.states[j][0], float(shares[j])) for j in order]
@@ -110,7 +108,7 @@ class Linear:
                     s,
                     size / (2 * np.pi),
                     -s.real / size if size > 0 else 1.0,
-                    float(np.log(2) / s.real) if abs(s.real) > uncertainty else float("inf"),
+                    float(np.log(2) / s.real) if _is_real_part_resolved(A, s) else float("inf"),
                     tuple(top) if determined else (),
                     "" if determined else _cluster_words(values, k),
                 )
@@ -148,8 +146,8 @@ def _drop_round_off(A: np.ndarray) -> np.ndarray:
 
 def _compute_participation(
     A: np.ndarray, values: np.ndarray, k: int, row: np.ndarray, column: np.ndarray
-) -> tuple[np.ndarray, float, bool]:
-    """Shares (n,) of the states in mode k, uncertainty of the eigenvalue, and whether the shares hold.
+) -> tuple[np.ndarray, bool]:
+    """Shares (n,) of the states in mode k, and whether they hold.
 
     An error E of A changes the projector P = r l^H / (l^H r) by -(S E P + P E S), with the reduced
     resolvent S = sum P_i / (s_i - s) over the other modes, which is large where another eigenvalue is
@@ -166,19 +164,39 @@ def _compute_participation(
     with np.errstate(all="ignore"):
         P = np.outer(column, row.conj()) / (row.conj() @ column)
         noise = np.max(round_off, axis=1, keepdims=True) * np.ones(n)
-        uncertainty = float(np.sum(np.abs(P.T) * noise))
         shares = np.abs(np.diag(P))
         shares = shares / np.sum(shares)
         try:
             S = np.linalg.inv(A - s * np.eye(n) + size * P) - P / size
         except np.linalg.LinAlgError:
-            return shares, uncertainty, False
+            return shares, False
         P, S = np.abs(P), np.abs(S)
         # of a decoupled pair of equal eigenvalues only the numbers off the diagonal change to first order
         change = lambda C: np.sqrt(np.max(C * C.T))
         errors = [change(S @ E @ P + P @ E @ S) for E in (round_off, noise)]
         determined = errors[0] < _SHARES_EXACT and errors[1] < _SHARES_NOISE
-    return shares, uncertainty if np.isfinite(uncertainty) else float("inf"), bool(determined)
+    return shares, bool(determined)
+
+
+def _is_real_part_resolved(A: np.ndarray, s: complex) -> bool:
+    """True if no round-off of A moves the eigenvalue s onto the imaginary axis.
+
+    A - i Im(s) has an inverse then, and so has every matrix that differs from it by numbers up to E if the
+    spectral radius of |(A - i Im(s))^-1| E is below one. This holds for multiple eigenvalues too, such as
+    those of critical damping, and does not depend on units.
+
+    Source: J. Demmel, The componentwise distance to the nearest singular matrix, SIAM J. Matrix
+    Analysis 13 (1992) 10-19.
+    """
+    n = len(A)
+    noise = n * _EPS * np.max(np.abs(A), axis=1, keepdims=True) * np.ones(n)
+    with np.errstate(all="ignore"):
+        try:
+            inverse = np.abs(np.linalg.inv(A - 1j * s.imag * np.eye(n)))
+        except np.linalg.LinAlgError:
+            return False
+        growth = inverse @ noise
+    return bool(np.all(np.isfinite(growth)) and np.max(np.abs(np.linalg.eigvals(growth))) < 1)
 
 
 def _cluster_words(values: np.ndarray, k: int) -> str:
