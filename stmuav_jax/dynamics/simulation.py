@@ -26,7 +26,7 @@ from ..mechanics.internal import counted_hinges, with_internal
 from ..mechanics.joint_states import JointMotion, coordinates_of, joint_motion
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state, moved_centres
-from .assembly.singular import describe_driver_jump, singular_posture
+from .assembly.singular import describe_driver_jump, describe_half_turn, singular_posture
 from .diagnostics import (
     LOOSER,
     Certificate,
@@ -807,7 +807,7 @@ def _describe_failure(run: Run, end: float, start: Start, opened: str) -> str:
             "and the steps of this method may not tolerate"
         )
     reason = opened or start.branches or posture or reason
-    reason = describe_driver_jump(system, t) or reason
+    reason = describe_driver_jump(system, t) or describe_half_turn(system, state) or reason
     kin = system.kinematics(state)
     for force in system.forces:
         # a load may cease to be finite right after the last state at which it was
