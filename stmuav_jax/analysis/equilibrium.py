@@ -221,9 +221,10 @@ class _Problem(eqx.Module):
         kin = system.kinematics(self.space.to_state(x, self.t))
         ratios = []
         for k in self.limited:
-            force, limit = system.forces[k], self.space.system.forces[k].limit
+            force: Any = system.forces[k]
+            limited: Any = self.space.system.forces[k]
             now = force.coordinate_at(kin)
-            ratios.append(force.law(now.value, now.rate, self.t) / limit)
+            ratios.append(force.law(now.value, now.rate, self.t) / limited.limit)
         return jnp.stack(ratios) if ratios else jnp.zeros(0)
 
     def count(self) -> int:
@@ -402,14 +403,14 @@ def _solve_trim(
     converged = converged & jnp.all(jnp.abs(efforts) <= 1 + _LIMIT_ROUND_OFF)
     if throw and has_values(residual) and not bool(converged):
         hint = ""
-        left = f"{float(residual):.3g}" if np.isfinite(residual) else "no finite value"
+        residual_text = f"{float(residual):.3g}" if np.isfinite(residual) else "no finite value"
         if not float(conditioning) > 1e-12:
             hint = (
                 " The equations are singular there: these unknowns do not reach all accelerations."
             )
         raise StateError(
             "No trim was found near the start: Newton's method stopped with a residual acceleration of "
-            f"{left} left (tolerance {TOLERANCE:.0e}) over the unknowns {chosen}.{hint}"
+            f"{residual_text} left (tolerance {TOLERANCE:.0e}) over the unknowns {chosen}.{hint}"
         )
     keep = lambda tree: jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), tree)
     point, trim_values = keep(problem.at(z))

@@ -72,16 +72,16 @@ def run_tune(command: Any) -> int:
     folder = results_folder(settings.out, f"tune_{command.what}_{scene.name}")
     search, input_table, is_done, figures = _tune_inputs(command, scene, folder)
     if has_converged(search) and not is_done:
-        words = (
+        failure_text = (
             f"no inputs were found that hold the start: the best leave a loss of {search.loss:.3g}, and "
             f"below {HOLDS:g} counts as held. {folder} has them."
         )
     else:
-        words = (
+        failure_text = (
             f"the search has not converged; {folder} has what it reached; try more --segments, or "
             "--resume with more --steps."
         )
-    return report_search(search, input_table, folder, figures, is_done, words)
+    return report_search(search, input_table, folder, figures, is_done, failure_text)
 
 
 def _tune_inputs(

@@ -360,13 +360,14 @@ def _choose_units(
     joint = next((joint for joint in joints if joint.name == table.get("joint")), None)
     free = free_coordinates(joint) if joint is not None else []
     driven = str(table["kind"]).removeprefix("drive_")
-    which = driven if driven in free else table.get("coordinate", free[0] if len(free) == 1 else "")
-    if which not in free:
+    single = free[0] if len(free) == 1 else ""
+    coordinate = driven if driven in free else table.get("coordinate", single)
+    if coordinate not in free:
         # a joint or coordinate that does not exist is refused where the object is made
         return slots
     # A moment in N for a hinge is a mistake that no range check would find. Units are listed as those of a
     # displacement or of an angle, but for the ratio of a coupling, which depends on two coordinates.
-    choice = ("displacement", "angle").index(which)
+    choice = ("displacement", "angle").index(coordinate)
     return {
         name: slot
         if name == "ratio" or not slot.unit or " or " not in slot.unit

@@ -446,11 +446,11 @@ def _make_scene(
     )
     if open_by > _CLOSED:
         state = assemble(system, state).state
-        moved = np.linalg.norm(np.asarray(state.r) - np.asarray(system.reference.r), axis=1)
-        farthest = int(np.argmax(moved))
+        distances = np.linalg.norm(np.asarray(state.r) - np.asarray(system.reference.r), axis=1)
+        farthest = int(np.argmax(distances))
         notes.append(
             f"The start is not at qpos0, where loops are open by {open_by:.2g} m or rad: closing them moves "
-            f"the body '{system.names[farthest]}' by {moved[farthest]:.2g} m."
+            f"the body '{system.names[farthest]}' by {distances[farthest]:.2g} m."
         )
     return Scene(
         name=name,

@@ -561,8 +561,8 @@ def _list_differences(stored: Mapping[str, Any], present: Mapping[str, Any]) -> 
 
     differences = []
     for key in dict.fromkeys([*stored_entries, *present_entries]):
-        there, here = as_json(stored_entries, key), as_json(present_entries, key)
-        if not key.startswith("layout") and there != here:
-            texts = f"{shorten(there, here)} there and {shorten(here, there)} here"
+        old, new = as_json(stored_entries, key), as_json(present_entries, key)
+        if not key.startswith("layout") and old != new:
+            texts = f"{shorten(old, new)} there and {shorten(new, old)} here"
             differences.append(f"{key} is {texts}")
     return differences
