@@ -12,7 +12,9 @@ FOLDERS = [
     "checks", "math", "mechanics", "estimation", "dynamics", "analysis", "control", "uav", "io",
     "studies", "figures", "missions", "cli",
 ]  # fmt: skip
-TREES = {path: ast.parse(path.read_text()) for path in sorted(ROOT.rglob("*.py"))}
+# `python -m stmuav_jax` starts the command line, and nothing imports it.
+STARTER = ROOT / "__main__.py"
+TREES = {path: ast.parse(path.read_text()) for path in sorted(set(ROOT.rglob("*.py")) - {STARTER})}
 
 
 def dotted(path: Path) -> tuple[str, ...]:
