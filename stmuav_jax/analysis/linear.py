@@ -33,6 +33,9 @@ _EPS = float(np.finfo(float).eps)
 # itself, and by round-off of the largest number of its row, which is what cancellation leaves where an
 # exact derivative is zero.
 _SHARES_EXACT, _SHARES_NOISE = 1e-6, 1e-3
+# Circles around an eigenvalue on which its round-off is looked for: radii over its real part, and points.
+_RADII = (0.5, 0.25, 0.75, 0.1, 0.9)
+_CIRCLE = np.exp(2j * np.pi * (np.arange(16) + 0.5) / 16)
 
 
 @dataclass(frozen=True)
@@ -179,24 +182,31 @@ def _compute_participation(
 
 
 def _is_real_part_resolved(A: np.ndarray, s: complex) -> bool:
-    """True if no round-off of A moves the eigenvalue s onto the imaginary axis.
+    """True if no round-off of A moves the eigenvalue s, or one of its cluster, onto the imaginary axis.
 
-    A - i Im(s) has an inverse then, and so has every matrix that differs from it by numbers up to E if the
-    spectral radius of |(A - i Im(s))^-1| E is below one. This holds for multiple eigenvalues too, such as
-    those of critical damping, and does not depend on units.
+    A matrix that differs from A by numbers up to E has no eigenvalue at z if the spectral radius of
+    |(A - z)^-1| E is below one. Where that holds on a circle around s that does not reach the axis, eigenvalues
+    stay inside. This holds for multiple ones too, such as those of critical damping, and not for the zeros
+    of a free body, whatever their round-off is.
 
     Source: J. Demmel, The componentwise distance to the nearest singular matrix, SIAM J. Matrix
     Analysis 13 (1992) 10-19.
     """
     n = len(A)
     noise = n * _EPS * np.max(np.abs(A), axis=1, keepdims=True) * np.ones(n)
-    with np.errstate(all="ignore"):
-        try:
-            inverse = np.abs(np.linalg.inv(A - 1j * s.imag * np.eye(n)))
-        except np.linalg.LinAlgError:
-            return False
-        growth = inverse @ noise
-    return bool(np.all(np.isfinite(growth)) and np.max(np.abs(np.linalg.eigvals(growth))) < 1)
+
+    def is_clear(z: complex) -> bool:
+        with np.errstate(all="ignore"):
+            try:
+                growth = np.abs(np.linalg.inv(A - z * np.eye(n))) @ noise
+            except np.linalg.LinAlgError:
+                return False
+        return bool(np.all(np.isfinite(growth)) and np.max(np.abs(np.linalg.eigvals(growth))) < 1)
+
+    # other eigenvalues may lie on one circle, and not on all of them
+    return s.real != 0 and any(
+        all(is_clear(s + share * abs(s.real) * turn) for turn in _CIRCLE) for share in _RADII
+    )
 
 
 def _cluster_words(values: np.ndarray, k: int) -> str:
