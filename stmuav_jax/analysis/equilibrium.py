@@ -43,6 +43,7 @@ from ..dynamics.actuation import (
 from ..dynamics.formulations.independence import DEPENDENT
 from ..dynamics.statespace.base import AbstractStateSpace, Time, check_regular, places_of
 from ..dynamics.statespace.selection import BASE
+from ..dynamics.statespace.tree import TreePoint
 from ..dynamics.tree.topology import spanning_tree
 from ..math import lapack
 from ..math.compiler import kept_jit
@@ -50,7 +51,9 @@ from ..math.newton import Implicit, NearestNewton, Newton
 from ..math.rotation import product, rotation_matrix, turn_about
 from ..math.space import Point
 from ..mechanics.inputs import Inputs, inputs_of
+from ..mechanics.internal import with_internal
 from ..mechanics.state import State
+from ..mechanics.system import System
 
 Conditions = Callable[[State], Float[Array, " c"]]
 
@@ -59,6 +62,8 @@ TOLERANCE = 1e-10
 # Inputs beyond this many times the mechanism's weight, or weight times size, are noted.
 LARGE = 100.0
 _MOST_STEPS = 50
+# Part of a limit by which round-off may exceed it.
+_LIMIT_ROUND_OFF = 1e-9
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -184,7 +189,7 @@ class _Problem(eqx.Module):
     def equations(self, z: Float[Array, " k"]) -> Float[Array, " e"]:
         """Accelerations less their targets, the rates of the forces' states, and the conditions."""
         x, values = self.at(z)
-        system = self.inputs.applied(self.space.system, values)
+        system = self.inputs.applied(self.without_limits(), values)
         # Only accelerations and states of forces are equations: velocities are what the flight
         # prescribes, and need not be zero.
         rates = self.space.rates(x, self.t, system)[self.space.dof :]
@@ -192,6 +197,35 @@ class _Problem(eqx.Module):
         if self.conditions is None:
             return residual
         return jnp.concatenate([residual, self.conditions(self.space.to_state(x, self.t))])
+
+    @property
+    def limited(self) -> tuple[int, ...]:
+        """Places of the forces whose inputs are chosen and that have a limit."""
+        chosen = sorted({entry.force for entry in self.inputs.entries})
+        forces = self.space.system.forces
+        return tuple(k for k in chosen if getattr(forces[k], "limit", None) is not None)
+
+    def without_limits(self) -> System:
+        """System whose chosen inputs give any force: beyond a limit Newton's method would have no slope."""
+        system = self.space.system
+        for k in self.limited:
+            system = eqx.tree_at(lambda s, k=k: s.forces[k].limit, system, None)
+        return system
+
+    def efforts(self, z: Float[Array, " k"]) -> Float[Array, " l"]:
+        """Efforts of the limited forces at unknowns z, in units of their limits."""
+        x, values = self.at(z)
+        system = self.inputs.applied(self.without_limits(), values)
+        if isinstance(x, TreePoint) and x.internal.shape[0]:
+            system = with_internal(system, x.internal)
+        kin = system.kinematics(self.space.to_state(x, self.t))
+        ratios = []
+        for k in self.limited:
+            force: Any = system.forces[k]
+            limited: Any = self.space.system.forces[k]
+            now = force.coordinate_at(kin)
+            ratios.append(force.law(now.value, now.rate, self.t) / limited.limit)
+        return jnp.stack(ratios) if ratios else jnp.zeros(0)
 
     def count(self) -> int:
         """The number of equations, found without tracing the motion."""
@@ -218,7 +252,7 @@ def _nearest_equations(both: Float[Array, " k"], problem: _Problem) -> Float[Arr
 
 @kept_jit
 def _solve_equations(problem: _Problem) -> tuple[Any, ...]:
-    """Solve for the unknowns; also residual, conditioning, steps, and the inputs' scales and effect."""
+    """Solve for the unknowns; also residual, conditioning, steps, the inputs' scales, effect and efforts."""
     count, rows = problem.unknowns, problem.count()
     square = count == rows
     atol = 0.1 * TOLERANCE
@@ -249,8 +283,9 @@ def _solve_equations(problem: _Problem) -> tuple[Any, ...]:
     g = weight / jnp.sum(space.system.bodies.mass)
     effect = jnp.stack(lengths)[:, None] * columns * scales[None] / g if lengths else columns
     conditioning, steps = values[-1] / values[0], solution.stats["num_steps"]
-    measures = residual, conditioning, steps, scales, effect
-    return solution.value[:count], *jax.lax.stop_gradient(measures)
+    z = solution.value[:count]
+    measures = residual, conditioning, steps, scales, effect, problem.efforts(z)
+    return z, *jax.lax.stop_gradient(measures)
 
 
 def trim(
@@ -289,7 +324,8 @@ def trim(
         throw: raise where there is no trim, if values are known.
 
     Raises:
-        StateError: no trim was found, or the posture is singular for the independent coordinates.
+        StateError: no trim was found, it needs more than the limit of an actuator, or the posture is
+            singular for the independent coordinates.
         SettingError: an unknown name, or fewer unknowns than equations.
         ModelError: numbers of another shape, or not finite.
     """
@@ -359,18 +395,22 @@ def _solve_trim(
             f"({chosen or 'none'}): add inputs, or name free states among "
             f"{', '.join(name for name, _ in space.names[: 2 * space.dof])}."
         )
-    z, residual, conditioning, steps, weights, effect = _solve_equations(problem)
+    z, residual, conditioning, steps, weights, effect, efforts = _solve_equations(problem)
     # A point that did not converge is returned as NaN and never as a guess that looks like a trim.
     converged = residual <= TOLERANCE
+    if throw and has_values(efforts) and bool(converged):
+        _check_efforts(problem, np.asarray(efforts))
+    converged = converged & jnp.all(jnp.abs(efforts) <= 1 + _LIMIT_ROUND_OFF)
     if throw and has_values(residual) and not bool(converged):
         hint = ""
+        residual_text = f"{float(residual):.3g}" if np.isfinite(residual) else "no finite value"
         if not float(conditioning) > 1e-12:
             hint = (
                 " The equations are singular there: these unknowns do not reach all accelerations."
             )
         raise StateError(
             "No trim was found near the start: Newton's method stopped with a residual acceleration of "
-            f"{float(residual):.3g} left (tolerance {TOLERANCE:.0e}) over the unknowns {chosen}.{hint}"
+            f"{residual_text} left (tolerance {TOLERANCE:.0e}) over the unknowns {chosen}.{hint}"
         )
     keep = lambda tree: jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), tree)
     point, trim_values = keep(problem.at(z))
@@ -380,6 +420,19 @@ def _solve_trim(
         tuple(name for name, _ in space.names[: space.dof]),
         force_units(space.system, inputs),
     )  # fmt: skip
+
+
+def _check_efforts(problem: _Problem, efforts: Float[np.ndarray, " l"]) -> None:
+    """Raise `StateError` where a trim needs more than the limit of a servo or an effort."""
+    for k, ratio in zip(problem.limited, efforts, strict=True):
+        if abs(ratio) <= 1 + _LIMIT_ROUND_OFF:
+            continue
+        force: Any = problem.space.system.forces[k]
+        limit = float(force.limit)
+        raise StateError(
+            f"The trim needs an effort of {ratio * limit:.6g} N or N m of the {type(force).__name__} in joint "
+            f"'{force.joint}', but its limit is {limit:.6g}: raise the limit, or choose another posture."
+        )
 
 
 # --- steady flight

@@ -33,6 +33,9 @@ _EPS = float(np.finfo(float).eps)
 # itself, and by round-off of the largest number of its row, which is what cancellation leaves where an
 # exact derivative is zero.
 _SHARES_EXACT, _SHARES_NOISE = 1e-6, 1e-3
+# Circles around an eigenvalue on which its round-off is looked for: radii over its real part, and points.
+_RADII = (0.5, 0.25, 0.75, 0.1, 0.9)
+_CIRCLE = np.exp(2j * np.pi * (np.arange(16) + 0.5) / 16)
 
 
 @dataclass(frozen=True)
@@ -98,9 +101,7 @@ class Linear:
         modes = []
         for k in map(int, np.argsort(-np.real(values))):
             s = complex(values[k])
-            shares, uncertainty, determined = _compute_participation(
-                A, values, k, rows[:, k], columns[:, k]
-            )
+            shares, determined = _compute_participation(A, values, k, rows[:, k], columns[:, k])
             # equal shares, as of an angle and its rate, keep the order of the states
             order = np.argsort(-np.round(shares, 9), kind="stable")[:3]
             top = [(self.states[j][0], float(shares[j])) for j in order]
@@ -110,7 +111,7 @@ class Linear:
                     s,
                     size / (2 * np.pi),
                     -s.real / size if size > 0 else 1.0,
-                    float(np.log(2) / s.real) if abs(s.real) > uncertainty else float("inf"),
+                    float(np.log(2) / s.real) if _is_real_part_resolved(A, s) else float("inf"),
                     tuple(top) if determined else (),
                     "" if determined else _cluster_words(values, k),
                 )
@@ -148,8 +149,8 @@ def _drop_round_off(A: np.ndarray) -> np.ndarray:
 
 def _compute_participation(
     A: np.ndarray, values: np.ndarray, k: int, row: np.ndarray, column: np.ndarray
-) -> tuple[np.ndarray, float, bool]:
-    """Shares (n,) of the states in mode k, uncertainty of the eigenvalue, and whether the shares hold.
+) -> tuple[np.ndarray, bool]:
+    """Shares (n,) of the states in mode k, and whether they hold.
 
     An error E of A changes the projector P = r l^H / (l^H r) by -(S E P + P E S), with the reduced
     resolvent S = sum P_i / (s_i - s) over the other modes, which is large where another eigenvalue is
@@ -166,19 +167,46 @@ def _compute_participation(
     with np.errstate(all="ignore"):
         P = np.outer(column, row.conj()) / (row.conj() @ column)
         noise = np.max(round_off, axis=1, keepdims=True) * np.ones(n)
-        uncertainty = float(np.sum(np.abs(P.T) * noise))
         shares = np.abs(np.diag(P))
         shares = shares / np.sum(shares)
         try:
             S = np.linalg.inv(A - s * np.eye(n) + size * P) - P / size
         except np.linalg.LinAlgError:
-            return shares, uncertainty, False
+            return shares, False
         P, S = np.abs(P), np.abs(S)
         # of a decoupled pair of equal eigenvalues only the numbers off the diagonal change to first order
         change = lambda C: np.sqrt(np.max(C * C.T))
         errors = [change(S @ E @ P + P @ E @ S) for E in (round_off, noise)]
         determined = errors[0] < _SHARES_EXACT and errors[1] < _SHARES_NOISE
-    return shares, uncertainty if np.isfinite(uncertainty) else float("inf"), bool(determined)
+    return shares, bool(determined)
+
+
+def _is_real_part_resolved(A: np.ndarray, s: complex) -> bool:
+    """True if no round-off of A moves the eigenvalue s, or one of its cluster, onto the imaginary axis.
+
+    A matrix that differs from A by numbers up to E has no eigenvalue at z if the spectral radius of
+    |(A - z)^-1| E is below one. Where that holds on a circle around s that does not reach the axis, eigenvalues
+    stay inside. This holds for multiple ones too, such as those of critical damping, and not for the zeros
+    of a free body, whatever their round-off is.
+
+    Source: J. Demmel, The componentwise distance to the nearest singular matrix, SIAM J. Matrix
+    Analysis 13 (1992) 10-19.
+    """
+    n = len(A)
+    noise = n * _EPS * np.max(np.abs(A), axis=1, keepdims=True) * np.ones(n)
+
+    def is_clear(z: complex) -> bool:
+        with np.errstate(all="ignore"):
+            try:
+                growth = np.abs(np.linalg.inv(A - z * np.eye(n))) @ noise
+            except np.linalg.LinAlgError:
+                return False
+        return bool(np.all(np.isfinite(growth)) and np.max(np.abs(np.linalg.eigvals(growth))) < 1)
+
+    # other eigenvalues may lie on one circle, and not on all of them
+    return s.real != 0 and any(
+        all(is_clear(s + share * abs(s.real) * turn) for turn in _CIRCLE) for share in _RADII
+    )
 
 
 def _cluster_words(values: np.ndarray, k: int) -> str:

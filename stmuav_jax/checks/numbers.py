@@ -187,14 +187,14 @@ def _advise_inertia(moments: np.ndarray) -> str:
     if size == 0:
         return (
             " A point mass has no inertia to turn: give it that of a small sphere, 2 m r^2 / 5 "
-            "(stmuav_jax.sphere); where nothing turns it, the value does not matter."
+            "(stmuav_jax.mechanics.sphere); where nothing turns it, the value does not matter."
         )
     if abs(moments[0]) <= _SINGULAR * size and moments[1] > _SINGULAR * size:
         return (
             " A rod without thickness has no inertia about its own axis, so that nothing would "
             "resist a turn about it: give it the moment that its thickness gives, m r^2 / 2 for "
-            "the radius r (stmuav_jax.cylinder); where joints keep it from that turn, the value does "
-            "not matter."
+            "the radius r (stmuav_jax.mechanics.cylinder); where joints keep it from that turn, the "
+            "value does not matter."
         )
     return ""
 
@@ -215,7 +215,7 @@ def check_unit(p: Numbers, subject: str, error: type[Exception]) -> None:
         raise error(f"The Euler parameters of {subject} are all zero, but a rotation needs norm 1.")
     raise error(
         f"The Euler parameters of {subject} must have norm 1, but {values.tolist()} has norm "
-        f"{norm:.6g}. If they are right up to scale, divide them by their norm "
-        "(stmuav_jax.normalise); if they were printed with few digits, find the nearest posture "
+        f"{norm:.12g}. If they are right up to scale, divide them by their norm "
+        "(stmuav_jax.rotation.normalise); if they were printed with few digits, find the nearest posture "
         "that the joints allow with stmuav_jax.assemble."
     )

@@ -71,9 +71,8 @@ def run_identify(command: Any) -> int:
     folder = results_folder(settings.out, f"identify_{scene.name}")
     search, parameter_table, is_done, verdict = _identify_parameters(command, scene, folder)
     figures = loss_figures(search, folder, settings.figures)
-    code = report_search(
-        search, parameter_table, folder, figures, is_done, f"{folder} has what it reached."
-    )
+    failure_text = f"the search has not converged; {folder} has what it reached."
+    code = report_search(search, parameter_table, folder, figures, is_done, failure_text)
     print_line(Console(), verdict.explanation)
     return UNTRUSTED if code == 0 and verdict.status == "inconsistent" else code
 

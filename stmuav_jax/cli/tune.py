@@ -71,8 +71,17 @@ def run_tune(command: Any) -> int:
     scene = chosen_scene(command)
     folder = results_folder(settings.out, f"tune_{command.what}_{scene.name}")
     search, input_table, is_done, figures = _tune_inputs(command, scene, folder)
-    more = f"{folder} has what it reached; try more --segments, or --resume with more --steps."
-    return report_search(search, input_table, folder, figures, is_done, more)
+    if has_converged(search) and not is_done:
+        failure_text = (
+            f"no inputs were found that hold the start: the best leave a loss of {search.loss:.3g}, and "
+            f"below {HOLDS:g} counts as held. {folder} has them."
+        )
+    else:
+        failure_text = (
+            f"the search has not converged; {folder} has what it reached; try more --segments, or "
+            "--resume with more --steps."
+        )
+    return report_search(search, input_table, folder, figures, is_done, failure_text)
 
 
 def _tune_inputs(
@@ -112,7 +121,8 @@ def _tune_inputs(
     every = np.asarray(tuning.motion(search.values).inputs)
     title = f"Inputs that {'lead there' if slews else 'hold'}"
     if not is_done:
-        title = f"NOT CONVERGED: the best of {search.steps} steps ({title.lower()})"
+        state = "NOT HELD" if has_converged(search) else "NOT CONVERGED"
+        title = f"{state}: the best of {search.steps} steps ({title.lower()})"
     input_table = make_table(
         "input", "at the start", "at the end", "smallest", "largest", "unit", title=title
     )

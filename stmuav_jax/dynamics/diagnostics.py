@@ -53,8 +53,7 @@ from .formulations.constraints import Constraints
 from .formulations.independence import (
     DEPENDENT,
     WEAK,
-    compute_condition,
-    find_extreme_bodies,
+    check_condition,
     find_independent_rows,
     longest_arm,
     open_limit,
@@ -566,7 +565,7 @@ def inspect_start(
     start = Start(batched_rows, rank, float(off_unit))
     check_rounded(system, rows)
     if rank.rows - rank.rank <= left_out and isinstance(formulation, Augmented):
-        check_condition(system, formulation, state)
+        check_condition(system, state)
     if rank.rank < rank.rows:
         check_compatible(rank, start_rows.matrix, start_rows.gamma)
         if rank.rows - rank.rank > left_out:
@@ -641,27 +640,6 @@ def check_compatible(rank: Rank, matrix: np.ndarray, gamma: np.ndarray) -> None:
             f"{', '.join(rank.redundant)}. If they are dependent in this posture alone, the initial "
             "velocities are inconsistent with it."
         )
-
-
-# Condition of the equations of `Augmented` at which accelerations lose all but four digits.
-_MOST_CONDITION = 3e11
-
-
-def check_condition(system: System, formulation: Augmented, state: State) -> None:
-    """Raise `ModelError` if round-off leaves too little of the accelerations by `Augmented`."""
-    row_mask = formulation.prepare(system).row_mask
-    row_mask = None if row_mask is None else np.asarray(row_mask)
-    condition, geometric = compute_condition(system, row_mask, state)
-    # a posture near a singular one is not the masses' fault
-    if condition <= _MOST_CONDITION or condition <= 1e3 * geometric:
-        return
-    light, heavy, ratio = find_extreme_bodies(system)
-    raise ModelError(
-        f"The masses and moments of inertia of the bodies '{light}' and '{heavy}' are too far apart for "
-        f"Augmented: they differ by {ratio:.1g} (moments over the squared longest arm), and round-off "
-        f"of its equations, of condition {condition:.1g}, would dominate the motion. Use Tree(), "
-        "or give the bodies inertias nearer to each other."
-    )
 
 
 def check_rounded(system: System, rows: AugmentedModel) -> None:

@@ -25,6 +25,7 @@ from .formulations.base import (
     Reactions,
     in_joint_axes,
 )
+from .formulations.independence import check_inertias
 from .formulations.stabilisation import Unstabilised
 from .integration.problem import at_internal
 
@@ -253,12 +254,13 @@ def evaluate(
         t: time [s].
         formulation: default `Augmented()`, which has a multiplier for every constraint row;
             `Tree()` has them for the loop-closing joints' rows only.
-        load: load that is added to the system's own forces; see `stmuav_jax.Load`.
+        load: load that is added to the system's own forces; see `stmuav_jax.mechanics.Load`.
         frame: axes of the reactions: "world", or "joint" for the joint's frame in body i.
 
     Raises:
         SettingError: shapes or precision of the state do not fit the system.
-        ModelError: a mass or a tensor of inertia that no body can have.
+        ModelError: a mass or a tensor of inertia that no body can have, or inertias so far apart that
+            `Augmented` would lose the accelerations to round-off.
     """
     check_state(system, state)
     check_bodies(system.bodies)
@@ -266,6 +268,8 @@ def evaluate(
         # A given load joins the system as one more force element, and the equations need no case for it.
         system = eqx.tree_at(lambda s: s.forces, system, (*system.forces, _ConstantLoad(load)))
     formulation = formulation if formulation is not None else Augmented()
+    if isinstance(formulation, Augmented):
+        check_inertias(system, state)
     model: Any = formulation.prepare(system)
     time = jnp.asarray(t, dtype=state.r.dtype)
     result = formulation.accelerations(model, time, state, Unstabilised())

@@ -42,7 +42,7 @@ from .formulations.augmented import AugmentedModel, prepare_rows
 from .formulations.base import count_left_out
 from .formulations.independence import displace_postures, longest_arm
 from .method import EXPLICIT_LIMIT, spectrum
-from .simulation import Scene
+from .simulation import Scene, output_times
 from .statespace.tree import TreeSpace
 from .tree.formulation import Tree
 from .tree.topology import spanning_tree
@@ -131,14 +131,17 @@ def check(
     """
     between: tuple[str, ...] = ()
     lost: tuple[str, ...] = ()
+    findings: list[Finding] = []
     if isinstance(mechanism, Scene) and state is None:
         between, lost = mechanism.links_between, mechanism.warnings
+        scene = mechanism
+        findings += _catch_fault("time span", lambda: output_times(scene, None, None, None))
         system, state, t = mechanism.system, mechanism.state0, mechanism.t0 if t is None else t
     elif isinstance(mechanism, System):
         system, state, t = mechanism, mechanism.reference if state is None else state, t or 0.0
     else:
         raise SettingError("check takes a Scene, or a System with or without a State.")
-    findings = [Finding("warning", "import", sentence) for sentence in lost]
+    findings += [Finding("warning", "import", sentence) for sentence in lost]
     findings += [*_check_bodies(system), *_check_magnitudes(system, state, between)]
     findings += list(_catch_fault("initial state", lambda: check_start(system, state)))
     if not any(finding.severity == "fault" for finding in findings):
@@ -154,7 +157,7 @@ def _catch_fault(subject: str, look: Callable[[], Any]) -> Iterator[Finding]:
     """Error of a check as a finding."""
     try:
         look()
-    except (ModelError, StateError) as error:
+    except (ModelError, SettingError, StateError) as error:
         yield Finding("fault", subject, str(error))
 
 

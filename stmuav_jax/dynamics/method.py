@@ -164,8 +164,10 @@ class Method(eqx.Module):
     max_step: float | Float[Array, ""] = float("inf")
 
     def __check_init__(self) -> None:
-        if self.max_steps < 1:
-            raise SettingError(f"max_steps must be at least 1, but it is {self.max_steps}.")
+        if not isinstance(self.max_steps, int) or self.max_steps < 1:
+            raise SettingError(
+                f"max_steps must be a whole number of at least 1, but it is {self.max_steps}."
+            )
         if not has_values(self.rtol, self.atol, self.first_step, self.max_step):
             return
         for name in ("rtol", "atol"):

@@ -26,7 +26,7 @@ from ..mechanics.internal import counted_hinges, with_internal
 from ..mechanics.joint_states import JointMotion, coordinates_of, joint_motion
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state, moved_centres
-from .assembly.singular import describe_driver_jump, singular_posture
+from .assembly.singular import describe_driver_jump, describe_half_turn, singular_posture
 from .diagnostics import (
     LOOSER,
     Certificate,
@@ -168,14 +168,16 @@ def integrate(
         method: method of integration; default `Method()`.
 
     Raises:
-        SettingError: shapes or precision of the state do not fit the system, or known times do not
-            increase where they must.
+        SettingError: shapes or precision of the state do not fit the system, or known times are not
+            finite or do not increase where they must.
     """
     check_state(system, state0)
     problem = prepare_problem(system, method if method is not None else Method())
     # Times may run backwards, as for the motion before a given state; jumps and events are sought
     # forwards only.
     ordered = problem.method.jump_ts is not None or problem.method.event is not None
+    if has_values(ts) and not np.all(np.isfinite(np.asarray(ts, dtype=float))):
+        raise SettingError("The output times ts must be a list of finite numbers.")
     if ordered and has_values(ts) and np.any(np.diff(np.asarray(ts)) < 0):
         raise SettingError(
             "The output times must increase with a method that has an event or times of jumps, but "
@@ -231,6 +233,8 @@ def _mark_unreached(problem: Problem, trajectory: Trajectory, ts: Float[Array, "
     # Decisions on values have no derivative: without the stop JAX would trace derivatives of all
     # residuals for them.
     missed = ~is_successful & (jax.lax.stop_gradient(trajectory.ts) < ts)
+    # a traced time may be no number: nothing was reached there or after
+    missed = missed | (jnp.cumsum(jnp.isnan(ts)) > 0)
     open_mask = problem.is_open(jax.lax.stop_gradient(trajectory.worst))
     missed = missed | open_mask
     diverged: Any = diffrax.RESULTS.nonlinear_divergence
@@ -403,6 +407,8 @@ _UNEQUAL = 1e8
 
 # Number of intervals between saved times of a run that is given by its end alone.
 _INTERVALS = 100
+# More saved times than a machine's memory holds are a slip of units.
+_MOST_TIMES = 1e7
 
 
 def scene_of(
@@ -445,12 +451,17 @@ def output_times(
                 f"The first output time must be the scene's t0 = {scene.t0} s, not {times[0]} s."
             )
         return times
-    end = scene.t1 if t1 is None else float(t1)
-    every = scene.save_every if save_every is None else float(save_every)
+    end = float(scene.t1 if t1 is None else t1)
+    every = float(scene.save_every if save_every is None else save_every)
     if not np.isfinite(end) or end < scene.t0:
         raise SettingError(f"The end t1 = {end} s must be finite and not before t0 = {scene.t0} s.")
     if not np.isfinite(every) or every <= 0:
         raise SettingError(f"save_every must be finite and positive, but it is {every} s.")
+    if (end - scene.t0) / every > _MOST_TIMES:
+        raise SettingError(
+            f"save_every = {every:g} s gives {(end - scene.t0) / every:.3g} saved times from t0 = "
+            f"{scene.t0:g} s to t1 = {end:g} s, but a run can have {_MOST_TIMES:.0e} of them."
+        )
     # Round-off of a quotient such as 2 / 0.01 must not lose the last interval or add one of length zero.
     count = int(np.floor((end - scene.t0) / every * (1 + 1e-12)))
     times = scene.t0 + every * np.arange(count + 1)
@@ -796,7 +807,7 @@ def _describe_failure(run: Run, end: float, start: Start, opened: str) -> str:
             "and the steps of this method may not tolerate"
         )
     reason = opened or start.branches or posture or reason
-    reason = describe_driver_jump(system, t) or reason
+    reason = describe_driver_jump(system, t) or describe_half_turn(system, state) or reason
     kin = system.kinematics(state)
     for force in system.forces:
         # a load may cease to be finite right after the last state at which it was

@@ -5,7 +5,7 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from ..math.rotation import rotation_matrix_in
 from ..mechanics.body import GROUND, Body
 from ..mechanics.forces import Gravity
 from ..mechanics.internal import counted_hinges, internal_states, with_start_angles
-from ..mechanics.joint import Joint, Mate
+from ..mechanics.joint import Joint, Mate, free_coordinates
 from ..mechanics.joint_states import coordinates_of
 from ..mechanics.load import SineMotion
 from ..mechanics.parameters import Parameter, Parameters
@@ -48,6 +48,7 @@ from .model_schema import (
     ROTORS,
     SECOND,
     START_BODY,
+    Entry,
     ModelFile,
     kind_of,
     read_entries,
@@ -212,7 +213,7 @@ def _build_system(source: str, model_data: ModelFile, parameters: Table) -> Syst
                 if hovering(table)
                 else None
             )
-            forces[name] = _read_force(table, parameters, carried)
+            forces[name] = _read_force(table, parameters, joints, carried)
     with _locate_errors(f"{source}"):
         # Inputs are numbered in the order of the file, whatever was read first.
         ordered_forces = [forces[name] for name in model_data.forces]
@@ -233,15 +234,15 @@ def _count_turns(system: System, model: ModelFile, parameters: Table) -> System:
     angles = {}
     for name in sorted({hinge for hinge in counted_hinges(system) if hinge in coordinates}):
         value = _fill_numbers(coordinates[name], parameters, f"coordinates.{name}")
-        labels = [
-            label for label, _ in coordinates_of(system.joints[system.joint_index(name)].kind)
-        ]
+        kind = system.joints[system.joint_index(name)].kind
+        labels = [label for label, _ in coordinates_of(kind)]
         values = value if isinstance(value, list) else [value]
         # another number of coordinates is refused where the start is made
         if len(values) == len(labels):
             angles[name] = values[labels.index("angle")]
     angles |= {
-        k: _fill_numbers(v, parameters, f"angles.{k}") for k, v in model.start.angles.items()
+        k: _fill_numbers(v, parameters, f"angles.{k}", ("rad",))
+        for k, v in model.start.angles.items()
     }
     return with_start_angles(system, angles)
 
@@ -306,8 +307,8 @@ def _read_joint(
     subject = f"A joint of kind {table['kind']}"
     if "in_bodies" not in table or kind.owner == "joint":
         entry_values = read_entries(
-            table, kind.slots, parameters, subject, owner=kind.owner, kind=True
-        )
+            table, _choose_units(kind.slots, table, before), parameters, subject, owner=kind.owner, kind=True
+        )  # fmt: skip
         del entry_values["kind"]
         if kind.owner == "bodies":
             return kind.make(name, *entry_values.pop("bodies"), **entry_values)
@@ -352,11 +353,37 @@ def _in_bodies(name: str, table: Mapping[str, Any], parameters: Table, subject: 
     return Joint(name=name, kind=table["kind"], body_i=i, body_j=j, in_world=False, **geometry)
 
 
-def _read_force(table: Mapping[str, Any], parameters: Table, carried: Any = None) -> Any:
+def _choose_units(
+    slots: Mapping[str, Entry], table: Mapping[str, Any], joints: Sequence[Joint]
+) -> Mapping[str, Entry]:
+    """Entries of a table, those of a joint's coordinate in the units of an angle or of a displacement."""
+    joint = next((joint for joint in joints if joint.name == table.get("joint")), None)
+    free = free_coordinates(joint) if joint is not None else []
+    driven = str(table["kind"]).removeprefix("drive_")
+    single = free[0] if len(free) == 1 else ""
+    coordinate = driven if driven in free else table.get("coordinate", single)
+    if coordinate not in free:
+        # a joint or coordinate that does not exist is refused where the object is made
+        return slots
+    # A moment in N for a hinge is a mistake that no range check would find. Units are listed as those of a
+    # displacement or of an angle, but for the ratio of a coupling, which depends on two coordinates.
+    choice = ("displacement", "angle").index(coordinate)
+    return {
+        name: slot
+        if name == "ratio" or not slot.unit or " or " not in slot.unit
+        else slot._replace(unit=slot.unit.split(" or ")[choice])
+        for name, slot in slots.items()
+    }
+
+
+def _read_force(
+    table: Mapping[str, Any], parameters: Table, joints: Sequence[Joint], carried: Any = None
+) -> Any:
     """Force of a table; rotors whose speeds are left out hover with what is `carried`."""
     kind = kind_of(table, FORCES, "A force element")
     subject = f"A force element of kind {table['kind']}"
-    entry_values = read_entries(table, kind.slots, parameters, subject, owner=kind.owner, kind=True)
+    slots = _choose_units(kind.slots, table, joints)
+    entry_values = read_entries(table, slots, parameters, subject, owner=kind.owner, kind=True)
     del entry_values["kind"]
     owner = entry_values.pop(kind.owner) if kind.owner else ()
     if carried is not None:
@@ -382,7 +409,8 @@ def _read_instrument(
 ) -> Instrument:
     kind = kind_of(table, INSTRUMENTS, "A sensor")
     subject = f"A sensor of kind {table['kind']}"
-    entry_values = read_entries(table, kind.slots, parameters, subject, owner=kind.owner, kind=True)
+    slots = _choose_units(kind.slots, table, system.joints)
+    entry_values = read_entries(table, slots, parameters, subject, owner=kind.owner, kind=True)
     owner, sensor_arguments = (
         entry_values[kind.owner],
         {k: v for k, v in entry_values.items() if k in kind.slots},
@@ -422,18 +450,33 @@ def _read_start(system: System, model_data: ModelFile, parameters: Table) -> Sta
     state = State(**{field: stack_arrays(rows) for field, rows in arrays.items()})
     if not (start.coordinates or start.rates):
         return state
+    units = {
+        joint.name: [unit for _, unit in coordinates_of(joint.kind)] for joint in system.joints
+    }
     coordinates, rates = (
         {
-            name: _fill_numbers(value, parameters, f"{table_name}.{name}")
+            name: _fill_numbers(
+                value,
+                parameters,
+                f"{table_name}.{name}",
+                [unit + per for unit in units.get(name, ())],
+            )
             for name, value in table.items()
         }
-        for table_name, table in (("coordinates", start.coordinates), ("rates", start.rates))
+        for table_name, table, per in (
+            ("coordinates", start.coordinates, ""),
+            ("rates", start.rates, "/s"),
+        )
     )
     return state_from_joints(system, coordinates, rates, start=state, t=model_data.t0)
 
 
-def _fill_numbers(value: Any, parameters: Table, key: str) -> Any:
-    filled = with_parameters(value, parameters, key)
+def _fill_numbers(value: Any, parameters: Table, key: str, units: Sequence[str] = ()) -> Any:
+    """Number or list of numbers of an entry, whose parameters must have the units of its components."""
+    if isinstance(value, list) and len(value) == len(units):
+        filled = [with_parameters(x, parameters, key, u) for x, u in zip(value, units, strict=True)]
+    else:
+        filled = with_parameters(value, parameters, key, " or ".join(dict.fromkeys(units)))
     every = filled if isinstance(filled, list) else [filled]
     # an array is the value of a parameter, which JAX may trace
     plain = [x for x in every if not eqx.is_array(x)]

@@ -89,7 +89,7 @@ def load_robot(
             raise SettingError(
                 "'floating' is for the root link of a URDF; a body of MJCF floats by its <freejoint/>."
             )
-        massless: list[str] = []
+        massless: dict[str, float] = {}
         # Warnings of the compiler are about the file and belong to its scene: printed by MuJoCo
         # they would be lost, or written to a file in the user's folder.
         with _collected_warnings(mujoco) as warned:
@@ -109,6 +109,10 @@ def load_robot(
         # round-off of the motion lets each joint have two bodies, as joints have here.
         share = LINK_SHARE if link_share is None else link_share
         closures = _closures_of_frames(loops or {}, model)
+        if urdf is not None:
+            # what such a link weighs is its share, not that of its shapes
+            shaped = tuple(link for link in urdf.without_inertial if link not in massless)
+            urdf = urdf._replace(without_inertial=shaped)
         scene = _make_scene(model, source.stem, share, urdf, floating, closures)
     except (ModelError, SettingError, StateError) as error:
         raise FileError(f"{source}: {error}") from error
@@ -116,10 +120,18 @@ def load_robot(
     scene = dataclasses.replace(scene, notes=notes)
     if not massless:
         return scene
-    sentence = f"Links without mass have {share:g} of the robot's mass (link_share): {', '.join(massless)}."
+    without_mass = ", ".join(name for name, mass in massless.items() if not mass)
+    without_inertia = ", ".join(name for name, mass in massless.items() if mass)
+    sentences = [
+        f"Links without mass have {share:g} of the robot's mass (link_share): {without_mass}."
+    ] * bool(without_mass)
+    sentences += [
+        f"Links without inertia have the moment of {share:g} of the robot's mass (link_share) at "
+        f"{_SHARE_RADIUS:g} m: {without_inertia}."
+    ] * bool(without_inertia)
     return dataclasses.replace(
         scene,
-        notes=(*scene.notes, sentence),
+        notes=(*scene.notes, *sentences),
         links_between=(*scene.links_between, *massless),
     )
 
@@ -156,12 +168,13 @@ def _compile_model(
     urdf: UrdfSource | None,
     floating: bool | None,
     share: float | None,
-    massless: list[str],
+    massless: dict[str, float],
 ) -> Any:
     """Compiled model: without files that do not matter where they are absent, with shares of mass.
 
     Args:
-        massless: list to which the names of the bodies are added that get a share of mass.
+        massless: mapping to which the names of the bodies are added that get a share of mass, or of
+            inertia beside the mass that they have [kg].
     """
     reduced = False
     while True:
@@ -169,8 +182,9 @@ def _compile_model(
             return _with_shares(spec, share, massless).compile()
         except ValueError as error:
             name = massless_body(str(error))
-            if share is not None and name and name not in massless:
-                massless.append(name)
+            mass = _stated_mass(spec, name) if name else 0.0
+            if share is not None and name and name not in massless and mass >= 0:
+                massless[name] = mass
             elif name is None and not reduced:
                 # files of meshes are often absent, and matter only where they give a body its inertia
                 reduced = True
@@ -180,14 +194,20 @@ def _compile_model(
             spec = _without_meshes(spec) if reduced else spec
 
 
-def _with_shares(spec: Any, share: float | None, massless: list[str]) -> Any:
+def _stated_mass(spec: Any, name: str) -> float:
+    """Mass [kg] that a file states of a body; zero where it states none."""
+    body = None if spec is None else spec.body(name)
+    return float(body.mass) if body is not None and body.explicitinertial else 0.0
+
+
+def _with_shares(spec: Any, share: float | None, massless: Mapping[str, float]) -> Any:
     # Relative to the whole robot: a given mass would be heavy for a gripper and lost beside an
     # excavator.
     total = sum(body.mass for body in spec.bodies if body.explicitinertial and body.mass > 0) or 1.0
-    for name in massless:
-        body = spec.body(name)
-        body.explicitinertial, body.mass = True, (share or 0.0) * total
-        body.inertia = [body.mass * _SHARE_RADIUS**2] * 3
+    for name, mass in massless.items():
+        body, added = spec.body(name), (share or 0.0) * total
+        body.explicitinertial, body.mass = True, mass or added
+        body.inertia = [added * _SHARE_RADIUS**2] * 3
         body.fullinertia = [np.nan] * 6
     return spec
 
@@ -204,9 +224,13 @@ def _advise_error(spec: Any, message: str) -> str:
     """Sentence on what to do about an error of MuJoCo's compiler; empty if there is none."""
     name = massless_body(message)
     if name:
+        mass = _stated_mass(spec, name)
+        if mass < 0:
+            return f" The mass of the link '{name}' must not be negative, but it is {mass:g} kg."
+        lack = "has a mass, but no inertia" if mass else "moves between joints without mass"
         return (
-            f" The link '{name}' moves between joints without mass: give it a mass and an inertia, or "
-            "load_robot(path, link_share=1e-9), which gives such links this share of the robot's mass."
+            f" The link '{name}' {lack}: give it a mass and an inertia, or load_robot(path, "
+            "link_share=1e-9), which gives such links this share of the robot's mass."
         )
     if spec is not None and "Error opening file" in message:
         needed = dict.fromkeys(
@@ -422,6 +446,12 @@ def _make_scene(
     )
     if open_by > _CLOSED:
         state = assemble(system, state).state
+        distances = np.linalg.norm(np.asarray(state.r) - np.asarray(system.reference.r), axis=1)
+        farthest = int(np.argmax(distances))
+        notes.append(
+            f"The start is not at qpos0, where loops are open by {open_by:.2g} m or rad: closing them moves "
+            f"the body '{system.names[farthest]}' by {distances[farthest]:.2g} m."
+        )
     return Scene(
         name=name,
         title=f"{name}, from MuJoCo's model",

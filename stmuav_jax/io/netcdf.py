@@ -331,7 +331,8 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
                 f"{source} is larger than {MOST_TOML / 1e6:g} MB; long lists of numbers belong in a "
                 "CSV file, which a factor can name."
             )
-        return tomllib.loads(source.read_text(encoding="utf-8"))
+        # some editors begin a file with a byte-order mark
+        return tomllib.loads(source.read_text(encoding="utf-8-sig"))
     except RecursionError:
         raise FileError(f"{source} is nested too deeply.") from None
     except FileError:

@@ -123,6 +123,11 @@ def read_urdf(robot: Element) -> UrdfSource:
             notes.append(f"Left out, elements <{tag}>: {owner_names}.")
         else:
             lost.append(f"Lost, unknown elements <{tag}>: {owner_names}.")
+    for name in roots[1:]:
+        # MuJoCo joins every link without a parent to the world
+        lost.append(
+            f"The link '{name}' is no joint's child, as the root link '{roots[0]}' is: it is fixed to ground."
+        )
     return UrdfSource(
         roots[0] if roots else "",
         tuple(loops),

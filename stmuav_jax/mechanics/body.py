@@ -83,7 +83,7 @@ class Body(eqx.Module):
         self.triangle_tolerance = triangle_tolerance
         self.mass = as_floats(mass)
         tensor = as_floats(inertia)
-        if tensor.ndim == 1:
+        if tensor.shape == (3,):
             # Three numbers are principal moments.
             tensor = as_floats(array_module(tensor).diag(tensor))
         self.inertia = tensor

@@ -177,7 +177,7 @@ def joint_motion(
     joint = system.joints[system.joint_index(name)]
     coordinate_count(joint)
     states = jax.tree.map(jnp.asarray, states)  # those of a run are NumPy arrays
-    check_state(system, states)
+    check_state(system, states, batched=True)
     if states.r.ndim == 2:
         return JointMotion(joint.name, joint.kind, *_read_joint(system, states, joint))
     if states.r.ndim != 3:

@@ -273,22 +273,25 @@ def check_precision(array: Float[Array | np.ndarray, "..."], allow_float32: bool
         )
 
 
-def check_state(system: System, state: State) -> None:
-    """Raise `SettingError` if the state's shapes or precision do not fit (any batch axes)."""
+def check_state(system: System, state: State, *, batched: bool = False) -> None:
+    """Raise `SettingError` if the shapes or the precision of a state, or of states in a batch, do not fit."""
     n = system.n_bodies
+    axes = "..., " if batched else ""
     for name, width in (("r", 3), ("p", 4), ("v", 3), ("omega", 3)):
         array = getattr(state, name)
         if not isinstance(array, jax.Array | np.ndarray):
             raise SettingError(
-                f"State.{name} must be an array of shape (..., {n}, {width}), but it is of type "
+                f"State.{name} must be an array of shape ({axes}{n}, {width}), but it is of type "
                 f"{type(array).__name__}: write jnp.asarray(...) around the numbers."
             )
         # JAX would broadcast one row to all bodies, and find an error many operations later, in
         # names of its own.
-        if jnp.shape(array)[-2:] != (n, width):
+        shape = jnp.shape(array)
+        if shape[-2:] != (n, width) or (len(shape) > 2 and not batched):
+            advice = "" if batched or len(shape) < 3 else " For many states use jax.vmap."
             raise SettingError(
-                f"State.{name} must have shape (..., {n}, {width}) for bodies "
-                f"{', '.join(system.names)}, but it has {jnp.shape(array)}."
+                f"State.{name} must have shape ({axes}{n}, {width}) for bodies "
+                f"{', '.join(system.names)}, but it has {shape}.{advice}"
             )
         check_precision(array, system.allow_float32)
 

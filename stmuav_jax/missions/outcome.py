@@ -290,6 +290,8 @@ def list_unreached(mission: Mapping[str, Any], end: float) -> list[str]:
     for fault in mission.get("faults") or ():
         kind = next(kind for kind in ("rotor", "slider", "sensor") if fault.get(kind) is not None)
         entries.append((f"the fault of {kind} {fault[kind]}", fault["at"], False))
+        if fault.get("until") is not None:
+            entries.append((f"the end of the fault of {kind} {fault[kind]}", fault["until"], True))
     for payload in mission.get("payloads") or ():
         times = {"pick-up": payload["at"] or None, "drop": payload["until"]}
         entries += [

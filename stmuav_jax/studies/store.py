@@ -9,6 +9,7 @@ depends neither on time nor on the order or the process in which chunks were com
 import contextlib
 import errno
 import functools
+import itertools
 import json
 import os
 import platform
@@ -34,6 +35,8 @@ from .schema import check_count
 
 FORMAT, FORMAT_VERSION = "stmuav_jax study", 2
 SAMPLE = "sample"
+# Longest text of a value in a message.
+_SHOWN_TEXT = 60
 _DISK_ADVICE = {
     errno.ENOSPC: "free space on the disk",
     errno.EDQUOT: "free space on the disk",
@@ -546,10 +549,20 @@ def _list_differences(stored: Mapping[str, Any], present: Mapping[str, Any]) -> 
         return json.dumps(side[key]) if key in side else "not given"
 
     stored_entries, present_entries = flatten_attributes(stored), flatten_attributes(present)
-    shorten = lambda text: text if len(text) <= 60 else f"{text[:57]}..."
-    return [
-        f"{key} is {shorten(as_json(stored_entries, key))} there and {shorten(as_json(present_entries, key))} here"
-        for key in dict.fromkeys([*stored_entries, *present_entries])
-        if not key.startswith("layout")
-        and as_json(stored_entries, key) != as_json(present_entries, key)
-    ]
+
+    def shorten(text: str, other: str) -> str:
+        """Text, of a long one the part around its first difference from another."""
+        if len(text) <= _SHOWN_TEXT:
+            return text
+        same = (a == b for a, b in zip(text, other, strict=False))
+        first = max(sum(itertools.takewhile(bool, same)) - _SHOWN_TEXT // 2, 0)
+        last = first + _SHOWN_TEXT - 6
+        return "..." * (first > 0) + text[first:last] + "..." * (last < len(text))
+
+    differences = []
+    for key in dict.fromkeys([*stored_entries, *present_entries]):
+        old, new = as_json(stored_entries, key), as_json(present_entries, key)
+        if not key.startswith("layout") and old != new:
+            texts = f"{shorten(old, new)} there and {shorten(new, old)} here"
+            differences.append(f"{key} is {texts}")
+    return differences

@@ -322,3 +322,30 @@ def static_forces(feet, heads):
     push = np.linalg.solve(np.array(columns).T, -wrench)
     # the effort carries the rod's own weight along the axis too
     return push - 0.5 * axes @ down
+
+
+@pytest.mark.parametrize("kind", ["effort", "servo"])
+def test_a_trim_begins_beyond_a_limit_and_keeps_it(kind):
+    """A weight of 19.62 N on a slide: the start asks for 100 N, where the force has no slope."""
+
+    def hold(limit, **options):
+        force = (
+            stm.JointEffort("slide", 100.0, limit=limit)
+            if kind == "effort"
+            else stm.mechanics.JointServo(
+                "slide", stiffness=100.0, damping=1.0, target=1.0, limit=limit
+            )
+        )
+        block = stm.Body("block", 2.0, [0.1] * 3)
+        slide = stm.translational("slide", "ground", "block", axis=[0.0, 0.0, 1.0])
+        space = stm.TreeSpace(stm.System([block], [slide], [stm.Gravity(), force]))
+        return stm.trim(space, at=space.from_state(space.system.reference), **options)
+
+    exact = 19.62 if kind == "effort" else 0.1962
+    assert float(hold(25.0).values[0]) == pytest.approx(exact, rel=1e-12)
+    words = r"needs an effort of 19.62 N .* in joint 'slide', but its limit is 5"
+    with pytest.raises(stm.StateError, match=words):
+        hold(5.0)
+    refused = hold(5.0, throw=False)
+    assert not bool(refused.converged)
+    assert np.all(np.isnan(refused.values))

@@ -101,6 +101,25 @@ def test_shares_of_two_equal_pendulums_are_refused(coupling):
             assert "shares are not determined: the eigenvalue is in a cluster" in mode.refusal
 
 
+def test_a_multiple_eigenvalue_doubles_or_halves_in_its_time():
+    """Critical damping, its unstable counterpart, and a double zero, which does neither."""
+    for rate in (-5.0, 5.0):
+        for mode in linear_of([[0.0, 1.0], [-(rate**2), 2 * rate]]).modes():
+            assert mode.states == ()
+            # the root of round-off, of a double eigenvalue
+            assert mode.doubling_time == pytest.approx(np.log(2) / rate, rel=1e-6)
+        # beside the zeros of a free body too
+        A = np.zeros((4, 4))
+        A[:2, :2], A[2, 3] = [[0.0, 1.0], [-(rate**2), 2 * rate]], 1.0
+        times = sorted(
+            mode.doubling_time for mode in linear_of(A).modes() if mode.doubling_time < np.inf
+        )
+        np.testing.assert_allclose(times, [np.log(2) / rate] * 2, rtol=1e-6)
+    assert [mode.doubling_time for mode in linear_of([[0.0, 1.0], [0.0, 0.0]]).modes()] == [
+        np.inf
+    ] * 2
+
+
 def test_a_stiff_machine_keeps_the_shares_of_its_slow_modes():
     """Frequencies 1e5 and 1 rad/s in one machine, weakly coupled."""
     A = np.zeros((4, 4))

@@ -188,3 +188,27 @@ def test_output_times_may_go_back():
         stm.SettingError, match="times must increase with a method that has an event"
     ):
         run((1.0, 2.0, 9.81), jnp.asarray([0.0, 0.5, 0.2]), event=lambda t, state: state.r[0, 2])
+
+
+def test_a_time_that_is_no_number_ends_the_values():
+    """A known one is refused; nothing after a traced one is a value."""
+    times = jnp.asarray([0.0, 0.2, jnp.nan, 0.5])
+    with pytest.raises(stm.SettingError, match="output times ts must be a list of finite numbers"):
+        run((1.0, 2.0, 9.81), times)
+    found = jax.jit(lambda ts: run((1.0, 2.0, 9.81), ts, adjoint=diffrax.ForwardMode()))(times)
+    assert np.all(np.isfinite(found.states.r[:2]))
+    assert np.all(np.isnan(found.states.r[2:]))
+
+
+@pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()])
+def test_a_welded_body_stays_where_it_is(formulation):
+    """No coordinate is left: nothing moves, and steps have no error."""
+    block = stm.Body("block", 10.0, [1.0, 1.0, 1.5], position=[0.5, 0.0, 0.0])
+    system = stm.System([block], [stm.weld("foot", "ground", "block")], [stm.Gravity()])
+    method = stm.Method(formulation=formulation)
+    path = stm.integrate(system, system.reference, jnp.asarray([0.0, 1.0]), method)
+    result = stm.simulate(system, system.reference, ts=[0.0, 1.0], method=method)
+    for states in (path.states, result.states):
+        np.testing.assert_allclose(states.r[-1], [[0.5, 0.0, 0.0]], atol=1e-12)
+    weight = np.asarray(stm.dynamics.run_loads(result).force)[-1]
+    np.testing.assert_allclose(weight, [[0.0, 0.0, 98.1]], atol=1e-9)

@@ -83,6 +83,9 @@ def test_a_loop_that_is_open_at_the_start_is_assembled(tmp_path):
     joint, kin = scene.system.joints[-1], scene.system.kinematics(scene.state0)
     ends = [kin.point(joint.body_i, joint.point_i)[0], kin.point(joint.body_j, joint.point_j)[0]]
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
+    assert any(
+        "The start is not at qpos0, where loops are open by 0.01 m" in note for note in scene.notes
+    )
 
 
 @pytest.mark.parametrize(
@@ -204,6 +207,8 @@ def test_a_root_on_ground_is_said_and_floats_if_asked_for(tmp_path):
     assert free.system.names == ("torso", "leg")
     assert stm.dynamics.rank(free.system, free.state0).dof == 7
     assert not any("root link" in note for note in free.notes)
+    second = robot(tmp_path, LEGGED.replace("</robot>", link("stray") + "</robot>"))
+    assert any(text.startswith("The link 'stray' is no joint's child") for text in second.warnings)
 
 
 def test_a_drone_floats_and_its_refusal_names_the_option(tmp_path, capsys):
@@ -238,6 +243,22 @@ def test_a_link_without_mass_between_two_hinges_is_refused_or_gets_its_share(tmp
     assert scene.links_between == ("cross",)
     assert any("Links without mass" in note and "cross" in note for note in scene.notes)
     assert float(scene.system.bodies.mass[0]) == pytest.approx(0.6e-9)
+    # a mass that the file states stays, whatever the share
+    dense = text.replace(link("cross", 0.0), '<link name="cross"><inertial><mass value="{}"/><inertia ixx="0" '
+                         'iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>')  # fmt: skip
+    with pytest.raises(FileError, match=r"link 'cross' has a mass, but no inertia"):
+        robot(tmp_path, dense.format(0.2))
+    scene = robot(tmp_path, dense.format(0.2), link_share=1e-9)
+    np.testing.assert_allclose(scene.system.bodies.mass, [0.2, 0.3])
+    assert any("Links without inertia" in note and "cross" in note for note in scene.notes)
+    with pytest.raises(
+        FileError, match="mass of the link 'cross' must not be negative, but it is -1"
+    ):
+        robot(tmp_path, dense.format(-1), link_share=1e-9)
+    floating = robot(
+        tmp_path, text.replace(link("base"), link("base", 0.0)), link_share=1e-9, floating=True
+    )
+    assert not any("collision shapes" in warning for warning in floating.warnings)
 
 
 def test_meshes_without_mass_may_be_absent(tmp_path):

@@ -13,7 +13,7 @@ from stmuav_jax.math.rotation import euler_parameter_rate, from_rotation_vector
 RATIO, I_A, I_B, TORQUE = -0.5, 0.02, 0.05, 0.3
 
 
-def wheels(*forces, drive=None):
+def wheels(*forces, drive=None, ratio=RATIO):
     """Two wheels on the ground, the second geared to the first."""
     z = [0.0, 0.0, 1.0]
     bodies = [
@@ -22,7 +22,7 @@ def wheels(*forces, drive=None):
     ]
     first = stm.revolute("A", "ground", "a", point=[0.0, 0.0, 0.0], axis=z)
     second = stm.revolute("B", "ground", "b", point=[0.3, 0.0, 0.0], axis=z)
-    joints = [first, second, stm.mimic("gear", second, first, ratio=RATIO)]
+    joints = [first, second, stm.mimic("gear", second, first, ratio=ratio)]
     if drive is not None:
         joints.append(stm.drive("motor", first, drive, coordinate="angle"))
     return stm.System(bodies, joints, forces)
@@ -45,6 +45,13 @@ def test_a_geared_pair_turns_with_the_reduced_inertia_through_whole_turns():
         # the load is that of body i on body j
         np.testing.assert_allclose(gear, I_B * RATIO * expected, rtol=1e-6)
         np.testing.assert_allclose(mate, -RATIO * I_B * RATIO * expected, rtol=1e-6)
+
+
+def test_a_ratio_without_whole_turns_stops_at_half_a_turn_and_says_so():
+    system = wheels(stm.JointEffort("A", TORQUE), ratio=np.sqrt(2.0))
+    words = "joint 'B' has come to half a turn, within which the coupling 'gear' holds: its ratio of 1.41421 is no"
+    with pytest.raises(stm.SimulationError, match=words):
+        stm.simulate(system, system.reference, ts=[0.0, 1.5])
 
 
 def cylinders():

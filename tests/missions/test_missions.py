@@ -397,6 +397,7 @@ def test_the_verdict_names_what_a_flight_did_not_come_to(data):
     content["faults"] = [
         {"rotor": 1, "slider": None, "at": 50.0},
         {"rotor": 2, "slider": None, "at": 2.2},
+        {"rotor": None, "slider": None, "sensor": "position", "at": 0.5, "until": 3.0},
     ]
     content["wind"]["change"] = {"to": [2.0, 0.0, 0.0], "at": 2.1, "rise": 0.2}
     content["panel"] = [{"at": 1.0, "duration": 1.2}, {"at": 30.0, "duration": 1.0}]
@@ -405,7 +406,8 @@ def test_the_verdict_names_what_a_flight_did_not_come_to(data):
     assert words == (
         "It flew to t = 2.2 s of 2.2 s. It ended before waypoint 3 at t = 6 s, the end of move 2 of the "
         "panel at t = 31 s, the fault of rotor 1 at t = 50 s, the fault of rotor 2 at t = 2.2 s, the end of "
-        "the wind's change at t = 2.3 s. Until then, tolerances and limits were met."
+        "the fault of sensor position at t = 3 s, the end of the wind's change at t = 2.3 s. Until then, "
+        "tolerances and limits were met."
     )
 
 

@@ -14,7 +14,7 @@ from stmuav_jax import Study
 from stmuav_jax.checks.errors import SettingError
 from stmuav_jax.io.netcdf import FileError
 from stmuav_jax.studies import Axis, Column
-from stmuav_jax.studies.store import create_store, open_store, resume_store
+from stmuav_jax.studies.store import _list_differences, create_store, open_store, resume_store
 
 WORK = Toy(seed=3)
 
@@ -243,3 +243,17 @@ def test_a_disk_that_fails_keeps_what_was_written(whole, tmp_path, monkeypatch, 
     with resume_store(path, WORK) as store:
         write_pending(store)
     assert contents(path) == contents(whole)
+
+
+def test_a_difference_far_into_a_long_value_is_shown():
+    factors = [{"name": "F", "distribution": "uniform", "low": 1.0, "high": 2.0}]
+    sides = []
+    for high in (2.0, 3.0):
+        identity = {"sampling": {"factors": [factors[0] | {"high": high, "note": "x" * 60}]}}
+        empty = dict.fromkeys(("layout", "reasons", "versions"), "{}")
+        sides.append({"identity": json.dumps(identity), **empty})
+    (difference,) = _list_differences(*sides)
+    there, here = difference.split(" there and ")
+    assert '"high": 2.0' in there
+    assert '"high": 3.0' in here
+    assert len(difference) < 180

@@ -84,5 +84,5 @@ def report_search(
     if search.reason is SearchReason.INTERRUPTED:
         return 130
     if not is_successful:
-        print_line(Console(stderr=True), f"stmuav: the search has not converged; {else_words}")
+        print_line(Console(stderr=True), f"stmuav: {else_words}")
     return 0 if is_successful else 1

@@ -31,6 +31,7 @@ from ..formulations.augmented import (
     move_bodies,
     prepare_rows,
 )
+from ..formulations.independence import check_inertias
 from ..formulations.stabilisation import Unstabilised
 
 _MOST_STEPS = 30
@@ -141,7 +142,7 @@ def _check_path(system: System, path: KinematicPath, guess: State, free: tuple[i
         freedom_count = len(free) - rank
         raise ModelError(
             f"The motion is not determined: {freedom_count} degree(s) of freedom are left. Give as many "
-            "drivers as there are (stmuav_jax.driven), or hold a body."
+            "drivers as there are (stmuav_jax.dynamics.add_drivers), or hold a body."
         )
     explanation = {
         PathReason.NOT_CONVERGED: "no posture satisfies the joints and drivers near the one before",
@@ -298,13 +299,16 @@ def driver_efforts(system: System, states: State, ts: Float[Array, " k"]) -> dic
             `kinematic_path`. ts: their times [s].
 
     Raises:
-        ModelError: the system has no drivers.
+        ModelError: the system has no drivers, or its inertias are too far apart.
     """
     drivers = {j.name: k for k, j in enumerate(system.joints) if j.kind.startswith("drive_")}
     if not drivers:
-        raise ModelError("The system has no drivers: add them with stmuav_jax.driven.")
+        raise ModelError(
+            "The system has no drivers: add them with stmuav_jax.dynamics.add_drivers."
+        )
     # Efforts of drivers are multipliers, which the joint-coordinate formulation eliminates.
     formulation = Augmented()
+    check_inertias(system, jax.tree.map(lambda x: x[0], states))
     model = formulation.prepare(system)
     owner = list(model.constraints.owner)
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...mechanics.joint import Which, free_coordinates
-from ...mechanics.joint_states import evaluate_coordinate
+from ...mechanics.joint_states import evaluate_coordinate, joint_motion
 from ...mechanics.state import State
 from ...mechanics.system import System
 from ..formulations.augmented import AugmentedModel, prepare_rows
@@ -30,6 +30,8 @@ from .rank import evaluate_jacobian, singular_values
 _WITHIN = (1e-12, 1e-9, 1e-6)
 # A change is a jump if it exceeds this many times what the slopes at both ends explain, and round-off.
 _EXCESS, _ROUND_OFF = 10.0, 1e-12
+# A run that stops this near to half a turn of a coupled joint has stopped there [rad].
+_NEAR_HALF_TURN = 1e-3
 
 
 def describe_driver_jump(system: System, t: float) -> str:
@@ -57,6 +59,23 @@ def describe_driver_jump(system: System, t: float) -> str:
                         "velocity must be continuous, only its acceleration may jump: give it a motion "
                         "that changes over a finite time"
                     )
+    return ""
+
+
+def describe_half_turn(system: System, state: State) -> str:
+    """Text on the first coupling of two angles that has come to half a turn and counts none; empty if none has."""
+    for joint in system.joints:
+        mate = joint.mate
+        if mate is None or mate.coordinates != ("angle", "angle") or np.isfinite(mate.period):
+            continue
+        for name in (mate.dependent, mate.joint.name):
+            angle = float(np.asarray(joint_motion(system, state, name).angle))
+            if np.pi - abs(angle) < _NEAR_HALF_TURN:
+                return (
+                    f"the joint '{name}' has come to half a turn, within which the coupling '{joint.name}' "
+                    f"holds: its ratio of {float(mate.ratio):.6g} is no fraction with a denominator of at "
+                    "most 64, with which whole turns count"
+                )
     return ""
 
 

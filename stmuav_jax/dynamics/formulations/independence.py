@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ...checks.errors import has_values
+from ...checks.errors import ModelError, has_values
 from ...checks.numbers import array_module, as_jax, as_numpy, stack_arrays
 from ...math.compiler import compute_untraced, kept_jit
 from ...mechanics.constraint import ROWS
@@ -289,6 +289,34 @@ def find_extreme_bodies(system: System) -> tuple[str, str, float]:
     least, most = int(np.argmin(light)), int(np.argmax(heavy))
     ratio = float(heavy[most] / light[least]) if light[least] > 0 else float("inf")
     return system.names[least], system.names[most], ratio
+
+
+# Condition of the equations of `Augmented` at which accelerations lose all but four digits.
+_MOST_CONDITION = 3e11
+# Inertias that differ by less leave its equations enough digits in any but a nearly singular posture.
+_APART_ENOUGH = 1e6
+
+
+def check_condition(system: System, state: State) -> None:
+    """Raise `ModelError` if round-off leaves too little of the accelerations by `Augmented`."""
+    row_mask = find_independent_rows(system).rows
+    condition, geometric = compute_condition(system, row_mask, state)
+    # a posture near a singular one is not the masses' fault
+    if condition <= _MOST_CONDITION or condition <= 1e3 * geometric:
+        return
+    light, heavy, ratio = find_extreme_bodies(system)
+    raise ModelError(
+        f"The masses and moments of inertia of the bodies '{light}' and '{heavy}' are too far apart for "
+        f"Augmented: they differ by {ratio:.1g} (moments over the squared longest arm), and round-off "
+        f"of its equations, of condition {condition:.1g}, would dominate the accelerations. Use Tree(), "
+        "or give the bodies inertias nearer to each other."
+    )
+
+
+def check_inertias(system: System, state: State) -> None:
+    """Check the condition of `Augmented` where values are known and inertias are far apart."""
+    if has_values((system, state)) and find_extreme_bodies(system)[2] > _APART_ENOUGH:
+        check_condition(system, state)
 
 
 def compare_clearance(

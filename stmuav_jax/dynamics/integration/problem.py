@@ -287,11 +287,12 @@ class Problem(eqx.Module):
         )
 
     def _make_guard(self) -> Guard | None:
-        if self.method.steps == "state":
+        size = self.n_state + self.n_internal
+        if self.method.steps == "state" or not size:
             return None
         tolerance = jnp.maximum(self.method.rtol, self.method.atol)
         solver: Any = self.method.solver
-        return make_guard(solver, tolerance, self.n_state + self.n_internal)
+        return make_guard(solver, tolerance, size)
 
     def take_step(
         self, t0: Any, t1: Any, y: Float[Array, " k"], solver_state: Any, solver: Any = None

@@ -185,3 +185,26 @@ def test_settings_that_make_no_sense_are_refused():
                 stm.Baumgarte(**{gain: value})
     with pytest.raises(stm.SettingError, match="at least 1 iteration, not 0"):
         stm.Projection(iterations=0)
+
+
+def test_accelerations_that_masses_far_apart_leave_to_round_off_are_refused():
+    """A link of 1e-12 kg between a hinge and a slide, as imports have them: right by `Tree`."""
+
+    def evaluate(link, formulation=None):
+        bodies = [
+            stm.Body("link", link, [0.02 * link] * 3),
+            stm.Body("load", 1.0, [0.02] * 3, com=[0.3, 0.0, -0.2]),
+        ]
+        joints = [
+            stm.revolute("hinge", "ground", "link", point=[0.1, 0.2, 0.3], axis=[0.0, 1.0, 0.0]),
+            stm.translational("slide", "link", "load", axis=[1.0, 1.0, 0.0]),
+        ]
+        system = stm.System(bodies, joints, [stm.Gravity()])
+        result = stm.dynamics.evaluate(system, system.reference, formulation=formulation)
+        return np.asarray(result.accelerations.v_rate)[1]
+
+    exact = evaluate(1e-12, stm.Tree())
+    # the link's mass itself changes the motion by its share
+    np.testing.assert_allclose(evaluate(1e-6), exact, rtol=3e-6)
+    with pytest.raises(stm.ModelError, match="bodies 'link' and 'load' are too far apart for Augm"):
+        evaluate(1e-12)
