@@ -3,17 +3,19 @@
 About the centre of mass c, with lagged commands s and thrust shapes T_i(s_i) (see `record`), rotors at
 (x_i, y_i) with spin e_i, rates (p, q, r), arms l and velocity v,
 
-    p' =  B_x sum (y_i - c_y) T_i / l_x + d_x p + h_x q r + m_x v_y + moments that nobody knows,
-    q' = -B_y sum (x_i - c_x) T_i / l_y + d_y q + h_y p r + m_y v_x + ...,
+    p' =  B_x sum (y_i - c_y) T_i / l_x + d_x p + h_x q r + m_x v_y - G_x q sum e_i s_i + moments that nobody knows,
+    q' = -B_y sum (x_i - c_x) T_i / l_y + d_y q + h_y p r + m_y v_x + G_y p sum e_i s_i + ...,
     r' = -B_z sum e_i T_i - S sum e_i s_i' + d_z r + h_z p q + ...,
 
+where G and S are the angular momentum of the rotors, which turns with the body,
 and an accelerometer at b from the centre of mass reads
 
-    a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + forces that nobody knows.
+    a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + E (q, -p, 0) + forces that nobody knows,
 
-The velocity v is not logged. By v' = f + g - w x v, with gravity g in body axes by the gyroscope,
+where drag that acts above or below the centre of mass, and rotors that flap, make E. The velocity v is not logged. By
+v' = f + g - w x v, with gravity g in body axes by the gyroscope,
 
-    f_x' - r f_y = -D_x (f_x + g_x - q v_z),   f_y' + r f_x = -D_y (f_y + g_y + p v_z),
+    f_x' - r f_y = -D_x (f_x + g_x - q v_z) + E_x q' + E_y r p,   f_y' + r f_x = -D_y (f_y + g_y + p v_z) - E_y p' + E_x r q,
     f_z' = sum T_i' k/m - D_z (f_z + g_z + q v_x - p v_y)
 
 where the drag tells v once D is roughly known. Both fits are by prediction errors, so the unknown moments
@@ -71,8 +73,10 @@ _CURVE_DETERMINED = 0.15
 _CLIMB = 3.0
 # Time in which the integral of the forces' relations forgets [s].
 _LEAK = 1.0
-# Columns of the forces' regression before those of the thrust: lever, drag, turning constants.
-_FORCE = 10
+# Columns of the forces' regression before those of the thrust: lever, drag, turning constants, rates.
+_FORCE = 12
+# Columns of the moments' regression about roll or pitch after those of the rotors.
+_MOMENT = 4
 # Time of a battery's sag, and lag whose change of the response stands for a second one [s].
 _SLOW, _SECOND_LAG = 3.0, 0.005
 # Pace of the observer of a variant.
@@ -227,6 +231,8 @@ def _rotation_regression(
         columns = [w[:, axis]] + ([signals.velocity[:, 1 - axis]] if axis < 2 else [])
         # the newest sample is that before the step of the output
         older = filter_columns(np.append(np.zeros(n), boxes), [1.0], np.stack(columns, axis=1))
+        # the velocity in the middle of the step, by a straight line through those before it
+        older[n:, 1:] += (n - 0.5) / n * (older[n:, 1:] - older[:-n, 1:])
         measured.append(np.column_stack([older[:, 0], product, older[:, 1:]])[first::n])
     factor = layout.thrust_model_factor if variant.factor is None else variant.factor
     levers = layout.positions - layout.centre
@@ -234,8 +240,11 @@ def _rotation_regression(
     def build(lags: np.ndarray) -> Regression:
         s = compute_rotor_states(record.commands, dt, *lags)
         T = compute_thrust_shape(s, factor)
+        momentum = apply_filter(b, a, s @ layout.spin)[:, None] * w[:, :2]
+        gyroscopic = filter_columns(np.convolve(boxes, [0.5, 0.5]), [1.0], momentum)[first::n]
         parts = []
         for axis, columns in zip(axes, measured, strict=True):
+            sign = 1 if axis == 0 else -1
             if axis == 2:
                 spin = -layout.spin
                 rotors = np.stack(
@@ -246,10 +255,10 @@ def _rotation_regression(
             elif free:
                 rotors = through(integral, T)
             else:
-                sign = 1 if axis == 0 else -1
                 moment = T @ levers[:, 1 - axis] / layout.arms[axis]
                 rotors = sign * through(integral, np.stack([moment, -np.sum(T, axis=1)], axis=1))
-            parts.append(np.hstack([rotors, columns]))
+            turned = [] if axis == 2 else [sign * -gyroscopic[:, [1 - axis]]]
+            parts.append(np.hstack([rotors, columns, *turned]))
         X = np.zeros((len(y), len(axes), sum(part.shape[1] for part in parts)))
         place = 0
         for c, part in enumerate(parts):
@@ -260,19 +269,22 @@ def _rotation_regression(
     return build
 
 
-def _lever_columns(record: FlightRecord) -> np.ndarray:
-    """Accelerations (k, 3, 3) at unit distances from the centre of mass, as the accelerometer reads them.
-
-    The gyroscope goes from its own filter to that of the accelerometer.
-    """
+def _delay_as_forces(record: FlightRecord, values: np.ndarray) -> np.ndarray:
+    """Values (k, n) of the gyroscope, or made of them, through the accelerometer's filter instead of the gyroscope's."""
     (bg, ag), (bf, af) = (low_pass(cutoff, record.dt) for cutoff in record.cutoffs)
-    # the numerators of two-pole filters have the same zeros, so their quotient is a number
-    b, a = (ag * (bf[0] / bg[0]), af) if len(bg) == len(bf) else (np.convolve(bf, ag), af)
+    # The numerators of two-pole filters have the same zeros, so their quotient is a number. Zeros
+    # of a gyroscope's filter alone cannot be divided by; its gain is.
+    b = ag * (bf[0] / bg[0]) if len(bg) == len(bf) else np.convolve(bf, ag) / np.sum(bg)
+    return apply_filter(b, af, values)
+
+
+def _lever_columns(record: FlightRecord) -> np.ndarray:
+    """Accelerations (k, 3, 3) at unit distances from the centre of mass, as the accelerometer reads them."""
     w = record.gyroscope
     # The accelerometer is off the centre of mass by an unknown lever: angular accelerations and
     # squares of rates appear in its reading, in proportion to it.
-    dw = np.gradient(apply_filter(b, a, w), record.dt, axis=0)
-    S = apply_filter(b, a, np.einsum("ki,kj->kij", w, w).reshape(-1, 9)).reshape(-1, 3, 3)
+    dw = np.gradient(_delay_as_forces(record, w), record.dt, axis=0)
+    S = _delay_as_forces(record, np.einsum("ki,kj->kij", w, w).reshape(-1, 9)).reshape(-1, 3, 3)
     S -= np.eye(3) * np.trace(S, axis1=1, axis2=2)[:, None, None]
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         S[:, j, i] += dw[:, k]
@@ -310,13 +322,12 @@ def _force_regression(
     """
     record, layout = signals.record, signals.layout
     dt, n = record.dt, _sample_step(record, variant.rate)
-    b, a = low_pass(record.cutoffs[1], dt)
-    turning = apply_filter(b, a, record.gyroscope[:, 2])
+    rates = _delay_as_forces(record, record.gyroscope)
 
     def relate(f: np.ndarray) -> np.ndarray:
         # Horizontal forces turn with the vehicle's heading, which no sensor here measures: their
         # rates in turning axes need the yaw rate alone.
-        rate = turning.reshape(-1, *(1,) * (f.ndim - 2))
+        rate = rates[:, 2].reshape(-1, *(1,) * (f.ndim - 2))
         change = np.concatenate([np.zeros_like(f[:1]), np.diff(f, axis=0)]) / dt
         change[:, 0] -= rate * f[:, 1]
         change[:, 1] += rate * f[:, 0]
@@ -331,14 +342,17 @@ def _force_regression(
     coupling = np.stack([q * v[:, 2], -p * v[:, 2], p * v[:, 1] - q * v[:, 0]], axis=1)
     # the force within a step of the output follows from those before it, whose noise is not that of the output
     force = filter_columns(np.r_[np.zeros(n), 2.0, np.zeros(n - 1), -1.0], [1.0], signals.force)
-    acceleration = force + apply_filter(b, a, signals.gravity - coupling)
+    acceleration = force + _delay_as_forces(record, signals.gravity - coupling)
     acceleration -= np.mean(acceleration[2 * n :], axis=0)
     for axis in range(3):
         columns[:, axis, 3 + axis] = -acceleration[:, axis]
     # biases of the accelerometer and the mean velocity, which nothing tells, turn with the body
-    rates = apply_filter(b, a, record.gyroscope)
     for column, (axis, rate) in enumerate(((0, 2), (1, 2), (2, 0), (2, 1))):
         columns[:, axis, 6 + column] = rates[:, rate]
+    # force that follows the rates: the speed of the place where drag acts, and the flapping of rotors
+    follow = np.zeros((len(rates), 3, 2))
+    follow[:, 0, 0], follow[:, 1, 1] = rates[:, 1], -rates[:, 0]
+    columns[:, :, 10:_FORCE] = relate(follow)
     # so does the velocity along z, which nothing tells either: a polygon over the flight
     places = np.linspace(record.ts[0], record.ts[-1], nodes)
     for j, node in enumerate(np.eye(nodes)):
@@ -630,8 +644,10 @@ def explain_rotation(
     n, first = _sample_step(record, _FORCE_RATE), round(_SETTLING / record.dt)
     build = _rotation_regression(signals, [0, 1], _Variant(_FORCE_RATE))
     X = build(result.rotation.lags).X
-    weights = theta[:10] * [1, 0, 1, 1, 1, 1, 0, 1, 1, 1]
-    slopes = [X[:, c, 5 * c + 1] * theta[5 * c] / layout.arms[c] for c in range(2)]
+    m = 2 + _MOMENT
+    weights = theta[: 2 * m].copy()
+    weights[[1, m + 1]] = 0.0
+    slopes = [X[:, c, m * c + 1] * theta[m * c] / layout.arms[c] for c in range(2)]
     rates = filter_columns(np.full(n, 1 / n), [1.0], record.gyroscope[:, :2])[first::n]
     return record.ts[first::n], rates, X @ weights, np.stack(slopes, axis=1)
 
@@ -813,7 +829,7 @@ def _identify_rotation(
                 evaluation.estimate("delay", "s", lambda z: z[-1]), signals.record.dt
             ),
         }
-        places = {axis: 5 * k for k, axis in enumerate(axes)}
+        places = {axis: (2 + _MOMENT) * k for k, axis in enumerate(axes)}
         for axis, k in places.items():
             name = AXES[axis]
             new[name] = evaluation.estimate(
@@ -845,7 +861,7 @@ def _identify_rotation(
             new["inertia_ratio"] = evaluation.estimate(
                 "inertia ratio Jy / Jx",
                 "1",
-                lambda z: z[0] / z[5] * layout.arms[1] / layout.arms[0],
+                lambda z: z[0] / z[2 + _MOMENT] * layout.arms[1] / layout.arms[0],
             )
         doubtful = {axis: new[AXES[axis]] for axis in axes}
         doubtful = {
@@ -1041,7 +1057,7 @@ def _fit_free_motors(
 def _strengths(layout: RotorLayout) -> np.ndarray:
     """Columns of the motors' strengths about roll, then pitch."""
     n = len(layout.positions)
-    return np.r_[0:n, n + 3 : 2 * n + 3]
+    return np.r_[0:n, n + _MOMENT : 2 * n + _MOMENT]
 
 
 def _identify_free_centre(signals: _Signals, estimates: dict[str, ParameterEstimate]) -> None:
