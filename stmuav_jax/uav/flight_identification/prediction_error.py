@@ -29,6 +29,8 @@ from ...analysis.fit_statistics import compute_block_covariance
 
 # Most iterations, and step in deviations that ends them.
 _ITERATIONS, _CONVERGED = 40, 0.01
+# Share of the expected decrease that a step must have, and shortest share of a step.
+_DECREASE, _SHORTEST = 0.1, 1 / 64
 # Relative step of a difference quotient by a lag, and largest relative change of one in an iteration.
 _DIFFERENCE, _LARGEST_CHANGE = 1e-4, 0.3
 
@@ -164,14 +166,9 @@ def fit_prediction_error(
     theta = _solve_columns((X / scale[:, None]).reshape(-1, p), (y / scale).ravel())
     low, high = np.array(bounds, float).reshape(-1, 2).T
     iteration = 0
+    state = _compute_errors(y, X, theta, order)
     while True:
-        error = y - X @ theta
-        pasts = [_Past(error[:, j], order) for j in range(c)]
-        A = np.array(
-            [np.append(1.0, -past.regress(error[order:, j])) for j, past in enumerate(pasts)]
-        )
-        e = _whiten_columns(A, error[:, :, None])[:, :, 0]
-        sigma = np.sqrt(np.mean(e**2, axis=0))
+        error, pasts, A, e, sigma = state
         slopes = np.concatenate([X, _slopes_by_lags(build, eta, X, theta, high)], axis=2)
         J = _project_columns(pasts, _whiten_columns(A, slopes) / sigma[:, None])
         free = np.ones(p + len(eta), bool)
@@ -207,10 +204,42 @@ def fit_prediction_error(
         # take the same share of it, since the step of theta goes with that of eta.
         limit = _LARGEST_CHANGE * np.maximum(eta, 0.005)
         share = np.min(limit / np.maximum(np.abs(step[p:]), limit), initial=1.0)
-        theta = theta + share * step[:p]
-        eta = np.clip(eta + share * step[p:], low, high)
-        if len(eta):
-            X = build(eta).X
+        # The least sum of squares depends on A(z) too, which bends it more than the slopes tell: a
+        # step that overshoots is halved.
+        expected = float((e / sigma).ravel() @ (J @ step).ravel()) / len(e)
+        logarithm = float(np.sum(np.log(sigma)))
+        while True:
+            new_theta = theta + share * step[:p]
+            new_eta = np.clip(eta + share * step[p:], low, high)
+            new_X = build(new_eta).X if len(eta) else X
+            state = _compute_errors(y, new_X, new_theta, order)
+            decrease = logarithm - float(np.sum(np.log(state.sigma)))
+            if decrease >= _DECREASE * share * expected or share <= _SHORTEST:
+                break
+            share = 0.5 * share
+        theta, eta, X = new_theta, new_eta, new_X
+
+
+class _Errors(NamedTuple):
+    """Noise v (k + o, c), its earlier values, A(z) (c, o + 1), errors e (k, c) and their deviations (c,)."""
+
+    noise: np.ndarray
+    pasts: "list[_Past]"
+    denominators: np.ndarray
+    errors: np.ndarray
+    sigma: np.ndarray
+
+
+def _compute_errors(y: np.ndarray, X: np.ndarray, theta: np.ndarray, order: int) -> _Errors:
+    """Prediction errors of theta with the A(z) that makes them smallest."""
+    v = y - X @ theta
+    pasts = [_Past(column, order) for column in v.T]
+    A = np.array([
+        np.append(1.0, -past.regress(column[order:]))
+        for past, column in zip(pasts, v.T, strict=True)
+    ])  # fmt: skip
+    e = _whiten_columns(A, v[:, :, None])[:, :, 0]
+    return _Errors(v, pasts, A, e, np.sqrt(np.mean(e**2, axis=0)))
 
 
 def _slopes_by_lags(
