@@ -15,7 +15,8 @@ and an accelerometer at b from the centre of mass reads
 where drag that acts above or below the centre of mass, and rotors that flap, make E. The velocity v is not logged. By
 v' = f + g - w x v, with gravity g in body axes by the gyroscope,
 
-    f_x' - r f_y = -D_x (f_x + g_x - q v_z) + E_x q' + E_y r p,   f_y' + r f_x = -D_y (f_y + g_y + p v_z) - E_y p' + E_x r q,
+    f_x' - r f_y = -D_x (f_x + g_x - q v_z) + (D_y - D_x) r v_y + E_x q' + E_y r p,
+    f_y' + r f_x = -D_y (f_y + g_y + p v_z) + (D_y - D_x) r v_x - E_y p' + E_x r q,
     f_z' = sum T_i' k/m - D_z (f_z + g_z + q v_x - p v_y)
 
 where the drag tells v once D is roughly known. Both fits are by prediction errors, so the unknown moments
@@ -338,7 +339,7 @@ def _force_regression(
     nodes = max(round((record.ts[-1] - record.ts[0]) / _CLIMB), 2)
     columns = np.zeros((len(record.ts), 3, _FORCE + nodes))
     columns[:, :, :3] = relate(_lever_columns(record))
-    (p, q, _), v = record.gyroscope.T, signals.velocity
+    (p, q, r), v = record.gyroscope.T, signals.velocity
     coupling = np.stack([q * v[:, 2], -p * v[:, 2], p * v[:, 1] - q * v[:, 0]], axis=1)
     # the force within a step of the output follows from those before it, whose noise is not that of the output
     force = filter_columns(np.r_[np.zeros(n), 2.0, np.zeros(n - 1), -1.0], [1.0], signals.force)
@@ -346,6 +347,10 @@ def _force_regression(
     acceleration -= np.mean(acceleration[2 * n :], axis=0)
     for axis in range(3):
         columns[:, axis, 3 + axis] = -acceleration[:, axis]
+    # drag that differs along x and y does not turn with the heading
+    turned = _delay_as_forces(record, r[:, None] * v[:, [1, 0]])
+    columns[:, :2, 3] -= turned
+    columns[:, :2, 4] += turned
     # biases of the accelerometer and the mean velocity, which nothing tells, turn with the body
     for column, (axis, rate) in enumerate(((0, 2), (1, 2), (2, 0), (2, 1))):
         columns[:, axis, 6 + column] = rates[:, rate]
@@ -361,6 +366,9 @@ def _force_regression(
             share * rates[:, 1],
             -share * rates[:, 0],
         )
+    # integrals over a step by the trapezoidal rule, as those of the derivatives are exact
+    mean = [3, 4, 5, 6, 7, 8, 9, *range(_FORCE, _FORCE + nodes)]
+    columns[1:, :, mean] = 0.5 * (columns[1:, :, mean] + columns[:-1, :, mean])
     measured = sampled(columns.reshape(len(record.ts), -1)).reshape(-1, 3, _FORCE + nodes)
     factor = layout.thrust_model_factor if variant.factor is None else variant.factor
 
