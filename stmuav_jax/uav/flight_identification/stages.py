@@ -548,7 +548,8 @@ class _Evaluation:
             chance = abs(float(H @ V @ H) - blocks)
             excess.append(max(difference**2 - chance, 0.0))
         variants = float(np.mean(excess)) if excess else 0.0
-        # what an error of the observer's drag or of the voltage's exponent, of one deviation, changes
+        # What another pace of the observer, whose errors are then about twice as large, and an error of
+        # its drag or of the voltage's exponent, of one deviation, change.
         variants += sum((float(of(fit.values)) - value) ** 2 for fit in self.shifted)
         deviation = np.sqrt(blocks + scatter**2 + variants)
         return ParameterEstimate(
@@ -604,13 +605,13 @@ def identify_flight(
     report(0.2)
     hover = float(np.mean(record.commands))
     translation = _identify_translation(
-        signals, faster, [shifted, *other], hover, estimates, refusals
+        signals, [faster, shifted, *other], hover, estimates, refusals
     )
     report(0.35)
     axes = _screen_axes(signals, refusals)
     excited = list(axes)
     report(0.4)
-    rotation = _identify_rotation(signals, faster, other, axes, hover, estimates, refusals)
+    rotation = _identify_rotation(signals, [faster, *other], axes, hover, estimates, refusals)
     _name_combinations(signals, excited, estimates, refusals)
     report(0.8)
     if {"roll", "pitch"} <= set(estimates):
@@ -795,7 +796,6 @@ def _check_order(layout: RotorLayout, responses: dict[int, np.ndarray]) -> None:
 
 def _identify_rotation(
     signals: _Signals,
-    faster: _Signals,
     shifted: Sequence[_Signals],
     axes: list[int],
     hover: float,
@@ -814,7 +814,6 @@ def _identify_rotation(
         for other, variant in (
             (signals, _Variant(_FORCE_RATE)),
             (signals, _Variant(memory=2 * _MOMENT_MEMORY)),
-            (faster, _Variant(memory=_MOMENT_MEMORY)),
             (signals, _Variant(memory=_MOMENT_MEMORY, factor=other_factor)),
         ):
             result = _fit_rotation(other, axes, variant, fit.lags)
@@ -927,7 +926,6 @@ def _is_rejected(variant: PredictionErrorFit, main: PredictionErrorFit) -> bool:
 
 def _identify_translation(
     signals: _Signals,
-    faster: _Signals,
     shifted: Sequence[_Signals],
     hover: float,
     estimates: dict[str, ParameterEstimate],
@@ -947,12 +945,11 @@ def _identify_translation(
 
     settings = (
         (signals, _Variant(_FORCE_RATE)),
-        (faster, _Variant(_FORCE_RATE)),
         (signals, _Variant(_FORCE_RATE, memory=2 * _MEMORY)),
         *((other, _Variant(_FORCE_RATE)) for other in shifted),
     )
     main, *others = [run(setting, curve=False) for setting in settings]
-    evaluation = _Evaluation(main, others[:2], windows, others[2:])
+    evaluation = _Evaluation(main, others[:1], windows, others[1:])
     thrust = evaluation.estimate("thrust of a rotor over mass", "m/s^2", lambda z: z[_FORCE])
     effect = _channel_effect(main, 2, slice(_FORCE, _FORCE + 1))
     if effect >= _EXCITED / 4 and thrust.deviation <= _DETERMINED * thrust.value:
@@ -962,7 +959,7 @@ def _identify_translation(
         curves = [run(setting, curve=True) for setting in settings]
         _identify_curve(
             signals,
-            _Evaluation(curves[0], curves[1:3], windows, curves[3:]),
+            _Evaluation(curves[0], curves[1:2], windows, curves[2:]),
             hover,
             estimates,
             refusals,
