@@ -186,38 +186,44 @@ def fit_prediction_error(
         V = np.diag(_expand_covariance(_invert_information(columns.T @ columns), free))
         size = np.abs(step[free]) / np.sqrt(V[free])
         is_converged = iteration > 2 and bool(np.all(size < _CONVERGED))
-        if is_converged or iteration == _ITERATIONS:
-            return PredictionErrorFit(
-                np.append(theta, eta),
-                len(eta),
-                e / sigma,
-                J,
-                error,
-                A,
-                sigma,
-                dt,
-                free,
-                is_converged,
-            )
-        iteration += 1
-        # Predictions are far from linear in a lag, so that a full step may overshoot. All values
-        # take the same share of it, since the step of theta goes with that of eta.
-        limit = _LARGEST_CHANGE * np.maximum(eta, 0.005)
-        share = np.min(limit / np.maximum(np.abs(step[p:]), limit), initial=1.0)
-        # The least sum of squares depends on A(z) too, which bends it more than the slopes tell: a
-        # step that overshoots is halved.
-        expected = float((e / sigma).ravel() @ (J @ step).ravel()) / len(e)
-        logarithm = float(np.sum(np.log(sigma)))
-        while True:
-            new_theta = theta + share * step[:p]
-            new_eta = np.clip(eta + share * step[p:], low, high)
-            new_X = build(new_eta).X if len(eta) else X
-            state = _compute_errors(y, new_X, new_theta, order)
-            decrease = logarithm - float(np.sum(np.log(state.sigma)))
-            if decrease >= _DECREASE * share * expected or share <= _SHORTEST:
-                break
-            share = 0.5 * share
-        theta, eta, X = new_theta, new_eta, new_X
+        if not is_converged and iteration < _ITERATIONS:
+            iteration += 1
+            # Predictions are far from linear in a lag, so that a full step may overshoot. All values
+            # take the same share of it, since the step of theta goes with that of eta.
+            limit = _LARGEST_CHANGE * np.maximum(eta, 0.005)
+            share = np.min(limit / np.maximum(np.abs(step[p:]), limit), initial=1.0)
+            # The least sum of squares depends on A(z) too, which bends it more than the slopes tell: a
+            # step that overshoots is halved.
+            expected = float((e / sigma).ravel() @ (J @ step).ravel()) / len(e)
+            while share > _SHORTEST:
+                new_theta = theta + share * step[:p]
+                new_eta = np.clip(eta + share * step[p:], low, high)
+                new_X = build(new_eta).X if len(eta) else X
+                state = _compute_errors(y, new_X, new_theta, order)
+                decrease = -float(np.sum(np.log(state.sigma / sigma)))
+                if decrease >= _DECREASE * share * expected:
+                    break
+                share = 0.5 * share
+            else:
+                # Where the delay passes a sample of the commands the slope by it jumps, and no share
+                # of a step of less than a deviation has a smaller sum.
+                is_converged = len(e) * expected < 1
+                iteration = _ITERATIONS
+            if iteration < _ITERATIONS:
+                theta, eta, X = new_theta, new_eta, new_X
+                continue
+        return PredictionErrorFit(
+            np.append(theta, eta),
+            len(eta),
+            e / sigma,
+            J,
+            error,
+            A,
+            sigma,
+            dt,
+            free,
+            is_converged,
+        )
 
 
 class _Errors(NamedTuple):

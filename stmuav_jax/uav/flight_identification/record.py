@@ -256,7 +256,8 @@ def observe_motion(
         # The method of Adams and Bashforth of second order: a step by Euler's would turn gravity by
         # an angle that lags by half a step, and lengthen it with each turn.
         now = tuple(
-            x + dt * (1.5 * c - 0.5 * o) for x, c, o in zip(now, slope, before or slope, strict=True)
+            x + dt * (1.5 * c - 0.5 * o)
+            for x, c, o in zip(now, slope, before or slope, strict=True)
         )
         before = slope
     return velocity, gravity

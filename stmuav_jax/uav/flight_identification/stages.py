@@ -809,20 +809,24 @@ def _identify_rotation(
     # An axis that is not determined is left out and the others are fitted again: its noise would
     # spoil the lag that all of them share.
     while axes:
-        fit = _fit_rotation(signals, axes, _Variant(memory=_MOMENT_MEMORY), np.array(_START))
+        # In calm air sensor noise and slow errors of the velocity are left, which need a longer A(z)
+        # than gusts do.
+        for memory in (_MOMENT_MEMORY, 2 * _MOMENT_MEMORY):
+            fit = _fit_rotation(signals, axes, _Variant(memory=memory), np.array(_START))
+            if _test_whiteness(fit) >= _LEVEL:
+                break
         variants, factors = [], []
-        for other, variant in (
-            (signals, _Variant(_FORCE_RATE)),
-            (signals, _Variant(memory=2 * _MOMENT_MEMORY)),
-            (signals, _Variant(memory=_MOMENT_MEMORY, factor=other_factor)),
+        for variant in (
+            _Variant(_FORCE_RATE),
+            _Variant(memory=2 * memory),
+            _Variant(memory=memory, factor=other_factor),
         ):
-            result = _fit_rotation(other, axes, variant, fit.lags)
+            result = _fit_rotation(signals, axes, variant, fit.lags)
             if variant.factor is None or not _is_rejected(result, fit):
                 variants.append(result)
                 factors.append(factor if variant.factor is None else variant.factor)
         further = [
-            _fit_rotation(other, axes, _Variant(memory=_MOMENT_MEMORY), fit.lags)
-            for other in shifted
+            _fit_rotation(other, axes, _Variant(memory=memory), fit.lags) for other in shifted
         ]
         evaluation = _Evaluation(fit, variants, _window_count(signals.record), further)
         # a thrust shape with another factor has another slope at hover
@@ -1322,9 +1326,12 @@ def _test_terms(
 def _test_whiteness(fit: PredictionErrorFit) -> float:
     """P-value of Ljung and Box's test of the prediction errors, of the channel that is least white."""
     measured = np.ones(fit.errors.shape, bool)
-    lags = len(fit.denominators[0]) + 19
-    Q = np.sum(compute_autocorrelation(fit.errors, measured, lags) ** 2, axis=0)
-    return float(min(1.0, np.min(stats.chi2.sf(Q, 20)) * fit.errors.shape[1]))
+    order = fit.denominators.shape[1] - 1
+    Q = np.sum(compute_autocorrelation(fit.errors, measured, order + 20) ** 2, axis=0)
+    # The noise of a derivative, which is all that calm air leaves, needs an A(z) without end. One of
+    # finite order leaves correlations of its inverse, which change no deviation by much.
+    rest = 20 * len(fit.errors) / order**2
+    return float(min(1.0, np.min(stats.ncx2.sf(Q, 20, rest)) * fit.errors.shape[1]))
 
 
 def _predict_left_out(evaluation: _Evaluation) -> float:
