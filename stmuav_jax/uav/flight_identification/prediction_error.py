@@ -160,7 +160,7 @@ def fit_prediction_error(
     regression = build(eta)
     y, X, dt = regression
     order = max(round(memory / dt), 2)
-    c, p = X.shape[1:]
+    p = X.shape[2]
     # a regression with white noise starts the search
     scale = np.std(y, axis=0)
     theta = _solve_columns((X / scale[:, None]).reshape(-1, p), (y / scale).ravel())

@@ -271,7 +271,7 @@ def _rotation_regression(
 
 
 def _delay_as_forces(record: FlightRecord, values: np.ndarray) -> np.ndarray:
-    """Values (k, n) of the gyroscope, or made of them, through the accelerometer's filter instead of the gyroscope's."""
+    """Values (k, n) of the gyroscope, or made of them, through the accelerometer's filter instead of its own."""
     (bg, ag), (bf, af) = (low_pass(cutoff, record.dt) for cutoff in record.cutoffs)
     # The numerators of two-pole filters have the same zeros, so their quotient is a number. Zeros
     # of a gyroscope's filter alone cannot be divided by; its gain is.
@@ -813,7 +813,7 @@ def _identify_rotation(
         # than gusts do.
         for memory in (_MOMENT_MEMORY, 2 * _MOMENT_MEMORY):
             fit = _fit_rotation(signals, axes, _Variant(memory=memory), np.array(_START))
-            if _test_whiteness(fit) >= _LEVEL:
+            if _test_whiteness(fit, 0.0) >= _LEVEL:
                 break
         variants, factors = [], []
         for variant in (
@@ -1323,14 +1323,17 @@ def _test_terms(
     return results
 
 
-def _test_whiteness(fit: PredictionErrorFit) -> float:
-    """P-value of Ljung and Box's test of the prediction errors, of the channel that is least white."""
+def _test_whiteness(fit: PredictionErrorFit, share: float = 1.0) -> float:
+    """P-value of Ljung and Box's test of the prediction errors, of the channel that is least white.
+
+    Correlations of a share of the inverse of A(z)'s order are allowed.
+    """
     measured = np.ones(fit.errors.shape, bool)
     order = fit.denominators.shape[1] - 1
     Q = np.sum(compute_autocorrelation(fit.errors, measured, order + 20) ** 2, axis=0)
     # The noise of a derivative, which is all that calm air leaves, needs an A(z) without end. One of
     # finite order leaves correlations of its inverse, which change no deviation by much.
-    rest = 20 * len(fit.errors) / order**2
+    rest = 20 * len(fit.errors) * (share / order) ** 2
     return float(min(1.0, np.min(stats.ncx2.sf(Q, 20, rest)) * fit.errors.shape[1]))
 
 
