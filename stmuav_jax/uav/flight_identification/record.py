@@ -211,6 +211,17 @@ def apply_filter(
     return filter_columns(b, a, values - values[:1]) + gain * values[:1]
 
 
+def refilter_rates(
+    record: FlightRecord, values: Float[np.ndarray, "k n"]
+) -> Float[np.ndarray, "k n"]:
+    """Readings of the gyroscope, or values made of them, through the accelerometer's filter instead of its own."""
+    (bg, ag), (bf, af) = (low_pass(cutoff, record.dt) for cutoff in record.cutoffs)
+    # The numerators of two-pole filters have the same zeros, so their quotient is a number. Zeros
+    # of a gyroscope's filter alone cannot be divided by; its gain is.
+    b = ag * (bf[0] / bg[0]) if len(bg) == len(bf) else np.convolve(bf, ag) / np.sum(bg)
+    return apply_filter(b, af, values)
+
+
 def observe_motion(
     record: FlightRecord,
     force: Float[np.ndarray, "k 3"],

@@ -48,6 +48,7 @@ from .record import (
     filter_columns,
     low_pass,
     observe_motion,
+    refilter_rates,
 )
 
 AXES = ("roll", "pitch", "yaw")
@@ -270,22 +271,13 @@ def _rotation_regression(
     return build
 
 
-def _delay_as_forces(record: FlightRecord, values: np.ndarray) -> np.ndarray:
-    """Values (k, n) of the gyroscope, or made of them, through the accelerometer's filter instead of its own."""
-    (bg, ag), (bf, af) = (low_pass(cutoff, record.dt) for cutoff in record.cutoffs)
-    # The numerators of two-pole filters have the same zeros, so their quotient is a number. Zeros
-    # of a gyroscope's filter alone cannot be divided by; its gain is.
-    b = ag * (bf[0] / bg[0]) if len(bg) == len(bf) else np.convolve(bf, ag) / np.sum(bg)
-    return apply_filter(b, af, values)
-
-
 def _lever_columns(record: FlightRecord) -> np.ndarray:
     """Accelerations (k, 3, 3) at unit distances from the centre of mass, as the accelerometer reads them."""
     w = record.gyroscope
     # The accelerometer is off the centre of mass by an unknown lever: angular accelerations and
     # squares of rates appear in its reading, in proportion to it.
-    dw = np.gradient(_delay_as_forces(record, w), record.dt, axis=0)
-    S = _delay_as_forces(record, np.einsum("ki,kj->kij", w, w).reshape(-1, 9)).reshape(-1, 3, 3)
+    dw = np.gradient(refilter_rates(record, w), record.dt, axis=0)
+    S = refilter_rates(record, np.einsum("ki,kj->kij", w, w).reshape(-1, 9)).reshape(-1, 3, 3)
     S -= np.eye(3) * np.trace(S, axis1=1, axis2=2)[:, None, None]
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         S[:, j, i] += dw[:, k]
@@ -323,7 +315,7 @@ def _force_regression(
     """
     record, layout = signals.record, signals.layout
     dt, n = record.dt, _sample_step(record, variant.rate)
-    rates = _delay_as_forces(record, record.gyroscope)
+    rates = refilter_rates(record, record.gyroscope)
 
     def relate(f: np.ndarray) -> np.ndarray:
         # Horizontal forces turn with the vehicle's heading, which no sensor here measures: their
@@ -343,12 +335,12 @@ def _force_regression(
     coupling = np.stack([q * v[:, 2], -p * v[:, 2], p * v[:, 1] - q * v[:, 0]], axis=1)
     # the force within a step of the output follows from those before it, whose noise is not that of the output
     force = filter_columns(np.r_[np.zeros(n), 2.0, np.zeros(n - 1), -1.0], [1.0], signals.force)
-    acceleration = force + _delay_as_forces(record, signals.gravity - coupling)
+    acceleration = force + refilter_rates(record, signals.gravity - coupling)
     acceleration -= np.mean(acceleration[2 * n :], axis=0)
     for axis in range(3):
         columns[:, axis, 3 + axis] = -acceleration[:, axis]
     # drag that differs along x and y does not turn with the heading
-    turned = _delay_as_forces(record, r[:, None] * v[:, [1, 0]])
+    turned = refilter_rates(record, r[:, None] * v[:, [1, 0]])
     columns[:, :2, 3] -= turned
     columns[:, :2, 4] += turned
     # biases of the accelerometer and the mean velocity, which nothing tells, turn with the body
