@@ -93,6 +93,14 @@ def test_a_flight_in_closed_loop_gives_the_true_numbers(result):
         assert e.deviation == pytest.approx(np.linalg.norm([e.blocks, e.windows, e.variants]))
     for axis, value in zip(("roll", "pitch"), TRUTH.B, strict=False):
         assert result.estimates[axis].deviation < 0.04 * value
+    # the rotors' angular momentum turns with the body, and drag below the centre of mass follows the rates
+    for fit, places, values in (
+        (result.rotation, [5, 11], TRUTH.gyroscopic),
+        (result.translation, [10, 11], TRUTH.rate_force),
+    ):
+        spread = np.sqrt(np.diag(fit.compute_covariance(1.0)))[places]
+        assert np.all(np.abs(fit.values[places] - values) < 3.5 * spread)
+        assert np.all(spread < np.abs(values))
     table = result.describe()
     assert all(e.name in table for e in result.estimates.values())
 

@@ -195,7 +195,7 @@ def fit_prediction_error(
             # The least sum of squares depends on A(z) too, which bends it more than the slopes tell: a
             # step that overshoots is halved.
             expected = float((e / sigma).ravel() @ (J @ step).ravel()) / len(e)
-            while share > _SHORTEST:
+            while True:
                 new_theta = theta + share * step[:p]
                 new_eta = np.clip(eta + share * step[p:], low, high)
                 new_X = build(new_eta).X if len(eta) else X
@@ -204,11 +204,12 @@ def fit_prediction_error(
                 if decrease >= _DECREASE * share * expected:
                     break
                 share = 0.5 * share
-            else:
-                # Where the delay passes a sample of the commands the slope by it jumps, and no share
-                # of a step of less than a deviation has a smaller sum.
-                is_converged = len(e) * expected < 1
-                iteration = _ITERATIONS
+                if share < _SHORTEST:
+                    # Where the delay passes a sample of the commands the slope by it jumps, and no share
+                    # of a step of less than a deviation has a smaller sum.
+                    is_converged = len(e) * expected < 1
+                    iteration = _ITERATIONS
+                    break
             if iteration < _ITERATIONS:
                 theta, eta, X = new_theta, new_eta, new_X
                 continue

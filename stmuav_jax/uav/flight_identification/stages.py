@@ -7,13 +7,13 @@ About the centre of mass c, with lagged commands s and thrust shapes T_i(s_i) (s
     q' = -B_y sum (x_i - c_x) T_i / l_y + d_y q + h_y p r + m_y v_x + G_y p sum e_i s_i + ...,
     r' = -B_z sum e_i T_i - S sum e_i s_i' + d_z r + h_z p q + ...,
 
-where G and S are the angular momentum of the rotors, which turns with the body,
-and an accelerometer at b from the centre of mass reads
+where the angular momentum of the rotors makes S and, as it turns with the body, G; an accelerometer at b from the
+centre of mass reads
 
     a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + E (q, -p, 0) + forces that nobody knows,
 
-where drag that acts above or below the centre of mass, and rotors that flap, make E. The velocity v is not logged. By
-v' = f + g - w x v, with gravity g in body axes by the gyroscope,
+where drag that acts above or below the centre of mass makes E. The velocity v is not logged. By v' = f + g - w x v,
+with gravity g in body axes by the gyroscope,
 
     f_x' - r f_y = -D_x (f_x + g_x - q v_z) + (D_y - D_x) r v_y + E_x q' + E_y r p,
     f_y' + r f_x = -D_y (f_y + g_y + p v_z) + (D_y - D_x) r v_x - E_y p' + E_x r q,
@@ -346,7 +346,7 @@ def _force_regression(
     # biases of the accelerometer and the mean velocity, which nothing tells, turn with the body
     for column, (axis, rate) in enumerate(((0, 2), (1, 2), (2, 0), (2, 1))):
         columns[:, axis, 6 + column] = rates[:, rate]
-    # force that follows the rates: the speed of the place where drag acts, and the flapping of rotors
+    # force that follows the rates, as the speed of a place above or below the centre of mass does
     follow = np.zeros((len(rates), 3, 2))
     follow[:, 0, 0], follow[:, 1, 1] = rates[:, 1], -rates[:, 0]
     columns[:, :, 10:_FORCE] = relate(follow)
