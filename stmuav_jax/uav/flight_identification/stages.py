@@ -259,8 +259,8 @@ def _rotation_regression(
             else:
                 moment = T @ levers[:, 1 - axis] / layout.arms[axis]
                 rotors = sign * through(integral, np.stack([moment, -np.sum(T, axis=1)], axis=1))
-            turned = [] if axis == 2 else [sign * -gyroscopic[:, [1 - axis]]]
-            parts.append(np.hstack([rotors, columns, *turned]))
+            coupling = [] if axis == 2 else [sign * -gyroscopic[:, [1 - axis]]]
+            parts.append(np.hstack([rotors, columns, *coupling]))
         X = np.zeros((len(y), len(axes), sum(part.shape[1] for part in parts)))
         place = 0
         for c, part in enumerate(parts):
@@ -340,9 +340,9 @@ def _force_regression(
     for axis in range(3):
         columns[:, axis, 3 + axis] = -acceleration[:, axis]
     # drag that differs along x and y does not turn with the heading
-    turned = refilter_rates(record, r[:, None] * v[:, [1, 0]])
-    columns[:, :2, 3] -= turned
-    columns[:, :2, 4] += turned
+    turning_speed = refilter_rates(record, r[:, None] * v[:, [1, 0]])
+    columns[:, :2, 3] -= turning_speed
+    columns[:, :2, 4] += turning_speed
     # biases of the accelerometer and the mean velocity, which nothing tells, turn with the body
     for column, (axis, rate) in enumerate(((0, 2), (1, 2), (2, 0), (2, 1))):
         columns[:, axis, 6 + column] = rates[:, rate]
