@@ -35,6 +35,11 @@ class Truth(NamedTuple):
     imu: tuple = (0.0007, 0.0037, -0.0022)
     drag: tuple = (0.45, 0.51, 0.4)
     speed: tuple = (-6.0, 6.0)  # moment of v_y and v_x [rad/(m s)]
+    gyroscopic: tuple = (
+        8.3,
+        7.9,
+    )  # moment of the spins' sum and a rate about the other axis [rad/s]
+    rate_force: tuple = (0.0036, 0.0041)  # of q and -p, by drag below the centre of mass [m/s]
     gyro_bias: tuple = (0.003, -0.002, 0.001)
     force_bias: tuple = (-0.16, -0.12, 0.05)
     gust_moment: tuple = (8.0, 8.0, 1.5)  # deviations [rad/s^2]
@@ -142,10 +147,13 @@ def _fly(key, pilot, truth, filters):
         ])  # fmt: skip
         vb = R.T @ v
         moments += jnp.array([truth.speed[0] * vb[1], truth.speed[1] * vb[0], 0.0])
+        G, E, spin = truth.gyroscopic, truth.rate_force, jnp.sum(SPIN * s2)
+        moments += spin * jnp.array([-G[0] * w[1], G[1] * w[0], 0.0])
         acceleration = (
             moments + gust[:3] + ratios * jnp.array([w[1] * w[2], w[0] * w[2], w[0] * w[1]])
         )
         force = jnp.array([0.0, 0.0, truth.thrust * jnp.sum(T)]) - drag * vb + gust[3:]
+        force += jnp.array([E[0] * w[1], -E[1] * w[0], 0.0])
         felt = force + jnp.cross(acceleration + spun / DT, imu) + jnp.cross(w, jnp.cross(w, imu))
         gf, gyro = filtered(
             gf, w + jnp.asarray(truth.gyro_bias) + truth.gyro_noise * e[:3], filters[0]

@@ -18,7 +18,9 @@ from problems.multirotor_flights import (
     simulate_flights,
 )
 from scipy.constants import g
+from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from stmuav_jax import missions
 from stmuav_jax.analysis.fit_statistics import compare_estimates
@@ -43,7 +45,14 @@ from stmuav_jax.uav.flight_identification.prediction_error import (
     Regression,
     fit_prediction_error,
 )
-from stmuav_jax.uav.flight_identification.record import compute_rotor_states
+from stmuav_jax.uav.flight_identification.record import (
+    FlightRecord,
+    apply_filter,
+    compute_rotor_states,
+    low_pass,
+    observe_motion,
+    refilter_rates,
+)
 
 FLIGHTS = Path(__file__).parents[2].parent / "shared" / "flights"
 real = pytest.mark.skipif(
@@ -84,6 +93,14 @@ def test_a_flight_in_closed_loop_gives_the_true_numbers(result):
         assert e.deviation == pytest.approx(np.linalg.norm([e.blocks, e.windows, e.variants]))
     for axis, value in zip(("roll", "pitch"), TRUTH.B, strict=False):
         assert result.estimates[axis].deviation < 0.04 * value
+    # the rotors' angular momentum turns with the body, and drag below the centre of mass follows the rates
+    for fit, places, values in (
+        (result.rotation, [5, 11], TRUTH.gyroscopic),
+        (result.translation, [10, 11], TRUTH.rate_force),
+    ):
+        spread = np.sqrt(np.diag(fit.compute_covariance(1.0)))[places]
+        assert np.all(np.abs(fit.values[places] - values) < 3.5 * spread)
+        assert np.all(spread < np.abs(values))
     table = result.describe()
     assert all(e.name in table for e in result.estimates.values())
 
@@ -265,7 +282,7 @@ def test_the_written_model_is_trimmed_and_simulated_from_the_command_line(
 
 @pytest.mark.slow
 def test_the_written_model_flies_and_its_log_gives_its_numbers_again(result, tmp_path):
-    """Model, mission, log as a CSV file, and identification again: each number within three deviations of both."""
+    """Model, mission, log as a CSV file, and identification again: each number within four of its deviations."""
     files = write_identified_model(result, tmp_path / "own.toml")
     # every factor of the study has an effect on the mission
     missions.load_mission_study(tomllib.loads(files.study.read_text()), tmp_path)
@@ -276,17 +293,42 @@ def test_the_written_model_flies_and_its_log_gives_its_numbers_again(result, tmp
     assert np.max(flight.run.rollout.signals["position_error"]) < 2.0
     save_flight_record(missions.to_flight_record(flight), tmp_path / "log.csv")
     log = read_flight_log(tmp_path / "log.csv")
-    again = identify_flight(log.to_record(), AIRFRAME).estimates
-    # The moments of horizontal speed are not compared: in a flight without gusts their deviations are too small, and
-    # that about roll is off by five of them.
-    for name in (
-        "lag", "delay", "roll", "pitch", "inertia_ratio", "centre_x", "centre_y", "thrust", "thrust_lag",
-        "drag_x", "drag_y", "drag_z", "inertia_x", "inertia_y", "free_centre_x",
-    ):  # fmt: skip
-        e, own = result.estimates[name], again[name]
-        assert abs(e.value - own.value) < 3 * np.hypot(e.deviation, own.deviation), name
+    again = identify_flight(log.to_record(), AIRFRAME)
+    # Numbers of the model itself are met within the deviations of this calm flight alone. The moments of horizontal
+    # speed are both those of one height of the drag.
+    numbers = tomllib.loads(files.model.read_text())["parameters"]
+    number = lambda name: numbers[name]["value"]
+    height = number("drag_height") - number("centre_z")
+    true = {
+        name: result.estimates[name].value
+        for name in ("roll", "pitch", "inertia_ratio", "centre_x", "centre_y")
+    }
+    true |= {f"drag_{x}": result.estimates[f"drag_{x}"].value for x in "xyz"}
+    true |= {
+        "lag": number("time_constant"),
+        "inertia_x": number("inertia_x"),
+        "inertia_y": number("inertia_y"),
+    }
+    true |= {
+        "delay": 0.004,
+        "thrust": result.estimates["thrust_slope"].value,
+        "thrust_lag": number("time_constant"),
+    }
+    true["roll_speed"] = height * number("drag_y") / number("inertia_x")
+    true["pitch_speed"] = -height * number("drag_x") / number("inertia_y")
+    for name, value in true.items():
+        e = again.estimates[name]
+        assert abs(e.value - value) < 4 * e.deviation, name
+    assert again.verdict.status == "consistent"
+    for name, size in (
+        ("roll", 0.002),
+        ("roll_speed", 0.03),
+        ("pitch_speed", 0.03),
+        ("drag_x", 0.05),
+    ):
+        assert again.estimates[name].deviation < size * abs(true[name])
     for x in "xyz":
-        assert abs(again[f"imu_{x}"].value) < 0.4e-3
+        assert abs(again.estimates[f"imu_{x}"].value) < 0.2e-3
 
 
 def test_a_filter_of_the_centre_ends_where_the_whole_record_does(record, result):
@@ -340,7 +382,8 @@ def test_positions_in_millimetres_are_refused(record):
     ("manoeuvres", "known", "signs"),
     [
         ((1.0, 0.0, 0.0, 0.0), {"roll", "lag", "centre_y", "thrust"}, {"pitch": "++--"}),
-        ((0.0, 0.0, 0.0, 0.0), {"imu_x", "drag_x"}, {"roll": "++++", "pitch": "++++"}),
+        # that of pitch is at the bound of what counts as determined: one gust more or less decides
+        ((0.0, 0.0, 0.0, 0.0), {"imu_x", "drag_x"}, {"roll": "++++"}),
         ((0.0, 0.0, 0.0, 1.5), {"thrust", "thrust_slope"}, {"roll": "++++", "pitch": "++++"}),
     ],
     ids=["roll", "hover", "climbs"],
@@ -422,6 +465,46 @@ def test_the_lag_is_exact_for_commands_that_hold():
     s = compute_rotor_states(u, dt, tau, delay)[:, 0]
     after = np.maximum(ts - 0.2 - delay, 0.0)
     np.testing.assert_allclose(s, 0.3 + 0.7 * (1 - np.exp(-after / tau)), atol=1e-12)
+
+
+def test_velocity_and_gravity_of_a_quick_motion_are_observed():
+    """Tilts of 20 degrees within a quarter of a second; gravity by Euler's method would be off by 0.018 m/s^2."""
+    ts = np.arange(0, 20, 0.002)
+    # the first seconds are level, as the observer starts
+    angles = lambda t: np.array([1.2 * np.sin(1.5 * t), 0.35 * np.sin(7 * t), 0.35 * np.sin(6 * t)])
+    tilt = lambda t: Rotation.from_euler("ZYX", (np.tanh(t / 4) * angles(t)).T)
+    turn = tilt(ts)
+    rates = (tilt(ts - 1e-5).inv() * tilt(ts + 1e-5)).as_rotvec() / 2e-5
+    drag, up = np.array([0.45, 0.5, 0.4]), np.array([0.0, 0.0, 1.0])
+
+    def push(t, v):
+        """Specific force in body axes of a vehicle that holds its height."""
+        R = tilt(t)
+        lift = (g - 3 * v[..., 2]) / R.as_matrix()[..., 2, 2]
+        return lift[..., None] * up - drag * R.inv().apply(v)
+
+    slope = lambda t, v: tilt(t).apply(push(t, v)) - g * up
+    v = solve_ivp(slope, (0, 20), np.zeros(3), t_eval=ts, rtol=1e-8).y.T
+    force, v = push(ts, v), turn.inv().apply(v)
+    record = FlightRecord(ts, np.zeros((len(ts), 4)), rates, force)
+    velocity, gravity = observe_motion(record, force, drag[:2])
+    late = ts > 10
+    assert np.all(np.std(velocity[late] - v[late], axis=0) < 0.01)
+    assert np.all(np.std(gravity[late] - turn.inv().apply(-g * up)[late], axis=0) < 0.004)
+
+
+@pytest.mark.parametrize(
+    "cutoffs", [(80.0, 30.0), (80.0, np.inf), (np.inf, 30.0), (np.inf, np.inf)]
+)
+def test_rates_pass_through_the_filter_of_the_forces(cutoffs):
+    """A ramp, late as a force would be; the zeros of a gyroscope's filter alone are a step of delay that stays."""
+    ts = np.arange(500) * 0.002
+    record = FlightRecord(
+        ts, np.zeros((500, 4)), np.zeros((500, 3)), np.zeros((500, 3)), None, cutoffs
+    )
+    by_gyroscope, by_force = (apply_filter(*low_pass(f, 0.002), ts[:, None] + 1.0) for f in cutoffs)
+    late = by_force[-1, 0] - refilter_rates(record, by_gyroscope)[-1, 0]
+    assert late == pytest.approx(0.002 if cutoffs == (80, np.inf) else 0.0, abs=1e-9)
 
 
 def layout_file(folder, text=""):

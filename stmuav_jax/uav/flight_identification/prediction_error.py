@@ -29,6 +29,8 @@ from ...analysis.fit_statistics import compute_block_covariance
 
 # Most iterations, and step in deviations that ends them.
 _ITERATIONS, _CONVERGED = 40, 0.01
+# Share of the expected decrease that a step must have, and shortest share of a step.
+_DECREASE, _SHORTEST = 0.1, 1 / 64
 # Relative step of a difference quotient by a lag, and largest relative change of one in an iteration.
 _DIFFERENCE, _LARGEST_CHANGE = 1e-4, 0.3
 
@@ -158,20 +160,15 @@ def fit_prediction_error(
     regression = build(eta)
     y, X, dt = regression
     order = max(round(memory / dt), 2)
-    c, p = X.shape[1:]
+    p = X.shape[2]
     # a regression with white noise starts the search
     scale = np.std(y, axis=0)
     theta = _solve_columns((X / scale[:, None]).reshape(-1, p), (y / scale).ravel())
     low, high = np.array(bounds, float).reshape(-1, 2).T
     iteration = 0
+    state = _compute_errors(y, X, theta, order)
     while True:
-        error = y - X @ theta
-        pasts = [_Past(error[:, j], order) for j in range(c)]
-        A = np.array(
-            [np.append(1.0, -past.regress(error[order:, j])) for j, past in enumerate(pasts)]
-        )
-        e = _whiten_columns(A, error[:, :, None])[:, :, 0]
-        sigma = np.sqrt(np.mean(e**2, axis=0))
+        error, pasts, A, e, sigma = state
         slopes = np.concatenate([X, _slopes_by_lags(build, eta, X, theta, high)], axis=2)
         J = _project_columns(pasts, _whiten_columns(A, slopes) / sigma[:, None])
         free = np.ones(p + len(eta), bool)
@@ -189,28 +186,67 @@ def fit_prediction_error(
         V = np.diag(_expand_covariance(_invert_information(columns.T @ columns), free))
         size = np.abs(step[free]) / np.sqrt(V[free])
         is_converged = iteration > 2 and bool(np.all(size < _CONVERGED))
-        if is_converged or iteration == _ITERATIONS:
-            return PredictionErrorFit(
-                np.append(theta, eta),
-                len(eta),
-                e / sigma,
-                J,
-                error,
-                A,
-                sigma,
-                dt,
-                free,
-                is_converged,
-            )
-        iteration += 1
-        # Predictions are far from linear in a lag, so that a full step may overshoot. All values
-        # take the same share of it, since the step of theta goes with that of eta.
-        limit = _LARGEST_CHANGE * np.maximum(eta, 0.005)
-        share = np.min(limit / np.maximum(np.abs(step[p:]), limit), initial=1.0)
-        theta = theta + share * step[:p]
-        eta = np.clip(eta + share * step[p:], low, high)
-        if len(eta):
-            X = build(eta).X
+        if not is_converged and iteration < _ITERATIONS:
+            iteration += 1
+            # Predictions are far from linear in a lag, so that a full step may overshoot. All values
+            # take the same share of it, since the step of theta goes with that of eta.
+            limit = _LARGEST_CHANGE * np.maximum(eta, 0.005)
+            share = np.min(limit / np.maximum(np.abs(step[p:]), limit), initial=1.0)
+            # The least sum of squares depends on A(z) too, which bends it more than the slopes tell: a
+            # step that overshoots is halved.
+            expected = float((e / sigma).ravel() @ (J @ step).ravel()) / len(e)
+            while True:
+                new_theta = theta + share * step[:p]
+                new_eta = np.clip(eta + share * step[p:], low, high)
+                new_X = build(new_eta).X if len(eta) else X
+                state = _compute_errors(y, new_X, new_theta, order)
+                decrease = -float(np.sum(np.log(state.sigma / sigma)))
+                if decrease >= _DECREASE * share * expected:
+                    break
+                share = 0.5 * share
+                if share < _SHORTEST:
+                    # Where the delay passes a sample of the commands the slope by it jumps, and no share
+                    # of a step of less than a deviation has a smaller sum.
+                    is_converged = len(e) * expected < 1
+                    iteration = _ITERATIONS
+                    break
+            if iteration < _ITERATIONS:
+                theta, eta, X = new_theta, new_eta, new_X
+                continue
+        return PredictionErrorFit(
+            np.append(theta, eta),
+            len(eta),
+            e / sigma,
+            J,
+            error,
+            A,
+            sigma,
+            dt,
+            free,
+            is_converged,
+        )
+
+
+class _Errors(NamedTuple):
+    """Noise v (k + o, c), its earlier values, A(z) (c, o + 1), errors e (k, c) and their deviations (c,)."""
+
+    noise: np.ndarray
+    pasts: "list[_Past]"
+    denominators: np.ndarray
+    errors: np.ndarray
+    sigma: np.ndarray
+
+
+def _compute_errors(y: np.ndarray, X: np.ndarray, theta: np.ndarray, order: int) -> _Errors:
+    """Prediction errors of theta with the A(z) that makes them smallest."""
+    v = y - X @ theta
+    pasts = [_Past(column, order) for column in v.T]
+    A = np.array([
+        np.append(1.0, -past.regress(column[order:]))
+        for past, column in zip(pasts, v.T, strict=True)
+    ])  # fmt: skip
+    e = _whiten_columns(A, v[:, :, None])[:, :, 0]
+    return _Errors(v, pasts, A, e, np.sqrt(np.mean(e**2, axis=0)))
 
 
 def _slopes_by_lags(

@@ -211,6 +211,17 @@ def apply_filter(
     return filter_columns(b, a, values - values[:1]) + gain * values[:1]
 
 
+def refilter_rates(
+    record: FlightRecord, values: Float[np.ndarray, "k n"]
+) -> Float[np.ndarray, "k n"]:
+    """Readings of the gyroscope, or values made of them, through the accelerometer's filter instead of its own."""
+    (bg, ag), (bf, af) = (low_pass(cutoff, record.dt) for cutoff in record.cutoffs)
+    # The numerators of two-pole filters have the same zeros, so their quotient is a number. Zeros
+    # of a gyroscope's filter alone cannot be divided by; its gain is.
+    b = ag * (bf[0] / bg[0]) if len(bg) == len(bf) else np.convolve(bf, ag) / np.sum(bg)
+    return apply_filter(b, af, values)
+
+
 def observe_motion(
     record: FlightRecord,
     force: Float[np.ndarray, "k 3"],
@@ -235,21 +246,29 @@ def observe_motion(
     target = -(force - mean)[:, :2] / drag
     frequency = pace * _OBSERVER
     quick, slow = 2 * _DAMPING * frequency, frequency**2
-    keep = 1 - pace * dt / _CLIMB
-    gx = gy = vx = vy = vz = 0.0
+    forget = pace / _CLIMB
+    now, before = (0.0,) * 5, None
     velocity, gravity = np.zeros_like(force), np.zeros_like(force)
     rows = np.concatenate([record.gyroscope, push, target], axis=1).tolist()
     # plain numbers: a loop over arrays of three would take twenty times as long
     for k, (p, q, r, fx, fy, fz, tx, ty) in enumerate(rows):
+        vx, vy, vz, gx, gy = now
         # The length of gravity is known: two components give the third, without drift.
         gz = -(max(GRAVITY**2 - gx * gx - gy * gy, 0.0) ** 0.5)
         velocity[k], gravity[k] = (vx, vy, vz), (gx, gy, gz)
         ex, ey = tx - vx, ty - vy
-        ax, ay = fx + gx - q * vz + r * vy + quick * ex, fy + gy - r * vx + p * vz + quick * ey
-        az = fz + gz - p * vy + q * vx
-        gx, gy = (
-            gx + dt * (slow * ex - q * gz + r * gy),
-            gy + dt * (slow * ey - r * gx + p * gz),
+        slope = (
+            fx + gx - q * vz + r * vy + quick * ex,
+            fy + gy - r * vx + p * vz + quick * ey,
+            fz + gz - p * vy + q * vx - forget * vz,
+            slow * ex - q * gz + r * gy,
+            slow * ey - r * gx + p * gz,
         )
-        vx, vy, vz = vx + dt * ax, vy + dt * ay, keep * vz + dt * az
+        # The method of Adams and Bashforth of second order: a step by Euler's would turn gravity by
+        # an angle that lags by half a step, and lengthen it with each turn.
+        now = tuple(
+            x + dt * (1.5 * c - 0.5 * o)
+            for x, c, o in zip(now, slope, before or slope, strict=True)
+        )
+        before = slope
     return velocity, gravity

@@ -3,17 +3,20 @@
 About the centre of mass c, with lagged commands s and thrust shapes T_i(s_i) (see `record`), rotors at
 (x_i, y_i) with spin e_i, rates (p, q, r), arms l and velocity v,
 
-    p' =  B_x sum (y_i - c_y) T_i / l_x + d_x p + h_x q r + m_x v_y + moments that nobody knows,
-    q' = -B_y sum (x_i - c_x) T_i / l_y + d_y q + h_y p r + m_y v_x + ...,
+    p' =  B_x sum (y_i - c_y) T_i / l_x + d_x p + h_x q r + m_x v_y - G_x q sum e_i s_i + moments that nobody knows,
+    q' = -B_y sum (x_i - c_x) T_i / l_y + d_y q + h_y p r + m_y v_x + G_y p sum e_i s_i + ...,
     r' = -B_z sum e_i T_i - S sum e_i s_i' + d_z r + h_z p q + ...,
 
-and an accelerometer at b from the centre of mass reads
+where the angular momentum of the rotors makes S and, as it turns with the body, G; an accelerometer at b from the
+centre of mass reads
 
-    a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + forces that nobody knows.
+    a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + E (q, -p, 0) + forces that nobody knows,
 
-The velocity v is not logged. By v' = f + g - w x v, with gravity g in body axes by the gyroscope,
+where drag that acts above or below the centre of mass makes E. The velocity v is not logged. By v' = f + g - w x v,
+with gravity g in body axes by the gyroscope,
 
-    f_x' - r f_y = -D_x (f_x + g_x - q v_z),   f_y' + r f_x = -D_y (f_y + g_y + p v_z),
+    f_x' - r f_y = -D_x (f_x + g_x - q v_z) + (D_y - D_x) r v_y + E_x q' + E_y r p,
+    f_y' + r f_x = -D_y (f_y + g_y + p v_z) + (D_y - D_x) r v_x - E_y p' + E_x r q,
     f_z' = sum T_i' k/m - D_z (f_z + g_z + q v_x - p v_y)
 
 where the drag tells v once D is roughly known. Both fits are by prediction errors, so the unknown moments
@@ -45,6 +48,7 @@ from .record import (
     filter_columns,
     low_pass,
     observe_motion,
+    refilter_rates,
 )
 
 AXES = ("roll", "pitch", "yaw")
@@ -71,8 +75,10 @@ _CURVE_DETERMINED = 0.15
 _CLIMB = 3.0
 # Time in which the integral of the forces' relations forgets [s].
 _LEAK = 1.0
-# Columns of the forces' regression before those of the thrust: lever, drag, turning constants.
-_FORCE = 10
+# Columns of the forces' regression before those of the thrust: lever, drag, turning constants, rates.
+_FORCE = 12
+# Columns of the moments' regression about roll or pitch after those of the rotors.
+_MOMENT = 4
 # Time of a battery's sag, and lag whose change of the response stands for a second one [s].
 _SLOW, _SECOND_LAG = 3.0, 0.005
 # Pace of the observer of a variant.
@@ -227,6 +233,8 @@ def _rotation_regression(
         columns = [w[:, axis]] + ([signals.velocity[:, 1 - axis]] if axis < 2 else [])
         # the newest sample is that before the step of the output
         older = filter_columns(np.append(np.zeros(n), boxes), [1.0], np.stack(columns, axis=1))
+        # the velocity in the middle of the step, by a straight line through those before it
+        older[n:, 1:] += (n - 0.5) / n * (older[n:, 1:] - older[:-n, 1:])
         measured.append(np.column_stack([older[:, 0], product, older[:, 1:]])[first::n])
     factor = layout.thrust_model_factor if variant.factor is None else variant.factor
     levers = layout.positions - layout.centre
@@ -234,8 +242,11 @@ def _rotation_regression(
     def build(lags: np.ndarray) -> Regression:
         s = compute_rotor_states(record.commands, dt, *lags)
         T = compute_thrust_shape(s, factor)
+        momentum = apply_filter(b, a, s @ layout.spin)[:, None] * w[:, :2]
+        gyroscopic = filter_columns(np.convolve(boxes, [0.5, 0.5]), [1.0], momentum)[first::n]
         parts = []
         for axis, columns in zip(axes, measured, strict=True):
+            sign = 1 if axis == 0 else -1
             if axis == 2:
                 spin = -layout.spin
                 rotors = np.stack(
@@ -246,10 +257,10 @@ def _rotation_regression(
             elif free:
                 rotors = through(integral, T)
             else:
-                sign = 1 if axis == 0 else -1
                 moment = T @ levers[:, 1 - axis] / layout.arms[axis]
                 rotors = sign * through(integral, np.stack([moment, -np.sum(T, axis=1)], axis=1))
-            parts.append(np.hstack([rotors, columns]))
+            coupling = [] if axis == 2 else [sign * -gyroscopic[:, [1 - axis]]]
+            parts.append(np.hstack([rotors, columns, *coupling]))
         X = np.zeros((len(y), len(axes), sum(part.shape[1] for part in parts)))
         place = 0
         for c, part in enumerate(parts):
@@ -261,18 +272,12 @@ def _rotation_regression(
 
 
 def _lever_columns(record: FlightRecord) -> np.ndarray:
-    """Accelerations (k, 3, 3) at unit distances from the centre of mass, as the accelerometer reads them.
-
-    The gyroscope goes from its own filter to that of the accelerometer.
-    """
-    (bg, ag), (bf, af) = (low_pass(cutoff, record.dt) for cutoff in record.cutoffs)
-    # the numerators of two-pole filters have the same zeros, so their quotient is a number
-    b, a = (ag * (bf[0] / bg[0]), af) if len(bg) == len(bf) else (np.convolve(bf, ag), af)
+    """Accelerations (k, 3, 3) at unit distances from the centre of mass, as the accelerometer reads them."""
     w = record.gyroscope
     # The accelerometer is off the centre of mass by an unknown lever: angular accelerations and
     # squares of rates appear in its reading, in proportion to it.
-    dw = np.gradient(apply_filter(b, a, w), record.dt, axis=0)
-    S = apply_filter(b, a, np.einsum("ki,kj->kij", w, w).reshape(-1, 9)).reshape(-1, 3, 3)
+    dw = np.gradient(refilter_rates(record, w), record.dt, axis=0)
+    S = refilter_rates(record, np.einsum("ki,kj->kij", w, w).reshape(-1, 9)).reshape(-1, 3, 3)
     S -= np.eye(3) * np.trace(S, axis1=1, axis2=2)[:, None, None]
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         S[:, j, i] += dw[:, k]
@@ -310,13 +315,12 @@ def _force_regression(
     """
     record, layout = signals.record, signals.layout
     dt, n = record.dt, _sample_step(record, variant.rate)
-    b, a = low_pass(record.cutoffs[1], dt)
-    turning = apply_filter(b, a, record.gyroscope[:, 2])
+    rates = refilter_rates(record, record.gyroscope)
 
     def relate(f: np.ndarray) -> np.ndarray:
         # Horizontal forces turn with the vehicle's heading, which no sensor here measures: their
         # rates in turning axes need the yaw rate alone.
-        rate = turning.reshape(-1, *(1,) * (f.ndim - 2))
+        rate = rates[:, 2].reshape(-1, *(1,) * (f.ndim - 2))
         change = np.concatenate([np.zeros_like(f[:1]), np.diff(f, axis=0)]) / dt
         change[:, 0] -= rate * f[:, 1]
         change[:, 1] += rate * f[:, 0]
@@ -327,18 +331,25 @@ def _force_regression(
     nodes = max(round((record.ts[-1] - record.ts[0]) / _CLIMB), 2)
     columns = np.zeros((len(record.ts), 3, _FORCE + nodes))
     columns[:, :, :3] = relate(_lever_columns(record))
-    (p, q, _), v = record.gyroscope.T, signals.velocity
+    (p, q, r), v = record.gyroscope.T, signals.velocity
     coupling = np.stack([q * v[:, 2], -p * v[:, 2], p * v[:, 1] - q * v[:, 0]], axis=1)
     # the force within a step of the output follows from those before it, whose noise is not that of the output
     force = filter_columns(np.r_[np.zeros(n), 2.0, np.zeros(n - 1), -1.0], [1.0], signals.force)
-    acceleration = force + apply_filter(b, a, signals.gravity - coupling)
+    acceleration = force + refilter_rates(record, signals.gravity - coupling)
     acceleration -= np.mean(acceleration[2 * n :], axis=0)
     for axis in range(3):
         columns[:, axis, 3 + axis] = -acceleration[:, axis]
+    # drag that differs along x and y does not turn with the heading
+    turning_speed = refilter_rates(record, r[:, None] * v[:, [1, 0]])
+    columns[:, :2, 3] -= turning_speed
+    columns[:, :2, 4] += turning_speed
     # biases of the accelerometer and the mean velocity, which nothing tells, turn with the body
-    rates = apply_filter(b, a, record.gyroscope)
     for column, (axis, rate) in enumerate(((0, 2), (1, 2), (2, 0), (2, 1))):
         columns[:, axis, 6 + column] = rates[:, rate]
+    # force that follows the rates, as the speed of a place above or below the centre of mass does
+    follow = np.zeros((len(rates), 3, 2))
+    follow[:, 0, 0], follow[:, 1, 1] = rates[:, 1], -rates[:, 0]
+    columns[:, :, 10:_FORCE] = relate(follow)
     # so does the velocity along z, which nothing tells either: a polygon over the flight
     places = np.linspace(record.ts[0], record.ts[-1], nodes)
     for j, node in enumerate(np.eye(nodes)):
@@ -347,6 +358,9 @@ def _force_regression(
             share * rates[:, 1],
             -share * rates[:, 0],
         )
+    # integrals over a step by the trapezoidal rule, as those of the derivatives are exact
+    mean = [3, 4, 5, 6, 7, 8, 9, *range(_FORCE, _FORCE + nodes)]
+    columns[1:, :, mean] = 0.5 * (columns[1:, :, mean] + columns[:-1, :, mean])
     measured = sampled(columns.reshape(len(record.ts), -1)).reshape(-1, 3, _FORCE + nodes)
     factor = layout.thrust_model_factor if variant.factor is None else variant.factor
 
@@ -526,7 +540,8 @@ class _Evaluation:
             chance = abs(float(H @ V @ H) - blocks)
             excess.append(max(difference**2 - chance, 0.0))
         variants = float(np.mean(excess)) if excess else 0.0
-        # what an error of the observer's drag or of the voltage's exponent, of one deviation, changes
+        # What another pace of the observer, whose errors are then about twice as large, and an error of
+        # its drag or of the voltage's exponent, of one deviation, change.
         variants += sum((float(of(fit.values)) - value) ** 2 for fit in self.shifted)
         deviation = np.sqrt(blocks + scatter**2 + variants)
         return ParameterEstimate(
@@ -582,13 +597,13 @@ def identify_flight(
     report(0.2)
     hover = float(np.mean(record.commands))
     translation = _identify_translation(
-        signals, faster, [shifted, *other], hover, estimates, refusals
+        signals, [faster, shifted, *other], hover, estimates, refusals
     )
     report(0.35)
     axes = _screen_axes(signals, refusals)
     excited = list(axes)
     report(0.4)
-    rotation = _identify_rotation(signals, faster, other, axes, hover, estimates, refusals)
+    rotation = _identify_rotation(signals, [faster, *other], axes, hover, estimates, refusals)
     _name_combinations(signals, excited, estimates, refusals)
     report(0.8)
     if {"roll", "pitch"} <= set(estimates):
@@ -630,8 +645,10 @@ def explain_rotation(
     n, first = _sample_step(record, _FORCE_RATE), round(_SETTLING / record.dt)
     build = _rotation_regression(signals, [0, 1], _Variant(_FORCE_RATE))
     X = build(result.rotation.lags).X
-    weights = theta[:10] * [1, 0, 1, 1, 1, 1, 0, 1, 1, 1]
-    slopes = [X[:, c, 5 * c + 1] * theta[5 * c] / layout.arms[c] for c in range(2)]
+    m = 2 + _MOMENT
+    weights = theta[: 2 * m].copy()
+    weights[[1, m + 1]] = 0.0
+    slopes = [X[:, c, m * c + 1] * theta[m * c] / layout.arms[c] for c in range(2)]
     rates = filter_columns(np.full(n, 1 / n), [1.0], record.gyroscope[:, :2])[first::n]
     return record.ts[first::n], rates, X @ weights, np.stack(slopes, axis=1)
 
@@ -771,7 +788,6 @@ def _check_order(layout: RotorLayout, responses: dict[int, np.ndarray]) -> None:
 
 def _identify_rotation(
     signals: _Signals,
-    faster: _Signals,
     shifted: Sequence[_Signals],
     axes: list[int],
     hover: float,
@@ -785,21 +801,24 @@ def _identify_rotation(
     # An axis that is not determined is left out and the others are fitted again: its noise would
     # spoil the lag that all of them share.
     while axes:
-        fit = _fit_rotation(signals, axes, _Variant(memory=_MOMENT_MEMORY), np.array(_START))
+        # In calm air sensor noise and slow errors of the velocity are left, which need a longer A(z)
+        # than gusts do.
+        for memory in (_MOMENT_MEMORY, 2 * _MOMENT_MEMORY):
+            fit = _fit_rotation(signals, axes, _Variant(memory=memory), np.array(_START))
+            if _test_whiteness(fit, 0.0) >= _LEVEL:
+                break
         variants, factors = [], []
-        for other, variant in (
-            (signals, _Variant(_FORCE_RATE)),
-            (signals, _Variant(memory=2 * _MOMENT_MEMORY)),
-            (faster, _Variant(memory=_MOMENT_MEMORY)),
-            (signals, _Variant(memory=_MOMENT_MEMORY, factor=other_factor)),
+        for variant in (
+            _Variant(_FORCE_RATE),
+            _Variant(memory=2 * memory),
+            _Variant(memory=memory, factor=other_factor),
         ):
-            result = _fit_rotation(other, axes, variant, fit.lags)
+            result = _fit_rotation(signals, axes, variant, fit.lags)
             if variant.factor is None or not _is_rejected(result, fit):
                 variants.append(result)
                 factors.append(factor if variant.factor is None else variant.factor)
         further = [
-            _fit_rotation(other, axes, _Variant(memory=_MOMENT_MEMORY), fit.lags)
-            for other in shifted
+            _fit_rotation(other, axes, _Variant(memory=memory), fit.lags) for other in shifted
         ]
         evaluation = _Evaluation(fit, variants, _window_count(signals.record), further)
         # a thrust shape with another factor has another slope at hover
@@ -813,7 +832,7 @@ def _identify_rotation(
                 evaluation.estimate("delay", "s", lambda z: z[-1]), signals.record.dt
             ),
         }
-        places = {axis: 5 * k for k, axis in enumerate(axes)}
+        places = {axis: (2 + _MOMENT) * k for k, axis in enumerate(axes)}
         for axis, k in places.items():
             name = AXES[axis]
             new[name] = evaluation.estimate(
@@ -845,7 +864,7 @@ def _identify_rotation(
             new["inertia_ratio"] = evaluation.estimate(
                 "inertia ratio Jy / Jx",
                 "1",
-                lambda z: z[0] / z[5] * layout.arms[1] / layout.arms[0],
+                lambda z: z[0] / z[2 + _MOMENT] * layout.arms[1] / layout.arms[0],
             )
         doubtful = {axis: new[AXES[axis]] for axis in axes}
         doubtful = {
@@ -903,7 +922,6 @@ def _is_rejected(variant: PredictionErrorFit, main: PredictionErrorFit) -> bool:
 
 def _identify_translation(
     signals: _Signals,
-    faster: _Signals,
     shifted: Sequence[_Signals],
     hover: float,
     estimates: dict[str, ParameterEstimate],
@@ -923,12 +941,11 @@ def _identify_translation(
 
     settings = (
         (signals, _Variant(_FORCE_RATE)),
-        (faster, _Variant(_FORCE_RATE)),
         (signals, _Variant(_FORCE_RATE, memory=2 * _MEMORY)),
         *((other, _Variant(_FORCE_RATE)) for other in shifted),
     )
     main, *others = [run(setting, curve=False) for setting in settings]
-    evaluation = _Evaluation(main, others[:2], windows, others[2:])
+    evaluation = _Evaluation(main, others[:1], windows, others[1:])
     thrust = evaluation.estimate("thrust of a rotor over mass", "m/s^2", lambda z: z[_FORCE])
     effect = _channel_effect(main, 2, slice(_FORCE, _FORCE + 1))
     if effect >= _EXCITED / 4 and thrust.deviation <= _DETERMINED * thrust.value:
@@ -938,7 +955,7 @@ def _identify_translation(
         curves = [run(setting, curve=True) for setting in settings]
         _identify_curve(
             signals,
-            _Evaluation(curves[0], curves[1:3], windows, curves[3:]),
+            _Evaluation(curves[0], curves[1:2], windows, curves[2:]),
             hover,
             estimates,
             refusals,
@@ -1041,7 +1058,7 @@ def _fit_free_motors(
 def _strengths(layout: RotorLayout) -> np.ndarray:
     """Columns of the motors' strengths about roll, then pitch."""
     n = len(layout.positions)
-    return np.r_[0:n, n + 3 : 2 * n + 3]
+    return np.r_[0:n, n + _MOMENT : 2 * n + _MOMENT]
 
 
 def _identify_free_centre(signals: _Signals, estimates: dict[str, ParameterEstimate]) -> None:
@@ -1298,12 +1315,18 @@ def _test_terms(
     return results
 
 
-def _test_whiteness(fit: PredictionErrorFit) -> float:
-    """P-value of Ljung and Box's test of the prediction errors, of the channel that is least white."""
+def _test_whiteness(fit: PredictionErrorFit, share: float = 1.0) -> float:
+    """P-value of Ljung and Box's test of the prediction errors, of the channel that is least white.
+
+    Correlations of a share of the inverse of A(z)'s order are allowed.
+    """
     measured = np.ones(fit.errors.shape, bool)
-    lags = len(fit.denominators[0]) + 19
-    Q = np.sum(compute_autocorrelation(fit.errors, measured, lags) ** 2, axis=0)
-    return float(min(1.0, np.min(stats.chi2.sf(Q, 20)) * fit.errors.shape[1]))
+    order = fit.denominators.shape[1] - 1
+    Q = np.sum(compute_autocorrelation(fit.errors, measured, order + 20) ** 2, axis=0)
+    # The noise of a derivative, which is all that calm air leaves, needs an A(z) without end. One of
+    # finite order leaves correlations of its inverse, which change no deviation by much.
+    rest = 20 * len(fit.errors) * (share / order) ** 2
+    return float(min(1.0, np.min(stats.ncx2.sf(Q, 20, rest)) * fit.errors.shape[1]))
 
 
 def _predict_left_out(evaluation: _Evaluation) -> float:
