@@ -511,11 +511,11 @@ def _run_filter(
         # Machine code takes the filters of a bank one by one, in the lanes of the processor's vectors; compiled
         # by XLA, each operation is one over all of them.
         has_lanes = jax.tree.map(lambda a: jnp.ndim(a) == 2, u)
-        one = lambda tree, lanes: jax.tree.map(
+        take_first = lambda tree, lanes: jax.tree.map(
             lambda a, lane: a[..., 0] if lane else a, tree, lanes
         )
-        first = one((before, y), jax.tree.map(lambda _: True, (before, y)))
-        if not evaluate.has_code(method.step, model, *first, one(u, has_lanes), dt):  # pyright: ignore
+        first = take_first((before, y), jax.tree.map(lambda _: True, (before, y)))
+        if not evaluate.has_code(method.step, model, *first, take_first(u, has_lanes), dt):  # pyright: ignore
             return method.step(model, before, y, u, dt)
         axes = (-1, -1, jax.tree.map(lambda lane: -1 if lane else None, has_lanes))
         step = lambda before, y, u: evaluate(method.step, model, before, y, u, dt)

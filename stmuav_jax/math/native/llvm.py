@@ -545,8 +545,8 @@ def _repeat_passes(arguments: Sequence[Buffer], results: Sequence[Buffer], loop:
     """Instructions that go through the passes of a loop."""
     (row,) = results
     count = len(next(iter(loop.tables.values())))
-    given = [k for k in range(len(arguments)) if k not in loop.tables]
-    lines = _find_buffers(given, 1)
+    numbers = [k for k in range(len(arguments)) if k not in loop.tables]
+    lines = _find_buffers(numbers, 1)
     args = []
     for k in range(len(arguments)):
         if k in loop.tables:

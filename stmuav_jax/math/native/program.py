@@ -475,10 +475,10 @@ def native(
             operation is a loop, x[i] = function(*args, A[i] @ x, *(table[i] for the others)) for all i, for an array
             x (s, k) of zeros that is the last argument. Batches of it are left to XLA.
     """
-    body = function
+    evaluate_row: Any = None
     if tables is not None:
-        body = _sum_rows(function, len(tables))
-        function = _make_loop(function, body, tables)
+        evaluate_row = native(_sum_rows(function, len(tables)))
+        function = _make_loop(function, evaluate_row, tables)
     jitted: Any = eqx.filter_jit(function)
     programs: OrderedDict[Any, tuple[Program, Any] | None] = OrderedDict()
 
@@ -501,7 +501,9 @@ def native(
             groups = [owners[k] for k in places]
             entry = _make(function, structure, static, places, arrays, groups)
             if tables is not None and entry is not None:
-                entry = _with_body(body, tables, args, groups, entry)
+                body = evaluate_row.find((*args, *(table[0] for table in tables)))
+                program = body and Recursion(entry[0].jaxpr, groups, body[0][0], tables)
+                entry = program and (program, entry[1])
             programs[key] = entry
             # A program holds its jaxpr, derivatives and graph. A process that makes many
             # structures, as a test suite does, would keep them all; the oldest go first.
@@ -523,17 +525,17 @@ def native(
 
     @wraps(function)
     def call(*args: Any) -> Any:
-        found = find(args)
-        if found is None:
+        match = find(args)
+        if match is None:
             return jitted(*args) if not is_on() or can_be_found(args) else function(*args)
-        (program, result), arrays = found
+        (program, result), arrays = match
         return result(native_p.bind(*arrays, program=program, lead=()))
 
     def has_code(*args: Any) -> bool:
-        found = find(args)
-        return found is not None and found[0][0].graph() is not None
+        match = find(args)
+        return match is not None and match[0][0].graph() is not None
 
-    call.has_code = has_code  # pyright: ignore[reportAttributeAccessIssue]
+    call.find, call.has_code = find, has_code  # pyright: ignore[reportAttributeAccessIssue]
     return call
 
 
@@ -555,17 +557,16 @@ def _sum_rows(function: Callable[..., Any], count: int) -> Callable[..., Any]:
 
 
 def _make_loop(
-    function: Callable[..., Any], evaluate_row: Callable[..., Any], tables: Sequence[np.ndarray]
+    function: Callable[..., Any], evaluate_row: Any, tables: Sequence[np.ndarray]
 ) -> Callable[..., Any]:
     """Loop over rows of tables in which a function makes one row after the other."""
     weights, *others = tables
-    by_code = native(evaluate_row)
 
     def fill_rows(*args: Any) -> Array:
         *first, x = args
         # Machine code is compiled once however often it is called, and a batch need not copy all rows to
         # change one. XLA would compile a copy of the function for every pass.
-        if not by_code.has_code(*args, *(table[0] for table in tables)):
+        if not evaluate_row.has_code(*args, *(table[0] for table in tables)):
 
             def add_row(x: Array, at: tuple[Any, ...]) -> tuple[Array, None]:
                 number, *row = at
@@ -581,20 +582,6 @@ def _make_loop(
         return jnp.stack(rows)
 
     return fill_rows
-
-
-def _with_body(
-    function: Any, tables: Sequence[np.ndarray], args: Any, groups: Sequence[int], entry: Any
-) -> tuple[Program, Any] | None:
-    """The entry with a program that has the loop's body."""
-    whole, result = entry
-    leaves, structure = jax.tree.flatten((*args, *(table[0] for table in tables)))
-    places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
-    static = tuple((k, leaf) for k, leaf in enumerate(leaves) if k not in set(places))
-    # each table is an argument of its own
-    more = [len(args) + k for k in range(len(tables))]
-    made = _make(function, structure, static, places, [leaves[k] for k in places], [*groups, *more])
-    return None if made is None else (Recursion(whole.jaxpr, groups, made[0], tables), result)
 
 
 def _make(
