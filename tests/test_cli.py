@@ -67,6 +67,7 @@ def test_version_and_help(capsys):
     assert "default: None" not in words
 
 
+@pytest.mark.slow
 def test_simulate_writes_results_and_prints_the_certificate(tmp_path, capsys):
     out = tmp_path / "results"
     assert run("simulate", "hexacopter", "--t1", "0.1", "--out", str(out)) == 0
@@ -138,6 +139,7 @@ def test_a_run_that_cannot_go_on_keeps_what_was_reached(tmp_path, capsys):
 SUN = ("sun", "--lat", "11.55", "--lon", "104.92", "--date", "2024-03-21")
 
 
+@pytest.mark.slow
 def test_sun_prints_draws_and_saves_a_day(tmp_path, capsys):
     """With an attitude from a file that is the one of the options."""
     code = run(*SUN, "--step", "900", "--yaw", "90", "--out", str(tmp_path / "a"))
@@ -340,6 +342,7 @@ def test_tune_commands(tmp_path, capsys):
     assert "search of another problem" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 def test_estimate_prints_draws_and_saves_a_case(tmp_path, capsys):
     code = run("estimate", "--case", "4", "--seeds", "3", "--t1", "0.05", "--out", str(tmp_path))
     # done, but the report's tuning cannot be trusted

@@ -49,6 +49,7 @@ def pushed():
     return tuning, jax.tree.map(lambda v: v + 0.1, tuning.start)
 
 
+@pytest.mark.slow
 def test_columns_in_groups_and_values_alone(pushed):
     """Derivatives against differences; values without them, and gradients within a program."""
     tuning, start = pushed
@@ -68,6 +69,7 @@ def test_columns_in_groups_and_values_alone(pushed):
     np.testing.assert_allclose(slope, J.T @ r, atol=1e-8 * np.max(np.abs(J.T @ r)))
 
 
+@pytest.mark.slow
 def test_a_motion_in_parts_is_that_in_one_piece(pushed):
     """23 output times, not a multiple of a call's: the motion by `integrate`, to 1e-8."""
     tuning, start = pushed
@@ -230,6 +232,7 @@ def test_a_four_bar_is_identified():
     assert found.within(truth, 4.0)
 
 
+@pytest.mark.slow
 def test_what_a_motion_model_refuses():
     space = stm.TreeSpace(pendulum())
     x = space.from_state(space.system.reference)

@@ -86,6 +86,7 @@ def test_nothing_accelerates_in_maximal_coordinates(uav, start):
     assert np.max(np.abs(found.accelerations.omega_rate)) < 1e-8
 
 
+@pytest.mark.slow
 def test_refused(uav):
     slow = TrimLimits(RotorLimits(0.0, 1350.0))
     with pytest.raises(stm.ModelError, match=r"72\.25 N are required, but within .* 71\.58 N"):
@@ -199,6 +200,7 @@ def end_of(system, state, ts):
     return jax.tree.map(lambda x: x[-1, 0], run.states)
 
 
+@pytest.mark.slow
 def test_linear_against_the_simulated_flight(uav, start, linear):
     """A small displacement's path over 0.1 s, in maximal coordinates, against expm(A t) x."""
     x = np.zeros(16)

@@ -90,6 +90,7 @@ def by_encoder():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_turns_of_an_angle_may_be_recorded_or_not(spun, by_encoder):
     """From a start 40 % off, wrapped and unwrapped."""
     found = {
@@ -126,6 +127,7 @@ def test_missing_readings_are_left_out(spun, by_encoder):
         stm.analysis.identify(by_encoder, bad, [NOISE], {"friction": 0.15}, SIZES)
 
 
+@pytest.mark.slow
 def test_an_exact_start_that_is_none_is_said(spun):
     """A start one hundredth of a radian off, taken as exact: the verdict speaks, and names the way out."""
     exact = stm.analysis.motion_model(
@@ -211,6 +213,7 @@ def coloured(rho, rng, count, rows):
     return filtered[:, 500:]
 
 
+@pytest.mark.slow
 def test_correlated_residuals_have_deviations_by_blocks():
     """95 % intervals of 100 records: as of white residuals they would hold the truth in a third of them."""
     noise = coloured(0.95, np.random.default_rng(2), 100, 2000)

@@ -35,6 +35,7 @@ def test_efforts_of_a_parallel_robot_are_those_of_drivers():
     assert [unit for _, unit in result.inputs] == ["N"] * 3
 
 
+@pytest.mark.slow
 def test_a_path_of_a_passive_joint_has_the_efforts_of_the_actuator():
     """The crank turns evenly, the slider is pushed: at rest by the weights' virtual power, at speed by drivers."""
     system = slider_crank(ANGLE, "slide")

@@ -170,6 +170,7 @@ def test_accelerations_at_the_start(peer, scene):
     assert np.abs(difference).max() <= CASES[peer.__name__][2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("peer", some())
 def test_motion(peer, scene):
     one, (setting, allowed, _) = ready(peer), CASES[peer.__name__]

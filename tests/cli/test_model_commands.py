@@ -29,6 +29,7 @@ def said(capsys):
     return " ".join((shown.out + shown.err).split())
 
 
+@pytest.mark.slow
 def test_trim_of_a_cart_that_accelerates(tmp_path, capsys):
     """The pole leans forward by tan(angle) = a / g, and the force moves both masses."""
     words = ["trim", str(MODELS / "cart_pole.toml"), "--coordinates", "hinge=0.1", "rail=0"]
@@ -79,6 +80,7 @@ def test_efforts_along_a_path_and_a_survey_of_postures(tmp_path, capsys, monkeyp
     assert "two coordinates with two limits each" in said(capsys)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [

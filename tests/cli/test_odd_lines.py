@@ -87,6 +87,7 @@ def stubbed(monkeypatch):
     return reached
 
 
+@pytest.mark.slow
 def test_odd_lines(stubbed, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lines, rng = 250, random.Random(250)

@@ -91,6 +91,7 @@ def test_the_words_of_the_method_are_that_of_the_library():
     assert eqx.tree_equal(simulate.method_of(command.settings, scene_of(command)), stm.Method())
 
 
+@pytest.mark.slow
 def test_a_run_with_options_is_that_of_the_library(tmp_path):
     words = (
         "simulate hexacopter --drag --wind.mean 6 0 0 --motor.time-constant 0.04 --t1 0.05 "

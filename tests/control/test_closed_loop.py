@@ -75,6 +75,7 @@ def test_a_loop_is_the_exact_sampled_system(steps):
     np.testing.assert_allclose(run.ts, np.arange(101) / RATE, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_adaptive_steps_are_safe_for_derivatives_unless_told_otherwise():
     """At rest, where the state has no error: by the held input, as the matrix exponential has it."""
     system, _ = spring_mass()
@@ -114,6 +115,7 @@ def cart():
     return system, space, linear, feedback, start
 
 
+@pytest.mark.slow
 def test_a_regulator_balances_a_cart_pole(cart):
     """Two solutions of the Riccati equation agree, and the nonlinear pole comes to rest."""
     system, _, _, feedback, start = cart
@@ -194,6 +196,7 @@ def test_gradients_of_a_closed_loop(cart):
     assert float(jnp.sum(by_K * side)) == pytest.approx(float(gains), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_single_loops(cart):
     """`rollout`, vmapped over starts, against `reset` and `step` of one after the other."""
     system, _, _, feedback, _ = cart

@@ -54,6 +54,7 @@ def unbalanced(system, state, loads, at, accelerations, applied):
     return left
 
 
+@pytest.mark.slow
 def test_every_body_is_in_equilibrium(short_run):
     """Joints, applied loads and inertia of each of the seven bodies, at every saved time."""
     flight, system = short_run, short_run.scene.system
@@ -193,6 +194,7 @@ def test_the_snap_through_of_case_2_is_not_missed():
     assert float(resolved.t_maximum[k, column]) == pytest.approx(0.86, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_three_hinged_arch_has_its_thrust():
     """Hinges of three rotational rows each, 15 rows of rank 12: the thrust W a / 2 h is determined.
 

@@ -20,6 +20,7 @@ def machine_code():
     stm.math.use_native_code(True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=["tree", "augmented"])
 def test_a_slider_crank_and_its_derivatives_are_those_by_xla(formulation, machine_code):
     system = slider_crank(0.8, "O")
@@ -58,6 +59,7 @@ def test_a_number_of_the_state_that_is_not_finite_is_seen_wherever_xla_sees_it(m
     assert not (found[True] & ~found[False]).any()
 
 
+@pytest.mark.slow
 def test_a_run_says_what_compiled_its_equations(machine_code):
     for on, name in ((False, "XLA"), (True, "LLVM")):
         machine_code(on)

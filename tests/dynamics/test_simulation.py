@@ -334,6 +334,7 @@ def test_without_analysis_there_is_no_snapshot(run):
         stm.simulate(with_start(r=START.r + 1e-5), analysis=False)
 
 
+@pytest.mark.slow
 def test_a_full_certificate_compares_two_formulations(run):
     assert run[0].certificate.formulation_difference is None
     method = stm.Method(rtol=1e-10, atol=1e-10, formulation=stm.Augmented())
@@ -421,6 +422,7 @@ def test_a_driver_that_jumps_is_named(motion, words):
         assert bool(found) == bool(words)
 
 
+@pytest.mark.slow
 def test_a_run_that_a_driver_stops_says_so():
     """The message names driver and time, and what would be valid."""
     system = driven(lambda t: jnp.where(t > 0.3, t - 0.3, 0.0))

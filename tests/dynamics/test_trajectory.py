@@ -74,6 +74,7 @@ def test_values_under_jit_and_vmap(batched):
         assert float(value) == pytest.approx(expected, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_a_batch_in_reverse_is_its_members_in_forward_mode(batched, forward):
     """Values to 10 times the tolerance."""
     for parameters, value, gradient in zip(BATCH, *batched, strict=True):
@@ -119,6 +120,7 @@ def test_a_flight_that_stops_on_the_way_is_not_a_number(of_batch, batched, forwa
         assert relative_error(gradients[k], batched[1][k]) < 1e-10
 
 
+@pytest.mark.slow
 def test_an_event_stops_at_its_time_on_the_constraint():
     """The pendulum passes through x = 0 (from x < 0, at 0.7 rad) on its way down."""
     ts = jnp.asarray([0.0, 0.05, 1.0, 2.0])
@@ -200,6 +202,7 @@ def test_a_time_that_is_no_number_ends_the_values():
     assert np.all(np.isnan(found.states.r[2:]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()])
 def test_a_welded_body_stays_where_it_is(formulation):
     """No coordinate is left: nothing moves, and steps have no error."""

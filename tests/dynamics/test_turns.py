@@ -102,6 +102,7 @@ def test_energy_counts_all_turns(run):
     np.testing.assert_allclose(total, total[0], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_states_between_saved_times_and_files_keep_the_turns(run, tmp_path):
     times = np.array([0.3, 1.1])
     omega = stm.dynamics.states_at(run, times).omega[:, 0, 2]
@@ -175,6 +176,7 @@ def test_trim_and_linearisation_count_turns(preloaded):
     np.testing.assert_allclose(linear.A, [[0, 1], [-(RATE**2), 0]], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_process_model_counts_turns(preloaded):
     """Runge-Kutta steps of 2 ms over 1 s, of order 4: (RATE 2 ms)^4 RATE / 120 of 9 rad is 4e-9 rad."""
     space, x = preloaded

@@ -30,6 +30,7 @@ MODEL, PRIOR = CASE.model(), CASE.prior()
 # --- failed filters
 
 
+@pytest.mark.slow
 def test_smoothing_starts_at_the_last_good_step_and_says_where_there_is_nothing():
     """The good part is that of the record up to the failure; all else is NaN or infinite."""
     y, short = CASE.y.copy(), CASE.y.copy()

@@ -143,6 +143,7 @@ def test_forms_agree_where_the_system_is_not_linear():
         np.testing.assert_allclose(a.covariance, b.covariance, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_smoother(whole):
     smoothed = smooth(CASE.model(), whole)
     m, P = textbook_smoother(CASE, MEANS, COVARIANCES)

@@ -48,6 +48,7 @@ def records():
     return jnp.asarray(np.array(ys))
 
 
+@pytest.mark.slow
 def test_known_variances_and_a_bias_come_back(records):
     """Within 3.3 standard errors (99.9 %), which are small enough to mean something."""
     seen = []

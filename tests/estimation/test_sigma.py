@@ -125,6 +125,7 @@ def stepped(start):
 Q0 = from_rotation_vector(jnp.array([0.3, -0.4, 0.9]))
 
 
+@pytest.mark.slow
 def test_rotations_have_no_sign_and_no_frame():
     a, b = stepped(prior(Q0)), stepped(prior(-Q0))
     np.testing.assert_allclose(SPACE.difference(a.mean, b.mean), 0, atol=1e-12)
@@ -137,6 +138,7 @@ def test_rotations_have_no_sign_and_no_frame():
         assert abs(jnp.linalg.norm(state.mean["p"]) - 1) < 1e-14
 
 
+@pytest.mark.slow
 def test_small_covariance_is_an_extended_filter():
     small = prior(Q0, 1e-6)
     extended = jax.jit(lambda g: GaussianFilter(sigma.Linearised()).step(MODEL, g, Y, U, 0.01)[0])

@@ -39,6 +39,7 @@ def turned(p: Any) -> np.ndarray:
     return np.array([np_rotation(q) for q in np.asarray(p)[:, 0]])
 
 
+@pytest.mark.slow
 def test_p_and_minus_p_are_one_rotation():
     start = swung(SYSTEM, 1.2, 2.0)
     other = stm.State(start.r, -start.p, start.v, start.omega)

@@ -18,6 +18,7 @@ def spun() -> stm.System:
     return stm.System([rod], [hinge], [stm.Gravity(), servo])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=str)
 def test_motions_and_their_derivatives_are_traced(formulation):
     """Nothing is compiled: the option acts where JAX traces the equations."""

@@ -35,6 +35,7 @@ def bits(run: stm.Run) -> str:
     return digest.hexdigest()
 
 
+@pytest.mark.slow
 def test_the_same_inputs_give_the_same_bits():
     first = bits(flown(1.7))
     flown(2.5)
@@ -119,6 +120,7 @@ def test_threads_compile_different_programs_at_once():
     assert [bits(chained(count)) for count in range(1, 4)] == together
 
 
+@pytest.mark.slow
 def test_importing_leaves_the_settings_of_jax_alone():
     code = (
         "import jax; before = dict(jax.config.values); import stmuav_jax as stm; "

@@ -59,6 +59,7 @@ def bits(scene):
 # --- the gallery's numbers, which docs/models.md shows
 
 
+@pytest.mark.slow
 def test_a_period_of_the_pendulum_by_the_command_line(tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     path = str(DOCS / "models" / "pendulum.toml")
@@ -153,6 +154,7 @@ def test_the_arms_of_the_delta_robot_fall_together(gallery):
     assert turning == pytest.approx(38.9884615, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_the_linkage_of_bricard_moves_although_it_should_not(gallery):
     scene = gallery["bricard"]
     found = rank(scene.system, scene.state0)
@@ -624,6 +626,7 @@ facing = {kind = "attitude", body = "rod", rate = 10}
 """
 
 
+@pytest.mark.slow
 def test_sensors_of_a_file_come_back(tmp_path):
     path = tmp_path / "sensed.toml"
     path.write_text(SENSED)

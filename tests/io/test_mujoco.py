@@ -119,6 +119,7 @@ def test_a_wound_spring_pulls_as_in_mujoco(mujoco):
     assert data.qfrc_passive[0] == pytest.approx(-51.0)
 
 
+@pytest.mark.slow
 def test_a_tree_moves_as_in_mujoco(mujoco, tree):
     model, scene = mujoco.MjModel.from_xml_string(TREE), tree
     assert scene.system.names == ("arm_link_1", "arm_link_2", "arm", "hand")
@@ -162,6 +163,7 @@ def closing(mujoco, model, data):
     return [np.concatenate(part) for part in zip(*parts, strict=True)]
 
 
+@pytest.mark.slow
 def test_loops_move_as_by_mujocos_matrices(mujoco):
     """Its own loops are soft; the exact ones follow from its mass matrix, bias and Jacobians."""
     model = mujoco.MjModel.from_xml_string(LOOPS)
@@ -205,6 +207,7 @@ MIMIC = """<link name="dial"><inertial><mass value="1"/>
   <mimic joint="turn" multiplier="2"/></joint></robot>"""
 
 
+@pytest.mark.slow
 def test_a_urdf_without_its_meshes_is_checked_by_the_command_line(mujoco, tmp_path, capsys):
     path = tmp_path / "r.urdf"
     path.write_text(URDF)
@@ -317,6 +320,7 @@ def test_limits_of_efforts_come_back_and_cut_off_as_here(mujoco, tmp_path):
     assert data.actuator_force.tolist() == [-1.5, 0.7]
 
 
+@pytest.mark.slow
 def test_a_start_is_a_keyframe(mujoco, tmp_path, tree):
     """Positions and velocities of MuJoCo's bodies at the keyframe are those of the start."""
     save_mjcf(tree, tmp_path / "rest.xml")

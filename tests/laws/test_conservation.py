@@ -117,6 +117,7 @@ def test_energy_of_a_floating_pair(floating, kind):
     assert np.max(np.abs(energy - energy[0])) < 1e-8 * energy[0]
 
 
+@pytest.mark.slow
 def test_a_chain_under_gravity_with_a_spring():
     """Three bodies on revolute, universal and ball joints: energy 1e-8; its certificate agrees."""
     rng = np.random.default_rng(31)
@@ -148,6 +149,7 @@ def test_a_chain_under_gravity_with_a_spring():
     assert run.certificate.relative_energy_error < 1e-8
 
 
+@pytest.mark.slow
 def test_a_motor_pays_for_the_energy():
     """Work of a driver and of dampers: T + V - work is constant; the motor's moment does it."""
     body = stm.Body("bob", 2.0, [0.02, 0.02, 0.01], position=[0, 0, -0.5])

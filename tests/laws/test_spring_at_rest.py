@@ -30,6 +30,7 @@ def end(x0, method):
     return stm.integrate(free, start, TS, method).states.r[-1, 0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_derivative_with_respect_to_the_start(mode):
     """d x(t) / d x0 = cos(omega t) with omega = 10 / s: cos 2 at 0.2 s."""

@@ -55,6 +55,7 @@ def test_programs_are_kept_by_structure_and_shape(programs):
     assert traced == ["a", "bb", "a", "a", "ccc", "bb"]
 
 
+@pytest.mark.slow
 def test_released_programs_give_their_memory_maps_back(programs):
     kept(X, "first")
     for k in range(4):

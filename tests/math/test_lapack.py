@@ -121,6 +121,7 @@ print("done")
 """
 
 
+@pytest.mark.slow
 def test_calls_at_once_do_not_wait_for_each_other():
     """24 independent factorisations of 64 matrices each: by `jax.numpy.linalg` they stand still."""
     given = {**os.environ, "PJRT_NPROC": "2", "JAX_PLATFORMS": "cpu"}

@@ -45,6 +45,7 @@ def test_not_positive_definite_is_nan(k):
         assert np.all(np.isnan(solve_definite(jnp.asarray(A), jnp.ones((k, 1)))[-1]))
 
 
+@pytest.mark.slow
 def test_derivative():
     A, B = jnp.asarray(positive(5)), jnp.ones((5, 1))
     f = lambda s: jnp.sum(solve_definite(A + s * jnp.eye(5), B) ** 2)

@@ -194,6 +194,7 @@ def compared(seed):
     return jax.tree.map(np.asarray, along_curves(coefficients, data, jnp.asarray(0.3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("kind", constraint.PRIMITIVES)
 def test_rows_are_the_derivatives_of_the_constraint(kind, seed):

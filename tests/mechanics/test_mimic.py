@@ -28,6 +28,7 @@ def wheels(*forces, drive=None, ratio=RATIO):
     return stm.System(bodies, joints, forces)
 
 
+@pytest.mark.slow
 def test_a_geared_pair_turns_with_the_reduced_inertia_through_whole_turns():
     """x_a'' = T / (I_a + k^2 I_b), and the gear's effort on b is I_b k x_a''."""
     system = wheels(stm.JointEffort("A", TORQUE))
@@ -72,6 +73,7 @@ def cylinders():
 KINDS = [(x, y) for x in ("angle", "displacement") for y in ("angle", "displacement")]
 
 
+@pytest.mark.slow
 def test_rows_are_derivatives_of_each_other():
     """Along a motion with constant velocities J u is the rate of Phi, and -gamma that of J u."""
     bodies, first, second, couple = cylinders()

@@ -60,6 +60,7 @@ def test_a_servo_too_fast_for_its_delay_is_refused_with_the_fastest_that_is_stab
         missions.make_mission(plain | motors | {"rates": {"delay": 0.02}})
 
 
+@pytest.mark.slow
 def test_a_controller_that_is_told_of_a_lost_rotor_is_checked_before_the_flight(monkeypatch):
     """Position and tilt keep the poles of all six rotors; yaw, which is given up, has none."""
     entries = {

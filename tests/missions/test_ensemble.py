@@ -144,6 +144,7 @@ def test_factors_that_cannot_be_drawn_are_refused(mission, factor, relative, wor
         missions.make_mission_study(mission, {factor: 1.0}, relative=names)
 
 
+@pytest.mark.slow
 def test_studies_that_cannot_be_flown_are_refused(tmp_path):
     (tmp_path / "held.toml").write_text(HELD)
     plain = {"kind": "missions", "mission": "held.toml", "factors": {"bare.mass": 1.0}}

@@ -123,6 +123,7 @@ def test_a_hexacopter_flies_along_its_waypoints(flight, data):
     assert np.mean(lift) == pytest.approx(9.81 * stm.PART_II.value("bare.mass"), rel=0.1)
 
 
+@pytest.mark.slow
 def test_report_of_a_flight(flight, data, tmp_path):
     """Its verdict, what it is judged by and the mission's entries; an early end stands out."""
     save_sealed(labelled_flight(flight), tmp_path / "flight.nc")

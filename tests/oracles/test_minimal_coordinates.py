@@ -56,6 +56,7 @@ def numeric_lagrange(kinetic_matrix, potential, torque):
 # --- a double pendulum with a damper and a coil spring in its elbow
 
 
+@pytest.mark.slow
 def test_double_pendulum():
     """Angles from -z about y, absolute: r1 = -c1 (sin a, 0, cos a), elbow at l1."""
     m1, m2, J1, J2, l1, c1, c2 = 1.3, 0.9, 0.03, 0.02, 0.5, 0.2, 0.3
@@ -107,6 +108,7 @@ def test_double_pendulum():
 # --- a slider-crank: a closed loop with one coordinate
 
 
+@pytest.mark.slow
 def test_slider_crank():
     """Crank about y at the origin, slider on the x axis, a spring on the slider; no dependent rows."""
     crank, rod = 0.15, 0.5
@@ -183,6 +185,7 @@ def test_slider_crank():
 # --- a heavy top on a ball joint: rotation in space, by the rotation matrix alone
 
 
+@pytest.mark.slow
 def test_heavy_top():
     """J w' + w x J w = moment of weight about the tip; R' = R w~ (no Euler parameters)."""
     mass, arm = 1.2, np.array([0.02, -0.01, 0.3])
@@ -224,6 +227,7 @@ def test_complex_step_lagrange_against_a_known_equation():
 # --- a body on a screw, whose axis is vertical and does not go through its centre of mass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=["tree", "augmented"])
 def test_screw(formulation):
     """Falling over six turns: z'' = -m g h^2 / (I + m e^2 + m h^2), and energy is kept."""

@@ -161,6 +161,7 @@ def outside(values, degrees):
     return int(np.sum((means < low) | (means > high)))
 
 
+@pytest.mark.slow
 def test_attitude_is_consistent(attitude):
     """NEES (8) and NIS (6) at 50 times in the 99.9 % window, at most one out; innovations white."""
     each, nis, scaled, mean = attitude(jnp.array(1.0), jnp.array(1.0))

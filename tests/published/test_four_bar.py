@@ -145,6 +145,7 @@ def test_six_loops_pass_the_singular_postures() -> None:
     passes(6, 1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupler", [1e-4, 1e6])
 def test_light_and_heavy_couplers_pass_the_singular_postures(coupler: float) -> None:
     """Masses of bodies up to a million times those of others."""

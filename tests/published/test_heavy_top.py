@@ -146,6 +146,7 @@ def test_slow_top_by_adaptive_steps(run: stm.Run, fine: Steps) -> None:
     np.testing.assert_allclose(run.states.r[-1, 0], fine(0.2, 100), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_slow_top_by_an_implicit_method(fine: Steps) -> None:
     """Solver class: Kvaerno5 at rtol 1e-8 meets the same acceptance, 1e-5 m at 0.2 s."""
     system, state = top(SLOW)

@@ -86,6 +86,7 @@ def whole(tmp_path_factory):
     return contents(path)
 
 
+@pytest.mark.slow
 def test_a_cluster_of_our_own(tmp_path, whole, monkeypatch):
     """Three processes; one kills itself in a chunk, and another takes its place.
 
@@ -120,6 +121,7 @@ def test_workers_that_come_later(whole, outside):
     assert outside.files == whole
 
 
+@pytest.mark.slow
 def test_a_worker_is_killed(tmp_path, whole, outside):
     """One of three, from outside and for good, while it computes."""
     path = tmp_path / "study.zarr"

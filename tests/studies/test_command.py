@@ -37,6 +37,7 @@ def study(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_fly_report_extend(study, tmp_path, capsys):
     # no path is taken for markup or a picture
     out = tmp_path / "out[/b][v2] :x:"

@@ -31,6 +31,7 @@ def test_nothing_drawn_is_the_scene(name, case):
     assert max(jax.tree.leaves(off)) < 1e-14
 
 
+@pytest.mark.slow
 def test_a_start_closes_the_loops():
     """Positions and velocities satisfy all rows of the joints, at any posture and rates."""
     of = make_flights("uav_tracker", 1)

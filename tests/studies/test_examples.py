@@ -23,6 +23,7 @@ def test_every_kind_of_ready_study_is_a_study(name):
     assert all(each["samples"] >= 1000 for each in READY.values())
 
 
+@pytest.mark.slow
 def test_estimation_is_that_of_the_case_study():
     few = make_study({"kind": "estimation", "name": "few", "case": 3, "t1": 0.6, "seed": 11})
     assert few.identity["settled"] == 0.36

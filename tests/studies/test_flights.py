@@ -77,6 +77,7 @@ def one_by_one(study, k, ts, **options):
     return system, integrate(system, state, jnp.asarray(ts), method)
 
 
+@pytest.mark.slow
 def test_as_flights_one_by_one(turning):
     study, found = turning
     ts = np.linspace(0.0, 0.4, 401)

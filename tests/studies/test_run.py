@@ -150,6 +150,7 @@ def test_a_chunk_is_by_default_what_is_best_computed_together(tmp_path):
     assert open_store(tmp_path / "b.zarr").chunk == 2**26 // 61
 
 
+@pytest.mark.slow
 def test_killed_at_random_moments(tmp_path):
     """SIGKILL, again and again: the store ends with the same files as an unbroken run's."""
     kills = 4
@@ -174,6 +175,7 @@ print(Toy(seed=7, pause={pause}).run({path!r}, 1000, chunk=10, progress=show).de
 """
 
 
+@pytest.mark.slow
 def test_a_signal_ends_a_run_after_its_chunk(tmp_path):
     path = tmp_path / "study.zarr"
     code = INTERRUPTED.format(tests=str(HERE.parent), path=str(path), pause=0.2)
@@ -195,6 +197,7 @@ def test_a_signal_ends_a_run_after_its_chunk(tmp_path):
     assert contents(path) == contents(tmp_path / "unbroken.zarr")
 
 
+@pytest.mark.slow
 def test_a_second_signal_ends_a_run_at_once(tmp_path):
     path = tmp_path / "study.zarr"
     code = INTERRUPTED.format(tests=str(HERE.parent), path=str(path), pause=60.0)

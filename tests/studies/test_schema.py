@@ -108,6 +108,7 @@ def scenes_made_once(monkeypatch):
     monkeypatch.setattr(disturbed_flights, "make_scene", make)
 
 
+@pytest.mark.slow
 def test_a_thousand_odd_studies(scenes_made_once):
     """No exception but the package's, no wait, no value at length; and the name of what is odd."""
     cases = list(odd_studies())

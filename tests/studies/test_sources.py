@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import stmuav_jax
 
 # Runs with a copy of the package as sys.argv[1], a store, a number of samples, and perhaps a file of
@@ -37,6 +39,7 @@ def run(package: Path, store: Path, samples: int, *changed: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_a_store_is_not_extended_by_changed_sources(tmp_path):
     """The version of the package is the same; a comment is enough, and the first sources resume it."""
     package, store = tmp_path / "package", tmp_path / "study.zarr"

@@ -238,6 +238,7 @@ def test_a_model_without_its_numbers_is_refused_by_their_names(result, tmp_path)
         write_identified_model(result, tmp_path / "own.nc")
 
 
+@pytest.mark.slow
 def test_figures_show_what_the_flight_determines(record, result, tmp_path):
     log = read_flight_log(save_flight_record(record, tmp_path / "flight.csv"))
     subject = IdentifiedFlight(log, record, result)
@@ -356,6 +357,7 @@ def test_motors_in_another_order_are_named(record):
         identify_flight(record, swapped)
 
 
+@pytest.mark.slow
 def test_a_hover_that_excites_nothing_is_refused_by_axis(calm):
     """Nor does a voltage that hardly changes tell anything."""
     voltage = np.linspace(4.0, 3.98, len(calm.ts))
@@ -527,6 +529,7 @@ def test_layouts_are_read_and_checked(tmp_path):
         read_rotor_layout(layout_file(tmp_path, "thrust_model_factor = 2"))
 
 
+@pytest.mark.slow
 @real
 def test_roll_and_pitch_manoeuvres_of_a_real_flight_agree_with_independent_answers(tmp_path):
     answers = json.loads((FLIGHTS / "answers.json").read_text())
@@ -561,6 +564,7 @@ def test_roll_and_pitch_manoeuvres_of_a_real_flight_agree_with_independent_answe
     assert "windows" in result.verdict.explanation.split(":")[1]
 
 
+@pytest.mark.slow
 @real
 def test_thrust_manoeuvres_of_a_real_flight_give_the_curve_and_no_roll(tmp_path):
     log = read_flight_log(FLIGHTS / "crazyflie" / "log10")
@@ -584,6 +588,7 @@ def test_a_hover_balances_about_the_centre_of_mass(calm):
         identify_hover_centre(part.ts, part.commands, LAYOUT)
 
 
+@pytest.mark.slow
 def test_the_command_reads_a_log_lists_it_and_identifies(calm, tmp_path, capsys, monkeypatch):
     """A CSV file, which knows no rotors: they are given by an option."""
     monkeypatch.setenv("COLUMNS", "140")

@@ -66,6 +66,7 @@ def test_the_attitude_error_decays_as_lee_proves():
     assert V[-1] < 1e-2 * V[0]
 
 
+@pytest.mark.slow
 def test_feedforward_leaves_an_error_of_the_sampling_alone():
     """On a curve, the error is proportional to the period of control: it vanishes with it."""
     path = control.follow_path(

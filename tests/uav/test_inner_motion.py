@@ -10,6 +10,7 @@ import stmuav_jax as stm
 from stmuav_jax.uav.inner_motion import BasePose, JointChain, set_on_base
 
 
+@pytest.mark.slow
 def test_a_chain_is_placed_where_it_was_read():
     system = machine()
     state = moving(system)

@@ -116,6 +116,7 @@ def test_computed_torque_gives_the_accelerations_that_it_asks_for(closed):
     )
 
 
+@pytest.mark.slow
 def test_the_moment_of_a_move_is_fed_forward():
     """At rest on its reference the base does not turn while the arm is accelerated; without feedforward it does."""
     system = machine()

@@ -56,6 +56,7 @@ def test_the_servo_of_strokes_is_a_spring_and_a_damper_of_each_slider():
             stm.uav.StrokeServo(bodies, **{name: -1.0})
 
 
+@pytest.mark.slow
 def test_the_servo_knows_the_trackers_equations():
     """Its forces, on a base of 1e9 kg that is held, give the accelerations they were found for."""
     heavy = {"mass.hexacopter_1": 1e9, "inertia.hexacopter_1": 1e9 * np.eye(3)}

@@ -86,6 +86,7 @@ def test_the_angular_momentum_obeys_the_filters_equation(machines, tumbling):
     np.testing.assert_allclose(L_rate, expected, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_filters_derivatives(machines, tumbling):
     """The matrices of errors and of readings against automatic derivatives, the panel at rest."""
     empty = machines[0]

@@ -124,6 +124,7 @@ def test_the_loop_of_a_hexacopter_is_that_of_its_axes(hexacopter):
     assert radius == pytest.approx(1.0654, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_a_joint_that_moves_has_the_loop_of_its_servo():
     """Computed torque makes a balanced arm a double integrator, whatever the base does."""
     bodies = [

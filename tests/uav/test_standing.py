@@ -79,6 +79,7 @@ def test_biases_and_attitude_are_known_after_standing(stood):
         assert np.max(np.abs(error[:, part])) < most
 
 
+@pytest.mark.slow
 def test_fixes_that_are_late_are_as_old_as_they_would_be_after_a_long_run():
     """At the first sample a fix that was read while standing arrives; without standing none does."""
     scene = stm.make_scene("hexacopter")

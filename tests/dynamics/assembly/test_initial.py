@@ -182,6 +182,7 @@ def test_held_joints_keep_their_coordinates():
     np.testing.assert_allclose(held.p[2], upright, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_drivers_are_met_at_their_times_and_differentiated_by_them():
     """A crank that a motor turns by 0.3 + 2 t about y: under jit, vmap and jvp, in closed form."""
     body = stm.Body("crank", 1.0, [0.1, 0.1, 0.1], position=[0.2, 0, 0])
@@ -206,6 +207,7 @@ def test_drivers_are_met_at_their_times_and_differentiated_by_them():
     np.testing.assert_allclose(rates.p[:, 0], p_rate, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_derivatives_in_a_dimension_of_a_loop(bars):
     """The assembled four-bar by the position of a joint in its coupler."""
     system, state = bars
@@ -241,6 +243,7 @@ def impossible():
     return stm.System([body], joints)
 
 
+@pytest.mark.slow
 def test_impossible_lengths_are_an_error_that_names_a_joint():
     system = impossible()
     with pytest.raises(stm.StateError, match=r"joint '(rod|J)' is still open by .* m"):

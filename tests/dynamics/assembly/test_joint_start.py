@@ -58,6 +58,7 @@ def misfit(system, state, t=0.0):
     return tuple(map(float, off(state)))
 
 
+@pytest.mark.slow
 def test_an_open_chain_takes_all_coordinates_and_rates(chain):
     state = stm.state_from_joints(chain, Q, U)
     assert max(misfit(chain, state)) < 3e-15

@@ -48,6 +48,7 @@ def exact(t, geometry=None):
     return jax.jvp(state, (t,), (jnp.ones_like(t),))
 
 
+@pytest.mark.slow
 def test_positions_as_in_closed_form(path):
     expected, _ = jax.vmap(exact)(path.ts)
     np.testing.assert_allclose(path.states.r, expected.r, atol=1e-14)

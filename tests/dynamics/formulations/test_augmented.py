@@ -132,6 +132,7 @@ def test_baumgarte_feeds_the_residuals_back(seven):
     assert relative_error(eq.matrix @ u_rate, eq.gamma + feedback) < 1e-10
 
 
+@pytest.mark.slow
 def test_baumgarte_pulls_the_norms_back():
     """pdot gets norm (1 - p . p) p, so that d(p . p)/dt = 2 norm (1 - p . p) p . p."""
     system = pendulum()
@@ -187,6 +188,7 @@ def test_settings_that_make_no_sense_are_refused():
         stm.Projection(iterations=0)
 
 
+@pytest.mark.slow
 def test_accelerations_that_masses_far_apart_leave_to_round_off_are_refused():
     """A link of 1e-12 kg between a hinge and a slide, as imports have them: right by `Tree`."""
 

@@ -83,6 +83,7 @@ class NewtonEuler(AbstractFormulation):
         return Residuals(none, none, none, none, off)
 
 
+@pytest.mark.slow
 def test_a_users_formulation_passes_through_simulate():
     """A top thrown: the trees' motion, balances and error estimate, by equations of one's own."""
     body = stm.Body("top", 0.4, (1e-3, 2e-3, 3e-3), free=True)

@@ -67,6 +67,7 @@ def test_the_three_that_there_are():
     assert [how.iterations_after_step() for how in ways] == [0, 0, 4]
 
 
+@pytest.mark.slow
 def test_steps_end_on_the_constraints_with_projection_alone():
     system = pendulum()
     scene = scene_of(system, swung(system, 1.0, 0.5), t1=0.2, save_every=0.1)

@@ -131,6 +131,7 @@ def test_a_long_span_beside_many_short_ones():
     assert gradient == pytest.approx(float(expected), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_in_diffrax_itself():
     """Elsewhere it is an adjoint like any other, with as many checkpoints."""
     term = diffrax.ODETerm(lambda t, y, k: -k * y)

@@ -77,6 +77,7 @@ def test_observed_order_is_five():
     np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 5, atol=0.1)
 
 
+@pytest.mark.slow
 def test_it_differentiates():
     """Forward = reverse = differences, from the stages' equations."""
     forward = jax.jvp(lambda x: END(x, 0.1)[0], (1.0,), (1.0,))[1]
@@ -180,6 +181,7 @@ def test_auto_takes_the_implicit_method_where_it_pays(rail):
     assert isinstance(stm.dynamics.choose_solver(soft, soft.reference), diffrax.Dopri8)
 
 
+@pytest.mark.slow
 def test_a_stiff_servo_in_few_steps(rail):
     start = rail.reference
     cart = stm.State(start.r, start.p, start.v.at[0, 2].set(0.3), start.omega)

@@ -26,6 +26,7 @@ class Plane(eqx.Module):
         return jnp.where(t > self.until, jnp.nan, state.r[0, 2] - self.height)
 
 
+@pytest.mark.slow
 def test_bouncing_ball():
     """Six arcs from one compiled function, each started at the event that ended the one before."""
     up = stm.translational("h", "ground", "m", point=(0, 0, 0), axis=(0, 0, 1))
@@ -57,6 +58,7 @@ def test_bouncing_ball():
     assert len(compiled) == 1
 
 
+@pytest.mark.slow
 def test_known_jumps():
     """A square wave of 3 N: as accurate as the tolerance, and without a rejected step."""
     along = stm.translational("h", "ground", "m", point=(0, 0, 0), axis=(1, 0, 0))
@@ -87,6 +89,7 @@ def land(h, adjoint):
     return path.ts[-1], (path.ts, path.states.r[:, 0, 2], path.result)
 
 
+@pytest.mark.slow
 def test_each_of_a_batch_ends_at_its_own_event():
     """Balls from heights whose events lie in different intervals, or do not come at all.
 

@@ -56,6 +56,7 @@ def reached(solver):
     return program(solver)(START)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_every_step_ends_on_the_constraints(solver):
     worst = reached(solver).worst

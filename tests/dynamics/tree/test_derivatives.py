@@ -37,6 +37,7 @@ def case():
     return rate, x, start, dx, jax.tree.map(step, start), rng.normal(size=x.shape)
 
 
+@pytest.mark.slow
 def test_forward_reverse_differences(case):
     rate, x, start, dx, dv, weight = case
     moved = lambda h: rate(x + h * dx, jax.tree.map(lambda a, b: a + h * b, start, dv))
@@ -53,6 +54,7 @@ def test_forward_reverse_differences(case):
     assert float(back) == pytest.approx(float(weight @ forward), rel=1e-9, abs=1e-10 * size)
 
 
+@pytest.mark.slow
 def test_second_derivative(case):
     rate, x, start, dx, _, weight = case
     gradient = jax.grad(lambda x: weight @ rate(x, start))
@@ -63,6 +65,7 @@ def test_second_derivative(case):
     np.testing.assert_allclose(second, expected, rtol=1e-7, atol=1e-7 * size)
 
 
+@pytest.mark.slow
 def test_linear_parts():
     """Rules of cross products, of picking, and of sums along chains, against their definition."""
     tree = stm.Tree().prepare(stm.make_scene("uav_tracker", 2).system).parameters.tree

@@ -23,6 +23,7 @@ from stmuav_jax.dynamics.tree.topology import find_supported, motion_columns
 from stmuav_jax.math.linalg import right_inverse, solve_saddle
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("floating", [True, False])
 def test_same_as_dense(floating):
     system = forked(floating)

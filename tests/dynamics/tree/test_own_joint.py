@@ -39,6 +39,7 @@ def star(monkeypatch):
     return stm.System(bodies, joints, [stm.Gravity([0.0, 0.0, -9.81])])
 
 
+@pytest.mark.slow
 def test_coordinates_come_back_in_both_directions(star):
     """From joint coordinates to a state and back, by the joints and by the tree's coordinates."""
     rng = np.random.default_rng(5)

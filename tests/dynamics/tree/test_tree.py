@@ -181,6 +181,7 @@ def test_sizes(name, case, velocities, rows):
     assert sum(system.joints[k].n_rows for k in tree.cut) == rows
 
 
+@pytest.mark.slow
 def test_another_tree_moves_alike():
     """The loop cut at a hinge, and at a universal joint."""
     system = four_bar(redundant=False)
@@ -201,6 +202,7 @@ def test_an_unknown_joint_cannot_be_cut():
         stm.Tree(cut=("S75",)).prepare(system)
 
 
+@pytest.mark.slow
 def test_a_mechanism_on_ground_far_from_the_origin():
     """A double pendulum moves as at the origin, in as many steps, to the round-off of its positions."""
 

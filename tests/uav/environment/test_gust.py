@@ -152,6 +152,7 @@ def test_derivatives_by_airspeed_and_intensity():
     np.testing.assert_allclose(by_speed, central(lambda h: value(V + h, 1.0), 1e-2), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_run_past_the_path_says_so():
     body = Body("hull", 1.0, [0.01] * 3, free=True)
     gusts = dryden(1, AIR, airspeed=V, duration=0.1, dt=DT)

@@ -34,6 +34,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 def test_spin_against_closed_form():
     """Report Part I, Eq. 4.28: 1e-12 in every Euler parameter at every saved time, 5 s, 60.2 rad."""
     spin_run = simulate(make_scene("spin"), method=Method(rtol=1e-13, atol=1e-13))
@@ -44,6 +45,7 @@ def test_spin_against_closed_form():
     assert np.abs(spin_run.states.p[:, 0] - exact).max() < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "case"), CASES)
 def test_two_seconds_with_default_settings(name, case):
     """Past the 0.45 to 0.5 s at which the report's simulation stopped."""

@@ -111,6 +111,7 @@ def test_nearest_reachable_of_a_reachable_direction_is_itself(day):
     assert np.degrees(np.abs(found - angles)).max() < 0.001
 
 
+@pytest.mark.slow
 def test_an_attitude_that_follows_the_sun_needs_no_tracker(day):
     """Body z at the sun: angles zero, always within reach, all the light that there is."""
 
@@ -170,6 +171,7 @@ def test_attitude_error_turns_the_panel_by_as_much():
     assert np.degrees(across.max()) > 0.2
 
 
+@pytest.mark.slow
 def test_actuator_steps_round_the_strokes(day):
     """Errors below what half a step does by the Jacobian; 0.5 mm make about half a degree."""
     step = 5e-4
@@ -295,6 +297,7 @@ SHORT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHORT)
 def test_what_is_said_of_a_day_does_not_depend_on_the_step(name):
     """Rows, energies and daylight at 2 hours and 15 minutes; the table alone has the step."""
@@ -306,6 +309,7 @@ def test_what_is_said_of_a_day_does_not_depend_on_the_step(name):
     assert len(fine.unix) == 97
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:DatetimeIndex.dayofyear:DeprecationWarning")
 @pytest.mark.parametrize("name", SHORT)
 def test_energies_and_daylight_against_pvlib_every_four_seconds(name):
@@ -340,6 +344,7 @@ def test_energies_and_daylight_against_pvlib_every_four_seconds(name):
         assert day.energy[panel] == pytest.approx(4.0 * float(np.sum(light)), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_the_minutes_in_which_the_sun_is_up_are_found():
     """A day whose sun stays up for less than a minute: no search by whole minutes may miss it."""
     best = lambda latitude: Place.degrees(latitude, 15.0)
@@ -361,6 +366,7 @@ def test_the_minutes_in_which_the_sun_is_up_are_found():
         track_day(best(high), "2024-12-21", "UTC")
 
 
+@pytest.mark.slow
 def test_longitudes_beyond_half_a_turn_are_places():
     """285 degrees are -75, as many data sets count them; the table of turbidity ends at 180."""
     expected = track_day(Place.degrees(40.0, -75.0), "2024-06-01", "-05:00", step=7200.0)

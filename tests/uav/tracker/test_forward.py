@@ -56,6 +56,7 @@ def test_any_start_in_the_workspace_gives_the_same(inside):
     assert np.max(np.abs(found.angles - inside)[:, good]) < ROUND_TRIP
 
 
+@pytest.mark.slow
 def test_derivatives_in_strokes(inside):
     """Along a path of strokes q + q' t + q'' t^2 / 2, differentiated twice."""
     x = inside[:, :50]

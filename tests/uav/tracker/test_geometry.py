@@ -134,6 +134,7 @@ def test_lengths_come_from_toml(tmp_path):
     assert np.asarray(initial_angles(table)).tolist() == [0.1, -0.3088]
 
 
+@pytest.mark.slow
 def test_gradients_with_respect_to_every_length():
     """Through placing, bodies, joints and `System`, against differences."""
     keys = [key for key in PART_I if key.startswith(("geometry.", "posture."))]

@@ -142,6 +142,7 @@ def test_a_direction_turns_without_its_angles():
         assert np.max(np.abs(one - other)) < 1e-15
 
 
+@pytest.mark.slow
 def test_velocities_keep_every_joint():
     """J u = 0 for the joints' own Jacobian; the sliders move at the strokes' rates."""
     g, scene = GEOMETRIES["uneven"], make_scene("tracker", 2, PART_I.replaced(UNEVEN))
