@@ -61,7 +61,7 @@ class Motion:
 
     Attributes:
         R: (3, 3). x: origin (3,). omega: angular velocity. turn_bias, bias: accelerations where those of
-            the coordinates vanish. axes: (coordinate, axis of its turn, None or its slide, origin).
+            the coordinates vanish. axes: (coordinate, axis of its turn or None, that of its slide or None, origin).
     """
 
     R: np.ndarray
@@ -69,7 +69,7 @@ class Motion:
     omega: np.ndarray
     turn_bias: np.ndarray
     bias: np.ndarray
-    axes: list[tuple[int, np.ndarray | None, np.ndarray | None, np.ndarray]]
+    axes: list[tuple[int, Any, Any, np.ndarray]]
 
     def point(self, place: np.ndarray) -> np.ndarray:
         """World place of a point in the link's axes."""
@@ -90,7 +90,8 @@ class Motion:
         }
 
 
-GROUND = Motion(np.eye(3), *np.zeros((4, 3)), [])
+_ZERO = np.zeros(3)
+GROUND = Motion(np.eye(3), _ZERO, _ZERO, _ZERO, _ZERO, [])
 
 
 class Equations:
