@@ -446,8 +446,8 @@ def test_the_readme_tells_what_its_flight_gave():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     found = json.loads((DOCS / "figures" / "flight" / "numbers.json").read_text(encoding="utf-8"))
     error = 1e3 * found["waypoints_largest_position_error_m"]
-    assert f"{error:.1f} mm of position" in text
-    assert f"{found['waypoints_largest_panel_error_deg']:.4f} degrees of the panel" in text
+    assert f"{error:.1f} mm in position" in text
+    assert f"{found['waypoints_largest_panel_error_deg']:.4f} degrees in panel direction" in text
     assert f"the motion ends at {found['as_printed_stops_s']:.2f} s" in text
     # as the trials behind docs/failure.md have it, by the same method at the same tolerances
     assert abs(found["as_printed_stops_s"] - 0.441) < 0.0005
