@@ -573,7 +573,9 @@ def _make_loop(
                 value = evaluate_row(*first, x, *row)
                 return jax.lax.dynamic_update_index_in_dim(x, value, number, 0), None
 
-            return jax.lax.scan(add_row, x, (np.arange(len(weights)), *tables))[0]
+            # in single precision tables are, too
+            numbers = (jnp.arange(len(weights)), *map(jnp.asarray, tables))
+            return jax.lax.scan(add_row, x, numbers)[0]
         rows: list[Array] = []
         for i, row in enumerate(weights):
             terms = [float(row[j]) * rows[j] for j in range(i) if row[j] != 0]
