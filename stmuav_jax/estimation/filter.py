@@ -510,16 +510,13 @@ def _run_filter(
             return evaluate(method.step, model, before, y, u, dt)
         # Machine code takes the filters of a bank one by one, in the lanes of the processor's vectors; compiled
         # by XLA, each operation is one over all of them.
-        has_lanes = jax.tree.map(lambda a: jnp.ndim(a) == 2, u)
-        take_first = lambda tree, lanes: jax.tree.map(
-            lambda a, lane: a[..., 0] if lane else a, tree, lanes
-        )
-        first = take_first((before, y), jax.tree.map(lambda _: True, (before, y)))
-        if not evaluate.has_code(method.step, model, *first, take_first(u, has_lanes), dt):  # pyright: ignore
+        axes = jax.tree.map(lambda a: -1 if jnp.ndim(a) == 2 else None, u)
+        first = jax.tree.map(lambda a: a[..., 0], (before, y))
+        inputs = jax.tree.map(lambda a: a[..., 0] if jnp.ndim(a) == 2 else a, u)
+        if not evaluate.has_code(method.step, model, *first, inputs, dt):  # pyright: ignore
             return method.step(model, before, y, u, dt)
-        axes = (-1, -1, jax.tree.map(lambda lane: -1 if lane else None, has_lanes))
         step = lambda before, y, u: evaluate(method.step, model, before, y, u, dt)
-        return jax.vmap(step, in_axes=axes, out_axes=-1)(before, y, u)
+        return jax.vmap(step, in_axes=(-1, -1, axes), out_axes=-1)(before, y, u)
 
     def filter_step(carry: tuple, now: tuple) -> tuple:
         before, running = carry

@@ -13,7 +13,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from functools import wraps
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -87,7 +87,9 @@ class Program:
                     self._reason = str(error)
             return self._graph
 
-    def write(self, shared: tuple[bool, ...], rows: int) -> llvm.Code:
+    def write(
+        self, shared: tuple[bool, ...], rows: int, loop: llvm.Loop | None = None
+    ) -> llvm.Code:
         """Machine code for a batch of this size.
 
         Raises:
@@ -95,18 +97,21 @@ class Program:
         """
         graph: Any = self.graph()
         layout, width = self.layout(shared, rows), llvm.vector_width() if rows > 1 else 1
-        return llvm.write(graph[0], graph[1], layout.buffers, self._results(), width, layout.places)
-
-    def _results(self) -> list[llvm.Buffer]:
-        return [llvm.Buffer(math.prod(a.shape), _DTYPES[str(a.dtype)]) for a in self.outputs]
+        results = [llvm.Buffer(math.prod(a.shape), _DTYPES[str(a.dtype)]) for a in self.outputs]
+        return llvm.write(graph[0], graph[1], layout.buffers, results, width, layout.places, loop)
 
     def layout(self, shared: tuple[bool, ...], rows: int) -> Layout:
-        """Buffers of operands for a batch of this size; None of them is shared where it is 1."""
+        """Buffers of operands for a batch of this size; none of them is shared where it is 1."""
+        make: Any = lambda: self._make_layout(shared, rows)
+        layout: Any = self.derived(("layout", shared, rows > 1), make)
+        return layout
+
+    def _make_layout(self, shared: tuple[bool, ...], rows: int) -> Layout:
         graph: Any = self.graph()
         nodes = graph[0].needed([n for out in graph[1] for n in out.ravel().tolist()])
         used = {graph[0].args[n][0] for n in nodes if graph[0].ops[n] == "input"}
-        # XLA hands over every operand at a cost of some ten nanoseconds, and a model has dozens of them.
-        # Numbers of one argument go together: where a loop does not change them, XLA joins them once.
+        # XLA takes time to hand over an operand, and a model has dozens of them. Numbers of one argument go
+        # together: where a loop does not change them, XLA joins them once.
         members: dict[Any, list[int]] = {}
         for k in sorted(used):
             joined = str(self.inputs[k].dtype) == "float64" and (shared[k] or rows == 1)
@@ -212,18 +217,18 @@ class Recursion(Program):
         del shared, rows
         return self.body.layout((False,) * len(self.body.inputs), 1)
 
-    def write(self, shared: tuple[bool, ...], rows: int) -> llvm.Code:
-        layout, first = self.layout(shared, rows), len(self.inputs)
-        buffers = {k: number for k, (number, _) in layout.places.items()}
+    def write(
+        self, shared: tuple[bool, ...], rows: int, loop: llvm.Loop | None = None
+    ) -> llvm.Code:
+        del shared, rows, loop
+        alone, first = (False,) * len(self.body.inputs), len(self.inputs)
+        buffers = {k: number for k, (number, _) in self.body.layout(alone, 1).places.items()}
         tables = {
             buffers[first + k]: table for k, table in enumerate(self.tables) if first + k in buffers
         }
         if first - 1 not in buffers or not tables:
             raise NotScalarError("a loop whose passes do not depend on each other")
-        loop, graph = llvm.Loop(buffers[first - 1], tables), cast(Any, self.graph())
-        return llvm.write(
-            graph[0], graph[1], layout.buffers, self.body._results(), 1, layout.places, loop
-        )
+        return self.body.write(alone, 1, llvm.Loop(buffers[first - 1], tables))
 
 
 def _zero_tangent(aval: Any) -> Any:
