@@ -121,3 +121,14 @@ def short_run():
     from stmuav_jax import make_scene, simulate
 
     return simulate(make_scene("uav_tracker", 2), t1=0.05, save_every=0.01)
+
+
+@pytest.fixture
+def machine_code():
+    """Turns machine code on or off for the time of a test."""
+    from stmuav_jax.math import use_native_code
+    from stmuav_jax.math.native import program
+
+    before = program._Switch.on
+    yield use_native_code
+    use_native_code(before)

@@ -13,13 +13,6 @@ from stmuav_jax.math.native.program import evaluate
 pytestmark = pytest.mark.skipif(not llvm.available(), reason="llvmlite is not installed")
 
 
-@pytest.fixture
-def machine_code():
-    """Turns machine code on or off for the time of a test."""
-    yield stm.math.use_native_code
-    stm.math.use_native_code(True)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=["tree", "augmented"])
 def test_a_slider_crank_and_its_derivatives_are_those_by_xla(formulation, machine_code):

@@ -156,11 +156,13 @@ def test_steps_for_which_newton_fails_are_taken_again(solver):
 
 
 @pytest.mark.slow
-def test_accuracy_of_each_precision():
+@pytest.mark.parametrize("native", [True, False])
+def test_accuracy_of_each_precision(native, machine_code):
     """First swing of a pendulum: 1e-8 m in double precision, 1e-6 m in single precision.
 
     docs/conventions.md has these figures: at the default tolerances of 1e-8 and of 1e-5.
     """
+    machine_code(native)
     exact = {t: float(mp_angle(t, GRAVITY, LENGTH)) for t in (0.7, 1.5)}
     errors = {}
     for name, tolerance in (("double", 1e-8), ("single", 1e-5)):

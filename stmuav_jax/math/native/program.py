@@ -578,8 +578,8 @@ def _make_loop(
                 value = evaluate_row(*first, x, *row)
                 return jax.lax.dynamic_update_index_in_dim(x, value, number, 0), None
 
-            # in single precision tables are, too
-            numbers = (jnp.arange(len(weights)), *map(jnp.asarray, tables))
+            # JAX remembers a NumPy array by its identity, with the precision that it once had
+            numbers = (jnp.arange(len(weights)), *(jnp.asarray(table, x.dtype) for table in tables))
             return jax.lax.scan(add_row, x, numbers)[0]
         rows: list[Array] = []
         for i, row in enumerate(weights):
