@@ -27,6 +27,7 @@ from ...math import lapack
 from ...math.compiler import kept_jit
 from ...math.derivative import directional_derivative
 from ...math.linalg import solve_saddle
+from ...math.native.program import native
 from ...math.rotation import conjugate, cross, product, rotation_matrix
 from ...math.stacked import apply_matrix, apply_transposed, sum_columns
 from ...mechanics.constraint import ROWS
@@ -291,15 +292,10 @@ class Tree(AbstractFormulation):
         )
 
     def to_vector(self, model: TreeModel, state: State) -> Float[Array, " k"]:
-        return join_coordinates(read_coordinates(model.parameters, state))
+        return _state_to_vector(model.parameters, state)
 
     def to_state(self, model: TreeModel, x: Float[Array, " k"]) -> State:
-        at = split_vector(model.parameters.tree, x)
-        placement = in_world(model.parameters, at, compute_motion(model.parameters, at))
-        p = euler_parameters(model.parameters, at.q, at.u)[:, :-1]
-        p = product(at.p, p) if model.parameters.tree.floating else p
-        bodies = lambda x: x[:, :-1].T
-        return State(bodies(placement.r), p.T, bodies(placement.v), bodies(placement.omega))
+        return _vector_to_state(model.parameters, x)
 
     def accelerations(
         self,
@@ -487,6 +483,21 @@ def _driver_power(solution: Solved) -> Float[Array, "*s"]:
 
 
 @kept_jit
+@native
+def _state_to_vector(parameters: TreeParameters, state: State) -> Float[Array, " k"]:
+    return join_coordinates(read_coordinates(parameters, state))
+
+
+@native
+def _vector_to_state(parameters: TreeParameters, x: Float[Array, " k"]) -> State:
+    at = split_vector(parameters.tree, x)
+    placement = in_world(parameters, at, compute_motion(parameters, at))
+    p = euler_parameters(parameters, at.q, at.u)[:, :-1]
+    p = product(at.p, p) if parameters.tree.floating else p
+    bodies = lambda x: x[:, :-1].T
+    return State(bodies(placement.r), p.T, bodies(placement.v), bodies(placement.omega))
+
+
 def _inverse_of_base(parameters: TreeParameters) -> Float[Array, "6 6"]:
     """Inverse mass matrix of a floating base whose only joints are welds."""
     tree = parameters.tree

@@ -23,9 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...checks.errors import has_values
 from ...checks.numbers import as_floats, as_jax, as_numpy, stack_arrays
-from ...math.compiler import kept_jit
+from ...math.compiler import compute_untraced, kept_jit
 from ...math.derivative import directional_derivative
+from ...math.native.program import native
 from ...math.rotation import conjugate, cross, from_matrix, product
 from ...math.stacked import apply_matrix, dot_product, multiply_matrices
 from ...mechanics.motions import CYCLIC, ColumnParts
@@ -81,11 +83,10 @@ class TreeParameters(eqx.Module):
 
 def tree_parameters(system: System, tree: SpanningTree) -> TreeParameters:
     """Parameters of a tree, from the joints and bodies of its system."""
-    # concrete numbers are handled by NumPy: a hundred small operations, none to compile
-    # The parameters do not depend on the forces, whose inputs may be traced: without them everything else
-    # stays known numbers.
+    # Known numbers are handled by NumPy, also beside traced ones such as masses: a hundred small operations,
+    # none to compile.
     system = eqx.tree_at(lambda s: s.forces, system, ())
-    system = as_numpy(system)
+    system = jax.tree.map(as_numpy, system)
     com_ref = [*system.bodies.com, np.zeros(3)]
     K: list[Any] = []
     k: list[Any] = []
@@ -119,14 +120,14 @@ def tree_parameters(system: System, tree: SpanningTree) -> TreeParameters:
     com.setdefault(ground, np.zeros(3))
     axes = [B[b] for b in range(ground + 1)]
     mass, centre, inertia = _by_frame(system, tree, axes, com)
-    stacked_K, stacked_B = _stack_last(K, (3, 3)), _stack_last(axes, (3, 3))
-    p = as_jax(system.reference.p)
-    K_p, B_p = _constant_euler_parameters(tree, stacked_K, stacked_B, p)
+    rotations = (K, axes, system.reference.p)
+    find_constants = compute_untraced if has_values(rotations) else lambda f, *args: f(*args)
+    K_p, B_p = find_constants(_constant_euler_parameters, tree, *rotations)
     return TreeParameters(
         tree,
-        stacked_K,
+        _stack_last(K, (3, 3)),
         _stack_last(k, (3,)),
-        stacked_B,
+        _stack_last(axes, (3, 3)),
         _stack_last([com[b] for b in range(ground + 1)], (3,)),
         mass,
         centre,
@@ -184,11 +185,19 @@ def _by_frame(
     )
 
 
-@kept_jit
 def _constant_euler_parameters(
-    tree: SpanningTree, K: Float[Array, "3 3 f"], B: Float[Array, "3 3 N"], p: Float[Array, "n 4"]
+    tree: SpanningTree, K: list[Any], axes: list[Any], p: Any
 ) -> tuple[Float[Array, "4 f"], Float[Array, "4 N"]]:
     """Euler parameters K_p and B_p of the constant rotations, with the signs of the reference."""
+    rotations = (_stack_last(K, (3, 3)), _stack_last(axes, (3, 3)))
+    return _read_constant_rotations(tree, *rotations, as_jax(p))
+
+
+@kept_jit
+@native
+def _read_constant_rotations(
+    tree: SpanningTree, K: Float[Array, "3 3 f"], B: Float[Array, "3 3 N"], p: Float[Array, "n 4"]
+) -> tuple[Float[Array, "4 f"], Float[Array, "4 N"]]:
     columns_of = lambda A: jax.vmap(from_matrix, in_axes=-1, out_axes=-1)(A)
     K_p = columns_of(K) if K.shape[2] else jnp.zeros((4, 0), K.dtype)
     B_p = columns_of(B)
