@@ -207,7 +207,7 @@ def repeat_window(problem: Problem, windows: Windows, number: Any) -> Steps:
     """Steps of a window before the last, computed again from its start."""
     # their lengths are known and none is rejected: no bounds are needed
     solver = dataclasses.replace(problem.solver(), projection_limit=None, guard=None)
-    term, ts = diffrax.ODETerm(problem.field), windows.ts[number]
+    term, ts = problem.term(), windows.ts[number]
     memory = solver.init(term, ts[0], ts[1], windows.starts[number], problem.model)
 
     def repeat_step(at: tuple[Any, ...]) -> tuple[Any, ...]:

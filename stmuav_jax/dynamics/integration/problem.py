@@ -248,6 +248,10 @@ class Problem(eqx.Module):
             parts += [flows.force, flows.moment]
         return jnp.concatenate(parts)
 
+    def term(self) -> diffrax.ODETerm:
+        """Right-hand side as a term of diffrax, whose argument is the model, so that it holds none itself."""
+        return diffrax.ODETerm(eqx.tree_at(lambda p: p.model, self, None).field)
+
     def at_step(self, t: Any, y: Any, args: Any) -> Any:
         """Model with the choices that are made once for a step that starts at y."""
         t, x = jnp.asarray(t, y.dtype), y[: self.n_state]
@@ -302,7 +306,7 @@ class Problem(eqx.Module):
         Args:
             solver: that of the problem by default.
         """
-        solver, term = self.solver() if solver is None else solver, diffrax.ODETerm(self.field)
+        solver, term = self.solver() if solver is None else solver, self.term()
         return solver.step(term, t0, t1, y, self.model, solver_state, True)
 
     def controller(self, step: Float[Array, ""]) -> StepSizeMemory:
@@ -345,7 +349,7 @@ class Problem(eqx.Module):
     ) -> diffrax.Solution:
         """Integrate from the carry to t1 [s], where the last step ends; `dense` keeps all steps."""
         return diffrax.diffeqsolve(
-            diffrax.ODETerm(self.field),
+            self.term(),
             self.solver(),
             carry.t,
             t1,
