@@ -3,8 +3,9 @@
 The equations of a mechanism are some thousand operations on arrays of a few entries, many of which
 are zeros and ones by construction. `scalarise` follows a jaxpr entry by entry: operations on known
 numbers are done at once, products with 0 and 1 vanish, equal operations become one node, and what
-no output needs is never made. A jaxpr with an operation that has no scalar form (a loop with an
-unknown number of passes, an index that is computed) raises `NotScalarError`, and is left to XLA.
+no output needs is never made. A jaxpr with an operation that has no scalar form, such as a loop with an
+unknown number of passes, raises `NotScalarError`, and is left to XLA. An index that is computed reads
+operands and known arrays as tables; of other arrays it chooses among a few entries.
 
 Only numbers that stand in the jaxpr itself are known; all arguments are inputs. A product 0 * x is
 0 here even where x is not finite; `Graph.dropped` holds such x, and the program adds 0 * x of the
@@ -46,6 +47,13 @@ _NUMPY: dict[str, Callable[..., Any]] = {
 }  # fmt: skip
 
 
+# Nodes without arguments that are nodes.
+LEAVES = ("input", "constant", "table")
+
+# Entries of an array that is no table among which a computed index chooses, at most.
+MOST_CHOICES = 64
+
+
 class NotScalarError(Exception):
     """A function has no scalar program; the message names the operation."""
 
@@ -59,7 +67,8 @@ class Graph:
             and its place in it, a constant's is its value.
         is_truth: whether the value of each node is a truth value; known ones are numbers.
         dropped: nodes x of products 0 * x that were taken for 0.
-        sees_nan: whether the program tells NaN from other numbers.
+        tables: known arrays that are read by a computed index.
+        order_tests: nodes that tell NaN from other numbers only in order to sort it.
     """
 
     def __init__(self, most_nodes: int) -> None:
@@ -67,8 +76,9 @@ class Graph:
         self.args: list[tuple[Any, ...]] = []
         self.is_truth: list[bool] = []
         self.dropped: set[int] = set()
-        self.sees_nan = False
-        self._most = most_nodes
+        self.tables: list[np.ndarray] = []
+        self.order_tests: set[int] = set()
+        self._most, self._inputs = most_nodes, 0
         self._known: dict[Any, int] = {}
 
     def node(self, op: str, *args: Any) -> int:
@@ -80,7 +90,7 @@ class Graph:
         number = self._known.get(key)
         if number is None:
             number = self._known[key] = len(self.ops)
-            if number >= self._most:
+            if number - self._inputs >= self._most:
                 raise NotScalarError(f"more than {self._most} operations")
             self.append(op, args)
         return number
@@ -88,10 +98,18 @@ class Graph:
     def append(self, op: str, args: tuple[Any, ...]) -> None:
         self.ops.append(op)
         self.args.append(args)
-        if op == "select":
+        if op in ("select", "lookup"):
             self.is_truth.append(self.is_truth[args[1]])
         else:
-            self.is_truth.append(op in TRUTHS or (op == "input" and args[2] == "b"))
+            self.is_truth.append(op in TRUTHS or (op in ("input", "table") and args[2] == "b"))
+
+    def add_inputs(self, number: int, count: int, kind: str) -> np.ndarray:
+        """Nodes of the entries of an operand, which are no operations: a table may have many."""
+        first = len(self.ops)
+        for k in range(count):
+            self.append("input", (number, k, kind))
+        self._inputs += count
+        return np.arange(first, first + count)
 
     def constant(self, value: float) -> int:
         """Node of a known number; NaN, which equals nothing, is one too."""
@@ -246,9 +264,33 @@ class Graph:
         args = tuple(self.select(a, zero, unit) if self.is_truth[a] else a for a in args)
         if op in ("max", "min") and args[0] == args[1]:
             return args[0]
-        if op == "is_finite" or (op in ("eq", "ne") and args[0] == args[1]):
-            self.sees_nan = True
         return self.node(op, *args)
+
+    def less(self, a: int, b: int, *, or_equal: bool) -> int:
+        """a < b or a <= b in the order in which NaN is the largest number."""
+        a, b = self._without_nan_sign(a), self._without_nan_sign(b)
+        tests = [self.apply("ne", n, n) for n in (a, b)]
+        self.order_tests.update(tests)
+        last = self.logical("and", tests[1], self.logical_not(tests[0]))
+        if or_equal:
+            last = tests[1]
+        return self.logical("or", self.apply("le" if or_equal else "lt", a, b), last)
+
+    def _without_nan_sign(self, n: int) -> int:
+        """x of the choice x != x ? NaN : x, by which JAX gives all NaN one sign before it sorts."""
+        if self.ops[n] != "select":
+            return n
+        condition, on_false, on_true = self.args[n]
+        is_test = self.ops[condition] == "ne" and len(set(self.args[condition])) == 1
+        value = self.value(on_true)
+        return on_false if is_test and value is not None and value != value else n
+
+    def sees_nan(self, live: set[int]) -> bool:
+        """True if one of these nodes tells NaN from other numbers."""
+        is_test = lambda n: self.ops[n] in ("eq", "ne") and len(set(self.args[n])) == 1
+        return any(
+            self.ops[n] == "is_finite" or (n not in self.order_tests and is_test(n)) for n in live
+        )
 
     def needed(self, outputs: Sequence[int]) -> list[int]:
         """Nodes that the outputs need, each after its arguments, depth first."""
@@ -262,7 +304,7 @@ class Graph:
                 node, opened = stack.pop()
                 if node in finished:
                     continue
-                if opened or self.ops[node] in ("input", "constant"):
+                if opened or self.ops[node] in LEAVES:
                     finished.add(node)
                     order.append(node)
                     continue
@@ -342,8 +384,10 @@ class _Translator:
         if name in _MOVES:
             return [self.move(name, params, inputs)]
         if name in _ELEMENTWISE:
-            # numbers of a graph are in double precision: a quotient, or bits, of integers would be wrong
+            # numbers of a graph are in double precision: bits of integers would be wrong
             is_whole = np.dtype(equation.outvars[0].aval.dtype).kind in "iu"
+            if is_whole and name == "div":
+                return [self.divide_integers(*inputs)]
             if is_whole and name not in _WHOLE and any(isinstance(x, Nodes) for x in inputs):
                 raise NotScalarError(f"{name} of integers")
             return [self.elementwise(_ELEMENTWISE[name], *inputs)]
@@ -403,7 +447,7 @@ class _Translator:
         new = np.dtype(params["new_dtype"])
         if not isinstance(x, Nodes):
             return x.astype(new)
-        if new.kind not in "fbi" or new == np.float32:
+        if new.kind not in "fbiu" or new == np.float32:
             raise NotScalarError(f"conversion to {new}")
         if new.kind == "b":
             return self.truth(x)
@@ -415,11 +459,58 @@ class _Translator:
                 for n in x.ids.ravel().tolist()
             ]
             return Nodes(np.array(flat, dtype=np.int64).reshape(x.shape))
-        return (
-            self.elementwise("trunc", x)
-            if new.kind in "iu" and params["old_dtype"].kind == "f"
-            else x
-        )
+        if new.kind in "iu" and params["old_dtype"].kind == "f":
+            x = self.elementwise("trunc", x)
+        if new.kind == "u" and params["old_dtype"].kind != "u":
+            # an integer without a sign would have other bits
+            is_negative = self.elementwise("lt", x, np.zeros(()))
+            x = self._select_n({}, is_negative, x, np.full(x.shape, np.nan))
+        return x
+
+    def divide_integers(self, x: Any, y: Any) -> Any:
+        """Quotient of integers, rounded to zero; that of numbers below 2^52 is exact."""
+        if not isinstance(x, Nodes) and not isinstance(y, Nodes):
+            return np.trunc(np.divide(x, y)).astype(np.result_type(x, y))
+        pairs = np.broadcast_arrays(self.ids(x), self.ids(y))
+        flat = zip(*(a.ravel().tolist() for a in pairs), strict=True)
+        quotients = [self.graph.node("div", *e) for e in flat]
+        return self.elementwise("trunc", Nodes(np.reshape(quotients, pairs[0].shape)))
+
+    def _lt_to(self, params: Any, x: Any, y: Any) -> Any:
+        return self.in_order(x, y, or_equal=False)
+
+    def _le_to(self, params: Any, x: Any, y: Any) -> Any:
+        return self.in_order(x, y, or_equal=True)
+
+    def in_order(self, x: Any, y: Any, *, or_equal: bool) -> Any:
+        pairs = np.broadcast_arrays(self.ids(x), self.ids(y))
+        flat = zip(*(a.ravel().tolist() for a in pairs), strict=True)
+        tests = [self.graph.less(*e, or_equal=or_equal) for e in flat]
+        return Nodes(np.reshape(tests, pairs[0].shape).astype(np.int64))
+
+    def _argmax(self, params: Any, x: Any) -> Any:
+        return self.find_extreme("gt", x, *params["axes"])
+
+    def _argmin(self, params: Any, x: Any) -> Any:
+        return self.find_extreme("lt", x, *params["axes"])
+
+    def find_extreme(self, op: str, x: Any, axis: int) -> Any:
+        """Index of the largest or smallest entry, or of the first that is NaN."""
+        rows = [Nodes(row) for row in np.moveaxis(self.ids(x), axis, 0)]
+        best, place = rows[0], np.zeros(rows[0].shape, int)
+        for k, row in enumerate(rows[1:], start=1):
+            is_nan = self.elementwise(
+                "and", self.is_nan(row), self.elementwise("not", self.is_nan(best))
+            )
+            is_better = self.elementwise("or", self.elementwise(op, row, best), is_nan)
+            best = self._select_n({}, is_better, best, row)
+            place = self._select_n({}, is_better, place, np.full(row.shape, k))
+        return place
+
+    def is_nan(self, x: Nodes) -> Any:
+        tests = self.elementwise("ne", x, x)
+        self.graph.order_tests.update(tests.ids.ravel().tolist())
+        return tests
 
     def _integer_pow(self, params: Any, x: Any) -> Any:
         return self._power(x, params["y"])
@@ -636,24 +727,152 @@ class _Translator:
         return np.asarray(index).astype(int)
 
     def _dynamic_slice(self, params: Any, x: Any, *starts: Any) -> Any:
-        array, is_known = (x, True) if not isinstance(x, Nodes) else (x.ids, False)
-        sizes = params["slice_sizes"]
-        at = [int(self.known_index(s)) for s in starts]
-        at = [min(max(s, 0), n - size) for s, n, size in zip(at, array.shape, sizes, strict=True)]
-        part = array[tuple(slice(s, s + size) for s, size in zip(at, sizes, strict=True))]
-        return part if is_known else Nodes(part)
+        if all(not isinstance(s, Nodes) for s in starts) and not isinstance(x, Nodes):
+            sizes = params["slice_sizes"]
+            at = [
+                min(max(int(s), 0), n - m) for s, n, m in zip(starts, x.shape, sizes, strict=True)
+            ]
+            return x[tuple(slice(s, s + m) for s, m in zip(at, sizes, strict=True))]
+        return Nodes(self.read_window(x, [int(self.ids(s)) for s in starts], params["slice_sizes"]))
+
+    def read_window(self, x: Any, starts: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
+        """Nodes of a window of an array that starts at these nodes, moved so that it lies within."""
+        graph, zero = self.graph, self.graph.constant(0.0)
+        limits = [n - m for n, m in zip(x.shape, sizes, strict=True)]
+        limited = [
+            graph.apply("max", zero, graph.apply("min", graph.constant(limit), s))
+            if limit
+            else zero
+            for s, limit in zip(starts, limits, strict=True)
+        ]
+        known = [graph.value(s) for s in limited]
+        begin = [0 if k is None else int(k) for k in known]
+        moving = [d for d, k in enumerate(known) if k is None]
+        table = self.find_table(x) if moving else None
+        if table is not None:
+            number, first, strides, kind = table
+            place = zero
+            for d in moving:
+                place = graph.add(place, graph.mul(limited[d], graph.constant(strides[d])))
+            grid = np.indices(sizes).reshape(len(sizes), -1)
+            offsets = first + np.asarray(strides, int) @ (grid + np.array(begin, int)[:, None])
+            flat = [
+                graph.node("lookup", place, graph.node("table", number, k, kind))
+                for k in offsets.tolist()
+            ]
+            return np.array(flat, np.int64).reshape(sizes)
+        array = self.ids(x)
+        pick = lambda at: array[tuple(slice(s, s + m) for s, m in zip(at, sizes, strict=True))]
+        if not moving:
+            return pick(begin)
+        if len(moving) > 1 or limits[moving[0]] >= MOST_CHOICES:
+            raise NotScalarError("an index that is computed, of an array that is")
+        (d,) = moving
+        window = Nodes(pick(begin))
+        for k in range(1, limits[d] + 1):
+            is_here = Nodes(
+                np.broadcast_to(graph.apply("eq", limited[d], graph.constant(k)), sizes)
+            )
+            window = self._select_n(
+                {}, is_here, window, Nodes(pick([*begin[:d], k, *begin[d + 1 :]]))
+            )
+        return window.ids
+
+    def find_table(self, x: Any) -> tuple[int, int, list[int], str] | None:
+        """Operand, or known array as -1 and less, first entry, strides and kind; None if it is neither."""
+        graph = self.graph
+        if not isinstance(x, Nodes):
+            values = np.ascontiguousarray(x, float)
+            same = (k for k, t in enumerate(graph.tables) if np.array_equal(t, values.ravel()))
+            number = next(same, len(graph.tables))
+            if number == len(graph.tables):
+                graph.tables.append(values.ravel())
+            kind = "b" if np.asarray(x).dtype == bool else "f"
+            return -1 - number, 0, [k // 8 for k in values.strides], kind
+        # The nodes of an operand's entries follow each other: a part of it is a table if its nodes have
+        # equal distances along every axis.
+        first, last = int(x.ids.flat[0]), int(x.ids.max())
+        is_operand = graph.ops[first] == graph.ops[last] == "input"
+        if not is_operand or graph.args[first][0] != graph.args[last][0]:
+            return None
+        number, entry, kind = graph.args[first]
+        strides = [
+            int(np.take(x.ids, 1, d).flat[0]) - first if n > 1 else 0 for d, n in enumerate(x.shape)
+        ]
+        regular = first + np.tensordot(strides, np.indices(x.shape), 1)
+        return (number, entry, strides, kind) if np.array_equal(regular, x.ids) else None
 
     def _dynamic_update_slice(self, params: Any, x: Any, update: Any, *starts: Any) -> Any:
         is_known = not isinstance(x, Nodes) and not isinstance(update, Nodes)
-        array, part = (
-            (np.array(x), update) if is_known else (np.array(self.ids(x)), self.ids(update))
-        )
-        at = [int(self.known_index(s)) for s in starts]
-        at = [min(max(s, 0), n - m) for s, n, m in zip(at, array.shape, part.shape, strict=True)]
-        array[tuple(slice(s, s + m) for s, m in zip(at, part.shape, strict=True))] = part
-        return array if is_known else Nodes(array)
+        array, part = (x, update) if is_known else (self.ids(x), self.ids(update))
+        limits = [n - m for n, m in zip(array.shape, part.shape, strict=True)]
+        values = [self.graph.value(int(self.ids(s))) for s in starts]
+        moving = [
+            d
+            for d, (v, limit) in enumerate(zip(values, limits, strict=True))
+            if v is None and limit
+        ]
+
+        def put(at: Sequence[int]) -> np.ndarray:
+            new = np.array(array)
+            new[tuple(slice(s, s + m) for s, m in zip(at, part.shape, strict=True))] = part
+            return new
+
+        at = [min(max(int(v or 0), 0), limit) for v, limit in zip(values, limits, strict=True)]
+        if not moving:
+            return put(at) if is_known else Nodes(put(at))
+        (d, *more), graph = moving, self.graph
+        if more or limits[d] >= MOST_CHOICES:
+            raise NotScalarError("a place that is computed, of many")
+        place = graph.apply("max", graph.constant(0.0), int(self.ids(starts[d])))
+        place = graph.apply("min", graph.constant(limits[d]), place)
+        array, part, result = self.ids(x), self.ids(update), None
+        for k in range(limits[d] + 1):
+            changed = Nodes(put([*at[:d], k, *at[d + 1 :]]))
+            is_here = Nodes(
+                np.broadcast_to(graph.apply("eq", place, graph.constant(k)), array.shape)
+            )
+            result = changed if result is None else self._select_n({}, is_here, result, changed)
+        return result
+
+    def _gather_computed(self, params: Any, x: Any, index: Nodes) -> Nodes:
+        """Windows of an array that start at computed places."""
+        graph, numbers, sizes = self.graph, params["dimension_numbers"], params["slice_sizes"]
+        dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+        inner = [m for d, m in enumerate(sizes) if d not in dropped]
+        batch = index.shape[:-1]
+        result = np.zeros((*batch, *inner), np.int64)
+        for at in np.ndindex(*batch):
+            starts = [graph.constant(0.0)] * len(sizes)
+            for d, n in zip(numbers.start_index_map, index.ids[at].tolist(), strict=True):
+                starts[d] = n
+            for d, k in zip(
+                numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True
+            ):
+                starts[d] = graph.constant(at[k])
+            window = self.read_window(x, starts, sizes).reshape(inner)
+            if _fills(params["mode"]):
+                window = self.fill_outside(params["fill_value"], x, starts, sizes, window)
+            result[at] = window
+        offset = numbers.offset_dims
+        order = np.argsort([*(d for d in range(result.ndim) if d not in offset), *offset])
+        return Nodes(result.transpose(*order))
+
+    def fill_outside(
+        self, value: Any, x: Any, starts: Sequence[int], sizes: Sequence[int], window: np.ndarray
+    ) -> np.ndarray:
+        """Window, or the value (NaN by default) where it would start outside of the array."""
+        graph, inside = self.graph, self.graph.constant(1.0)
+        for s, n, m in zip(starts, x.shape, sizes, strict=True):
+            for op, limit in (("ge", 0.0), ("le", float(n - m))):
+                inside = graph.logical("and", inside, graph.apply(op, s, graph.constant(limit)))
+        is_inside = Nodes(np.broadcast_to(inside, window.shape))
+        value = np.full(window.shape, np.nan if value is None else value)
+        return self.ids(self._select_n({}, is_inside, value, Nodes(window)))
 
     def _gather(self, params: Any, x: Any, index: Any) -> Any:
+        if isinstance(index, Nodes) and None in map(self.graph.value, index.ids.ravel().tolist()):
+            return self._gather_computed(params, x, index)
         is_known, index = not isinstance(x, Nodes), self.known_index(index)
         array = x if is_known else x.ids
         numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
@@ -858,8 +1077,9 @@ def make_operands(graph: Graph, avals: Sequence[Any]) -> list[Nodes]:
         if dtype not in (np.float64, np.bool_, np.int32, np.int64):
             raise NotScalarError(f"an argument of type {dtype}")
         kind = "b" if dtype.kind == "b" else "f"
-        flat = [graph.node("input", number, k, kind) for k in range(math.prod(aval.shape))]
-        operands.append(Nodes(np.array(flat, dtype=np.int64).reshape(aval.shape)))
+        operands.append(
+            Nodes(graph.add_inputs(number, math.prod(aval.shape), kind).reshape(aval.shape))
+        )
     return operands
 
 
@@ -881,7 +1101,7 @@ def make_graph(jaxpr: Any, most_nodes: int) -> tuple[Graph, list[np.ndarray]]:
     live = set(graph.needed([n for out in outputs for n in out.ravel().tolist()]))
     leaves = [n for n in graph.needed(sorted(graph.dropped)) if graph.ops[n] == "input"]
     leaves = [n for n in leaves if graph.args[n][2] == "f"]
-    if leaves and not graph.sees_nan and live:
+    if leaves and live and not graph.sees_nan(live):
         zero = graph.constant(0.0)
         # some sums side by side, as each addition waits for the one before
         sums = [graph.node("mul", leaf, zero) for leaf in leaves[:_SUMS]]

@@ -29,7 +29,7 @@ from typing import Any, no_type_check
 import jax
 import numpy as np
 
-from .graph import Graph, NotScalarError
+from .graph import LEAVES, Graph, NotScalarError
 
 # Operations of one LLVM function; time of compilation grows faster than in proportion beyond.
 CHUNK = 4000
@@ -128,6 +128,15 @@ class _Block:
     def compare(self, predicate: str, a: str, b: str) -> str:
         return self.new(f"fcmp {predicate} {self.real} {a}, {b}")
 
+    def join(self, kind: str, lanes: Sequence[str]) -> str:
+        """Vector of the lanes' values, or the one value."""
+        if self.width == 1:
+            return lanes[0]
+        form, vector = f"<{self.width} x {kind}>", "poison"
+        for k, lane in enumerate(lanes):
+            vector = self.new(f"insertelement {form} {vector}, {kind} {lane}, i64 {k}")
+        return vector
+
     def library(self, name: str, *args: str) -> str:
         """Function of the C library, number by number."""
         arguments = ", ".join(["double"] * len(args))
@@ -137,13 +146,11 @@ class _Block:
             return self.new(call(args))
         # Not every C library has functions of vectors: lanes are taken apart and put together.
         # Such functions are rare in equations of motion, whose angles need sines and cosines only.
-        result = "poison"
+        lanes = []
         for k in range(self.width):
             parts = [self.new(f"extractelement {self.real} {a}, i64 {k}") for a in args]
-            result = self.new(
-                f"insertelement {self.real} {result}, double {self.new(call(parts))}, i64 {k}"
-            )
-        return result
+            lanes.append(self.new(call(parts)))
+        return self.join("double", lanes)
 
     def extreme(self, a: str, b: str, *, largest: bool) -> str:
         """Larger or smaller of two, NaN if either is."""
@@ -245,11 +252,12 @@ def fuse(graph: Graph, outputs: Sequence[int]) -> tuple[Graph, list[int]]:
     # value that was rounded once more, and results would depend on what else a program computes.
     uses: dict[int, int] = {}
     for node in order:
-        for arg in graph.args[node] if graph.ops[node] not in ("input", "constant") else ():
+        for arg in graph.args[node] if graph.ops[node] not in LEAVES else ():
             uses[arg] = uses.get(arg, 0) + 1
     for node in outputs:
         uses[node] = uses.get(node, 0) + 1
     new = Graph(10**9)
+    new.tables = graph.tables
     place: dict[int, int] = {}
 
     def put(op: str, *args: Any) -> int:
@@ -286,7 +294,7 @@ def fuse(graph: Graph, outputs: Sequence[int]) -> tuple[Graph, list[int]]:
         op, args = graph.ops[node], graph.args[node]
         if node in absorbed_products:
             continue
-        if op in ("input", "constant"):
+        if op in LEAVES:
             place[node] = put(op, *args)
         elif node in quotients:
             a, b = args
@@ -349,11 +357,11 @@ def write(
     order = [n for n in range(len(graph.ops))]
     if places is not None:
         for node in order:
-            if graph.ops[node] == "input":
+            if graph.ops[node] in ("input", "table") and graph.args[node][0] >= 0:
                 number, entry, kind = graph.args[node]
                 buffer, first = places[number]
                 graph.args[node] = (buffer, first + entry, kind)
-    operations = sum(graph.ops[n] not in ("input", "constant") for n in order)
+    operations = sum(graph.ops[n] not in LEAVES for n in order)
     names: set[str] = set()
     parts = [
         _functions(graph, order, flat, arguments, results, w, names) for w in sorted({1, width})
@@ -385,22 +393,60 @@ def _load(block: _Block, buffer: Buffer, number: int, entry: int) -> str:
         at = block.new(f"getelementptr {kind}, ptr {start}, i64 {entry}")
         return block.new(f"load {kind}, ptr {at}")
 
-    scalars = [load_lane(0)] if buffer.shared else [load_lane(k) for k in range(block.width)]
-    if block.width == 1:
-        vector, form = scalars[0], kind
+    if buffer.shared and block.width > 1:
+        form, zeros = f"<{block.width} x {kind}>", f"<{block.width} x i32> zeroinitializer"
+        vector = block.new(f"insertelement {form} poison, {kind} {load_lane(0)}, i64 0")
+        vector = block.new(f"shufflevector {form} {vector}, {form} poison, {zeros}")
     else:
-        form, vector = f"<{block.width} x {kind}>", "poison"
-        for k, scalar in enumerate(scalars):
-            vector = block.new(f"insertelement {form} {vector}, {kind} {scalar}, i64 {k}")
-        if buffer.shared:
-            zeros = f"<{block.width} x i32> zeroinitializer"
-            vector = block.new(f"shufflevector {form} {vector}, {form} poison, {zeros}")
-    if buffer.dtype == "f8":
+        vector = block.join(kind, [load_lane(k) for k in range(block.width)])
+    return _read_as_number(block, buffer.dtype, vector)
+
+
+@no_type_check
+def _read_as_number(block: _Block, dtype: str, vector: str) -> str:
+    """Numbers or truth values of what an argument of a data type holds."""
+    kind = _TYPES[dtype]
+    form = kind if block.width == 1 else f"<{block.width} x {kind}>"
+    if dtype == "f8":
         return vector
-    if buffer.dtype == "b1":
+    if dtype == "b1":
         zero = "0" if block.width == 1 else "zeroinitializer"
         return block.new(f"icmp ne {form} {vector}, {zero}")
     return block.new(f"sitofp {form} {vector} to {block.real}")
+
+
+@no_type_check
+def _look_up(
+    block: _Block, graph: Graph, arguments: Sequence[Buffer], table: int, place: str
+) -> str:
+    """Entry of a table at a computed place, which lies within it; NaN where the place is NaN."""
+    number, first, kind_of_value = graph.args[table]
+    is_number = block.compare("ord", place, place)
+    # a place that is NaN would be any address
+    within = block.select(is_number, place, block.number(0.0))
+    if number < 0:
+        buffer = Buffer(len(graph.tables[-1 - number]), "f8", shared=True)
+        values = ", ".join(f"double {_bits(v)}" for v in graph.tables[-1 - number].tolist())
+        block.names.add(
+            f"@known{-1 - number} = private constant [{buffer.size} x double] [{values}]"
+        )
+    else:
+        buffer = arguments[number]
+    kind, lanes = _TYPES[buffer.dtype], []
+    for lane in range(block.width):
+        at = within
+        if block.width > 1:
+            at = block.new(f"extractelement {block.real} {within}, i64 {lane}")
+        at = block.new(f"fptosi double {at} to i64")
+        start = f"@known{-1 - number}" if number < 0 else f"%x{number}"
+        start += f"l{lane}" if lane and not buffer.shared else ""
+        at = block.new(f"add i64 {at}, {first}")
+        at = block.new(f"getelementptr {kind}, ptr {start}, i64 {at}")
+        lanes.append(block.new(f"load {kind}, ptr {at}"))
+    value = _read_as_number(block, buffer.dtype, block.join(kind, lanes))
+    if kind_of_value == "b":
+        return value if buffer.dtype == "b1" else block.compare("une", value, block.number(0.0))
+    return block.select(is_number, value, block.number(math.nan))
 
 
 @no_type_check
@@ -451,10 +497,10 @@ def _functions(
     # registers.
     handed: dict[int, int] = {}
     for node in order:
-        if graph.ops[node] in ("input", "constant"):
+        if graph.ops[node] in LEAVES:
             continue
         for arg in graph.args[node]:
-            if piece_of[arg] != piece_of[node] and graph.ops[arg] not in ("input", "constant"):
+            if piece_of[arg] != piece_of[node] and graph.ops[arg] not in LEAVES:
                 handed.setdefault(arg, len(handed))
     places_of_outputs: dict[int, list[tuple[int, int]]] = {}
     place = 0
@@ -477,6 +523,8 @@ def _functions(
             if op == "input":
                 number, entry, _ = graph.args[node]
                 values[node] = _load(block, arguments[number], number, entry)
+            elif op == "table":
+                values[node] = ""
             elif op == "constant":
                 values[node] = block.number(graph.args[node][0])
             else:
@@ -485,13 +533,17 @@ def _functions(
                 values[node] = block.new(f"load {form}, ptr {at}")
 
         for node in piece:
-            if graph.ops[node] in ("input", "constant"):
+            if graph.ops[node] in LEAVES:
                 if node in places_of_outputs:
                     get(node)
             else:
                 for arg in graph.args[node]:
                     get(arg)
-                values[node] = _emit(block, graph, node, values, pairs)
+                if graph.ops[node] == "lookup":
+                    place, table = graph.args[node]
+                    values[node] = _look_up(block, graph, arguments, table, values[place])
+                else:
+                    values[node] = _emit(block, graph, node, values, pairs)
                 if node in handed:
                     form = block.truth if graph.is_truth[node] else block.real
                     at = block.new(f"getelementptr {block.real}, ptr %memory, i64 {handed[node]}")

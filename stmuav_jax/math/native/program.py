@@ -109,12 +109,19 @@ class Program:
     def _make_layout(self, shared: tuple[bool, ...], rows: int) -> Layout:
         graph: Any = self.graph()
         nodes = graph[0].needed([n for out in graph[1] for n in out.ravel().tolist()])
-        used = {graph[0].args[n][0] for n in nodes if graph[0].ops[n] == "input"}
+        named = {
+            op: {graph[0].args[n][0] for n in nodes if graph[0].ops[n] == op}
+            for op in ("input", "table")
+        }
+        tables = {k for k in named["table"] if k >= 0}
+        used = named["input"] | tables
         # XLA takes time to hand over an operand, and a model has dozens of them. Numbers of one argument go
         # together: where a loop does not change them, XLA joins them once.
         members: dict[Any, list[int]] = {}
         for k in sorted(used):
             joined = str(self.inputs[k].dtype) == "float64" and (shared[k] or rows == 1)
+            # a table may be long, and would be copied
+            joined = joined and k not in tables
             members.setdefault(("joined", self.groups[k]) if joined else k, []).append(k)
         packs = tuple(tuple(pack) for pack in members.values())
         places: dict[int, tuple[int, int]] = {}
