@@ -21,7 +21,7 @@ import jax.core as jax_core
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxlib.mlir import ir
 from jaxtyping import Array
 
@@ -477,7 +477,10 @@ _ALLOWED = tuple(np.dtype(name) for name in _DTYPES)
 
 
 def native(
-    function: Callable[..., Any], *, tables: Sequence[np.ndarray] | None = None
+    function: Callable[..., Any],
+    *,
+    tables: Sequence[np.ndarray] | None = None,
+    keeps_unused: bool = False,
 ) -> Callable[..., Any]:
     """Function that is one operation of the programs around it, as machine code where that exists.
 
@@ -489,10 +492,11 @@ def native(
     """
     evaluate_row: Any = None
     if tables is not None:
-        evaluate_row = native(_sum_rows(function, len(tables)))
+        keeps_unused = True
+        evaluate_row = native(_sum_rows(function, len(tables)), keeps_unused=True)
         function = _make_loop(function, evaluate_row, tables)
     jitted: Any = eqx.filter_jit(function)
-    programs: OrderedDict[Any, tuple[Program, Any] | None] = OrderedDict()
+    programs: OrderedDict[Any, tuple[Program, Any, list[int]] | None] = OrderedDict()
 
     def find(args: Any) -> tuple[tuple[Program, Any], list[Any]] | None:
         """Program, what puts its results together, and its operands; None where XLA compiles the function."""
@@ -511,11 +515,11 @@ def native(
         if key not in programs:
             owners = [k for k, arg in enumerate(args) for _ in jax.tree.leaves(arg)]
             groups = [owners[k] for k in places]
-            entry = _make(function, structure, static, places, arrays, groups)
+            entry = _make(function, structure, static, places, arrays, groups, keeps_unused)
             if tables is not None and entry is not None:
                 body = evaluate_row.find((*args, *(table[0] for table in tables)))
                 program = body and Recursion(entry[0].jaxpr, groups, body[0][0], tables)
-                entry = program and (program, entry[1])
+                entry = program and (program, *entry[1:])
             programs[key] = entry
             # A program holds its jaxpr, derivatives and graph. A process that makes many
             # structures, as a test suite does, would keep them all; the oldest go first.
@@ -528,7 +532,8 @@ def native(
         # one has none.
         if entry is None or (not _tracing.depth and entry[0].graph() is None):
             return None
-        return entry, arrays
+        program, result, used = entry
+        return (program, result), [arrays[k] for k in used]
 
     def can_be_found(args: Any) -> bool:
         """False for a function of the user's that is of a kind which no program is found by."""
@@ -599,9 +604,16 @@ def _make_loop(
 
 
 def _make(
-    function: Any, structure: Any, static: Any, places: Any, arrays: Any, groups: Any
-) -> tuple[Program, Any] | None:
-    """Program of a function for arguments of one structure, and what puts its results together."""
+    function: Any,
+    structure: Any,
+    static: Any,
+    places: Any,
+    arrays: Any,
+    groups: Any,
+    keeps_unused: bool,
+) -> tuple[Program, Any, list[int]] | None:
+    """Program of a function for arguments of one structure, what puts its results together, and the arrays
+    that are its operands."""
     form: list[Any] = []
 
     def flat(*traced_arrays: Any) -> list[Any]:
@@ -626,7 +638,14 @@ def _make(
     if any(isinstance(c, jax_core.Tracer) for c in jaxpr.consts):
         # a number that the function closes over is being traced, and may be another one next time
         return None
-    program = Program(jaxpr, groups)
+    used = [True] * len(arrays)
+    if not keeps_unused:
+        # A model has some hundred numbers, of which a function may need a few: each operand takes time in
+        # every transformation of JAX.
+        needed, used = partial_eval.dce_jaxpr(jaxpr.jaxpr, used_outputs=True)
+        jaxpr = core.ClosedJaxpr(needed, jaxpr.consts)
+    used_arrays = [k for k, is_used in enumerate(used) if is_used]
+    program = Program(jaxpr, [groups[k] for k in used_arrays])
     tree, traced, rest = form
 
     def result(values: Sequence[Any]) -> Any:
@@ -635,4 +654,4 @@ def _make(
             whole[k] = value
         return jax.tree.unflatten(tree, whole)
 
-    return program, result
+    return program, result, used_arrays
