@@ -377,9 +377,11 @@ def test_a_hover_that_excites_nothing_is_refused_by_axis(calm):
     assert result.rotation is None
     assert "it changes by 0.02 V; 1 % of it or more" in result.refusals["voltage"]
     assert "voltage_exponent" not in result.estimates
-    for axis in ("roll", "pitch"):
+    for axis in ("roll", "pitch", "thrust"):
         assert "is not excited" in result.refusals[axis]
-        assert axis not in result.estimates
+    # its gusts tell the IMU's position and the drag, but neither an axis, nor lag, thrust or mass
+    assert "yaw" in result.refusals
+    assert all(name.startswith(("imu_", "drag_")) for name in result.estimates)
 
 
 @pytest.mark.slow
@@ -395,24 +397,24 @@ def test_positions_in_millimetres_are_refused(record):
 @pytest.mark.parametrize(
     ("manoeuvres", "known", "signs"),
     [
-        ((1.0, 0.0, 0.0, 0.0), {"roll", "lag", "centre_y", "thrust"}, {"pitch": "++--"}),
-        # that of pitch is at the bound of what counts as determined: one gust more or less decides
-        ((0.0, 0.0, 0.0, 0.0), {"imu_x", "drag_x"}, {"roll": "++++"}),
+        ((1.0, 0.0, 0.0, 0.0), {"roll", "lag", "centre_y", "thrust"}, {"pitch": "++++ ++--"}),
+        ((0.0, 0.0, 0.0, 0.0), {"imu_x", "drag_x"}, {"roll": "++++", "pitch": "++++"}),
         ((0.0, 0.0, 0.0, 1.5), {"thrust", "thrust_slope"}, {"roll": "++++", "pitch": "++++"}),
     ],
     ids=["roll", "hover", "climbs"],
 )
 def test_what_a_flight_tells_of_other_axes_is_named(manoeuvres, known, signs):
-    """Commands about roll tell their effect about pitch, and a hover or climbs that of all motors together."""
+    """The balance of any flight tells the sum of the responses; commands about roll, their effect about pitch too."""
     record = simulate_flights([2], 16.0, TRUTH._replace(manoeuvres=manoeuvres))[0]
     result = identify_flight(record, LAYOUT)
     assert known <= set(result.estimates)
     for axis, pattern in signs.items():
         assert axis not in result.estimates
         words = result.refusals[axis].partition("Of the motors' responses only")[2]
-        terms = re.findall(r"(-?)\+? ?(?:[\d.]+ )?motor (\d)", words)
-        assert "".join(sign or "+" for sign, _ in terms) == pattern
-        assert [number for _, number in terms] == list("1234")
+        sums = [re.findall(r"(-?)\+? ?(?:[\d.]+ )?motor (\d)", part) for part in words.split(";")]
+        same = [["-+"[sign == terms[0][0]] for sign, _ in terms] for terms in sums]
+        assert " ".join(map("".join, same)) == pattern
+        assert all([number for _, number in terms] == list("1234") for terms in sums)
     if "curve" in result.refusals and "thrust" in result.estimates:
         # the slope by the square of the command at hover
         linear, value = map(

@@ -65,6 +65,8 @@ _WINDOW, _WINDOWS = 6.0, 5
 _EXCITED = 2.0
 # Relative deviation up to which an effectiveness is determined.
 _DETERMINED = 0.1
+# That of a combination of the motors' responses about an axis that is not excited, of which little is known.
+_COMBINED = 0.04
 # Deviations up to which the IMU's position [m], and the drag as a share of it, are determined.
 _IMU_DETERMINED, _DRAG_DETERMINED = 0.005, 0.5
 # Deviation of the voltage's exponent up to which it is determined, and range of the voltage from which it is sought.
@@ -737,21 +739,23 @@ def _name_combinations(
 ) -> None:
     """Add which combinations of the motors' responses about roll and pitch an axis that is not excited still tells.
 
-    They have no values: without excitation the controller's own relation of rates and commands biases the fit.
+    They have no values: without excitation little noise suffices to bias the fit.
     """
     layout, count = signals.layout, len(signals.layout.positions)
     lag = estimates.get("lag", estimates.get("thrust_lag"))
     lags = np.array([_START[0] if lag is None else lag.value, _START[1]])
     shape = compute_thrust_shape(signals.record.commands, layout.thrust_model_factor)
     for axis in {0, 1} - set(excited):
-        build = _rotation_regression(signals, [axis], _Variant(_FORCE_RATE), free=True)
+        # Where the controller alone moves the vehicle, errors of averages over a coarser grid, which depend on the
+        # commands, would make its own gain of the responses.
+        build = _rotation_regression(signals, [axis], _Variant(), free=True)
         regression = build(lags)
         fit = fit_prediction_error(lambda _, same=regression: same, np.zeros(0), (), _MEMORY)
         # a vehicle whose radius of gyration is its arm has this effectiveness
         usual = GRAVITY / (count * float(np.mean(shape)) * layout.arms[axis])
         sentence = describe_combinations(
             [f"motor {k + 1}" for k in range(count)], "", fit.values[:count],
-            fit.compute_covariance(_BLOCK)[:count, :count], np.full(count, _DETERMINED * usual),
+            fit.compute_covariance(_BLOCK)[:count, :count], np.full(count, _COMBINED * usual),
         )  # fmt: skip
         refusals[AXES[axis]] += sentence.replace("Only", "Of the motors' responses only")
 
