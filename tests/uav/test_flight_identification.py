@@ -362,11 +362,18 @@ def test_a_filter_of_the_centre_ends_where_the_whole_record_does(record, result)
         )
 
 
-def test_motors_in_another_order_are_named(record):
-    order = [1, 0, 3, 2]
-    swapped = make_layout(LAYOUT.positions[order], LAYOUT.spin[order])
-    with pytest.raises(SettingError, match="motors 1 to 4 respond as rotors 2 1 4 3 of the layout"):
-        identify_flight(record, swapped)
+@pytest.mark.parametrize(
+    ("order", "spin", "words"),
+    [
+        ([1, 0, 3, 2], [-1, 1, -1, 1], "motors 1 to 4 respond as rotors 2 1 4 3 of the layout"),
+        ([0, 1, 2, 3], [-1, 1, -1, 1], "of the spin [1, -1, 1, -1], but the layout has [-1, 1, -1, 1]"),
+        ([0, 1, 2, 3], [1, 1, -1, -1], "of the spin [1, -1, 1, -1], but the layout has [1, 1, -1, -1]"),
+    ],
+    ids=["order", "reversed", "pairs"],
+)  # fmt: skip
+def test_motors_in_another_order_or_with_another_spin_are_named(record, order, spin, words):
+    with pytest.raises(SettingError, match=re.escape(words)):
+        identify_flight(record, make_layout(LAYOUT.positions[order], spin))
 
 
 @pytest.mark.slow
@@ -382,6 +389,17 @@ def test_a_hover_that_excites_nothing_is_refused_by_axis(calm):
     # its gusts tell the IMU's position and the drag, but neither an axis, nor lag, thrust or mass
     assert "yaw" in result.refusals
     assert all(name.startswith(("imu_", "drag_")) for name in result.estimates)
+
+
+@pytest.mark.slow
+def test_a_vehicle_that_is_held_while_its_motors_run_is_refused(record):
+    rng = np.random.default_rng(0)
+    force, rates = (size * rng.normal(size=(len(record.ts), 3)) for size in (0.3, 0.01))
+    held = record._replace(gyroscope=rates, accelerometer=force + np.array([0, 0, g]))
+    with pytest.raises(
+        SettingError, match=r"not follow its motors: .*where 5\.\d m/s\^2 would carry"
+    ):
+        identify_flight(held, LAYOUT)
 
 
 @pytest.mark.slow
@@ -441,6 +459,8 @@ def test_records_that_cannot_be_identified_are_refused(record):
         )
     with pytest.raises(SettingError, match="gyroscope's axis y is 0 throughout"):
         identify_flight(record._replace(gyroscope=np.abs(record.gyroscope) * [1, 0, 1]), LAYOUT)
+    with pytest.raises(SettingError, match=r"command of motor 1 is 0\.5 throughout the flight"):
+        identify_flight(record._replace(commands=0 * record.commands + 0.5), LAYOUT)
     with pytest.raises(SettingError, match="one line"):
         make_layout([[0, 1], [0, 2], [0, 3]], [1, 1, -1])
     with pytest.raises(SettingError, match="spin must be"):
