@@ -21,6 +21,8 @@ from ...checks.shapes import Numbers
 
 # Natural frequency [rad/s] and damping of the observer of velocity, and time in which it forgets that along z [s].
 _OBSERVER, _DAMPING, _CLIMB = 0.4, 0.7, 3.0
+# Shortest record that is identified [s].
+SHORTEST_RECORD = 10.0
 # Rotors closer than this to an axis have no side of it, as a share of the largest arm.
 _ON_AXIS = 0.05
 

@@ -40,6 +40,7 @@ from .prediction_error import (
     fit_prediction_error,
 )
 from .record import (
+    SHORTEST_RECORD,
     FlightRecord,
     RotorLayout,
     apply_filter,
@@ -95,8 +96,8 @@ _CARRYING = 0.3
 _GYRATION = (0.1, 5.0)
 # Level of the verdict and of variants that the record rejects.
 _LEVEL = 0.01
-# Lowest rates of commands and IMU [Hz], and shortest flight [s].
-_SLOWEST, _SHORTEST = 50.0, 10.0
+# Lowest rate of commands [Hz].
+_SLOWEST = 50.0
 
 
 class ParameterEstimate(NamedTuple):
@@ -664,9 +665,9 @@ def _check_record(record: FlightRecord, layout: RotorLayout) -> None:
             f"The record has commands of {count} rotors, but the layout has {len(layout.positions)}."
         )
     length, rate = float(record.ts[-1] - record.ts[0]), 1 / record.dt
-    if length < _SHORTEST:
+    if length < SHORTEST_RECORD:
         raise SettingError(
-            f"The flight is {length:.3g} s long; {_SHORTEST:g} s or more would be valid."
+            f"The flight is {length:.3g} s long; {SHORTEST_RECORD:g} s or more would be valid."
         )
     if rate < 0.99 * _FORCE_RATE:
         raise SettingError(
