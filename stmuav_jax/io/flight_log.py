@@ -19,7 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from ..checks.errors import SettingError, nearest_names
 from ..checks.schema import format_value, quote_name
-from ..uav.flight_identification.record import FlightRecord, RotorLayout, make_layout
+from ..uav.flight_identification.record import (
+    SHORTEST_RECORD,
+    FlightRecord,
+    RotorLayout,
+    make_layout,
+)
 from .csv_table import write_csv_table
 from .log_formats import (
     DECODERS,
@@ -49,6 +54,8 @@ _UPRIGHT = 0.8
 _FASTEST = 40.0
 # Lowest rate of commands that resolves the lag of motors [Hz].
 _SLOWEST_COMMANDS = 50.0
+# Range of commands from which their ends may be limits.
+_MOVES = 0.1
 # Share of samples at a limit, or without an order in time, that is said or refused.
 _SAID, _REFUSED = 0.01, 0.1
 # Highest rate of a record for identification [Hz], longest gap that is bridged, and margins at its ends [s].
@@ -233,7 +240,7 @@ class FlightLog:
 
         Raises:
             SettingError: the log has refusals or no such flight, lacks commands and speeds, gyroscope or
-                accelerometer, or its commands are slower than the lag of motors.
+                accelerometer, its commands are slower than the lag of motors, or gaps leave less than 10 s.
         """
         flight = self.flight(index)
         # speeds that were measured take the place of commands, as shares of the highest
@@ -258,7 +265,13 @@ class FlightLog:
         t0, t1 = flight.flights[0] + [_TAKE_OFF, -_LANDING]
         # Ends of gaps, in order, are the edges of the stretches between them.
         edges = np.array([t0, *np.ravel(sorted(gaps)), t1]).reshape(-1, 2)
+        whole_length = t1 - t0
         t0, t1 = edges[np.argmax(edges[:, 1] - edges[:, 0])].tolist()
+        if t1 - t0 < SHORTEST_RECORD <= whole_length:
+            raise SettingError(
+                f"Gaps of more than {_BRIDGED:g} s leave at most {t1 - t0:.3g} s of the flight of {self.name} without "
+                f"one; {SHORTEST_RECORD:g} s or more would be valid."
+            )
         rate = float(
             round(min(_RECORD_RATE, flight["gyroscope"].rate, flight["accelerometer"].rate))
         )
@@ -756,16 +769,20 @@ def _check_commands(draft: LogDraft, channels: Mapping[str, Channel], flights: n
     if not np.any(inside):
         return
     values = channel.values[inside]
-    for limit, share in (
-        ("upper", np.mean(values >= 0.995, axis=0)),
-        ("lower", np.mean(values <= 0.005, axis=0)),
+    # A firmware may limit its commands to less than the whole range: motors then stay at the largest or the
+    # smallest of all commands, which in free flight few samples are.
+    highest, lowest = float(np.max(values)), float(np.min(values))
+    for limit, bound, share in (
+        ("upper", highest, np.mean(values >= min(highest, 0.995), axis=0)),
+        ("lower", lowest, np.mean(values <= max(lowest, 0.005), axis=0)),
     ):
+        is_end = not 0.005 < bound < 0.995
         # One sentence on the worst motor is enough to doubt the record.
         k = int(np.argmax(share))
-        if share[k] > _SAID:
+        if share[k] > (_SAID if is_end else _REFUSED) and (is_end or highest - lowest > _MOVES):
             draft.notes.append(
-                f"motor_commands are saturated: motor {k + 1} is at its {limit} limit in {100 * share[k]:.0f} % "
-                "of the flight; commands between the limits would be valid."
+                f"motor_commands are saturated: motor {k + 1} is at its {limit} limit of {bound:.3g} in "
+                f"{100 * share[k]:.0f} % of the flight; commands between the limits would be valid."
             )
 
 

@@ -122,8 +122,7 @@ class LogDraft:
     def refuse_vehicle(self, kind: str) -> None:
         self.vehicle = kind
         self.refuse(
-            f"The log is of {kind}, whose wings or wheels the models of multirotors leave out; a "
-            "multirotor would be valid."
+            f"The log is of {kind}, which the models of multirotors do not describe; a multirotor would be valid."
         )
 
     def set_cutoffs(
@@ -274,11 +273,14 @@ _OTHERS = {
     11: "a boat", 12: "a submarine", **dict.fromkeys(range(19, 26), "a VTOL aircraft"),
 }  # fmt: skip
 _AIRFRAMES = {
-    1: "a fixed-wing aircraft",
-    2: "a VTOL aircraft",
-    3: "a VTOL aircraft",
-    4: "a VTOL aircraft",
-}
+    1: "a fixed-wing aircraft", **dict.fromkeys((2, 3, 4), "a VTOL aircraft"),
+    **dict.fromkeys((5, 6, 13), "a rover"), **dict.fromkeys((10, 11, 12), "a helicopter"),
+}  # fmt: skip
+# Words of a map of columns for them, and ArduPilot's frames and functions of servos that only they have.
+_OTHER_WORDS = re.compile(
+    r"fixed.?wing|plane|vtol|helicopter|rover|boat|submarine|airship|glider", re.I
+)
+_HELICOPTERS, _SURFACES = (6, 11, 13), (4, 19, 24, 25, 77, 78, 79, 80)
 
 
 def _read_px4_vehicle(draft: LogDraft, parameters: Mapping[str, Any]) -> None:
@@ -502,10 +504,16 @@ def _read_ardupilot_vehicle(
 ) -> None:
     text = " ".join(texts)
     draft.is_simulated = "SITL" in text or any(name.startswith("SIM_") for name in parameters)
-    firmware = re.search(r"(ArduPlane|ArduRover|Rover|ArduSub|Blimp)", text)
-    if firmware or parameters.get("Q_ENABLE", 0) > 0:
-        kind = f"a vehicle with the firmware {firmware[0]}" if firmware else "a VTOL aircraft"
-        draft.refuse_vehicle(kind)
+    firmware = re.search(r"(ArduPlane|ArduRover|Rover|ArduSub|Blimp|AntennaTracker)", text)
+    functions = {v for name, v in parameters.items() if re.fullmatch(r"SERVO\d+_FUNCTION", name)}
+    if firmware:
+        draft.refuse_vehicle(f"a vehicle with the firmware {firmware[0]}")
+    elif parameters.get("Q_ENABLE", 0) > 0:
+        draft.refuse_vehicle("a VTOL aircraft")
+    elif functions.intersection(_SURFACES):
+        draft.refuse_vehicle("an aircraft with control surfaces (SERVOn_FUNCTION)")
+    elif parameters.get("FRAME_CLASS") in _HELICOPTERS or "Frame: HELI" in text:
+        draft.refuse_vehicle("a helicopter")
     elif "Copter" in text:
         draft.vehicle = "multirotor"
 
@@ -732,6 +740,8 @@ def decode_csv(source: Path, columns: Any) -> LogDraft:
             )
         plan = validate_model(_ColumnMap, table, "The map of columns")
     draft = LogDraft("CSV", vehicle=plan.vehicle, is_down=plan.axes == "forward-right-down")
+    if _OTHER_WORDS.search(plan.vehicle):
+        draft.refuse_vehicle(f"a {plan.vehicle} (the map's vehicle)")
     if cells.is_cut:
         draft.notes.append("The file is truncated; its last row is not whole and was left out.")
 

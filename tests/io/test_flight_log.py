@@ -364,6 +364,19 @@ def test_a_gap_of_more_than_a_second_ends_a_flight(tmp_path):
     np.testing.assert_allclose(log.flights, [[2.0, 3.195], [4.505, 6.0]], atol=1e-5)
 
 
+def test_gaps_that_leave_too_little_of_a_flight_are_named(tmp_path):
+    ts = np.arange(20 * RATE) / RATE
+    values = np.sin(ts)[:, None] + np.zeros(4)
+    parts = {"t": ts, "accelerometer": values[:, :3] + [0, 0, g], "gyroscope": values[:, :3]}
+    parts["motor_commands"] = 0.5 + 0.1 * values
+    kept = (ts + 1) % 2 > 0.1
+    log = read_flight_log(csv_file(tmp_path / "log", {k: v[kept] for k, v in parts.items()}))
+    with pytest.raises(
+        SettingError, match=r"Gaps of more than 0\.05 s leave at most 1\.9 s of the flight"
+    ):
+        log.to_record()
+
+
 def test_windows_keep_the_log_s_times(tmp_path):
     log = read_flight_log(csv_file(tmp_path / "log", flight()))
     part = log.window(1.0, 3.0)
@@ -454,7 +467,9 @@ NOTED = {
     "impact": (lambda: at_end(flight(accelerometer=np.where(flight()["t"][:, None] == 2.5, 90, [0, 0, 9.81])),
                               "gyroscope", 0.0), "exceeds 49 m/s^2 in flight, first at 2.50 s", False),
     "saturated": (lambda: at_end(flight(), "motor_commands", [0.6, 0.6, 1.0, 0.6], 200),
-                  "motor 3 is at its upper limit in 25 % of the flight", False),
+                  "motor 3 is at its upper limit of 1 in 25 % of the flight", False),
+    "limited": (lambda: flight(motor_commands=np.minimum(flight()["motor_commands"], 0.65)),
+                "motor 1 is at its upper limit of 0.65 in", False),
     "slow": (lambda: {k: v[::10] for k, v in flight().items()}, "motor_commands come at 20 Hz", False),
 }  # fmt: skip
 
@@ -489,11 +504,25 @@ def test_a_single_wrong_stamp_costs_one_sample(tmp_path):
         ("ulog", {"parameters": [("MAV_TYPE", 1)]}, "of a fixed-wing aircraft"),
         ("bin", {"texts": ["ArduPlane V4.5"]}, "the firmware ArduPlane"),
         ("bin", {"parameters": [("Q_ENABLE", 1.0)]}, "of a VTOL aircraft"),
+        ("ulog", {"parameters": [("MAV_TYPE", 0), ("CA_AIRFRAME", 11)]}, "of a helicopter"),
+        ("bin", {"parameters": [("FRAME_CLASS", 6.0)]}, "of a helicopter"),
+        ("bin", {"texts": (), "parameters": [("SERVO1_FUNCTION", 4.0)]}, "of an aircraft with control surfaces"),
     ],
-)
-def test_vehicles_with_wings_are_refused(kind, options, words, tmp_path):
+)  # fmt: skip
+def test_vehicles_that_are_no_multirotors_are_refused(kind, options, words, tmp_path):
     log = read_flight_log(written(kind, tmp_path, flight(), **options))
     assert words in log.refusals[0]
+
+
+def test_a_vehicle_of_the_map_that_is_no_multirotor_is_refused(tmp_path):
+    (tmp_path / "log").write_text("t [s],volt [V]\n0,1\n1,1\n")
+    table = {"time": {"column": "t"}, "battery_voltage": {"columns": ["volt"]}}
+    log = read_flight_log(tmp_path / "log", {**table, "vehicle": "fixed-wing"})
+    assert "of a fixed-wing (the map's vehicle)" in log.refusals[0]
+    assert (
+        "of a "
+        not in read_flight_log(tmp_path / "log", {**table, "vehicle": "Crazyflie"}).refusals[0]
+    )
 
 
 @pytest.mark.parametrize(

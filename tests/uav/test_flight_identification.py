@@ -106,6 +106,18 @@ def test_a_flight_in_closed_loop_gives_the_true_numbers(result):
 
 
 @pytest.mark.slow
+def test_a_record_that_starts_in_a_manoeuvre_gives_the_true_numbers(record):
+    """At 10.4 s it is tilted by 48 degrees and moves at 2.5 m/s; as if level, drag would be 15 deviations off."""
+    result = identify_flight(record.between(10.4, 24.0), LAYOUT)
+    assert result.verdict.status == "consistent"
+    for name, value in VALUES.items():
+        e = result.estimates[name]
+        assert abs(e.value - value) < 4 * e.deviation, name
+    for x in "xy":
+        assert result.estimates[f"drag_{x}"].deviation < 0.1 * VALUES[f"drag_{x}"]
+
+
+@pytest.mark.slow
 def test_effectiveness_is_unbiased_and_intervals_cover_over_many_flights():
     """Statistical: the mean of 8 flights within 2 %, and 95 % intervals that cover 91 % or more of 230."""
     results = [identify_flight(r, LAYOUT) for r in simulate_flights(range(20, 28), 24.0)]
@@ -350,11 +362,18 @@ def test_a_filter_of_the_centre_ends_where_the_whole_record_does(record, result)
         )
 
 
-def test_motors_in_another_order_are_named(record):
-    order = [1, 0, 3, 2]
-    swapped = make_layout(LAYOUT.positions[order], LAYOUT.spin[order])
-    with pytest.raises(SettingError, match="motors 1 to 4 respond as rotors 2 1 4 3 of the layout"):
-        identify_flight(record, swapped)
+@pytest.mark.parametrize(
+    ("order", "spin", "words"),
+    [
+        ([1, 0, 3, 2], [-1, 1, -1, 1], "motors 1 to 4 respond as rotors 2 1 4 3 of the layout"),
+        ([0, 1, 2, 3], [-1, 1, -1, 1], "of the spin [1, -1, 1, -1], but the layout has [-1, 1, -1, 1]"),
+        ([0, 1, 2, 3], [1, 1, -1, -1], "of the spin [1, -1, 1, -1], but the layout has [1, 1, -1, -1]"),
+    ],
+    ids=["order", "reversed", "pairs"],
+)  # fmt: skip
+def test_motors_in_another_order_or_with_another_spin_are_named(record, order, spin, words):
+    with pytest.raises(SettingError, match=re.escape(words)):
+        identify_flight(record, make_layout(LAYOUT.positions[order], spin))
 
 
 @pytest.mark.slow
@@ -365,9 +384,22 @@ def test_a_hover_that_excites_nothing_is_refused_by_axis(calm):
     assert result.rotation is None
     assert "it changes by 0.02 V; 1 % of it or more" in result.refusals["voltage"]
     assert "voltage_exponent" not in result.estimates
-    for axis in ("roll", "pitch"):
+    for axis in ("roll", "pitch", "thrust"):
         assert "is not excited" in result.refusals[axis]
-        assert axis not in result.estimates
+    # its gusts tell the IMU's position and the drag, but neither an axis, nor lag, thrust or mass
+    assert "yaw" in result.refusals
+    assert all(name.startswith(("imu_", "drag_")) for name in result.estimates)
+
+
+@pytest.mark.slow
+def test_a_vehicle_that_is_held_while_its_motors_run_is_refused(record):
+    rng = np.random.default_rng(0)
+    force, rates = (size * rng.normal(size=(len(record.ts), 3)) for size in (0.3, 0.01))
+    held = record._replace(gyroscope=rates, accelerometer=force + np.array([0, 0, g]))
+    with pytest.raises(
+        SettingError, match=r"not follow its motors: .*where 5\.\d m/s\^2 would carry"
+    ):
+        identify_flight(held, LAYOUT)
 
 
 @pytest.mark.slow
@@ -383,24 +415,24 @@ def test_positions_in_millimetres_are_refused(record):
 @pytest.mark.parametrize(
     ("manoeuvres", "known", "signs"),
     [
-        ((1.0, 0.0, 0.0, 0.0), {"roll", "lag", "centre_y", "thrust"}, {"pitch": "++--"}),
-        # that of pitch is at the bound of what counts as determined: one gust more or less decides
-        ((0.0, 0.0, 0.0, 0.0), {"imu_x", "drag_x"}, {"roll": "++++"}),
+        ((1.0, 0.0, 0.0, 0.0), {"roll", "lag", "centre_y", "thrust"}, {"pitch": "++++ ++--"}),
+        ((0.0, 0.0, 0.0, 0.0), {"imu_x", "drag_x"}, {"roll": "++++", "pitch": "++++"}),
         ((0.0, 0.0, 0.0, 1.5), {"thrust", "thrust_slope"}, {"roll": "++++", "pitch": "++++"}),
     ],
     ids=["roll", "hover", "climbs"],
 )
 def test_what_a_flight_tells_of_other_axes_is_named(manoeuvres, known, signs):
-    """Commands about roll tell their effect about pitch, and a hover or climbs that of all motors together."""
+    """The balance of any flight tells the sum of the responses; commands about roll, their effect about pitch too."""
     record = simulate_flights([2], 16.0, TRUTH._replace(manoeuvres=manoeuvres))[0]
     result = identify_flight(record, LAYOUT)
     assert known <= set(result.estimates)
     for axis, pattern in signs.items():
         assert axis not in result.estimates
         words = result.refusals[axis].partition("Of the motors' responses only")[2]
-        terms = re.findall(r"(-?)\+? ?(?:[\d.]+ )?motor (\d)", words)
-        assert "".join(sign or "+" for sign, _ in terms) == pattern
-        assert [number for _, number in terms] == list("1234")
+        sums = [re.findall(r"(-?)\+? ?(?:[\d.]+ )?motor (\d)", part) for part in words.split(";")]
+        same = [["-+"[sign == terms[0][0]] for sign, _ in terms] for terms in sums]
+        assert " ".join(map("".join, same)) == pattern
+        assert all([number for _, number in terms] == list("1234") for terms in sums)
     if "curve" in result.refusals and "thrust" in result.estimates:
         # the slope by the square of the command at hover
         linear, value = map(
@@ -427,6 +459,8 @@ def test_records_that_cannot_be_identified_are_refused(record):
         )
     with pytest.raises(SettingError, match="gyroscope's axis y is 0 throughout"):
         identify_flight(record._replace(gyroscope=np.abs(record.gyroscope) * [1, 0, 1]), LAYOUT)
+    with pytest.raises(SettingError, match=r"command of motor 1 is 0\.5 throughout the flight"):
+        identify_flight(record._replace(commands=0 * record.commands + 0.5), LAYOUT)
     with pytest.raises(SettingError, match="one line"):
         make_layout([[0, 1], [0, 2], [0, 3]], [1, 1, -1])
     with pytest.raises(SettingError, match="spin must be"):
@@ -469,12 +503,17 @@ def test_the_lag_is_exact_for_commands_that_hold():
     np.testing.assert_allclose(s, 0.3 + 0.7 * (1 - np.exp(-after / tau)), atol=1e-12)
 
 
-def test_velocity_and_gravity_of_a_quick_motion_are_observed():
-    """Tilts of 20 degrees within a quarter of a second; gravity by Euler's method would be off by 0.018 m/s^2."""
+@pytest.mark.parametrize(
+    ("rise", "start", "bounds"),
+    # gravity by Euler's method would be off by 0.018 m/s^2; a start that counts as level and at rest, by 2 m/s^2
+    [(4.0, 0.0, (0.01, 0.004)), (1e-9, 0.5, (0.1, 0.03))],
+    ids=["level", "moving"],
+)
+def test_velocity_and_gravity_of_a_quick_motion_are_observed(rise, start, bounds):
+    """Tilts of 20 degrees within a quarter of a second, from the first sample on or rising from a hover."""
     ts = np.arange(0, 20, 0.002)
-    # the first seconds are level, as the observer starts
-    angles = lambda t: np.array([1.2 * np.sin(1.5 * t), 0.35 * np.sin(7 * t), 0.35 * np.sin(6 * t)])
-    tilt = lambda t: Rotation.from_euler("ZYX", (np.tanh(t / 4) * angles(t)).T)
+    angles = lambda t: np.array([1.2 * np.sin(1.5 * t), 0.35 * np.sin(7 * t), 0.35 * np.cos(6 * t)])
+    tilt = lambda t: Rotation.from_euler("ZYX", (np.tanh((t + 1e-4) / rise) * angles(t)).T)
     turn = tilt(ts)
     rates = (tilt(ts - 1e-5).inv() * tilt(ts + 1e-5)).as_rotvec() / 2e-5
     drag, up = np.array([0.45, 0.5, 0.4]), np.array([0.0, 0.0, 1.0])
@@ -486,13 +525,13 @@ def test_velocity_and_gravity_of_a_quick_motion_are_observed():
         return lift[..., None] * up - drag * R.inv().apply(v)
 
     slope = lambda t, v: tilt(t).apply(push(t, v)) - g * up
-    v = solve_ivp(slope, (0, 20), np.zeros(3), t_eval=ts, rtol=1e-8).y.T
+    v = solve_ivp(slope, (0, 20), start * np.array([1, -1, 0.5]), t_eval=ts, rtol=1e-8).y.T
     force, v = push(ts, v), turn.inv().apply(v)
     record = FlightRecord(ts, np.zeros((len(ts), 4)), rates, force)
     velocity, gravity = observe_motion(record, force, drag[:2])
-    late = ts > 10
-    assert np.all(np.std(velocity[late] - v[late], axis=0) < 0.01)
-    assert np.all(np.std(gravity[late] - turn.inv().apply(-g * up)[late], axis=0) < 0.004)
+    for part in (ts > 10, ts < 5):
+        assert np.all(np.std((velocity - v)[part], axis=0) < bounds[0])
+        assert np.all(np.std((gravity - turn.inv().apply(-g * up))[part], axis=0) < bounds[1])
 
 
 @pytest.mark.parametrize(

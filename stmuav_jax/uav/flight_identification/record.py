@@ -21,6 +21,8 @@ from ...checks.shapes import Numbers
 
 # Natural frequency [rad/s] and damping of the observer of velocity, and time in which it forgets that along z [s].
 _OBSERVER, _DAMPING, _CLIMB = 0.4, 0.7, 3.0
+# Shortest record that is identified [s].
+SHORTEST_RECORD = 10.0
 # Rotors closer than this to an axis have no side of it, as a share of the largest arm.
 _ON_AXIS = 0.05
 
@@ -232,7 +234,7 @@ def observe_motion(
 
     It integrates v' = f + g - w x v and g' = -w x g with the specific force f at the centre of mass.
     The drag tells the horizontal velocity, -f / D, which draws both within seconds; along z the velocity
-    forgets, as nothing tells it.
+    forgets, as nothing tells it. The state at the start is that of a pass backwards in time.
 
     Args:
         force: f. drag: D along x and y [1/s]. pace: factor of the usual speed at which it is drawn.
@@ -247,28 +249,32 @@ def observe_motion(
     frequency = pace * _OBSERVER
     quick, slow = 2 * _DAMPING * frequency, frequency**2
     forget = pace / _CLIMB
-    now, before = (0.0,) * 5, None
-    velocity, gravity = np.zeros_like(force), np.zeros_like(force)
-    rows = np.concatenate([record.gyroscope, push, target], axis=1).tolist()
-    # plain numbers: a loop over arrays of three would take twenty times as long
-    for k, (p, q, r, fx, fy, fz, tx, ty) in enumerate(rows):
-        vx, vy, vz, gx, gy = now
-        # The length of gravity is known: two components give the third, without drift.
-        gz = -(max(GRAVITY**2 - gx * gx - gy * gy, 0.0) ** 0.5)
-        velocity[k], gravity[k] = (vx, vy, vz), (gx, gy, gz)
-        ex, ey = tx - vx, ty - vy
-        slope = (
-            fx + gx - q * vz + r * vy + quick * ex,
-            fy + gy - r * vx + p * vz + quick * ey,
-            fz + gz - p * vy + q * vx - forget * vz,
-            slow * ex - q * gz + r * gy,
-            slow * ey - r * gx + p * gz,
-        )
-        # The method of Adams and Bashforth of second order: a step by Euler's would turn gravity by
-        # an angle that lags by half a step, and lengthen it with each turn.
-        now = tuple(
-            x + dt * (1.5 * c - 0.5 * o)
-            for x, c, o in zip(now, slope, before or slope, strict=True)
-        )
-        before = slope
+    state, velocity, gravity = (0.0,) * 5, np.zeros_like(force), np.zeros_like(force)
+    # A record may start tilted and in motion, which nothing measures: in reversed time, where rates and
+    # velocity change their signs, a pass comes to the start as settled as the pass before it to the end.
+    for sign in (1, -1, 1):
+        rows = np.concatenate([sign * record.gyroscope, push, sign * target], axis=1)[::sign]
+        now, before = state, None
+        # plain numbers: a loop over arrays of three would take twenty times as long
+        for k, (p, q, r, fx, fy, fz, tx, ty) in enumerate(rows.tolist()):
+            vx, vy, vz, gx, gy = now
+            # The length of gravity is known: two components give the third, without drift.
+            gz = -(max(GRAVITY**2 - gx * gx - gy * gy, 0.0) ** 0.5)
+            velocity[k], gravity[k] = (vx, vy, vz), (gx, gy, gz)
+            ex, ey = tx - vx, ty - vy
+            slope = (
+                fx + gx - q * vz + r * vy + quick * ex,
+                fy + gy - r * vx + p * vz + quick * ey,
+                fz + gz - p * vy + q * vx - forget * vz,
+                slow * ex - q * gz + r * gy,
+                slow * ey - r * gx + p * gz,
+            )
+            # The method of Adams and Bashforth of second order: a step by Euler's would turn gravity by
+            # an angle that lags by half a step, and lengthen it with each turn.
+            now = tuple(
+                x + dt * (1.5 * c - 0.5 * o)
+                for x, c, o in zip(now, slope, before or slope, strict=True)
+            )
+            before = slope
+        state = (*(-velocity[-1]).tolist(), *gravity[-1, :2].tolist())
     return velocity, gravity

@@ -40,6 +40,7 @@ from .prediction_error import (
     fit_prediction_error,
 )
 from .record import (
+    SHORTEST_RECORD,
     FlightRecord,
     RotorLayout,
     apply_filter,
@@ -65,6 +66,10 @@ _WINDOW, _WINDOWS = 6.0, 5
 _EXCITED = 2.0
 # Relative deviation up to which an effectiveness is determined.
 _DETERMINED = 0.1
+# That of a combination of the motors' responses about an axis that is not excited, of which little is known.
+_COMBINED = 0.04
+# Deviations from which a response about yaw has a clear sign.
+_CLEAR = 5.0
 # Deviations up to which the IMU's position [m], and the drag as a share of it, are determined.
 _IMU_DETERMINED, _DRAG_DETERMINED = 0.005, 0.5
 # Deviation of the voltage's exponent up to which it is determined, and range of the voltage from which it is sought.
@@ -85,12 +90,14 @@ _SLOW, _SECOND_LAG = 3.0, 0.005
 _OTHER_PACE = 2.0
 # Drag over mass with which the observer starts [1/s], and most passes until its drag is that of the fit.
 _DRAG, _PASSES = 0.4, 6
+# Share of the thrust that carries the vehicle below which it does not fly.
+_CARRYING = 0.3
 # Radii of gyration of multirotors over their mean arms.
 _GYRATION = (0.1, 5.0)
 # Level of the verdict and of variants that the record rejects.
 _LEVEL = 0.01
-# Lowest rates of commands and IMU [Hz], and shortest flight [s].
-_SLOWEST, _SHORTEST = 50.0, 10.0
+# Lowest rate of commands [Hz].
+_SLOWEST = 50.0
 
 
 class ParameterEstimate(NamedTuple):
@@ -248,10 +255,8 @@ def _rotation_regression(
         for axis, columns in zip(axes, measured, strict=True):
             sign = 1 if axis == 0 else -1
             if axis == 2:
-                spin = -layout.spin
-                rotors = np.stack(
-                    [through(integral, T @ spin), through(derivative, s @ spin)], axis=1
-                )
+                spins = np.eye(len(levers)) if free else -layout.spin[:, None]
+                rotors = np.hstack([through(integral, T @ spins), through(derivative, s @ spins)])
             # Motors that differ have a coefficient each; equal ones share one, and the centre of
             # mass is then the only other unknown of the moment.
             elif free:
@@ -579,8 +584,8 @@ def identify_flight(
         progress: function that is called with the completed fraction after each stage.
 
     Raises:
-        SettingError: the record is too short or too slow, has another number of rotors, or its motors
-            respond in another order than the layout says.
+        SettingError: the record is too short or too slow, has another number of rotors, the vehicle does not
+            follow its motors, or these respond in another order or with another spin than the layout says.
 
     Source: the module's equations; L. Ljung, System Identification (1999), ch. 7 and 13.4.
     """
@@ -660,19 +665,13 @@ def _check_record(record: FlightRecord, layout: RotorLayout) -> None:
             f"The record has commands of {count} rotors, but the layout has {len(layout.positions)}."
         )
     length, rate = float(record.ts[-1] - record.ts[0]), 1 / record.dt
-    if length < _SHORTEST:
+    if length < SHORTEST_RECORD:
         raise SettingError(
-            f"The flight is {length:.3g} s long; {_SHORTEST:g} s or more would be valid."
+            f"The flight is {length:.3g} s long; {SHORTEST_RECORD:g} s or more would be valid."
         )
     if rate < 0.99 * _FORCE_RATE:
         raise SettingError(
             f"The record has {rate:.3g} samples a second; {_FORCE_RATE:g} or more would be valid."
-        )
-    changes = np.sum(np.any(np.diff(record.commands, axis=0) != 0, axis=1)) / length
-    if changes < _SLOWEST:
-        raise SettingError(
-            f"The commands change {changes:.3g} times a second, which is slower than the lag of motors; "
-            f"{_SLOWEST:g} or more would be valid (a high-rate logging profile)."
         )
     for name in ("commands", "gyroscope", "accelerometer"):
         if not np.all(np.isfinite(getattr(record, name))):
@@ -689,6 +688,12 @@ def _check_record(record: FlightRecord, layout: RotorLayout) -> None:
                 f"The {name} {label} is {columns[0, constant[0]]:g} throughout the flight; values that change would "
                 "be valid."
             )
+    changes = np.sum(np.any(np.diff(record.commands, axis=0) != 0, axis=1)) / length
+    if changes < _SLOWEST:
+        raise SettingError(
+            f"The commands change {changes:.3g} times a second, which is slower than the lag of motors; "
+            f"{_SLOWEST:g} or more would be valid (a high-rate logging profile)."
+        )
 
 
 def _channel_effect(fit: PredictionErrorFit, channel: int, columns: slice) -> float:
@@ -700,14 +705,18 @@ def _screen_axes(signals: _Signals, refusals: dict[str, str]) -> list[int]:
     """Axes that the commands excite, with the order of the motors checked."""
     layout = signals.layout
     count = len(layout.positions)
-    axes, responses, yaw = [], {}, 0.0
+    axes, responses = [], {}
+
+    def fit_axis(axis: int, *, free: bool) -> PredictionErrorFit:
+        build = _rotation_regression(signals, [axis], _Variant(_FORCE_RATE), free=free)
+        return fit_prediction_error(build, np.array(_START), _BOUNDS, _MEMORY)
+
     for axis, name in enumerate(AXES):
-        free = axis < 2
+        is_free = axis < 2
         # Each motor is free here, so that an order of the motors other than the layout's shows in
         # the signs of their responses instead of in a poor fit.
-        build = _rotation_regression(signals, [axis], _Variant(_FORCE_RATE), free=free)
-        fit = fit_prediction_error(build, np.array(_START), _BOUNDS, _MEMORY)
-        effect = _channel_effect(fit, 0, slice(0, count if free else 2))
+        fit = fit_axis(axis, free=is_free)
+        effect = _channel_effect(fit, 0, slice(0, count if is_free else 2))
         if effect < _EXCITED:
             refusals[name] = (
                 f"{name.capitalize()} is not excited: the commands cause {effect:.2g} times what nobody "
@@ -715,17 +724,12 @@ def _screen_axes(signals: _Signals, refusals: dict[str, str]) -> list[int]:
             )
             continue
         axes.append(axis)
-        if free:
+        if is_free:
             response = fit.values[:count] * (1 if axis == 0 else -1)
             responses[axis] = (response - np.mean(response)) / np.std(response)
-        else:
-            yaw = fit.values[0]
     _check_order(layout, responses)
-    if yaw < 0:
-        raise SettingError(
-            "The rotors turn the body about yaw in the sense of their spin, where the opposite sense would be "
-            "valid: are the signs of spin, or the gyroscope's axes, exchanged?"
-        )
+    # With a wrong spin yaw seems not to be excited, so this needs free motors too.
+    _check_spin(layout, fit_axis(2, free=True))
     return axes
 
 
@@ -737,21 +741,23 @@ def _name_combinations(
 ) -> None:
     """Add which combinations of the motors' responses about roll and pitch an axis that is not excited still tells.
 
-    They have no values: without excitation the controller's own relation of rates and commands biases the fit.
+    They have no values: without excitation little noise suffices to bias the fit.
     """
     layout, count = signals.layout, len(signals.layout.positions)
     lag = estimates.get("lag", estimates.get("thrust_lag"))
     lags = np.array([_START[0] if lag is None else lag.value, _START[1]])
     shape = compute_thrust_shape(signals.record.commands, layout.thrust_model_factor)
     for axis in {0, 1} - set(excited):
-        build = _rotation_regression(signals, [axis], _Variant(_FORCE_RATE), free=True)
+        # Where the controller alone moves the vehicle, errors of averages over a coarser grid, which depend on the
+        # commands, would make its own gain of the responses.
+        build = _rotation_regression(signals, [axis], _Variant(), free=True)
         regression = build(lags)
         fit = fit_prediction_error(lambda _, same=regression: same, np.zeros(0), (), _MEMORY)
         # a vehicle whose radius of gyration is its arm has this effectiveness
         usual = GRAVITY / (count * float(np.mean(shape)) * layout.arms[axis])
         sentence = describe_combinations(
             [f"motor {k + 1}" for k in range(count)], "", fit.values[:count],
-            fit.compute_covariance(_BLOCK)[:count, :count], np.full(count, _DETERMINED * usual),
+            fit.compute_covariance(_BLOCK)[:count, :count], np.full(count, _COMBINED * usual),
         )  # fmt: skip
         refusals[AXES[axis]] += sentence.replace("Only", "Of the motors' responses only")
 
@@ -784,6 +790,21 @@ def _check_order(layout: RotorLayout, responses: dict[int, np.ndarray]) -> None:
     raise SettingError(
         f"The motors' responses about {names} are not those of the rotors' positions: {hint}"
     )
+
+
+def _check_spin(layout: RotorLayout, fit: PredictionErrorFit) -> None:
+    """Refuse motors whose responses about yaw are those of another spin; the fit has free motors."""
+    count = len(layout.spin)
+    responses = fit.values[:count]
+    spread = np.sqrt(np.diag(fit.compute_covariance(_BLOCK))[:count])
+    spin = -np.sign(responses).astype(int)
+    effect = _channel_effect(fit, 0, slice(0, 2 * count))
+    is_clear = effect >= _EXCITED and np.all(np.abs(responses) > _CLEAR * spread)
+    if is_clear and np.any(spin != layout.spin):
+        raise SettingError(
+            f"The motors' responses about yaw are those of the spin {spin.tolist()}, but the layout has "
+            f"{layout.spin.astype(int).tolist()}; the first would be valid, or the other sign of the gyroscope's z."
+        )
 
 
 def _identify_rotation(
@@ -948,6 +969,15 @@ def _identify_translation(
     evaluation = _Evaluation(main, others[:1], windows, others[1:])
     thrust = evaluation.estimate("thrust of a rotor over mass", "m/s^2", lambda z: z[_FORCE])
     effect = _channel_effect(main, 2, slice(_FORCE, _FORCE + 1))
+    record, factor = signals.record, signals.layout.thrust_model_factor
+    shapes = np.sum(compute_thrust_shape(record.commands, factor), axis=1)
+    usual = float(np.mean(record.accelerometer[:, 2]) / np.mean(shapes))
+    if thrust.value + 3 * thrust.deviation < _CARRYING * usual:
+        raise SettingError(
+            "The vehicle does not follow its motors: by the collective commands a rotor's thrust over mass at the "
+            f"command 1 is {thrust.value:.2g} +- {thrust.deviation:.2g} m/s^2, where {usual:.2g} m/s^2 would carry the "
+            "vehicle. Was it held, or on the ground, or have commands and IMU different clocks?"
+        )
     if effect >= _EXCITED / 4 and thrust.deviation <= _DETERMINED * thrust.value:
         estimates["thrust"] = thrust
         if main.free[-2]:
@@ -979,10 +1009,10 @@ def _identify_translation(
             estimates[f"imu_{letter}"] = position
     for k, letter in enumerate("xyz"):
         drag = evaluation.estimate(f"drag over mass, {letter}", "1/s", lambda z, k=k: z[3 + k])
-        if drag.deviation > _DRAG_DETERMINED * abs(drag.value):
+        if not drag.deviation <= _DRAG_DETERMINED * drag.value:
             refusals[f"drag_{letter}"] = (
                 f"The drag along {letter} is not determined: it is {drag.value:.2g} 1/s with a deviation of "
-                f"{drag.deviation:.2g} 1/s."
+                f"{drag.deviation:.2g} 1/s; a positive one of twice its deviation or more would be valid."
             )
         else:
             estimates[f"drag_{letter}"] = drag
