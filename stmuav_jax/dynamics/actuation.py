@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 
 from ..math import lapack
 from ..math.compiler import kept_jit
+from ..math.native.program import native
 from ..math.space import Point
 from ..mechanics.body import GROUND
 from ..mechanics.forces import Gravity
@@ -67,6 +68,7 @@ class Actuation(NamedTuple):
     scales: Float[Array, "*s m"]
 
 
+@native
 def mechanism_size(system: System, state: State) -> Float[Array, ""]:
     """Size of a mechanism [m]: the longest edge of the box about its mass centres and joints.
 

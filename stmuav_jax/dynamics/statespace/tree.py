@@ -215,6 +215,10 @@ class TreeSpace(AbstractStateSpace):
         return self.model.constraints.n_rows > len(self.selection.rows)
 
     def retract(self, x: TreePoint, v: Float[Array, "n *s"]) -> TreePoint:
+        # machine code is for one point: that of a stack would do each of its points apart
+        return _retract_point(self, x, v) if v.ndim == 1 else self._retract_points(x, v)
+
+    def _retract_points(self, x: TreePoint, v: Float[Array, "n *s"]) -> TreePoint:
         tree = self.model.parameters.tree
         b, dof = 6 * tree.floating, self.dof
         dq, du, dz = v[:dof], v[dof : 2 * dof], v[2 * dof :]
@@ -241,6 +245,10 @@ class TreeSpace(AbstractStateSpace):
         )
 
     def difference(self, y: TreePoint, x: TreePoint) -> Float[Array, "n *s"]:
+        is_single = y.u.ndim == x.u.ndim == 1
+        return _subtract_points(self, y, x) if is_single else self._subtract_points(y, x)
+
+    def _subtract_points(self, y: TreePoint, x: TreePoint) -> Float[Array, "n *s"]:
         tree = self.model.parameters.tree
         batch = jnp.broadcast_shapes(y.u.shape[1:], x.u.shape[1:])
         y, x = _broadcast_leaves(y, batch), _broadcast_leaves(x, batch)
@@ -525,6 +533,16 @@ def _compute_rates(
     if x.internal.shape[0]:
         parts.append(terms.internal_rates[space._actuator_places()])
     return jnp.concatenate(parts)
+
+
+@native
+def _retract_point(space: TreeSpace, x: TreePoint, v: Float[Array, " n"]) -> TreePoint:
+    return space._retract_points(x, v)
+
+
+@native
+def _subtract_points(space: TreeSpace, y: TreePoint, x: TreePoint) -> Float[Array, " n"]:
+    return space._subtract_points(y, x)
 
 
 @native

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...math import lapack
+from ...math.native.program import native
 from ...math.rotation import (
     conjugate,
     cross,
@@ -136,6 +137,7 @@ def coordinate_rates(
     )
 
 
+@native
 def read_coordinates(parameters: TreeParameters, state: State) -> TreeCoordinates:
     """Coordinates of a state of all bodies that satisfies the tree's joints.
 

@@ -292,7 +292,7 @@ class Tree(AbstractFormulation):
         )
 
     def to_vector(self, model: TreeModel, state: State) -> Float[Array, " k"]:
-        return _state_to_vector(model.parameters, state)
+        return join_coordinates(read_coordinates(model.parameters, state))
 
     def to_state(self, model: TreeModel, x: Float[Array, " k"]) -> State:
         return _vector_to_state(model.parameters, x)
@@ -483,11 +483,6 @@ def _driver_power(solution: Solved) -> Float[Array, "*s"]:
 
 
 @kept_jit
-@native
-def _state_to_vector(parameters: TreeParameters, state: State) -> Float[Array, " k"]:
-    return join_coordinates(read_coordinates(parameters, state))
-
-
 @native
 def _vector_to_state(parameters: TreeParameters, x: Float[Array, " k"]) -> State:
     at = split_vector(parameters.tree, x)
