@@ -96,7 +96,9 @@ class Program:
             NotScalarError: an operation has none.
         """
         graph: Any = self.graph()
-        layout, width = self.layout(shared, rows), llvm.vector_width() if rows > 1 else 1
+        # fewer rows than a vector holds are done one by one
+        layout, width = self.layout(shared, rows), llvm.vector_width()
+        width = width if rows >= width else 1
         results = [llvm.Buffer(math.prod(a.shape), _DTYPES[str(a.dtype)]) for a in self.outputs]
         return llvm.write(graph[0], graph[1], layout.buffers, results, width, layout.places, loop)
 
@@ -420,7 +422,8 @@ def _target(program: Program, lead: tuple[int, ...], avals: Sequence[Any]) -> st
         except NotScalarError:
             return None
 
-    return program.derived(("target", shared, rows > 1, llvm.settings), make)  # pyright: ignore
+    size = (rows > 1, rows >= llvm.vector_width())
+    return program.derived(("target", shared, size, llvm.settings), make)  # pyright: ignore
 
 
 class _Switch:
