@@ -128,7 +128,7 @@ def test_python_of_the_page_on_studies_runs():
 
 @pytest.mark.slow
 def test_an_own_multirotor_flies_from_a_file_to_a_film(tmp_path, monkeypatch):
-    """The files of docs/multirotors.md by its commands, except the simulation and the study, and its Python with few flights."""
+    """Files and commands of docs/multirotors.md without simulation and study; its Python with few flights."""
     monkeypatch.chdir(tmp_path)
     text = (DOCS / "multirotors.md").read_text(encoding="utf-8")
     names_of_files = ("hexacopter", "survey", "study")

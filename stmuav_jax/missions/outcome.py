@@ -55,10 +55,10 @@ def labelled_flight(flight: MissionFlight) -> Labelled:
     if len(kinds := {drive.unit for drive in machine.joints}) == 1:
         unit = kinds.pop()
         effort_unit = {"rad": "N m", "m": "N"}[unit]
-        exact = {"rad or m": unit, "N m or N": effort_unit}
+        units = {"rad or m": unit, "N m or N": effort_unit}
         labels = {
-            name: (dims, exact.get(label, label), words)
-            for name, (dims, label, words) in labels.items()
+            name: (dims, units.get(label_unit, label_unit), description)
+            for name, (dims, label_unit, description) in labels.items()
         }
     loop = labelled_loop(
         flight.run, labels, title=entries.title, ending=flight.ending,
