@@ -21,7 +21,7 @@ import jax.core as jax_core
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxlib.mlir import ir
 from jaxtyping import Array
 
@@ -534,7 +534,7 @@ def native(
         if match is None:
             return jitted(*args) if not is_on() or can_be_found(args) else function(*args)
         (program, result), arrays = match
-        return result(native_p.bind(*arrays, program=program, lead=()))
+        return result(native_p.bind(*arrays, program=program, lead=()), arrays)
 
     def has_code(*args: Any) -> bool:
         match = find(args)
@@ -619,13 +619,21 @@ def _make(
     if any(isinstance(c, jax_core.Tracer) for c in jaxpr.consts):
         # a number that the function closes over is being traced, and may be another one next time
         return None
-    program = Program(jaxpr, groups)
+    # Results that are arguments, such as the masses and gusts of a model that gets other inputs, are
+    # passed on: machine code would be thousands of instructions that copy them.
+    arguments = {id(v): k for k, v in enumerate(jaxpr.jaxpr.invars)}
+    origins = [arguments.get(id(v)) for v in jaxpr.jaxpr.outvars]
+    computed_mask = [origin is None for origin in origins]
+    if not any(computed_mask):
+        return None
+    remainder, _ = partial_eval.dce_jaxpr(jaxpr.jaxpr, computed_mask, instantiate=True)
+    program = Program(jaxpr.replace(jaxpr=remainder), groups)
     tree, traced, rest = form
 
-    def result(values: Sequence[Any]) -> Any:
-        whole = list(rest)
-        for k, value in zip(traced, values, strict=True):
-            whole[k] = value
+    def result(values: Sequence[Any], operands: Sequence[Any]) -> Any:
+        whole, values_left = list(rest), iter(values)
+        for k, origin in zip(traced, origins, strict=True):
+            whole[k] = next(values_left) if origin is None else operands[origin]
         return jax.tree.unflatten(tree, whole)
 
     return program, result
