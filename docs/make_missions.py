@@ -37,14 +37,12 @@ HEAD = (
 )
 # Errors above this are those of a machine that falls [m].
 FALLS = 3.0
-# Errors below this are those of the arithmetic [m, degrees].
-ROUND_OFF = 1e-9
 
 
 def shown(measure: stm.missions.Measure) -> str:
     """Value of a measure with its unit, and whether its tolerance was not met."""
     value, unit = measure.value, measure.unit
-    if unit in ("m", "degrees") and value < ROUND_OFF:
+    if measure.text == f"0 {unit}":
         words = "round-off"
     elif unit == "m":
         words = f"{100 * value:.2g} cm" if value < 1 else f"{value:.2g} m"

@@ -4,11 +4,13 @@ import functools
 import importlib.util
 import json
 import re
+import runpy
 import shlex
 import tomllib
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -101,6 +103,11 @@ CHECKS = {
     "parallel_robot": lambda n: (
         n["distance"] < 1e-7
         and abs(n["held"].values[0] - 36.14202518) < 1e-6
+        and np.allclose(
+            jax.jacfwd(n["find_place"])(0.45),
+            (n["find_place"](0.4501) - n["find_place"](0.4499)) / 2e-4,
+            atol=1e-6,
+        )
         and n["run"].certificate.relative_energy_error < 1e-6
     ),
     "parameters": lambda n: n["scene"].parameters["mass.panel_7"]["value"] == 0.95,
@@ -121,7 +128,7 @@ def test_python_of_the_page_on_studies_runs():
 
 @pytest.mark.slow
 def test_an_own_multirotor_flies_from_a_file_to_a_film(tmp_path, monkeypatch):
-    """The files of docs/multirotors.md by its commands, except the simulation and the study, and its Python."""
+    """Files and commands of docs/multirotors.md without simulation and study; its Python with few flights."""
     monkeypatch.chdir(tmp_path)
     text = (DOCS / "multirotors.md").read_text(encoding="utf-8")
     names_of_files = ("hexacopter", "survey", "study")
@@ -151,9 +158,13 @@ def test_an_own_multirotor_flies_from_a_file_to_a_film(tmp_path, monkeypatch):
         if measure.name.lower() in shown:
             assert measure.value == pytest.approx(float(shown.pop(measure.name.lower())), rel=0.05)
     assert not shown
-    names: dict = {}
-    exec(blocks(DOCS / "multirotors.md")[0], names)
-    assert np.linalg.norm(names["loop"].states.r[-1, 0]) < 0.3
+    program = blocks(DOCS / "multirotors.md")[0]
+    assert len(program.splitlines()) <= 60
+    (tmp_path / "own.py").write_text(program.replace("compute(0, 200)", "compute(0, 16)"))
+    names = runpy.run_path("own.py")
+    target = jax.vmap(names["path"])(names["flight"].ts).r
+    assert np.max(np.linalg.norm(names["flight"].states.r[:, 0] - target, axis=1)) < 0.3
+    assert np.all(names["study"].compute(0, 16)["error"] < 0.3)
 
 
 def test_every_page_with_python_is_run():

@@ -1,6 +1,7 @@
 """Digest of a function with all that it refers to, which tells a study of it from another study."""
 
 import dataclasses
+import dis
 import functools
 import hashlib
 import inspect
@@ -108,6 +109,10 @@ def _source_text(value: Any) -> str:
 
 
 def _names_in(code: types.CodeType) -> set[str]:
-    """Names of globals and attributes in a function's code, and in the functions that it makes."""
+    """Names of globals in a function's code, and in the functions that it makes.
+
+    `co_names` would not do: it has names of attributes too, and `jnp.linalg.norm` does not refer to a global `norm`.
+    """
     inner = (_names_in(part) for part in code.co_consts if isinstance(part, types.CodeType))
-    return set(code.co_names).union(*inner)
+    loads = (x for x in dis.get_instructions(code) if x.opname in ("LOAD_GLOBAL", "LOAD_NAME"))
+    return {load.argval for load in loads}.union(*inner)

@@ -106,9 +106,7 @@ def _print_flight(out: Console, data: Any, flight: "MissionFlight") -> None:
     for measure in measures(data):
         allowed = "-" if measure.allowed is None else f"{measure.allowed:g}"
         mark = "" if measure.is_met else "  (not met)"
-        add_row(
-            measure_table, measure.name, f"{measure.value:.4g} {measure.unit}", f"{allowed}{mark}"
-        )
+        add_row(measure_table, measure.name, measure.text, f"{allowed}{mark}")
     certificate = flight.run.certificate
     seconds = f"{certificate.compile_seconds:.1f} s, {certificate.run_seconds:.1f} s"
     add_row(

@@ -205,7 +205,7 @@ def _mission_content(data: "xr.Dataset") -> dict[str, Any]:
     is_success, sentence = verdict(data)
     failure = data.attrs.get("failure", "")
     rows = [
-        (measure.name, f"{measure.value:.4g} {measure.unit}", "" if measure.allowed is None else f"{measure.allowed:g}",
+        (measure.name, measure.text, "" if measure.allowed is None else f"{measure.allowed:g}",
          "" if measure.allowed is None else "met" if measure.is_met else "not met")
         for measure in measures(data)
     ]  # fmt: skip

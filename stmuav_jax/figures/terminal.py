@@ -44,7 +44,7 @@ def add_row(rich_table: Table, *cells: object) -> None:
 def _format_number(value: float, unit: str) -> str:
     if math.isnan(value):
         return "not found"
-    return f"{value:.2e} {unit}".rstrip()
+    return f"{value:.2e} {unit}".rstrip() if value else f"0 {unit}".rstrip()
 
 
 def _format_estimate(largest: float, end: float, unit: str) -> str:

@@ -33,6 +33,8 @@ MARGINS = (
 )
 # Round-off of speeds that are held at a limit, as a share of the range.
 AT_LIMIT = 1e-9
+# Errors below this are those of the arithmetic [m, degrees].
+ROUND_OFF = 1e-9
 _DEGREE = math.pi / 180
 # Time in flight before a touchdown [s]; what follows sooner is a rebound.
 _ALOFT = 0.1
@@ -47,8 +49,19 @@ def labelled_flight(flight: MissionFlight) -> Labelled:
     """Labelled arrays with the content of `to_data`."""
     machine, entries = flight.mission.machine, flight.mission.file
     count = machine.rotors.spin.shape[0]
+    labels = GAUGES | _BATTERY
+    # Angles and displacements of joints share a variable, whose unit is one where all of them have it.
+    effort_unit = "N m or N"
+    if len(kinds := {drive.unit for drive in machine.joints}) == 1:
+        unit = kinds.pop()
+        effort_unit = {"rad": "N m", "m": "N"}[unit]
+        units = {"rad or m": unit, "N m or N": effort_unit}
+        labels = {
+            name: (dims, units.get(label_unit, label_unit), description)
+            for name, (dims, label_unit, description) in labels.items()
+        }
     loop = labelled_loop(
-        flight.run, GAUGES | _BATTERY, title=entries.title, ending=flight.ending,
+        flight.run, labels, title=entries.title, ending=flight.ending,
         mission=json.loads(entries.model_dump_json()), scene=machine.scene.name,
         watch=list(machine.scene.watch), growth=flight.mission.growth,
     )  # fmt: skip
@@ -81,8 +94,8 @@ def labelled_flight(flight: MissionFlight) -> Labelled:
             {},
         )
         if np.any(np.isfinite(machine.efforts)):
-            limits["lowest_effort"] = ("driven_joint", -machine.efforts, "N m or N")
-            limits["highest_effort"] = ("driven_joint", machine.efforts, "N m or N")
+            limits["lowest_effort"] = ("driven_joint", -machine.efforts, effort_unit)
+            limits["highest_effort"] = ("driven_joint", machine.efforts, effort_unit)
     limit_variables = {
         name: ((dim,), values, {"units": unit, "description": f"limit of {dim}s"})
         for name, (dim, values, unit) in limits.items()
@@ -131,6 +144,12 @@ class Measure(NamedTuple):
     unit: str
     allowed: float | None = None
     is_met: bool = True
+
+    @property
+    def text(self) -> str:
+        """Value with its unit for a table; 0 for errors of the arithmetic."""
+        is_round_off = self.unit in ("m", "degrees") and abs(self.value) < ROUND_OFF
+        return f"{0.0 if is_round_off else self.value:.4g} {self.unit}"
 
 
 def measures(data: "xr.Dataset") -> list[Measure]:

@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, check_finite, has_values
@@ -211,9 +212,11 @@ def _per_rotor(value: Numbers, count: int, quantity: str, unit: str) -> Float[Ar
 def _check_least(value: Float[Array, " k"], quantity: str, unit: str, *, strictly: bool) -> None:
     if not has_values(value):
         return
-    violation_mask = value <= 0 if strictly else value < 0
-    if bool(jnp.any(violation_mask)):
+    # NumPy: inside of a traced function an operation of JAX is traced, though its numbers are known.
+    numbers = np.asarray(value)
+    violation_mask = numbers <= 0 if strictly else numbers < 0
+    if np.any(violation_mask):
         requirement = "positive" if strictly else "not negative"
         raise ModelError(
-            f"{quantity} must be {requirement}, but it is {float(value[jnp.argmax(violation_mask)]):g} {unit}."
+            f"{quantity} must be {requirement}, but it is {numbers[violation_mask][0]:g} {unit}."
         )

@@ -169,11 +169,7 @@ def test_thrust_sites_are_rotors_that_move_the_body_as_in_mujoco(mujoco, tmp_pat
     data.ctrl[:] = controls
     mujoco.mj_forward(model, data)
     system = stm.mechanics.with_inputs(scene.system, {"speed_squared": controls})
-    found = (
-        stm.analysis.TreeSpace
-        if False
-        else stm.dynamics.evaluate(system, system.reference).accelerations
-    )
+    found = stm.dynamics.evaluate(system, system.reference).accelerations
     np.testing.assert_allclose(found.v_rate[0], data.qacc[:3], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found.omega_rate[0], data.qacc[3:], rtol=1e-9, atol=1e-9)
 

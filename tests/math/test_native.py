@@ -323,6 +323,22 @@ def test_numbers_of_one_argument_are_handed_over_together():
     np.testing.assert_allclose(*pairs, rtol=1e-14)
 
 
+def test_results_that_are_arguments_are_passed_on():
+    """A model with other inputs is the same but for these: machine code copies nothing, a batch neither."""
+    model = {"gusts": jnp.ones((200, 3)), "u": jnp.zeros(3), "w": jnp.asarray(X)}
+    function = native(lambda model, u: (model | {"u": 2.0 * u}, jnp.sum(model["w"]) * u))
+    axes = ({"gusts": None, "u": 0, "w": None}, 0)
+    found, total = jax.vmap(function, (None, 0), axes)(model, model["w"])
+    np.testing.assert_array_equal(found["u"], 2.0 * X)
+    np.testing.assert_allclose(total, np.sum(X) * X, rtol=1e-14)
+    assert (found["gusts"].shape, found["w"].shape) == ((200, 3), X.shape)
+    text = jax.jit(function).lower(model, X[0]).as_text()
+    (results,) = re.findall(r"custom_call @stmuav_.*-> (.*)", text)
+    assert results.count("tensor") == 2
+    slope = jax.jacobian(lambda w: function(model | {"w": w}, X[0])[0]["w"])(model["w"])
+    np.testing.assert_array_equal(slope.reshape(6, 6), np.eye(6))
+
+
 A, C = np.tril(np.arange(1.0, 17.0).reshape(4, 4), -1) / 40, np.linspace(0.0, 1.0, 4)
 
 

@@ -196,6 +196,10 @@ def test_other_numbers_make_the_system_that_would_be_built_with_them():
     assert float(limited.forces[2].limit) == 0.5
     mass = lambda m: jnp.sum(gimbal().with_parameters({"camera.mass": m}).bodies.mass)
     assert float(jax.grad(mass)(0.5)) == 1.0
+    # numbers of a system that was made outside of the traced function, checked again inside
+    system: Any = gimbal()
+    thrust = lambda k: system.with_parameters({"frame.k_f": k}).forces[1].rotors.k_f
+    assert float(jax.jit(thrust)(2e-5)) == 2e-5
 
 
 def test_a_scene_with_other_numbers_starts_with_its_frames_where_they_were():

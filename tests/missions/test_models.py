@@ -94,11 +94,13 @@ def test_an_own_machine_flies_in_gusts_and_moves_its_gimbal(flight, data):
     kept, words = missions.verdict(data)
     assert kept, words
     assert list(data.driven_joint.values) == ["roll", "pitch"]
+    assert (data.joint_error.units, data.highest_effort.units) == ("rad", "N m")
     start, end = data.joint_position.values[[0, -1]]
     assert start == pytest.approx([0.0, 0.0], abs=1e-12)
     # the mechanical servo gives way to the weight of the camera, computed torque does not
     assert np.degrees(end[1]) == pytest.approx(-30.0, abs=0.1)
     assert 1e-3 < abs(np.degrees(end[0]) - 10.0) < 5.0
+    assert missions.Measure("Largest tilt error", 2e-15, "degrees").text == "0 degrees"
     measures = {one.name: one for one in missions.measures(data)}
     pitch = measures["Largest pitch error from 0.5 s on"]
     late = data.time.values >= 0.5

@@ -13,6 +13,7 @@ from stmuav_jax.studies import FINE, Axis, Column, open_store
 
 FACTORS = {"speed": scipy.stats.norm(10.0, 1.0), "angle": scipy.stats.uniform(-0.5, 1.5)}
 G = 9.81
+norm = scipy.stats.norm(0.0, 1.0)  # it is no part of a function that calls jnp.linalg.norm
 
 
 class Throw(eqx.Module):
@@ -118,6 +119,7 @@ def test_a_function_can_name_units_axes_and_reasons():
     np.testing.assert_array_equal(found["seed"], 7.0 + np.arange(40))
     np.testing.assert_array_equal(found["status"], np.where(found["speed"] > 10.0, 7, FINE))
     assert study.identity["law"] == 1
+    stm.Study(lambda sample, key: {"y": jnp.linalg.norm(sample["speed"])}, FACTORS)
 
 
 def test_functions_that_cannot_be_studied_are_refused():

@@ -473,6 +473,14 @@ def targets_in(jaxpr: Any) -> set[str]:
     return names
 
 
+class _Traced(NamedTuple):
+    """Program of a function, the arrays of its arguments that are operands, and what puts results together."""
+
+    program: Program
+    used: list[int]
+    restore: Callable[[Sequence[Any], Sequence[Any]], Any]
+
+
 # Structures of arguments for which a function keeps its program.
 MOST_PROGRAMS = 64
 
@@ -499,10 +507,10 @@ def native(
         evaluate_row = native(_sum_rows(function, len(tables)), keeps_unused=True)
         function = _make_loop(function, evaluate_row, tables)
     jitted: Any = eqx.filter_jit(function)
-    programs: OrderedDict[Any, tuple[Program, Any, list[int]] | None] = OrderedDict()
+    programs: OrderedDict[Any, _Traced | None] = OrderedDict()
 
-    def find(args: Any) -> tuple[tuple[Program, Any], list[Any]] | None:
-        """Program, what puts its results together, and its operands; None where XLA compiles the function."""
+    def find(args: Any) -> tuple[_Traced, list[Any]] | None:
+        """Program and the arrays of the arguments; None where XLA compiles the function."""
         if not is_on():
             return None
         leaves, structure = jax.tree.flatten(args)
@@ -521,8 +529,8 @@ def native(
             entry = _make(function, structure, static, places, arrays, groups, keeps_unused)
             if tables is not None and entry is not None:
                 body = evaluate_row.find((*args, *(table[0] for table in tables)))
-                program = body and Recursion(entry[0].jaxpr, groups, body[0][0], tables)
-                entry = program and (program, *entry[1:])
+                program = body and Recursion(entry.program.jaxpr, groups, body[0].program, tables)
+                entry = program and entry._replace(program=program)
             programs[key] = entry
             # A program holds its jaxpr, derivatives and graph. A process that makes many
             # structures, as a test suite does, would keep them all; the oldest go first.
@@ -533,10 +541,9 @@ def native(
         # has none is not wrapped in a primitive that hides it from XLA's fusion. Within another
         # function of the kind it becomes a part of that one's graph, or is traced again where that
         # one has none.
-        if entry is None or (not _tracing.depth and entry[0].graph() is None):
+        if entry is None or (not _tracing.depth and entry.program.graph() is None):
             return None
-        program, result, used = entry
-        return (program, result), [arrays[k] for k in used]
+        return entry, arrays
 
     def can_be_found(args: Any) -> bool:
         """False for a function of the user's that is of a kind which no program is found by."""
@@ -548,12 +555,13 @@ def native(
         match = find(args)
         if match is None:
             return jitted(*args) if not is_on() or can_be_found(args) else function(*args)
-        (program, result), arrays = match
-        return result(native_p.bind(*arrays, program=program, lead=()))
+        entry, arrays = match
+        operands = [arrays[k] for k in entry.used]
+        return entry.restore(native_p.bind(*operands, program=entry.program, lead=()), arrays)
 
     def has_code(*args: Any) -> bool:
         match = find(args)
-        return match is not None and match[0][0].graph() is not None
+        return match is not None and match[0].program.graph() is not None
 
     call.find, call.has_code = find, has_code  # pyright: ignore[reportAttributeAccessIssue]
     return call
@@ -614,9 +622,8 @@ def _make(
     arrays: Any,
     groups: Any,
     keeps_unused: bool,
-) -> tuple[Program, Any, list[int]] | None:
-    """Program of a function for arguments of one structure, what puts its results together, and the arrays
-    that are its operands."""
+) -> _Traced | None:
+    """Program of a function for arguments of one structure."""
     form: list[Any] = []
 
     def flat(*traced_arrays: Any) -> list[Any]:
@@ -641,20 +648,24 @@ def _make(
     if any(isinstance(c, jax_core.Tracer) for c in jaxpr.consts):
         # a number that the function closes over is being traced, and may be another one next time
         return None
-    used = [True] * len(arrays)
-    if not keeps_unused:
-        # A model has some hundred numbers, of which a function may need a few: each operand takes time in
-        # every transformation of JAX.
-        needed, used = partial_eval.dce_jaxpr(jaxpr.jaxpr, used_outputs=True)
-        jaxpr = core.ClosedJaxpr(needed, jaxpr.consts)
-    used_arrays = [k for k, is_used in enumerate(used) if is_used]
-    program = Program(jaxpr, [groups[k] for k in used_arrays])
+    # Results that are arguments, such as the masses and gusts of a model that gets other inputs, are
+    # passed on: machine code would be thousands of instructions that copy them.
+    arguments = {id(v): k for k, v in enumerate(jaxpr.jaxpr.invars)}
+    origins = [arguments.get(id(v)) for v in jaxpr.jaxpr.outvars]
+    computed_mask = [origin is None for origin in origins]
+    if not any(computed_mask):
+        return None
+    # A model has some hundred numbers, of which a function may need a few: each operand takes time in every
+    # transformation of JAX.
+    needed, used = partial_eval.dce_jaxpr(jaxpr.jaxpr, computed_mask, instantiate=keeps_unused)
+    places_used = [k for k, is_used in enumerate(used) if is_used]
+    program = Program(jaxpr.replace(jaxpr=needed), [groups[k] for k in places_used])
     tree, traced, rest = form
 
-    def result(values: Sequence[Any]) -> Any:
-        whole = list(rest)
-        for k, value in zip(traced, values, strict=True):
-            whole[k] = value
+    def restore(values: Sequence[Any], arrays: Sequence[Any]) -> Any:
+        whole, values_left = list(rest), iter(values)
+        for k, origin in zip(traced, origins, strict=True):
+            whole[k] = next(values_left) if origin is None else arrays[origin]
         return jax.tree.unflatten(tree, whole)
 
-    return program, result, used_arrays
+    return _Traced(program, places_used, restore)
