@@ -745,9 +745,9 @@ class _Translator:
             else zero
             for s, limit in zip(starts, limits, strict=True)
         ]
-        known = [graph.value(s) for s in limited]
-        begin = [0 if k is None else int(k) for k in known]
-        moving = [d for d, k in enumerate(known) if k is None]
+        values = [graph.value(s) for s in limited]
+        begin = [0 if k is None else int(k) for k in values]
+        moving = [d for d, k in enumerate(values) if k is None]
         table = self.find_table(x) if moving else None
         if table is not None:
             number, first, strides, kind = table
