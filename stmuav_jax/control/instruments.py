@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -233,14 +234,9 @@ class Bench(eqx.Module):
         self, sensed_motion: SensedMotion, system: System, k: Int[Array, ""], key: Array
     ) -> list[Point]:
         readings = []
-        # Noise depends on sample and instrument alone: another sensor or rate leaves the noise of the others
-        # as it is.
-        draws = jax.random.fold_in(key, k) if self.instruments else key
-        for number, instrument in enumerate(self.instruments):
-            value, error = (
-                instrument.sensor.read(sensed_motion),
-                self._draw_error(instrument, draws, number),
-            )
+        errors = self._draw_errors(k, key)
+        for instrument, error in zip(self.instruments, errors, strict=True):
+            value = instrument.sensor.read(sensed_motion)
             present = [
                 (k >= jnp.asarray(fault.at) * self.rate)
                 & (k < jnp.asarray(fault.until) * self.rate)
@@ -261,11 +257,20 @@ class Bench(eqx.Module):
             readings.append(value)
         return readings
 
-    @staticmethod
-    def _draw_error(instrument: Instrument, key: Array, number: int) -> Float[Array, " c"] | None:
-        error = None if instrument.bias is None else jnp.asarray(instrument.bias)
-        if instrument.noise is None:
-            return error
-        scale = jnp.asarray(instrument.noise)
-        white = scale * jax.random.normal(jax.random.fold_in(key, number), scale.shape, scale.dtype)
-        return white if error is None else error + white
+    def _draw_errors(self, k: Int[Array, ""], key: Array) -> list[Float[Array, " c"] | None]:
+        """Bias and noise of each instrument at sample k."""
+        errors = [None if i.bias is None else jnp.asarray(i.bias) for i in self.instruments]
+        scales = [None if i.noise is None else jnp.asarray(i.noise) for i in self.instruments]
+        noisy = [number for number, scale in enumerate(scales) if scale is not None]
+        if not noisy:
+            return errors
+        # Noise depends on sample and instrument alone: another sensor or rate leaves the noise of the others
+        # as it is. All instruments draw at once, since each draw is a loop of its own in a compiled
+        # program, and a number does not depend on how many follow it.
+        widest = max(scales[number].size for number in noisy)
+        keys = jax.vmap(partial(jax.random.fold_in, jax.random.fold_in(key, k)))(np.array(noisy))
+        white = jax.vmap(lambda key: jax.random.normal(key, (widest,), float))(keys)
+        for number, row in zip(noisy, white, strict=True):
+            noise, bias = scales[number] * row[: scales[number].size], errors[number]
+            errors[number] = noise if bias is None else bias + noise
+        return errors
