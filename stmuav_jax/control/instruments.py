@@ -15,6 +15,7 @@ from ..analysis.sensors import AbstractSensor, SensedMotion
 from ..checks.errors import SettingError, has_values
 from ..checks.numbers import as_floats, check_numbers
 from ..checks.shapes import Numbers
+from ..math.native.program import native
 from ..math.space import Point
 from ..mechanics.system import System
 
@@ -193,7 +194,7 @@ class Bench(eqx.Module):
     def fill_queues(self, motion: SensedMotion, system: System, key: Array) -> tuple[Any, ...]:
         """Queues of readings at the start: those of the first motion, as if it had lasted."""
         zero = jnp.zeros((), int)
-        values = self._read_values(motion, system, zero, key)
+        values = self._read_values(motion, system, zero, self._draw_noise(zero, key))
         queues = []
         for value, late in zip(values, self.late, strict=True):
             # A delayed sensor would have nothing to say at first; it reads as if the start had lasted.
@@ -210,7 +211,17 @@ class Bench(eqx.Module):
         key: Array,
     ) -> tuple[Any, ...]:
         """Queues one sample later: what is read at sample k comes in, the oldest goes out."""
-        values = self._read_values(motion, system, k, key)
+        return _advance_queues(self, queues, motion, system, k, self._draw_noise(k, key))
+
+    def _push_values(
+        self,
+        queues: tuple[Any, ...],
+        motion: SensedMotion,
+        system: System,
+        k: Int[Array, ""],
+        noise: Float[Array, "i c"],
+    ) -> tuple[Any, ...]:
+        values = self._read_values(motion, system, k, noise)
         new_queues = []
         for queue, value, every in zip(queues, values, self.every, strict=True):
             due = k % every == 0
@@ -231,11 +242,14 @@ class Bench(eqx.Module):
         }
 
     def _read_values(
-        self, sensed_motion: SensedMotion, system: System, k: Int[Array, ""], key: Array
+        self,
+        sensed_motion: SensedMotion,
+        system: System,
+        k: Int[Array, ""],
+        noise: Float[Array, "i c"],
     ) -> list[Point]:
         readings = []
-        errors = self._draw_errors(k, key)
-        for instrument, error in zip(self.instruments, errors, strict=True):
+        for instrument, error in zip(self.instruments, self._sum_errors(noise), strict=True):
             value = instrument.sensor.read(sensed_motion)
             present = [
                 (k >= jnp.asarray(fault.at) * self.rate)
@@ -257,20 +271,38 @@ class Bench(eqx.Module):
             readings.append(value)
         return readings
 
-    def _draw_errors(self, k: Int[Array, ""], key: Array) -> list[Float[Array, " c"] | None]:
-        """Bias and noise of each instrument at sample k."""
-        errors = [None if i.bias is None else jnp.asarray(i.bias) for i in self.instruments]
-        scales = [None if i.noise is None else jnp.asarray(i.noise) for i in self.instruments]
-        noisy = [number for number, scale in enumerate(scales) if scale is not None]
-        if not noisy:
-            return errors
+    def _draw_noise(self, k: Int[Array, ""], key: Array) -> Float[Array, "i c"]:
+        """Standard normal numbers of the noisy instruments at sample k."""
+        sizes = [i.noise.size for i in self.instruments if i.noise is not None]
+        numbers = [number for number, i in enumerate(self.instruments) if i.noise is not None]
+        if not numbers:
+            return jnp.zeros((0, 0))
         # Noise depends on sample and instrument alone: another sensor or rate leaves the noise of the others
         # as it is. All instruments draw at once, since each draw is a loop of its own in a compiled
         # program, and a number does not depend on how many follow it.
-        widest = max(scales[number].size for number in noisy)
-        keys = jax.vmap(partial(jax.random.fold_in, jax.random.fold_in(key, k)))(np.array(noisy))
-        white = jax.vmap(lambda key: jax.random.normal(key, (widest,), float))(keys)
-        for number, row in zip(noisy, white, strict=True):
-            noise, bias = scales[number] * row[: scales[number].size], errors[number]
-            errors[number] = noise if bias is None else bias + noise
+        keys = jax.vmap(partial(jax.random.fold_in, jax.random.fold_in(key, k)))(np.array(numbers))
+        return jax.vmap(lambda key: jax.random.normal(key, (max(sizes),), float))(keys)
+
+    def _sum_errors(self, noise: Float[Array, "i c"]) -> list[Float[Array, " c"] | None]:
+        """Bias and noise of each instrument, without faults."""
+        errors, rows = [], iter(noise)
+        for instrument in self.instruments:
+            error = None if instrument.bias is None else jnp.asarray(instrument.bias)
+            if instrument.noise is not None:
+                scale = jnp.asarray(instrument.noise)
+                white = scale * next(rows)[: scale.size]
+                error = white if error is None else error + white
+            errors.append(error)
         return errors
+
+
+@native
+def _advance_queues(
+    bench: Bench,
+    queues: tuple[Any, ...],
+    motion: SensedMotion,
+    system: System,
+    k: Int[Array, ""],
+    noise: Float[Array, "i c"],
+) -> tuple[Any, ...]:
+    return bench._push_values(queues, motion, system, k, noise)
