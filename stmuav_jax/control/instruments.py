@@ -283,7 +283,7 @@ class Bench(eqx.Module):
         keys = jax.vmap(partial(jax.random.fold_in, jax.random.fold_in(key, k)))(np.array(numbers))
         return jax.vmap(lambda key: jax.random.normal(key, (max(sizes),), float))(keys)
 
-    def _sum_errors(self, noise: Float[Array, "i c"]) -> list[Float[Array, " c"] | None]:
+    def _sum_errors(self, noise: Float[Array, "i c"]) -> list[Array | None]:
         """Bias and noise of each instrument, without faults."""
         errors, rows = [], iter(noise)
         for instrument in self.instruments:
