@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from ..analysis.sensors import AbstractSensor, SensedMotion
 from ..checks.errors import SettingError, has_values
 from ..checks.numbers import as_floats, check_numbers
 from ..checks.shapes import Numbers
+from ..math.native.program import native
 from ..math.space import Point
 from ..mechanics.system import System
 
@@ -192,7 +194,7 @@ class Bench(eqx.Module):
     def fill_queues(self, motion: SensedMotion, system: System, key: Array) -> tuple[Any, ...]:
         """Queues of readings at the start: those of the first motion, as if it had lasted."""
         zero = jnp.zeros((), int)
-        values = self._read_values(motion, system, zero, key)
+        values = self._read_values(motion, system, zero, self._draw_noise(zero, key))
         queues = []
         for value, late in zip(values, self.late, strict=True):
             # A delayed sensor would have nothing to say at first; it reads as if the start had lasted.
@@ -209,7 +211,17 @@ class Bench(eqx.Module):
         key: Array,
     ) -> tuple[Any, ...]:
         """Queues one sample later: what is read at sample k comes in, the oldest goes out."""
-        values = self._read_values(motion, system, k, key)
+        return _advance_queues(self, queues, motion, system, k, self._draw_noise(k, key))
+
+    def _push_values(
+        self,
+        queues: tuple[Any, ...],
+        motion: SensedMotion,
+        system: System,
+        k: Int[Array, ""],
+        noise: Float[Array, "i c"],
+    ) -> tuple[Any, ...]:
+        values = self._read_values(motion, system, k, noise)
         new_queues = []
         for queue, value, every in zip(queues, values, self.every, strict=True):
             due = k % every == 0
@@ -230,17 +242,15 @@ class Bench(eqx.Module):
         }
 
     def _read_values(
-        self, sensed_motion: SensedMotion, system: System, k: Int[Array, ""], key: Array
+        self,
+        sensed_motion: SensedMotion,
+        system: System,
+        k: Int[Array, ""],
+        noise: Float[Array, "i c"],
     ) -> list[Point]:
         readings = []
-        # Noise depends on sample and instrument alone: another sensor or rate leaves the noise of the others
-        # as it is.
-        draws = jax.random.fold_in(key, k) if self.instruments else key
-        for number, instrument in enumerate(self.instruments):
-            value, error = (
-                instrument.sensor.read(sensed_motion),
-                self._draw_error(instrument, draws, number),
-            )
+        for instrument, error in zip(self.instruments, self._sum_errors(noise), strict=True):
+            value = instrument.sensor.read(sensed_motion)
             present = [
                 (k >= jnp.asarray(fault.at) * self.rate)
                 & (k < jnp.asarray(fault.until) * self.rate)
@@ -261,11 +271,38 @@ class Bench(eqx.Module):
             readings.append(value)
         return readings
 
-    @staticmethod
-    def _draw_error(instrument: Instrument, key: Array, number: int) -> Float[Array, " c"] | None:
-        error = None if instrument.bias is None else jnp.asarray(instrument.bias)
-        if instrument.noise is None:
-            return error
-        scale = jnp.asarray(instrument.noise)
-        white = scale * jax.random.normal(jax.random.fold_in(key, number), scale.shape, scale.dtype)
-        return white if error is None else error + white
+    def _draw_noise(self, k: Int[Array, ""], key: Array) -> Float[Array, "i c"]:
+        """Standard normal numbers of the noisy instruments at sample k."""
+        sizes = [i.noise.size for i in self.instruments if i.noise is not None]
+        numbers = [number for number, i in enumerate(self.instruments) if i.noise is not None]
+        if not numbers:
+            return jnp.zeros((0, 0))
+        # Noise depends on sample and instrument alone: another sensor or rate leaves the noise of the others
+        # as it is. All instruments draw at once, since each draw is a loop of its own in a compiled
+        # program, and a number does not depend on how many follow it.
+        keys = jax.vmap(partial(jax.random.fold_in, jax.random.fold_in(key, k)))(np.array(numbers))
+        return jax.vmap(lambda key: jax.random.normal(key, (max(sizes),), float))(keys)
+
+    def _sum_errors(self, noise: Float[Array, "i c"]) -> list[Array | None]:
+        """Bias and noise of each instrument, without faults."""
+        errors, rows = [], iter(noise)
+        for instrument in self.instruments:
+            error = None if instrument.bias is None else jnp.asarray(instrument.bias)
+            if instrument.noise is not None:
+                scale = jnp.asarray(instrument.noise)
+                white = scale * next(rows)[: scale.size]
+                error = white if error is None else error + white
+            errors.append(error)
+        return errors
+
+
+@native
+def _advance_queues(
+    bench: Bench,
+    queues: tuple[Any, ...],
+    motion: SensedMotion,
+    system: System,
+    k: Int[Array, ""],
+    noise: Float[Array, "i c"],
+) -> tuple[Any, ...]:
+    return bench._push_values(queues, motion, system, k, noise)

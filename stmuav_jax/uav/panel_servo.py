@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from ..checks.numbers import as_floats, as_numpy, check_positive
 from ..checks.shapes import Numbers
 from ..math.compiler import quick_jit
+from ..math.native.program import native
 from ..math.rotation import rotation_matrix
 from ..mechanics.state import State
 from ..mechanics.system import System
@@ -65,6 +66,7 @@ class PanelReaction(NamedTuple):
 
 
 @quick_jit
+@native
 def panel_motion(state: State) -> PairMotion:
     """Panel angles and their rates, with accelerations of zero, from true states of base and panel.
 

@@ -84,6 +84,26 @@ def test_an_instrument_loses_readings_and_gains_a_bias_in_their_times(flight):
     np.testing.assert_allclose(readings[19:], np.tile([1.1, 2.1, 3.1], (10, 1)))
 
 
+def test_noise_of_an_instrument_does_not_depend_on_the_others(flight):
+    system = flight.mission.machine.scene.system
+    make = lambda name, **errors: Instrument(stm.analysis.SENSORS[name]("hexacopter"), **errors)
+    gyroscope, position = make("gyroscope", noise=0.1), make("position", noise=[0.1, 0.2, 0.3])
+    others = (make("attitude", noise=0.01), make("accelerometer", bias=0.1))
+    zero = jnp.zeros_like(system.reference.v)
+    motion = stm.analysis.SensedMotion(
+        system.kinematics(system.reference), system.reference.p, zero, zero, jnp.zeros(3)
+    )
+    readings = []
+    for entries in ((gyroscope, position), (gyroscope, position, *others)):
+        bench = Bench(entries, system, 100.0)
+        queues = bench.fill_queues(motion, system, jax.random.key(3))
+        queues = bench.advance_queues(queues, motion, system, jnp.asarray(5), jax.random.key(3))
+        oldest = bench.oldest_readings(queues)
+        readings.append([oldest[i.name].value for i in (gyroscope, position)])
+    for alone, beside in zip(*readings, strict=True):
+        np.testing.assert_array_equal(alone, beside)
+
+
 def test_faults_of_sensors_that_cannot_be_are_refused():
     position = {"sensor": "position", "at": 1.0}
     for changes, words in (

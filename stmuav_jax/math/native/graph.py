@@ -791,9 +791,8 @@ class _Translator:
             return -1 - number, 0, [k // 8 for k in values.strides], kind
         # The nodes of an operand's entries follow each other: a part of it is a table if its nodes have
         # equal distances along every axis.
-        first, last = int(x.ids.flat[0]), int(x.ids.max())
-        is_operand = graph.ops[first] == graph.ops[last] == "input"
-        if not is_operand or graph.args[first][0] != graph.args[last][0]:
+        first, ends = int(x.ids.flat[0]), (int(x.ids.min()), int(x.ids.max()))
+        if {graph.ops[n] for n in ends} != {"input"} or len({graph.args[n][0] for n in ends}) > 1:
             return None
         number, entry, kind = graph.args[first]
         strides = [
