@@ -51,7 +51,7 @@ _NUMPY: dict[str, Callable[..., Any]] = {
 LEAVES = ("input", "constant", "table")
 
 # Entries of an array that is no table among which a computed index chooses, at most.
-MOST_CHOICES = 64
+MOST_CHOICES = 16
 
 
 class NotScalarError(Exception):
@@ -487,30 +487,6 @@ class _Translator:
         flat = zip(*(a.ravel().tolist() for a in pairs), strict=True)
         tests = [self.graph.less(*e, or_equal=or_equal) for e in flat]
         return Nodes(np.reshape(tests, pairs[0].shape).astype(np.int64))
-
-    def _argmax(self, params: Any, x: Any) -> Any:
-        return self.find_extreme("gt", x, *params["axes"])
-
-    def _argmin(self, params: Any, x: Any) -> Any:
-        return self.find_extreme("lt", x, *params["axes"])
-
-    def find_extreme(self, op: str, x: Any, axis: int) -> Any:
-        """Index of the largest or smallest entry, or of the first that is NaN."""
-        rows = [Nodes(row) for row in np.moveaxis(self.ids(x), axis, 0)]
-        best, place = rows[0], np.zeros(rows[0].shape, int)
-        for k, row in enumerate(rows[1:], start=1):
-            is_nan = self.elementwise(
-                "and", self.is_nan(row), self.elementwise("not", self.is_nan(best))
-            )
-            is_better = self.elementwise("or", self.elementwise(op, row, best), is_nan)
-            best = self._select_n({}, is_better, best, row)
-            place = self._select_n({}, is_better, place, np.full(row.shape, k))
-        return place
-
-    def is_nan(self, x: Nodes) -> Any:
-        tests = self.elementwise("ne", x, x)
-        self.graph.order_tests.update(tests.ids.ravel().tolist())
-        return tests
 
     def _integer_pow(self, params: Any, x: Any) -> Any:
         return self._power(x, params["y"])

@@ -36,7 +36,7 @@ CHUNK = 4000
 # Operations up to which code is optimised; beyond, LLVM would take longer than the code is worth.
 MOST_OPTIMISED = 20_000
 # Operations above which a program is left to XLA, and bytes of code of all programs of a process.
-MOST_NODES, MOST_BYTES = 100_000, 400_000_000
+MOST_NODES, MOST_BYTES = 80_000, 400_000_000
 
 _ARITHMETIC = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 _COMPARE = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
