@@ -273,7 +273,7 @@ class Bench(eqx.Module):
 
     def _draw_noise(self, k: Int[Array, ""], key: Array) -> Float[Array, "i c"]:
         """Standard normal numbers of the noisy instruments at sample k."""
-        sizes = [i.noise.size for i in self.instruments if i.noise is not None]
+        sizes = [np.size(i.noise) for i in self.instruments if i.noise is not None]
         numbers = [number for number, i in enumerate(self.instruments) if i.noise is not None]
         if not numbers:
             return jnp.zeros((0, 0))
