@@ -213,26 +213,6 @@ class Bench(eqx.Module):
         """Queues one sample later: what is read at sample k comes in, the oldest goes out."""
         return _advance_queues(self, queues, motion, system, k, self._draw_noise(k, key))
 
-    def _push_values(
-        self,
-        queues: tuple[Any, ...],
-        motion: SensedMotion,
-        system: System,
-        k: Int[Array, ""],
-        noise: Float[Array, "i c"],
-    ) -> tuple[Any, ...]:
-        values = self._read_values(motion, system, k, noise)
-        new_queues = []
-        for queue, value, every in zip(queues, values, self.every, strict=True):
-            due = k % every == 0
-            last_value = jax.tree.map(lambda x: x[-1], queue.value)
-            current_value = jax.tree.map(
-                lambda new, old, due=due: jnp.where(due, new, old), value, last_value
-            )
-            join = lambda x, new: jnp.concatenate([x[1:], new[None]])
-            new_queues.append(jax.tree.map(join, queue, Reading(current_value, due)))
-        return tuple(new_queues)
-
     def oldest_readings(self, queues: tuple[Any, ...]) -> dict[str, Reading]:
         """Readings that the estimator sees now, by the sensor's name."""
         oldest_readings = [jax.tree.map(lambda x: x[0], queue) for queue in queues]
@@ -305,4 +285,14 @@ def _advance_queues(
     k: Int[Array, ""],
     noise: Float[Array, "i c"],
 ) -> tuple[Any, ...]:
-    return bench._push_values(queues, motion, system, k, noise)
+    values = bench._read_values(motion, system, k, noise)
+    new_queues = []
+    for queue, value, every in zip(queues, values, bench.every, strict=True):
+        due = k % every == 0
+        last_value = jax.tree.map(lambda x: x[-1], queue.value)
+        current_value = jax.tree.map(
+            lambda new, old, due=due: jnp.where(due, new, old), value, last_value
+        )
+        join = lambda x, new: jnp.concatenate([x[1:], new[None]])
+        new_queues.append(jax.tree.map(join, queue, Reading(current_value, due)))
+    return tuple(new_queues)

@@ -17,12 +17,9 @@ pytestmark = pytest.mark.skipif(not llvm.available(), reason="llvmlite is not in
 
 
 @pytest.fixture(autouse=True)
-def machine_code():
+def code_on(machine_code):
     """Machine code for the time of a test, also where the environment turns it off."""
-    before = program._Switch.on
-    use_native_code(True)
-    yield
-    use_native_code(before)
+    machine_code(True)
 
 
 X = np.linspace(0.2, 0.9, 6).reshape(2, 3)
@@ -276,6 +273,8 @@ def test_truth_values_and_integers():
         np.testing.assert_array_equal(a, b)
     for a, b in zip(divided(n, -m)[:3], quotient(n, -m)[:3], strict=True):
         np.testing.assert_array_equal(a, b)
+    by_zero = jax.jit(native(jax.lax.div))
+    np.testing.assert_array_equal(by_zero(n, 0 * m), jax.lax.div(n, 0 * m))
 
 
 def test_a_quotient_is_rounded_once_where_its_divisor_has_one_use():

@@ -348,7 +348,7 @@ def try_step(plan: Plan, problem: Problem, lane: BatchSlot) -> BatchSlot:
     """Try one step; a run that has ended keeps its values."""
     # Runs end their steps at kept times: values there need no interpolation, whose error the tolerances
     # do not bound.
-    order = problem.solver().error_order(diffrax.ODETerm(problem.field))
+    order = problem.solver().error_order(problem.term())
     running = lane.ending == Ending.RUNNING
     goal = jnp.asarray(plan.times, lane.t.dtype)[jnp.minimum(lane.place, len(plan.times) - 1)]
     t0, t1 = lane.t, jnp.where(running & (lane.next < goal), lane.next, goal)

@@ -459,7 +459,7 @@ def begin_integration(problem: Problem, t0: Float[Array, ""], state0: State) -> 
     # diffrax makes these states itself at the start of a solve. They are made here, since an
     # integration in chunks hands them on and a loop needs their structure beforehand.
     solver, controller = problem.solver(), problem.controller(step).wrap(1)
-    terms = diffrax.ODETerm(problem.field)
+    terms = problem.term()
     solver_state = solver.init(terms, t0, t0 + step, y, problem.model)
     _, controller_state = controller.init(
         terms, t0, t0 + step, y, None, problem.model, solver.func, solver.error_order(terms)

@@ -121,8 +121,10 @@ def tree_parameters(system: System, tree: SpanningTree) -> TreeParameters:
     axes = [B[b] for b in range(ground + 1)]
     mass, centre, inertia = _by_frame(system, tree, axes, com)
     rotations = (K, axes, system.reference.p)
-    find_constants = compute_untraced if has_values(rotations) else lambda f, *args: f(*args)
-    K_p, B_p = find_constants(_constant_euler_parameters, tree, *rotations)
+    if has_values(rotations):
+        K_p, B_p = compute_untraced(_constant_euler_parameters, tree, *rotations)
+    else:
+        K_p, B_p = _constant_euler_parameters(tree, *rotations)
     return TreeParameters(
         tree,
         _stack_last(K, (3, 3)),

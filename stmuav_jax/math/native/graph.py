@@ -271,10 +271,10 @@ class Graph:
         a, b = self._without_nan_sign(a), self._without_nan_sign(b)
         tests = [self.apply("ne", n, n) for n in (a, b)]
         self.order_tests.update(tests)
-        last = self.logical("and", tests[1], self.logical_not(tests[0]))
-        if or_equal:
-            last = tests[1]
-        return self.logical("or", self.apply("le" if or_equal else "lt", a, b), last)
+        is_last = tests[1]
+        if not or_equal:
+            is_last = self.logical("and", is_last, self.logical_not(tests[0]))
+        return self.logical("or", self.apply("le" if or_equal else "lt", a, b), is_last)
 
     def _without_nan_sign(self, n: int) -> int:
         """x of the choice x != x ? NaN : x, by which JAX gives all NaN one sign before it sorts."""
@@ -474,7 +474,10 @@ class _Translator:
         pairs = np.broadcast_arrays(self.ids(x), self.ids(y))
         flat = zip(*(a.ravel().tolist() for a in pairs), strict=True)
         quotients = [self.graph.node("div", *e) for e in flat]
-        return self.elementwise("trunc", Nodes(np.reshape(quotients, pairs[0].shape)))
+        whole = self.elementwise("trunc", Nodes(np.reshape(quotients, pairs[0].shape)))
+        # XLA's quotient by 0 is -1
+        is_zero = self.elementwise("eq", Nodes(pairs[1]), np.zeros(()))
+        return self._select_n({}, is_zero, whole, np.full(whole.shape, -1.0))
 
     def _lt_to(self, params: Any, x: Any, y: Any) -> Any:
         return self.in_order(x, y, or_equal=False)
@@ -713,21 +716,15 @@ class _Translator:
 
     def read_window(self, x: Any, starts: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
         """Nodes of a window of an array that starts at these nodes, moved so that it lies within."""
-        graph, zero = self.graph, self.graph.constant(0.0)
-        limits = [n - m for n, m in zip(x.shape, sizes, strict=True)]
-        limited = [
-            graph.apply("max", zero, graph.apply("min", graph.constant(limit), s))
-            if limit
-            else zero
-            for s, limit in zip(starts, limits, strict=True)
-        ]
+        graph, limits = self.graph, [n - m for n, m in zip(x.shape, sizes, strict=True)]
+        limited = [self.limit_place(s, limit) for s, limit in zip(starts, limits, strict=True)]
         values = [graph.value(s) for s in limited]
         begin = [0 if k is None else int(k) for k in values]
         moving = [d for d, k in enumerate(values) if k is None]
         table = self.find_table(x) if moving else None
         if table is not None:
             number, first, strides, kind = table
-            place = zero
+            place = graph.constant(0.0)
             for d in moving:
                 place = graph.add(place, graph.mul(limited[d], graph.constant(strides[d])))
             grid = np.indices(sizes).reshape(len(sizes), -1)
@@ -744,15 +741,28 @@ class _Translator:
         if len(moving) > 1 or limits[moving[0]] >= MOST_CHOICES:
             raise NotScalarError("an index that is computed, of an array that is")
         (d,) = moving
-        window = Nodes(pick(begin))
-        for k in range(1, limits[d] + 1):
-            is_here = Nodes(
-                np.broadcast_to(graph.apply("eq", limited[d], graph.constant(k)), sizes)
+        return self.choose(
+            limited[d],
+            [pick([*begin[:d], k, *begin[d + 1 :]]) for k in range(limits[d] + 1)],
+        )
+
+    def limit_place(self, start: int, limit: int) -> int:
+        """Node of a start that is moved to 0 to `limit`."""
+        graph = self.graph
+        zero = graph.constant(0.0)
+        if not limit:
+            return zero
+        return graph.apply("max", zero, graph.apply("min", graph.constant(limit), start))
+
+    def choose(self, place: int, cases: Sequence[np.ndarray]) -> np.ndarray:
+        """Nodes of the case with the number that a node has."""
+        result = Nodes(cases[0])
+        for k, case in enumerate(cases[1:], start=1):
+            is_here = self.graph.apply("eq", place, self.graph.constant(k))
+            result = self._select_n(
+                {}, Nodes(np.broadcast_to(is_here, case.shape)), result, Nodes(case)
             )
-            window = self._select_n(
-                {}, is_here, window, Nodes(pick([*begin[:d], k, *begin[d + 1 :]]))
-            )
-        return window.ids
+        return result.ids
 
     def find_table(self, x: Any) -> tuple[int, int, list[int], str] | None:
         """Operand, or known array as -1 and less, first entry, strides and kind; None if it is neither."""
@@ -796,19 +806,13 @@ class _Translator:
         at = [min(max(int(v or 0), 0), limit) for v, limit in zip(values, limits, strict=True)]
         if not moving:
             return put(at) if is_known else Nodes(put(at))
-        (d, *more), graph = moving, self.graph
+        d, *more = moving
         if more or limits[d] >= MOST_CHOICES:
             raise NotScalarError("a place that is computed, of many")
-        place = graph.apply("max", graph.constant(0.0), int(self.ids(starts[d])))
-        place = graph.apply("min", graph.constant(limits[d]), place)
-        array, part, result = self.ids(x), self.ids(update), None
-        for k in range(limits[d] + 1):
-            changed = Nodes(put([*at[:d], k, *at[d + 1 :]]))
-            is_here = Nodes(
-                np.broadcast_to(graph.apply("eq", place, graph.constant(k)), array.shape)
-            )
-            result = changed if result is None else self._select_n({}, is_here, result, changed)
-        return result
+        place = self.limit_place(int(self.ids(starts[d])), limits[d])
+        array, part = self.ids(x), self.ids(update)
+        cases = [put([*at[:d], k, *at[d + 1 :]]) for k in range(limits[d] + 1)]
+        return Nodes(self.choose(place, cases))
 
     def _gather_computed(self, params: Any, x: Any, index: Nodes) -> Nodes:
         """Windows of an array that start at computed places."""

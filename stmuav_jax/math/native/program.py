@@ -500,6 +500,7 @@ def native(
         tables: with arrays A (s, s), whose entries on and above the diagonal are zero, and others (s, .), the
             operation is a loop, x[i] = function(*args, A[i] @ x, *(table[i] for the others)) for all i, for an array
             x (s, k) of zeros that is the last argument. Batches of it are left to XLA.
+        keeps_unused: arrays that the function does not use are operands too, as a loop and its passes need.
     """
     evaluate_row: Any = None
     if tables is not None:
