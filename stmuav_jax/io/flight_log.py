@@ -26,6 +26,7 @@ from ..uav.flight_identification.record import (
     make_layout,
 )
 from .csv_table import write_csv_table
+from .log_consistency import find_contradictions
 from .log_formats import (
     DECODERS,
     FOREIGN_FORMATS,
@@ -62,6 +63,8 @@ _SAID, _REFUSED = 0.01, 0.1
 _RECORD_RATE, _BRIDGED, _TAKE_OFF, _LANDING = 500.0, 0.05, 1.0, 0.5
 # Largest number of steps of a grid.
 _MOST_STEPS = 4e6
+# Share of rows with the commands of the row before from which they were sampled, not stamped when they changed.
+_REPEATED = 0.2
 # Resolution of the stamps [s]: a grid this close to a sample is on it.
 _TICK = 1e-6
 
@@ -118,7 +121,7 @@ class FlightLog:
         settings: `gyroscope_cutoff` and `accelerometer_cutoff` [Hz] of low-pass filters that the
             channels went through, `rotor_positions` (n, 3) [m], `rotor_spin` (n,) as in `Rotors`, and
             `thrust_model_factor` f of thrust f u^2 + (1 - f) u; those that are known.
-        notes: sentences on what was read, cut or is doubtful.
+        notes: sentences on what was read, cut or is doubtful, and on what counts in place of missing settings.
         refusals: sentences, which are among the notes, why no multirotor can be identified.
         is_simulated: true if the file says that a simulator wrote it.
     """
@@ -275,9 +278,13 @@ class FlightLog:
         rate = float(
             round(min(_RECORD_RATE, flight["gyroscope"].rate, flight["accelerometer"].rate))
         )
-        grid = flight.window(t0, t1).resample(rate)
+        part = flight.window(t0, t1)
+        grid = part.resample(rate)
         ts = grid["gyroscope"].ts
         columns = {name: grid[name].values for name in (*names, "battery_voltage") if name in grid}
+        resolution = 0.0
+        if motors == "motor_commands":
+            columns[motors], resolution = _hold_commands(part, ts, rate)
         whole = np.all([np.all(np.isfinite(columns[name]), axis=1) for name in names], axis=0)
         for name, values in columns.items():
             present = np.all(np.isfinite(values), axis=1)
@@ -298,7 +305,7 @@ class FlightLog:
             commands = (commands + after) / (2 * np.max(self[motors].values))
             voltage = None
         channels = (commands, gyroscope, accelerometer, voltage)
-        return FlightRecord(ts[inside], *channels, (cutoffs[0], cutoffs[1]))
+        return FlightRecord(ts[inside], *channels, (cutoffs[0], cutoffs[1]), resolution)
 
     def to_layout(self, mass: float | int | None = None) -> RotorLayout:
         """Layout of the rotors that the vehicle's parameters give.
@@ -401,6 +408,23 @@ def _on_grid(
     return result
 
 
+def _hold_commands(flight: FlightLog, grid: np.ndarray, rate: float) -> tuple[np.ndarray, float]:
+    """Commands (k, n) that a record holds over the step after each time of a grid, and when they changed [s].
+
+    The second is the standard deviation of the times at which they changed.
+    """
+    channel = flight["motor_commands"]
+    ts, values, late = channel.ts, channel.values, 0.0
+    # Rows that repeat their commands are samples of what changed at any time since the row before: by half a step
+    # before the row, up to the deviation of a uniform distribution.
+    if np.mean(np.all(values[1:] == values[:-1], axis=1)) > _REPEATED:
+        late = 1 / channel.rate
+    gaps = [(gap.start, gap.end) for gap in flight.gaps if gap.channel == "motor_commands"]
+    # The mean over the step has the same integral as the commands: a mean around its start would act half a step late.
+    held = _on_grid(grid + 0.5 / rate, 1 / rate, ts - 0.5 * late, values, True, gaps)
+    return held, late / 12**0.5
+
+
 def read_flight_log(
     path: str | os.PathLike[str], columns: str | os.PathLike[str] | Mapping[str, Any] | None = None
 ) -> FlightLog:
@@ -491,9 +515,12 @@ def _assemble_log(source: Path, draft: LogDraft) -> FlightLog:
     _check_channels(draft, channels, gaps)
     _check_units(draft, channels, flights)
     _check_commands(draft, channels, flights)
+    for sentence, is_refused in find_contradictions(channels, flights):
+        (draft.refuse if is_refused else draft.notes.append)(sentence)
+    _note_assumptions(draft, channels, flights)
     return FlightLog(
         source.name, draft.format, draft.vehicle, start / 1e6, duration, channels, flights, gaps,
-        draft.settings, tuple(draft.notes), tuple(draft.refusals), draft.is_simulated,
+        draft.settings, (*draft.notes, *draft.assumptions), tuple(draft.refusals), draft.is_simulated,
     )  # fmt: skip
 
 
@@ -665,6 +692,46 @@ def _cut_crashes(
     return np.array(remaining, float).reshape(-1, 2)
 
 
+def _note_assumptions(
+    draft: LogDraft, channels: Mapping[str, Channel], flights: np.ndarray
+) -> None:
+    """Note what an identification assumes in place of settings and channels that the log lacks."""
+    if draft.refusals or not len(flights) or not {"accelerometer", "gyroscope"} <= set(channels):
+        return
+    unknown = [
+        name
+        for name in ("gyroscope", "accelerometer")
+        if f"{name}_cutoff" not in draft.settings and name not in draft.unfiltered
+    ]
+    if unknown:
+        names = " and ".join(f"{name}_cutoff" for name in unknown)
+        place = "settings of the map of columns" if draft.format == "CSV" else "record's cutoffs"
+        draft.assume(
+            f"{' and '.join(unknown)} went through no low-pass filter",
+            f"the log has no {names}",
+            "the delay of one, 2.8 ms of two poles at 80 Hz and 7.5 ms at 30 Hz, would count as delay and lag of the "
+            f"motors; the {place} take cut-offs [Hz]",
+        )
+    if "rotor_positions" in draft.settings and "thrust_model_factor" not in draft.settings:
+        draft.assume(
+            "thrust is the square of the command",
+            "the log has no thrust_model_factor",
+            "another curve changes effectiveness at other commands than the mean one",
+        )
+    if "motor_commands" not in channels:
+        draft.assume(
+            "measured rotor_speeds over the highest of them are the commands",
+            "the log has no motor_commands",
+            "effectiveness is that of the highest speed in the log, and no lag is identified",
+        )
+    elif "battery_voltage" not in channels:
+        draft.assume(
+            "the battery's voltage is constant",
+            "the log has no battery_voltage",
+            "as it falls, so does the effectiveness, in which windows then differ",
+        )
+
+
 def _check_channels(draft: LogDraft, channels: Mapping[str, Channel], gaps: Sequence[Gap]) -> None:
     """Note sensors that are missing, gaps, and quaternions that are not of unit length."""
     for name in ("accelerometer", "gyroscope"):
@@ -736,7 +803,7 @@ def _check_units(draft: LogDraft, channels: Mapping[str, Channel], flights: np.n
     )
     if not is_checked:
         draft.notes.append(
-            "The log has no rest, so gravity cannot check the accelerometer's scale."
+            "The log has no rest, so gravity checks the accelerometer's scale by the mean in flight only."
         )
     gravity = float(np.median(force[resting if is_checked else in_flight]))
     if not low <= gravity <= high:

@@ -112,8 +112,11 @@ class LogDraft:
     settings: dict[str, LogSetting] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     refusals: list[str] = field(default_factory=list)
+    assumptions: list[str] = field(default_factory=list)
     switches: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     is_simulated: bool = False
+    # channels that are known to have no low-pass filter
+    unfiltered: set[str] = field(default_factory=set)
 
     def refuse(self, sentence: str) -> None:
         self.notes.append(sentence)
@@ -123,6 +126,17 @@ class LogDraft:
         self.vehicle = kind
         self.refuse(
             f"The log is of {kind}, which the models of multirotors do not describe; a multirotor would be valid."
+        )
+
+    def assume(self, assumption: str, missing: str, effect: str) -> None:
+        """Note what counts in place of a setting that the log lacks, and what a wrong one changes."""
+        self.assumptions.append(f"Assumed: {assumption}, because {missing}; {effect}.")
+
+    def assume_range(self, names: str) -> None:
+        self.assume(
+            "pulses of 1000 to 2000 us are commands of 0 to 1",
+            f"the log has no {names}",
+            "another range changes the thrust curve, and all effectiveness in proportion",
         )
 
     def set_cutoffs(
@@ -136,6 +150,9 @@ class LogDraft:
                 # ones have another.
                 value = float(parameters[parameter])
                 self.settings[f"{channel}_cutoff"] = LogSetting(value, "Hz", parameter)
+            # Zero turns a filter off, and other sources have none: neither is an assumption.
+            elif used and (used.topic != topic or parameter in parameters):
+                self.unfiltered.add(channel)
 
     def set_factor(self, parameters: Mapping[str, Any], name: str) -> None:
         if name in parameters:
@@ -266,7 +283,8 @@ _ULOG = [
     LogSource("battery_voltage", "battery_status", ("voltage_v",)),
     LogSource("battery_current", "battery_status", ("current_a",)),
 ]  # fmt: skip
-# Numbers of rotors by MAV_TYPE, and words for vehicles that are no multirotors.
+# Numbers of rotors by MAV_TYPE, and words for vehicles that are no multirotors. Sources: MAVLink common.xml (MAV_TYPE);
+# PX4-Autopilot, src/modules/control_allocator/module.yaml (CA_AIRFRAME).
 _ROTORS = {2: 4, 13: 6, 14: 8, 15: 3, 29: 12, 35: 10}
 _OTHERS = {
     1: "a fixed-wing aircraft", 3: "a coaxial helicopter", 4: "a helicopter", 7: "an airship", 10: "a rover",
@@ -274,13 +292,18 @@ _OTHERS = {
 }  # fmt: skip
 _AIRFRAMES = {
     1: "a fixed-wing aircraft", **dict.fromkeys((2, 3, 4), "a VTOL aircraft"),
+    7: "a vehicle with motors along several axes", 8: "a multirotor with tilting rotors",
     **dict.fromkeys((5, 6, 13), "a rover"), **dict.fromkeys((10, 11, 12), "a helicopter"),
 }  # fmt: skip
-# Words of a map of columns for them, and ArduPilot's frames and functions of servos that only they have.
+# Words of a map of columns for them, and ArduPilot's frames and functions of servos that only they have. Sources:
+# ardupilot, libraries/AP_Motors/AP_Motors_Class.h (motor_frame_class), libraries/SRV_Channel/SRV_Channel.h (Function).
 _OTHER_WORDS = re.compile(
     r"fixed.?wing|plane|vtol|helicopter|rover|boat|submarine|airship|glider", re.I
 )
+# Tilt of a rotor's axis up to which it counts as upright [degrees].
+_TILTED = 10.0
 _HELICOPTERS, _SURFACES = (6, 11, 13), (4, 19, 24, 25, 77, 78, 79, 80)
+_VANES = {8: "a single rotor above vanes", 9: "a coaxial rotor above vanes", 10: "a tailsitter"}
 
 
 def _read_px4_vehicle(draft: LogDraft, parameters: Mapping[str, Any]) -> None:
@@ -301,7 +324,19 @@ def _read_px4_vehicle(draft: LogDraft, parameters: Mapping[str, Any]) -> None:
     rotors = [f"CA_ROTOR{k}_" for k in range(count)]
     if rotors and all(f"{name}PX" in parameters for name in rotors):
         places = [[parameters.get(f"{name}P{axis}", 0.0) for axis in "XYZ"] for name in rotors]
-        # The moment's coefficient is of unknown accuracy; its sign is the sense of rotation.
+        # Rotors push along (AX, AY, AZ), by default up; those of the model push along z.
+        axes = [
+            [parameters.get(f"{name}A{axis}", usual) for axis, usual in zip("XYZ", (0.0, 0.0, -1.0), strict=True)]
+            for name in rotors
+        ]  # fmt: skip
+        tilts = [np.degrees(np.arctan2(np.hypot(x, y), -z)) for x, y, z in axes]
+        if max(tilts) > _TILTED:
+            draft.refuse(
+                f"Rotor {np.argmax(tilts) + 1} is tilted by {max(tilts):.3g} degrees (CA_ROTORn_AX, AY, AZ); rotors "
+                f"that push up within {_TILTED:g} degrees would be valid."
+            )
+        # The moment's coefficient is of unknown accuracy. It is positive for a rotor that turns anticlockwise seen
+        # from above. Source: PX4-Autopilot, src/modules/control_allocator/module.yaml (CA_ROTORn_KM).
         spin = np.sign([parameters.get(f"{name}KM", 0.05) for name in rotors])
         positions = np.array(places) * _VECTOR + 0.0
         draft.settings["rotor_positions"] = LogSetting(positions, "m", "CA_ROTORn_PX, PY, PZ")
@@ -315,6 +350,14 @@ def _px4_motors(draft: LogDraft, parameters: Mapping[str, Any]) -> list[LogSourc
         names = [f"control[{k}]" for k in range(12) if f"control[{k}]" in topic.fields]
         # Motors that do not exist are NaN in this topic.
         used = tuple(name for name in names if np.any(np.isfinite(topic.fields[name])))
+        # The allocator's values are thrusts: the output drivers solve f u^2 + (1 - f) u for the command u that the
+        # motors get. Source: PX4-Autopilot, src/lib/mixer_module/functions/FunctionMotors.hpp (updateValues).
+        f = parameters.get("THR_MDL_FAC", 0.0)
+        if 0 < f <= 1:
+            solve = lambda T: (np.sqrt((1 - f) ** 2 + 4 * f * np.maximum(T, 0.0)) - 1 + f) / (2 * f)
+            commands = {f"{name} (by THR_MDL_FAC)": solve(topic.fields[name]) for name in used}
+            draft.topics["actuator_motors"] = LogTopic(topic.stamps, {**topic.fields, **commands})
+            used = tuple(commands)
         # the stamp of the output itself, not that of the measurement that it answers
         return [LogSource("motor_commands", "actuator_motors", used)]
     topic = draft.topics.get("actuator_outputs")
@@ -335,7 +378,15 @@ def _px4_motors(draft: LogDraft, parameters: Mapping[str, Any]) -> list[LogSourc
         # 0 and -1 stand for the common parameter
         return next((float(parameters[n]) for n in names if parameters.get(n, 0) > 0), usual)
 
+    if outputs and not functions:
+        draft.assume(
+            f"outputs 1 to {count} are the motors",
+            "the log has no PWM_MAIN_FUNCn",
+            "another order gives other responses of the motors",
+        )
     ends = [(limit_value("MIN", k, 1000.0), limit_value("MAX", k, 2000.0)) for k in outputs]
+    if not any(name.startswith(("PWM_MAIN_M", "PWM_M")) for name in parameters):
+        draft.assume_range("PWM_MAIN_MINn and PWM_MAIN_MAXn")
     return _pulse_source(draft, "actuator_outputs", [f"output[{k}]" for k in outputs], ends)
 
 
@@ -367,6 +418,7 @@ def _px4_speeds(draft: LogDraft) -> list[LogSource]:
     return [LogSource("rotor_speeds", "esc_status", tuple(sorted(available, key=order)), _RPM)]
 
 
+# Source: ardupilot, libraries/AP_Logger/AP_Logger.h (LogEvent).
 _ARMED, _DISARMED, _LANDED, _NOT_LANDED = 10, 11, 18, 28
 _NKF = ("XKF1", "NKF1", "EKF1")
 _BIN = [
@@ -379,6 +431,7 @@ _BIN = [
     *(LogSource("battery_voltage", name, ("Volt",)) for name in ("BAT", "CURR")),
     *(LogSource("battery_current", name, ("Curr",)) for name in ("BAT", "CURR")),
 ]
+# Motors by FRAME_CLASS. Source: ardupilot, libraries/AP_Motors/AP_Motors_Class.h (motor_frame_class).
 _CLASSES = {1: 4, 2: 6, 3: 8, 4: 8, 5: 6, 7: 3, 12: 12, 14: 10}
 _FRAMES = {"TRI": 3, "QUAD": 4, "HEXA": 6, "Y6": 6, "OCTA": 8}
 
@@ -514,6 +567,8 @@ def _read_ardupilot_vehicle(
         draft.refuse_vehicle("an aircraft with control surfaces (SERVOn_FUNCTION)")
     elif parameters.get("FRAME_CLASS") in _HELICOPTERS or "Frame: HELI" in text:
         draft.refuse_vehicle("a helicopter")
+    elif parameters.get("FRAME_CLASS") in _VANES:
+        draft.refuse_vehicle(_VANES[int(parameters["FRAME_CLASS"])])
     elif "Copter" in text:
         draft.vehicle = "multirotor"
 
@@ -539,14 +594,25 @@ def _ardupilot_motors(
         )
         outputs = list(range(1, count + 1))
         if outputs:
-            draft.notes.append(
-                f"Outputs 1 to {count} count as motors, by the frame: the log has no SERVOn_FUNCTION."
+            draft.assume(
+                f"outputs 1 to {count} are the motors, by the frame",
+                "the log has no SERVOn_FUNCTION",
+                "another order gives other responses of the motors",
             )
     if outputs:
         draft.vehicle = f"multirotor with {len(outputs)} rotors"
     prefix = "C" if "C1" in draft.topics["RCOU"].fields else "Ch"
     low = parameters.get("MOT_PWM_MIN", 0) or parameters.get("RC3_MIN", 0) or 1000.0
     high = parameters.get("MOT_PWM_MAX", 0) or parameters.get("RC3_MAX", 0) or 2000.0
+    if outputs and not {"MOT_PWM_MIN", "RC3_MIN"} & set(parameters):
+        draft.assume_range("MOT_PWM_MIN and MOT_PWM_MAX")
+    # The command of the thrust curve f u^2 + (1 - f) u, f = MOT_THST_EXPO, is 0 at MOT_SPIN_MIN and 1 at MOT_SPIN_MAX.
+    # Source: ardupilot, libraries/AP_Motors/AP_Motors_Thrust_Linearization.cpp (thrust_to_actuator).
+    span = high - low
+    low, high = (
+        low + span * parameters.get(name, usual)
+        for name, usual in (("MOT_SPIN_MIN", 0.0), ("MOT_SPIN_MAX", 1.0))
+    )
     return _pulse_source(
         draft, "RCOU", [f"{prefix}{k}" for k in outputs], [(low, high)] * len(outputs)
     )
@@ -667,7 +733,8 @@ def _decode_crazyflie(source: Path, data: bytes) -> LogDraft:
         draft.sources += [LogSource("thrust_commands", both.topic, names, 1 / 65535)]
     for channel, cutoff in (("gyroscope", 80.0), ("accelerometer", 30.0)):
         used = draft.chosen(channel)
-        if used and used.fields[0] in ("acc.x", "gyro.x"):
+        # the rates of stateEstimateZ are those of the same filtered gyroscope
+        if used and used.fields[0] in ("acc.x", "gyro.x", "stateEstimateZ.rateRoll"):
             draft.settings[f"{channel}_cutoff"] = LogSetting(cutoff, "Hz", _CHIP)
     return draft
 
@@ -744,6 +811,12 @@ def decode_csv(source: Path, columns: Any) -> LogDraft:
         draft.refuse_vehicle(f"a {plan.vehicle} (the map's vehicle)")
     if cells.is_cut:
         draft.notes.append("The file is truncated; its last row is not whole and was left out.")
+    if "axes" not in plan.model_fields_set and columns is not None:
+        draft.assume(
+            "x is forward, y left and z up",
+            "the map of columns has no 'axes'",
+            'with axes = "forward-right-down" y and z change their signs',
+        )
 
     def read_column(name: str, unit: str, map_unit: str | None) -> np.ndarray:
         """Numbers of a column in the channel's unit."""

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import struct
 import sys
 import zlib
@@ -181,13 +182,26 @@ def test_each_format_gives_the_same_channels(kind, tmp_path):
     for name, bound in (("accelerometer", 1e-5), ("gyroscope", 1e-6), ("motor_commands", 6e-4)):
         channel = log[name]
         # single precision of the files, and pulses in whole microseconds
-        np.testing.assert_allclose(channel.values, parts[name], rtol=0, atol=bound)
+        # PX4 logs what its outputs solve f u^2 + (1 - f) u for
+        value = channel.values
+        if (kind, name) == ("ulog", "motor_commands"):
+            value = 0.3 * value**2 + 0.7 * value
+        np.testing.assert_allclose(value, parts[name], rtol=0, atol=bound)
         np.testing.assert_allclose(channel.ts, parts["t"], rtol=0, atol=1e-9)
         assert channel.rate == pytest.approx(RATE)
         assert channel.unit == {"accelerometer": "m/s^2", "gyroscope": "rad/s"}.get(name, "1")
     assert log["accelerometer"].clock == log["gyroscope"].clock
     np.testing.assert_allclose(log.flights, [[TAKE_OFF, LANDING]], atol=1 / RATE)
-    assert log.notes == ()
+    # what the file does not say is assumed, and said
+    assumed = {
+        "csv": ["went through no low-pass filter", "voltage is constant"],
+        "card": ["voltage is constant"],
+        "ulog": ["voltage is constant"],
+        "bin": ["1000 to 2000 us", "accelerometer went through no", "voltage is constant"],
+    }[kind]
+    assert len(log.notes) == len(assumed)
+    for note, words in zip(log.notes, assumed, strict=True):
+        assert re.match(rf"Assumed: .*{words}.*, because the log has no .*; .*\.", note)
     assert log.refusals == ()
     assert not log.is_simulated
     assert log.flight().duration == log.duration
@@ -224,6 +238,19 @@ def test_settings_of_the_other_formats_have_their_sources(tmp_path):
     assert "not the log" in card["accelerometer_cutoff"].source
     pilot = read_flight_log(written("bin", tmp_path, flight())).settings
     assert pilot["gyroscope_cutoff"] == (40.0, "Hz", "INS_GYRO_FILTER")
+
+
+def test_commands_are_those_of_the_thrust_curve_of_their_factor(tmp_path):
+    """PX4 logs what the outputs solve f u^2 + (1 - f) u for; ArduPilot's curve begins at MOT_SPIN_MIN."""
+    T = flight()["motor_commands"]
+    log = read_flight_log(written("ulog", tmp_path, flight(), parameters=[("THR_MDL_FAC", 0.3)]))
+    u = log["motor_commands"].values
+    np.testing.assert_allclose(0.3 * u**2 + 0.7 * u, T, atol=1e-6)
+    spins = [("MOT_SPIN_MIN", 0.15), ("MOT_SPIN_MAX", 0.95), ("MOT_PWM_MIN", 1000.0)]
+    log = read_flight_log(written("bin", tmp_path, flight(), parameters=spins))
+    expected = np.maximum((T - 0.15) / 0.8, 0.0)
+    np.testing.assert_allclose(log["motor_commands"].values, expected, atol=1e-3)
+    assert not any("1000 to 2000" in note for note in log.notes)
 
 
 def test_landed_states_end_a_flight_whose_motors_turn(tmp_path):
@@ -507,6 +534,10 @@ def test_a_single_wrong_stamp_costs_one_sample(tmp_path):
         ("ulog", {"parameters": [("MAV_TYPE", 0), ("CA_AIRFRAME", 11)]}, "of a helicopter"),
         ("bin", {"parameters": [("FRAME_CLASS", 6.0)]}, "of a helicopter"),
         ("bin", {"texts": (), "parameters": [("SERVO1_FUNCTION", 4.0)]}, "of an aircraft with control surfaces"),
+        ("bin", {"parameters": [("FRAME_CLASS", 9.0)]}, "of a coaxial rotor above vanes"),
+        ("ulog", {"parameters": [("CA_AIRFRAME", 8)]}, "of a multirotor with tilting rotors"),
+        ("ulog", {"parameters": [("CA_ROTOR_COUNT", 1), ("CA_ROTOR0_PX", 0.1), ("CA_ROTOR0_AY", -0.5)]},
+         "Rotor 1 is tilted by 26.6 degrees"),
     ],
 )  # fmt: skip
 def test_vehicles_that_are_no_multirotors_are_refused(kind, options, words, tmp_path):

@@ -128,6 +128,7 @@ class FlightRecord(NamedTuple):
         gyroscope: (k, 3) [rad/s]. accelerometer: specific force (k, 3) [m/s^2].
         voltage: of the battery (k,) [V], None if it is not known.
         cutoffs: of the two-pole low-pass filters of gyroscope and accelerometer [Hz]; infinite for none.
+        resolution: standard deviation of the times at which commands changed [s].
     """
 
     ts: Float[np.ndarray, " k"]
@@ -136,6 +137,7 @@ class FlightRecord(NamedTuple):
     accelerometer: Float[np.ndarray, "k 3"]
     voltage: Float[np.ndarray, " k"] | None = None
     cutoffs: tuple[float, float] = (np.inf, np.inf)
+    resolution: float = 0.0
 
     @property
     def dt(self) -> float:
@@ -155,7 +157,7 @@ class FlightRecord(NamedTuple):
         voltage = None if self.voltage is None else self.voltage[inside]
         return FlightRecord(
             self.ts[inside], self.commands[inside], self.gyroscope[inside], self.accelerometer[inside],
-            voltage, self.cutoffs,
+            voltage, self.cutoffs, self.resolution,
         )  # fmt: skip
 
 
@@ -194,13 +196,21 @@ def filter_columns(
 def low_pass(cutoff: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Numerator and denominator of a two-pole low-pass filter; 1 and 1 without a cutoff.
 
-    The filter runs at a higher rate than the grid's, so its delay is that of the filter in continuous time.
+    The filter is a digital one of at least twice the grid's rate, which meets its cutoff exactly.
     """
     if not np.isfinite(cutoff):
         return np.ones(1), np.ones(1)
-    poles = butter(2, 2 * np.pi * cutoff, analog=True, output="ba")
+    poles = butter(2, np.sqrt(2) / filter_delay(cutoff, 0.5 * dt), analog=True, output="ba")
     numerator, denominator = bilinear(*poles, fs=1 / dt)  # pyright: ignore
     return np.asarray(numerator), np.asarray(denominator)
+
+
+def filter_delay(cutoff: float, step: float) -> float:
+    """Delay [s] of slow signals by a two-pole low-pass filter of a digital clock's step, or of continuous time, 0."""
+    # Butterworth's design by the bilinear transform moves the poles up so that the cutoff is met; a filter that is
+    # close to half its clock's rate, which no firmware has, moves them no further.
+    half = min(np.pi * cutoff * step, np.pi / 4)
+    return float(np.sqrt(2) / (2 * np.pi * cutoff) * (half / np.tan(half) if half else 1.0))
 
 
 def apply_filter(

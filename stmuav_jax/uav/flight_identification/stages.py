@@ -47,6 +47,7 @@ from .record import (
     compute_rotor_states,
     compute_thrust_shape,
     filter_columns,
+    filter_delay,
     low_pass,
     observe_motion,
     refilter_rates,
@@ -850,7 +851,7 @@ def _identify_rotation(
         new = {
             "lag": evaluation.estimate("lag", "s", lambda z: z[-2]),
             "delay": _add_resolution(
-                evaluation.estimate("delay", "s", lambda z: z[-1]), signals.record.dt
+                evaluation.estimate("delay", "s", lambda z: z[-1]), signals.record
             ),
         }
         places = {axis: (2 + _MOMENT) * k for k, axis in enumerate(axes)}
@@ -925,11 +926,15 @@ def _fit_rotation(
     return fit_prediction_error(build, start, _BOUNDS, variant.memory)
 
 
-def _add_resolution(delay: ParameterEstimate, dt: float) -> ParameterEstimate:
-    """Estimate whose deviation allows for commands that change at an unknown time of a step of the grid."""
-    # Standard deviation of a uniform distribution over a step.
-    resolution = dt / 12**0.5
-    parts = (np.hypot(x, resolution) for x in (delay.deviation, delay.variants))
+def _add_resolution(delay: ParameterEstimate, record: FlightRecord) -> ParameterEstimate:
+    """Estimate whose deviation allows for the times at which commands changed and for the clock of on-board filters."""
+    cutoff, clock = record.cutoffs[0], 0.0
+    if np.isfinite(cutoff):
+        # A filter runs at the grid's rate or a higher one, up to continuous time; which, no log tells.
+        clock = filter_delay(cutoff, 0.0) - filter_delay(cutoff, 0.5 * record.dt)
+    parts = (
+        np.linalg.norm([x, record.resolution, clock]) for x in (delay.deviation, delay.variants)
+    )
     return delay._replace(**dict(zip(("deviation", "variants"), map(float, parts), strict=True)))
 
 
