@@ -179,9 +179,9 @@ def _model_numbers(
     add("centre_z", layout.centre_height or 0.0, "m", None)
     for name in "xyz":
         e = estimates.get(f"drag_{name}")
-        # A drag below zero, which noise may give, would feed energy to the model.
-        if e is None or e.value <= 0:
-            notes.append(f"There is no drag along {name}: it is not determined.")
+        # A drag below zero, which noise may give or a study draw, would feed energy to the model.
+        if e is None or e.value < 2 * e.deviation:
+            notes.append(f"There is no drag along {name}: it is not clearly positive.")
         else:
             add(f"drag_{name}", mass * e.value, "N s/m", e, mass)
     height = _drag_height(numbers, estimates)

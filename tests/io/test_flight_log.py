@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.constants import degree, g
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 import stmuav_jax as stm
 from stmuav_jax.checks.errors import SettingError
@@ -513,6 +515,105 @@ def test_doubtful_logs_say_what_would_be_valid(case, tmp_path):
             log.flight()
     if case == "crash":
         np.testing.assert_allclose(log.flights, [[2.0, 5.475]], atol=0.01)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """Channels whose motion, forces and commands agree, made of random splines; in flight from 2 to 22 s."""
+    rng, ts = np.random.default_rng(1), np.arange(0, 24, 0.01)
+    knots = np.arange(0, 24.5, 0.5)
+    shares = np.clip(np.minimum(knots - 2, 22 - knots) / 2, 0, 1)[:, None]
+    angles = CubicSpline(knots, shares * [0.3, 0.3, 0.5] * rng.normal(size=(len(knots), 3)))
+    places = CubicSpline(knots, shares * [0.5, 0.5, 0.1] * rng.normal(size=(len(knots), 3)))
+    turn = lambda t: Rotation.from_euler("ZYX", angles(t)[:, ::-1])
+    rates = (turn(ts - 1e-4).inv() * turn(ts + 1e-4)).as_rotvec() / 2e-4
+    force = turn(ts).inv().apply(places(ts, 2) + g * np.eye(3)[2])
+    spins = np.array([[-1, -1, 1], [-1, 1, -1], [1, 1, 1], [1, -1, -1]])
+    commands = 0.5 + 0.02 * (force[:, 2:] - g) + 2e-3 * np.gradient(rates, 0.01, axis=0) @ spins.T
+    flying = ((ts > 2) & (ts < 22))[:, None]
+    return {
+        "t": ts, "accelerometer": force, "gyroscope": rates, "motor_commands": commands * flying,
+        "attitude": turn(ts).as_quat(scalar_first=True), "euler_angles": angles(ts),
+        "position": places(ts), "velocity": places(ts, 1),
+    }  # fmt: skip
+
+
+def late(parts, seconds, *names):
+    """Channels of which some come later."""
+    return parts | {name: np.roll(parts[name], round(100 * seconds), axis=0) for name in names}
+
+
+def scaled(name, factor):
+    return lambda parts: parts | {name: parts[name] * factor}
+
+
+FAULTS = {
+    "right": (lambda parts: parts, None, False),
+    "gyroscope by 3": (
+        scaled("gyroscope", 3), "attitude turns about x, y, z 0.333 times as much as the gyroscope", True,
+    ),
+    "gyroscope in degrees": (scaled("gyroscope", 1 / degree), "as if one were in deg/s", True),
+    "gyroscope of other axes": (
+        lambda parts: parts | {"gyroscope": parts["gyroscope"][:, [1, 0, 2]]},
+        "about x, y, z as the gyroscope measures y, x, z", True,
+    ),
+    "attitude of other signs": (
+        scaled("attitude", [1, 1, -1, -1]), "about x, y, z as the gyroscope measures x, -y, -z", True,
+    ),
+    "attitude from degrees": (
+        lambda parts: {k: v for k, v in parts.items() if k != "attitude"}
+        | {"euler_angles": parts["euler_angles"] / degree},
+        "not as the gyroscope measures", True,
+    ),
+    "attitude of another clock": (
+        lambda parts: late(parts, 2.0, "attitude"), "2.0 s after the gyroscope measures it", True,
+    ),
+    "position in centimetres": (
+        scaled("position", 100), "position moves along x, y, z 100 times as much as the velocity measures, as if one "
+        "were in cm", False,
+    ),
+    "velocity of other signs": (scaled("velocity", [1, -1, -1]), "measures x, -y, -z", False),
+    "accelerometer in g": (
+        lambda parts: scaled("accelerometer", 0.6)({k: v for k, v in parts.items() if k != "position"}),
+        "velocity changes along x, y, z 1.6", False,
+    ),
+    "position alone in centimetres": (
+        lambda parts: scaled("position", 100)({k: v for k, v in parts.items() if k != "velocity"}),
+        "times as much as the accelerometer measures", False,
+    ),
+    "commands of another clock": (
+        lambda parts: late(parts, 8.0, "gyroscope", "accelerometer", "attitude"),
+        "The IMU feels motor_commands 8.0 s after their time stamps", True,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_channels_that_contradict_each_other_are_named(fault, motion, tmp_path):
+    change, words, is_refused = FAULTS[fault]
+    parts = dict(change(motion))
+    if "attitude" in parts:
+        parts.pop("euler_angles")
+    ts = parts.pop("t")
+    units = {
+        "accelerometer": "m/s^2",
+        "gyroscope": "rad/s",
+        "euler_angles": "rad",
+        "position": "m",
+        "velocity": "m/s",
+    }
+    ends = {"attitude": "wxyz", "motor_commands": "1234", "euler_angles": ("roll", "pitch", "yaw")}
+    heads = [f"{k}.{end} [{units.get(k, '1')}]" for k in parts for end in ends.get(k, AXES)]
+    table = np.column_stack([ts, *parts.values()])
+    path = tmp_path / "log"
+    np.savetxt(path, table, delimiter=",", header=",".join(["t [s]", *heads]), comments="")
+    log = read_flight_log(path)
+    notes = [note for note in log.notes if not note.startswith("Assumed")]
+    if words is None:
+        assert not notes
+    else:
+        assert any(words in note for note in (log.refusals if is_refused else notes)), notes
+    assert bool(log.refusals) == is_refused or fault == "accelerometer in g"
 
 
 def test_a_single_wrong_stamp_costs_one_sample(tmp_path):

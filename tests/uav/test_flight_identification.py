@@ -19,7 +19,7 @@ from problems.multirotor_flights import (
 )
 from scipy.constants import g
 from scipy.integrate import solve_ivp
-from scipy.signal import lfilter
+from scipy.signal import butter, group_delay, lfilter
 from scipy.spatial.transform import Rotation
 
 from stmuav_jax import missions
@@ -49,10 +49,12 @@ from stmuav_jax.uav.flight_identification.record import (
     FlightRecord,
     apply_filter,
     compute_rotor_states,
+    filter_delay,
     low_pass,
     observe_motion,
     refilter_rates,
 )
+from stmuav_jax.uav.flight_identification.stages import _check_size
 
 FLIGHTS = Path(__file__).parents[2].parent / "shared" / "flights"
 real = pytest.mark.skipif(
@@ -461,6 +463,10 @@ def test_records_that_cannot_be_identified_are_refused(record):
         identify_flight(record._replace(gyroscope=np.abs(record.gyroscope) * [1, 0, 1]), LAYOUT)
     with pytest.raises(SettingError, match=r"command of motor 1 is 0\.5 throughout the flight"):
         identify_flight(record._replace(commands=0 * record.commands + 0.5), LAYOUT)
+    for name, factor in (("gyroscope", 3.0), ("gyroscope", 57.3), ("accelerometer", 0.93)):
+        scaled = {name: factor * getattr(record, name)}
+        with pytest.raises(SettingError, match=r"along the vertical|unit"):
+            identify_flight(record._replace(**scaled), LAYOUT)
     with pytest.raises(SettingError, match="one line"):
         make_layout([[0, 1], [0, 2], [0, 3]], [1, 1, -1])
     with pytest.raises(SettingError, match="spin must be"):
@@ -532,6 +538,45 @@ def test_velocity_and_gravity_of_a_quick_motion_are_observed(rise, start, bounds
     for part in (ts > 10, ts < 5):
         assert np.all(np.std((velocity - v)[part], axis=0) < bounds[0])
         assert np.all(np.std((gravity - turn.inv().apply(-g * up))[part], axis=0) < bounds[1])
+
+
+def test_commands_hold_over_the_steps_of_a_record(tmp_path):
+    """At 500 Hz as they are; sampled at 1 kHz while they change at 440 Hz, by their means over the steps."""
+    rng = np.random.default_rng(0)
+    for rate, every in ((500, 1), (1000, 2.3)):
+        ts = np.arange(14 * rate) / rate
+        changes = rng.normal(size=len(ts) + 1)
+        u = np.clip(0.5 + 0.05 * changes[np.floor(np.arange(len(ts)) / every).astype(int)], 0, 1)
+        noise = rng.normal(size=(len(ts), 3))
+        record = FlightRecord(
+            ts, u[:, None] + np.zeros(4), 0.1 * noise, 9.81 * np.eye(3)[2] + noise
+        )
+        part = read_flight_log(save_flight_record(record, tmp_path / "log.csv")).to_record()
+        # a change came by half a sample before the row that shows it
+        late = 0.0 if rate == 500 else 0.5e-3
+        integral = np.append(0.0, np.cumsum(u)) / rate
+        edges = np.append(part.ts, part.ts[-1] + part.dt)
+        means = (
+            np.diff(np.interp(edges + late, np.append(ts, ts[-1] + 1 / rate), integral)) / part.dt
+        )
+        np.testing.assert_allclose(part.commands[:, 0], means, atol=1e-6)
+        assert part.resolution == pytest.approx(late / 3**0.5)
+
+
+def test_filters_of_firmware_have_the_delay_of_a_digital_clock():
+    for cutoff in (30.0, 80.0):
+        _, delay = group_delay(butter(2, cutoff, fs=1000.0), [1e-3])
+        assert filter_delay(cutoff, 1e-3) == pytest.approx(delay[0] / 1000, rel=1e-4)
+        assert filter_delay(cutoff, 0.0) == pytest.approx(2**0.5 / (2 * np.pi * cutoff))
+
+
+def test_a_radius_of_gyration_that_is_not_usual_is_said(result):
+    assert _check_size(LAYOUT, result.estimates) == ""
+    half = LAYOUT._replace(positions=LAYOUT.positions / 2.5)
+    sentence = _check_size(half, result.estimates)
+    assert re.search(
+        r"about roll is 1\.4 of the mean arm of 0\.0113 m, where 0\.3 to 1\.3 is", sentence
+    )
 
 
 @pytest.mark.parametrize(

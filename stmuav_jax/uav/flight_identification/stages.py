@@ -71,8 +71,9 @@ _DETERMINED = 0.1
 _COMBINED = 0.04
 # Deviations from which a response about yaw has a clear sign.
 _CLEAR = 5.0
-# Deviations up to which the IMU's position [m], and the drag as a share of it, are determined.
-_IMU_DETERMINED, _DRAG_DETERMINED = 0.005, 0.5
+# Deviations up to which the IMU's position [m] and the drag over mass [1/s] are determined. A bound as a share of the
+# drag that was found would keep those that came out too large.
+_IMU_DETERMINED, _DRAG_DETERMINED = 0.005, 0.2
 # Deviation of the voltage's exponent up to which it is determined, and range of the voltage from which it is sought.
 _EXPONENT_DETERMINED, _STEADY = 0.25, 0.01
 # Deviation of the curve's quadratic part up to which it is determined, as a share of the slope.
@@ -93,8 +94,10 @@ _OTHER_PACE = 2.0
 _DRAG, _PASSES = 0.4, 6
 # Share of the thrust that carries the vehicle below which it does not fly.
 _CARRYING = 0.3
-# Radii of gyration of multirotors over their mean arms.
-_GYRATION = (0.1, 5.0)
+# Radii of gyration of multirotors over their mean arms: possible and usual ones.
+_GYRATION, _USUAL = (0.1, 5.0), (0.3, 1.3)
+# Mean specific force along the vertical in flight [m/s^2], change of the speed along it, and largest speed [m/s].
+_VERTICAL, _SPEED_CHANGE, _FASTEST = (9.4, 10.2), 2.0, 300.0
 # Level of the verdict and of variants that the record rejects.
 _LEVEL = 0.01
 # Lowest rate of commands [Hz].
@@ -469,7 +472,13 @@ def _observe_signals(
 
     def observe(imu: np.ndarray, drag: np.ndarray, pace: float = 1.0) -> _Signals:
         force = record.accelerometer - levers @ imu
-        return _Signals(record, layout, force, *observe_motion(record, force, drag, pace))
+        signals = _Signals(record, layout, force, *observe_motion(record, force, drag, pace))
+        if not np.all(np.abs(signals.velocity) < _FASTEST):
+            raise SettingError(
+                f"By gyroscope and accelerometer the vehicle would exceed {_FASTEST:g} m/s: are their units rad/s and "
+                "m/s^2?"
+            )
+        return signals
 
     # Drag and lever are found from the velocity, which is observed with drag and lever: a few
     # passes agree, since either depends little on the other.
@@ -485,6 +494,43 @@ def _observe_signals(
     signals = observe(imu, drag)
     spread = np.sqrt(np.diag(fit.compute_covariance(_BLOCK))[3:5])
     return signals, observe(imu, drag, _OTHER_PACE), observe(imu, drag + spread)
+
+
+def _check_gravity(signals: _Signals) -> None:
+    """Refuse a specific force that on average is not gravity along the vertical which the gyroscope carries on."""
+    record = signals.record
+    along = float(np.mean(np.sum(record.accelerometer * -signals.gravity, axis=1))) / GRAVITY
+    # The observer counts the mean horizontal force as a bias. It may be a tilt in wind instead.
+    most = float(np.hypot(along, np.linalg.norm(np.mean(record.accelerometer[:, :2], axis=0))))
+    low, high = _VERTICAL
+    change = _SPEED_CHANGE / float(record.ts[-1] - record.ts[0])
+    if not (most >= low - change and along <= high + change):
+        raise SettingError(
+            f"The accelerometer measures {along:.3g} m/s^2 on average along the vertical that the gyroscope tells; "
+            f"{low - change:.3g} to {high + change:.3g} m/s^2 would be valid: is the unit or the scale of the "
+            "gyroscope or of the accelerometer another?"
+        )
+
+
+def _double_noise(record: FlightRecord) -> FlightRecord:
+    """Record with as much noise again in the gyroscope as it has.
+
+    Noise of the regressors that are made of it draws their coefficients towards zero; what more noise changes is by how
+    much. Source: J. R. Cook, L. A. Stefanski, Journal of the American Statistical Association 89 (1994) 1314-1328.
+    """
+    cutoff, count = record.cutoffs[0], len(record.ts)
+    # White noise is all that is left above the vehicle's motions and where the filter has not yet taken it away.
+    # Medians do not see the lines of vibrations.
+    highest = min(0.45 / record.dt, 1.5 * cutoff)
+    frequencies = np.fft.rfftfreq(count, record.dt)
+    band = (frequencies > highest / 1.5) & (frequencies < highest)
+    rates = record.gyroscope * np.hanning(count)[:, None]
+    power = np.abs(np.fft.rfft(rates, axis=0))[band] ** 2 * (8 / 3) / count
+    power *= 1 + (frequencies[band, None] / cutoff) ** 4
+    size = np.sqrt(np.median(power, axis=0) / np.log(2))
+    noise = np.random.default_rng(0).normal(size=(count, 3)) * size
+    b, a = low_pass(cutoff, record.dt)
+    return record._replace(gyroscope=record.gyroscope + filter_columns(b, a, noise))
 
 
 def _window_count(record: FlightRecord) -> int:
@@ -599,11 +645,13 @@ def identify_flight(
     # Forces come first: they give the lever of the IMU and the drag, without which the moments'
     # regression lacks the velocity.
     signals, faster, shifted = _observe_signals(record, layout)
+    _check_gravity(signals)
     other = [] if further is None else [signals._replace(record=further)]
     report(0.2)
     hover = float(np.mean(record.commands))
+    noisy = signals._replace(record=_double_noise(record))
     translation = _identify_translation(
-        signals, [faster, shifted, *other], hover, estimates, refusals
+        signals, [faster, shifted, noisy, *other], hover, estimates, refusals
     )
     report(0.35)
     axes = _screen_axes(signals, refusals)
@@ -615,7 +663,7 @@ def identify_flight(
     if {"roll", "pitch"} <= set(estimates):
         _identify_free_centre(signals, estimates)
     report(1.0)
-    _check_size(layout, estimates)
+    size = _check_size(layout, estimates)
     if layout.mass is not None:
         _scale_by_mass(layout, estimates, refusals)
     else:
@@ -623,6 +671,7 @@ def identify_flight(
             "Masses, forces and inertias: the log determines ratios only; give the mass for SI values."
         )
     verdict = _judge_estimates(signals, rotation, translation.fit, estimates)
+    verdict = verdict._replace(explanation=verdict.explanation + size)
     fits = (rotation.fit if rotation else None, translation.fit)
     return FlightIdentification(estimates, refusals, verdict, layout, *fits, hover)
 
@@ -1014,10 +1063,11 @@ def _identify_translation(
             estimates[f"imu_{letter}"] = position
     for k, letter in enumerate("xyz"):
         drag = evaluation.estimate(f"drag over mass, {letter}", "1/s", lambda z, k=k: z[3 + k])
-        if not drag.deviation <= _DRAG_DETERMINED * drag.value:
+        if not drag.deviation <= _DRAG_DETERMINED or drag.value < -2 * drag.deviation:
             refusals[f"drag_{letter}"] = (
                 f"The drag along {letter} is not determined: it is {drag.value:.2g} 1/s with a deviation of "
-                f"{drag.deviation:.2g} 1/s; a positive one of twice its deviation or more would be valid."
+                f"{drag.deviation:.2g} 1/s; one that is not negative, with {_DRAG_DETERMINED:g} 1/s or less, would be "
+                "valid."
             )
         else:
             estimates[f"drag_{letter}"] = drag
@@ -1160,8 +1210,13 @@ def _identify_free_centre(signals: _Signals, estimates: dict[str, ParameterEstim
         )  # fmt: skip
 
 
-def _check_size(layout: RotorLayout, estimates: dict[str, ParameterEstimate]) -> None:
-    """Refuse arms that no radius of gyration fits, J / m = (T / m) l / B."""
+def _check_size(layout: RotorLayout, estimates: dict[str, ParameterEstimate]) -> str:
+    """Sentence after a blank on arms that no usual radius of gyration fits, J / m = (T / m) l / B.
+
+    Raises:
+        SettingError: none that is possible does.
+    """
+    sentence = ""
     for axis, arm in enumerate(layout.arms):
         if "thrust" in estimates and AXES[axis] in estimates:
             ratio = estimates["thrust"].value * arm / estimates[AXES[axis]].value
@@ -1171,6 +1226,12 @@ def _check_size(layout: RotorLayout, estimates: dict[str, ParameterEstimate]) ->
                     f"The radius of gyration about {AXES[axis]} would be {share:.2g} of the mean arm of {arm:.3g} m; "
                     f"{_GYRATION[0]:g} to {_GYRATION[1]:g} of it would be valid: are the positions in m?"
                 )
+            if not _USUAL[0] < share < _USUAL[1]:
+                sentence += (
+                    f" The radius of gyration about {AXES[axis]} is {share:.2g} of the mean arm of {arm:.3g} m, where "
+                    f"{_USUAL[0]:g} to {_USUAL[1]:g} is usual: are the gyroscope's scale and the positions right?"
+                )
+    return sentence
 
 
 def _scale_by_mass(
