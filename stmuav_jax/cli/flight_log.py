@@ -55,6 +55,7 @@ def is_log(arguments: Sequence[str]) -> bool:
 def run_identify_log(command: Any) -> int:
     """Run the command; return the exit code."""
     from ..io.flight_log import read_flight_log, read_rotor_layout
+    from ..io.netcdf import read_toml
     from ..uav.flight_identification.stages import identify_flight
 
     out = Console()
@@ -71,6 +72,14 @@ def run_identify_log(command: Any) -> int:
         print_line(out, note)
     record = log.to_record(command.flight)
     layout = log.to_layout() if command.airframe is None else read_rotor_layout(command.airframe)
+    if command.airframe is not None and "thrust_model_factor" not in read_toml(command.airframe):
+        setting = log.settings.get("thrust_model_factor")
+        if setting is not None:
+            layout = layout._replace(thrust_model_factor=setting.value)
+        source = (
+            "it is not given" if setting is None else f"only the log gives it ({setting.source})"
+        )
+        print_line(out, f"The thrust model factor is {layout.thrust_model_factor:g}, as {source}.")
     if command.mass is not None:
         if not 0 < command.mass < float("inf"):
             raise SettingError(f"The mass must be positive, but it is {command.mass:g} kg.")

@@ -98,9 +98,9 @@ def _list_pairs(channels: Mapping[str, Any], grid: np.ndarray) -> Iterator[_Pair
         )
     if attitude and "accelerometer" in channels:
         force = channels["accelerometer"]
-        near = np.clip(np.searchsorted(attitude.ts, force.ts), 0, len(attitude.ts) - 1)
+        nearest = np.clip(np.searchsorted(attitude.ts, force.ts), 0, len(attitude.ts) - 1)
         # changes are compared less their median, to which gravity adds
-        speed = _integrate(grid, force.ts, turns[near].apply(force.values))
+        speed = _integrate(grid, force.ts, turns[nearest].apply(force.values))
         if "velocity" in channels:
             pair = (curves("velocity"), speed)
             yield _Pair("velocity", "accelerometer", pair, 0.3, "m/s^2", False)
@@ -126,17 +126,17 @@ def _compare_curves(pair: _Pair) -> str:
     if not len(active) or np.any(sizes == 0):
         return ""
     alike = (y.T @ x) / len(y) / np.outer(*sizes)
-    own = np.diag(alike)[active]
+    diagonal = np.diag(alike)[active]
     names = ", ".join(XYZ[k] for k in active)
     change = {"attitude": "turns", "position": "moves", "velocity": "changes"}[pair.first]
     side = "about" if pair.first == "attitude" else "along"
     fault = lambda sentence: f"The {pair.first} {change} {side} {names} {sentence}"
-    if np.any(own < _ALIKE):
+    if np.any(diagonal < _ALIKE):
         order, best = max(
             ((order, np.abs(alike[active, np.array(order)[active]])) for order in permutations(range(3))),
             key=lambda match: np.sum(match[1]),
         )  # fmt: skip
-        if np.sum(best) - np.sum(own) > _BETTER * len(active) and np.min(best) > _ALIKE:
+        if np.sum(best) - np.sum(diagonal) > _BETTER * len(active) and np.min(best) > _ALIKE:
             signed = ", ".join(
                 f"{'-' if alike[k, order[k]] < 0 else ''}{XYZ[order[k]]}" for k in active
             )
@@ -146,7 +146,7 @@ def _compare_curves(pair: _Pair) -> str:
             )
     # Heading and height are the worst of an estimator's: where both others agree, they are right.
     clear = (active < 2) & (np.min(sizes, axis=0)[active] > pair.least)
-    if np.any(own[clear] < _UNLIKE):
+    if np.any(diagonal[clear] < _UNLIKE):
         shift = _find_shift(y[:, active], x[:, active])
         if shift is not None:
             return fault(
@@ -154,11 +154,11 @@ def _compare_curves(pair: _Pair) -> str:
                 "for both would be valid."
             )
         return fault(
-            f"not as the {pair.second} measures (correlation {np.min(own[clear]):.2f}; {_ALIKE:g} would be valid): "
-            "unit, order or signs of one's columns are wrong."
+            f"not as the {pair.second} measures (correlation {np.min(diagonal[clear]):.2f}; {_ALIKE:g} would be "
+            "valid): unit, order or signs of one's columns are wrong."
         )
     factor = np.mean(y[:, active] * x[:, active], axis=0) / np.mean(x[:, active] ** 2, axis=0)
-    wrong = (own > _ALIKE) & ((factor < _FACTORS[0]) | (factor > _FACTORS[1]))
+    wrong = (diagonal > _ALIKE) & ((factor < _FACTORS[0]) | (factor > _FACTORS[1]))
     if not np.any(wrong):
         return ""
     names = ", ".join(XYZ[k] for k in active[wrong])
@@ -215,9 +215,9 @@ def _compare_commands(channels: Mapping[str, Any], grid: np.ndarray) -> str:
         explained.append(np.einsum("il,ij,jl->l", c, inverse, c) * overlap**2)
     share = np.max(explained, axis=0)
     times = lags * _STEP
-    near = (times >= _NO_SHIFT[0]) & (times <= _NO_SHIFT[1])
-    k = int(np.argmax(np.where(near, 0.0, share)))
-    if not share[k] > max(_EXPLAINED, _MORE * np.max(share[near])):
+    in_time = (times >= _NO_SHIFT[0]) & (times <= _NO_SHIFT[1])
+    k = int(np.argmax(np.where(in_time, 0.0, share)))
+    if not share[k] > max(_EXPLAINED, _MORE * np.max(share[in_time])):
         return ""
     return (
         f"The IMU feels {motors} {abs(times[k]):.1f} s {'after' if times[k] > 0 else 'before'} their time stamps; "

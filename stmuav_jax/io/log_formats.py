@@ -228,6 +228,7 @@ def _decode_ulog(source: Path, data: bytes) -> LogDraft:
     # the cut-off.
     draft.set_cutoffs(parameters, filtered)
     draft.set_factor(parameters, "THR_MDL_FAC")
+    # Source: PX4-Autopilot, msg/VehicleStatus.msg (ARMING_STATE_ARMED).
     for switch, topic, name, on in (
         ("armed", "vehicle_status", "arming_state", 2),
         ("armed", "actuator_armed", "armed", 1),

@@ -499,14 +499,14 @@ def _observe_signals(
 def _check_gravity(signals: _Signals) -> None:
     """Refuse a specific force that on average is not gravity along the vertical which the gyroscope carries on."""
     record = signals.record
-    along = float(np.mean(np.sum(record.accelerometer * -signals.gravity, axis=1))) / GRAVITY
+    vertical = float(np.mean(np.sum(signals.force * -signals.gravity, axis=1))) / GRAVITY
     # The observer counts the mean horizontal force as a bias. It may be a tilt in wind instead.
-    most = float(np.hypot(along, np.linalg.norm(np.mean(record.accelerometer[:, :2], axis=0))))
+    most = float(np.hypot(vertical, np.linalg.norm(np.mean(signals.force[:, :2], axis=0))))
     low, high = _VERTICAL
     change = _SPEED_CHANGE / float(record.ts[-1] - record.ts[0])
-    if not (most >= low - change and along <= high + change):
+    if not (most >= low - change and vertical <= high + change):
         raise SettingError(
-            f"The accelerometer measures {along:.3g} m/s^2 on average along the vertical that the gyroscope tells; "
+            f"The accelerometer measures {vertical:.3g} m/s^2 on average along the vertical that the gyroscope tells; "
             f"{low - change:.3g} to {high + change:.3g} m/s^2 would be valid: is the unit or the scale of the "
             "gyroscope or of the accelerometer another?"
         )
@@ -951,6 +951,13 @@ def _identify_rotation(
                 refusals["lag"] = (
                     f"The lag is not determined: it ends at the bound of {1e3 * fit.values[-2]:g} ms; rotor speeds "
                     "that were measured have none."
+                )
+            elif not fit.free[-1]:
+                del new["delay"]
+                refusals["delay"] = (
+                    f"The delay is not determined: it ends at the bound of {1e3 * fit.values[-1]:g} ms. Time "
+                    "stamps of the commands that are late or early against the gyroscope's would bias lag and "
+                    "effectiveness too."
                 )
             estimates |= new
             return evaluation
