@@ -90,7 +90,13 @@ def simulate_flights(seeds, length=40.0, truth=None, settings=(80.0, 30.0)):
     has_voltage = truth.discharge > 0 or truth.dip > 0
     return [
         FlightRecord(
-            ts, commands, gyroscope, accelerometer, 4.0 * volts if has_voltage else None, settings
+            ts,
+            commands,
+            gyroscope,
+            accelerometer,
+            4.0 * volts if has_voltage else None,
+            settings,
+            filter_rate=1 / DT,
         )
         for commands, gyroscope, accelerometer, volts in zip(
             *map(pick, (u, w, f, ratio)), strict=True

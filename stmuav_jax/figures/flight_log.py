@@ -141,7 +141,7 @@ def _predict_force(record: FlightRecord, result: FlightIdentification) -> np.nda
         weight = GRAVITY / float(np.mean(np.sum(shape, axis=1)))
         force = (e["thrust"].value if "thrust" in e else weight) * shape
     total = np.sum(force, axis=1)
-    b, a = low_pass(record.cutoffs[1], record.dt)
+    b, a = low_pass(record.cutoffs[1], record.dt, record.filter_step)
     # the level holds the offset of the curve and the accelerometer's bias
     return apply_filter(b, a, total - np.mean(total) + np.mean(record.accelerometer[:, 2]))
 
@@ -166,7 +166,7 @@ def draw_response(subject: IdentifiedFlight) -> Figure | None:
     shape = compute_thrust_shape(record.commands, layout.thrust_model_factor)
     size = min(round(_SEGMENT / record.dt), len(record.ts))
     settings = {"fs": 1 / record.dt, "nperseg": size}
-    b, a = low_pass(record.cutoffs[0], record.dt)
+    b, a = low_pass(record.cutoffs[0], record.dt, record.filter_step)
     for column, axis in enumerate(axes_of):
         u, y = shape @ sides[axis], np.gradient(record.gyroscope[:, axis], record.dt)
         # Spectra averaged over segments suppress the noise of the gyroscope, which a quotient of

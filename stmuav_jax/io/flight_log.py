@@ -119,8 +119,9 @@ class FlightLog:
         flights: start and end (n, 2) [s] of each stretch in flight. A crash is cut off.
         gaps: stretches without samples.
         settings: `gyroscope_cutoff` and `accelerometer_cutoff` [Hz] of low-pass filters that the
-            channels went through, `rotor_positions` (n, 3) [m], `rotor_spin` (n,) as in `Rotors`, and
-            `thrust_model_factor` f of thrust f u^2 + (1 - f) u; those that are known.
+            channels went through, `filter_rate` [Hz] of the filters' clock, `rotor_positions` (n, 3) [m],
+            `rotor_spin` (n,) as in `Rotors`, and `thrust_model_factor` f of thrust f u^2 + (1 - f) u; those
+            that are known.
         notes: sentences on what was read, cut or is doubtful, and on what counts in place of missing settings.
         refusals: sentences, which are among the notes, why no multirotor can be identified.
         is_simulated: true if the file says that a simulator wrote it.
@@ -297,6 +298,8 @@ class FlightLog:
             float(self.settings[key].value) if key in self.settings else np.inf
             for key in ("gyroscope_cutoff", "accelerometer_cutoff")
         )
+        setting = self.settings.get("filter_rate")
+        filter_rate = None if setting is None else float(setting.value)
         voltage = columns["battery_voltage"][inside, 0] if "battery_voltage" in columns else None
         commands, gyroscope, accelerometer = (columns[name][inside] for name in names)
         if motors == "rotor_speeds":
@@ -305,7 +308,9 @@ class FlightLog:
             commands = (commands + after) / (2 * np.max(self[motors].values))
             voltage = None
         channels = (commands, gyroscope, accelerometer, voltage)
-        return FlightRecord(ts[inside], *channels, (cutoffs[0], cutoffs[1]), resolution)
+        return FlightRecord(
+            ts[inside], *channels, (cutoffs[0], cutoffs[1]), resolution, filter_rate
+        )
 
     def to_layout(self, mass: float | int | None = None) -> RotorLayout:
         """Layout of the rotors that the vehicle's parameters give.

@@ -737,6 +737,7 @@ def _decode_crazyflie(source: Path, data: bytes) -> LogDraft:
         # the rates of stateEstimateZ are those of the same filtered gyroscope
         if used and used.fields[0] in ("acc.x", "gyro.x", "stateEstimateZ.rateRoll"):
             draft.settings[f"{channel}_cutoff"] = LogSetting(cutoff, "Hz", _CHIP)
+            draft.settings["filter_rate"] = LogSetting(1000.0, "Hz", _CHIP)
     return draft
 
 
@@ -782,7 +783,7 @@ class _ColumnMap(Entries):
 
 
 _SETTING_UNITS = {
-    "gyroscope_cutoff": "Hz", "accelerometer_cutoff": "Hz", "thrust_model_factor": "1",
+    "gyroscope_cutoff": "Hz", "accelerometer_cutoff": "Hz", "filter_rate": "Hz", "thrust_model_factor": "1",
     "rotor_positions": "m", "rotor_spin": "1",
 }  # fmt: skip
 
@@ -895,6 +896,8 @@ def _map_setting(name: str, value: Any) -> Any:
     if not good:
         kind = ("a number", "a list of numbers", "a list of points [x, y, z]")[shape]
         raise SettingError(f"The setting {name} must be {kind}, but it is {format_value(value)}.")
+    if _SETTING_UNITS[name] == "Hz" and not numbers > 0:
+        raise SettingError(f"The setting {name} must be positive, but it is {numbers:g} Hz.")
     return numbers if shape else float(numbers)
 
 

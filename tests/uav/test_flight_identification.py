@@ -182,6 +182,14 @@ def test_voltage_and_commands_that_change_together_are_not_told_apart():
 
 
 @pytest.mark.slow
+def test_commands_with_stamps_that_are_late_are_said(record):
+    early = record._replace(commands=np.roll(record.commands, 10, axis=0))
+    result = identify_flight(early.between(1.0, 24.0), LAYOUT)
+    assert "ends at the bound of 0 ms" in result.refusals["delay"]
+    assert "delay" not in result.estimates
+
+
+@pytest.mark.slow
 def test_measured_rotor_speeds_take_the_place_of_commands(record, tmp_path):
     """Speeds that follow the commands with the true lag: effectiveness by shares of the highest one, and no lag."""
     s = compute_rotor_states(record.commands, record.dt, TRUTH.tau, TRUTH.delay)

@@ -129,6 +129,7 @@ class FlightRecord(NamedTuple):
         voltage: of the battery (k,) [V], None if it is not known.
         cutoffs: of the two-pole low-pass filters of gyroscope and accelerometer [Hz]; infinite for none.
         resolution: standard deviation of the times at which commands changed [s].
+        filter_rate: of the clock of the low-pass filters [Hz], None if unknown.
     """
 
     ts: Float[np.ndarray, " k"]
@@ -138,6 +139,12 @@ class FlightRecord(NamedTuple):
     voltage: Float[np.ndarray, " k"] | None = None
     cutoffs: tuple[float, float] = (np.inf, np.inf)
     resolution: float = 0.0
+    filter_rate: float | None = None
+
+    @property
+    def filter_step(self) -> float:
+        """Step of the clock of the low-pass filters [s]; if unknown, half of the grid's, which is no faster."""
+        return 0.5 * self.dt if self.filter_rate is None else 1 / self.filter_rate
 
     @property
     def dt(self) -> float:
@@ -157,7 +164,7 @@ class FlightRecord(NamedTuple):
         voltage = None if self.voltage is None else self.voltage[inside]
         return FlightRecord(
             self.ts[inside], self.commands[inside], self.gyroscope[inside], self.accelerometer[inside],
-            voltage, self.cutoffs, self.resolution,
+            voltage, self.cutoffs, self.resolution, self.filter_rate,
         )  # fmt: skip
 
 
@@ -193,14 +200,14 @@ def filter_columns(
     return np.asarray(lfilter(b, a, values, axis=0))
 
 
-def low_pass(cutoff: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
+def low_pass(cutoff: float, dt: float, step: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Numerator and denominator of a two-pole low-pass filter; 1 and 1 without a cutoff.
 
-    The filter is a digital one of at least twice the grid's rate, which meets its cutoff exactly.
+    A filter of a digital clock's step meets its cutoff exactly, which shortens its delay; zero is continuous time.
     """
     if not np.isfinite(cutoff):
         return np.ones(1), np.ones(1)
-    poles = butter(2, np.sqrt(2) / filter_delay(cutoff, 0.5 * dt), analog=True, output="ba")
+    poles = butter(2, np.sqrt(2) / filter_delay(cutoff, step), analog=True, output="ba")
     numerator, denominator = bilinear(*poles, fs=1 / dt)  # pyright: ignore
     return np.asarray(numerator), np.asarray(denominator)
 
@@ -227,7 +234,9 @@ def refilter_rates(
     record: FlightRecord, values: Float[np.ndarray, "k n"]
 ) -> Float[np.ndarray, "k n"]:
     """Readings of the gyroscope, or values made of them, through the accelerometer's filter instead of its own."""
-    (bg, ag), (bf, af) = (low_pass(cutoff, record.dt) for cutoff in record.cutoffs)
+    (bg, ag), (bf, af) = (
+        low_pass(cutoff, record.dt, record.filter_step) for cutoff in record.cutoffs
+    )
     # The numerators of two-pole filters have the same zeros, so their quotient is a number. Zeros
     # of a gyroscope's filter alone cannot be divided by; its gain is.
     b = ag * (bf[0] / bg[0]) if len(bg) == len(bf) else np.convolve(bf, ag) / np.sum(bg)

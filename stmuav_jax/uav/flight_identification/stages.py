@@ -229,7 +229,7 @@ def _rotation_regression(
     change[[0, -1]] = 1, -1
     w = record.gyroscope
     y = filter_columns(np.convolve(box, change) / (n * dt), [1.0], w)[first::n]
-    b, a = low_pass(record.cutoffs[0], dt)
+    b, a = low_pass(record.cutoffs[0], dt, record.filter_step)
     # integrals over a step by the trapezoidal rule, and of a derivative exactly
     integral, derivative = (
         np.convolve(b, np.convolve(boxes, x)) for x in ([0.5, 0.5], [1 / dt, -1 / dt])
@@ -309,7 +309,7 @@ def _integrate_relation(record: FlightRecord, n: int, values: np.ndarray) -> np.
 
 def _thrust_columns(record: FlightRecord, n: int, thrust: np.ndarray) -> np.ndarray:
     """Terms that thrusts (k, m) over mass add to the relation of the forces along z, as the accelerometer reads it."""
-    b, a = low_pass(record.cutoffs[1], record.dt)
+    b, a = low_pass(record.cutoffs[1], record.dt, record.filter_step)
     difference = np.array([1.0, -1.0]) / record.dt
     return _integrate_relation(record, n, apply_filter(np.convolve(b, difference), a, thrust))
 
@@ -529,7 +529,7 @@ def _double_noise(record: FlightRecord) -> FlightRecord:
     power *= 1 + (frequencies[band, None] / cutoff) ** 4
     size = np.sqrt(np.median(power, axis=0) / np.log(2))
     noise = np.random.default_rng(0).normal(size=(count, 3)) * size
-    b, a = low_pass(cutoff, record.dt)
+    b, a = low_pass(cutoff, record.dt, record.filter_step)
     return record._replace(gyroscope=record.gyroscope + filter_columns(b, a, noise))
 
 
@@ -985,8 +985,8 @@ def _fit_rotation(
 def _add_resolution(delay: ParameterEstimate, record: FlightRecord) -> ParameterEstimate:
     """Estimate whose deviation allows for the times at which commands changed and for the clock of on-board filters."""
     cutoff, clock = record.cutoffs[0], 0.0
-    if np.isfinite(cutoff):
-        # A filter runs at the grid's rate or a higher one, up to continuous time; which, no log tells.
+    if np.isfinite(cutoff) and record.filter_rate is None:
+        # The filter runs at the grid's rate or a higher one, up to continuous time.
         clock = filter_delay(cutoff, 0.0) - filter_delay(cutoff, 0.5 * record.dt)
     parts = (
         np.linalg.norm([x, record.resolution, clock]) for x in (delay.deviation, delay.variants)
@@ -1361,7 +1361,7 @@ def _test_terms(
     sides = np.column_stack(
         [levers[:, 1] / layout.arms[0], -levers[:, 0] / layout.arms[1], -layout.spin]
     )
-    b, a = low_pass(record.cutoffs[0], dt)
+    b, a = low_pass(record.cutoffs[0], dt, record.filter_step)
     b = np.convolve(b, [0.5, 0.5])
     effectiveness = np.array([estimates[AXES[axis]].value for axis in axes])
     time = ((record.ts - record.ts[0]) / (record.ts[-1] - record.ts[0]) - 0.5)[:, None]
