@@ -714,6 +714,7 @@ def test_other_files_are_refused_in_words(content, words, tmp_path):
         ({"motor_commands": {"columns": ["m"], "range": [5, 5]}}, "two different ends"),
         ({"settings": {"gyroscope_cutof": 80}}, "gyroscope_cutoff"),
         ({"settings": {"gyroscope_cutoff": "80 Hz"}}, "must be a number"),
+        ({"settings": {"gyroscope_cutoff": 0}}, "must be positive, but it is 0 Hz"),
     ],
 )
 def test_maps_that_do_not_fit_are_refused_in_words(change, words, tmp_path):

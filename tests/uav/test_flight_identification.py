@@ -183,10 +183,13 @@ def test_voltage_and_commands_that_change_together_are_not_told_apart():
 
 @pytest.mark.slow
 def test_commands_with_stamps_that_are_late_are_said(record):
-    early = record._replace(commands=np.roll(record.commands, 10, axis=0))
-    result = identify_flight(early.between(1.0, 24.0), LAYOUT)
+    """By 8 ms, twice the delay."""
+    shifted = record._replace(commands=np.roll(record.commands, 4, axis=0))
+    result = identify_flight(shifted.between(1.0, 24.0), LAYOUT)
     assert "ends at the bound of 0 ms" in result.refusals["delay"]
     assert "delay" not in result.estimates
+    assert result.verdict.status == "inconsistent"
+    assert "their time stamps differ" in result.verdict.explanation
 
 
 @pytest.mark.slow
@@ -596,7 +599,9 @@ def test_rates_pass_through_the_filter_of_the_forces(cutoffs):
     record = FlightRecord(
         ts, np.zeros((500, 4)), np.zeros((500, 3)), np.zeros((500, 3)), None, cutoffs
     )
-    by_gyroscope, by_force = (apply_filter(*low_pass(f, 0.002), ts[:, None] + 1.0) for f in cutoffs)
+    by_gyroscope, by_force = (
+        apply_filter(*low_pass(f, 0.002, record.filter_step), ts[:, None] + 1.0) for f in cutoffs
+    )
     late = by_force[-1, 0] - refilter_rates(record, by_gyroscope)[-1, 0]
     assert late == pytest.approx(0.002 if cutoffs == (80, np.inf) else 0.0, abs=1e-9)
 

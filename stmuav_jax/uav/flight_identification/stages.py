@@ -770,7 +770,8 @@ def _screen_axes(signals: _Signals, refusals: dict[str, str]) -> list[int]:
         if effect < _EXCITED:
             refusals[name] = (
                 f"{name.capitalize()} is not excited: the commands cause {effect:.2g} times what nobody "
-                f"commands; {_EXCITED:g} times or more would be valid (a manoeuvre about this axis)."
+                f"commands; {_EXCITED:g} times or more would be valid (a manoeuvre about this axis, and one clock for "
+                "commands and gyroscope)."
             )
             continue
         axes.append(axis)
@@ -1318,6 +1319,12 @@ def _judge_estimates(
             p_values[name] = p_value
             if p_value < _LEVEL:
                 sentences.append(sentence)
+        if rotation.fit.free[-2] and not rotation.fit.free[-1]:
+            p_values["delay"] = _test_bound(rotation.fit)
+            if p_values["delay"] < _LEVEL:
+                sentences.append(
+                    "The gyroscope follows the commands best with a delay beyond its bound: their time stamps differ."
+                )
         p_values["whiteness"] = _test_whiteness(rotation.fit)
         if p_values["whiteness"] < _LEVEL / 6:
             sentences.append("Prediction errors are correlated in time; blocks allow for it.")
@@ -1416,6 +1423,15 @@ def _test_terms(
         p = float(stats.norm.sf(share * np.sqrt(np.sum(weights))))
         results[name] = (p, sentence.format(share))
     return results
+
+
+def _test_bound(fit: PredictionErrorFit) -> float:
+    """P-value of the score of the last value, which ended at a bound."""
+    J = fit.slopes.reshape(-1, len(fit.values))
+    free = J[:, fit.free]
+    scale = np.linalg.norm(free, axis=0)
+    column = J[:, -1] - free @ (np.linalg.lstsq(free / scale, J[:, -1], rcond=None)[0] / scale)
+    return float(stats.norm.sf(abs(column @ fit.errors.ravel()) / np.linalg.norm(column)))
 
 
 def _test_whiteness(fit: PredictionErrorFit, share: float = 1.0) -> float:
