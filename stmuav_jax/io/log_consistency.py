@@ -85,8 +85,8 @@ def _list_pairs(channels: Mapping[str, Any], grid: np.ndarray) -> Iterator[_Pair
     curves = lambda name: _interpolate(grid, channels[name].ts, channels[name].values)
     integral = lambda name: _integrate(grid, channels[name].ts, channels[name].values)
     attitude = channels.get("attitude")
-    turns = attitude and Rotation.from_quat(attitude.values, scalar_first=True)
-    if attitude and "gyroscope" in channels:
+    turns = None if attitude is None else Rotation.from_quat(attitude.values, scalar_first=True)
+    if attitude is not None and turns is not None and "gyroscope" in channels:
         # The sum of small turns in body axes is the integral of the rates: a wrong factor stays one, however large.
         steps = np.zeros((len(attitude.ts), 3))
         steps[1:] = (turns[:-1].inv() * turns[1:]).as_rotvec()
@@ -96,7 +96,7 @@ def _list_pairs(channels: Mapping[str, Any], grid: np.ndarray) -> Iterator[_Pair
         yield _Pair(
             "position", "velocity", (curves("position"), integral("velocity")), 0.1, "m", False
         )
-    if attitude and "accelerometer" in channels:
+    if attitude is not None and turns is not None and "accelerometer" in channels:
         force = channels["accelerometer"]
         nearest = np.clip(np.searchsorted(attitude.ts, force.ts), 0, len(attitude.ts) - 1)
         # changes are compared less their median, to which gravity adds
