@@ -38,7 +38,7 @@ from .motor import MotorRotors
 from .rotor import Rotors
 from .tracker.bodies import LinearActuator, place_on_base
 from .tracker.geometry import TrackerGeometry, turn_by_angles
-from .tracker.kinematics import RISING, Reason, panel_angles
+from .tracker.kinematics import Reason, panel_angles
 from .tracker.workspace import Limits, measure, reasons, survey, why_outside
 
 PANEL_COORDINATES = ("U47.angle_1", "U47.angle_2")
@@ -336,7 +336,7 @@ def _trim_flight(uav: Uav, condition: FlightCondition, limits: TrimLimits) -> Fl
     values, speeds = trim.values, sharp_sqrt(squared)
     lower, upper = (0.0, jnp.inf) if limits.rotors is None else limits.rotors.squared(count)
     assert limits.workspace is not None
-    strokes, margins, _ = measure(uav.geometry, limits.workspace, turn_by_angles(angles), RISING)
+    strokes, margins, _ = measure(uav.geometry, limits.workspace, turn_by_angles(angles))
     # the posture exists if the rods reach and the sliders hold the panel
     is_held = margins.parallel + limits.workspace.margin > 0
     outside = reasons(margins)
