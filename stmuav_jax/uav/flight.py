@@ -12,7 +12,6 @@ implicit function.
 """
 
 from collections.abc import Callable, Mapping
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..analysis.equilibrium import TOLERANCE, FlightCondition, trim_condition
-from ..checks.errors import ModelError, StateError, first_reason, has_values
+from ..checks.errors import AbstractReason, ModelError, StateError, first_reason, has_values
 from ..checks.numbers import as_floats
 from ..checks.shapes import Numbers
 from ..dynamics.actuation import mechanism_weight
@@ -165,7 +164,7 @@ def _panel_angles(uav: Uav, x: TreePoint) -> Float[Array, "2"]:
     return panel_angles(R_wb.T @ R_wp[:, 2])
 
 
-class TrimReason(IntEnum):
+class TrimReason(AbstractReason):
     """Reason for which there is no trim; the first that applies."""
 
     VALID = 0
