@@ -491,9 +491,9 @@ def test_table_and_figures(day):
     [
         (None, "There is no file"),
         ("time,roll\n0,1\n", "must begin with"),
-        ("t,roll,pitch,yaw\n0,1,2\n", "four numbers"),
+        ("t,roll,pitch,yaw\n0,1,2\n", "3 cells"),
         ("t,roll,pitch,yaw\n0,1,2,3\n0,1,2,3\n", "times that increase"),
-        ("t,roll,pitch,yaw\n", "times that increase"),
+        ("t,roll,pitch,yaw\n", "no rows"),
     ],
 )
 def test_attitude_files_that_cannot_be_used(text, words, tmp_path):
