@@ -105,7 +105,9 @@ def path_nees(filtered: Any, truth: Point, space: AbstractSpace) -> Float[Array,
     return jnp.where(filtered.ok, jnp.moveaxis(nees_values, -1, 0), jnp.inf)
 
 
-def mean_interval(degrees: int, count: int = 1, level: float = 0.999) -> tuple[float, float]:
+def mean_interval(
+    degrees: int | float, count: int = 1, level: float = 0.999
+) -> tuple[float, float]:
     """Two-sided interval in which the mean of independent chi-squared variables lies with probability `level`.
 
     Args:

@@ -16,8 +16,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..studies.sensitivity import IndexIntervals, separation
-from ..studies.statistics import SampleSummary, bands, probability
+from ..studies.sensitivity import separation
+from ..studies.statistics import Intervals, SampleSummary, bands, probability
 from .plot import STYLES, grid
 from .study_data import (
     ROWS,
@@ -45,17 +45,14 @@ def wrap_label(description: str, unit: str, width: int = 30) -> str:
     """Label in lines of about `width` characters, escaped from matplotlib's mathematics."""
     text = label_unit(description, unit).replace("$", r"\$")
     # dotted keys such as start.roll.angle_rate are broken at their dots, not inside of a word
-    words = [
-        re.findall(r"[^._]+[._]*", word) if len(word) > width else [word] for word in text.split()
-    ]
     lines = [""]
-    for part, space in (
-        (part, "" if k else " ") for parts in words for k, part in enumerate(parts)
-    ):
-        if lines[-1] and len(lines[-1]) + len(space + part) > width:
-            lines.append(part)
-        else:
-            lines[-1] += (space if lines[-1] else "") + part
+    for word in text.split():
+        for k, part in enumerate(re.findall(r"[^._]+[._]*", word) if len(word) > width else [word]):
+            space = "" if k or not lines[-1] else " "
+            if lines[-1] and len(lines[-1] + space + part) > width:
+                lines.append(part)
+            else:
+                lines[-1] += space + part
     return "\n".join(lines)
 
 
@@ -491,7 +488,7 @@ def _sobol_bars(ax: Axes, finding: QuantityAnalysis, names: list[str]) -> None:
 
 
 def _draw_bars(
-    ax: Axes, places: np.ndarray, shares: IndexIntervals, picked: list[int], height: float,
+    ax: Axes, places: np.ndarray, shares: Intervals, picked: list[int], height: float,
     colour: str, legend_label: str,
 ) -> float:  # fmt: skip
     """Draw shares with their intervals from 0 to 1, where all shares lie; the largest end."""

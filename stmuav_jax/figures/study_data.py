@@ -23,7 +23,6 @@ from ..checks.errors import SettingError
 from ..io.netcdf import FileError, write_atomically
 from ..studies.columns import FINE, MISSING, column_name
 from ..studies.sensitivity import (
-    IndexIntervals,
     SobolIndices,
     separation,
     sobol,
@@ -34,9 +33,9 @@ from ..studies.statistics import (
     LEVEL,
     SHARES,
     IntervalEstimate,
+    Intervals,
     Outcomes,
     SampleSummary,
-    independent_mask,
     outcomes,
     probability,
     summarise,
@@ -123,7 +122,8 @@ class StudyData:
     def chosen(self) -> np.ndarray:
         """Mask of the samples that share no factor values with others (n,)."""
         # A base point of Saltelli's design has d + 2 samples: A, B, and A with each column of B.
-        return independent_mask(len(self.status), len(self.factors) + 2, self.design)
+        row = len(self.factors) + 2 if self.design == "saltelli" else 1
+        return np.arange(len(self.status)) % row < 2
 
     @functools.cached_property
     def computed(self) -> np.ndarray:
@@ -295,8 +295,8 @@ class Influence(NamedTuple):
 
     names: tuple[str, ...]
     indices: SobolIndices | None
-    first: IndexIntervals | None
-    ranks: IndexIntervals | None
+    first: Intervals | None
+    ranks: Intervals | None
     samples: int
     note: str
 
@@ -552,7 +552,7 @@ def to_json(value: Any) -> Any:
 
 
 def _plain_influence(influence: Influence) -> dict[str, Any]:
-    def shares(part: IndexIntervals | None) -> dict[str, Any] | None:
+    def shares(part: Intervals | None) -> dict[str, Any] | None:
         if part is None:
             return None
         rows = zip(part.value.tolist(), part.low.tolist(), part.high.tolist(), strict=True)
