@@ -298,13 +298,9 @@ class AbstractFlights(abc.ABC):
         """True if bodies can have a sample's masses and inertia tensors; may be traced."""
         return is_possible(self.table, self._table_factors(sample), self.relative)
 
-    def nominal(self) -> tuple[System, State]:
-        """System and initial state without any disturbance."""
-        return self.build({})
-
     def facing(self) -> np.ndarray:
         """The world direction of the last body's z axis at the start (3,); a panel faces it."""
-        return np.asarray(_rotation(self.nominal()[1].p[-1]))[:, 2]
+        return np.asarray(_rotation(self.build({})[1].p[-1]))[:, 2]
 
     def _table_factors(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         return {name: value for name, value in sample.items() if name not in self.own_factors}
