@@ -32,7 +32,7 @@ def test_the_double_integrators_regulator_in_closed_form():
     linear = linear_of([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
     found = control.regulator(linear, [1.0, 1.0], [1.0])
     np.testing.assert_allclose(found.K, [[1.0, np.sqrt(3.0)]], rtol=1e-12)
-    assert np.all(found.poles.real < 0)
+    assert np.all(np.real(found.poles) < 0)
 
 
 def test_modes_that_nothing_moves_are_named():
