@@ -83,7 +83,7 @@ class Sampling:
     def limit(self) -> int | None:
         """Largest number of samples; None for an unlimited design."""
         if self.design == "table":
-            return max(len(one.parameters.get("values", ())) for one in self.factors.values())
+            return max(len(factor.parameters.get("values", ())) for factor in self.factors.values())
         if self.design in ("sobol", "saltelli"):
             return SOBOL_POINTS * self.together
         return None
