@@ -3,14 +3,13 @@
 import dataclasses
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from rich.console import Console
 
 from ..figures.terminal import add_row, make_table, print_line
 from ..uav.scenes.registry import SCENES
-from .options import Cache, default_text, shared_option
+from .options import Cache, Params, default_text, shared_option
 from .scene_options import chosen_scene, scene_command
 
 EXIT_CODES = {"note": 0, "warning": 1, "fault": 2}
@@ -23,9 +22,7 @@ class CheckSettings:
     case: Annotated[int | None, shared_option("case"), default_text("the scene's first choice")] = (
         None
     )
-    params: Annotated[Path | None, shared_option("params"), default_text("the report's values")] = (
-        None
-    )
+    params: Params = None
     floating: bool = False
     """Let the root link of a URDF float; without it the root is fixed to ground."""
     cache: Cache = True
@@ -60,21 +57,6 @@ def run_check(command: Any) -> int:
     return EXIT_CODES[result.worst]
 
 
-def _make_schema(kind: str) -> dict[str, Any]:
-    """JSON schema of a kind of file."""
-    if kind == "model":
-        from ..io.model_schema import model_json_schema
-
-        return model_json_schema()
-    if kind == "mission":
-        from ..missions.schema import MissionFile
-
-        return MissionFile.model_json_schema()
-    from ..studies.schema import study_json_schema
-
-    return study_json_schema()
-
-
 @dataclasses.dataclass
 class List:
     """List the scenes, their cases and where the report describes them; or print the schema of a file.
@@ -90,7 +72,15 @@ def run_list(command: List) -> int:
     """Print the scenes, or a schema; the exit code."""
     if command.schema is not None:
         # not by the console, which would break lines
-        print(json.dumps(_make_schema(command.schema), indent=1))
+        if command.schema == "model":
+            from ..io.model_schema import model_json_schema as make_schema
+        elif command.schema == "mission":
+            from ..missions.schema import MissionFile
+
+            make_schema = MissionFile.model_json_schema
+        else:
+            from ..studies.schema import study_json_schema as make_schema
+        print(json.dumps(make_schema(), indent=1))
         return 0
     scene_table = make_table("scene", "cases", "what it is", "report", "end [s]")
     for name, entry in SCENES.items():

@@ -8,9 +8,21 @@ from rich.console import Console
 from rich.table import Table
 
 from .models.estimation import ABOUT, UNTRUSTED, EstimateSettings, run_estimate_model
-from .options import END, Cache, Figures, Number, Seed, count_range, default_text, shared_option
+from .options import (
+    END,
+    Cache,
+    Figures,
+    Number,
+    Params,
+    Seed,
+    count_range,
+    default_text,
+    shared_option,
+)
 from .output import print_paths
 from .scene_options import command_or_scene
+
+_CASE = Number("number of the case", "", 1, 8)
 
 
 @dataclasses.dataclass
@@ -24,12 +36,7 @@ class Estimate:
     2 wrong input; 3 done, but a filter's own account of its errors cannot be trusted. The report's
     tuning is of this kind in all eight cases."""
 
-    case: Annotated[
-        int | None,
-        Number("number of the case", "", 1, 8),
-        shared_option("case"),
-        default_text("all 8"),
-    ] = None
+    case: Annotated[int | None, _CASE, shared_option("case"), default_text("all 8")] = None
     tuning: Literal["both", "report", "consistent"] = "both"
     """Covariances of Table 2.4.2 of the report, consistent ones, or both for comparison."""
     model: Literal["default", "observable", "report", "printed", "attitude"] = "default"
@@ -38,9 +45,7 @@ class Estimate:
     seeds: Annotated[int, count_range("runs", 100_000), shared_option("seeds")] = 50
     seed: Seed = 0
     t1: Annotated[float, END, shared_option("t1")] = 2.0
-    params: Annotated[Path | None, shared_option("params"), default_text("the report's values")] = (
-        None
-    )
+    params: Params = None
     filter_params: Annotated[Path | None, default_text("the values of --params")] = None
     """TOML file with values for the filters alone, to try a wrong model; --params is for truth and filters alike."""
     out: Annotated[Path | None, shared_option("out"), default_text("runs/estimate_CASE")] = None
@@ -55,13 +60,10 @@ def run_estimate(command: Any) -> int:
     """Run the command and print its table; return the exit code."""
     if not isinstance(command, Estimate):
         return run_estimate_model(command)
-    from ..checks.errors import SettingError
     from ..figures.estimate import verdict_lines
     from ..io.netcdf import load_parameters
     from ..uav.quadrotor.model import PART_III
 
-    if command.case is not None and command.case not in range(1, 9):
-        raise SettingError(f"The report has cases 1 to 8, not {command.case}.")
     table = load_parameters(command.params, PART_III)
     names = ("report", "consistent") if command.tuning == "both" else (command.tuning,)
     # The filter's model may differ from the truth, as it always does in practice.
@@ -88,11 +90,9 @@ def _estimate_cases(
     from ..uav.quadrotor.assessment import consistent_tuning, report_tuning, study_case
 
     cases = range(1, 9) if command.case is None else (command.case,)
-    has_filter_model: Any = command.model != "default"
-    kinds: dict[str, Any] = {
-        "report": command.model if has_filter_model else "report",
-        "consistent": command.model if has_filter_model else "observable",
-    }
+    kinds: dict[str, Any] = {"report": "report", "consistent": "observable"}
+    if command.model != "default":
+        kinds = dict.fromkeys(kinds, command.model)
     tuning_by_key: dict[Any, Any] = {}
     summaries, paths = [], []
     for case in cases:

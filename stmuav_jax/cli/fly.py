@@ -10,11 +10,10 @@ from rich.console import Console
 from ..checks.errors import SimulationError
 from ..figures.terminal import add_row, make_table, print_line
 from .options import END, Cache, Figures, default_text, shared_option
-from .output import print_paths, results_folder
+from .output import print_paths, results_folder, show_progress
 
 if TYPE_CHECKING:
     from ..missions.flight import MissionFlight
-    from ..missions.mission import Mission
 
 
 @dataclasses.dataclass
@@ -46,13 +45,17 @@ NOT_KEPT = 3
 def run_fly(command: Fly) -> int:
     """Run the command; return the exit code."""
     from ..io.netcdf import save_sealed
+    from ..missions.flight import fly
     from ..missions.mission import load_mission
     from ..missions.outcome import labelled_flight, verdict
 
     # All checks of a mission happen here, before the compilation.
     mission = load_mission(command.mission, t1=command.t1, true_states=command.true_states)
     folder = results_folder(command.out, mission.file.name)
-    flight = _fly_with_progress(mission)
+    name, end = mission.file.name, mission.file.t1
+    with show_progress(f"{name}: compiling") as report:
+        tell = lambda share: report(share, f"{name}: {share * end:.0f} s of {end:g} s")
+        flight = fly(mission, progress=tell)
     arrays = labelled_flight(flight)
     data, paths = arrays.dataset(), [save_sealed(arrays, folder / "flight.nc")]
     if command.log:
@@ -79,24 +82,6 @@ def run_fly(command: Fly) -> int:
         raise SimulationError(f"{flight.run.failure} Results up to there are in {folder}.")
     # A script tells a flight that failed its aims from one that could not be computed.
     return 0 if is_success else NOT_KEPT
-
-
-def _fly_with_progress(mission: "Mission") -> "MissionFlight":
-    """Flight with a progress bar on stderr."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    from ..missions.flight import fly
-
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(f"{mission.file.name}: compiling", total=1.0)
-
-        def report_share(share: float) -> None:
-            t = share * mission.file.t1
-            progress_text = f"{mission.file.name}: {t:.0f} s of {mission.file.t1:g} s"
-            bar.update(task, completed=share, description=progress_text)
-
-        return fly(mission, progress=report_share)
 
 
 def _print_flight(out: Console, data: Any, flight: "MissionFlight") -> None:

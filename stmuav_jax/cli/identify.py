@@ -109,7 +109,10 @@ def _identify_parameters(
     unknowns = [Unknown(name, max(abs(value), 1e-12)) for name, value in start.items()]
     point_of, parameter_states = _start_of_parameters(model, space, x, unknowns, start, settings)
     # Angles of a joint may differ from a record by whole turns.
-    readings = CyclicVector(tuple(_is_turning(scene.system, name) for name in sigma))
+    parts = [name.rpartition(".")[::2] for name in sigma]
+    joint_of = lambda name: scene.system.joints[scene.system.joint_index(name)]
+    turns = (kind == "angle" and not joint_of(joint).pitched for joint, kind in parts)
+    readings = CyclicVector(tuple(turns))
     deviations = np.array(list(sigma.values()))
     state = space.to_state(x)
     values = {name: float(output.of(scene.system, state)) for name, output in every.items()}
@@ -168,12 +171,6 @@ def _identify_parameters(
         has_converged(fit_result.search) or stopped,
         fit_result.verdict,
     )
-
-
-def _is_turning(system: Any, name: str) -> bool:
-    """Test whether an output is an angle that is the same after a turn."""
-    joint, _, component = name.rpartition(".")
-    return component == "angle" and not system.joints[system.joint_index(joint)].pitched
 
 
 def _parse_bounds(

@@ -133,17 +133,6 @@ _REPEATABLE = ("simulate", "check", "trim")
 _FREE = ("out", "figures", "cache")
 
 
-def _command_data(name: str, command: Any) -> dict[str, Any] | None:
-    """Plain data of all on which a command's programs depend; None if that is not known.
-
-    A robot's file may name other files, which are not looked for.
-    """
-    scene = str(getattr(command, "scene", ""))
-    if name not in _REPEATABLE or scene.endswith((".xml", ".urdf")):
-        return None
-    return {"command": name, "options": _plain_options(command)}
-
-
 def _plain_options(value: Any) -> Any:
     """Plain data of options; of a file its content."""
     if dataclasses.is_dataclass(value):
@@ -151,11 +140,8 @@ def _plain_options(value: Any) -> Any:
         return {field: _plain_options(getattr(value, field)) for field in fields}
     if isinstance(value, Path) or (isinstance(value, str) and value.endswith(".toml")):
         with contextlib.suppress(OSError):
-            return (
-                hashlib.sha256(Path(value).read_bytes()).hexdigest()
-                if Path(value).is_file()
-                else None
-            )
+            path = Path(value)
+            return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
     return value if isinstance(value, str | int | float | bool | None) else repr(value)
 
 
@@ -185,7 +171,10 @@ def _run_command(name: str, options: Any, keep_programs: bool) -> int:
     """Run one command; its exit code."""
     command = COMMANDS[name]
     folder = _configure_cache(options.cache) if hasattr(options, "cache") else None
-    if keep_programs and folder is not None and (data := _command_data(name, options)):
+    # a robot's file may name other files, which are not looked for
+    is_robot = str(getattr(options, "scene", "")).endswith((".xml", ".urdf"))
+    if keep_programs and folder is not None and name in _REPEATABLE and not is_robot:
+        data = {"command": name, "options": _plain_options(options)}
         from ..math.compiler import keep_command_programs
         from ..math.exported import Programs
 

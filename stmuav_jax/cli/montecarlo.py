@@ -10,11 +10,12 @@ import tyro
 from rich.console import Console
 
 from ..checks.errors import SettingError
+from ..figures.terminal import print_line
 from .options import SEED, Cache, Figures, Resume, count_range, default_text, shared_option
-from .output import print_paths, results_folder
+from .output import print_paths, results_folder, show_progress
 
 if TYPE_CHECKING:
-    from ..studies.study import Study, StudyOutcome
+    from ..studies.study import Study, StudyOutcome, StudyProgress
 
 
 @dataclasses.dataclass
@@ -54,22 +55,13 @@ class Montecarlo:
     cache: Cache = True
 
 
-def count_cores() -> int:
-    """Number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def plain_of(command: Montecarlo) -> dict[str, Any]:
     """Plain data of the study, with the changes by the options."""
-    from ..studies.examples import READY, ready
+    from ..studies.examples import ready
     from ..studies.study_file import load_study
 
-    if command.study in READY:
-        plain = ready(command.study)
-    elif command.study.endswith(".toml") or os.sep in command.study:
-        plain = load_study(command.study)
-    else:
-        plain = ready(command.study)
+    is_file = command.study.endswith(".toml") or os.sep in command.study
+    plain = load_study(command.study) if is_file else ready(command.study)
     if command.seed is not None:
         plain["seed"] = command.seed
     return plain
@@ -97,7 +89,9 @@ def _make_study(command: Montecarlo) -> "Study":
     devices = command.devices
     if command.scheduler is None and command.workers is None and jax.default_backend() == "cpu":
         # All cores of a CPU, unless a cluster's workers choose for themselves.
-        devices = devices or count_cores()
+        has_affinity = hasattr(os, "sched_getaffinity")
+        cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count()
+        devices = devices or cores or 1
     settings = {"lanes": command.lanes, "devices": devices}
     try:
         if plain.get("kind") != "missions":
@@ -127,7 +121,7 @@ def run_montecarlo(command: Montecarlo) -> int:
     folder = results_folder(command.out, study.name)
     outcome = _run_with_progress(command, study, folder / "study.zarr")
     out = Console()
-    out.print(outcome.describe(), highlight=False, markup=False, emoji=False)
+    print_line(out, outcome.describe())
     paths = [folder / "study.zarr"]
     if command.figures != "none" or not outcome.interrupted:
         paths += report_study(folder / "study.zarr", folder, command.figures, out)
@@ -138,29 +132,14 @@ def run_montecarlo(command: Montecarlo) -> int:
 
 def _run_with_progress(command: Montecarlo, study: "Study", store: Path) -> "StudyOutcome":
     """Compute the missing samples of the store, with a progress bar on stderr."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )  # fmt: skip
+    with show_progress("samples") as report:
 
-    from ..studies.study import StudyProgress
-
-    columns = (
-        TextColumn("samples"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("samples", total=None)
-
-        def show_state(progress: StudyProgress) -> None:
+        def show_state(progress: "StudyProgress") -> None:
             if progress.note:
-                bar.console.print(progress.note, highlight=False, markup=False, emoji=False)
+                print_line(Console(stderr=True), progress.note)
             else:
-                bar.update(task, total=progress.total, completed=progress.completed)
+                completed, total = progress.completed, progress.total
+                report(completed / total, f"{completed:,} of {total:,} samples")
 
         return study.run(
             store, command.samples, chunk=command.chunk, resume=command.resume, progress=show_state,
@@ -194,5 +173,5 @@ def report_study(store: Path, folder: Path, figures: Any, out: Console) -> list[
             paths += save_figures(figure_by_name, folder / "figures", figures, dpi=160)
     out.print(summary_table(analysis), markup=False, emoji=False)
     for line in summary_lines(analysis):
-        out.print(line, highlight=False, markup=False, emoji=False)
+        print_line(out, line)
     return paths

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
@@ -102,6 +103,7 @@ FORCE = Number("limit of the force", "N", above=0.0, high=1e6)
 TOLERANCE = Number("tolerance", "", above=0.0, high=1.0)
 
 # Options that all or most commands have; the words of a default stand beside them.
+Params = Annotated[Path | None, shared_option("params"), default_text("the report's values")]
 Cache = Annotated[bool, shared_option("cache")]
 Figures = Annotated[Literal["png", "pdf", "svg", "none"], shared_option("figures")]
 Resume = Annotated[bool, shared_option("resume")]

@@ -45,10 +45,10 @@ def show_activity(message: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def show_progress(message: str) -> Iterator[Callable[[float], None]]:
+def show_progress(message: str) -> Iterator[Callable[..., None]]:
     """Show a progress bar on stderr, if that is a terminal; the context gives a function that moves it.
 
-    The function takes the share that is done, from 0 to 1.
+    The function takes the share that is done, from 0 to 1, and optionally another message.
     """
     # slow to import, and most commands show no bar
     from rich.progress import (
@@ -60,7 +60,7 @@ def show_progress(message: str) -> Iterator[Callable[[float], None]]:
     )
 
     columns = (
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(), TimeRemainingColumn(),
     )  # fmt: skip
     console = Console(stderr=True)
@@ -68,7 +68,7 @@ def show_progress(message: str) -> Iterator[Callable[[float], None]]:
         *columns, console=console, transient=True, disable=not console.is_terminal
     ) as bar:
         task = bar.add_task(message, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
+        yield lambda share, text=message: bar.update(task, completed=share, description=text)
 
 
 # --- errors

@@ -22,10 +22,10 @@ from ..dynamics.choices import (
     stabilisation_named,
 )
 from ..figures.terminal import print_line
+from .check import CheckSettings
 from .options import (
     END,
     TOLERANCE,
-    Cache,
     Figures,
     Number,
     count_range,
@@ -50,12 +50,9 @@ GAIN = Number("gain of Baumgarte's feedback", "1/s", 0.0, 1e6)
 
 
 @dataclasses.dataclass
-class Settings:
+class Settings(CheckSettings):
     """Options of a run and of its files, which all scenes share."""
 
-    case: Annotated[int | None, shared_option("case"), default_text("the scene's first choice")] = (
-        None
-    )
     t1: Annotated[float | None, END, shared_option("t1"), default_text("the scene's own")] = None
     rtol: Annotated[float, dataclasses.replace(TOLERANCE, quantity="relative tolerance")] = (
         STEP_TOLERANCE
@@ -89,18 +86,12 @@ class Settings:
     """Estimate the run's error by a second run beside it."""
     certificate: Literal["standard", "full"] = "standard"
     """With full, the accelerations are also compared with those of another formulation, which compiles longer."""
-    params: Annotated[Path | None, shared_option("params"), default_text("the report's values")] = (
-        None
-    )
-    floating: bool = False
-    """Let the root link of a URDF float; without it the root is fixed to ground."""
     out: Annotated[Path | None, shared_option("out"), default_text("runs/SCENE")] = None
     figures: Figures = "png"
     verbose: bool = False
     """Print all entries of the accuracy report; without it the six that decide."""
     loads: bool = False
     """Also write the reaction loads of the joints, with their peaks between saved times, to loads.csv and a figure."""
-    cache: Cache = True
 
 
 ABOUT = """Simulate a scene, or a model's file; write run.nc, certificate.json and figures.
@@ -124,28 +115,23 @@ def scene_of(command: Any) -> "Scene":
     return scene
 
 
-def _choose_stabilisation(settings: Settings) -> Any:
-    """Stabilisation of the settings; raises `SettingError` for gains of one that has none."""
-    if settings.baumgarte_gains is None:
-        return stabilisation_named(settings.stabilisation)
-    if settings.stabilisation != "baumgarte":
-        raise SettingError(
-            "--baumgarte-gains is for --stabilisation baumgarte, but it is "
-            f"{settings.stabilisation}."
-        )
-    from ..dynamics.formulations.stabilisation import Baumgarte
-
-    return Baumgarte(*settings.baumgarte_gains)
-
-
 def method_of(settings: Settings, scene: "Scene") -> "Method":
     """Method of integration that the settings describe.
 
     Raises:
         SettingError: gains without their stabilisation, or a jump outside the run.
     """
+    from ..dynamics.formulations.stabilisation import Baumgarte
     from ..dynamics.method import Method
 
+    stabilisation: Any = stabilisation_named(settings.stabilisation)
+    if settings.baumgarte_gains is not None:
+        if settings.stabilisation != "baumgarte":
+            raise SettingError(
+                "--baumgarte-gains is for --stabilisation baumgarte, but it is "
+                f"{settings.stabilisation}."
+            )
+        stabilisation = Baumgarte(*settings.baumgarte_gains)
     end = scene.t1 if settings.t1 is None else settings.t1
     for jump in settings.jump_times:
         if not scene.t0 < jump < end:
@@ -156,7 +142,7 @@ def method_of(settings: Settings, scene: "Scene") -> "Method":
     return Method(
         formulation=formulation_named(settings.formulation),
         solver=solver_named(settings.solver),
-        stabilisation=_choose_stabilisation(settings),
+        stabilisation=stabilisation,
         rtol=settings.rtol,
         atol=settings.atol,
         first_step=settings.first_step,

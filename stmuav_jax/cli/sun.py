@@ -9,7 +9,7 @@ from rich.console import Console
 
 from ..checks.errors import SettingError
 from ..figures.terminal import print_line
-from .options import ANGLE, Cache, Figures, Number, default_text, shared_option
+from .options import ANGLE, Cache, Figures, Number, Params, default_text, shared_option
 from .output import print_paths, results_folder
 
 
@@ -51,9 +51,7 @@ class SunDay:
         float | None, Number("turbidity", "", 1, 20), default_text("the month's mean at the place")
     ] = None
     """Linke turbidity of the air."""
-    params: Annotated[Path | None, shared_option("params"), default_text("the report's values")] = (
-        None
-    )
+    params: Params = None
     out: Annotated[Path | None, shared_option("out"), default_text("runs/sun_DATE")] = None
     figures: Figures = "png"
     cache: Cache = True

@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ..checks.errors import ModelError, SettingError
+from ..checks.errors import ModelError, SettingError, named_places
 from ..figures.terminal import add_row, make_table, print_line
 from .models.point import inputs_named, scalars_by_name, starting_point
 from .models.postures import PostureSettings, write_path, write_survey
@@ -23,6 +23,7 @@ from .options import (
     TURN,
     Cache,
     Number,
+    Params,
     default_text,
     shared_option,
 )
@@ -107,9 +108,7 @@ class TrimCommand:
     by: tuple[str, ...] = ()
     """Parameters by which the trim is differentiated, such as mass.panel_7."""
     model: _Linear = dataclasses.field(default_factory=LinearSettings)
-    params: Annotated[Path | None, shared_option("params"), default_text("the report's values")] = (
-        None
-    )
+    params: Params = None
     out: Annotated[Path | None, shared_option("out"), default_text("runs/trim")] = None
     cache: Cache = True
 
@@ -176,7 +175,12 @@ def trim_space(space: "TreeSpace", x: Any, settings: TrimSettings, t: float) -> 
     if not spanning_tree(space.system).floating:
         if any(flying):
             raise SettingError("--climb, --speed, --turn and --yaw are for a floating base.")
-        target = _target_accelerations(space, settings)
+        wanted_rates = scalars_by_name(settings.accelerations, "--accelerations")
+        names = [name for name, _ in space.names[space.dof : 2 * space.dof]]
+        subject, target = "The target accelerations", np.zeros(space.dof)
+        target[list(named_places(list(wanted_rates), names, subject, "velocity"))] = list(
+            wanted_rates.values()
+        )
         return trim(
             space, at=x, free=settings.free, inputs=inputs, values=values, accelerations=target, t=t,
         )  # fmt: skip
@@ -185,17 +189,6 @@ def trim_space(space: "TreeSpace", x: Any, settings: TrimSettings, t: float) -> 
     return trim_condition(
         space, flight_of(settings), at=x, free=settings.free, inputs=inputs, values=values
     )
-
-
-def _target_accelerations(space: "TreeSpace", settings: TrimSettings) -> np.ndarray:
-    from ..checks.errors import named_places
-
-    acceleration_by_name = scalars_by_name(settings.accelerations, "--accelerations")
-    names = [name for name, _ in space.names[space.dof : 2 * space.dof]]
-    target = np.zeros(space.dof)
-    places = named_places(list(acceleration_by_name), names, "The target accelerations", "velocity")
-    target[list(places)] = list(acceleration_by_name.values())
-    return target
 
 
 class RotorSpeed(NamedTuple):
@@ -241,14 +234,6 @@ def rotor_speeds(
         speed = math.sqrt(squared)
         rotors[entry.name] = RotorSpeed(speed, thrust, None if highest is None else speed / highest)
     return rotors
-
-
-def _list_changes(space: "TreeSpace", x: Any, trim_result: "Trim") -> dict[str, tuple[float, str]]:
-    """States that differ from the start, by how much, with their units."""
-    departure = np.asarray(space.difference(trim_result.point, x))
-    # The search moves every state by round-off; only what the trim has chosen is listed.
-    named = zip(space.names, departure, strict=True)
-    return {name: (float(v), unit) for (name, unit), v in named if abs(v) > 1e-12}
 
 
 def modes_table(modes: Sequence[Any]) -> Table:
@@ -348,7 +333,13 @@ def _write_scene_trim(
     space: "TreeSpace", x: Any, trim_result: "Trim", folder: Path, title: str
 ) -> None:
     """Print a trim of any mechanism and write it to trim.json."""
-    changes = _list_changes(space, x, trim_result)
+    departure = np.asarray(space.difference(trim_result.point, x))
+    # The search moves every state by round-off; only what the trim has chosen is listed.
+    changes = {
+        name: (float(value), unit)
+        for (name, unit), value in zip(space.names, departure, strict=True)
+        if abs(value) > _ROUND_OFF
+    }
     names = trim_result.inputs.names
     values = [float(v) for v in np.asarray(trim_result.values)]
     unknown_table = make_table("unknown", "value", "unit", title=f"Trim: {title}")
@@ -383,17 +374,10 @@ def _write_scene_trim(
 # --- the UAV with its tracker, whose trim observes limits
 
 
-def table_of(params: Path | None) -> "Parameters":
-    """Parameter table of the report's Part II, with the user's values."""
-    from ..io.netcdf import load_parameters
-    from ..uav.airframe import PART_II
-
-    return load_parameters(params, PART_II)
-
-
 def compute_flight_target(settings: SteadyFlight, values: "Parameters") -> Any:
     """The flight condition that the options describe."""
     from ..uav.tracker.geometry import initial_angles
+    from .view import towards_sun
 
     if settings.sun is not None and (settings.phi is not None or settings.theta is not None):
         raise SettingError("Give --sun or --phi and --theta, not both.")
@@ -403,10 +387,7 @@ def compute_flight_target(settings: SteadyFlight, values: "Parameters") -> Any:
                 "--sun is for straight flights, since in a turn the panel would have to move: give "
                 "--phi and --theta with --turn."
             )
-        azimuth, height = (math.radians(x) for x in settings.sun)
-        level = math.cos(height)
-        sun = [level * math.sin(azimuth), level * math.cos(azimuth), math.sin(height)]
-        return flight_of(settings, sun=sun)
+        return flight_of(settings, sun=towards_sun(*settings.sun))
     first = np.asarray(initial_angles(values))
     option_angles = (settings.phi, settings.theta)
     angles = [
@@ -446,6 +427,9 @@ def _solve_uav(
 
 
 def _run_uav(command: TrimCommand) -> int:
+    from ..io.netcdf import load_parameters
+    from ..uav.airframe import PART_II
+
     is_linear = command.model.linear == "trim"
     if command.model.linear == "start":
         raise SettingError("--linear start is for a scene or a model's file: name one after trim.")
@@ -453,7 +437,7 @@ def _run_uav(command: TrimCommand) -> int:
         raise ModelError(
             "A turn has no constant matrices in the world's axes: linearise a straight flight."
         )
-    parameters = table_of(command.params)
+    parameters = load_parameters(command.params, PART_II)
     uav, trim_result, slopes = _solve_uav(command, parameters, _trim_limits(command))
     unknowns, labels = np.asarray(trim_result.vector), trim_result.names
     out = Console()

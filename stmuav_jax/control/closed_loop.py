@@ -181,21 +181,9 @@ def rollout(
     # The loop runs to its end even after a failure: a batch of loops has one length, and those
     # that go on must not be ended by one that does not.
     (end, final_memory, *_), rows = jax.lax.scan(body, carry, length=samples)
-    ts, (states, internal, inputs, signal_values, work), counts, worst, reason, element = rows
-    return Rollout(
-        ts,
-        states,
-        internal,
-        inputs,
-        signal_values,
-        work,
-        counts,
-        worst,
-        reason,
-        element,
-        end,
-        final_memory,
-    )
+    ts, (states, internal, inputs, signal_values, work), *rest = rows
+    numbers = states, internal, inputs, signal_values, work, *rest
+    return Rollout(ts, *numbers, end=end, memory=final_memory)
 
 
 def _check_returned(plant: Plant, returned: Any, before: Any) -> tuple[Float[Array, " m"], Any]:
@@ -509,11 +497,7 @@ def _certify_rollout(
     return LoopCertificate(
         result=LoopReason(int(reason[-1])).label if failure else "successful",
         t_end=t_end,
-        position_violation=float(worst.position[last_sample]),
-        angle_violation=float(worst.angle[last_sample]),
-        velocity_violation=float(worst.velocity[last_sample]),
-        angular_velocity_violation=float(worst.angular_velocity[last_sample]),
-        norm_violation=float(worst.norm[last_sample]),
+        **{f"{name}_violation": float(x[last_sample]) for name, x in vars(worst).items()},
         energy_error=errors[0],
         relative_energy_error=errors[1],
         position_difference=difference[0],

@@ -228,9 +228,14 @@ class Bench(eqx.Module):
         k: Int[Array, ""],
         noise: Float[Array, "i c"],
     ) -> list[Point]:
-        readings = []
-        for instrument, error in zip(self.instruments, self._sum_errors(noise), strict=True):
+        readings, rows = [], iter(noise)
+        for instrument in self.instruments:
             value = instrument.sensor.read(sensed_motion)
+            error = None if instrument.bias is None else jnp.asarray(instrument.bias)
+            if instrument.noise is not None:
+                scale = jnp.asarray(instrument.noise)
+                white = scale * next(rows)[: scale.size]
+                error = white if error is None else error + white
             present = [
                 (k >= jnp.asarray(fault.at) * self.rate)
                 & (k < jnp.asarray(fault.until) * self.rate)
@@ -262,18 +267,6 @@ class Bench(eqx.Module):
         # program, and a number does not depend on how many follow it.
         keys = jax.vmap(partial(jax.random.fold_in, jax.random.fold_in(key, k)))(np.array(numbers))
         return jax.vmap(lambda key: jax.random.normal(key, (max(sizes),), float))(keys)
-
-    def _sum_errors(self, noise: Float[Array, "i c"]) -> list[Array | None]:
-        """Bias and noise of each instrument, without faults."""
-        errors, rows = [], iter(noise)
-        for instrument in self.instruments:
-            error = None if instrument.bias is None else jnp.asarray(instrument.bias)
-            if instrument.noise is not None:
-                scale = jnp.asarray(instrument.noise)
-                white = scale * next(rows)[: scale.size]
-                error = white if error is None else error + white
-            errors.append(error)
-        return errors
 
 
 @native

@@ -72,7 +72,11 @@ class HeldMotion(eqx.Module):
         # Steps of a fixed length have no loop of unknown length: they can be differentiated in
         # reverse and batched without waiting for the slowest.
         if self.steps is None:
-            return _integrate_adaptively(problem, now, t1)
+            # A plant that has failed integrates over no time: the loop around it goes on, and each further
+            # period costs nothing.
+            is_running = now.result == diffrax.RESULTS.successful
+            end = jnp.where(is_running, t1, now.t)
+            return continue_from(now, read_end(problem.solve(now, end, problem.method.adjoint)))
         h, steps = (t1 - now.t) / self.steps, self.steps
 
         def step_once(carry: Any, j: Any) -> tuple[Any, None]:
@@ -122,19 +126,6 @@ class HeldMotion(eqx.Module):
         # which is what makes a period cheap.
         system = self.inputs.applied(self.problem.model.system, values)
         return eqx.tree_at(lambda p: p.model.system, self.problem, system)
-
-
-def _integrate_adaptively(
-    problem: Problem, now: IntegrationState, t1: Float[Array, ""]
-) -> IntegrationState:
-    """Integrate to t1 [s] by steps of the method's own control; after a failure, stay there."""
-    # A plant that has failed integrates over no time: the loop around it goes on, and each further
-    # period costs nothing.
-    is_successful = now.result == diffrax.RESULTS.successful
-    solution = read_end(
-        problem.solve(now, jnp.where(is_successful, t1, now.t), problem.method.adjoint)
-    )
-    return continue_from(now, solution)
 
 
 def check_steps(steps: int | None) -> None:
@@ -379,11 +370,8 @@ class Plant(eqx.Module):
             queues, estimate, memory = self._after_standing(t, state, internal, sensed_motion, key)
             readings = self.bench.oldest_readings(queues)
         else:
-            queues = (
-                self.bench.fill_queues(sensed_motion, self.system, key)
-                if sensed_motion is not None
-                else ()
-            )
+            fill = self.bench.fill_queues
+            queues = () if sensed_motion is None else fill(sensed_motion, self.system, key)
             readings = self.bench.oldest_readings(queues)
             estimate, memory = self._estimate_state(
                 t, state, internal, readings, self.before, self.memory

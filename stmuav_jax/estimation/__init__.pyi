@@ -4,7 +4,6 @@ from .consistency import (
     RunsVerdict as RunsVerdict,
     Verdict as Verdict,
     autocorrelation as autocorrelation,
-    chi2_interval as chi2_interval,
     inconsistent as inconsistent,
     mean_interval as mean_interval,
     nees as nees,

@@ -93,9 +93,7 @@ def nees(
     return jnp.where(wrong, jnp.inf, jnp.sum(scaled**2, axis=0))
 
 
-def path_nees(
-    filtered: Any, truth: Point, space: AbstractSpace, *, only: slice | None = None
-) -> Float[Array, "T *s"]:
+def path_nees(filtered: Any, truth: Point, space: AbstractSpace) -> Float[Array, "T *s"]:
     """NEES at each time of a `Filtered` or `Smoothed` path or bank; `truth` has T first.
 
     It is infinite where the filter has failed, as the NIS is.
@@ -103,32 +101,29 @@ def path_nees(
     # times become one more axis of the stack
     last = lambda leaf: jnp.moveaxis(leaf, 0, -1)
     mean, true = (jax.tree.map(last, a) for a in (filtered.mean, truth))
-    nees_values = nees(mean, last(filtered.factor), true, space, only=only)
+    nees_values = nees(mean, last(filtered.factor), true, space)
     return jnp.where(filtered.ok, jnp.moveaxis(nees_values, -1, 0), jnp.inf)
 
 
-def chi2_interval(degrees: int | float, level: float = 0.999) -> tuple[float, float]:
-    """Two-sided interval in which a chi-squared variable lies with probability `level`."""
-    from scipy import stats
-
-    if not 0 < level < 1 or degrees <= 0:
-        raise SettingError(
-            f"The level must lie in (0, 1) and the degrees of freedom above 0, but they are {level} and {degrees}."
-        )
-    low, high = stats.chi2.interval(level, degrees)
-    return float(low), float(high)
-
-
-def mean_interval(degrees: int, count: int, level: float = 0.999) -> tuple[float, float]:
-    """Two-sided interval for the mean of `count` independent chi-squared variables.
+def mean_interval(
+    degrees: int | float, count: int = 1, level: float = 0.999
+) -> tuple[float, float]:
+    """Two-sided interval in which the mean of independent chi-squared variables lies with probability `level`.
 
     Args:
-        degrees: degrees of freedom of each variable: n for NEES, m for NIS.
+        degrees: degrees of freedom of each variable: n for NEES, m for NIS. count: number of variables.
     """
+    from scipy import stats
+
+    if not 0 < level < 1 or degrees * count <= 0:
+        raise SettingError(
+            f"The level must lie in (0, 1) and the degrees of freedom above 0, but they are {level} and "
+            f"{degrees * count}."
+        )
     # Sums of independent chi-squared variables are chi-squared with the sum of the degrees, so that the
     # interval of a mean is exact for any number of runs.
-    low, high = chi2_interval(degrees * count, level)
-    return low / count, high / count
+    low, high = stats.chi2.interval(level, degrees * count)
+    return float(low) / count, float(high) / count
 
 
 def autocorrelation(scaled: Float[Array, "T m *s"], lag: int) -> Float[Array, "*s"]:

@@ -344,7 +344,24 @@ class EstimationError(RuntimeError):
         self.filtered = filtered
 
 
-class Filtered(eqx.Module):
+class AbstractPath(eqx.Module):
+    """Estimates at T times: points with T first, an array or a pytree, and roots of their covariances."""
+
+    mean: eqx.AbstractVar[Point]
+    factor: eqx.AbstractVar[Float[Array, "T n n *s"]]
+
+    @property
+    def covariance(self) -> Float[Array, "T n n *s"]:
+        """Covariances P at each time."""
+        return jax.vmap(outer_square)(self.factor)
+
+    @property
+    def standard_deviation(self) -> Float[Array, "T n *s"]:
+        """Standard deviations at each time."""
+        return jnp.sqrt(jnp.sum(self.factor**2, axis=2))
+
+
+class Filtered(AbstractPath):
     """Filtered estimates, after each of T measurements.
 
     Attributes:
@@ -365,16 +382,6 @@ class Filtered(eqx.Module):
     dt: Float[Array, " T"]
     prior: Gaussian
     method: AbstractFilter
-
-    @property
-    def covariance(self) -> Float[Array, "T n n *s"]:
-        """Covariances P after each measurement."""
-        return jax.vmap(outer_square)(self.factor)
-
-    @property
-    def standard_deviation(self) -> Float[Array, "T n *s"]:
-        """Standard deviations after each measurement."""
-        return jnp.sqrt(jnp.sum(self.factor**2, axis=2))
 
     @property
     def nis(self) -> Float[Array, "T *s"]:

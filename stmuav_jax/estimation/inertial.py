@@ -102,19 +102,6 @@ def strapdown(
     return next_point, errors
 
 
-def mean_force(
-    before: Float[Array, "3"], now: Float[Array, "3"], omega: Float[Array, "3"], h: Float[Array, ""]
-) -> Float[Array, "3"]:
-    """Mean of the forces at both ends of a step, each in its own attitude, in the axes at its middle (3,).
-
-    The force of one end alone would be late by half a step, an error h / 2 (omega x f).
-    """
-    # Both forces are turned to the middle of the step, where the trapezoidal mean is correct to second
-    # order while the vehicle rotates.
-    turn = _turn_matrix(h / 2 * omega)
-    return (turn.T @ before + turn @ now) / 2
-
-
 def predict_base(
     belief: Belief,
     turning: tuple[Float[Array, "3"], Float[Array, "3"]],
@@ -130,7 +117,10 @@ def predict_base(
         noise: covariance that the step adds.
     """
     x, rate = belief.mean, (turning[0] + turning[1]) / 2
-    felt = mean_force(*force, rate - x["gyroscope_bias"], h)
+    # Both forces are turned to the middle of the step, where the trapezoidal mean is correct to second
+    # order while the vehicle rotates; that of one end alone would be late by half a step.
+    turn = _turn_matrix(h / 2 * (rate - x["gyroscope_bias"]))
+    felt = (turn.T @ force[0] + turn @ force[1]) / 2
     x, F = strapdown(x, rate, felt, gravity, h)
     # A plain covariance serves here, because the position and attitude sensors bound the ratio of its
     # largest to its smallest variance; its symmetric part removes round-off.

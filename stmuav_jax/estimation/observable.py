@@ -10,14 +10,13 @@ A direction v with O v = 0 changes no measurement, so no filter can estimate it.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, SettingError, check_finite, has_values
-from ..math.space import AbstractSpace, Point
+from ..math.space import Point
 from .filter import compiled_once
 from .gaussians import divide_lower
 from .model import Inputs, StateSpaceModel
@@ -134,7 +133,6 @@ def observability(
     count: int,
     scale: Any = None,
     tolerance: float = 1e-9,
-    space: AbstractSpace | None = None,
 ) -> Observability:
     """Rank, singular values and null directions of the observability matrix along a path.
 
@@ -143,10 +141,7 @@ def observability(
         scale: size of a notable error of each component (n,), so that the result does not depend
             on units; ones by default.
         tolerance: fraction of the largest singular value below which others count as zero.
-        space: space whose errors the directions are; the model's by default.
     """
-    if space is not None:
-        model = eqx.tree_at(lambda m: m.space, model, space)
     if isinstance(start, list | tuple) and not hasattr(start, "_fields"):
         start = jnp.asarray(as_numbers(start, "The start"), model.noise.dtype)
     u = read_inputs(u)

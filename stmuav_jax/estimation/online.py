@@ -181,8 +181,15 @@ class OnlineFilter:
                 f"The times of an online filter must not decrease, but after t = {self.t:g} s comes {t:g} s."
             )
         # Process noise given per step is the same for any length of step, which is wrong for uneven ones.
-        self._watch_steps(t - self.t)
-        program, step_input = self._prepare_arrays(y, t - self.t, u)
+        dt = t - self.t
+        if self.model.noise_per == "step" and dt > 0 and not np.isnan(self._longest):
+            self._shortest, self._longest = min(self._shortest, dt), max(self._longest, dt)
+            is_uneven = self._longest - self._shortest > EQUAL * self._longest
+            if is_uneven and np.any(self.model.noise):
+                warn_of_steps(self._shortest, self._longest)
+                # once is enough
+                self._longest = np.nan
+        program, step_input = self._prepare_arrays(y, dt, u)
         # The estimate stays on the device from step to step, and one array goes each way.
         after = program(self._now, step_input)
         numbers = np.asarray(after)
@@ -203,15 +210,6 @@ class OnlineFilter:
         self.missing += int(missing)
         self._nis.append(nis)
         return OnlineEstimate(self.t, numbers, self._layout, nis, int(missing))
-
-    def _watch_steps(self, dt: float) -> None:
-        """Warn, once, if steps of different lengths add the same process noise."""
-        if self.model.noise_per != "step" or dt <= 0 or np.isnan(self._longest):
-            return
-        self._shortest, self._longest = min(self._shortest, dt), max(self._longest, dt)
-        if self._longest - self._shortest > EQUAL * self._longest and np.any(self.model.noise):
-            warn_of_steps(self._shortest, self._longest)
-            self._longest = np.nan
 
     def _prepare_arrays(
         self, y: Any, dt: float, u: Inputs

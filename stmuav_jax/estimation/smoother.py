@@ -12,7 +12,6 @@ S. Sarkka, L. Svensson, Bayesian filtering and smoothing, 2nd ed. (2023), ch. 12
 
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,14 +20,14 @@ from jaxtyping import Array, Bool, Float
 from ..checks.errors import has_values
 from ..math.native.program import evaluate
 from ..math.space import Point
-from .filter import EstimationError, Filtered, compiled_once, is_finite
-from .gaussians import Gaussian, divide_lower, downdate_factor, outer_square, triangularise_rows
+from .filter import AbstractPath, EstimationError, Filtered, compiled_once, is_finite
+from .gaussians import Gaussian, divide_lower, downdate_factor, triangularise_rows
 from .model import Inputs, StateSpaceModel
 from .records import check_functions, check_prior
 from .sigma import AbstractRule
 
 
-class Smoothed(eqx.Module):
+class Smoothed(AbstractPath):
     """Smoothed estimates, given all T measurements.
 
     Attributes:
@@ -43,16 +42,6 @@ class Smoothed(eqx.Module):
     factor: Float[Array, "T n n *s"]
     start: Gaussian
     ok: Bool[Array, "T *s"]
-
-    @property
-    def covariance(self) -> Float[Array, "T n n *s"]:
-        """Covariances P at each time."""
-        return jax.vmap(outer_square)(self.factor)
-
-    @property
-    def standard_deviation(self) -> Float[Array, "T n *s"]:
-        """Standard deviations at each time."""
-        return jnp.sqrt(jnp.sum(self.factor**2, axis=2))
 
 
 def smooth(
@@ -132,9 +121,13 @@ def _smooth_step(
     propagated = rule.transform(lambda x: model(x, u, dt), estimate, space, space)
     # The joint root of the states at k + 1 and k holds gain and smoothed covariance as blocks, so that no
     # covariance is subtracted from another (square-root form of the RTS smoother; S. Särkkä 2013, ch. 8).
-    both = triangularise_rows(
-        _joint_rows(propagated.rows, propagated.inputs, model.step_noise(dt, propagated.rows.ndim))
-    )
+    rows, inputs, lanes = propagated.rows, propagated.inputs, propagated.rows.shape[2:]
+    none = jnp.zeros((len(rows) - len(inputs), n, *lanes), rows.dtype)
+    above = jnp.concatenate([rows, jnp.concatenate([inputs, none])], axis=1)
+    noise = jnp.swapaxes(model.step_noise(dt, rows.ndim), 0, 1)
+    noise = jnp.broadcast_to(noise, (n, n, *lanes))
+    below = jnp.concatenate([noise, jnp.zeros_like(noise)], axis=1)
+    both = triangularise_rows(jnp.concatenate([above, below]))
     if propagated.less is not None:
         both = downdate_factor(
             both, jnp.concatenate([propagated.less, jnp.zeros_like(propagated.less)])
@@ -150,15 +143,3 @@ def _smooth_step(
     # a difference.
     rows = jnp.concatenate([jnp.swapaxes(rest, 0, 1), jnp.swapaxes(spread, 0, 1)])
     return Gaussian(space.retract(estimate.mean, move), triangularise_rows(rows))
-
-
-def _joint_rows(rows: Array, inputs: Array, noise: Array) -> Array:
-    """Rows whose Gram matrix is the joint covariance of (x_(k+1), x_k)."""
-    r, n = rows.shape[:2]
-    lanes = rows.shape[2:]
-    none = jnp.zeros((r - inputs.shape[0], n, *lanes), rows.dtype)
-    transposed = jnp.broadcast_to(jnp.swapaxes(noise, 0, 1), (n, n, *lanes))
-    above = jnp.concatenate([rows, jnp.concatenate([inputs, none])], axis=1)
-    return jnp.concatenate(
-        [above, jnp.concatenate([transposed, jnp.zeros_like(transposed)], axis=1)]
-    )

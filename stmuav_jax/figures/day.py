@@ -1,6 +1,5 @@
 """Tables, figures, dataset and files of a day of pointing at the sun."""
 
-import csv
 import math
 import os
 from collections.abc import Callable
@@ -13,9 +12,9 @@ from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
-from rich.text import Text
 
-from ..io.netcdf import FileError, Labelled, label_table, regular_file
+from ..io.csv_table import read_csv_table
+from ..io.netcdf import FileError, Labelled, label_table
 from ..math.compiler import quick_jit
 from ..uav.environment.sun import attitude
 from ..uav.tracker.day import PANELS, Day
@@ -23,7 +22,7 @@ from ..uav.tracker.geometry import TrackerGeometry
 from ..uav.tracker.kinematics import Reason, panel_angles
 from ..uav.tracker.workspace import Limits, direction_grid, survey
 from .plot import STYLES, grid
-from .terminal import add_row, make_table
+from .terminal import add_row, make_pairs, make_table
 
 FORMAT = "stmuav_jax day"
 FORMAT_VERSION = 1
@@ -104,11 +103,7 @@ def day_rows(day: Day) -> list[tuple[str, str]]:
 
 def day_tables(day: Day) -> tuple[Table, Table]:
     """Tables for the terminal: main results, and the energies of the panels."""
-    figures = Table(title=Text(day_title(day)), show_header=False, title_justify="left")
-    figures.add_column(style="bold")
-    figures.add_column()
-    for cells in day_rows(day):
-        add_row(figures, *cells)
+    figures = make_pairs(day_title(day), day_rows(day))
     heads = ("panel", "kWh/m² a day", "more than level", "more than single axis")
     energies = make_table(*heads, title="Under a clear sky", right=1)
     for panel in PANELS:
@@ -186,27 +181,16 @@ def load_attitude(path: str | os.PathLike[str]) -> Callable[[Array], Float[Array
     Raises:
         FileError: the file is missing, or has other columns, values or order.
     """
-    source, names = regular_file(path), ["t", "roll", "pitch", "yaw"]
-    try:
-        with source.open(newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FileError(f"{source} is not a readable CSV file: {error}.") from error
-    if not rows or [cell.strip() for cell in rows[0]] != names:
-        first = ",".join(rows[0])[:80] if rows else ""
+    table, names = read_csv_table(path), ["t", "roll", "pitch", "yaw"]
+    source = table.source
+    if list(table.heads) != names:
+        first = ",".join(table.heads)[:80]
         raise FileError(
             f"{source} must begin with the line t,roll,pitch,yaw, but it begins with '{first}'."
         )
-    try:
-        # rows of another length are refused, also where all numbers would fill rows of four
-        numbers = np.array(rows[1:], dtype=float)
-        t, *degrees = numbers.reshape(len(rows) - 1, 4).T
-    except ValueError:
-        raise FileError(f"{source} must have four numbers in each line after the first.") from None
-    if len(t) == 0 or not np.all(np.isfinite([t, *degrees])) or np.any(t[1:] <= t[:-1]):
-        raise FileError(
-            f"{source} must have finite numbers and times that increase from line to line."
-        )
+    t, *degrees = (table.read_numbers(name) for name in names)
+    if np.any(t[1:] <= t[:-1]):
+        raise FileError(f"{source} must have times that increase from line to line.")
     if np.max(np.abs(degrees)) > _MOST_TURNED:
         raise FileError(f"{source} has angles beyond {_MOST_TURNED:g} degrees.")
     # Interpolation between 359 and 1 degrees must go by zero.

@@ -42,10 +42,10 @@ from .page import (
     watched_bodies,
 )
 from .shapes import Shape, body_shapes, make_quads, rotor_points
+from .sketch import COLOURS
 
 # Browsers show a frame of a GIF for at least 0.02 s.
 _FASTEST = {".gif": 50.0, ".mp4": 240.0}
-_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#f0e442")
 _BASE, _PANEL, _JOINT, _ROTOR = "#8b929c", "#1d3f72", "#69717d", "#c3c8d0"
 # Size of the box of a film by that of the motion, and its smallest edge by the largest.
 _MARGIN, _FLATTEST = 1.05, 0.4
@@ -194,7 +194,7 @@ def draw_mechanism(
         Line3DCollection([], colors=_JOINT, linewidths=1.5), autolim=False
     )
     base = names.index(watched_bodies(run)[0])
-    (trail,) = axes.plot([], [], [], color=_COLOURS[0], linewidth=1.2)
+    (trail,) = axes.plot([], [], [], color=COLOURS[0], linewidth=1.2)
     title = str(run.attrs.get("title", "")) or str(run.attrs.get("scene", ""))
     figure.text(0.02, 0.97, title, va="top", fontsize=9, parse_math=False)
     # Below, where a long title cannot push it out of the picture.
@@ -259,7 +259,7 @@ def make_faces(run: xr.Dataset, names: Sequence[str]) -> Faces:
     solids: list[tuple[str, Shape, str]] = []
     for n, name in enumerate(str(name) for name in run["body"].values):
         rotors = rotor_points(run, name)
-        colour = _PANEL if "panel" in name.lower() else _COLOURS[n % len(_COLOURS)]
+        colour = _PANEL if "panel" in name.lower() else COLOURS[n % len(COLOURS)]
         solids += [(name, s, _BASE if len(rotors) else colour) for s in body_shapes(run, name)]
         gaps = np.linalg.norm(rotors[:, None] - rotors[None], axis=2)
         radius = 0.45 * float(np.min(gaps[gaps > 0], initial=0.5 * machine_size(run)))

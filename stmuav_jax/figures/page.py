@@ -31,7 +31,8 @@ from ..dynamics.simulation import Run
 from ..io.netcdf import FileError, load, write_atomically
 from ..io.run_file import loop_to_dataset, to_dataset
 from ..mechanics.body import GROUND
-from .shapes import SLIDING, Shape, body_centre, body_shapes, joint_points, rotor_points
+from .run import SLIDING, displacement_of, motion_of
+from .shapes import Shape, body_centre, body_shapes, joint_points, rotor_points
 
 # Largest number of saved times in a page: more are thinned out evenly.
 MOST_TIMES = 2000
@@ -233,13 +234,8 @@ def joint_of(run: xr.Dataset, k: int) -> dict[str, Any]:
 
 def joint_displacement(run: xr.Dataset, k: int) -> Float[np.ndarray, " t"]:
     """Displacement of a joint's point on body j along the axis on body i (t,) [m]."""
-    ends = []
-    for side in ("i", "j"):
-        body = str(run[f"joint_body_{side}"].values[k])
-        r, R = _body_poses(run, body)
-        ends.append(r + R @ (run[f"joint_point_{side}"].values[k] - body_centre(run, body)))
-    R_i = _body_poses(run, str(run["joint_body_i"].values[k]))[1]
-    return np.sum((ends[1] - ends[0]) * (R_i @ run["joint_frame_i"].values[k][:, 2]), axis=1)
+    motion = motion_of(run)
+    return displacement_of(motion, motion.joints[k])
 
 
 def _rotor_data(run: xr.Dataset) -> dict[str, Any] | None:

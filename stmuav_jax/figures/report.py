@@ -75,7 +75,20 @@ def write_report(
     Raises:
         FileError: the dataset is no result of this package.
     """
-    page = _report_content(result, analysis)
+    kind = "" if isinstance(result, FilterRecord) else result.attrs.get("format", "")
+    if isinstance(result, FilterRecord):
+        page = _of_filters(result)
+    elif "sample" in result.dims:
+        page = _of_study(result, analysis)
+    elif kind in (FORMAT, LOOP_FORMAT):
+        page = _of_motion(result)
+    elif kind == filter_record.FORMAT:
+        page = _of_filters(record_of_dataset(result))
+    else:
+        raise FileError(
+            "A report needs a run, a closed loop, a filter record or a study, but the dataset has the "
+            f"format '{kind}'."
+        )
     embedded_figures = []
     for caption, figure in itertools.chain(figures, page.figures):
         # Pictures within the page: one file that can be sent and kept.
@@ -89,21 +102,6 @@ def write_report(
         tables=[*tables, *page.tables], figures=embedded_figures,
     )  # fmt: skip
     return write_atomically(path, text.encode())
-
-
-def _report_content(result: xr.Dataset | FilterRecord, analysis: Analysis | None) -> _Content:
-    if isinstance(result, FilterRecord):
-        return _of_filters(result)
-    kind = result.attrs.get("format", "")
-    if "sample" in result.dims:
-        return _of_study(result, analysis)
-    if kind in (FORMAT, LOOP_FORMAT):
-        return _of_motion(result)
-    if kind == filter_record.FORMAT:
-        return _of_filters(record_of_dataset(result))
-    raise FileError(
-        f"A report needs a run, a closed loop, a filter record or a study, but the dataset has the format '{kind}'."
-    )
 
 
 def _of_motion(data: xr.Dataset) -> _Content:

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 
 # Largest number of curves in a panel: each has a style of its own.
 _MOST = 4
-_SLIDING = ("translational", "cylindrical", "screw")
+# Kinds of joints along whose axis the bodies slide, and those that turn about it.
+SLIDING = ("translational", "cylindrical", "screw")
 _TURNING = ("revolute", "cylindrical")
 # Largest number of joints in the figure of loads: more curves cannot be told apart at page width.
 _LOADED = 8
@@ -192,13 +193,13 @@ def joints_of(motion: Motion) -> tuple[Any, ...]:
     """
     panels = []
     joints = motion.joints
-    sliding = [joint for joint in joints if joint.kind in _SLIDING][:_MOST]
+    sliding = [joint for joint in joints if joint.kind in SLIDING][:_MOST]
     if sliding:
-        displacements = np.stack([_joint_displacement(motion, joint) for joint in sliding], axis=1)
+        displacements = np.stack([displacement_of(motion, joint) for joint in sliding], axis=1)
         # Joints measure from different origins; strokes from the start are comparable.
         displacements = displacements - displacements[0]
         unit, scale = ("mm", 1e3) if np.nanmax(np.abs(displacements)) < 1 else ("m", 1.0)
-        labels = tuple(f"{joint.name}, {_other_body(joint)}" for joint in sliding)
+        labels = tuple(f"{joint.name}, {joint.body_j.replace('_', ' ')}" for joint in sliding)
         panels.append((f"stroke from the start [{unit}]", labels, scale * displacements))
     name = next((name for name in motion.names if "panel" in name.lower()), None)
     turning = [joint for joint in joints if joint.kind in _TURNING][:_MOST]
@@ -379,10 +380,6 @@ def _base_name(run: "Run") -> str:
     return (run.scene.watch or run.scene.system.names)[-1]
 
 
-def _other_body(joint: Any) -> str:
-    return joint.body_j.replace("_", " ")
-
-
 def _rotation_matrices(p: Any) -> np.ndarray:
     """Rotation matrices (k, 3, 3) of Euler parameters (k, 4); no number stays none."""
     return np.moveaxis(np.asarray(rotation_matrix_in(np, np.asarray(p).T)), -1, 0)
@@ -400,7 +397,7 @@ def joint_side(motion: Motion, joint: Any, side: str) -> tuple[np.ndarray, np.nd
     return motion.r[:, at] + R @ (side_value("point") - motion.com[at]), R @ side_value("frame")
 
 
-def _joint_displacement(motion: Motion, joint: Any) -> np.ndarray:
+def displacement_of(motion: Motion, joint: Any) -> np.ndarray:
     """Displacement of the joint's point on body j along the joint's z axis on body i (k,) [m]."""
     (start, F), (end, _) = joint_side(motion, joint, "i"), joint_side(motion, joint, "j")
     return np.sum((end - start) * F[:, :, 2], axis=1)

@@ -19,9 +19,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ..mechanics.body import GROUND
-
-# Kinds of joints along whose axis the bodies slide.
-SLIDING = ("translational", "cylindrical", "screw")
+from .run import SLIDING
 
 # Relative difference below which two principal moments count as equal; products of inertia below
 # this part of the largest moment leave the solid along the body's own axes.
@@ -153,7 +151,8 @@ def inertia_solid(mass: float, inertia: Float[np.ndarray, "3 3"], kind: str | No
         radius, length = np.sqrt(2 * moments[symmetry_axis] / mass), edges[symmetry_axis]
         return Shape("cylinder", (float(radius), float(length)), orientation=turn)
     size = tuple(float(edge) for edge in edges)
-    return Shape("panel" if kind == "panel" else "box", size, orientation=_matrix_parameters(R))
+    x, y, z, w = map(float, Rotation.from_matrix(R).as_quat())
+    return Shape("panel" if kind == "panel" else "box", size, orientation=(w, x, y, z))
 
 
 def make_quads(shape: Shape) -> Float[np.ndarray, "f 4 3"]:
@@ -217,11 +216,6 @@ def turn_towards(axis: Float[np.ndarray, "3"]) -> tuple[float, ...]:
         return (0.0, 1.0, 0.0, 0.0)
     e = np.array([1 + z[2], *half])
     return tuple(float(x) for x in e / np.linalg.norm(e))
-
-
-def _matrix_parameters(R: Float[np.ndarray, "3 3"]) -> tuple[float, ...]:
-    x, y, z, w = Rotation.from_matrix(R).as_quat()
-    return (float(w), float(x), float(y), float(z))
 
 
 def _distinct_points(

@@ -16,13 +16,12 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..studies.sensitivity import IndexIntervals, separation
-from ..studies.statistics import SampleSummary, bands, probability
+from ..studies.sensitivity import separation
+from ..studies.statistics import Intervals, SampleSummary, bands, probability
 from .plot import STYLES, grid
 from .study_data import (
     ROWS,
     Analysis,
-    Curve,
     QuantityAnalysis,
     StudyData,
     StudyQuantity,
@@ -46,20 +45,15 @@ def wrap_label(description: str, unit: str, width: int = 30) -> str:
     """Label in lines of about `width` characters, escaped from matplotlib's mathematics."""
     text = label_unit(description, unit).replace("$", r"\$")
     # dotted keys such as start.roll.angle_rate are broken at their dots, not inside of a word
-    parts = [part for word in text.split() for part in _word_parts(word, width)]
     lines = [""]
-    for part, space in parts:
-        if lines[-1] and len(lines[-1]) + len(space + part) > width:
-            lines.append(part)
-        else:
-            lines[-1] += (space if lines[-1] else "") + part
+    for word in text.split():
+        for k, part in enumerate(re.findall(r"[^._]+[._]*", word) if len(word) > width else [word]):
+            space = "" if k or not lines[-1] else " "
+            if lines[-1] and len(lines[-1] + space + part) > width:
+                lines.append(part)
+            else:
+                lines[-1] += space + part
     return "\n".join(lines)
-
-
-def _word_parts(word: str, width: int) -> list[tuple[str, str]]:
-    """Parts of a word, split at dots and underscores if it exceeds the width, and the blank before each."""
-    parts = re.findall(r"[^._]+[._]*", word) if len(word) > width else [word]
-    return [(part, "" if k else " ") for k, part in enumerate(parts)]
 
 
 def make_panels(count: int, height: float, columns: int = 2) -> tuple[Figure, list[Axes]]:
@@ -114,7 +108,7 @@ def draw_fans(data: StudyData, analysis: Analysis) -> Figure | None:
     return figure
 
 
-def _draw_fan(data: StudyData, curve: Curve, ax: Axes) -> int:
+def _draw_fan(data: StudyData, curve: StudyQuantity, ax: Axes) -> int:
     # A study may be larger than memory; a median of this many samples is exact enough for a picture.
     limit = max(1, NUMBERS // max(data.dataset.sizes[curve.axis], 1))
     x, y = data.curve(curve, limit)
@@ -417,15 +411,13 @@ def _draw_map(figure: Figure, ax: Axes, x: np.ndarray, y: np.ndarray, hits: np.n
     middles = [(edges[1:] + edges[:-1]) / 2 for edges in (x_edges, y_edges)]
     for i, j in np.ndindex(counts.shape):
         dark = share[i, j] > 0.6 * most
-        ax.text(float(middles[0][i]), float(middles[1][j]), _short_text(int(counts[i, j])), fontsize=5.5, ha="center",
-                va="center", color="white" if dark else "0.3")  # fmt: skip
+        count = int(counts[i, j])
+        text = f"{count}" if count < 10_000 else f"{count // 1000}k"
+        ax.text(float(middles[0][i]), float(middles[1][j]), text, fontsize=5.5, ha="center", va="center",
+                color="white" if dark else "0.3")  # fmt: skip
     bar = figure.colorbar(mesh, ax=ax, fraction=0.06)
     bar.set_label("estimated probability", fontsize=8)
     bar.ax.tick_params(labelsize=8)
-
-
-def _short_text(count: int) -> str:
-    return f"{count}" if count < 10_000 else f"{count // 1000}k"
 
 
 def _plot_share(ax: Axes, x: np.ndarray, hits: np.ndarray, level: float) -> None:
@@ -496,7 +488,7 @@ def _sobol_bars(ax: Axes, finding: QuantityAnalysis, names: list[str]) -> None:
 
 
 def _draw_bars(
-    ax: Axes, places: np.ndarray, shares: IndexIntervals, picked: list[int], height: float,
+    ax: Axes, places: np.ndarray, shares: Intervals, picked: list[int], height: float,
     colour: str, legend_label: str,
 ) -> float:  # fmt: skip
     """Draw shares with their intervals from 0 to 1, where all shares lie; the largest end."""

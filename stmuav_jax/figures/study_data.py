@@ -23,7 +23,6 @@ from ..checks.errors import SettingError
 from ..io.netcdf import FileError, write_atomically
 from ..studies.columns import FINE, MISSING, column_name
 from ..studies.sensitivity import (
-    IndexIntervals,
     SobolIndices,
     separation,
     sobol,
@@ -34,9 +33,9 @@ from ..studies.statistics import (
     LEVEL,
     SHARES,
     IntervalEstimate,
+    Intervals,
     Outcomes,
     SampleSummary,
-    independent_mask,
     outcomes,
     probability,
     summarise,
@@ -51,13 +50,14 @@ BLOCK = 2**22
 
 
 class StudyQuantity(NamedTuple):
-    """Quantity with a number for each sample: a column, or one component of it.
+    """Quantity with a number, or a curve of numbers, for each sample: a column, or one component of it.
 
     Attributes:
         key: name, such as "peak_force[joint=hinge_1]".
         column, place: column, and indices by dimension of the component in it.
         label, unit: description and unit for labels; "1" is no unit.
         whole: true if its numbers are integers or truth values.
+        axis: dimension of a curve's axis, "" for a number. axis_words, axis_unit: for the axis' label.
     """
 
     key: str
@@ -66,24 +66,9 @@ class StudyQuantity(NamedTuple):
     label: str
     unit: str
     whole: bool = False
-
-
-class Curve(NamedTuple):
-    """Curve of numbers over an axis for each sample, with further attributes as in `StudyQuantity`.
-
-    Attributes:
-        axis: dimension of the axis.
-        axis_words, axis_unit: description and unit of the axis for its label.
-    """
-
-    key: str
-    column: str
-    place: dict[str, int]
-    label: str
-    unit: str
-    axis: str
-    axis_words: str
-    axis_unit: str
+    axis: str = ""
+    axis_words: str = ""
+    axis_unit: str = "1"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +89,7 @@ class StudyData:
     reasons: dict[int, str]
     inputs: tuple[StudyQuantity, ...]
     quantities: tuple[StudyQuantity, ...]
-    curves: tuple[Curve, ...]
+    curves: tuple[StudyQuantity, ...]
     notes: tuple[str, ...]
 
     @functools.cached_property
@@ -137,7 +122,8 @@ class StudyData:
     def chosen(self) -> np.ndarray:
         """Mask of the samples that share no factor values with others (n,)."""
         # A base point of Saltelli's design has d + 2 samples: A, B, and A with each column of B.
-        return independent_mask(len(self.status), len(self.factors) + 2, self.design)
+        row = len(self.factors) + 2 if self.design == "saltelli" else 1
+        return np.arange(len(self.status)) % row < 2
 
     @functools.cached_property
     def computed(self) -> np.ndarray:
@@ -148,10 +134,6 @@ class StudyData:
     def completed(self) -> np.ndarray:
         """Increasing numbers of the completed samples among the chosen ones."""
         return np.flatnonzero(self.chosen & (self.status == FINE))
-
-    def whole_column(self, quantity: StudyQuantity) -> np.ndarray:
-        """Values of all samples (n,) as doubles."""
-        return np.asarray(self.dataset[quantity.column].isel(quantity.place).values, dtype=float)
 
     def values(
         self,
@@ -175,7 +157,7 @@ class StudyData:
         count = len((self.completed if of == "fine" else self.computed)[:limit])
         return np.stack(columns, axis=1) if columns else np.empty((count, 0))
 
-    def curve(self, curve: Curve, limit: int) -> tuple[np.ndarray, np.ndarray]:
+    def curve(self, curve: StudyQuantity, limit: int) -> tuple[np.ndarray, np.ndarray]:
         """Axis (k,), and curves (m, k) of the first m <= `limit` completed samples."""
         numbers = self.completed[:limit]
         axis = np.asarray(self.dataset[curve.axis].values, dtype=float)
@@ -211,16 +193,13 @@ def study_data(dataset: xr.Dataset) -> StudyData:
     }
     inputs: list[StudyQuantity] = []
     quantities: list[StudyQuantity] = []
-    curves: list[Curve] = []
+    curves: list[StudyQuantity] = []
     notes: list[str] = []
     for name, role in roles.items():
         if role not in ("input", "quantity") or "sample" not in dataset[name].dims:
             continue
         for part in _column_parts(dataset, name, notes):
-            if isinstance(part, Curve):
-                curves.append(part)
-            else:
-                (inputs if role == "input" else quantities).append(part)
+            (curves if part.axis else inputs if role == "input" else quantities).append(part)
     codes = np.asarray(dataset[status[0]].values)
     remaining_fields = (tuple(quantities), tuple(curves), tuple(notes))
     data = StudyData(dataset, codes, identity, reasons, tuple(inputs), *remaining_fields)
@@ -235,9 +214,7 @@ def label_unit(text: str, unit: str) -> str:
     return text if unit in ("", "1") else f"{text} [{unit}]"
 
 
-def _column_parts(
-    dataset: xr.Dataset, name: str, notes: list[str]
-) -> Iterator[StudyQuantity | Curve]:
+def _column_parts(dataset: xr.Dataset, name: str, notes: list[str]) -> Iterator[StudyQuantity]:
     """Quantities and curves of a column."""
     variable = dataset[name]
     long_name = str(variable.attrs.get("long_name") or name.replace("_", " "))
@@ -252,7 +229,8 @@ def _column_parts(
         )
     for place in places[:COMPONENTS]:
         where = dict(zip(others, place, strict=True))
-        marks = [f"{dim}={_coordinate_text(dataset, dim, k)}" for dim, k in where.items()]
+        of = lambda dim, k: dataset[dim].values[k] if dim in dataset.coords else k
+        marks = [f"{dim}={of(dim, k)}" for dim, k in where.items()]
         key = f"{name}[{', '.join(marks)}]" if marks else name
         full_name = (
             f"{long_name}, {', '.join(m.split('=')[1] for m in marks)}" if marks else long_name
@@ -260,16 +238,8 @@ def _column_parts(
         if axis:
             attributes = dataset[axis].attrs
             axis_words = str(attributes.get("long_name") or axis.replace("_", " "))
-            yield Curve(
-                key,
-                name,
-                where,
-                full_name,
-                unit,
-                axis,
-                axis_words,
-                str(attributes.get("units", "1")),
-            )
+            of_axis = axis, axis_words, str(attributes.get("units", "1"))
+            yield StudyQuantity(key, name, where, full_name, unit, False, *of_axis)
         else:
             yield StudyQuantity(key, name, where, full_name, unit, variable.dtype.kind in "biu")
 
@@ -284,10 +254,6 @@ def _curve_axis(dataset: xr.Dataset, dims: list[str]) -> str | None:
         if numbers and dataset[dim].attrs.get("units", "1") not in ("", "1"):
             return dim
     return None
-
-
-def _coordinate_text(dataset: xr.Dataset, dim: str, k: int) -> str:
-    return str(dataset[dim].values[k]) if dim in dataset.coords else str(k)
 
 
 def _read_json(dataset: xr.Dataset, name: str) -> dict[str, Any]:
@@ -329,8 +295,8 @@ class Influence(NamedTuple):
 
     names: tuple[str, ...]
     indices: SobolIndices | None
-    first: IndexIntervals | None
-    ranks: IndexIntervals | None
+    first: Intervals | None
+    ranks: Intervals | None
     samples: int
     note: str
 
@@ -397,7 +363,11 @@ def analyse(data: StudyData, level: float = LEVEL) -> Analysis:
         for quantity in data.inputs
     }
     # An input that does not vary has no influence, and a regression on it has no slope.
-    varying = tuple(quantity for quantity in data.inputs if _has_spread(inputs[quantity.key]))
+    varying = tuple(
+        quantity
+        for quantity, summary in zip(data.inputs, inputs.values(), strict=True)
+        if summary.minimum != summary.maximum
+    )
     picked = [data.inputs.index(quantity) for quantity in varying]
     table = data.table(limit=ROWS)[:, picked]
     names = (
@@ -473,7 +443,8 @@ def _sobol_influence(
     resamples = min(499, max(RESAMPLES, DRAWS // max(len(data.status), 1)))
     # Indices need the samples in their places, failed ones included, since a base point counts
     # whole or not at all.
-    values = data.whole_column(quantity)
+    column = data.dataset[quantity.column].isel(quantity.place)
+    values = np.asarray(column.values, dtype=float)
     try:
         indices = sobol(values, data.status, len(names), level=level, resamples=resamples)
     except SettingError as error:
@@ -514,11 +485,6 @@ def _failing_distance(data: StudyData, picked: list[int]) -> np.ndarray | None:
     if not picked or not np.any(failed) or np.all(failed):
         return None
     return separation(data.table("computed", ROWS)[:, picked], failed)
-
-
-def _has_spread(summary: SampleSummary) -> bool:
-    least, most = summary.minimum, summary.maximum
-    return least is not None and most is not None and least < most
 
 
 def _study_notes(data: StudyData) -> tuple[str, ...]:
@@ -586,7 +552,7 @@ def to_json(value: Any) -> Any:
 
 
 def _plain_influence(influence: Influence) -> dict[str, Any]:
-    def shares(part: IndexIntervals | None) -> dict[str, Any] | None:
+    def shares(part: Intervals | None) -> dict[str, Any] | None:
         if part is None:
             return None
         rows = zip(part.value.tolist(), part.low.tolist(), part.high.tolist(), strict=True)

@@ -1,6 +1,7 @@
 """Tables and lines of the terminal, printed literally: brackets are units and paths, not markup."""
 
 import math
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -39,6 +40,16 @@ def make_table(*heads: str, title: str | None = None, right: int = 0) -> Table:
 def add_row(rich_table: Table, *cells: object) -> None:
     """Add a row of cells that are printed literally."""
     rich_table.add_row(*(Text(str(cell)) for cell in cells))
+
+
+def make_pairs(title: str, rows: Iterable[Sequence[str]]) -> Table:
+    """Table of quantities and their values, without heads."""
+    pairs = Table(title=Text(title), show_header=False, title_justify="left")
+    pairs.add_column(style="bold")
+    pairs.add_column()
+    for cells in rows:
+        add_row(pairs, *cells)
+    return pairs
 
 
 def _format_number(value: float, unit: str) -> str:
@@ -129,12 +140,8 @@ def certificate_table(run: "Run", *, verbose: bool = False) -> Table:
         run: run.
         verbose: True for all entries, False for the six that decide.
     """
-    two_column_table = Table(title=Text(run.scene.title), show_header=False, title_justify="left")
-    two_column_table.add_column(style="bold")
-    two_column_table.add_column()
-    for cells in (certificate_rows if verbose else summary_rows)(run.certificate):
-        add_row(two_column_table, *cells)
-    return two_column_table
+    rows = (certificate_rows if verbose else summary_rows)(run.certificate)
+    return make_pairs(run.scene.title, rows)
 
 
 def loads_table(scene: "Scene", loads: "JointLoads") -> Table:

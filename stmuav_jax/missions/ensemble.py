@@ -33,9 +33,8 @@ from ..studies.disturbed_flights import (
     suggest_names,
     table_entry,
 )
-from ..studies.schema import factors_of
 from ..studies.study import Study
-from ..studies.study_file import check_study, study_settings
+from ..studies.study_file import check_study, factors_of, study_settings
 from ..uav.allocation import RotorLimits
 from ..uav.motor import MotorRotors, only_rotors
 from .controller import AT_ONCE
@@ -390,13 +389,13 @@ def make_mission_study(
     }
     quantities = _list_quantities(mission.machine)
     find_target = lambda factor: _find_target(evaluation, factor)
-    columns = factor_columns(
-        factors, find_target, relative, {*quantities, "end", "status", "sample"}
-    )
-    for name, (unit, description) in quantities.items():
-        columns[name] = Column("int8" if name == "kept" else "float64", unit, description)
+    columns = {
+        name: Column("int8" if name == "kept" else "float64", unit, description)
+        for name, (unit, description) in quantities.items()
+    }
     columns["end"] = Column("float64", "s", "last time with valid numbers", "diagnostic")
     columns["status"] = Column("int8", "1", "how the flight ended", "status")
+    columns = factor_columns(factors, find_target, relative, columns)
     return Study(
         evaluation, factors, columns=columns,
         reasons=loop_reasons | {NOT_PHYSICAL: "masses or inertias that no body can have"},

@@ -36,7 +36,6 @@ from .sensitivity import (
 )
 from .statistics import (
     bands as bands,
-    convergence as convergence,
     mean as mean,
     outcomes as outcomes,
     probability as probability,

@@ -54,7 +54,7 @@ from ..uav.scenes.registry import SCENES, entry_of, make_scene, options_from_pla
 from ..uav.scenes.uav_tracker import make_uav
 from ..uav.tracker.bodies import LinearActuator
 from ..uav.tracker.geometry import initial_angles
-from .columns import Column, column_name
+from .columns import Column
 
 # Relative tolerance for round-off in the check of sampled inertia tensors.
 ROUND_OFF = 1e-12
@@ -120,19 +120,18 @@ def factor_columns(
     factors: Iterable[str],
     find_target: Callable[[str], FactorTarget],
     relative: frozenset[str],
-    others: Iterable[str],
+    others: Mapping[str, Column],
 ) -> dict[str, Column]:
-    """Columns of factors, each of which has a target and a column of its own.
+    """Columns of factors by their names, each of which has a target of its own, and other columns.
 
     Args:
-        find_target: function of a name. relative: factors that multiply a value. others: further columns.
+        find_target: function of a name. relative: factors that multiply a value.
 
     Raises:
-        SettingError: two factors of one number or of one column, or a column that is another's.
+        SettingError: two factors of one number, or a factor with the name of another column.
     """
     places: dict[Any, str] = {}
-    columns: dict[str, Column] = {}
-    owners = {name: name for name in others}
+    columns = dict(others)
     for name in factors:
         target = find_target(name)
         # a factor of a whole array and one of its entries would both set the entry
@@ -140,12 +139,10 @@ def factor_columns(
             if (other := places.get((target.name, place))) is not None:
                 raise SettingError(f"'{other}' and '{name}' are the same number; give one of them.")
             places[target.name, place] = name
-        column = column_name(name)
-        if (owner := owners.get(column)) is not None:
-            raise SettingError(f"'{owner}' and '{name}' would share the column '{column}'.")
-        owners[column] = name
+        if name in others:
+            raise SettingError(f"'{name}' and '{name}' would share the column '{name}'.")
         label = f"{name}, share of the table's" if name in relative else name
-        columns[column] = Column("float64", target.unit, label, "input")
+        columns[name] = Column("float64", target.unit, label, "input")
     return columns
 
 
@@ -301,13 +298,9 @@ class AbstractFlights(abc.ABC):
         """True if bodies can have a sample's masses and inertia tensors; may be traced."""
         return is_possible(self.table, self._table_factors(sample), self.relative)
 
-    def nominal(self) -> tuple[System, State]:
-        """System and initial state without any disturbance."""
-        return self.build({})
-
     def facing(self) -> np.ndarray:
         """The world direction of the last body's z axis at the start (3,); a panel faces it."""
-        return np.asarray(_rotation(self.nominal()[1].p[-1]))[:, 2]
+        return np.asarray(_rotation(self.build({})[1].p[-1]))[:, 2]
 
     def _table_factors(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         return {name: value for name, value in sample.items() if name not in self.own_factors}
@@ -462,16 +455,6 @@ def _other_inputs(system: System) -> Inputs:
     return Inputs(tuple(e for e in every if not named_apart[e.force])).constant(system)
 
 
-def _uav_hover(table: Parameters) -> Float[np.ndarray, " m"]:
-    trim_result = trim_flight(make_uav(table), hover(initial_angles(table)))
-    if int(trim_result.reason) != TrimReason.VALID:
-        raise SettingError(
-            "There is no hover at the initial posture of these parameters: "
-            f"{TrimReason(int(trim_result.reason)).name.lower().replace('_', ' ')}."
-        )
-    return np.asarray(trim_result.values)
-
-
 def trim_inputs(scene: str, built: Scene) -> Float[np.ndarray, " m"]:
     """Inputs of a scene at which it hovers, or stands still at its start if its base is fixed (m,)."""
     if not len(inputs_of(built.system)):
@@ -526,8 +509,15 @@ def make_flights(
         option_names=option_parameters,
     )
     if settings.inputs == "trim":
-        of_uav = scene == "uav_tracker"
-        held_inputs = _uav_hover(table) if of_uav else trim_inputs(scene, built)
+        if scene == "uav_tracker":
+            trim_result = trim_flight(make_uav(table), hover(initial_angles(table)))
+            if (reason := TrimReason(int(trim_result.reason))) != TrimReason.VALID:
+                raise SettingError(
+                    f"There is no hover at the initial posture of these parameters: {reason.label}."
+                )
+            held_inputs = np.asarray(trim_result.values)
+        else:
+            held_inputs = trim_inputs(scene, built)
         settings = replace(settings, held_inputs=held_inputs)
     vars(settings)["system"] = built.system
     return settings

@@ -19,7 +19,6 @@ import numpy as np
 from ..checks.errors import SettingError, nearest_names
 from ..checks.schema import SHOWN, quote_name, validate_model
 from ..dynamics.choices import ExplicitSolverName, solver_named
-from ..dynamics.formulations.base import AbstractFormulation
 from ..dynamics.integration.lanes import REASONS, Ending, Plan, RunResult, integrate_batch
 from ..dynamics.integration.problem import Problem, prepare_problem
 from ..dynamics.method import Method, describe_part
@@ -104,11 +103,6 @@ class Failure:
     def __post_init__(self) -> None:
         validate_model(FailureEntry, vars(self), "A failure")
 
-    def plain(self) -> dict[str, Any]:
-        """Plain data, as in a study's file."""
-        limits = {"above": self.above, "below": self.below}
-        return {"quantity": self.quantity} | {k: v for k, v in limits.items() if v is not None}
-
 
 @dataclass(frozen=True)
 class FlightEvaluation(AbstractBatch):
@@ -146,7 +140,19 @@ class FlightEvaluation(AbstractBatch):
         validate_model(Integrating, {k: settings[k] for k in Integrating.model_fields}, "A study")
         if not self.quantities:
             raise SettingError("The study has no quantities: give it at least one.")
-        _check_numbers(self)
+        if self.every is not None and self.every > self.t1:
+            raise SettingError(
+                f"Times {self.every:g} s apart do not fit into a flight of {self.t1:g} s."
+            )
+        if self.every is not None and self.t1 / self.every > MOST_TIMES:
+            raise SettingError(
+                f"Times {self.every:g} s apart are more than {MOST_TIMES:,} in {self.t1:g} s."
+            )
+        length = 1.0 if self.direction is None else math.hypot(*self.direction)
+        if not abs(length - 1) <= 1e-9:
+            raise SettingError(
+                f"The direction must be a unit vector, but its length is {length:.12g}."
+            )
 
     def __getstate__(self) -> dict[str, Any]:
         """State without what is found again from the rest."""
@@ -166,6 +172,10 @@ class FlightEvaluation(AbstractBatch):
 
     def plain(self) -> dict[str, Any]:
         """Plain data of everything on which the numbers depend, except the sampling."""
+        plain = lambda q: {
+            "signal": q.signal, "take": q.take,
+            **({} if q.level is None else {"level": q.level, "stop": q.stop}),
+        }  # fmt: skip
         return (
             self.flights.plain()
             | {"t1": self.t1}
@@ -174,7 +184,7 @@ class FlightEvaluation(AbstractBatch):
                 "kind": "flights",
                 "parameters": digest_table(self.flights.table),
                 "relative": sorted(self.flights.relative),
-                "quantities": {k: _plain_quantity(q) for k, q in self.quantities.items()},
+                "quantities": {name: plain(q) for name, q in self.quantities.items()},
                 "times": self.times.tolist(),
                 "direction": None if self.direction is None else list(self.direction),
             }
@@ -217,26 +227,20 @@ class FlightEvaluation(AbstractBatch):
         # the first to ask may be a program that is being traced
         return compute_untraced(self.flights.facing)
 
-    @property
-    def _formulation(self) -> AbstractFormulation:
-        """Formulation of the runs, asked for where nothing is traced."""
-        chosen = self.method.formulation
-        if not self.flights.dependent_rows:
-            return chosen
-        allowing = chosen.allowing_dependent_rows()
-        if allowing is None:
-            raise SettingError(
-                f"The system has dependent constraint rows, which {chosen} does not support."
-            )
-        return allowing
-
     @cached_property
     def plan(self) -> Plan:
         """Plan of the batch integration, whose numbers are samples and data of their keys (2,)."""
-        direction = self._facing
+        direction, formulation = self._facing, self.method.formulation
+        if self.flights.dependent_rows:
+            formulation = formulation.allowing_dependent_rows()
+            if formulation is None:
+                raise SettingError(
+                    "The system has dependent constraint rows, which "
+                    f"{self.method.formulation} does not support."
+                )
         method = dataclasses.replace(
             self.method,
-            formulation=self._formulation,
+            formulation=formulation,
             adjoint=diffrax.ForwardMode(),
             steps="state",
         )
@@ -351,29 +355,31 @@ def make_flight_study(
             quantity; also as for `Study`.
     """
     flights = evaluation.flights
-    inputs = factor_columns(factors, flights.entry, flights.relative, OWN)
-    # Quantities and factors are columns of one dataset.
-    clash = sorted({*evaluation.quantities} & (set(inputs) | OWN))
-    if clash:
+    # Quantities, factors and diagnostics are columns of one dataset.
+    if clash := sorted(OWN & {*evaluation.quantities}):
         name_list = ", ".join(clash)
         raise SettingError(f"Quantities must not have the names of other columns: {name_list}.")
     identity = evaluation.plain()
     if failure is not None:
-        _check_failure(failure, evaluation.quantities)
-        identity["failure"] = failure.plain()
-    columns = inputs | evaluation.columns
+        quantities = evaluation.quantities
+        scalars = [name for name, quantity in quantities.items() if quantity.take != "path"]
+        if failure.quantity not in scalars:
+            raise SettingError(
+                f"The failure is of {quote_name(failure.quantity)}, which is no quantity with one number "
+                f"a flight.{nearest_names(failure.quantity[:SHOWN], scalars)}"
+            )
+        is_crossing = quantities[failure.quantity].take.startswith("when_")
+        if not is_crossing and failure.above is None and failure.below is None:
+            raise SettingError(
+                f"The failure by '{failure.quantity}' needs a limit: above = ... or below = ..."
+            )
+        identity["failure"] = {k: v for k, v in vars(failure).items() if v is not None}
+    columns = factor_columns(factors, flights.entry, flights.relative, evaluation.columns)
     reasons = {int(code): reason for code, reason in REASONS.items()}
     return Study(
         evaluation, factors, columns=columns, axes=evaluation.axes, reasons=reasons, identity=identity,
         **settings,
     )  # fmt: skip
-
-
-def _plain_quantity(quantity: Quantity) -> dict[str, Any]:
-    result: dict[str, Any] = {"signal": quantity.signal, "take": quantity.take}
-    if quantity.level is not None:
-        result |= {"level": quantity.level, "stop": quantity.stop}
-    return result
 
 
 # Parts of a method that a study cannot have, and why.
@@ -384,8 +390,12 @@ _NOT_OF_STUDIES = {
 }
 
 
-def _method_entries(method: Method) -> dict[str, Any]:
-    """Entries of a study's file for its method; raises `SettingError` for one that it cannot have."""
+def method_plain(method: Method) -> dict[str, Any]:
+    """Plain data of a study's method: the file's entries, and other parts where they are not usual.
+
+    Raises:
+        SettingError: a part that a study cannot have, or that plain data cannot describe.
+    """
     if not isinstance(method, Method):
         raise SettingError(
             f"The method of a study must be a stmuav_jax.Method, not of type {type(method).__name__}."
@@ -395,24 +405,17 @@ def _method_entries(method: Method) -> dict[str, Any]:
             raise SettingError(f"The method of a study cannot have '{name}': {reason}.")
     solvers = {name: solver_named(name) for name in get_args(ExplicitSolverName)}
     # A study's file has names for solvers; one with other settings could not be read back.
-    result = [name for name, solver in solvers.items() if eqx.tree_equal(method.solver, solver)]
-    if not result:
-        solver_name = (
-            method.solver if isinstance(method.solver, str) else type(method.solver).__name__
-        )
+    names = [name for name, solver in solvers.items() if eqx.tree_equal(method.solver, solver)]
+    if not names:
+        is_text = isinstance(method.solver, str)
+        solver_name = method.solver if is_text else type(method.solver).__name__
         valid = " or ".join(f"{type(solver).__name__}()" for solver in solvers.values())
         raise SettingError(f"The solver of a study must be diffrax's {valid}, not {solver_name}.")
-    tolerances = {"rtol": float(method.rtol), "atol": float(method.atol)}
-    return tolerances | {"solver": result[0], "max_steps": method.max_steps}
-
-
-def method_plain(method: Method) -> dict[str, Any]:
-    """Plain data of a study's method: the file's entries, and other parts where they are not usual.
-
-    Raises:
-        SettingError: a part that a study cannot have, or that plain data cannot describe.
-    """
-    usual, result = Method(), _method_entries(method)
+    usual = Method()
+    result: dict[str, Any] = {
+        "rtol": float(method.rtol), "atol": float(method.atol), "solver": names[0],
+        "max_steps": method.max_steps,
+    }  # fmt: skip
     for name in ("first_step", "max_step"):
         if (value := float(getattr(method, name))) != float(getattr(usual, name)):
             result[name] = value
@@ -428,34 +431,3 @@ def method_plain(method: Method) -> dict[str, Any]:
                     f"has '{min(odd)}'."
                 )
     return result
-
-
-def _check_failure(failure: Failure, quantities: Mapping[str, Quantity]) -> None:
-    scalar_names = [name for name, quantity in quantities.items() if quantity.take != "path"]
-    if failure.quantity not in scalar_names:
-        raise SettingError(
-            f"The failure is of {quote_name(failure.quantity)}, which is no quantity with one number a "
-            f"flight.{nearest_names(failure.quantity[:SHOWN], scalar_names)}"
-        )
-    crossing = quantities[failure.quantity].take.startswith("when_")
-    if not crossing and failure.above is None and failure.below is None:
-        raise SettingError(
-            f"The failure by '{failure.quantity}' needs a limit: above = ... or below = ..."
-        )
-
-
-def _check_numbers(evaluation: FlightEvaluation) -> None:
-    if evaluation.every is not None and evaluation.every > evaluation.t1:
-        raise SettingError(
-            f"Times {evaluation.every:g} s apart do not fit into a flight of {evaluation.t1:g} s."
-        )
-    if evaluation.every is not None and evaluation.t1 / evaluation.every > MOST_TIMES:
-        raise SettingError(
-            f"Times {evaluation.every:g} s apart are more than {MOST_TIMES:,} in {evaluation.t1:g} s."
-        )
-    if evaluation.direction is not None:
-        size = math.hypot(*evaluation.direction)
-        if not abs(size - 1) <= 1e-9:
-            raise SettingError(
-                f"The direction must be a unit vector, but its length is {size:.12g}."
-            )

@@ -83,7 +83,7 @@ class Sampling:
     def limit(self) -> int | None:
         """Largest number of samples; None for an unlimited design."""
         if self.design == "table":
-            return _count_rows(self.factors)
+            return max(len(factor.parameters.get("values", ())) for factor in self.factors.values())
         if self.design in ("sobol", "saltelli"):
             return SOBOL_POINTS * self.together
         return None
@@ -200,14 +200,12 @@ def _make_hypercube(seed: int, b: int, size: int, d: int) -> np.ndarray:
     return np.minimum(points, np.nextafter(1.0, 0.0))
 
 
-def _draw_sobol(sampling: Sampling, first: int, count: int) -> np.ndarray:
-    return _sobol_sequence(len(sampling.factors), sampling.seed, first, count, "sobol")
-
-
-def _sobol_sequence(d: int, seed: int, first: int, count: int, design: str) -> np.ndarray:
+def _draw_sobol(sampling: Sampling, first: int, count: int, d: int = 0) -> np.ndarray:
+    """Scrambled Sobol sequence in d dimensions, by default one for each factor."""
     from scipy.stats import qmc
 
-    rng = np.random.default_rng([seed, _STREAM[design]])
+    d = d or len(sampling.factors)
+    rng = np.random.default_rng([sampling.seed, _STREAM[sampling.design]])
     engine = qmc.Sobol(d, scramble=True, bits=SOBOL_BITS, rng=rng)
     if count == 0:
         return np.empty((0, d))
@@ -223,7 +221,7 @@ def _draw_saltelli(sampling: Sampling, first: int, count: int) -> np.ndarray:
     d = len(sampling.factors)
     k = first // (d + 2)
     points = -(-(first + count) // (d + 2)) - k
-    base = _sobol_sequence(2 * d, sampling.seed, k, points, "saltelli")
+    base = _draw_sobol(sampling, k, points, 2 * d)
     a, b = base[:, :d], base[:, d:]
     rows = np.repeat(a[:, None], d + 2, axis=1)
     rows[:, 1] = b
@@ -265,10 +263,6 @@ def _table_column(distribution: Distribution, first: int, count: int) -> np.ndar
 
 def _count_up(distribution: Distribution, first: int, count: int) -> np.ndarray:
     return distribution.parameters["first"] + np.arange(first, first + count)
-
-
-def _count_rows(factors: Mapping[str, Distribution]) -> int:
-    return max(len(distribution.parameters.get("values", ())) for distribution in factors.values())
 
 
 # --- checks

@@ -23,7 +23,6 @@ from ..checks.schema import (
     Tuples,
     format_value,
     quote_name,
-    validate_model,
 )
 from ..dynamics.choices import STEP_TOLERANCE, ExplicitSolverName
 from ..uav.scenes.registry import SCENES
@@ -183,33 +182,6 @@ class MissionStudyFile(Drawing):
 def study_json_schema() -> dict[str, Any]:
     """JSON schema of a study's file, for editors."""
     return TypeAdapter(FlightsFile | EstimationFile | MissionStudyFile).json_schema()
-
-
-def flights_file(plain: Mapping[str, Any]) -> FlightsFile:
-    """Study of motions from its plain data, with all types and ranges checked.
-
-    Raises:
-        SettingError: an entry that is unknown, missing, of another type or out of range.
-    """
-    return validate_model(FlightsFile, plain, "A study")
-
-
-def estimation_file(plain: Mapping[str, Any]) -> EstimationFile:
-    """Study of estimation from its plain data, checked as by `flights_file`."""
-    return validate_model(EstimationFile, plain, "A study of estimation")
-
-
-def factors_of(entries: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[str]]:
-    """Distributions of the factors in plain form, and the names of relative ones."""
-    result: dict[str, Any] = {}
-    relative = set()
-    for name, distribution in entries.items():
-        if isinstance(distribution, Mapping):
-            distribution = dict(distribution)
-            if distribution.pop("relative", False):
-                relative.add(name)
-        result[name] = distribution
-    return result, frozenset(relative)
 
 
 def check_count(value: Any, subject: str, most: int = MOST) -> int:

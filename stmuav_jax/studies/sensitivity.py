@@ -17,18 +17,10 @@ from jaxtyping import Bool, Float, Integer, Shaped
 
 from ..checks.errors import SettingError
 from .columns import FINE, MISSING
-from .statistics import LEVEL
+from .statistics import LEVEL, Intervals
 
 # Largest number of doubles in one batch of the bootstrap, 128 MiB.
 _BATCH = 2**24
-
-
-class IndexIntervals(NamedTuple):
-    """Estimates for d factors with the ends of their confidence intervals, each (d,)."""
-
-    value: Float[np.ndarray, " d"]
-    low: Float[np.ndarray, " d"]
-    high: Float[np.ndarray, " d"]
 
 
 class SobolIndices(NamedTuple):
@@ -39,8 +31,8 @@ class SobolIndices(NamedTuple):
         used, lost, pending: numbers of base points used, lost to failures, and not computed yet.
     """
 
-    first: IndexIntervals
-    total: IndexIntervals
+    first: Intervals
+    total: Intervals
     used: int
     lost: int
     pending: int
@@ -101,9 +93,7 @@ def sobol(
     )  # fmt: skip
     results = np.stack([_sobol_indices(*y, axis=-1), *result.confidence_interval])
     first, total = np.split(results, 2, axis=1)
-    return SobolIndices(
-        IndexIntervals(*first), IndexIntervals(*total), used, lost, int(np.sum(pending))
-    )
+    return SobolIndices(Intervals(*first), Intervals(*total), used, lost, int(np.sum(pending)))
 
 
 def _sobol_indices(a: np.ndarray, b: np.ndarray, *mixed: np.ndarray, axis: int) -> np.ndarray:
@@ -132,7 +122,7 @@ def _check_points(used: int, lost: int, allowed: float) -> None:
 
 def spline_shares(
     inputs: Float[np.ndarray, "n d"], values: Shaped[np.ndarray, " n"], level: float = LEVEL
-) -> IndexIntervals:
+) -> Intervals:
     """First-order indices from any independent samples, by regression on splines of each factor.
 
         S_j = 1 - mean(e_i^2 / (1 - h_ii)) / V
@@ -180,7 +170,7 @@ def spline_shares(
         chance = 2 * (basis.shape[1] - 1) * ((1 - shares[k]) / n) ** 2
         errors[k] = np.sqrt(np.var(influence) / n + chance)
     half = ndtri(0.5 + level / 2) * errors
-    return IndexIntervals(shares, shares - half, shares + half)
+    return Intervals(shares, shares - half, shares + half)
 
 
 def _spline_basis(x: Float[np.ndarray, " n"], columns: int) -> Float[np.ndarray, "n k"]:
@@ -203,7 +193,7 @@ def _spline_basis(x: Float[np.ndarray, " n"], columns: int) -> Float[np.ndarray,
 
 def spearman(
     inputs: Float[np.ndarray, "n d"], values: Shaped[np.ndarray, " n"], level: float = LEVEL
-) -> IndexIntervals:
+) -> Intervals:
     """Rank correlation of each factor with a quantity; infinite values have ranks too.
 
     Raises:
@@ -224,7 +214,7 @@ def spearman(
     # correlations of +-1 have infinite arctanh, and an interval of zero length
     with np.errstate(divide="ignore"):
         z = np.arctanh(r)
-    return IndexIntervals(r, np.tanh(z - half), np.tanh(z + half))
+    return Intervals(r, np.tanh(z - half), np.tanh(z + half))
 
 
 def separation(

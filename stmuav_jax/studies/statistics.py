@@ -15,10 +15,10 @@ Nagaraja, Order Statistics, 3rd ed., section 7.1); Wilson (1927), J. Am. Stat. A
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int, Shaped
 
 from ..checks.errors import SettingError
 from .columns import FINE, MISSING
@@ -82,27 +82,15 @@ class SampleSummary(NamedTuple):
     quantiles: dict[float, IntervalEstimate]
 
 
-class Bands(NamedTuple):
-    """Quantiles over the samples at every point of an axis; each (q, k).
+class Intervals(NamedTuple):
+    """Estimates with the ends of their confidence intervals, NaN where there are too few samples.
 
-    The ends `low` and `high` of the intervals are NaN where there are too few samples.
+    Quantiles along an axis (q, k), or sensitivities to d factors (d,).
     """
 
-    value: Float[np.ndarray, "q k"]
-    low: Float[np.ndarray, "q k"]
-    high: Float[np.ndarray, "q k"]
-
-
-class Convergence(NamedTuple):
-    """Convergence of an estimate: from the first 1, 2, 4, 8, ... samples and from all; each (k,).
-
-    The ends `low` and `high` of the intervals are NaN where there are too few samples.
-    """
-
-    sizes: Int[np.ndarray, " k"]
-    value: Float[np.ndarray, " k"]
-    low: Float[np.ndarray, " k"]
-    high: Float[np.ndarray, " k"]
+    value: Float[np.ndarray, "*k"]
+    low: Float[np.ndarray, "*k"]
+    high: Float[np.ndarray, "*k"]
 
 
 def probability(hits: int, count: int, level: float = LEVEL) -> IntervalEstimate:
@@ -217,8 +205,8 @@ def quantiles(
 
 def bands(
     values: Float[np.ndarray, "n k"], shares: Sequence[float] = SHARES, level: float = LEVEL
-) -> Bands:
-    """Quantiles at each of k points; NaN where a value is NaN, or without values.
+) -> Intervals:
+    """Quantiles (q, k) at each of k points; NaN where a value is NaN, or without values.
 
     Intervals hold at each point, not at all points simultaneously.
 
@@ -226,7 +214,7 @@ def bands(
         SettingError: a share or level outside (0, 1).
     """
     n, k = values.shape
-    result = Bands(*np.full((3, len(shares), k), np.nan))
+    result = Intervals(*np.full((3, len(shares), k), np.nan))
     for share in shares:
         if not 0 < share < 1:
             raise SettingError(f"The share of a quantile must lie in (0, 1), but it is {share:g}.")
@@ -280,49 +268,6 @@ def summarise(
         standard_deviation=standard_deviation(defined_values, level) if finite and count > 1 else None,
         quantiles=quantiles(defined_values, shares, level) if count else {},
     )  # fmt: skip
-
-
-def convergence(
-    values: Values,
-    of: Literal["mean", "probability"] | float = "mean",
-    level: float = LEVEL,
-) -> Convergence:
-    """Convergence of an estimate with the number of samples, taken in their order.
-
-    Args:
-        values: values of the samples (n,).
-        of: "mean"; "probability" of values that are true; or the probability of a quantile.
-        level: confidence level of the intervals.
-
-    Raises:
-        SettingError: as for the estimates.
-    """
-    n = len(values)
-    # Sizes that double show the decay over all magnitudes, and together cost about twice the last
-    # one.
-    sizes = sorted({2**k for k in range(n.bit_length()) if 2**k <= n} | ({n} if n else set()))
-    rows = []
-    for size in sizes:
-        part = values[:size]
-        if of == "mean":
-            result = mean(part, level)
-        elif of == "probability":
-            result = probability(int(np.count_nonzero(part)), size, level)
-        else:
-            result = quantiles(part, (of,), level)[of]
-        rows.append([math.nan if x is None else x for x in result])
-    table = np.asarray(rows, dtype=float).reshape(-1, 3)
-    return Convergence(np.asarray(sizes, dtype=int), *table.T)
-
-
-def independent_mask(count: int, together: int, design: str) -> Bool[np.ndarray, " n"]:
-    """Mask of the samples that share no factor values with each other.
-
-    In the design "saltelli" these are A and B, whose values the rest repeat; elsewhere all are.
-    """
-    if design != "saltelli":
-        return np.ones(count, dtype=bool)
-    return np.arange(count) % together < 2
 
 
 def _standard_deviation(y: np.ndarray) -> float:

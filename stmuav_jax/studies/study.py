@@ -180,7 +180,8 @@ class Study:
                 f"lanes must be a multiple of {TOGETHER}, but it is {lanes}: a processor computes so "
                 "many together, and a sample's numbers may not depend on its lane."
             )
-        if devices is not None and devices > (most := _most_devices()):
+        most = MOST_DEVICES if kind == "cpu" else len(jax.local_devices())
+        if devices is not None and devices > most:
             raise SettingError(f"There are {most} devices, but {devices} were requested.")
         self._devices = devices
         block = (block or evaluate.block) if isinstance(evaluate, AbstractBatch) else None
@@ -283,11 +284,7 @@ class Study:
             return StudyOutcome(target, finished, total, finished - before, seconds, is_stopped)
 
     def compute(self, first: int, count: int) -> dict[str, np.ndarray]:
-        """Columns (count, ...) of the samples first, first + 1, ..., which are not stored.
-
-        Raises:
-            SimulationError: JAX cannot be switched to double precision.
-        """
+        """Columns (count, ...) of the samples first, first + 1, ..., which are not stored."""
         if not count:
             row = lambda c: tuple(len(self.axes[dim].values) for dim in c.dims)
             return {name: np.zeros((0, *row(c)), c.dtype) for name, c in self.columns.items()}
@@ -332,16 +329,28 @@ class Study:
     def _on_all(self, parts: list[tuple[np.ndarray, int, int, int]]) -> list[dict[str, np.ndarray]]:
         """Outcomes of the parts; each device takes the next part that is not taken yet."""
         places, idle = self._places[: len(parts)], queue.SimpleQueue()
-        with _enable_double():
+        with jax.enable_x64(True):
             # programs are compiled here, once for each device, before the threads need them
             for place in places:
                 idle.put(self._device_program(place))
 
         def carry_out(part: tuple[np.ndarray, int, int, int]) -> dict[str, np.ndarray]:
+            # samples begin + start, ..., begin + stop - 1
+            values, begin, start, stop = part
+            # The block is always full, so that one program of fixed shape serves every part; the next
+            # samples, or repeats of the last, fill it, and their outcomes are cut off.
+            rows = np.minimum(np.arange(start, start + self._block), len(values) - 1)
+            # A key follows from the seed and the sample's number alone, so that neither the order nor
+            # the process of the chunks changes it.
+            draw_key = lambda k: np.random.SeedSequence((self.sampling.seed, k)).generate_state(2)
+            key_data = np.stack([draw_key(begin + int(row)) for row in rows]).astype(np.uint32)
             program = idle.get()
             try:
-                with _enable_double():
-                    return self._run_block(program, *part)
+                with jax.enable_x64(True):
+                    outcomes = program(values[rows], key_data, np.int32(stop - start))
+                    return {
+                        k: np.array(v[: stop - start]) for k, v in jax.device_get(outcomes).items()
+                    }
             finally:
                 idle.put(program)
 
@@ -353,20 +362,6 @@ class Study:
             finally:
                 # after Ctrl-C or an error no further part is begun
                 pool.shutdown(wait=False, cancel_futures=True)
-
-    def _run_block(
-        self, program: Any, values: np.ndarray, begin: int, start: int, stop: int
-    ) -> dict[str, np.ndarray]:
-        """Outcomes of the samples begin + start, ..., begin + stop - 1, the last of which fills the block."""
-        # The block is always full, so that one program of fixed shape serves every part; the next
-        # samples, or repeats of the last, fill it, and their outcomes are cut off.
-        rows = np.minimum(np.arange(start, start + self._block), len(values) - 1)
-        # A key follows from the seed and the sample's number alone, so that neither the order nor
-        # the process of the chunks changes it.
-        draw_key = lambda k: np.random.SeedSequence((self.sampling.seed, k)).generate_state(2)
-        key_data = np.stack([draw_key(begin + int(row)) for row in rows]).astype(np.uint32)
-        outcomes = program(values[rows], key_data, np.int32(stop - start))
-        return {k: np.array(v[: stop - start]) for k, v in jax.device_get(outcomes).items()}
 
     @cached_property
     def _places(self) -> list[Any]:
@@ -419,12 +414,16 @@ class Study:
     def _describe_columns(self, descriptions: Mapping[str, Column]) -> dict[str, Column]:
         """Columns of the factors and the outcomes, with the units and labels that are known."""
         result: dict[str, Column] = {}
+        outcomes = {k: c for k, c in descriptions.items() if k not in self.sampling.factors}
         for name in self.sampling.names:
-            if (column := column_name(name)) in result:
-                raise SettingError(f"Two factors would share the column '{column}' of '{name}'.")
-            result[column] = descriptions.get(column, Column("float64", "1", name, "input"))
-        if any(column.role == "status" for column in descriptions.values()):
-            return result | dict(descriptions)
+            column, described = column_name(name), descriptions.get(name)
+            if column in outcomes and outcomes[column].role == "input":
+                described = outcomes.pop(column)
+            if column in result or column in outcomes:
+                raise SettingError(f"Two columns would share the name '{column}' of '{name}'.")
+            result[column] = described or Column("float64", "1", name, "input")
+        if any(column.role == "status" for column in outcomes.values()):
+            return result | outcomes
         with jax.enable_x64(True):
             # Tracing gives shapes and types of the outcomes without a compilation.
             of = jax.ShapeDtypeStruct
@@ -480,20 +479,6 @@ def _name_outcomes(outcomes: Any) -> dict[str, Any]:
     leaves = jax.tree_util.tree_leaves_with_path(outcomes)
     path_text = lambda path: jax.tree_util.keystr(path, simple=True, separator="_") or "outcome"
     return {column_name(path_text(path)): jnp.asarray(leaf) for path, leaf in leaves}
-
-
-def _enable_double() -> Any:
-    """Context of double precision for this thread."""
-    with jax.enable_x64(True):
-        if jnp.zeros(()).dtype != jnp.float64:
-            raise SimulationError("Double precision could not be switched on.")
-    return jax.enable_x64(True)
-
-
-def _most_devices() -> int:
-    """Largest number of threads, or of devices."""
-    devices = jax.local_devices()
-    return MOST_DEVICES if devices[0].platform == "cpu" else len(devices)
 
 
 def _split_ranges(count: int, block: int, lanes: int, devices: int) -> Iterator[tuple[int, int]]:

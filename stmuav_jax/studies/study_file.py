@@ -15,7 +15,7 @@ from ..checks.schema import format_value, validate_model
 from ..dynamics.choices import solver_named
 from ..dynamics.method import Method
 from ..io.csv_table import read_csv_table
-from ..io.model_file import ParametricModel, Robot, read_model
+from ..io.model_file import Robot, read_model
 from ..io.mujoco_import import load_robot
 from ..io.netcdf import FileError, read_toml
 from ..mechanics.parameters import Parameters
@@ -23,15 +23,7 @@ from .disturbed_flights import AbstractFlights, ModelFlights, make_flights, star
 from .estimates import make_estimation_study
 from .flights import Failure, FlightEvaluation, Quantity, make_flight_study
 from .sampling import Sampling
-from .schema import (
-    Drawing,
-    FlightsFile,
-    Integrating,
-    MissionStudyFile,
-    estimation_file,
-    factors_of,
-    flights_file,
-)
+from .schema import Drawing, EstimationFile, FlightsFile, Integrating, MissionStudyFile
 from .study import Study
 
 
@@ -53,7 +45,9 @@ def load_study(path: str | os.PathLike[str]) -> dict[str, Any]:
             "its factors and quantities (docs/studies.md)."
         )
     if isinstance(content.get("model"), str):
-        content["model"] = _load_model(source.parent / content["model"])
+        model = source.parent / content["model"]
+        is_toml = model.suffix == ".toml"
+        content["model"] = read_model(model) if is_toml else Robot(load_robot(model))
     factors = content.get("factors", {})
     if isinstance(factors, Mapping):
         content["factors"] = {
@@ -88,8 +82,9 @@ def make_study(plain: Mapping[str, Any], table: Parameters | None = None, **sett
     if kind == "estimation":
         if table is not None:
             raise SettingError("Studies of estimation take no other parameters yet.")
-        return make_estimation_study(estimation_file(plain), **settings)
-    entries = flights_file(plain)
+        entries = validate_model(EstimationFile, plain, "A study of estimation")
+        return make_estimation_study(entries, **settings)
+    entries = validate_model(FlightsFile, plain, "A study")
     factors, relative = factors_of(entries.factors)
     quantities, failure = _read_results(entries)
     method = entries.model_dump(include=set(Integrating.model_fields))
@@ -102,6 +97,13 @@ def make_study(plain: Mapping[str, Any], table: Parameters | None = None, **sett
     return make_flight_study(
         evaluation, factors, failure=failure, **study_settings(entries), **settings
     )
+
+
+def factors_of(entries: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[str]]:
+    """Distributions of the factors in plain form, and the names of relative ones."""
+    tables = {name: dict(entry) for name, entry in entries.items() if isinstance(entry, Mapping)}
+    relative = frozenset(name for name, table in tables.items() if table.pop("relative", False))
+    return {**entries, **tables}, relative
 
 
 def study_settings(entries: FlightsFile | MissionStudyFile) -> dict[str, Any]:
@@ -134,11 +136,11 @@ def check_study(plain: Mapping[str, Any]) -> None:
     """
     kind = study_kind(plain)
     if kind == "estimation":
-        estimation_file(plain)
+        validate_model(EstimationFile, plain, "A study of estimation")
     elif kind == "missions":
         _check_factors(validate_model(MissionStudyFile, plain, "A study of a mission"))
     else:
-        entries = flights_file(plain)
+        entries = validate_model(FlightsFile, plain, "A study")
         _check_factors(entries)
         # Quantities and failures check themselves as they are made; nothing else is wanted here.
         _read_results(entries)
@@ -168,12 +170,6 @@ def _read_flights(
     if table is not None:
         raise SettingError("A table of parameters is for scenes; a model's file has its own.")
     return ModelFlights(entries.model, relative, entries.inputs, start_states(entries.factors))
-
-
-def _load_model(path: Path) -> ParametricModel | Robot:
-    if path.suffix == ".toml":
-        return read_model(path)
-    return Robot(load_robot(path))
 
 
 def _fill_entry(entry: Mapping[str, Any], folder: Path) -> dict[str, Any]:

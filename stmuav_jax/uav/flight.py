@@ -12,7 +12,6 @@ implicit function.
 """
 
 from collections.abc import Callable, Mapping
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..analysis.equilibrium import TOLERANCE, FlightCondition, trim_condition
-from ..checks.errors import ModelError, StateError, first_reason, has_values
+from ..checks.errors import AbstractReason, ModelError, StateError, first_reason, has_values
 from ..checks.numbers import as_floats
 from ..checks.shapes import Numbers
 from ..dynamics.actuation import mechanism_weight
@@ -38,7 +37,7 @@ from .motor import MotorRotors
 from .rotor import Rotors
 from .tracker.bodies import LinearActuator, place_on_base
 from .tracker.geometry import TrackerGeometry, turn_by_angles
-from .tracker.kinematics import RISING, Reason, panel_angles
+from .tracker.kinematics import Reason, panel_angles
 from .tracker.workspace import Limits, measure, reasons, survey, why_outside
 
 PANEL_COORDINATES = ("U47.angle_1", "U47.angle_2")
@@ -165,7 +164,7 @@ def _panel_angles(uav: Uav, x: TreePoint) -> Float[Array, "2"]:
     return panel_angles(R_wb.T @ R_wp[:, 2])
 
 
-class TrimReason(IntEnum):
+class TrimReason(AbstractReason):
     """Reason for which there is no trim; the first that applies."""
 
     VALID = 0
@@ -336,7 +335,7 @@ def _trim_flight(uav: Uav, condition: FlightCondition, limits: TrimLimits) -> Fl
     values, speeds = trim.values, sharp_sqrt(squared)
     lower, upper = (0.0, jnp.inf) if limits.rotors is None else limits.rotors.squared(count)
     assert limits.workspace is not None
-    strokes, margins, _ = measure(uav.geometry, limits.workspace, turn_by_angles(angles), RISING)
+    strokes, margins, _ = measure(uav.geometry, limits.workspace, turn_by_angles(angles))
     # the posture exists if the rods reach and the sliders hold the panel
     is_held = margins.parallel + limits.workspace.margin > 0
     outside = reasons(margins)

@@ -72,7 +72,7 @@ def stubbed(monkeypatch):
         raise SettingError("The work would begin.")
 
     for module, name in (
-        (simulate, "run_scene"), (trim, "_solve_uav"), (trim, "table_of"), (tune, "_tune_inputs"),
+        (simulate, "run_scene"), (trim, "_solve_uav"), (tune, "_tune_inputs"),
         (identify, "_identify_parameters"),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, stop)

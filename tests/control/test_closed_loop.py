@@ -25,11 +25,11 @@ START = np.array([0.1, -0.2])
 HELD = 1e-9
 
 
-def spring_mass():
-    """A mass on a rail along x with a spring, a damper and a driving force."""
+def spring_mass(damping=DAMPING):
+    """A mass on a rail along x with a spring, a damper [N s/m] and a driving force."""
     mass = stm.Body("mass", MASS, np.eye(3) * 0.1)
     rail = stm.translational("rail", "ground", "mass", point=[0.0] * 3, axis=[1.0, 0.0, 0.0])
-    spring = stm.mechanics.JointServo("rail", target=0.0, stiffness=STIFFNESS, damping=DAMPING)
+    spring = stm.mechanics.JointServo("rail", target=0.0, stiffness=STIFFNESS, damping=damping)
     system = stm.System([mass], [rail], [spring, stm.JointEffort("rail", 0.0)])
     return system, stm.state_from_joints(system, {"rail": START[0]}, {"rail": START[1]})
 
@@ -40,13 +40,13 @@ def position_feedback(estimate, reference, memory):
     return -jnp.asarray(GAIN) @ (x - reference)[:, None], memory
 
 
-def by_hand(samples, late, reference):
+def by_hand(samples, late, reference, damping=DAMPING, rate=RATE):
     """Positions, rates and commands of the exact sampled system, late by whole samples."""
-    A = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]])
-    A_d, B_d = control.held_matrices(A, np.array([[0.0], [1 / MASS]]), 1 / RATE)
+    A = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -damping / MASS]])
+    A_d, B_d = control.held_matrices(A, np.array([[0.0], [1 / MASS]]), 1 / rate)
     x, queue, rows = START.copy(), [0.0] * late, []
     for k in range(samples):
-        u = float(-GAIN @ (x - reference(k / RATE)))
+        u = float(-GAIN @ (x - reference(k / rate)))
         rows.append([*x, u])
         queue.append(u)
         x = A_d @ x + B_d[:, 0] * queue.pop(0)
@@ -73,6 +73,55 @@ def test_a_loop_is_the_exact_sampled_system(steps):
     assert run.successful
     assert run.certificate.energy_error < 1e-6
     np.testing.assert_allclose(run.ts, np.arange(101) / RATE, atol=1e-14)
+
+
+def stiff_loop(method=None, steps=None):
+    """Of a damper of 1e5 N s/m: its mode decays in 20 us, a thousandth of a period."""
+    plant = control.Plant(
+        *spring_mass(1e5), rate=50.0, inputs=["effort"], method=method, steps=steps
+    )
+    return control.close_loop(
+        plant, position_feedback, 0.6, reference=lambda t: jnp.zeros(2), balances=False, throw=False
+    )
+
+
+TIGHT = {"rtol": HELD, "atol": HELD, "steps": "state"}
+
+
+def test_an_implicit_loop_is_the_exact_sampled_system():
+    run = stiff_loop(stm.Method(solver=stm.dynamics.kvaerno5(), **TIGHT))
+    exact = by_hand(31, 0, lambda t: np.zeros(2), 1e5, 50.0)
+    assert run.successful
+    np.testing.assert_allclose(run.states.r[:, 0, 0], exact[:, 0], atol=HELD)
+    np.testing.assert_allclose(run.states.v[1:, 0, 0], exact[1:, 1], atol=HELD)
+
+
+def test_fixed_steps_of_the_default_method_are_too_long_for_a_stiff_loop():
+    """Four steps of order 4 in a period of 20 ms: the loop says that its motion is no longer finite."""
+    run = stiff_loop(steps=4)
+    assert not run.successful
+    assert "its steps are too long" in run.failure
+
+
+@pytest.mark.slow
+def test_a_hexacopter_flies_the_same_way_implicitly():
+    """Along a circle with a climb, by diffrax's Kvaerno5 and by the default fixed steps."""
+    path = control.follow_path(lambda t: jnp.stack([jnp.cos(2 * t) - 1.0, jnp.sin(2 * t), 0.2 * t]))
+    scene = stm.make_scene("hexacopter")
+    pilot = stm.uav.FlightController(scene.system, 100.0)
+    ends = {}
+    for name, method, steps in (
+        ("implicit", stm.Method(solver=diffrax.Kvaerno5(), **TIGHT), None),
+        ("fixed", None, 2),
+    ):
+        plant = control.Plant(scene, rate=100.0, method=method, steps=steps)
+        ends[name] = control.close_loop(
+            plant, pilot, 1.0, reference=path, memory=pilot.start(), balances=False
+        )
+    for field in ("r", "p", "v", "omega"):
+        one, other = (getattr(end.states, field) for end in ends.values())
+        # two fixed steps of order 4 in 10 ms leave 3e-7 rad/s
+        np.testing.assert_allclose(one, other, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -126,44 +175,6 @@ def test_a_regulator_balances_a_cart_pole(cart):
     assert run.certificate.relative_energy_error < 1e-6
     assert run.certificate.position_violation < 1e-9
     assert run.certificate.steps == 1600
-
-
-def test_regulators_are_those_of_the_closed_form():
-    """The double integrator: K = (1, sqrt 3) for unit weights; the held one by iteration."""
-    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-    names = (("x", "m"), ("v", "m/s"))
-    linear = stm.analysis.Linear(A, B, np.eye(2), np.zeros((2, 1)), names, (("u", "N"),), names)
-    found = control.regulator(linear, [1.0, 1.0], [1.0])
-    np.testing.assert_allclose(found.K, [[1.0, np.sqrt(3.0)]], rtol=1e-12)
-    assert np.all(found.poles.real < 0)
-    held = control.regulator(linear, [1.0, 1.0], [1.0], rate=10.0)
-    A_d = np.array([[1.0, 0.1], [0.0, 1.0]])
-    B_d = np.array([[0.005], [0.1]])
-    S, Q, R = np.zeros((2, 2)), np.eye(2) / 10, np.eye(1) / 10
-    K = np.zeros((1, 2))
-    for _ in range(3000):
-        K = np.linalg.solve(R + B_d.T @ S @ B_d, B_d.T @ S @ A_d)
-        S = Q + A_d.T @ S @ (A_d - B_d @ K)
-    np.testing.assert_allclose(held.K, K, rtol=1e-9)
-    assert np.all(np.abs(held.poles) < 1)
-
-
-def test_modes_that_nothing_moves_are_named():
-    """Two masses, one of them without a force; a weight that sees one only."""
-    A = np.zeros((4, 4))
-    A[0, 2] = A[1, 3] = 1.0
-    B = np.array([[0.0], [0.0], [1.0], [0.0]])
-    names = tuple((n, "m") for n in ("a", "b", "a_rate", "b_rate"))
-    linear = stm.analysis.Linear(A, B, np.eye(4), np.zeros((4, 1)), names, (("u", "N"),), names)
-    with pytest.raises(stm.ModelError, match=r"cannot stabilise .* b.*they do not move it"):
-        control.regulator(linear, np.ones(4), [1.0])
-    both = stm.analysis.Linear(
-        A, np.eye(4)[:, 2:], np.eye(4), np.zeros((4, 2)), names, (("u", "N"), ("w", "N")), names
-    )
-    with pytest.raises(stm.ModelError, match=r"do not determine .* b.*they do not see it"):
-        control.regulator(both, [1.0, 0.0, 1.0, 0.0], [1.0, 1.0])
-    with pytest.raises(stm.ModelError, match="R of the regulator must be positive definite"):
-        control.regulator(both, np.ones(4), [1.0, 0.0])
 
 
 def cost(plant, feedback, samples=101):

@@ -27,6 +27,26 @@ def linear_of(A, B):
     )
 
 
+def test_the_double_integrators_regulator_in_closed_form():
+    """K = (1, sqrt 3) for unit weights."""
+    linear = linear_of([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    found = control.regulator(linear, [1.0, 1.0], [1.0])
+    np.testing.assert_allclose(found.K, [[1.0, np.sqrt(3.0)]], rtol=1e-12)
+    assert np.all(np.real(found.poles) < 0)
+
+
+def test_modes_that_nothing_moves_are_named():
+    """Two masses, one of them without a force; a weight that sees one only."""
+    A = np.eye(4, k=2)
+    with pytest.raises(stm.ModelError, match=r"cannot stabilise .* x[13].*they do not move it"):
+        control.regulator(linear_of(A, np.eye(4)[:, 2:3]), np.ones(4), [1.0])
+    both = linear_of(A, np.eye(4)[:, 2:])
+    with pytest.raises(stm.ModelError, match=r"do not determine .* x[13].*they do not see it"):
+        control.regulator(both, [1.0, 0.0, 1.0, 0.0], [1.0, 1.0])
+    with pytest.raises(stm.ModelError, match="R of the regulator must be positive definite"):
+        control.regulator(both, np.ones(4), [1.0, 0.0])
+
+
 @pytest.fixture(scope="module")
 def systems():
     """A cart-pole about its upright posture, and one drawn with two inputs."""

@@ -75,6 +75,10 @@ def test_every_entry_checks():
         ({"u": np.zeros((4, 1, 3))}, r"Inputs must have shape \(T, k\)"),
         ({"y": jnp.asarray(Y, jnp.float32)}, "float32"),
         ({"prior": Gaussian(jnp.array([jnp.nan, 0.0]), jnp.eye(2))}, "must be finite"),
+        ({"prior": gaussian(np.zeros(5), np.eye(5))}, "5 x 5"),
+        ({"dt": -0.1}, "must be positive"),
+        ({"dt": None}, "either dt"),
+        ({"y": Y[:, :1]}, "2 components"),
     ],
 )
 def test_records(given, words):

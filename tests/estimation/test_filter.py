@@ -233,19 +233,6 @@ def test_an_estimate_outside_the_record_is_refused(whole):
 # --- bad input
 
 
-def test_times_and_shapes():
-    model, prior = CASE.model(), CASE.prior()
-    y = CASE.y[:3]
-    with pytest.raises(SettingError, match="must be positive"):
-        kalman_filter(model, prior, y, dt=-0.1)
-    with pytest.raises(SettingError, match="either dt"):
-        kalman_filter(model, prior, y)
-    with pytest.raises(ModelError, match="3 components"):
-        kalman_filter(model, prior, y[:, :2], dt=1.0)
-    with pytest.raises(ModelError, match="5 x 5"):
-        kalman_filter(model, gaussian(np.zeros(5), np.eye(5)), y, dt=1.0)
-
-
 def test_single_precision_refuses_a_small_alpha():
     """D1 in single precision: 1e-4 for alpha >= 0.1, refused below."""
     single = lambda a: jnp.asarray(a, jnp.float32)

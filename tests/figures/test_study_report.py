@@ -10,8 +10,8 @@ import scipy.stats as st
 import xarray as xr
 from html_pages import Page
 from matplotlib.image import imread
-from rich.console import Console
 from study_samples import FACTORS, REASONS, study
+from test_terminal import printed
 
 from stmuav_jax.checks.errors import SettingError
 from stmuav_jax.figures import study as study_plot, study_data as data_module
@@ -26,8 +26,8 @@ from stmuav_jax.figures.study_data import (
     summary_table,
 )
 from stmuav_jax.io.netcdf import FileError
-from stmuav_jax.studies.sensitivity import IndexIntervals, sobol
-from stmuav_jax.studies.statistics import mean, probability, quantiles
+from stmuav_jax.studies.sensitivity import sobol
+from stmuav_jax.studies.statistics import Intervals, mean, probability, quantiles
 
 
 def tiny(count: int, **more) -> xr.Dataset:
@@ -295,10 +295,7 @@ def test_without_a_declared_failure_none_is_reported():
     analysis = analyse(study_data(study(100, failing=False)))
     assert analysis.failure is None
     assert "failure" not in " ".join(summary_lines(analysis))
-    table = summary_table(analysis)
-    console = Console(width=200, file=io.StringIO())
-    console.print(table)
-    assert "largest angle [rad]" in console.file.getvalue()  # pyright: ignore
+    assert "largest angle [rad]" in printed(summary_table(analysis), 200)
 
 
 def test_shares_are_drawn_between_zero_and_one():
@@ -307,7 +304,7 @@ def test_shares_are_drawn_between_zero_and_one():
     one = analysis.findings[0]
     names = list(one.influence.names)
     level = np.ones(len(names))
-    shares = IndexIntervals(-0.4 * level, -0.5 * level, 0.1 * level)
+    shares = Intervals(-0.4 * level, -0.5 * level, 0.1 * level)
     finding = one._replace(influence=one.influence._replace(first=shares))
     figure, axes = grid(1, 1, 3.0)
     study_plot._share_bars(axes[0, 0], finding, names)

@@ -220,7 +220,7 @@ def as_mission(path):
 
 
 def as_study(path):
-    schema.flights_file(stm.studies.load_study(path))
+    validate_model(schema.FlightsFile, stm.studies.load_study(path), "A study")
 
 
 def as_study_of_missions(path):

@@ -14,7 +14,7 @@ import pytest
 from scipy.integrate import quad
 
 from stmuav_jax.estimation import sigma
-from stmuav_jax.estimation.consistency import autocorrelation, chi2_interval, mean_interval, nees
+from stmuav_jax.estimation.consistency import autocorrelation, mean_interval, nees
 from stmuav_jax.estimation.filter import filter_bank
 from stmuav_jax.estimation.gaussians import gaussian
 from stmuav_jax.math.compiler import outer_jit
@@ -167,7 +167,7 @@ def test_attitude_is_consistent(attitude):
     each, nis, scaled, mean = attitude(jnp.array(1.0), jnp.array(1.0))
     assert outside(each, 8) <= 1
     assert outside(nis, 6) <= 1
-    low, high = chi2_interval(6 * COUNT * RUNS)
+    low, high = mean_interval(6 * COUNT * RUNS)
     assert low < float(np.sum(nis)) < high
     for lag in range(1, 6):
         assert abs(np.mean(autocorrelation(scaled, lag))) < 3.3 / np.sqrt(6 * COUNT * RUNS)
@@ -180,7 +180,7 @@ def test_wrong_noise_is_seen(attitude, q, r):
     """The power check: Q or R wrong by a factor of four must fail the same tests."""
     each, nis, _, _ = attitude(jnp.array(q), jnp.array(r))
     assert outside(each, 8) > 1
-    low, high = chi2_interval(6 * COUNT * RUNS)
+    low, high = mean_interval(6 * COUNT * RUNS)
     assert not low < float(np.sum(nis)) < high
 
 

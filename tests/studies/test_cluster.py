@@ -286,5 +286,4 @@ def test_ctrl_c(tmp_path):
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate()
     assert (process.returncode, err) == (0, "")
-    assert err == ""
     assert f"Interrupted: {path} keeps {open_store(path).finished} of 900" in out

@@ -24,7 +24,7 @@ def build(of, **values):
 )
 def test_nothing_drawn_is_the_scene(name, case):
     scene = make_scene(name, case)
-    system, state = make_flights(name, case).nominal()
+    system, state = make_flights(name, case).build({})
     same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), system, scene.system)
     assert all(jax.tree.leaves(same))
     off = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b))), state, scene.state0)
@@ -74,7 +74,7 @@ def test_a_sampled_product_of_inertia_keeps_the_tensor_symmetric():
 
 def test_inputs():
     of = make_flights("uav_tracker", 2)
-    plain = of.nominal()[0].forces
+    plain = of.build({})[0].forces
     system, state = build(of, input__rotor_2=1.1, input__actuator_3=0.5)
     rotors: Any = lambda forces: next(f for f in forces if hasattr(f, "speed_squared"))
     ratio = rotors(system.forces).speed_squared / rotors(plain).speed_squared
@@ -89,7 +89,7 @@ def test_inputs():
 
 @pytest.mark.slow
 def test_a_trims_inputs_hold():
-    system, state = make_flights("uav_tracker", inputs="trim").nominal()
+    system, state = make_flights("uav_tracker", inputs="trim").build({})
     tree = Tree()
     model = tree.prepare(system)
     accelerations = jax.jit(lambda s: tree.accelerations(model, jnp.zeros(()), s, Unstabilised()))
@@ -104,7 +104,7 @@ def test_a_trim_of_another_scene():
     study = make_flights("hexacopter", inputs="trim")
     held: Any
     drawn: Any
-    systems = study.nominal()[0], build(study, input__rotor_1=1.1)[0]
+    systems = study.build({})[0], build(study, input__rotor_1=1.1)[0]
     held, drawn = (next(f for f in s.forces if isinstance(f, Rotors)) for s in systems)
     weight = 9.81 * float(jnp.sum(systems[0].bodies.mass))
     assert float(held.k_f * jnp.sum(held.speed_squared)) == pytest.approx(weight, rel=1e-10)
@@ -145,7 +145,7 @@ def test_options_of_the_scene_are_those_of_all_flights():
     options = {"servo": {"stiffness": 2e4}, "start": {"phi": -0.2}}
     of = make_flights("tracker", 2, options=options)
     scene = make_scene("tracker", 2, servo=Servo(2e4), start=PanelStart(phi=-0.2))
-    system, state = of.nominal()
+    system, state = of.build({})
     same = jax.tree.map(
         lambda a, b: bool(jnp.all(a == b)), (system, state), (scene.system, scene.state0)
     )

@@ -147,14 +147,6 @@ def test_correlation_in_ranks():
         assert np.max(np.abs(found - truth)) < 4.5 / np.sqrt(n)
 
 
-def test_correlated_normals_have_the_covariance():
-    rho, factors = 0.8, {"x": st.norm(1.0, 2.0), "y": st.norm(-3.0, 0.5)}
-    x = Sampling(factors, 4, correlation=[("y", "x", rho)]).draw(0, 40000)
-    # deviation of a correlation: (1 - rho^2) / sqrt(n) = 0.0018
-    assert np.corrcoef(x.T)[0, 1] == pytest.approx(rho, abs=0.008)
-    assert np.std(x, axis=0) == pytest.approx([2.0, 0.5], rel=0.02)
-
-
 def test_latin_fills_every_stratum_and_is_extended_by_whole_ones():
     sampling = Sampling({"x": st.uniform(), "y": st.uniform()}, 3, "latin", stratum=50)
     x = sampling.draw(0, 150).reshape(3, 50, 2)
@@ -163,15 +155,6 @@ def test_latin_fills_every_stratum_and_is_extended_by_whole_ones():
     assert not np.array_equal(x[0], x[1])
     assert sampling.whole(101) == 150
     assert sampling.whole(100) == 100
-
-
-def test_latin_means_are_better_than_random_ones():
-    """For a sum the variance all but vanishes."""
-    factors = {str(k): st.uniform() for k in range(3)}
-    latin = Sampling(factors, 1, "latin", stratum=100).draw(0, 10000).reshape(100, 100, 3)
-    plain = Sampling(factors, 1).draw(0, 10000).reshape(100, 100, 3)
-    spread = [np.std(x.sum(axis=2).mean(axis=1)) for x in (latin, plain)]
-    assert spread[0] < 0.05 * spread[1]
 
 
 def test_sobol_is_a_net():
@@ -201,19 +184,24 @@ def test_saltelli_layout():
     assert sampling.whole(11) == 15
 
 
-def test_table_gives_its_rows_and_ends():
+def test_table_gives_its_rows():
     sampling = Sampling({"x": empirical([3.0, 1.0, 2.0]), "y": empirical([1, 1, 5])}, 0, "table")
     np.testing.assert_array_equal(sampling.draw(1, 2), [[1.0, 1.0], [2.0, 5.0]])
     assert sampling.limit == 3
-    with pytest.raises(SettingError, match="table has 3 rows, but samples up to 4"):
-        sampling.draw(2, 2)
+    assert SAMPLINGS["sobol"].limit == SOBOL_POINTS
 
 
-def test_sobol_ends():
-    sampling = Sampling({"x": st.uniform()}, 0, "sobol")
-    assert sampling.limit == SOBOL_POINTS
-    with pytest.raises(SettingError, match="has 2147483648 samples"):
-        sampling.draw(SOBOL_POINTS - 1, 2)
+@pytest.mark.parametrize(
+    ("name", "first", "words"),
+    [
+        ("table", 599, "table has 600 rows, but samples up to 601"),
+        ("sobol", SOBOL_POINTS - 1, "has 2147483648 samples"),
+        ("random", -1, "count from 0"),
+    ],
+)
+def test_samples_beyond_the_ends_are_refused(name, first, words):
+    with pytest.raises(SettingError, match=words):
+        SAMPLINGS[name].draw(first, 2)
 
 
 PLAIN = {
@@ -264,8 +252,3 @@ def test_what_is_refused(case):
     with pytest.raises(SettingError) as caught:
         read(PLAIN | change)
     assert words in str(caught.value)
-
-
-def test_negative_numbers_are_refused():
-    with pytest.raises(SettingError, match="count from 0"):
-        SAMPLINGS["random"].draw(-1, 2)

@@ -14,8 +14,7 @@ from stmuav_jax.checks.schema import format_value, name_fault
 from stmuav_jax.io.netcdf import FileError
 from stmuav_jax.studies import disturbed_flights
 from stmuav_jax.studies.examples import READY, ready
-from stmuav_jax.studies.schema import estimation_file, flights_file
-from stmuav_jax.studies.study_file import load_study, make_study
+from stmuav_jax.studies.study_file import check_study, load_study, make_study
 from stmuav_jax.uav import make_scene
 
 NORMAL = {"distribution": "normal", "mean": 0.0, "standard_deviation": 0.3}
@@ -190,9 +189,7 @@ def test_words(change, words):
 
 def test_ready_studies_fit_the_schema():
     for name in READY:
-        plain = ready(name)
-        read = estimation_file if plain.get("kind") == "estimation" else flights_file
-        assert read(plain).name == name
+        check_study(ready(name))
     assert ready("collapse")["failure"] == {"quantity": "collapse"}
 
 

@@ -9,8 +9,6 @@ import scipy.stats as st
 from stmuav_jax.checks.errors import SettingError
 from stmuav_jax.studies.statistics import (
     bands,
-    convergence,
-    independent_mask,
     mean,
     outcomes,
     probability,
@@ -181,18 +179,6 @@ def test_bands_are_quantiles_at_every_place():
     assert np.all(np.isnan(bands(np.empty((0, 3))).value))
 
 
-def test_convergence_takes_the_first_samples():
-    y = np.random.default_rng(2).normal(size=100)
-    found = convergence(y)
-    np.testing.assert_array_equal(found.sizes, [1, 2, 4, 8, 16, 32, 64, 100])
-    assert (found.value[4], found.low[4], found.high[4]) == mean(y[:16])
-    median = convergence(y, 0.5)
-    assert median.value[-1] == quantiles(y, (0.5,))[0.5].value
-    share = convergence(y > 1, "probability")
-    assert (share.value[-1], share.low[-1], share.high[-1]) == probability(int(np.sum(y > 1)), 100)
-    assert len(convergence(np.array([])).sizes) == 0
-
-
 def test_outcomes():
     status = np.array([0, 0, 1, 1, 1, 2, 3, 3, 9], dtype=np.int8)
     found = outcomes(status, {2: "too stiff", 3: "left the ground", 4: "never seen"})
@@ -205,11 +191,6 @@ def test_outcomes():
     nothing = outcomes(np.zeros(5, dtype=np.int8), {})
     assert nothing.failure is None
     assert nothing.missing == 5
-
-
-def test_independent_samples_of_designs():
-    np.testing.assert_array_equal(independent_mask(7, 4, "saltelli"), [1, 1, 0, 0, 1, 1, 0])
-    assert np.all(independent_mask(7, 1, "random"))
 
 
 @pytest.mark.parametrize(

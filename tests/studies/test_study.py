@@ -128,5 +128,5 @@ def test_functions_that_cannot_be_studied_are_refused():
         stm.Study(lambda sample, key: {"y": sample["speed"] + file.fileno()}, FACTORS)
     with pytest.raises(stm.SettingError, match="'angle' is a factor and an outcome"):
         stm.Study(lambda sample, key: sample, FACTORS)
-    with pytest.raises(stm.SettingError, match="would share the column 'a_b' of 'a_b'"):
+    with pytest.raises(stm.SettingError, match="would share the name 'a_b' of 'a_b'"):
         stm.Study(lambda sample, key: {"y": 1.0}, {"a.b": 1.0, "a_b": 2.0})

@@ -85,7 +85,7 @@ def test_innovations_are_as_large_as_predicted(flights):
     count = float(np.sum(flights["components"]))
     # 12 flights of 3 s, 50 positions and 100 attitudes a second, the first of them late
     assert count == pytest.approx(12 * 3 * 3 * (50 + 100), rel=0.01)
-    low, high = stm.estimation.chi2_interval(count, 0.95)
+    low, high = stm.estimation.mean_interval(count, level=0.95)
     assert low < np.sum(flights["nis"]) < high
 
 

@@ -61,7 +61,9 @@ def test_all_errors_after_standing_are_as_small_as_the_estimator_says(stood):
         low, high = stm.estimation.mean_interval(own.shape[1], SEEDS, 0.99)
         assert low < np.mean(nees) < high, part
         # none of them is beyond what one in 10,000 of so many draws would be
-        assert np.max(nees) < stm.estimation.chi2_interval(own.shape[1], 1 - 1e-4 / SEEDS)[1], part
+        assert (
+            np.max(nees) < stm.estimation.mean_interval(own.shape[1], level=1 - 1e-4 / SEEDS)[1]
+        ), part
 
 
 def test_biases_and_attitude_are_known_after_standing(stood):

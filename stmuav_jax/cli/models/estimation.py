@@ -105,24 +105,17 @@ def run_estimate_model(command: Any) -> int:
         is_consistent = is_consistent and verdict.holds
         print_line(out, verdict.explanation)
     folder = results_folder(settings.out, f"estimate_{scene.name}")
-    content = record_content(
-        scene.title or scene.name, space.names, result._asdict(), _describe_filter(command)
-    )
+    options = {k: v for k, v in vars(settings).items() if k not in ("out", "cache")}
+    options = {k: str(v) if isinstance(v, Path) else v for k, v in options.items()}
+    about = {"scene": command.scene} | {k: v for k, v in options.items() if v not in (None, ())}
+    title = scene.title or scene.name
+    content = record_content(title, space.names, result._asdict(), about)
     print_paths(out, [write_atomically(folder / "estimate.npz", content)])
     lost = int(np.sum(~result.ok))
     if lost:
         print_line(out, f"{lost} filters lost their covariance.")
         return 1
     return 0 if is_consistent else UNTRUSTED
-
-
-def _describe_filter(command: Any) -> dict[str, Any]:
-    """Options of the filter as plain data, for its file."""
-    settings = dataclasses.asdict(command.settings)
-    plain = {
-        k: str(v) if isinstance(v, Path) else v for k, v in settings.items() if v not in (None, ())
-    }
-    return {"scene": command.scene} | {k: v for k, v in plain.items() if k not in ("out", "cache")}
 
 
 def _choose_instruments(scene: "Scene", names: Sequence[str]) -> list[Any]:
@@ -169,14 +162,17 @@ def _estimate_records(
     import jax
     import jax.numpy as jnp
 
-    from ...analysis.sensors import system_model
+    from ...analysis.sensors import AttitudeFix, system_model
     from ...estimation.consistency import path_nees
     from ...estimation.filter import filter_bank
     from ...estimation.gaussians import gaussian
     from ...figures.filter_record import normalised_innovations
     from ...math.compiler import quick_jit
 
-    rate, steps = _sample_times(scene, instruments, settings)
+    rates = [instrument.rate for instrument in instruments if instrument.rate is not None]
+    rate = settings.rate or max(rates, default=100.0)
+    t1 = scene.t1 - scene.t0 if settings.t1 is None else settings.t1
+    steps = max(round(t1 * rate), 1)
     sensors = [instrument.sensor for instrument in instruments]
     sizes = [len(instrument.sensor.components(space.system)) for instrument in instruments]
     noise, bias = (
@@ -210,9 +206,12 @@ def _estimate_records(
     truth, true_readings = fly(first, normal_sample(wander, steps))
     errors = normal_sample(noise, steps) + bias[:, None]
     y = np.array(jax.vmap(truth_model.sensor.space.retract)(true_readings, errors))
-    fresh_mask = _fresh_readings(
-        y, instruments, [_reading_length(instrument, space) for instrument in instruments], rate
-    )
+    # an attitude has four numbers, with errors in three components
+    lengths = [
+        4 if isinstance(sensor, AttitudeFix) else k
+        for sensor, k in zip(sensors, sizes, strict=True)
+    ]
+    fresh_mask = _fresh_readings(y, instruments, lengths, rate)
     out = filter_bank(model, prior, jnp.asarray(y), dt=1.0 / rate)
     every = jax.vmap(space.difference)(out.mean, truth)
     degrees = np.array(
@@ -223,22 +222,6 @@ def _estimate_records(
         np.asarray(out.standard_deviation), np.asarray(path_nees(out, truth, space)),
         np.asarray(out.nis), degrees, np.asarray(out.ok)[-1], normalised_innovations(out.innovations),
     )  # fmt: skip
-
-
-def _sample_times(scene: "Scene", instruments: Sequence[Any], settings: Any) -> tuple[float, int]:
-    """Rate of the filter [Hz] and number of its steps."""
-    rates = [instrument.rate for instrument in instruments if instrument.rate is not None]
-    rate = settings.rate or max(rates, default=100.0)
-    t1 = scene.t1 - scene.t0 if settings.t1 is None else settings.t1
-    return rate, max(round(t1 * rate), 1)
-
-
-def _reading_length(instrument: Any, space: "TreeSpace") -> int:
-    """Numbers in a reading: an attitude has four, with errors in three components."""
-    from ...analysis.sensors import AttitudeFix
-
-    sensor = instrument.sensor
-    return 4 if isinstance(sensor, AttitudeFix) else len(sensor.components(space.system))
 
 
 def _fresh_readings(

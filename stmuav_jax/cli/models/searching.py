@@ -4,11 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from ...figures.terminal import print_line
-from ..output import print_paths
+from ..output import print_paths, show_progress
 
 if TYPE_CHECKING:
     from ...math.least_squares import Search
@@ -17,34 +16,20 @@ if TYPE_CHECKING:
 HOLDS = 1e-6
 
 
-class _Watch:
-    """Display of progress on stderr, with a checkpoint after every step."""
-
-    def __init__(self, problem: str, path: Path, steps: int) -> None:
-        columns = (TextColumn("{task.description}"), TimeElapsedColumn())
-        self.bar = Progress(*columns, console=Console(stderr=True), transient=True)
-        self.task = self.bar.add_task("compiling")
-        self.problem, self.path, self.steps = problem, path, steps
-
-    def __call__(self, now: "Search") -> None:
-        from ...figures.tuning import save_search
-
-        progress_text = (
-            f"step {now.steps} of {self.steps}: loss {now.history[-1]:.4g}, best {now.loss:.4g}"
-        )
-        self.bar.update(self.task, description=progress_text)
-        save_search(now, self.problem, self.path)
-
-
 def run_search(settings: Any, folder: Path, problem: str, start: Any, run: Any) -> Any:
     """Call run(steps=, report=, resume=) with progress, checkpoints and the search to resume."""
-    from ...figures.tuning import load_search
+    from ...figures.tuning import load_search, save_search
 
-    path = folder / "search.npz"
+    path, steps = folder / "search.npz", settings.steps
     before = load_search(path, problem, start) if settings.resume else None
-    watch = _Watch(problem, path, settings.steps)
-    with watch.bar:
-        return run(steps=settings.steps, report=watch, resume=before)
+    with show_progress("compiling") as report:
+
+        def report_step(now: "Search") -> None:
+            losses = f"loss {now.history[-1]:.4g}, best {now.loss:.4g}"
+            report(now.steps / steps, f"step {now.steps} of {steps}: {losses}")
+            save_search(now, problem, path)
+
+        return run(steps=steps, report=report_step, resume=before)
 
 
 def has_converged(search: "Search") -> bool:

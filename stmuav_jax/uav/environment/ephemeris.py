@@ -71,14 +71,11 @@ class Place(eqx.Module):
             arrays such a latitude or number gets a reason code from `sun_position`.
     """
 
-    latitude: Float[Array, "*#s"]
-    longitude: Float[Array, "*#s"]
-    altitude: Float[Array, "*#s"]
+    latitude: Float[Array, "*#s"] = eqx.field(converter=as_floats)
+    longitude: Float[Array, "*#s"] = eqx.field(converter=as_floats)
+    altitude: Float[Array, "*#s"] = eqx.field(converter=as_floats, default=0.0)
 
-    def __init__(self, latitude: Numbers, longitude: Numbers, altitude: Numbers = 0.0) -> None:
-        self.latitude = jnp.asarray(latitude, dtype=float)
-        self.longitude = jnp.asarray(longitude, dtype=float)
-        self.altitude = jnp.asarray(altitude, dtype=float)
+    def __check_init__(self) -> None:
         if has_values(self.latitude, self.longitude, self.altitude) and self.latitude.ndim == 0:
             _check_place(self)
 
@@ -126,12 +123,10 @@ class Air(eqx.Module):
             above zero.
     """
 
-    pressure: Float[Array, "*#s"]
-    temperature: Float[Array, "*#s"]
+    pressure: Float[Array, "*#s"] = eqx.field(converter=as_floats, default=101325.0)
+    temperature: Float[Array, "*#s"] = eqx.field(converter=as_floats, default=285.15)
 
-    def __init__(self, pressure: Numbers = 101325.0, temperature: Numbers = 285.15) -> None:
-        self.pressure = jnp.asarray(pressure, dtype=float)
-        self.temperature = jnp.asarray(temperature, dtype=float)
+    def __check_init__(self) -> None:
         check_finite(self.pressure, "The air's pressure", "Pa", SettingError)
         check_finite(self.temperature, "The air's temperature", "K", SettingError)
         if has_values(self.pressure, self.temperature) and not (

@@ -270,16 +270,11 @@ def _estimate_record(
     )  # fmt: skip
 
 
-def convergence(estimates: Estimates, t: Any, within: float) -> np.ndarray:
-    """Last time at which the offset is further than `within` from the truth (s,) [s].
-
-    The time is zero if there is none, and NaN if the offset is so at the end.
-    """
-    return np.asarray(last_beyond(estimates.error[:, 3:], t, within))
-
-
 def last_beyond(error: Float[Array, "T k s"], t: Any, within: float) -> Float[Array, " s"]:
-    """Times as in `convergence` for errors at the times t[1:]."""
+    """Last of the times t[1:] at which an error is larger than `within` (s,) [s].
+
+    The time is zero if there is none, and NaN if the error is so at the end.
+    """
     outside_mask = ~(jnp.max(jnp.abs(error), axis=1) <= within)
     last_index = len(outside_mask) - 1 - jnp.argmax(outside_mask[::-1], axis=0)
     when = jnp.where(outside_mask.any(axis=0), jnp.asarray(t)[last_index + 1], 0.0)
@@ -311,7 +306,7 @@ def summarise(estimates: Estimates, record: CaseRecord, tuning: str) -> CaseSumm
         none = (nan, nan)
         return CaseSummary(record.case, tuning, record.seeds, record.seeds, nan, nan, nan, none, nan,
                        nan, nan, none, none, none, 0, *judged)  # fmt: skip
-    close, times_to_5mm = (convergence(good, t, within) for within in (0.02, 0.005))
+    close, times_to_5mm = (last_beyond(good.error[:, 3:], t, within) for within in (0.02, 0.005))
     error = np.asarray(good.error)[after_start, 3:]
     window = mean_interval(5, count)
     # Errors of neighbouring steps are correlated; a count at 50 spread times can be compared with the

@@ -9,7 +9,7 @@ Source: report Part II, section 3.1 (joints); docs/report_machine.md (lengths)."
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...checks.errors import ModelError, SettingError, check_finite, check_shape, has_values
-from ...checks.numbers import as_floats
+from ...checks.numbers import as_floats, as_numpy
 from ...checks.schema import quantity
 from ...checks.shapes import Numbers
 from ...math.compiler import kept_jit, quick_jit
@@ -143,21 +143,15 @@ class Placement(NamedTuple):
     axes: dict[str, Float[Array, "3"]]
 
 
-class _PlacedBodies(NamedTuple):
-    """Bodies of a `Placement`, and what its joints' points and axes are made of."""
+def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RISING) -> Placement:
+    """Place every body and joint at panel angles (phi, theta) (2,) [rad]; NaN out of reach.
 
-    r: Float[Array, "6 3"]
-    p: Float[Array, "6 4"]
-    hinge: Float[Array, "3"]
-    top: Float[Array, "3"]
-    low: tuple[Float[Array, "3"], Float[Array, "3"]]
-    balls: tuple[Float[Array, "3"], Float[Array, "3"]]
-    R_panel: Float[Array, "3 3"]
+    Body axes: z along the post and the rods, upward from the lower joint; post R_x, rod 6
+    R_y, rod 5 R_y R_x (the y axis of universal joint 3-5 is in the slider, its x axis in the
+    rod), panel R_x R_y.
 
-
-def _compute_places(
-    geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods
-) -> _PlacedBodies:
+    Source: report Part II, section 3.1 and Eq. 3.10; docs/report_machine.md.
+    """
     # From the panel down: its angles place the ball joints, these the rods, and the rods the
     # sliders, in closed form.
     loops = close_loops(geometry, turn_by_angles(angles))
@@ -192,30 +186,16 @@ def _compute_places(
         ]
     )
     p = jnp.stack([level, level, post, rod_5, rod_6, panel])
-    return _PlacedBodies(r, p, hinge, top, (low_2, low_3), (ball_2, ball_3), R_panel)
-
-
-def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RISING) -> Placement:
-    """Place every body and joint at panel angles (phi, theta) (2,) [rad]; NaN out of reach.
-
-    Body axes: z along the post and the rods, upward from the lower joint; post R_x, rod 6
-    R_y, rod 5 R_y R_x (the y axis of universal joint 3-5 is in the slider, its x axis in the
-    rod), panel R_x R_y.
-
-    Source: report Part II, section 3.1 and Eq. 3.10; docs/report_machine.md.
-    """
-    layout = _compute_places(geometry, angles, rods)
-    x, y, z = jnp.eye(3)
     points = {
-        "T12": layout.r[0], "T13": layout.r[1], "R14": layout.hinge, "R26": layout.low[0],
-        "U35": layout.low[1], "U47": layout.top, "S57": layout.balls[1], "S67": layout.balls[0],
+        "T12": r[0], "T13": r[1], "R14": hinge, "R26": low_2,
+        "U35": low_3, "U47": top, "S57": ball_3, "S67": ball_2,
     }  # fmt: skip
     axes = {
         "T12": z, "T13": z, "R14": x, "R26": y,
-        "U35.i": y, "U35.j": rotation_matrix(layout.p[3])[:, 0],
-        "U47.i": x, "U47.j": layout.R_panel[:, 1],
+        "U35.i": y, "U35.j": rotation_matrix(rod_5)[:, 0],
+        "U47.i": x, "U47.j": R_panel[:, 1],
     }  # fmt: skip
-    return Placement(layout.r, layout.p, points, axes)
+    return Placement(r, p, points, axes)
 
 
 @quick_jit
@@ -223,7 +203,6 @@ def posture(
     geometry: TrackerGeometry,
     angles: Float[Array, "2"],
     rates: Float[Array, "2"] | None = None,
-    rods: Rods = RISING,
 ) -> State:
     """State of the six bodies on a base at rest.
 
@@ -233,8 +212,8 @@ def posture(
     """
 
     def body_poses(x: Array) -> tuple[Array, Array]:
-        layout = _compute_places(geometry, x, rods)
-        return layout.r, layout.p
+        placement = place(geometry, x)
+        return placement.r, placement.p
 
     if rates is None:
         r, p = body_poses(angles)
@@ -277,48 +256,24 @@ def place_on_base(
     return State(stack(r, r_all), stack(p, p_all), stack(v, v_all), stack(omega, omega_all))
 
 
-class _Posture(NamedTuple):
-    """Poses of the bodies, points and axes of the joints by name, in the world."""
-
-    poses: dict[str, tuple[Any, Any]]
-    points: dict[str, Any]
-    axes: dict[str, Any]
-
-
-_POINTS = ("T12", "T13", "R14", "R26", "U35", "U47", "S57", "S67")
-_AXES = ("T12", "T13", "R14", "R26", "U35.i", "U35.j", "U47.i", "U47.j")
-
-
 @kept_jit
-def _place_all(
+def _place_displaced(
     geometry: TrackerGeometry, angles: Float[Array, "2"], displacement: Float[Array, "3"]
-) -> tuple[Array, ...]:
-    """Arrays of `_Posture`, compiled as one: each small operation alone would cost a compilation."""
+) -> Placement:
+    """Displaced placement, compiled as one: each small operation alone would cost a compilation."""
     placement = place(geometry, angles)
-    points = jnp.stack([placement.points[name] for name in _POINTS])
-    return (
-        placement.r + displacement[None],
-        placement.p,
-        points + displacement[None],
-        jnp.stack([placement.axes[name] for name in _AXES]),
-    )
+    points = {name: point + displacement for name, point in placement.points.items()}
+    return placement._replace(r=placement.r + displacement[None], points=points)
 
 
-def _place_tracker(parameters: Parameters, displacement: Numbers) -> _Posture:
+def _place_tracker(parameters: Parameters, displacement: Numbers) -> Placement:
     geometry, angles = tracker_geometry(parameters), initial_angles(parameters)
-    arrays = _place_all(geometry, angles, as_floats(displacement))
-    if has_values(arrays):
-        arrays = tuple(np.asarray(array) for array in arrays)
-        # NaN means that a root of the closed form was imaginary; which leg does not reach is then
-        # found for the message.
-        if not np.all(np.isfinite(arrays[0])):
-            check_closure(geometry, angles)
-    r, p, points, axes = arrays
-    return _Posture(
-        {name: (r[k], p[k]) for k, name in enumerate(TRACKER_BODIES)},
-        {name: points[k] for k, name in enumerate(_POINTS)},
-        {name: axes[k] for k, name in enumerate(_AXES)},
-    )
+    placement = as_numpy(_place_displaced(geometry, angles, as_floats(displacement)))
+    # NaN means that a root of the closed form was imaginary; which leg does not reach is then
+    # found for the message.
+    if has_values(placement) and not np.all(np.isfinite(placement.r)):
+        check_closure(geometry, angles)
+    return placement
 
 
 def tracker_bodies(
@@ -330,17 +285,17 @@ def tracker_bodies(
         ModelError: numbers that no body can have, or lengths with which the tracker cannot take
             that posture; the message says which leg, or the post, does not reach.
     """
-    initial_posture = _place_tracker(parameters, displacement)
+    placement = _place_tracker(parameters, displacement)
     return tuple(
         Body(
             name,
             parameters.value(f"mass.{name}"),
             parameters.value(f"inertia.{name}"),
-            position=initial_posture.poses[name][0],
-            orientation=initial_posture.poses[name][1],
+            position=placement.r[k],
+            orientation=placement.p[k],
             triangle_tolerance=parameters[f"inertia.{name}"].tolerance,
         )
-        for name in TRACKER_BODIES
+        for k, name in enumerate(TRACKER_BODIES)
     )
 
 
@@ -352,8 +307,7 @@ def tracker_joints(
     Raises:
         ModelError: lengths that cannot be assembled.
     """
-    initial_posture = _place_tracker(parameters, displacement)
-    points, axes = initial_posture.points, initial_posture.axes
+    _, _, points, axes = _place_tracker(parameters, displacement)
 
     def make_slide(name: str, slider: str) -> Joint:
         return translational(name, base, slider, axis=axes[name], point=points[name])

@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import date, datetime, tzinfo
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -203,15 +203,6 @@ def attitude_history(attitude: Attitude, times: Samples) -> Float[np.ndarray, "3
     return R
 
 
-class _Aim(NamedTuple):
-    """Pointing of the panel at n times, day or night; arrays as in `Day`."""
-
-    angles: Float[Array, "2 n"]
-    strokes: Float[Array, "2 n"]
-    normals_w: Float[Array, "3 n"]
-    reason: Int[Array, " n"]
-
-
 def _aim_panel(
     geometry: TrackerGeometry,
     limits: Limits,
@@ -220,8 +211,8 @@ def _aim_panel(
     flaws: Imperfections,
     up: np.ndarray,
     grid: ReachableGrid | None,
-) -> _Aim:
-    """Panel angles and strokes, as the controller computes them: within reach where the sun is up."""
+) -> tuple[Array, Array, Array, Array]:
+    """Angles, strokes, normals and reasons as in `Day`, at any time: within reach where the sun is up."""
     s_b, angles, reason = _wish_angles(geometry, limits, s_w, R_wb, as_floats(flaws.attitude_error))
     outside_mask = up & (np.asarray(reason) != Reason.VALID)
     target_angles = np.array(angles)
@@ -235,7 +226,7 @@ def _aim_panel(
         # The motors' steps round the strokes, and the panel's angles follow from those.
         angles = jax.jit(angles_from_strokes)(geometry, q, angles).angles
     q, normals = _hold_angles(geometry, angles, R_wb)
-    return _Aim(angles, q, normals, reason)
+    return angles, q, normals, reason
 
 
 @quick_jit
@@ -393,8 +384,8 @@ def track_day(
         up = np.asarray(sun.is_up)
         sky = clear_sky(times, place, sun, air, turbidity=turbidity)
         R_wb = attitude_history(attitude, times - unix[0])
-        aimed = _aim_panel(geometry, limits, sun.s_w, as_jax(R_wb), flaws, up, grid)
-        angles, q, normals = (np.where(up, np.asarray(part), np.nan) for part in aimed[:3])
+        *aimed, reason = _aim_panel(geometry, limits, sun.s_w, as_jax(R_wb), flaws, up, grid)
+        angles, q, normals = (np.where(up, np.asarray(part), np.nan) for part in aimed)
         faces = {
             # By night the tracker rests level, and its normal must be a number.
             "tracker": np.where(up, normals, level_normals(len(times))),
@@ -405,7 +396,7 @@ def track_day(
         }
         return Pointing(
             start, times, weights, sun, R_wb, np.einsum("jin,jn->in", R_wb, np.asarray(sun.s_w)),
-            angles, q, normals, np.where(up, aimed.reason, np.int8(Reason.BELOW_HORIZON)), sky,
+            angles, q, normals, np.where(up, reason, np.int8(Reason.BELOW_HORIZON)), sky,
             {name: panel_irradiance(faces[name], sun, sky, albedo=albedo) for name in PANELS},
         )  # fmt: skip
 

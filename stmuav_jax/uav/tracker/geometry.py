@@ -24,7 +24,6 @@ from jaxtyping import Array, Float
 
 from ...checks.errors import ModelError, check_finite, check_shape, has_values
 from ...checks.numbers import as_floats
-from ...checks.shapes import Numbers
 from ...math.compiler import kept_jit
 from ...math.derivative import safe_sqrt
 from ...mechanics.parameters import Parameters
@@ -61,58 +60,27 @@ class TrackerGeometry(eqx.Module):
         ModelError: a wrong shape, a number that is not finite, or r, a, b, L not positive.
     """
 
-    axis: Float[Array, "2"]
-    hinge: Float[Array, ""]
-    post: Float[Array, ""]
-    arms: Float[Array, "2"]
-    panel_arms: Float[Array, "2"]
-    panel_depths: Float[Array, "2"]
-    rods: Float[Array, "2"]
-    slider_out: Float[Array, "2"]
-    slider_up: Float[Array, "2"]
-    post_com: Float[Array, "3"]
-    rod_com: Float[Array, "2"]
-    panel_com: Float[Array, "3"]
+    axis: Float[Array, "2"] = eqx.field(converter=as_floats)
+    hinge: Float[Array, ""] = eqx.field(converter=as_floats)
+    post: Float[Array, ""] = eqx.field(converter=as_floats)
+    arms: Float[Array, "2"] = eqx.field(converter=as_floats)
+    panel_arms: Float[Array, "2"] = eqx.field(converter=as_floats)
+    panel_depths: Float[Array, "2"] = eqx.field(converter=as_floats)
+    rods: Float[Array, "2"] = eqx.field(converter=as_floats)
+    slider_out: Float[Array, "2"] = eqx.field(converter=as_floats)
+    slider_up: Float[Array, "2"] = eqx.field(converter=as_floats)
+    post_com: Float[Array, "3"] = eqx.field(converter=as_floats)
+    rod_com: Float[Array, "2"] = eqx.field(converter=as_floats)
+    panel_com: Float[Array, "3"] = eqx.field(converter=as_floats)
 
-    def __init__(
-        self,
-        *,
-        axis: Numbers,
-        hinge: Numbers,
-        post: Numbers,
-        arms: Numbers,
-        panel_arms: Numbers,
-        panel_depths: Numbers,
-        rods: Numbers,
-        slider_out: Numbers,
-        slider_up: Numbers,
-        post_com: Numbers,
-        rod_com: Numbers,
-        panel_com: Numbers,
-    ) -> None:
-        self.axis = as_floats(axis)
-        self.hinge = as_floats(hinge)
-        self.post = as_floats(post)
-        self.arms = as_floats(arms)
-        self.panel_arms = as_floats(panel_arms)
-        self.panel_depths = as_floats(panel_depths)
-        self.rods = as_floats(rods)
-        self.slider_out = as_floats(slider_out)
-        self.slider_up = as_floats(slider_up)
-        self.post_com = as_floats(post_com)
-        self.rod_com = as_floats(rod_com)
-        self.panel_com = as_floats(panel_com)
+    def __check_init__(self) -> None:
         for name, shape in _SHAPES.items():
-            _check_length(name, getattr(self, name), shape)
-
-
-def _check_length(name: str, value: Array, shape: tuple[int, ...]) -> None:
-    quantity = f"geometry.{name} of the tracker"
-    check_shape(value, shape, quantity)
-    check_finite(value, quantity, "m")
-    if name in _POSITIVE and has_values(value) and not np.all(np.asarray(value) > 0):
-        lengths_mm = (1e3 * np.asarray(value)).round(9).tolist()
-        raise ModelError(f"{quantity} must be positive, but it is {lengths_mm} mm.")
+            value, quantity = getattr(self, name), f"geometry.{name} of the tracker"
+            check_shape(value, shape, quantity)
+            check_finite(value, quantity, "m")
+            if name in _POSITIVE and has_values(value) and not np.all(np.asarray(value) > 0):
+                lengths_mm = (1e3 * np.asarray(value)).round(9).tolist()
+                raise ModelError(f"{quantity} must be positive, but it is {lengths_mm} mm.")
 
 
 def tracker_geometry(parameters: Parameters) -> TrackerGeometry:

@@ -178,21 +178,15 @@ def solve_2x2(J: Float[Array, "2 2 *s"], x: Float[Array, "2 *s"]) -> Float[Array
     return jnp.stack([J[1, 1] * x[0] - J[0, 1] * x[1], J[0, 0] * x[1] - J[1, 0] * x[0]]) / det
 
 
-def _jacobian_and_rate(
-    geometry: TrackerGeometry, angles: Array, rates: Array, rods: Rods
-) -> tuple[Float[Array, "2 2 *s"], Float[Array, "2 2 *s"]]:
-    """Stroke Jacobian and its time derivative, by one forward derivative of the closed form."""
-    return jax.jvp(lambda x: stroke_jacobian(geometry, x, rods), (angles,), (rates,))
-
-
-def stroke_motion(geometry: TrackerGeometry, angles: PairMotion, rods: Rods = RISING) -> PairMotion:
+def stroke_motion(geometry: TrackerGeometry, angles: PairMotion) -> PairMotion:
     """Stroke motion [m], [m/s], [m/s^2] of a moving panel [rad], [rad/s], [rad/s^2].
 
     q' = J x', q'' = J x'' + J' x'.
     """
-    J, J_rate = _jacobian_and_rate(geometry, angles.value, angles.rate, rods)
+    jacobian = lambda x: stroke_jacobian(geometry, x)
+    J, J_rate = jax.jvp(jacobian, (angles.value,), (angles.rate,))
     return PairMotion(
-        strokes(geometry, angles.value, rods),
+        strokes(geometry, angles.value),
         _apply_jacobian(J, angles.rate),
         _apply_jacobian(J, angles.acceleration) + _apply_jacobian(J_rate, angles.rate),
     )

@@ -42,7 +42,6 @@ from ...checks.errors import (
     has_values,
 )
 from ...checks.numbers import as_floats
-from ...checks.shapes import Numbers
 from ...math.compiler import in_blocks, kept_jit, quick_jit
 from ...mechanics.parameters import Parameters
 from .geometry import (
@@ -55,9 +54,7 @@ from .geometry import (
     turn_by_angles,
 )
 from .kinematics import (
-    RISING,
     Reason,
-    Rods,
     loop_jacobian,
     panel_angles,
     panel_normal,
@@ -80,26 +77,13 @@ class Limits(eqx.Module):
         ModelError: lower not below upper, a tilt outside (0, pi], a margin that is not finite.
     """
 
-    home: Float[Array, "2"]
-    lower: Float[Array, "2"]
-    upper: Float[Array, "2"]
-    tilt: Float[Array, ""]
-    margin: Float[Array, ""]
+    home: Float[Array, "2"] = eqx.field(converter=as_floats)
+    lower: Float[Array, "2"] = eqx.field(converter=as_floats, default=(-np.inf, -np.inf))
+    upper: Float[Array, "2"] = eqx.field(converter=as_floats, default=(np.inf, np.inf))
+    tilt: Float[Array, ""] = eqx.field(converter=as_floats, default=np.pi / 3)
+    margin: Float[Array, ""] = eqx.field(converter=as_floats, default=0.0)
 
-    def __init__(
-        self,
-        *,
-        home: Numbers,
-        lower: Numbers = (-np.inf, -np.inf),
-        upper: Numbers = (np.inf, np.inf),
-        tilt: Numbers = np.pi / 3,
-        margin: Numbers = 0.0,
-    ) -> None:
-        self.home = as_floats(home)
-        self.lower = as_floats(lower)
-        self.upper = as_floats(upper)
-        self.tilt = as_floats(tilt)
-        self.margin = as_floats(margin)
+    def __check_init__(self) -> None:
         for name in ("home", "lower", "upper"):
             check_shape(getattr(self, name), (2,), f"{name} of the workspace's limits")
         check_finite(self.home, "home of the workspace's limits", "m")
@@ -188,12 +172,12 @@ def align_pair(pair: Float[Array, "2"], like: Array) -> Float[Array, "2 *s"]:
 
 
 def measure(
-    geometry: TrackerGeometry, limits: Limits, turn: Turn, rods: Rods
+    geometry: TrackerGeometry, limits: Limits, turn: Turn
 ) -> tuple[Float[Array, "2 *s"], Margins, Any]:
     """Strokes, margins, and the Jacobians of `loop_jacobian`."""
     loops = close_loops(geometry, turn)
-    q = jnp.stack(strokes_of(geometry, loops, rods))
-    rows = loop_jacobian(geometry, turn, loops, rods)
+    q = jnp.stack(strokes_of(geometry, loops))
+    rows = loop_jacobian(geometry, turn, loops)
     (a, b), _ = rows
     # Divided by the arms, the determinant has no unit, and one margin holds for any size of tracker.
     determinant = (a[1] * b[0] - a[0] * b[1]) / (geometry.panel_arms[0] * geometry.panel_arms[1])
@@ -234,11 +218,10 @@ def survey(
     geometry: TrackerGeometry,
     angles: Float[Array | np.ndarray, "2 *s"],
     limits: Limits,
-    rods: Rods = RISING,
 ) -> Survey:
     """Kinematics and margins at any postures (2, ...) [rad]; elementwise."""
     angles = jnp.asarray(angles)
-    q, margins, ((a, b), c) = measure(geometry, limits, turn_by_angles(angles), rods)
+    q, margins, ((a, b), c) = measure(geometry, limits, turn_by_angles(angles))
     finite = jnp.isfinite(angles[0] + angles[1])
     return Survey(
         angles,
@@ -295,7 +278,6 @@ def aim(
     geometry: TrackerGeometry,
     direction: Float[Array | np.ndarray, "3 *s"],
     limits: Limits,
-    rods: Rods = RISING,
     *,
     throw: bool = True,
 ) -> Aim:
@@ -326,33 +308,20 @@ def aim(
         ]
     )
     turn = turn_by_direction(n)
-    q, margins, _ = measure(geometry, limits, turn, rods)
+    q, margins, _ = measure(geometry, limits, turn)
     reason = reasons(margins, (~finite, Reason.NOT_FINITE), (~usable, Reason.ZERO_LENGTH))
     if throw and direction.ndim == 1 and has_values(geometry, direction, limits):
-        _raise(geometry, direction, limits, margins, Reason(int(reason)))
+        code, components = Reason(int(reason)), np.asarray(direction).tolist()
+        if code == Reason.NOT_FINITE:
+            raise StateError(f"The direction to face must be finite, but it is {components}.")
+        if code == Reason.ZERO_LENGTH:
+            raise StateError("The direction to face has zero length; give any vector towards it.")
+        if code != Reason.VALID:
+            explanation = why_outside(geometry, limits, margins, code)
+            raise StateError(f"The panel cannot face the direction {components}: {explanation}")
     valid = reason == Reason.VALID
     keep = lambda x: jnp.where(valid, x, jnp.nan)
     return Aim(keep(panel_angles(n)), keep(q), keep(q - align_pair(limits.home, q)), reason)
-
-
-def _raise(
-    geometry: TrackerGeometry,
-    direction: Array,
-    limits: Limits,
-    margins: Margins,
-    reason: Reason,
-) -> None:
-    """Raise the `StateError` of one direction outside the workspace."""
-    if reason == Reason.VALID:
-        return
-    components = np.asarray(direction).tolist()
-    if reason == Reason.NOT_FINITE:
-        raise StateError(f"The direction to face must be finite, but it is {components}.")
-    if reason == Reason.ZERO_LENGTH:
-        raise StateError("The direction to face has zero length; give any vector towards it.")
-    raise StateError(
-        f"The panel cannot face the direction {components}: {why_outside(geometry, limits, margins, reason)}"
-    )
 
 
 def why_outside(geometry: TrackerGeometry, limits: Limits, margins: Margins, reason: Reason) -> str:

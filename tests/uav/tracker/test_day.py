@@ -1,7 +1,10 @@
 """A day of pointing: against NumPy, pvlib's own calls, brute force, and as files and figures."""
 
+import inspect
 import json
+import math
 from datetime import UTC, date, datetime, timedelta, timezone
+from types import SimpleNamespace
 from typing import Any
 from zoneinfo import ZoneInfo
 
@@ -13,6 +16,7 @@ import pvlib
 import pytest
 import xarray as xr
 from helpers import np_rotation, turn
+from vectors import np_panel, np_strokes
 
 import stmuav_jax as stm
 from stmuav_jax.figures.day import (
@@ -27,6 +31,7 @@ from stmuav_jax.uav.environment.calendar import day_zone, local_time, parse_date
 from stmuav_jax.uav.environment.ephemeris import Air, Place, sun_direction
 from stmuav_jax.uav.environment.irradiance import clear_sky, single_axis_normals
 from stmuav_jax.uav.environment.sun import attitude, sun_position
+from stmuav_jax.uav.tracker import day as day_module
 from stmuav_jax.uav.tracker.day import PANELS, Imperfections, attitude_history, day_times, track_day
 from stmuav_jax.uav.tracker.kinematics import Reason, panel_normal, stroke_jacobian
 from stmuav_jax.uav.tracker.workspace import nearest_reachable, survey
@@ -46,22 +51,6 @@ def day():
     return phnom_penh()
 
 
-def np_strokes(angles):
-    """Report Part II, Eq. 3.9 to 3.20 as corrected, one posture, in NumPy."""
-    value = stm.PART_II.value
-    phi, theta = angles
-    R = np_rotation(turn([1, 0, 0], phi)) @ np_rotation(turn([0, 1, 0], theta))
-    (a2, a3), (b2, b3) = value("geometry.arms"), value("geometry.panel_arms")
-    h2, h3 = value("geometry.panel_depths")
-    feet, balls = np.array([[-a2, 0, 0], [0, a3, 0]]), np.array([[-b2, 0, -h2], [0, b3, -h3]]) @ R.T
-    lean = balls[0, 1] / value("geometry.post")
-    top = value("geometry.post") * np.array([0, -lean, np.sqrt(1 - lean**2)])
-    t = top - feet + balls
-    rods = np.array(value("geometry.rods"))
-    root = np.sqrt(rods**2 + t[:, 2] ** 2 - np.sum(t * t, axis=1))
-    return value("geometry.hinge") + t[:, 2] - root
-
-
 # --- pointing
 
 
@@ -70,10 +59,10 @@ def test_panel_faces_the_sun_within_reach(day):
     assert 5 < day.hours_of(day.facing) < 10
     s_w = np.asarray(day.sun.s_w)
     for k in np.flatnonzero(day.facing):
-        phi, theta = day.angles[:, k]
-        R = np_rotation(turn([1, 0, 0], phi)) @ np_rotation(turn([0, 1, 0], theta))
-        np.testing.assert_allclose(NORTHWARD @ R[:, 2], s_w[:, k], atol=1e-12)
-        np.testing.assert_allclose(np_strokes(day.angles[:, k]), day.strokes[:, k], atol=1e-14)
+        normal = np_panel(day.angles[:, k])[:, 2]
+        np.testing.assert_allclose(NORTHWARD @ normal, s_w[:, k], atol=1e-12)
+        expected = np_strokes(day.geometry, day.angles[:, k])
+        np.testing.assert_allclose(expected, day.strokes[:, k], atol=1e-14)
     assert np.max(day.pointing_error[day.facing]) < 1e-12
     np.testing.assert_allclose(day.incidence_cosine[day.facing], 1.0, atol=1e-14)
 
@@ -181,12 +170,32 @@ def test_actuator_steps_round_the_strokes(day):
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
     assert np.max(np.abs(rough.strokes - day.strokes)[:, on]) <= step / 2 + 1e-12
     for k in np.flatnonzero(on):
-        np.testing.assert_allclose(np_strokes(rough.angles[:, k]), rough.strokes[:, k], atol=1e-12)
+        expected = np_strokes(day.geometry, rough.angles[:, k])
+        np.testing.assert_allclose(expected, rough.strokes[:, k], atol=1e-12)
     jacobian = jax.jit(stroke_jacobian)(day.geometry, jnp.asarray(day.angles))
     jacobian = np.moveaxis(np.asarray(jacobian), -1, 0)[on]
     bound = np.linalg.norm(np.abs(np.linalg.inv(jacobian)).sum(axis=2), axis=1) * step / 2
     assert np.all(rough.pointing_error[on] < 1.05 * bound)
     assert 0.3 < np.degrees(rough.pointing_error[on].max()) < 0.6
+
+
+@pytest.mark.parametrize(("best", "found"), [(64, 60), (44, 45), (-170, -165), (-179, 180)])
+def test_the_best_multiple_of_fifteen_degrees(best, found, monkeypatch):
+    """Of an energy with one maximum, in ten days or fewer."""
+    tried = []
+
+    def day(place, day, zone, R_wb, **options):
+        assert options["step"] > 0
+        tried.append(R_wb)
+        return SimpleNamespace(energy={"tracker": math.cos(R_wb - math.radians(best))})
+
+    monkeypatch.setattr(day_module, "track_day", day)
+    search = inspect.unwrap(day_module.best_heading)
+    yaw = search(PHNOM_PENH, EQUINOX, UTC, lambda yaw: yaw)
+    assert math.degrees(math.remainder(yaw - math.radians(found), 2 * math.pi)) == pytest.approx(
+        0.0, abs=1e-9
+    )
+    assert len(tried) <= 10
 
 
 # --- light
@@ -491,9 +500,9 @@ def test_table_and_figures(day):
     [
         (None, "There is no file"),
         ("time,roll\n0,1\n", "must begin with"),
-        ("t,roll,pitch,yaw\n0,1,2\n", "four numbers"),
+        ("t,roll,pitch,yaw\n0,1,2\n", "3 cells"),
         ("t,roll,pitch,yaw\n0,1,2,3\n0,1,2,3\n", "times that increase"),
-        ("t,roll,pitch,yaw\n", "times that increase"),
+        ("t,roll,pitch,yaw\n", "no rows"),
     ],
 )
 def test_attitude_files_that_cannot_be_used(text, words, tmp_path):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import central, np_rotation
+from vectors import UNEVEN
 
 from stmuav_jax import PART_I, PART_II, Augmented, ModelError, System, make_scene
 from stmuav_jax.io.netcdf import load_parameters
@@ -13,10 +14,8 @@ from stmuav_jax.uav import TrackerGeometry, tracker_geometry
 from stmuav_jax.uav.tracker.bodies import TRACKER_BODIES, place, tracker_bodies, tracker_joints
 from stmuav_jax.uav.tracker.geometry import (
     check_closure,
-    close_loops,
     initial_angles,
     safe_root,
-    turn_by_angles,
 )
 
 # The assembled mechanism to which the lengths were first fitted, frame of Part I [m]; it was
@@ -44,15 +43,6 @@ POINTS = {
     "S67": (-0.07813957942925931, 0.015, 0.11257370380874829),
 }
 ROUND_OFF = 1e-15  # [m]: a few additions of numbers below 0.2
-
-UNEVEN = {
-    "geometry.arms": (0.094, 0.089),
-    "geometry.panel_arms": (0.069, 0.073),
-    "geometry.panel_depths": (0.013, 0.016),
-    "geometry.rods": (0.093, 0.098),
-    "geometry.rod_com": (0.4, 0.55),
-    "geometry.panel_com": (0.002, -0.003, 0.004),
-}
 
 
 def test_the_tables_lengths_give_the_assembled_mechanism():
@@ -206,12 +196,3 @@ def test_nothing_is_checked_inside_a_transformation():
     assert not np.any(np.isfinite(jax.jit(place)(g, initial_angles(PART_I)).r[0, 2]))
     jax.jit(lambda x: check_closure(g, x))(initial_angles(PART_I))
     assert float(jax.grad(lambda x: jnp.where(x > 0, safe_root(x), 0.0))(-1.0)) == 0.0
-
-
-def test_loops_need_no_particular_shape():
-    g = tracker_geometry(PART_I)
-    angles = jnp.asarray(np.random.default_rng(1).uniform(-0.4, 0.4, (2, 3, 4)))
-    whole = close_loops(g, turn_by_angles(angles))
-    one = close_loops(g, turn_by_angles(angles[:, 1, 2]))
-    assert whole.rise.shape == (3, 4)
-    assert float(whole.squares[1][1, 2]) == pytest.approx(float(one.squares[1]), abs=1e-18)

@@ -6,17 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import np_rotation, turn
+from helpers import np_rotation
+from vectors import UNEVEN, np_panel, np_strokes
 
 from stmuav_jax import PART_I, Augmented, State, make_scene
-from stmuav_jax.checks.errors import first_reason
 from stmuav_jax.uav import tracker_geometry
 from stmuav_jax.uav.tracker.bodies import place, posture
 from stmuav_jax.uav.tracker.geometry import turn_by_angles
 from stmuav_jax.uav.tracker.kinematics import (
     RISING,
     PairMotion,
-    Reason,
     panel_angles,
     panel_normal,
     solve_2x2,
@@ -28,12 +27,6 @@ from stmuav_jax.uav.tracker.kinematics import (
 
 ROUND_OFF = 1e-15  # [m]
 AUTODIFF = 1e-11  # of derivatives in SI units
-UNEVEN = {
-    "geometry.arms": (0.094, 0.089),
-    "geometry.panel_arms": (0.069, 0.073),
-    "geometry.panel_depths": (0.013, 0.016),
-    "geometry.rods": (0.093, 0.098),
-}
 GEOMETRIES = {
     "even": tracker_geometry(PART_I),
     "uneven": tracker_geometry(PART_I.replaced(UNEVEN)),
@@ -51,22 +44,6 @@ def angles():
     x = np.random.default_rng(7).uniform(-0.75, 0.75, (2, 200))
     x[1] = x[1].clip(-0.5)
     return jnp.asarray(x)
-
-
-def np_strokes(g, angles, signs):
-    """Report Part II, Eq. 3.9 in vectors, corrected, with the hinge as origin."""
-    R = np_rotation(turn([1, 0, 0], angles[0])) @ np_rotation(turn([0, 1, 0], angles[1]))
-    (a2, a3), (b2, b3), (h2, h3) = map(np.asarray, (g.arms, g.panel_arms, g.panel_depths))
-    arm_2, arm_3 = R @ [-b2, 0, -h2], R @ [0, b3, -h3]
-    sine = arm_2[1] / float(g.post)
-    top = float(g.post) * np.array([0, -sine, np.sqrt(1 - sine**2)])
-    found, z = [], np.array([0, 0, 1])
-    (rod_2, rod_3), low_2, low_3 = np.asarray(g.rods), np.array([-a2, 0, 0]), np.array([0, a3, 0])
-    legs = ((arm_2, low_2, rod_2), (arm_3, low_3, rod_3))
-    for (arm, low, rod), sign in zip(legs, signs, strict=True):
-        t = top - low + arm
-        found.append(float(g.hinge) + z @ t - sign * np.sqrt(rod**2 + (z @ t) ** 2 - t @ t))
-    return np.array(found)
 
 
 @pytest.mark.parametrize("rods", [RISING, (-1.0, 1.0), (1.0, -1.0)], ids=["up", "down 2", "down 3"])
@@ -117,9 +94,8 @@ def test_rates_and_accelerations(geometry, angles):
 
 def test_normal_is_the_rotations_third_column(angles):
     normals = np.asarray(panel_normal(angles))
-    for (phi, theta), n in zip(np.asarray(angles).T[:20], normals.T, strict=False):
-        R = np_rotation(turn([1, 0, 0], phi)) @ np_rotation(turn([0, 1, 0], theta))
-        assert n == pytest.approx(R[:, 2], abs=1e-15)
+    for x, n in zip(np.asarray(angles).T[:20], normals.T, strict=False):
+        assert n == pytest.approx(np_panel(x)[:, 2], abs=1e-15)
 
 
 def test_angles_of_a_normal_in_every_octant():
@@ -188,10 +164,3 @@ def test_posture_at_rest_is_the_scenes_start():
         assert np.asarray(getattr(at, field.name)) == pytest.approx(
             np.asarray(getattr(scene.state0, field.name)), abs=ROUND_OFF
         )
-
-
-def test_first_reason_is_the_first():
-    a, b = jnp.array([True, False, True]), jnp.array([True, True, False])
-    codes = first_reason((a, Reason.TILT), (b, Reason.SINGULAR))
-    assert codes.tolist() == [Reason.TILT, Reason.SINGULAR, Reason.TILT]
-    assert first_reason((a & ~a, Reason.TILT)).tolist() == [Reason.VALID] * 3
