@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -41,7 +42,7 @@ def draw(
     """Figure of a mechanism: sketch with bodies, joints and frames, and graph of the joints.
 
     The sketch has a frame (x, y, z) at every centre of mass and the shapes of the viewer. In the
-    graph, joints of the spanning tree are full lines from the root down, and joints that
+    graph, joints of the spanning tree are solid lines from the root down, and joints that
     close loops are dashed.
 
     Args:
@@ -58,6 +59,7 @@ def draw(
     _draw_graph(figure.add_subplot(1, 2, 2), system)
     if isinstance(machine, Scene):
         figure.suptitle(machine.title)
+    place_labels(figure)
     return figure
 
 
@@ -106,52 +108,62 @@ def _draw_sketch(ax: Any, run: xr.Dataset, view: tuple[float, float]) -> None:
     ax.set_box_aspect((1, 1, 1))
     ax.view_init(*view)
     ax.tick_params(labelsize=7)
+    ax.locator_params(nbins=5)
     for set_label, name in ((ax.set_xlabel, "x"), (ax.set_ylabel, "y"), (ax.set_zlabel, "z")):
         set_label(f"{name} [m]", fontsize=8)
     ax.set_title("frames of the bodies: x red, y green, z blue", fontsize=9)
-    # At last, since places in the picture are known only with view and limits.
-    _place_labels(ax, labels)
+    # Points in the picture are known only with view and limits.
+    projection = ax.get_proj()
+    line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 1}
+    for name, (x, y, z), colour in labels:
+        ax.annotate(
+            name, proj3d.proj_transform(x, y, z, projection)[:2], (0, 0), textcoords="offset points",
+            fontsize=8, color=_darken(colour), va="bottom", arrowprops=line,
+            fontweight="normal" if colour == "black" else "bold", **_ON_TOP,
+        )  # fmt: skip
 
 
-def _place_labels(ax: Any, labels: list[tuple[str, np.ndarray, str]]) -> None:
-    """Write names beside their points (name, point (3,) [m], colour) without overlap, as far as there is space.
+def place_labels(figure: Figure) -> None:
+    """Move the names of a sketch beside their points, without overlap as far as there is space.
 
     Each name takes the nearest free place among a few directions and distances (greedy point-feature labelling);
     a line leads to its point from farther ones. Where no place is free, it takes the one with the least overlap.
+    Call it again after a change of the figure's size or layout.
 
     Source: J. Christensen, J. Marks, S. Shieber, ACM Trans. Graphics 14 (1995) 203-232.
     """
-    per_pixel = 72.0 / ax.figure.dpi
-    projection = ax.get_proj()
-    anchors = [
-        np.array(proj3d.proj_transform(x, y, z, projection)[:2]) for _, (x, y, z), _ in labels
-    ]
-    pixels = ax.transData.transform(np.array(anchors)) * per_pixel
-    boxes: list[np.ndarray] = []
-    for (name, _, colour), anchor, pixel in zip(labels, anchors, pixels, strict=True):
-        is_body = colour != "black"
-        size = np.array([(5.6 if is_body else 5.0) * len(name), 10.0])
+    # The layout changes the size of the sketch, and with it the distances between points.
+    figure.draw_without_rendering()
+    per_pixel = 72.0 / figure.dpi
+    labels: Any = figure.axes[0].texts
+    anchors = figure.axes[0].transData.transform([label.xy for label in labels]) * per_pixel
+    # A name covers no point of another name.
+    boxes = [np.concatenate([anchor - 2.0, anchor + 2.0]) for anchor in anchors]
+    for label, anchor in zip(labels, anchors, strict=True):
+        extent = label.get_window_extent()
+        size = np.array([extent.width, extent.height]) * per_pixel
         best, best_box, best_overlap = np.zeros(2), np.zeros(4), np.inf
         for radius in _RADII:
             for angle in _DIRECTIONS:
-                offset = radius * np.array([np.cos(angle), np.sin(angle)])
+                direction = np.array([np.cos(angle), np.sin(angle)])
                 # the name's nearest side, or its middle above and below, faces the point
-                corner = (
-                    pixel + offset - size * 0.5 * (1 - np.array([np.cos(angle), np.sin(angle)]))
-                )
+                corner = anchor + radius * direction - size * 0.5 * (1 - direction)
                 box = np.concatenate([corner, corner + size])
                 overlap = sum(_overlap_area(box, other) for other in boxes)
                 if overlap < best_overlap:
-                    best, best_box, best_overlap = corner - pixel, box, overlap
+                    best, best_box, best_overlap = corner - anchor, box, overlap
             if best_overlap == 0:
                 break
         boxes.append(best_box)
+        label.set_position(best)
         is_far = np.linalg.norm(best + 0.5 * size) > 0.5 * size[0] + _RADII[1]
-        line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 1}
-        ax.annotate(
-            name, anchor, best, textcoords="offset points", fontsize=8, color=colour, va="bottom",
-            fontweight="bold" if is_body else "normal", arrowprops=line if is_far else None, **_ON_TOP,
-        )  # fmt: skip
+        label.arrow_patch.set_visible(bool(is_far))
+
+
+def _darken(colour: str) -> Any:
+    """Colour dark enough for text on white: its luminance is at most 0.4."""
+    rgb = np.array(to_rgb(colour))
+    return tuple(rgb * min(1.0, 0.4 / max(float(rgb @ (0.299, 0.587, 0.114)), 1e-9)))
 
 
 def _overlap_area(a: np.ndarray, b: np.ndarray) -> float:
@@ -200,7 +212,7 @@ def _draw_graph(ax: Axes, system: System) -> None:
         ax.text(x, y, tree.bodies[k], ha="center", va="center", fontsize=8, bbox=box)
     ax.margins(0.18, 0.12)
     ax.set_axis_off()
-    loops = "full: spanning tree; dashed: closes a loop" if tree.cut else "spanning tree"
+    loops = "solid: spanning tree; dashed: closes a loop" if tree.cut else "spanning tree"
     ax.set_title(f"joints; {loops}", fontsize=9)
 
 
