@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 
 import stmuav_jax as stm
-from stmuav_jax.figures.sketch import place_labels
 
 FOLDER = Path(__file__).parent
 FIGURES = FOLDER / "figures"
@@ -40,7 +39,6 @@ def sketch_alone(figure: Figure, title: str) -> Figure:
     figure.axes[0].set_subplotspec(GridSpec(1, 1, figure=figure)[0])
     figure.axes[0].set_title("")
     figure.suptitle(title, fontsize=11)
-    place_labels(figure)
     return figure
 
 
@@ -51,7 +49,6 @@ def stacked(figure: Figure) -> Figure:
     places = GridSpec(2, 1, figure=figure)
     for k, axes in enumerate(figure.axes):
         axes.set_subplotspec(places[k])
-    place_labels(figure)
     return figure
 
 

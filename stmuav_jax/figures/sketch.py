@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial.transform import Rotation
@@ -53,17 +54,28 @@ def draw(
     system = machine.system if isinstance(machine, Scene) else machine
     if state is None:
         state = machine.state0 if isinstance(machine, Scene) else system.reference
-    figure = Figure(figsize=(10.0, 5.0), layout="constrained")
+    figure = _SketchFigure(figsize=(10.0, 5.0), layout="constrained")
     FigureCanvasAgg(figure)
     _draw_sketch(figure.add_subplot(1, 2, 1, projection="3d"), posture(system, state), view)
     _draw_graph(figure.add_subplot(1, 2, 2), system)
     if isinstance(machine, Scene):
         figure.suptitle(machine.title)
-    place_labels(figure)
     return figure
 
 
 # --- sketch
+
+
+class _SketchFigure(Figure):
+    """Figure whose names are placed at every drawing, when its size and layout are known."""
+
+    def draw(self, renderer: Any) -> None:
+        engine = self.get_layout_engine()
+        if engine is not None:
+            engine.execute(self)
+        self.axes[0].apply_aspect()
+        _place_labels(self)
+        super().draw(renderer)
 
 
 def _draw_sketch(ax: Any, run: xr.Dataset, view: tuple[float, float]) -> None:
@@ -116,31 +128,38 @@ def _draw_sketch(ax: Any, run: xr.Dataset, view: tuple[float, float]) -> None:
     projection = ax.get_proj()
     line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 1}
     for name, (x, y, z), colour in labels:
-        ax.annotate(
+        label = ax.annotate(
             name, proj3d.proj_transform(x, y, z, projection)[:2], (0, 0), textcoords="offset points",
             fontsize=8, color=_darken(colour), va="bottom", arrowprops=line,
             fontweight="normal" if colour == "black" else "bold", **_ON_TOP,
         )  # fmt: skip
+        label.set_in_layout(False)
 
 
-def place_labels(figure: Figure) -> None:
+def _darken(colour: str) -> Any:
+    """Colour dark enough for text on white: its luminance is at most 0.4."""
+    rgb = np.array(to_rgb(colour))
+    return tuple(rgb * min(1.0, 0.4 / max(float(rgb @ (0.299, 0.587, 0.114)), 1e-9)))
+
+
+def _place_labels(figure: Figure) -> None:
     """Move the names of a sketch beside their points, without overlap as far as there is space.
 
     Each name takes the nearest free place among a few directions and distances (greedy point-feature labelling);
     a line leads to its point from farther ones. Where no place is free, it takes the one with the least overlap.
-    Call it again after a change of the figure's size or layout.
 
     Source: J. Christensen, J. Marks, S. Shieber, ACM Trans. Graphics 14 (1995) 203-232.
     """
-    # The layout changes the size of the sketch, and with it the distances between points.
-    figure.draw_without_rendering()
     per_pixel = 72.0 / figure.dpi
     labels: Any = figure.axes[0].texts
     anchors = figure.axes[0].transData.transform([label.xy for label in labels]) * per_pixel
-    # A name covers no point of another name.
-    boxes = [np.concatenate([anchor - 2.0, anchor + 2.0]) for anchor in anchors]
-    for label, anchor in zip(labels, anchors, strict=True):
-        extent = label.get_window_extent()
+    points = [np.concatenate([anchor - 2.0, anchor + 2.0]) for anchor in anchors]
+    boxes: list[np.ndarray] = []
+    for k, (label, anchor) in enumerate(zip(labels, anchors, strict=True)):
+        # without the line to the point, which the extent of an annotation includes
+        extent = Text.get_window_extent(label)
+        # A name covers no other name, and no point of another name.
+        obstacles = [*boxes, *points[:k], *points[k + 1 :]]
         size = np.array([extent.width, extent.height]) * per_pixel
         best, best_box, best_overlap = np.zeros(2), np.zeros(4), np.inf
         for radius in _RADII:
@@ -148,8 +167,8 @@ def place_labels(figure: Figure) -> None:
                 direction = np.array([np.cos(angle), np.sin(angle)])
                 # the name's nearest side, or its middle above and below, faces the point
                 corner = anchor + radius * direction - size * 0.5 * (1 - direction)
-                box = np.concatenate([corner, corner + size])
-                overlap = sum(_overlap_area(box, other) for other in boxes)
+                box = np.concatenate([corner - 1.5, corner + size + 1.5])
+                overlap = sum(_overlap_area(box, other) for other in obstacles)
                 if overlap < best_overlap:
                     best, best_box, best_overlap = corner - anchor, box, overlap
             if best_overlap == 0:
@@ -158,12 +177,6 @@ def place_labels(figure: Figure) -> None:
         label.set_position(best)
         is_far = np.linalg.norm(best + 0.5 * size) > 0.5 * size[0] + _RADII[1]
         label.arrow_patch.set_visible(bool(is_far))
-
-
-def _darken(colour: str) -> Any:
-    """Colour dark enough for text on white: its luminance is at most 0.4."""
-    rgb = np.array(to_rgb(colour))
-    return tuple(rgb * min(1.0, 0.4 / max(float(rgb @ (0.299, 0.587, 0.114)), 1e-9)))
 
 
 def _overlap_area(a: np.ndarray, b: np.ndarray) -> float:
