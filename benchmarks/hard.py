@@ -29,36 +29,32 @@ PEERS: tuple[type[Peer], ...] = (MujocoC, ExudynPeer, PinocchioCpp)
 PAGE = ROOT / "docs" / "validation.md"
 HEAD = """## Hard cases
 
-Each case is simulated with the defaults of `simulate`, unless the case sets others, and compared with a motion
-that is known independently of this package. The table has the error and the run's own estimate of it. Seconds
-are those of the run without compilation. `python benchmarks/hard.py` makes this section from
-`benchmarks/results/hard.json`; the cases are in `benchmarks/problems/hard.py`, and `tests/hard` runs them.
+Each case has a known motion. The table compares the error of a run with the required error and with the run's own
+estimate; run times are without compilation. Settings are the defaults of `simulate` unless stated otherwise.
+`python benchmarks/hard.py` makes this section, and `tests/hard` repeats the cases.
 """
 SWEEP = """### All tolerances
 
-A pendulum of 1 m is released with its rod horizontal and swings for 4.8 s, 15 radians in phase of a small swing.
-The required error is 1,000 tolerances, and at least 1e-11 m.
+A pendulum of 1 m is released with a horizontal rod and swings for 4.8 s. The required error is the larger of 1,000
+tolerances and 1e-11 m.
 """
 SINGULAR = """### Starts at a singular posture
 
-The branch of the motion is undetermined: the start must raise an error that names the posture.
+The branch of the motion is undetermined, so the start must raise an error that names the posture:
 """
 BESIDE = """### Other programs
 
-The installed programs of `benchmarks/peers` run the cases with position errors, once each, at their finest
-setting whose steps end at the output times: error, seconds, and that setting (fixed step, or tolerance). If a
-program did not run or complete a case, a sentence gives the reason, and coarser settings are not tried.
+The table has error, run time and setting (fixed step or tolerance) of other programs at their finest setting, for cases
+with position errors. "Not in our adapter" marks a limit of our adapters in `benchmarks/peers`, not of the program.
 """
 LIMITS = """### Limits
 
-- If only rods or cut loops connect a mechanism to ground, and it is 1,000 km or more from the origin, its run
-  stops with "step size collapsed": positions are 1e6 times as large as the motion. Put the origin near the
-  mechanism, or use `formulation=stm.Augmented()`. Trees with a joint to ground are
-  computed about that joint: the motion of a double pendulum at 10,000 km is the same as at the origin.
-- Tolerances are lengths in metres as well as numbers. Motion that is described by angles only, such as that
-  of rods on hinges, is equally accurate at any size: the scaled results of a slider-crank of a nanometre and
-  one of a metre agree to 1e-10. For sliding or floating bodies in a mechanism much smaller than a
-  millimetre, the default of 1e-8 m is too coarse: give tolerances that suit its size.
+- **Distance from the origin.** A mechanism that is connected to ground only by rods or loop-closing joints stops with
+  "step size collapsed" 1,000 km or more from the origin. Put the origin near the mechanism, or use
+  `formulation=stm.Augmented()`. A mechanism with a tree joint to ground has no such limit.
+- **Size.** The absolute tolerance is a length in metres. For sliding or floating bodies much smaller than a millimetre
+  the default of 1e-8 m is too coarse: set a smaller tolerance. Motion in angles only, such as that of rods on
+  hinges, is equally accurate at any size.
 """
 
 
@@ -150,6 +146,8 @@ def result_of(one: dict[str, Any]) -> str:
         tolerance, step = setting["tolerance"], setting["step"]
         at = f"step {step:.2g} s" if tolerance is None else f"tolerance {tolerance:.0e}"
     if reason := one["reason"]:
+        if "not supported" in reason:
+            return "not in our adapter"
         return f"{reason.rstrip('.')} ({at})." if at else reason
     return f"{two(one['error'])}, {two(one['seconds'])} s ({at})"
 
@@ -162,8 +160,7 @@ def more(content: dict[str, Any]) -> list[str]:
         columns = (
             ("start", "name"),
             ("difficulty", "why"),
-            ("named", "named", named),
-            ("message", "said"),
+            ("error names the posture", "named", named),
         )
         parts += [SINGULAR, titled("", starts, *columns).lstrip(), ""]
     ran = [row for row in content["cases"] if row.get("peers")]

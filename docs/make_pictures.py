@@ -6,6 +6,7 @@ python docs/make_pictures.py flight      # the flight, its film, and the printed
 
 import json
 import sys
+import textwrap
 from pathlib import Path
 
 import jax
@@ -41,19 +42,29 @@ def sketch_alone(figure: Figure, title: str) -> Figure:
     return figure
 
 
+def stacked(figure: Figure) -> Figure:
+    """Figure of `stm.draw` with the graph below the sketch, so that words are legible on a narrow window."""
+    figure.set_size_inches(5.0, 8.6)
+    figure.suptitle(textwrap.fill(figure.get_suptitle(), 50), fontsize=11)
+    places = GridSpec(2, 1, figure=figure)
+    for k, axes in enumerate(figure.axes):
+        axes.set_subplotspec(places[k])
+    return figure
+
+
 def gallery() -> None:
     """Sketches of all models of docs/models, alone and with the graphs of their joints."""
     for name in MODELS:
         scene = stm.io.load_model(FOLDER / "models" / f"{name}.toml")
-        figure = stm.draw(scene)
+        figure = stacked(stm.draw(scene))
         stm.figures.save_figures({name: figure}, FIGURES / "gallery", "png", dpi=90)
         if name in OF_README:
             title = scene.title if name != "tracker" else "Solar tracker"
             sketch = {f"{name}_sketch": sketch_alone(figure, title)}
             stm.figures.save_figures(sketch, FIGURES / "gallery", "png", dpi=90)
         print(name)
-    figure = stm.draw(stm.make_scene("uav_tracker", 2))
-    stm.figures.save_figures({"mechanism": figure}, FIGURES / "viewer", "png", dpi=100)
+    figure = stacked(stm.draw(stm.make_scene("uav_tracker", 2)))
+    stm.figures.save_figures({"mechanism": figure}, FIGURES / "viewer", "png", dpi=90)
 
 
 def state_at(data, k: int) -> stm.State:

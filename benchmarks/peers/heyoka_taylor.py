@@ -1,6 +1,6 @@
 """heyoka: Taylor series of high order, compiled by LLVM, from symbolic equations of motion.
 
-heyoka integrates explicit differential equations and knows no mechanisms. The equations are written
+heyoka integrates explicit differential equations and has no model of mechanisms. The equations are written
 here as a user of it would write them: coordinates of a spanning tree, the mass matrix from the
 bodies' Jacobians, and the cut joints' rows by Lagrange multipliers, solved symbolically by Cholesky
 factors. It shares coordinates, but no equation with the package.
@@ -316,7 +316,7 @@ class HeyokaTaylor(Peer):
         "batches by taylor_adaptive_batch of the recommended width, one after the other."
     )
     caveats = (
-        "The equations are ours: heyoka knows no mechanisms.",
+        "The equations are ours: heyoka has no model of mechanisms.",
         "Not stabilised: violations of the constraints grow with the integrator's error.",
         "Its compile time is that of one order.",
     )

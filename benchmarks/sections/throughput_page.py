@@ -75,26 +75,27 @@ def write_page(result: Path, page: Path) -> Path:
     peers: list[Row] = [dict(zip(PROGRAM, of_peer(r), strict=True)) for r in content["peers"]]
     lines = [
         "## Throughput", "",
-        "Measured by `python benchmarks/montecarlo.py` ([result](../benchmarks/results/montecarlo.json)).",
-        "",
-        f"Flights of {content['what'].split(', ')[1]} to {content['t1']:g} s, {content['flights']} of them, Dopri8 at "
-        f"{content['tolerance']:g}; medians. {about['cores']} cores, commit {about['commit'][:10]}"
-        f"{dirty}, {about['date'][:10]}, equations compiled by {about['versions'].get('equations', 'XLA')}, load "
-        f"{about['load_at_start']:.0f} at the start (work on all cores competes with other processes).",
+        f"The tables have medians over {content['flights']} flights of {content['what'].split(', ')[1]} to "
+        f"{content['t1']:g} s with Dopri8 at {content['tolerance']:g} and equations compiled by "
+        f"{about['versions'].get('equations', 'XLA')} (`python benchmarks/montecarlo.py`, "
+        f"[result](../benchmarks/results/montecarlo.json), {about['cores']} cores, commit "
+        f"{about['commit'][:10]}{dirty}, {about['date'][:10]}).",
         "", f"![lanes]({picture.relative_to(page.parent)})", "", "### One core", "",
         *listed(rows, "lanes", ("flights per second", "per_second", one),
                 ("us per step and flight", "microseconds_per_step", one),
                 ("compile [s]", "compile_seconds", one), "failed"),
-        "", f"One by one: {one(content['one_lane_per_second'])} per second.",
+        "", f"A single lane completes {one(content['one_lane_per_second'])} flights per second.",
         "", "### Error of a batch", "",
         *listed(tried, ("tolerance", "tolerance", "{:g}".format),
                 ("median [m]", "median_error", "{:.1e}".format),
                 ("largest [m]", "largest_error", "{:.1e}".format)),
         "", "### Other programs, one core", "", *listed(peers, *PROGRAM), "",
-        *(f"stmuav-jax completes {one(rate)} flights per second at a largest error of "
-          f"{error:.1e} m. {p['method']} completes "
-          f"{one(p['per_second'])} at {p['largest_error']:.1e} m, its fastest setting with at most twice "
-          f"that error: a ratio of {rate / p['per_second']:.2f}." for p in comparable(content)),
+        "The next table has the fastest setting of each program with at most twice our error:", "",
+        *listed([{"program": "stmuav_jax", "per_second": rate, "largest_error": error},
+                 *({"program": p["method"]} | p for p in comparable(content))],
+                "program", ("per second", "per_second", one),
+                ("largest [m]", "largest_error", "{:.1e}".format),
+                ("time per flight, relative to ours", None, lambda p: f"{rate / p['per_second']:.2f}")),
         "", "### More cores, and the store", "",
         *listed(cores, ("cores", "devices"), "flights", ("per second", "per_second", one),
                 ("efficiency", None, spent), ("with study and store", "per_second_stored", one),

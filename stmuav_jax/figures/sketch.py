@@ -7,7 +7,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial.transform import Rotation
@@ -41,7 +43,7 @@ def draw(
     """Figure of a mechanism: sketch with bodies, joints and frames, and graph of the joints.
 
     The sketch has a frame (x, y, z) at every centre of mass and the shapes of the viewer. In the
-    graph, joints of the spanning tree are full lines from the root down, and joints that
+    graph, joints of the spanning tree are solid lines from the root down, and joints that
     close loops are dashed.
 
     Args:
@@ -52,7 +54,7 @@ def draw(
     system = machine.system if isinstance(machine, Scene) else machine
     if state is None:
         state = machine.state0 if isinstance(machine, Scene) else system.reference
-    figure = Figure(figsize=(10.0, 5.0), layout="constrained")
+    figure = _SketchFigure(figsize=(10.0, 5.0), layout="constrained")
     FigureCanvasAgg(figure)
     _draw_sketch(figure.add_subplot(1, 2, 1, projection="3d"), posture(system, state), view)
     _draw_graph(figure.add_subplot(1, 2, 2), system)
@@ -62,6 +64,18 @@ def draw(
 
 
 # --- sketch
+
+
+class _SketchFigure(Figure):
+    """Figure whose names are placed at every drawing, when its size and layout are known."""
+
+    def draw(self, renderer: Any) -> None:
+        engine = self.get_layout_engine()
+        if engine is not None:
+            engine.execute(self)
+        self.axes[0].apply_aspect()
+        _place_labels(self)
+        super().draw(renderer)
 
 
 def _draw_sketch(ax: Any, run: xr.Dataset, view: tuple[float, float]) -> None:
@@ -106,52 +120,63 @@ def _draw_sketch(ax: Any, run: xr.Dataset, view: tuple[float, float]) -> None:
     ax.set_box_aspect((1, 1, 1))
     ax.view_init(*view)
     ax.tick_params(labelsize=7)
+    ax.locator_params(nbins=5)
     for set_label, name in ((ax.set_xlabel, "x"), (ax.set_ylabel, "y"), (ax.set_zlabel, "z")):
         set_label(f"{name} [m]", fontsize=8)
     ax.set_title("frames of the bodies: x red, y green, z blue", fontsize=9)
-    # At last, since places in the picture are known only with view and limits.
-    _place_labels(ax, labels)
+    # Points in the picture are known only with view and limits.
+    projection = ax.get_proj()
+    line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 1}
+    for name, (x, y, z), colour in labels:
+        label = ax.annotate(
+            name, proj3d.proj_transform(x, y, z, projection)[:2], (0, 0), textcoords="offset points",
+            fontsize=8, color=_darken(colour), va="bottom", arrowprops=line,
+            fontweight="normal" if colour == "black" else "bold", **_ON_TOP,
+        )  # fmt: skip
+        label.set_in_layout(False)
 
 
-def _place_labels(ax: Any, labels: list[tuple[str, np.ndarray, str]]) -> None:
-    """Write names beside their points (name, point (3,) [m], colour) without overlap, as far as there is space.
+def _darken(colour: str) -> Any:
+    """Colour dark enough for text on white: its luminance is at most 0.4."""
+    rgb = np.array(to_rgb(colour))
+    return tuple(rgb * min(1.0, 0.4 / max(float(rgb @ (0.299, 0.587, 0.114)), 1e-9)))
+
+
+def _place_labels(figure: Figure) -> None:
+    """Move the names of a sketch beside their points, without overlap as far as there is space.
 
     Each name takes the nearest free place among a few directions and distances (greedy point-feature labelling);
     a line leads to its point from farther ones. Where no place is free, it takes the one with the least overlap.
 
     Source: J. Christensen, J. Marks, S. Shieber, ACM Trans. Graphics 14 (1995) 203-232.
     """
-    per_pixel = 72.0 / ax.figure.dpi
-    projection = ax.get_proj()
-    anchors = [
-        np.array(proj3d.proj_transform(x, y, z, projection)[:2]) for _, (x, y, z), _ in labels
-    ]
-    pixels = ax.transData.transform(np.array(anchors)) * per_pixel
+    per_pixel = 72.0 / figure.dpi
+    labels: Any = figure.axes[0].texts
+    anchors = figure.axes[0].transData.transform([label.xy for label in labels]) * per_pixel
+    points = [np.concatenate([anchor - 2.0, anchor + 2.0]) for anchor in anchors]
     boxes: list[np.ndarray] = []
-    for (name, _, colour), anchor, pixel in zip(labels, anchors, pixels, strict=True):
-        is_body = colour != "black"
-        size = np.array([(5.6 if is_body else 5.0) * len(name), 10.0])
+    for k, (label, anchor) in enumerate(zip(labels, anchors, strict=True)):
+        # without the line to the point, which the extent of an annotation includes
+        extent = Text.get_window_extent(label)
+        # A name covers no other name, and no point of another name.
+        obstacles = [*boxes, *points[:k], *points[k + 1 :]]
+        size = np.array([extent.width, extent.height]) * per_pixel
         best, best_box, best_overlap = np.zeros(2), np.zeros(4), np.inf
         for radius in _RADII:
             for angle in _DIRECTIONS:
-                offset = radius * np.array([np.cos(angle), np.sin(angle)])
+                direction = np.array([np.cos(angle), np.sin(angle)])
                 # the name's nearest side, or its middle above and below, faces the point
-                corner = (
-                    pixel + offset - size * 0.5 * (1 - np.array([np.cos(angle), np.sin(angle)]))
-                )
-                box = np.concatenate([corner, corner + size])
-                overlap = sum(_overlap_area(box, other) for other in boxes)
+                corner = anchor + radius * direction - size * 0.5 * (1 - direction)
+                box = np.concatenate([corner - 1.5, corner + size + 1.5])
+                overlap = sum(_overlap_area(box, other) for other in obstacles)
                 if overlap < best_overlap:
-                    best, best_box, best_overlap = corner - pixel, box, overlap
+                    best, best_box, best_overlap = corner - anchor, box, overlap
             if best_overlap == 0:
                 break
         boxes.append(best_box)
+        label.set_position(best)
         is_far = np.linalg.norm(best + 0.5 * size) > 0.5 * size[0] + _RADII[1]
-        line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 1}
-        ax.annotate(
-            name, anchor, best, textcoords="offset points", fontsize=8, color=colour, va="bottom",
-            fontweight="bold" if is_body else "normal", arrowprops=line if is_far else None, **_ON_TOP,
-        )  # fmt: skip
+        label.arrow_patch.set_visible(bool(is_far))
 
 
 def _overlap_area(a: np.ndarray, b: np.ndarray) -> float:
@@ -200,7 +225,7 @@ def _draw_graph(ax: Axes, system: System) -> None:
         ax.text(x, y, tree.bodies[k], ha="center", va="center", fontsize=8, bbox=box)
     ax.margins(0.18, 0.12)
     ax.set_axis_off()
-    loops = "full: spanning tree; dashed: closes a loop" if tree.cut else "spanning tree"
+    loops = "solid: spanning tree; dashed: closes a loop" if tree.cut else "spanning tree"
     ax.set_title(f"joints; {loops}", fontsize=9)
 
 
