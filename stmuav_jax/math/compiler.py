@@ -10,7 +10,7 @@ import itertools
 import threading
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, wraps
 from pathlib import Path
@@ -22,10 +22,11 @@ import jax.core
 import jax.export
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import get_opaque_trace_state
+from jax.extend.core import get_opaque_trace_state, jaxpr_as_fun
 
 from ..math import exported
 from .native.program import is_on, targets_in
+from .native.structure import Structure, agrees, find_structure, fold_structure, read_structure
 
 Options = dict[str, str | bool | int | float]
 
@@ -124,7 +125,9 @@ def _jit_with_options(function: Callable[..., Any], *, quick: bool) -> Callable[
     return call
 
 
-_programs: OrderedDict[Hashable, Callable[..., Any]] = OrderedDict()
+_programs: OrderedDict[tuple[Any, Any, Structure], Callable[..., Any]] = OrderedDict()
+# structure of the first program of a function and form of arguments
+_structures: dict[Hashable, Structure] = {}
 _lock = threading.Lock()
 
 
@@ -188,8 +191,12 @@ def cached_program(function: Callable[..., Any], *args: Any) -> Callable[..., An
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return function
-    key = (function, *_argument_form(args))
+    form, structure = _argument_form(args), find_structure(args) if is_on() else ()
     with _lock:
+        # Numbers that have not the structure of the first program all share another, for any numbers.
+        first = _structures.setdefault((function, form), structure)
+        structure = first if agrees(structure, first) else ()
+        key = (function, form, structure)
         entry = _programs.get(key)
         if entry is not None:
             _programs.move_to_end(key)
@@ -199,16 +206,18 @@ def cached_program(function: Callable[..., Any], *args: Any) -> Callable[..., An
     check_maps()
     # Compiled outside of the lock, so that threads with other programs do not wait; the same program
     # compiled twice does no harm.
-    compiled = compile_for_shapes(function, *args, quick=True)
+    compiled = compile_for_shapes(function, *args, quick=True, structure=structure)
     with _lock:
         _programs[key] = compiled
         while len(_programs) > MOST_PROGRAMS:
-            _programs.popitem(last=False)
+            (function, form, structure), _ = _programs.popitem(last=False)
+            if not any(key[:2] == (function, form) for key in _programs):
+                _structures.pop((function, form), None)
     return compiled
 
 
 def compile_for_shapes(
-    function: Callable[..., Any], *args: Any, quick: bool = False
+    function: Callable[..., Any], *args: Any, quick: bool = False, structure: Structure = ()
 ) -> Callable[..., Any]:
     """Compiled program of a function for arrays of these shapes, which this module does not keep.
 
@@ -217,10 +226,11 @@ def compile_for_shapes(
         args: pytrees, which may have a `jax.ShapeDtypeStruct` in the place of an array; the program
             accepts the same pytrees with arrays.
         quick: compile with the quick options of `compiler_options`.
+        structure: entries of the arguments' arrays on which the program relies, see `find_structure`.
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return function
-    leaves, structure = jax.tree.flatten(args)
+    leaves, tree_in = jax.tree.flatten(args)
     # Only arrays become arguments of the program; everything else is structure and is compiled in.
     places = [k for k, leaf in enumerate(leaves) if _is_array_or_shape(leaf)]
     result_places: list[Any] = []
@@ -229,7 +239,7 @@ def compile_for_shapes(
         filled = list(leaves)
         for k, array in zip(places, arrays, strict=True):
             filled[k] = array
-        outputs, tree = jax.tree.flatten(function(*jax.tree.unflatten(structure, filled)))
+        outputs, tree = jax.tree.flatten(function(*jax.tree.unflatten(tree_in, filled)))
         count = itertools.count()
         marked = [exported.Place(next(count)) if eqx.is_array(x) else x for x in outputs]
         result_places[:] = [jax.tree.unflatten(tree, marked)]
@@ -237,11 +247,13 @@ def compile_for_shapes(
 
     run_arrays.__name__ = run_arrays.__qualname__ = getattr(function, "__name__", "run")
     options, arrays = compiler_options(quick=quick), [leaves[k] for k in places]
-    outermost, result = run_arrays, None
+    run = _rely_on(run_arrays, arrays, read_structure(structure, leaves, places))
+    outermost, result = run, None
     programs = _Command.programs
-    if programs is not None and (key := programs.next_key(run_arrays.__name__, args, options)):
+    about = [sorted(options.items()), [(place, codes.hex()) for place, codes in structure]]
+    if programs is not None and (key := programs.next_key(run_arrays.__name__, args, about)):
         outermost, result = programs.load(key) or _export_program(
-            programs, key, run_arrays, arrays, result_places
+            programs, key, run, arrays, result_places
         )
     compiled = jax.jit(outermost, compiler_options=options).lower(arrays).compile()
     result = result_places[0] if result is None else result
@@ -253,6 +265,21 @@ def compile_for_shapes(
         return jax.tree.map(put, result)
 
     return call
+
+
+def _rely_on(
+    run: Callable[..., Any], arrays: list[Any], known: Sequence[Any]
+) -> Callable[..., Any]:
+    """Function of arrays, made for the entries of them that are known."""
+    if all(x is None for x in known):
+        return run
+
+    def run_folded(arrays: list[Any]) -> list[Any]:
+        jaxpr = fold_structure(jax.make_jaxpr(run)(arrays), known)
+        return jaxpr_as_fun(jaxpr)(*arrays)
+
+    run_folded.__name__ = run_folded.__qualname__ = run.__name__
+    return run_folded
 
 
 class _Command:

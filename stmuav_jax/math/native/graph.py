@@ -381,7 +381,7 @@ class _Translator:
         handler = getattr(self, "_" + name.replace("-", "_"), None)
         if name == "while":
             raise NotScalarError(name)
-        if name in _MOVES:
+        if name in MOVES:
             return [self.move(name, params, inputs)]
         if name in _ELEMENTWISE:
             # numbers of a graph are in double precision: bits of integers would be wrong
@@ -655,8 +655,8 @@ class _Translator:
     def move(self, name: str, params: Any, inputs: list[Any]) -> Any:
         """Operation that only moves entries."""
         if any(isinstance(x, Nodes) for x in inputs):
-            return Nodes(np.asarray(_MOVES[name](params, *map(self.ids, inputs))))
-        return np.asarray(_MOVES[name](params, *inputs))
+            return Nodes(np.asarray(MOVES[name](params, *map(self.ids, inputs))))
+        return np.asarray(MOVES[name](params, *inputs))
 
     def _split(self, params: Any, x: Any) -> list[Any]:
         cuts = np.cumsum(params["sizes"])[:-1]
@@ -945,12 +945,7 @@ class _Translator:
 
     def _scan(self, params: Any, *inputs: Any) -> list[Any]:
         body = params["jaxpr"]
-        if "ft_in" in params:  # JAX 0.11
-            fixed, carried = (
-                len(list(part)) for part in params["ft_in"].update(inputs).unpack()[:2]
-            )
-        else:
-            fixed, carried = params["num_consts"], params["num_carry"]
+        fixed, carried = count_carried(params, inputs)
         constants = [np.asarray(c) for c in body.consts]
         carry = list(inputs[fixed : fixed + carried])
         rows = inputs[fixed + carried :]
@@ -970,6 +965,14 @@ class _Translator:
             for operands in zip(*outputs, strict=True)
         ]
         return [*carry, *(stacked or empty)]
+
+
+def count_carried(params: Any, inputs: Sequence[Any]) -> tuple[int, int]:
+    """Numbers of a scan's operands that are the same in all passes, and that a pass hands on."""
+    if "ft_in" in params:  # JAX 0.11
+        fixed, carried = (len(list(part)) for part in params["ft_in"].update(inputs).unpack()[:2])
+        return fixed, carried
+    return params["num_consts"], params["num_carry"]
 
 
 def _fills(mode: Any) -> bool:
@@ -1017,7 +1020,7 @@ _ELEMENTWISE = {name: name for name in (*BINARY, *COMPARISONS, *UNARY) if name !
 # Operations on integers that are exact in double precision.
 _WHOLE = {"add", "sub", "neg", "max", "min", "abs", "sign", "rem", "add_any"}
 
-_MOVES: dict[str, Callable[..., np.ndarray]] = {
+MOVES: dict[str, Callable[..., np.ndarray]] = {
     "reshape": lambda p, x: x.reshape(p["new_sizes"]),
     "squeeze": lambda p, x: np.squeeze(x, tuple(p["dimensions"])),
     "expand_dims": lambda p, x: np.expand_dims(x, tuple(p["dimensions"])),
@@ -1066,14 +1069,24 @@ def make_operands(graph: Graph, avals: Sequence[Any]) -> list[Nodes]:
 _SUMS = 8
 
 
-def make_graph(jaxpr: Any, most_nodes: int) -> tuple[Graph, list[np.ndarray]]:
+def make_graph(
+    jaxpr: Any, most_nodes: int, known: Sequence[np.ndarray | None] = ()
+) -> tuple[Graph, list[np.ndarray]]:
     """Scalar program of a closed jaxpr: its graph, and the nodes of its outputs.
+
+    Args:
+        known: entries of the arguments that are known, those of the others NaN; None for none.
 
     Where NaN and infinities of inputs could be lost in products with 0, and the function itself does
     not look for them, 0 times those inputs is added to all outputs that are numbers.
     """
     graph = Graph(most_nodes)
-    outputs = scalarise(graph, jaxpr, make_operands(graph, [v.aval for v in jaxpr.jaxpr.invars]))
+    operands = make_operands(graph, [v.aval for v in jaxpr.jaxpr.invars])
+    for operand, values in zip(operands, known, strict=False):
+        if values is not None:
+            for place in np.argwhere(~np.isnan(values)):
+                operand.ids[tuple(place)] = graph.constant(values[tuple(place)])
+    outputs = scalarise(graph, jaxpr, operands)
     for aval in jaxpr.out_avals:
         if np.dtype(aval.dtype) not in (np.float64, np.bool_, np.int32, np.int64):
             raise NotScalarError(f"a result of type {aval.dtype}")

@@ -1,0 +1,254 @@
+"""Zeros and ones of a model that its compiled programs take for structure.
+
+Most numbers of a model's frames and axes are 0, 1 or -1, which makes up to half of its operations
+needless. Which they are is read from the arguments of a program (`find_structure`) and is a part of what
+the program is found by, as shapes are; numbers that JAX traces have no structure. `fold_structure`
+hands it on through the traced program to the machine code that the program calls. By then all
+derivatives and batches have been taken, with every entry a variable: none is lost.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import jax
+import numpy as np
+
+from .graph import MOVES, count_carried
+from .program import Recursion, native_p
+
+# Entries of an array that are known to be 0, 1 or -1, those of the others NaN; None where none is known.
+Known = np.ndarray | None
+
+# Leaves of arguments by number, with the codes of all their entries: their value, or 2 for any.
+Structure = tuple[tuple[int, bytes], ...]
+
+# Fields of classes by the values that are structure in them.
+_FIELDS: dict[type, dict[str, tuple[float, ...]]] = {}
+
+_ZERO, _UNIT = (0.0,), (0.0, 1.0, -1.0)
+_NUMBER = 2
+
+
+def has_structure(*, zero: Sequence[str] = (), unit: Sequence[str] = ()) -> Callable[[type], type]:
+    """Decorator of a class of pytrees whose arrays in the fields have structure.
+
+    Args:
+        zero: fields whose zeros are structure. unit: those of frames and axes, whose 1 and -1 are, too.
+    """
+
+    def mark(kind: type) -> type:
+        _FIELDS[kind] = dict.fromkeys(zero, _ZERO) | dict.fromkeys(unit, _UNIT)
+        return kind
+
+    return mark
+
+
+@cache
+def _find_places(tree: Any) -> dict[int, tuple[float, ...]]:
+    """Numbers of the leaves that have structure, with its values."""
+    numbered = jax.tree.unflatten(tree, list(range(tree.num_leaves)))
+    nodes = jax.tree.leaves(numbered, is_leaf=lambda node: type(node) in _FIELDS)
+    return {
+        leaf: values
+        for node in nodes
+        for field, values in _FIELDS.get(type(node), {}).items()
+        for leaf in jax.tree.leaves(getattr(node, field))
+    }
+
+
+def find_structure(args: Any) -> Structure:
+    """Entries of arguments' arrays that are structure."""
+    leaves, tree = jax.tree.flatten(args)
+    structure = []
+    for place, values in _find_places(tree).items():
+        leaf = leaves[place]
+        if not isinstance(leaf, np.ndarray | jax.Array) or leaf.dtype != np.float64:
+            continue
+        array = np.asarray(leaf)
+        codes = np.full(array.shape, _NUMBER, np.int8)
+        for value in values:
+            codes[array == value] = value
+        structure.append((place, codes.tobytes()))
+    return tuple(structure)
+
+
+def agrees(structure: Structure, other: Structure) -> bool:
+    """True if numbers of a structure are such that a program made for the other holds for them."""
+    if structure == other or not other:
+        return True
+    pairs = zip(structure, other, strict=True)
+    codes = [[np.frombuffer(codes, np.int8) for _, codes in pair] for pair in pairs]
+    return all(((b == _NUMBER) | (a == b)).all() for a, b in codes)
+
+
+def read_structure(
+    structure: Structure, leaves: Sequence[Any], places: Sequence[int]
+) -> list[Known]:
+    """Known entries of the leaves at these places."""
+    known: dict[int, Known] = {}
+    for place, codes in structure:
+        code = np.frombuffer(codes, np.int8).reshape(leaves[place].shape)
+        known[place] = np.where(code == _NUMBER, np.nan, code)
+    return [known.get(place) for place in places]
+
+
+def fold_structure(jaxpr: Any, known: Sequence[Known]) -> Any:
+    """Closed jaxpr whose machine code is made for the known entries of its arguments."""
+    return _Fold().fold_closed(jaxpr, known)[0]
+
+
+class _Fold:
+    """Pass through a jaxpr and those within it; each is done once for the same known entries."""
+
+    def __init__(self) -> None:
+        self._done: dict[Any, tuple[Any, list[Known], Any]] = {}
+
+    def fold_closed(self, closed: Any, known: Sequence[Known]) -> tuple[Any, list[Known]]:
+        """Closed jaxpr made for its known arguments, and what is known of its results."""
+        jaxpr, results = self.fold(closed.jaxpr, [_read_units(c) for c in closed.consts], known)
+        return (closed if jaxpr is closed.jaxpr else closed.replace(jaxpr=jaxpr)), results
+
+    def fold(
+        self, jaxpr: Any, constants: Sequence[Known], known: Sequence[Known]
+    ) -> tuple[Any, list[Known]]:
+        """Jaxpr made for its known constants and arguments, and what is known of its results."""
+        given = [*constants, *known]
+        if all(x is None for x in given):
+            return jaxpr, [None] * len(jaxpr.outvars)
+        key = (id(jaxpr), tuple(None if x is None else x.tobytes() for x in given))
+        if key not in self._done:
+            # the jaxpr is kept with its result, so that no other gets its identity
+            self._done[key] = (*self._fold_equations(jaxpr, given), jaxpr)
+        return self._done[key][:2]
+
+    def _fold_equations(self, jaxpr: Any, given: Sequence[Known]) -> tuple[Any, list[Known]]:
+        values = {
+            variable: x
+            for variable, x in zip([*jaxpr.constvars, *jaxpr.invars], given, strict=True)
+            if x is not None
+        }
+
+        def read(atom: Any) -> Known:
+            return _read_units(atom.val) if hasattr(atom, "val") else values.get(atom)
+
+        equations, has_changed = [], False
+        for equation in jaxpr.eqns:
+            inputs = [read(atom) for atom in equation.invars]
+            params, results = self._fold_equation(equation, inputs)
+            if params is not equation.params:
+                has_changed = True
+                equation = equation.replace(params=params)  # noqa: PLW2901
+            equations.append(equation)
+            values.update(
+                (v, x) for v, x in zip(equation.outvars, results, strict=True) if x is not None
+            )
+        results = [read(atom) for atom in jaxpr.outvars]
+        return (jaxpr.replace(eqns=equations) if has_changed else jaxpr), results
+
+    def _fold_equation(self, equation: Any, known: list[Known]) -> tuple[Any, list[Known]]:
+        """Parameters of an equation made for its known operands, and what is known of its results."""
+        params, name = equation.params, equation.primitive.name
+        unknown: list[Known] = [None] * len(equation.outvars)
+        if all(x is None for x in known):
+            return params, unknown
+        if equation.primitive is native_p:
+            return _fold_native(params, known), unknown
+        if name in MOVES:
+            arrays = [
+                np.full(v.aval.shape, np.nan) if x is None else x
+                for v, x in zip(equation.invars, known, strict=True)
+            ]
+            return params, [np.asarray(MOVES[name](params, *arrays))]
+        if name == "while":
+            return self._fold_while(params, known)
+        if name == "scan":
+            return self._fold_scan(params, known)
+        if name == "cond":
+            branches = [self.fold_closed(branch, known[1:]) for branch in params["branches"]]
+            results = [_meet(xs) for xs in zip(*(results for _, results in branches), strict=True)]
+            return {**params, "branches": tuple(branch for branch, _ in branches)}, results
+        for key in ("jaxpr", "call_jaxpr"):
+            inner = params.get(key)
+            if hasattr(inner, "consts") and len(inner.jaxpr.invars) == len(known):
+                folded, results = self.fold_closed(inner, known)
+            elif hasattr(inner, "eqns") and len(inner.invars) == len(known):
+                folded, results = self.fold(inner, [], known)
+            else:
+                continue
+            return (params if folded is inner else {**params, key: folded}), results
+        return params, unknown
+
+    def _fold_body(
+        self, body: Any, fixed: list[Known], carried: list[Known], rows: list[Known]
+    ) -> tuple[Any, list[Known], list[Known]]:
+        """Pass of a loop, what is known of its carry in every pass, and of its other results."""
+        while True:
+            folded, results = self.fold_closed(body, [*fixed, *carried, *rows])
+            count = len(carried)
+            meet = [_meet(pair) for pair in zip(carried, results[:count], strict=True)]
+            # every pass knows less than the one before, or the same
+            if all(_is_same(a, b) for a, b in zip(carried, meet, strict=True)):
+                return folded, carried, results[count:]
+            carried = meet
+
+    def _fold_while(self, params: Any, known: list[Known]) -> tuple[Any, list[Known]]:
+        conditions, fixed = params["cond_nconsts"], params["body_nconsts"]
+        first, middle = known[:conditions], known[conditions : conditions + fixed]
+        start = known[conditions + fixed :]
+        body, carried, _ = self._fold_body(params["body_jaxpr"], middle, start, [])
+        condition, _ = self.fold_closed(params["cond_jaxpr"], [*first, *carried])
+        return {**params, "body_jaxpr": body, "cond_jaxpr": condition}, carried
+
+    def _fold_scan(self, params: Any, known: list[Known]) -> tuple[Any, list[Known]]:
+        fixed, carried = count_carried(params, known)
+        rows = [
+            None if x is None else _meet(list(x)) if len(x) else None
+            for x in known[fixed + carried :]
+        ]
+        start = known[fixed : fixed + carried]
+        body, carry, results = self._fold_body(params["jaxpr"], known[:fixed], start, rows)
+        length = params["length"]
+        stacked: list[Known] = [
+            None if x is None else np.broadcast_to(x, (length, *x.shape)) for x in results
+        ]
+        return {**params, "jaxpr": body}, [*carry, *stacked]
+
+
+def _fold_native(params: Any, known: list[Known]) -> Any:
+    program, rank = params["program"], len(params["lead"])
+    # of rows of a batch, what is the same in all
+    rows = [
+        None if x is None else _meet(list(x.reshape(-1, *x.shape[rank:]))) for x in known
+    ]
+    if isinstance(program, Recursion):
+        # batches of a loop are XLA's, with the machine code that it calls
+        jaxpr = fold_structure(program.jaxpr, rows)
+        return {**params, "program": program.fold_loop(rows, jaxpr)}
+    return {**params, "program": program.fold(rows)}
+
+
+def _read_units(value: Any) -> Known:
+    """Known entries of a constant."""
+    is_array = isinstance(value, np.ndarray | np.generic | float | jax.Array)
+    if not is_array or getattr(value, "dtype", np.float64) != np.float64:
+        return None
+    array = np.asarray(value, float)
+    is_unit = np.isin(array, _UNIT)
+    return np.where(is_unit, array, np.nan) if is_unit.any() else None
+
+
+def _meet(arrays: Sequence[Known]) -> Known:
+    """Entries that are known and equal in all arrays."""
+    first = arrays[0]
+    for other in arrays[1:]:
+        if first is None or other is None:
+            return None
+        first = np.where(first == other, first, np.nan)
+    return None if first is None or np.isnan(first).all() else first
+
+
+def _is_same(a: Known, b: Known) -> bool:
+    if a is None or b is None:
+        return a is b
+    return np.array_equal(a, b, equal_nan=True)
