@@ -10,7 +10,7 @@ import itertools
 import threading
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, wraps
 from pathlib import Path
@@ -22,11 +22,11 @@ import jax.core
 import jax.export
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import get_opaque_trace_state, jaxpr_as_fun
+from jax.extend.core import get_opaque_trace_state
 
 from ..math import exported
 from .native.program import is_on, targets_in
-from .native.structure import Structure, agrees, find_structure, fold_structure, read_structure
+from .native.structure import Structure, choose_structure, find_structure, rely_on
 
 Options = dict[str, str | bool | int | float]
 
@@ -110,18 +110,28 @@ def _jit_with_options(function: Callable[..., Any], *, quick: bool) -> Callable[
     nested: Any = eqx.filter_jit(function)
 
     @cache
-    def make_outermost(options: tuple[tuple[str, Any], ...]) -> Any:
-        return eqx.filter_jit(function, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
+    def make_outermost(options: tuple[tuple[str, Any], ...], structure: Structure | None) -> Any:
+        of = function if structure is None else rely_on(function, structure)
+        return eqx.filter_jit(of, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
 
-    def outermost() -> Any:
-        return make_outermost(tuple(compiler_options(quick=quick).items()))
+    first: dict[Any, Structure] = {}
+
+    def outermost(args: Any) -> Any:
+        options = tuple(compiler_options(quick=quick).items())
+        if not is_on():
+            return make_outermost(options, None)
+        structure = find_structure(args)
+        if structure:
+            structure = choose_structure(first, jax.tree.structure(args), structure)
+        return make_outermost(options, structure)
 
     @wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
-        jitted = nested if is_transformed((args, keywords)) else outermost()
+        transformed = is_transformed((args, keywords))
+        jitted = nested if transformed else outermost((args, keywords))
         return jitted(*args, **keywords)
 
-    call.lower = lambda *args, **keywords: outermost().lower(*args, **keywords)  # pyright: ignore
+    call.lower = lambda *args, **keywords: outermost((args, keywords)).lower(*args, **keywords)  # pyright: ignore
     return call
 
 
@@ -193,9 +203,7 @@ def cached_program(function: Callable[..., Any], *args: Any) -> Callable[..., An
         return function
     form, structure = _argument_form(args), find_structure(args) if is_on() else ()
     with _lock:
-        # Numbers that have not the structure of the first program all share another, for any numbers.
-        first = _structures.setdefault((function, form), structure)
-        structure = first if agrees(structure, first) else ()
+        structure = choose_structure(_structures, (function, form), structure)
         key = (function, form, structure)
         entry = _programs.get(key)
         if entry is not None:
@@ -230,30 +238,31 @@ def compile_for_shapes(
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return function
-    leaves, tree_in = jax.tree.flatten(args)
+    leaves, tree = jax.tree.flatten(args)
     # Only arrays become arguments of the program; everything else is structure and is compiled in.
     places = [k for k, leaf in enumerate(leaves) if _is_array_or_shape(leaf)]
     result_places: list[Any] = []
+    name = getattr(function, "__name__", "run")
+    function = rely_on(function, structure) if structure else function
 
     def run_arrays(arrays: list[Any]) -> list[Any]:
         filled = list(leaves)
         for k, array in zip(places, arrays, strict=True):
             filled[k] = array
-        outputs, tree = jax.tree.flatten(function(*jax.tree.unflatten(tree_in, filled)))
+        outputs, form = jax.tree.flatten(function(*jax.tree.unflatten(tree, filled)))
         count = itertools.count()
         marked = [exported.Place(next(count)) if eqx.is_array(x) else x for x in outputs]
-        result_places[:] = [jax.tree.unflatten(tree, marked)]
+        result_places[:] = [jax.tree.unflatten(form, marked)]
         return [x for x in outputs if eqx.is_array(x)]
 
-    run_arrays.__name__ = run_arrays.__qualname__ = getattr(function, "__name__", "run")
+    run_arrays.__name__ = run_arrays.__qualname__ = name
     options, arrays = compiler_options(quick=quick), [leaves[k] for k in places]
-    run = _rely_on(run_arrays, arrays, read_structure(structure, leaves, places))
-    outermost, result = run, None
+    outermost, result = run_arrays, None
     programs = _Command.programs
     about = [sorted(options.items()), [(place, codes.hex()) for place, codes in structure]]
     if programs is not None and (key := programs.next_key(run_arrays.__name__, args, about)):
         outermost, result = programs.load(key) or _export_program(
-            programs, key, run, arrays, result_places
+            programs, key, run_arrays, arrays, result_places
         )
     compiled = jax.jit(outermost, compiler_options=options).lower(arrays).compile()
     result = result_places[0] if result is None else result
@@ -265,21 +274,6 @@ def compile_for_shapes(
         return jax.tree.map(put, result)
 
     return call
-
-
-def _rely_on(
-    run: Callable[..., Any], arrays: list[Any], known: Sequence[Any]
-) -> Callable[..., Any]:
-    """Function of arrays, made for the entries of them that are known."""
-    if all(x is None for x in known):
-        return run
-
-    def run_folded(arrays: list[Any]) -> list[Any]:
-        jaxpr = fold_structure(jax.make_jaxpr(run)(arrays), known)
-        return jaxpr_as_fun(jaxpr)(*arrays)
-
-    run_folded.__name__ = run_folded.__qualname__ = run.__name__
-    return run_folded
 
 
 class _Command:

@@ -340,6 +340,12 @@ def scalarise(graph: Graph, jaxpr: Any, operands: Sequence[Any]) -> list[np.ndar
     return [translator.ids(x) for x in translator.run(jaxpr.jaxpr, constants, operands)]
 
 
+def translate(graph: Graph, equation: Any, operands: Sequence[Any]) -> list[np.ndarray]:
+    """Nodes of the results of one equation, see `scalarise`."""
+    translator = _Translator(graph)
+    return [translator.ids(x) for x in translator.equation(equation, list(operands))]
+
+
 @no_type_check
 class _Translator:
     """Translation of jaxprs, equation by equation."""
@@ -1051,17 +1057,30 @@ MOVES: dict[str, Callable[..., np.ndarray]] = {
 }
 
 
-def make_operands(graph: Graph, avals: Sequence[Any]) -> list[Nodes]:
-    """Inputs of a graph for arguments of these shapes; `NotScalarError` for types without scalar form."""
+def is_scalar(aval: Any) -> bool:
+    """True for arrays whose entries a graph can hold."""
+    return aval.dtype in (np.float64, np.bool_, np.int32, np.int64)
+
+
+def make_operands(
+    graph: Graph, avals: Sequence[Any], known: Sequence[np.ndarray | None] = ()
+) -> list[Nodes]:
+    """Inputs of a graph for arguments of these shapes; `NotScalarError` for types without scalar form.
+
+    Args:
+        known: values of entries that are known, those of the others NaN; None for none.
+    """
     operands = []
     for number, aval in enumerate(avals):
-        dtype = np.dtype(aval.dtype)
-        if dtype not in (np.float64, np.bool_, np.int32, np.int64):
-            raise NotScalarError(f"an argument of type {dtype}")
-        kind = "b" if dtype.kind == "b" else "f"
-        operands.append(
-            Nodes(graph.add_inputs(number, math.prod(aval.shape), kind).reshape(aval.shape))
-        )
+        if not is_scalar(aval):
+            raise NotScalarError(f"an argument of type {aval.dtype}")
+        kind = "b" if aval.dtype == np.bool_ else "f"
+        nodes = graph.add_inputs(number, math.prod(aval.shape), kind).reshape(aval.shape)
+        values = known[number] if number < len(known) else None
+        if values is not None:
+            for place in map(tuple, np.argwhere(~np.isnan(values))):
+                nodes[place] = graph.constant(values[place])
+        operands.append(Nodes(nodes))
     return operands
 
 
@@ -1075,20 +1094,16 @@ def make_graph(
     """Scalar program of a closed jaxpr: its graph, and the nodes of its outputs.
 
     Args:
-        known: entries of the arguments that are known, those of the others NaN; None for none.
+        known: see `make_operands`.
 
     Where NaN and infinities of inputs could be lost in products with 0, and the function itself does
     not look for them, 0 times those inputs is added to all outputs that are numbers.
     """
     graph = Graph(most_nodes)
-    operands = make_operands(graph, [v.aval for v in jaxpr.jaxpr.invars])
-    for operand, values in zip(operands, known, strict=False):
-        if values is not None:
-            for place in np.argwhere(~np.isnan(values)):
-                operand.ids[tuple(place)] = graph.constant(values[tuple(place)])
+    operands = make_operands(graph, [v.aval for v in jaxpr.jaxpr.invars], known)
     outputs = scalarise(graph, jaxpr, operands)
     for aval in jaxpr.out_avals:
-        if np.dtype(aval.dtype) not in (np.float64, np.bool_, np.int32, np.int64):
+        if not is_scalar(aval):
             raise NotScalarError(f"a result of type {aval.dtype}")
     live = set(graph.needed([n for out in outputs for n in out.ravel().tolist()]))
     leaves = [n for n in graph.needed(sorted(graph.dropped)) if graph.ops[n] == "input"]

@@ -7,18 +7,24 @@ hands it on through the traced program to the machine code that the program call
 derivatives and batches have been taken, with every entry a variable: none is lost.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, wraps
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
+from jax.extend.core import jaxpr_as_fun
 
-from .graph import MOVES, count_carried
+from .graph import Graph, NotScalarError, count_carried, is_scalar, make_operands, translate
 from .program import Recursion, native_p
 
-# Entries of an array that are known to be 0, 1 or -1, those of the others NaN; None where none is known.
+# Values of the entries of an array that are known, those of the others NaN; None where none is known.
 Known = np.ndarray | None
+
+# Entries of the operands and results of an operation that is done with known entries.
+MOST_ENTRIES = 4096
 
 # Leaves of arguments by number, with the codes of all their entries: their value, or 2 for any.
 Structure = tuple[tuple[int, bytes], ...]
@@ -73,24 +79,44 @@ def find_structure(args: Any) -> Structure:
     return tuple(structure)
 
 
-def agrees(structure: Structure, other: Structure) -> bool:
-    """True if numbers of a structure are such that a program made for the other holds for them."""
-    if structure == other or not other:
+def choose_structure(first: dict[Any, Structure], key: Any, structure: Structure) -> Structure:
+    """Structure of the program for these numbers: that of the first ones, or none where they differ.
+
+    So there are two programs for a form of arguments at most.
+
+    Args:
+        first: structures of the first numbers by key.
+    """
+    chosen = first.setdefault(key, structure)
+    return chosen if _agrees(structure, chosen) else ()
+
+
+def _agrees(structure: Structure, other: Structure) -> bool:
+    """True if what is made for the other structure holds for numbers of this one."""
+    if structure == other:
         return True
     pairs = zip(structure, other, strict=True)
     codes = [[np.frombuffer(codes, np.int8) for _, codes in pair] for pair in pairs]
     return all(((b == _NUMBER) | (a == b)).all() for a, b in codes)
 
 
-def read_structure(
-    structure: Structure, leaves: Sequence[Any], places: Sequence[int]
-) -> list[Known]:
-    """Known entries of the leaves at these places."""
-    known: dict[int, Known] = {}
-    for place, codes in structure:
-        code = np.frombuffer(codes, np.int8).reshape(leaves[place].shape)
-        known[place] = np.where(code == _NUMBER, np.nan, code)
-    return [known.get(place) for place in places]
+def rely_on(function: Callable[..., Any], structure: Structure) -> Callable[..., Any]:
+    """Function to be compiled, for arguments of this structure and with that of its constants."""
+
+    @wraps(function)
+    def run(*args: Any, **keywords: Any) -> Any:
+        leaves = jax.tree.leaves((args, keywords))
+        known: dict[int, Known] = {}
+        for place, codes in structure:
+            code = np.frombuffer(codes, np.int8).reshape(leaves[place].shape)
+            known[place] = np.where(code == _NUMBER, np.nan, code)
+        traced, shapes, static = eqx.filter_make_jaxpr(function)(*args, **keywords)
+        places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
+        folded = fold_structure(traced, [known.get(k) for k in places])
+        outputs = jaxpr_as_fun(folded)(*(leaves[k] for k in places))
+        return eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), outputs), static)
+
+    return run
 
 
 def fold_structure(jaxpr: Any, known: Sequence[Known]) -> Any:
@@ -138,7 +164,7 @@ class _Fold:
             params, results = self._fold_equation(equation, inputs)
             if params is not equation.params:
                 has_changed = True
-                equation = equation.replace(params=params)  # noqa: PLW2901
+                equation = equation.replace(params=params)
             equations.append(equation)
             values.update(
                 (v, x) for v, x in zip(equation.outvars, results, strict=True) if x is not None
@@ -153,13 +179,8 @@ class _Fold:
         if all(x is None for x in known):
             return params, unknown
         if equation.primitive is native_p:
-            return _fold_native(params, known), unknown
-        if name in MOVES:
-            arrays = [
-                np.full(v.aval.shape, np.nan) if x is None else x
-                for v, x in zip(equation.invars, known, strict=True)
-            ]
-            return params, [np.asarray(MOVES[name](params, *arrays))]
+            params = _fold_native(params, known)
+            return params, _read_results(params)
         if name == "while":
             return self._fold_while(params, known)
         if name == "scan":
@@ -177,7 +198,7 @@ class _Fold:
             else:
                 continue
             return (params if folded is inner else {**params, key: folded}), results
-        return params, unknown
+        return params, _evaluate(equation, known) or unknown
 
     def _fold_body(
         self, body: Any, fixed: list[Known], carried: list[Known], rows: list[Known]
@@ -218,14 +239,51 @@ class _Fold:
 def _fold_native(params: Any, known: list[Known]) -> Any:
     program, rank = params["program"], len(params["lead"])
     # of rows of a batch, what is the same in all
-    rows = [
-        None if x is None else _meet(list(x.reshape(-1, *x.shape[rank:]))) for x in known
-    ]
+    rows = [None if x is None else _meet(list(x.reshape(-1, *x.shape[rank:]))) for x in known]
     if isinstance(program, Recursion):
         # batches of a loop are XLA's, with the machine code that it calls
         jaxpr = fold_structure(program.jaxpr, rows)
         return {**params, "program": program.fold_loop(rows, jaxpr)}
     return {**params, "program": program.fold(rows)}
+
+
+def _read_results(params: Any) -> list[Known]:
+    """Entries of the results of machine code that are known."""
+    program, lead = params["program"], params["lead"]
+    graph = None if isinstance(program, Recursion) else program.graph()
+    if graph is None:
+        return [None] * len(program.outputs)
+    rows = [
+        _read_nodes(graph[0], nodes, a) for nodes, a in zip(graph[1], program.outputs, strict=True)
+    ]
+    return [None if x is None else np.broadcast_to(x, (*lead, *x.shape)) for x in rows]
+
+
+def _evaluate(equation: Any, known: list[Known]) -> list[Known] | None:
+    """Entries of the results of a small operation that are known; None where it has no scalar form."""
+    avals = [v.aval for v in (*equation.invars, *equation.outvars)]
+    if sum(math.prod(a.shape) for a in avals) > MOST_ENTRIES or not all(map(is_scalar, avals)):
+        return None
+    graph = Graph(MOST_ENTRIES)
+    operands: list[Any] = make_operands(graph, [v.aval for v in equation.invars], known)
+    for k, atom in enumerate(equation.invars):
+        if hasattr(atom, "val"):
+            operands[k] = np.asarray(atom.val)
+    try:
+        results = translate(graph, equation, operands)
+    except NotScalarError:
+        return None
+    return [_read_nodes(graph, x, v.aval) for x, v in zip(results, equation.outvars, strict=True)]
+
+
+def _read_nodes(graph: Graph, nodes: np.ndarray, aval: Any) -> Known:
+    """Values of nodes that are known numbers."""
+    if np.dtype(aval.dtype) != np.float64:
+        return None
+    values = [graph.value(n) for n in nodes.ravel().tolist()]
+    if all(value is None for value in values):
+        return None
+    return np.array([np.nan if v is None else v for v in values]).reshape(nodes.shape)
 
 
 def _read_units(value: Any) -> Known:
