@@ -55,12 +55,13 @@ def _find_places(tree: Any) -> dict[int, tuple[float, ...]]:
     """Numbers of the leaves that have structure, with its values."""
     numbered = jax.tree.unflatten(tree, list(range(tree.num_leaves)))
     nodes = jax.tree.leaves(numbered, is_leaf=lambda node: type(node) in _FIELDS)
-    return {
+    places = {
         leaf: values
         for node in nodes
         for field, values in _FIELDS.get(type(node), {}).items()
         for leaf in jax.tree.leaves(getattr(node, field))
     }
+    return dict(sorted(places.items()))
 
 
 def find_structure(args: Any) -> Structure:
@@ -224,7 +225,7 @@ class _Fold:
     def _fold_scan(self, params: Any, known: list[Known]) -> tuple[Any, list[Known]]:
         fixed, carried = count_carried(params, known)
         rows = [
-            None if x is None else _meet(list(x)) if len(x) else None
+            None if x is None or not len(x) else _meet([*map(np.asarray, x)])
             for x in known[fixed + carried :]
         ]
         start = known[fixed : fixed + carried]
@@ -239,7 +240,10 @@ class _Fold:
 def _fold_native(params: Any, known: list[Known]) -> Any:
     program, rank = params["program"], len(params["lead"])
     # of rows of a batch, what is the same in all
-    rows = [None if x is None else _meet(list(x.reshape(-1, *x.shape[rank:]))) for x in known]
+    rows = [
+        None if x is None else _meet([*map(np.asarray, x.reshape(-1, *x.shape[rank:]))])
+        for x in known
+    ]
     if isinstance(program, Recursion):
         # batches of a loop are XLA's, with the machine code that it calls
         jaxpr = fold_structure(program.jaxpr, rows)
