@@ -58,6 +58,15 @@ def test_the_structure_of_arguments_is_their_zeros_and_units_in_marked_fields():
     assert find_structure((X, {"a": X})) == ()
 
 
+def test_arrays_without_entries_have_no_structure(operations):
+    empty = eqx.tree_at(lambda f: f.axes, make_frame(), jnp.zeros((3, 0)))
+    assert [place for place, _ in find_structure(empty)] == [1]
+    total = native(lambda frame, x: jnp.sum(frame.axes) + jnp.sum(jnp.sin(frame.arm * x)))
+    for jit in (kept_jit, outer_jit):
+        np.testing.assert_allclose(jit(total)(empty, X), np.sin(X[1]), rtol=1e-15)
+    np.testing.assert_allclose(outer_jit(lambda x: total(empty, x))(X), np.sin(X[1]), rtol=1e-15)
+
+
 @pytest.mark.parametrize("jit", [kept_jit, outer_jit])
 def test_other_numbers_with_the_same_structure_share_a_program_and_all_others_a_second_one(
     jit, operations
@@ -97,7 +106,7 @@ def test_derivatives_by_entries_that_are_structure_are_not_lost(operations):
     np.testing.assert_allclose(value, turn(frame, X), rtol=1e-15)
     step = 1e-6
     ahead, behind = (
-        turn(jax.tree.map(lambda a: a * (1 + s), frame), X * (1 + s)) for s in (step, -step)
+        turn(*jax.tree.map(lambda a, s=s: a * (1 + s), (frame, X))) for s in (step, -step)
     )
     np.testing.assert_allclose(tangent, (ahead - behind) / (2 * step), atol=1e-9)
 

@@ -70,7 +70,7 @@ def find_structure(args: Any) -> Structure:
     structure = []
     for place, values in _find_places(tree).items():
         leaf = leaves[place]
-        if not isinstance(leaf, np.ndarray | jax.Array) or leaf.dtype != np.float64:
+        if not eqx.is_array(leaf) or leaf.dtype != np.float64 or not leaf.size:
             continue
         array = np.asarray(leaf)
         codes = np.full(array.shape, _NUMBER, np.int8)
@@ -224,10 +224,7 @@ class _Fold:
 
     def _fold_scan(self, params: Any, known: list[Known]) -> tuple[Any, list[Known]]:
         fixed, carried = count_carried(params, known)
-        rows = [
-            None if x is None or not len(x) else _meet([*map(np.asarray, x)])
-            for x in known[fixed + carried :]
-        ]
+        rows = [_meet_rows(x, 1) for x in known[fixed + carried :]]
         start = known[fixed : fixed + carried]
         body, carry, results = self._fold_body(params["jaxpr"], known[:fixed], start, rows)
         length = params["length"]
@@ -239,11 +236,7 @@ class _Fold:
 
 def _fold_native(params: Any, known: list[Known]) -> Any:
     program, rank = params["program"], len(params["lead"])
-    # of rows of a batch, what is the same in all
-    rows = [
-        None if x is None else _meet([*map(np.asarray, x.reshape(-1, *x.shape[rank:]))])
-        for x in known
-    ]
+    rows = [_meet_rows(x, rank) for x in known]
     if isinstance(program, Recursion):
         # batches of a loop are XLA's, with the machine code that it calls
         jaxpr = fold_structure(program.jaxpr, rows)
@@ -298,6 +291,13 @@ def _read_units(value: Any) -> Known:
     array = np.asarray(value, float)
     is_unit = np.isin(array, _UNIT)
     return np.where(is_unit, array, np.nan) if is_unit.any() else None
+
+
+def _meet_rows(x: Known, rank: int) -> Known:
+    """What is known of all entries of the first `rank` dimensions alike."""
+    if x is None or not x.size:
+        return None
+    return _meet([*map(np.asarray, x.reshape(-1, *x.shape[rank:]))])
 
 
 def _meet(arrays: Sequence[Known]) -> Known:
