@@ -149,3 +149,12 @@ def test_numbers_that_are_not_finite_come_through(bad, operations):
         assert not jnp.isfinite(program(make_frame(), X.at[k].set(bad))).any()
     no_mass = eqx.tree_at(lambda f: f.mass, make_frame(), jnp.array(bad))
     assert not jnp.isfinite(program(no_mass, X)).any()
+
+
+@pytest.mark.parametrize("value", [True, 1.0, 2, np.float64(1.5), jnp.arange(2)])
+def test_results_that_are_constants_stay_arrays_of_their_types(value, machine_code):
+    machine_code(True)
+    of = lambda frame, x: (turn(frame, x), jnp.asarray(value))
+    result, expected = outer_jit(of)(make_frame(), X)[1], jax.jit(of)(make_frame(), X)[1]
+    assert jnp.array_equal(result, expected)
+    assert (result.dtype, result.weak_type) == (expected.dtype, expected.weak_type)

@@ -14,6 +14,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
@@ -114,10 +115,19 @@ def rely_on(function: Callable[..., Any], structure: Structure) -> Callable[...,
         traced, shapes, static = eqx.filter_make_jaxpr(function)(*args, **keywords)
         places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
         folded = fold_structure(traced, [known.get(k) for k in places])
-        outputs = jaxpr_as_fun(folded)(*(leaves[k] for k in places))
+        values = jaxpr_as_fun(folded)(*(leaves[k] for k in places))
+        outputs = [_as_array(*of) for of in zip(values, traced.out_avals, strict=True)]
         return eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), outputs), static)
 
     return run
+
+
+def _as_array(value: Any, aval: Any) -> Any:
+    """Result of a jaxpr as an array; one that is a constant comes as a number."""
+    if eqx.is_array(value):
+        return value
+    kind = {"b": bool, "i": int, "f": float}.get(aval.dtype.kind)
+    return jnp.asarray(kind(value)) if aval.weak_type and kind else jnp.asarray(value, aval.dtype)
 
 
 def fold_structure(jaxpr: Any, known: Sequence[Known]) -> Any:
