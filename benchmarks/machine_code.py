@@ -33,7 +33,7 @@ from stmuav_jax.dynamics.integration.problem import (
     prepare_problem,
 )
 from stmuav_jax.math.native import llvm
-from stmuav_jax.math.native.graph import _MOVES, make_graph
+from stmuav_jax.math.native.graph import MOVES, make_graph
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def count_traced(jaxpr: Any) -> int:
             total += (2 * terms - 1) * shapes[0]
         elif name.startswith("reduce_"):
             total += math.prod(equation.invars[0].aval.shape) - shapes[0]
-        elif name not in _MOVES and name not in ("gather", "scatter", "split", "pad", "iota"):
+        elif name not in MOVES and name not in ("gather", "scatter", "split", "pad", "iota"):
             total += sum(shapes)
     return total
 

@@ -26,6 +26,7 @@ from jax.extend.core import get_opaque_trace_state
 
 from ..math import exported
 from .native.program import is_on, targets_in
+from .native.structure import Structure, choose_structure, find_structure, rely_on
 
 Options = dict[str, str | bool | int | float]
 
@@ -109,22 +110,34 @@ def _jit_with_options(function: Callable[..., Any], *, quick: bool) -> Callable[
     nested: Any = eqx.filter_jit(function)
 
     @cache
-    def make_outermost(options: tuple[tuple[str, Any], ...]) -> Any:
-        return eqx.filter_jit(function, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
+    def make_outermost(options: tuple[tuple[str, Any], ...], structure: Structure | None) -> Any:
+        of = function if structure is None else rely_on(function, structure)
+        return eqx.filter_jit(of, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
 
-    def outermost() -> Any:
-        return make_outermost(tuple(compiler_options(quick=quick).items()))
+    first: dict[Any, Structure] = {}
+
+    def outermost(args: Any) -> Any:
+        options = tuple(compiler_options(quick=quick).items())
+        if not is_on():
+            return make_outermost(options, None)
+        structure = find_structure(args)
+        if structure:
+            structure = choose_structure(first, jax.tree.structure(args), structure)
+        return make_outermost(options, structure)
 
     @wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
-        jitted = nested if is_transformed((args, keywords)) else outermost()
+        transformed = is_transformed((args, keywords))
+        jitted = nested if transformed else outermost((args, keywords))
         return jitted(*args, **keywords)
 
-    call.lower = lambda *args, **keywords: outermost().lower(*args, **keywords)  # pyright: ignore
+    call.lower = lambda *args, **keywords: outermost((args, keywords)).lower(*args, **keywords)  # pyright: ignore
     return call
 
 
-_programs: OrderedDict[Hashable, Callable[..., Any]] = OrderedDict()
+_programs: OrderedDict[tuple[Any, Any, Structure], Callable[..., Any]] = OrderedDict()
+# structure of the first program of a function and form of arguments
+_structures: dict[Hashable, Structure] = {}
 _lock = threading.Lock()
 
 
@@ -188,8 +201,10 @@ def cached_program(function: Callable[..., Any], *args: Any) -> Callable[..., An
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return function
-    key = (function, *_argument_form(args))
+    form, structure = _argument_form(args), find_structure(args) if is_on() else ()
     with _lock:
+        structure = choose_structure(_structures, (function, form), structure)
+        key = (function, form, structure)
         entry = _programs.get(key)
         if entry is not None:
             _programs.move_to_end(key)
@@ -199,16 +214,18 @@ def cached_program(function: Callable[..., Any], *args: Any) -> Callable[..., An
     check_maps()
     # Compiled outside of the lock, so that threads with other programs do not wait; the same program
     # compiled twice does no harm.
-    compiled = compile_for_shapes(function, *args, quick=True)
+    compiled = compile_for_shapes(function, *args, quick=True, structure=structure)
     with _lock:
         _programs[key] = compiled
         while len(_programs) > MOST_PROGRAMS:
-            _programs.popitem(last=False)
+            (function, form, structure), _ = _programs.popitem(last=False)
+            if not any(key[:2] == (function, form) for key in _programs):
+                _structures.pop((function, form), None)
     return compiled
 
 
 def compile_for_shapes(
-    function: Callable[..., Any], *args: Any, quick: bool = False
+    function: Callable[..., Any], *args: Any, quick: bool = False, structure: Structure = ()
 ) -> Callable[..., Any]:
     """Compiled program of a function for arrays of these shapes, which this module does not keep.
 
@@ -217,29 +234,33 @@ def compile_for_shapes(
         args: pytrees, which may have a `jax.ShapeDtypeStruct` in the place of an array; the program
             accepts the same pytrees with arrays.
         quick: compile with the quick options of `compiler_options`.
+        structure: entries of the arguments' arrays on which the program relies, see `find_structure`.
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return function
-    leaves, structure = jax.tree.flatten(args)
+    leaves, tree = jax.tree.flatten(args)
     # Only arrays become arguments of the program; everything else is structure and is compiled in.
     places = [k for k, leaf in enumerate(leaves) if _is_array_or_shape(leaf)]
     result_places: list[Any] = []
+    name = getattr(function, "__name__", "run")
+    function = rely_on(function, structure) if structure else function
 
     def run_arrays(arrays: list[Any]) -> list[Any]:
         filled = list(leaves)
         for k, array in zip(places, arrays, strict=True):
             filled[k] = array
-        outputs, tree = jax.tree.flatten(function(*jax.tree.unflatten(structure, filled)))
+        outputs, form = jax.tree.flatten(function(*jax.tree.unflatten(tree, filled)))
         count = itertools.count()
         marked = [exported.Place(next(count)) if eqx.is_array(x) else x for x in outputs]
-        result_places[:] = [jax.tree.unflatten(tree, marked)]
+        result_places[:] = [jax.tree.unflatten(form, marked)]
         return [x for x in outputs if eqx.is_array(x)]
 
-    run_arrays.__name__ = run_arrays.__qualname__ = getattr(function, "__name__", "run")
+    run_arrays.__name__ = run_arrays.__qualname__ = name
     options, arrays = compiler_options(quick=quick), [leaves[k] for k in places]
     outermost, result = run_arrays, None
     programs = _Command.programs
-    if programs is not None and (key := programs.next_key(run_arrays.__name__, args, options)):
+    about = [sorted(options.items()), [(place, codes.hex()) for place, codes in structure]]
+    if programs is not None and (key := programs.next_key(run_arrays.__name__, args, about)):
         outermost, result = programs.load(key) or _export_program(
             programs, key, run_arrays, arrays, result_places
         )

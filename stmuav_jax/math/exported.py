@@ -74,7 +74,7 @@ class Programs:
         about = [dict(command), source_digest(), versions, ambient, code]
         self._about = json.dumps(about, sort_keys=True)
 
-    def next_key(self, name: str, arguments: Any, options: Mapping[str, Any]) -> str | None:
+    def next_key(self, name: str, arguments: Any, options: Any) -> str | None:
         """Key of the command's next program; None for arrays on any but the first device."""
         self.count += 1
         leaves, structure = jax.tree.flatten(arguments)
@@ -87,7 +87,7 @@ class Programs:
             [list(x.shape), str(x.dtype)] if hasattr(x, "shape") else _static_text(x)
             for x in leaves
         ]
-        described = [self.count, name, _static_text(structure), forms, sorted(options.items())]
+        described = [self.count, name, _static_text(structure), forms, options]
         return hashlib.sha256((self._about + json.dumps(described)).encode()).hexdigest()
 
     def load(self, key: str) -> tuple[Call, Any] | None:

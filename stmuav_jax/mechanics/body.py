@@ -27,6 +27,7 @@ from ..checks.numbers import (
     stack_arrays,
 )
 from ..checks.shapes import Numbers
+from ..math.native.structure import has_structure
 from ..math.rotation import rotation_matrix, rotation_matrix_in
 
 GROUND = "ground"
@@ -113,6 +114,7 @@ class Body(eqx.Module):
         return position + rotation_matrix_in(array_module(p, position, com), p) @ com
 
 
+@has_structure(zero=("com", "inertia"))
 class Bodies(eqx.Module):
     """Moving bodies of a system, stacked: mass (n,), com (n, 3), inertia (n, 3, 3)."""
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from ..checks.errors import ModelError, has_values
 from ..checks.numbers import array_module, as_floats, as_numpy, check_scalar, check_vector
 from ..checks.shapes import Numbers
+from ..math.native.structure import has_structure
 from ..math.rotation import rotation_matrix_in
 from .body import Body
 from .constraint import COUPLINGS, ROWS, Data
@@ -152,6 +153,7 @@ class Mate(eqx.Module):
     period: Float[Array, ""]
 
 
+@has_structure(zero=("point_i", "point_j"), unit=("frame_i", "frame_j"))
 class Joint(eqx.Module):
     """Joint between two named bodies, either of which may be "ground".
 

@@ -29,6 +29,7 @@ from ..checks.digest import digest_value
 from ..checks.errors import SettingError, SimulationError
 from ..checks.schema import quote_name
 from ..math.compiler import compile_for_shapes
+from ..math.native.structure import find_structure
 from .columns import FINE, Axis, Column, column_name
 from .sampling import Sampling
 from .store import Store, check_absent, computing_versions, create_store, resume_store
@@ -392,7 +393,9 @@ class Study:
             of = lambda dtype, *shape: jax.ShapeDtypeStruct(shape, dtype, sharding=at)
             values = of(jnp.float64, self._block, len(self.sampling.names))
             shapes = values, of(jnp.uint32, self._block, 2), of(jnp.int32)
-            program = compile_for_shapes(run_block, arrays, *shapes)
+            program = compile_for_shapes(
+                run_block, arrays, *shapes, structure=find_structure((arrays,))
+            )
             self._compiled[place] = lambda *block: program(arrays, *block)
         return self._compiled[place]
 

@@ -28,6 +28,7 @@ from ...checks.numbers import as_floats, as_jax, as_numpy, stack_arrays
 from ...math.compiler import compute_untraced, kept_jit
 from ...math.derivative import directional_derivative
 from ...math.native.program import native
+from ...math.native.structure import has_structure
 from ...math.rotation import conjugate, cross, from_matrix, product
 from ...math.stacked import apply_matrix, dot_product, multiply_matrices
 from ...mechanics.motions import CYCLIC, ColumnParts
@@ -49,6 +50,7 @@ from .topology import (
 _EYE = np.eye(3)
 
 
+@has_structure(zero=("k", "com", "centre", "inertia"), unit=("K", "B", "K_p", "B_p"))
 class TreeParameters(eqx.Module):
     """Parameters of a tree with f frames besides frame 0 and n bodies.
 

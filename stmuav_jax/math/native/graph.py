@@ -340,6 +340,12 @@ def scalarise(graph: Graph, jaxpr: Any, operands: Sequence[Any]) -> list[np.ndar
     return [translator.ids(x) for x in translator.run(jaxpr.jaxpr, constants, operands)]
 
 
+def translate(graph: Graph, equation: Any, operands: Sequence[Any]) -> list[np.ndarray]:
+    """Nodes of the results of one equation, see `scalarise`."""
+    translator = _Translator(graph)
+    return [translator.ids(x) for x in translator.equation(equation, list(operands))]
+
+
 @no_type_check
 class _Translator:
     """Translation of jaxprs, equation by equation."""
@@ -381,7 +387,7 @@ class _Translator:
         handler = getattr(self, "_" + name.replace("-", "_"), None)
         if name == "while":
             raise NotScalarError(name)
-        if name in _MOVES:
+        if name in MOVES:
             return [self.move(name, params, inputs)]
         if name in _ELEMENTWISE:
             # numbers of a graph are in double precision: bits of integers would be wrong
@@ -655,8 +661,8 @@ class _Translator:
     def move(self, name: str, params: Any, inputs: list[Any]) -> Any:
         """Operation that only moves entries."""
         if any(isinstance(x, Nodes) for x in inputs):
-            return Nodes(np.asarray(_MOVES[name](params, *map(self.ids, inputs))))
-        return np.asarray(_MOVES[name](params, *inputs))
+            return Nodes(np.asarray(MOVES[name](params, *map(self.ids, inputs))))
+        return np.asarray(MOVES[name](params, *inputs))
 
     def _split(self, params: Any, x: Any) -> list[Any]:
         cuts = np.cumsum(params["sizes"])[:-1]
@@ -945,12 +951,7 @@ class _Translator:
 
     def _scan(self, params: Any, *inputs: Any) -> list[Any]:
         body = params["jaxpr"]
-        if "ft_in" in params:  # JAX 0.11
-            fixed, carried = (
-                len(list(part)) for part in params["ft_in"].update(inputs).unpack()[:2]
-            )
-        else:
-            fixed, carried = params["num_consts"], params["num_carry"]
+        fixed, carried = count_carried(params, inputs)
         constants = [np.asarray(c) for c in body.consts]
         carry = list(inputs[fixed : fixed + carried])
         rows = inputs[fixed + carried :]
@@ -970,6 +971,14 @@ class _Translator:
             for operands in zip(*outputs, strict=True)
         ]
         return [*carry, *(stacked or empty)]
+
+
+def count_carried(params: Any, inputs: Sequence[Any]) -> tuple[int, int]:
+    """Numbers of a scan's operands that are the same in all passes, and that a pass hands on."""
+    if "ft_in" in params:  # JAX 0.11
+        fixed, carried = (len(list(part)) for part in params["ft_in"].update(inputs).unpack()[:2])
+        return fixed, carried
+    return params["num_consts"], params["num_carry"]
 
 
 def _fills(mode: Any) -> bool:
@@ -1017,7 +1026,7 @@ _ELEMENTWISE = {name: name for name in (*BINARY, *COMPARISONS, *UNARY) if name !
 # Operations on integers that are exact in double precision.
 _WHOLE = {"add", "sub", "neg", "max", "min", "abs", "sign", "rem", "add_any"}
 
-_MOVES: dict[str, Callable[..., np.ndarray]] = {
+MOVES: dict[str, Callable[..., np.ndarray]] = {
     "reshape": lambda p, x: x.reshape(p["new_sizes"]),
     "squeeze": lambda p, x: np.squeeze(x, tuple(p["dimensions"])),
     "expand_dims": lambda p, x: np.expand_dims(x, tuple(p["dimensions"])),
@@ -1048,17 +1057,30 @@ _MOVES: dict[str, Callable[..., np.ndarray]] = {
 }
 
 
-def make_operands(graph: Graph, avals: Sequence[Any]) -> list[Nodes]:
-    """Inputs of a graph for arguments of these shapes; `NotScalarError` for types without scalar form."""
+def is_scalar(aval: Any) -> bool:
+    """True for arrays whose entries a graph can hold."""
+    return aval.dtype in (np.float64, np.bool_, np.int32, np.int64)
+
+
+def make_operands(
+    graph: Graph, avals: Sequence[Any], known: Sequence[np.ndarray | None] = ()
+) -> list[Nodes]:
+    """Inputs of a graph for arguments of these shapes; `NotScalarError` for types without scalar form.
+
+    Args:
+        known: values of entries that are known, those of the others NaN; None for none.
+    """
     operands = []
     for number, aval in enumerate(avals):
-        dtype = np.dtype(aval.dtype)
-        if dtype not in (np.float64, np.bool_, np.int32, np.int64):
-            raise NotScalarError(f"an argument of type {dtype}")
-        kind = "b" if dtype.kind == "b" else "f"
-        operands.append(
-            Nodes(graph.add_inputs(number, math.prod(aval.shape), kind).reshape(aval.shape))
-        )
+        if not is_scalar(aval):
+            raise NotScalarError(f"an argument of type {aval.dtype}")
+        kind = "b" if aval.dtype == np.bool_ else "f"
+        nodes = graph.add_inputs(number, math.prod(aval.shape), kind).reshape(aval.shape)
+        values = known[number] if number < len(known) else None
+        if values is not None:
+            for place in map(tuple, np.argwhere(~np.isnan(values))):
+                nodes[place] = graph.constant(values[place])
+        operands.append(Nodes(nodes))
     return operands
 
 
@@ -1066,16 +1088,22 @@ def make_operands(graph: Graph, avals: Sequence[Any]) -> list[Nodes]:
 _SUMS = 8
 
 
-def make_graph(jaxpr: Any, most_nodes: int) -> tuple[Graph, list[np.ndarray]]:
+def make_graph(
+    jaxpr: Any, most_nodes: int, known: Sequence[np.ndarray | None] = ()
+) -> tuple[Graph, list[np.ndarray]]:
     """Scalar program of a closed jaxpr: its graph, and the nodes of its outputs.
+
+    Args:
+        known: see `make_operands`.
 
     Where NaN and infinities of inputs could be lost in products with 0, and the function itself does
     not look for them, 0 times those inputs is added to all outputs that are numbers.
     """
     graph = Graph(most_nodes)
-    outputs = scalarise(graph, jaxpr, make_operands(graph, [v.aval for v in jaxpr.jaxpr.invars]))
+    operands = make_operands(graph, [v.aval for v in jaxpr.jaxpr.invars], known)
+    outputs = scalarise(graph, jaxpr, operands)
     for aval in jaxpr.out_avals:
-        if np.dtype(aval.dtype) not in (np.float64, np.bool_, np.int32, np.int64):
+        if not is_scalar(aval):
             raise NotScalarError(f"a result of type {aval.dtype}")
     live = set(graph.needed([n for out in outputs for n in out.ravel().tolist()]))
     leaves = [n for n in graph.needed(sorted(graph.dropped)) if graph.ops[n] == "input"]

@@ -32,7 +32,7 @@ import numpy as np
 from .graph import LEAVES, Graph, NotScalarError
 
 # Operations of one LLVM function; time of compilation grows faster than in proportion beyond.
-CHUNK = 4000
+CHUNK = 8000
 # Operations up to which code is optimised; beyond, LLVM would take longer than the code is worth.
 MOST_OPTIMISED = 20_000
 # Operations above which a program is left to XLA, and bytes of code of all programs of a process.

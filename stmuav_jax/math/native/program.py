@@ -52,11 +52,17 @@ class Program:
 
     Attributes:
         jaxpr: traced function, whose constants are known. groups: number of the argument to which each
-            operand belongs.
+            operand belongs. known: entries of operands that machine code may rely on, those of the others
+            NaN; None where there are none. See `structure`.
     """
 
-    def __init__(self, jaxpr: Any, groups: Sequence[int] | None = None) -> None:
-        self.jaxpr = jaxpr
+    def __init__(
+        self,
+        jaxpr: Any,
+        groups: Sequence[int] | None = None,
+        known: Sequence[np.ndarray | None] = (),
+    ) -> None:
+        self.jaxpr, self.known = jaxpr, known
         self.groups = tuple(groups or [0] * len(jaxpr.in_avals))
         self._derived: dict[Any, Program] = {}
         self._lock = threading.RLock()
@@ -82,7 +88,7 @@ class Program:
             # attempt takes as long as a success.
             if self._graph is None and self._reason is None:
                 try:
-                    self._graph = make_graph(self.jaxpr, llvm.MOST_NODES)
+                    self._graph = make_graph(self.jaxpr, llvm.MOST_NODES, self.known)
                 except NotScalarError as error:
                     self._reason = str(error)
             return self._graph
@@ -142,6 +148,11 @@ class Program:
             if key not in self._derived:
                 self._derived[key] = make()
             return self._derived[key]
+
+    def fold(self, known: Sequence[np.ndarray | None]) -> "Program":
+        """Program for operands some of whose entries are known."""
+        key = tuple(None if x is None else x.tobytes() for x in known)
+        return self.derived(("known", key), lambda: Program(self.jaxpr, self.groups, known))
 
     def push_forward(self, tangent_mask: tuple[bool, ...]) -> "Program":
         """Program of (arguments, tangents of those that move) for the tangents of the results."""
@@ -221,6 +232,12 @@ class Recursion(Program):
 
     def graph(self) -> Any:
         return self.body.graph()
+
+    def fold_loop(self, known: Sequence[np.ndarray | None], jaxpr: Any) -> "Recursion":
+        """Loop for operands some of whose entries are known, with the traced loop for batches."""
+        # the last operand begins as zeros and is filled by the passes
+        body = self.body.fold([*known[:-1], *[None] * (1 + len(self.tables))])
+        return Recursion(jaxpr, self.groups, body, self.tables)
 
     def layout(self, shared: tuple[bool, ...], rows: int) -> Layout:
         del shared, rows
