@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float
 
 from ..checks.shapes import Matrix, Vector
 from ..math import lapack
-from .stacked import transposed_multiply
 
 # Weight w of the proximal term relative to rows of unit size, and number of iterations. The error
 # that remains along a singular value s is (w / (w + s))^steps. In a singular posture of a mechanism
@@ -17,10 +16,6 @@ from .stacked import transposed_multiply
 # only has to exceed the round-off of the matrix, as rows that are always dependent are left out.
 _PROXIMAL_WEIGHT = 1e-15
 _PROXIMAL_STEPS = 4
-
-
-# Number of multiplications above which a matrix product is left to a library.
-_LARGE = 10_000
 
 
 class Factor(eqx.Module):
@@ -174,12 +169,6 @@ def independent_rows(S: Matrix, tolerance: float | Float[Array, ""]) -> Bool[Arr
     return jax.lax.while_loop(has_pivot, take_row, start)[1]
 
 
-def _gram_matrix(Y: Matrix) -> Matrix:
-    """Gram matrix Y^T Y; small ones by sums, which fuse and avoid the cost of a library call."""
-    k, m = Y.shape
-    return Y.T @ Y if k * m * m > _LARGE else transposed_multiply(Y, Y)
-
-
 class Saddle(eqx.Module):
     """Factorisation of the equations M x - J^T y = f, J x = g, with M symmetric positive definite.
 
@@ -223,9 +212,7 @@ def factor_saddle(
         return Saddle(L, J.T, Factor(jnp.zeros((0, 0), L.dtype)))
     Y = solve_lower(L, J[:, ::-1].T)
     Y = Y if row_mask is None else jnp.where(row_mask[None], Y, 0.0)
-    # Small Gram matrices are sums, which fuse and avoid the cost of a library call.
-    k, m = Y.shape
-    S = Y.T @ Y if k * m * m > _LARGE else transposed_multiply(Y, Y)
+    S = Y.T @ Y
     if row_mask is not None:
         S = S + jnp.diag(1.0 - row_mask)
     if redundant == "fast":

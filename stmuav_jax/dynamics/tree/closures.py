@@ -24,7 +24,7 @@ from ...math.linalg import factor_cholesky, factor_saddle, independent_rows, sol
 from ...math.rotation import cross, rotation_matrix
 from ...math.stacked import apply_matrix, apply_transposed, multiply_matrices
 from ...mechanics.body import GROUND
-from ...mechanics.constraint import ROWS, side_world
+from ...mechanics.constraint import ROWS, BodyKinematics
 from ...mechanics.state import Kinematics
 from ...mechanics.system import System
 from ..formulations.base import AbstractModel, Residuals, residuals_of
@@ -155,7 +155,8 @@ def closure_rows(
 ) -> Rows:
     """Constraint rows of the loop-closing joints, from their primitives and the spatial axes."""
     tree = parameters.tree
-    sides = side_world(moving.c, moving.v, moving.R, moving.w)
+    twists = jnp.concatenate([moving.v, moving.w])
+    sides = BodyKinematics(moving.c, moving.v, moving.R, moving.w, twists)
     group_rows = [group.rows(sides, t, "world") for group in constraints.groups]
     batch = moving.c.shape[2:]
 
