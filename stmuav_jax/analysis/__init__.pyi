@@ -31,9 +31,8 @@ from .linear import (
     linearize as linearize,
 )
 from .mass_properties import (
-    centre_of_mass as centre_of_mass,
-    inertia_about_centre as inertia_about_centre,
-    inner_momentum as inner_momentum,
+    Moments as Moments,
+    mass_moments as mass_moments,
 )
 from .multiple_shooting import (
     make_shooting as make_shooting,

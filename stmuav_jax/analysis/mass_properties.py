@@ -1,4 +1,6 @@
-"""Mass properties of all bodies together, in the axes of the first one."""
+"""Moments of the masses of all bodies together, in the axes of the first one."""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,33 +11,39 @@ from ..mechanics.state import State
 from ..mechanics.system import System
 
 
-def centre_of_mass(system: System, state: State) -> Float[Array, "3"]:
-    """Centre of mass of all bodies, from the first one's origin in its axes [m]."""
-    return rotation_matrix(state.p[0]).T @ (system.com(state) - state.r[0])
+class Moments(NamedTuple):
+    """Moments of a machine's masses about the base's centre of mass O, base axes.
 
-
-def inertia_about_centre(system: System, state: State) -> Float[Array, "3 3"]:
-    """Inertia of all bodies together about their centre of mass, axes of the first one [kg m^2]."""
-    mass = system.bodies.mass
-    R_0w = rotation_matrix(state.p[0]).T
-    arms = (state.r - system.com(state)[None]) @ R_0w.T
-    R = jnp.einsum("ij,njk->nik", R_0w, jax.vmap(rotation_matrix)(state.p))
-    body_inertia = jnp.einsum("nij,njk,nlk->il", R, system.bodies.inertia, R)
-    square = jnp.sum(mass * jnp.sum(arms**2, axis=1))
-    return body_inertia + square * jnp.eye(3) - jnp.einsum("n,ni,nj->ij", mass, arms, arms)
-
-
-def inner_momentum(system: System, state: State) -> Float[Array, "3"]:
-    """Angular momentum of the bodies relative to the first one, in its axes [N m s].
-
-    The reference point is the centre of mass.
+    Attributes:
+        mass: m [kg].
+        first: p = m c (3,) [kg m]. first_rate: its rate against the base (3,) [kg m/s].
+        inertia: J (3, 3) [kg m^2].
+        momentum: H of the parts that move against the base (3,) [N m s].
     """
+
+    mass: Float[Array, ""]
+    first: Float[Array, "3"]
+    first_rate: Float[Array, "3"]
+    inertia: Float[Array, "3 3"]
+    momentum: Float[Array, "3"]
+
+
+def mass_moments(system: System, state: State) -> Moments:
+    """Moments of all bodies of a system at a state; the first body is the base."""
     mass = system.bodies.mass
     R_0w = rotation_matrix(state.p[0]).T
-    arms = (state.r - system.com(state)[None]) @ R_0w.T
-    from_base = (state.r - state.r[:1]) @ R_0w.T
-    v = (state.v - state.v[:1]) @ R_0w.T - jnp.cross(state.omega[:1], from_base)
+    d = (state.r - state.r[0]) @ R_0w.T
+    d_rate = (state.v - state.v[0]) @ R_0w.T - jnp.cross(state.omega[0], d)
     R = jnp.einsum("ij,njk->nik", R_0w, jax.vmap(rotation_matrix)(state.p))
-    spin = jnp.einsum("nij,nj->ni", R, state.omega) - state.omega[:1]
-    spin_momentum = jnp.einsum("nij,njk,nlk,nl->i", R, system.bodies.inertia, R, spin)
-    return spin_momentum + jnp.einsum("n,ni->i", mass, jnp.cross(arms, v))
+    body_inertias = jnp.einsum("nij,njk,nlk->nil", R, system.bodies.inertia, R)
+    spin = jnp.einsum("nij,nj->ni", R, state.omega) - state.omega[0]
+    square = jnp.sum(mass * jnp.sum(d**2, axis=1))
+    return Moments(
+        jnp.sum(mass),
+        mass @ d,
+        mass @ d_rate,
+        jnp.sum(body_inertias, axis=0)
+        + square * jnp.eye(3)
+        - jnp.einsum("n,ni,nj->ij", mass, d, d),
+        mass @ jnp.cross(d, d_rate) + jnp.einsum("nij,nj->i", body_inertias, spin),
+    )

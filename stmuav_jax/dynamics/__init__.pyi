@@ -79,7 +79,6 @@ from .simulation import (
 )
 from .statespace.base import (
     AbstractStateSpace as AbstractStateSpace,
-    error_rates as error_rates,
 )
 from .statespace.tree import (
     TreePoint as TreePoint,

@@ -220,7 +220,12 @@ def describe_result(system: System, path: Trajectory) -> str:
         "nonfinite": "the value of the event is not a number",
         "nonlinear_divergence": "the joints have come open",
     }
-    for name, text in reasons.items():
+    return _name_result(path, reasons)
+
+
+def _name_result(path: Trajectory, names: Mapping[str, str]) -> str:
+    """Text of a trajectory's result, by the name of the result in diffrax, or diffrax's own."""
+    for name, text in names.items():
         if same_result(path.result, getattr(diffrax.RESULTS, name)):
             return text
     return diffrax.RESULTS[path.result].splitlines()[0]
@@ -261,6 +266,12 @@ _compiled_path = kept_jit(_integrate_path)
 
 # Results of a run that reached the end of its span or an event, with closed joints.
 SUCCESSFUL = ("successful", "event occurred")
+_OUTCOMES = {
+    "successful": "successful",
+    "event_occurred": "event occurred",
+    "max_steps_reached": "max_steps reached",
+    "dt_min_reached": "step size collapsed",
+}
 
 
 @dataclass(frozen=True)
@@ -622,7 +633,9 @@ def _carried_out(
     method = dataclasses.replace(method, formulation=formulation)
     inspection_seconds = time.perf_counter() - clock
     clock = time.perf_counter()
-    method = dataclasses.replace(method, solver=_choose_solver(scene, method))
+    if isinstance(method.solver, str):
+        solver = choose_solver(scene.system, scene.state0, scene.t0, formulation=formulation)
+        method = dataclasses.replace(method, solver=solver)
     problem = fit_first_step(prepare_problem(scene.system, method), times[-1] - times[0])
     prepared = time.perf_counter() - clock
     integration = _run_chunks(scene, problem, times, progress, run_options.estimate)
@@ -639,7 +652,7 @@ def _carried_out(
         compile=integration.seconds.compile + prepared,
         analysis=inspection_seconds + time.perf_counter() - clock,
     )
-    result = integration.stopped or _describe_result(first)
+    result = integration.stopped or _name_result(first, _OUTCOMES)
     opened = describe_open_joints(problem, rows, first, checked.worst)
     if opened and result in SUCCESSFUL:
         result = "joints came open"
@@ -649,14 +662,6 @@ def _carried_out(
     model = problem.model if run_options.analysis else None
     run = Run(scene, method, first, model, errors, certificate, _describe_method(method))
     return _Outcome(run, problem, start, opened)
-
-
-def _choose_solver(scene: Scene, method: Method) -> diffrax.AbstractSolver:
-    """Solver of the method, or the choice of `choose_solver` at the start for "auto"."""
-    if isinstance(method.solver, diffrax.AbstractSolver):
-        return method.solver
-    formulation = method.formulation
-    return choose_solver(scene.system, scene.state0, scene.t0, formulation=formulation)
 
 
 class _Done(NamedTuple):
@@ -737,19 +742,6 @@ def _estimate_errors(
         looser.follow(first)
     looser_estimate = estimate_error(first, looser, rates)
     return result if looser_estimate.estimated_count < result.estimated_count else looser_estimate
-
-
-def _describe_result(trajectory: Trajectory) -> str:
-    names = (
-        (diffrax.RESULTS.successful, "successful"),
-        (diffrax.RESULTS.event_occurred, "event occurred"),
-        (diffrax.RESULTS.max_steps_reached, "max_steps reached"),
-        (diffrax.RESULTS.dt_min_reached, "step size collapsed"),
-    )
-    for code, text in names:
-        if same_result(trajectory.result, code):
-            return text
-    return diffrax.RESULTS[trajectory.result].splitlines()[0]
 
 
 def _describe_method(method: Method) -> dict[str, Any]:

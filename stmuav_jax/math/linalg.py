@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float
 
 from ..checks.shapes import Matrix, Vector
 from ..math import lapack
-from .stacked import transposed_multiply
 
 # Weight w of the proximal term relative to rows of unit size, and number of iterations. The error
 # that remains along a singular value s is (w / (w + s))^steps. In a singular posture of a mechanism
@@ -19,15 +18,11 @@ _PROXIMAL_WEIGHT = 1e-15
 _PROXIMAL_STEPS = 4
 
 
-# Number of multiplications above which a matrix product is left to a library.
-_LARGE = 10_000
-
-
 class Factor(eqx.Module):
     """Cholesky factorisation of a symmetric positive definite matrix S, for many right-hand sides.
 
-    Rows of mixed units (m and rad) do no harm: the relative round-off of Cholesky's method does not
-    depend on a scaling of rows and columns.
+    A singular S gives NaN, never a wrong number. Rows of mixed units (m and rad) do no harm: the relative
+    round-off of Cholesky's method does not depend on a scaling of rows and columns.
     """
 
     lower: Matrix
@@ -40,31 +35,18 @@ class Factor(eqx.Module):
 
 
 class MinimumNorm(eqx.Module):
-    """Pseudoinverse of a symmetric matrix S, singular or not.
+    """Pseudoinverse of a symmetric positive semi-definite matrix S scaled to a unit diagonal.
 
-    S is not scaled: that would change which solution has minimum norm.
+    Units then do not matter, and if S is singular, the solution has minimum norm in the scaled unknowns.
     """
 
     inverse: Matrix
-
-    def solve(self, b: Float[Array, "m *r"]) -> Float[Array, "m *r"]:
-        """Minimum-norm solution x of S x = b, shape (m,) or (m, r)."""
-        return self.inverse @ b
-
-
-class Scaled(eqx.Module):
-    """Factorisation of a symmetric matrix S scaled to a unit diagonal, so that units do not matter.
-
-    If S is singular, the solution has minimum norm in the scaled unknowns.
-    """
-
-    factor: Factor | MinimumNorm
     scale: Vector
 
     def solve(self, b: Float[Array, "m *r"]) -> Float[Array, "m *r"]:
         """Solution x of S x = b, shape (m,) or (m, r)."""
         scale = self.scale.reshape(-1, *(1,) * (b.ndim - 1))
-        return scale * self.factor.solve(scale * b)
+        return scale * (self.inverse @ (scale * b))
 
 
 class Proximal(eqx.Module):
@@ -114,30 +96,6 @@ def solve_lower(L: Matrix, B: Matrix, *, transpose: bool = False) -> Matrix:
     return jax.lax.linalg.triangular_solve(L, B, **options)
 
 
-class Inverse(eqx.Module):
-    """Inverse of a general square matrix A, for many solutions x of A x = b.
-
-    It is a constant for differentiation; derivatives of a solution follow from A x = b.
-    """
-
-    matrix: Matrix
-    inverse: Matrix
-
-    def solve(self, b: Vector) -> Vector:
-        """Solution x of A x = b, shape (k,); not finite if A is singular."""
-        multiply = lambda x: self.matrix @ x
-        forward_solve, transpose_solve = (
-            lambda _, b: self.inverse @ b,
-            lambda _, b: self.inverse.T @ b,
-        )
-        return jax.lax.custom_linear_solve(multiply, b, forward_solve, transpose_solve)
-
-
-def invert_matrix(A: Matrix) -> Inverse:
-    """Invert a general square matrix, shape (k, k), by LU factorisation with partial pivoting."""
-    return Inverse(A, lapack.inverse(jax.lax.stop_gradient(A)))
-
-
 def _scale_diagonal(S: Matrix) -> tuple[Matrix, Vector]:
     """Matrix S scaled to a unit diagonal, and its scale factors."""
     diagonal = jnp.diagonal(S)
@@ -147,26 +105,17 @@ def _scale_diagonal(S: Matrix) -> tuple[Matrix, Vector]:
     return scale[:, None] * S * scale[None, :], scale
 
 
-def factor_redundant(S: Matrix, *, redundant: bool, rcond: float) -> Factor | MinimumNorm:
-    """Factorise a symmetric positive (semi-)definite matrix, shape (m, m).
+def factor_minimum_norm(S: Matrix, rcond: float = 1e-11) -> MinimumNorm:
+    """Factorise a positive semi-definite matrix by its singular values, shape (m, m).
 
-    `redundant=False` uses Cholesky's method; a singular S gives NaN, never a wrong number.
-    `redundant=True` uses a singular value decomposition, in which values below `rcond` times the
-    largest count as zero.
+    Values of the scaled matrix below `rcond` times the largest count as zero.
     """
-    if redundant:
-        return MinimumNorm(lapack.pseudoinverse(S, rcond))
-    return Factor(factor_cholesky(S))
-
-
-def factorise_scaled(S: Matrix, *, redundant: bool, rcond: float) -> Scaled:
-    """`factor_redundant` of S scaled to a unit diagonal; `rcond` is relative to that matrix."""
     scaled, scale = _scale_diagonal(S)
-    return Scaled(factor_redundant(scaled, redundant=redundant, rcond=rcond), scale)
+    return MinimumNorm(lapack.pseudoinverse(scaled, rcond), scale)
 
 
 def share_multipliers(
-    S: Matrix, factor: Factor | Scaled, multipliers: Vector, rcond: float = 1e-11
+    S: Matrix, factor: Factor | MinimumNorm | Proximal, multipliers: Vector
 ) -> Vector:
     """Multipliers y (m,) of all rows, of minimum norm, with the effect of those of a set of rows.
 
@@ -177,7 +126,7 @@ def share_multipliers(
         factor: factorisation of J_0 W J_0^T, with ones on the diagonal for rows outside of the set.
         multipliers: those of the set (m,), zero for rows outside of it.
     """
-    return lapack.pseudoinverse(factor.solve(S), rcond) @ multipliers
+    return lapack.pseudoinverse(factor.solve(S), 1e-11) @ multipliers
 
 
 def factor_proximal(S: Matrix) -> Proximal:
@@ -190,14 +139,6 @@ def factor_proximal(S: Matrix) -> Proximal:
 
 
 Redundant = Literal[False, "fast", "minimum norm"]
-
-
-def _factor_schur(S: Matrix, redundant: Redundant) -> Factor | Proximal | Scaled:
-    if redundant == "fast":
-        return factor_proximal(S)
-    if redundant:
-        return factorise_scaled(S, redundant=True, rcond=1e-11)
-    return Factor(factor_cholesky(S))
 
 
 def independent_rows(S: Matrix, tolerance: float | Float[Array, ""]) -> Bool[Array, " m"]:
@@ -228,65 +169,52 @@ def independent_rows(S: Matrix, tolerance: float | Float[Array, ""]) -> Bool[Arr
     return jax.lax.while_loop(has_pivot, take_row, start)[1]
 
 
-def _gram_matrix(Y: Matrix) -> Matrix:
-    """Gram matrix Y^T Y; small ones by sums, which fuse and avoid the cost of a library call."""
-    k, m = Y.shape
-    return Y.T @ Y if k * m * m > _LARGE else transposed_multiply(Y, Y)
+class Saddle(eqx.Module):
+    """Factorisation of the equations M x - J^T y = f, J x = g, with M symmetric positive definite.
 
-
-def solve_saddle(
-    M: Matrix,
-    J: Matrix,
-    f: Vector,
-    g: Vector,
-    *,
-    redundant: Redundant,
-    row_mask: Bool[Array, " m"] | None = None,
-    shared: bool = False,
-) -> tuple[Vector, Vector]:
-    """Solution x (k,), y (m,) of M x - J^T y = f, J x = g, with M symmetric positive definite.
-
-    If rows of J are dependent, `redundant` determines the choice of y; x does not depend on it.
-    With `row_mask` the other rows are left out, and their y is zero; if `shared`, y is then that of minimum
-    norm in all rows with the same effect.
+    Attributes:
+        lower: Cholesky factor L of M with its unknowns in reverse. Y: columns L^-1 J^T (k, m), zero for rows left out.
+        factor: factorisation of Y^T Y = J M^-1 J^T.
     """
-    L = factor_cholesky(M)
+
+    lower: Matrix
+    Y: Matrix
+    factor: Factor | MinimumNorm | Proximal
+
+    def solve(self, f: Vector, g: Vector) -> tuple[Vector, Vector]:
+        """Solution x (k,) and y (m,); g has to be zero for rows left out, whose y then is zero."""
+        rest = solve_lower(self.lower, f[::-1, None])[:, 0]
+        if len(g):
+            g = self.factor.solve(g - jnp.sum(self.Y * rest[:, None], axis=0))
+            rest = rest + jnp.sum(self.Y * g[None], axis=1)
+        return solve_lower(self.lower, rest[:, None], transpose=True)[::-1, 0], g
+
+    def share_multipliers(self, J: Matrix, y: Vector) -> Vector:
+        """Multipliers of minimum norm in all rows J with the effect of those y of the rows held."""
+        return share_multipliers(self.Y.T @ solve_lower(self.lower, J[:, ::-1].T), self.factor, y)
+
+    def right_inverse(self) -> Matrix:
+        """Right inverse G = M^-1 J^T (J M^-1 J^T)^-1 (k, m): x = G b solves J x = b with minimum x^T M x."""
+        return solve_lower(self.lower, self.factor.solve(self.Y.T).T, transpose=True)[::-1]
+
+
+def factor_saddle(
+    M: Matrix, J: Matrix, *, redundant: Redundant, row_mask: Bool[Array, " m"] | None = None
+) -> Saddle:
+    """Factorise the equations of a `Saddle`, without the rows of J that `row_mask` leaves out.
+
+    If rows of J are dependent, `redundant` determines the choice of y; x does not depend on it. Unknowns are
+    eliminated from the last to the first: in the mass matrix of a tree that is numbered outwards, no zero
+    between two branches fills in. Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 6.5.
+    """
+    L = factor_cholesky(M[::-1, ::-1])
     if not J.shape[0]:
-        # Without rows the forward and backward substitutions alone give the accelerations.
-        y = solve_lower(L, f[:, None])
-        return solve_lower(L, y, transpose=True)[:, 0], g
-    # One substitution serves the forces and all rows: Y^T Y is then J M^-1 J^T without an inverse of M.
-    Y = solve_lower(L, jnp.concatenate([f[:, None], J.T], axis=1))
-    y, all_Y = Y[:, 0], Y[:, 1:]
-    Y = all_Y
+        return Saddle(L, J.T, Factor(jnp.zeros((0, 0), L.dtype)))
+    Y = solve_lower(L, J[:, ::-1].T)
+    Y = Y if row_mask is None else jnp.where(row_mask[None], Y, 0.0)
+    S = Y.T @ Y
     if row_mask is not None:
-        Y, g = jnp.where(row_mask[None], Y, 0.0), jnp.where(row_mask, g, 0.0)
-    factor = _factor_schur(_with_ones(_gram_matrix(Y), row_mask), redundant)
-    multipliers = factor.solve(g - jnp.sum(Y * y[:, None], axis=0))
-    x = y + jnp.sum(Y * multipliers[None], axis=1)
-    if shared:
-        assert not isinstance(factor, Proximal)
-        multipliers = share_multipliers(Y.T @ all_Y, factor, multipliers)
-    return solve_lower(L, x[:, None], transpose=True)[:, 0], multipliers
-
-
-def _with_ones(S: Matrix, row_mask: Bool[Array, " m"] | None) -> Matrix:
-    """Add ones to the diagonal of S in the rows left out, which are zero otherwise."""
-    return S if row_mask is None else S + jnp.diag(1.0 - row_mask)
-
-
-def right_inverse(
-    M: Matrix, J: Matrix, *, redundant: bool, row_mask: Bool[Array, " m"] | None = None
-) -> Matrix:
-    """Right inverse G = M^-1 J^T (J M^-1 J^T)^-1: x = G b solves J x = b with minimum x^T M x.
-
-    With `row_mask` it is the inverse for these rows; columns of the others are zero.
-    """
-    L = factor_cholesky(M)
-    Y = solve_lower(L, J.T)
-    if row_mask is not None:
-        Y = jnp.where(row_mask, Y, 0.0)
-    S = _with_ones(_gram_matrix(Y), row_mask)
-    return solve_lower(
-        L, _factor_schur(S, "fast" if redundant else False).solve(Y.T).T, transpose=True
-    )
+        S = S + jnp.diag(1.0 - row_mask)
+    if redundant == "fast":
+        return Saddle(L, Y, factor_proximal(S))
+    return Saddle(L, Y, factor_minimum_norm(S) if redundant else Factor(factor_cholesky(S)))

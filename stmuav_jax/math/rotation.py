@@ -16,14 +16,12 @@ are fixed by A = G L^T). Conventions: docs/conventions.md.
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from ..checks.shapes import Mat3Like, Quat, QuatLike, Quats, Vec3, Vec3s
-from .stacked import apply_matrix, dot_product, unit_matrix
+from .stacked import dot_product, unit_matrix
 
 # Squared angle (or squared sine) below which the series replaces the quotient; the first
 # neglected term is then under 1e-16.
@@ -39,31 +37,9 @@ def skew(a: Vec3s) -> Float[Array, "3 3 ..."]:
 
 def cross(a: Vec3s, b: Vec3s) -> Float[Array, "3 ..."]:
     """Cross product a x b, shape (3,)."""
-    return _cross_rows(a, b)
-
-
-@jax.custom_jvp
-def _cross_rows(a: Array, b: Array) -> Array:
     x, y, z = a[0], a[1], a[2]
     u, v, w = b[0], b[1], b[2]
     return jnp.stack([y * w - z * v, z * u - x * w, x * v - y * u])
-
-
-def _cross_jvp(primals: Any, tangents: Any) -> Any:
-    # by matrices: the transpose of reading single components pads one array for each of them
-    (a, b), (a_dot, b_dot) = primals, tangents
-    out = _cross_rows(a, b)
-    change = jnp.zeros_like(out)
-    if not isinstance(b_dot, SymbolicZero):
-        # As a product with a matrix the derivative stays a product under vmap, and an operand without a
-        # derivative costs nothing.
-        change = change + apply_matrix(skew(a), b_dot)
-    if not isinstance(a_dot, SymbolicZero):
-        change = change - apply_matrix(skew(b), a_dot)
-    return out, change
-
-
-_cross_rows.defjvp(_cross_jvp, symbolic_zeros=True)
 
 
 def relative_acceleration(omega: Vec3s, omega_rate: Vec3s, arm: Vec3s) -> Float[Array, "3 ..."]:

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..math.rotation import cross, skew
-from ..math.stacked import apply_matrix, dot_product, multiply_matrices
+from ..math.stacked import apply_matrix, apply_transposed, dot_product, multiply_matrices
 
 Form = Literal["omega", "world"]
 
@@ -84,16 +84,6 @@ class BodyKinematics(eqx.Module):
     R_wb: Float[Array, "3 3 *batch"]
     omega_w: Float[Array, "3 *batch"]
     velocity: Float[Array, "6 *batch"]
-
-
-def side_world(
-    r: Float[Array, "3 *batch"],
-    v: Float[Array, "3 *batch"],
-    R_wb: Float[Array, "3 3 *batch"],
-    omega_w: Float[Array, "3 *batch"],
-) -> BodyKinematics:
-    """Kinematics of bodies for form "world", with the angular velocity in world axes."""
-    return BodyKinematics(r, v, R_wb, omega_w, jnp.concatenate([v, omega_w]))
 
 
 class BodyVector(eqx.Module):
@@ -154,13 +144,6 @@ def _make_row(
     return Row(value, jnp.zeros_like(value), J_i, J_j, gamma)
 
 
-def _vector_matrix(
-    s: Float[Array, "3 *batch"], D: Float[Array, "3 k *batch"]
-) -> Float[Array, "k *batch"]:
-    """Product s^T D of a vector and a matrix."""
-    return jnp.sum(s[:, None] * D, axis=0)
-
-
 def point_rows(i: BodyKinematics, j: BodyKinematics, data: Data, form: Form) -> Row:
     """Coincident points, s,3: r_i + s_i^P - r_j - s_j^P = 0."""
     a, b = vector_jet(i, data.point_i, form), vector_jet(j, data.point_j, form)
@@ -181,8 +164,8 @@ def _dot_row(a: BodyVector, b: BodyVector) -> Row:
     gamma = -(dot_product(a.s, b.c) + dot_product(b.s, a.c) + 2 * dot_product(a.rate, b.rate))
     return _make_row(
         dot_product(a.s, b.s)[None],
-        _join_blocks(none, _vector_matrix(b.s, a.D)[None]),
-        _join_blocks(none, _vector_matrix(a.s, b.D)[None]),
+        _join_blocks(none, apply_transposed(a.D, b.s)[None]),
+        _join_blocks(none, apply_transposed(b.D, a.s)[None]),
         gamma[None],
     )
 
@@ -198,14 +181,17 @@ def _arm_jets(
 
 
 def n2_row(i: BodyKinematics, j: BodyKinematics, data: Data, form: Form) -> Row:
-    """Vector perpendicular to d, n2,1: s_i . d = 0, d from the point on i to the point on j."""
+    """Vector perpendicular to d, n2,1: s_i . d = 0, d from the point on i to the point on j.
+
+    The value s_i . d is the displacement along the axis, from which a driver subtracts its motion.
+    """
     a = vector_jet(i, data.axis_i, form)
     arm_i, arm_j, (d, d_rate, d_c) = _arm_jets(i, j, data, form)
     gamma = -(dot_product(a.s, d_c) + dot_product(d, a.c) + 2 * dot_product(a.rate, d_rate))
     return _make_row(
         dot_product(a.s, d)[None],
-        _join_blocks(-a.s[None], (_vector_matrix(d, a.D) - _vector_matrix(a.s, arm_i.D))[None]),
-        _join_blocks(a.s[None], _vector_matrix(a.s, arm_j.D)[None]),
+        _join_blocks(-a.s[None], (apply_transposed(a.D, d) - apply_transposed(arm_i.D, a.s))[None]),
+        _join_blocks(a.s[None], apply_transposed(arm_j.D, a.s)[None]),
         gamma[None],
     )
 
@@ -217,15 +203,10 @@ def distance(i: BodyKinematics, j: BodyKinematics, data: Data, form: Form) -> Ro
     gamma = -2 * (dot_product(d, d_c) + dot_product(d_rate, d_rate))
     return _make_row(
         (dot_product(d, d) - data.length**2)[None],
-        2 * _join_blocks(-d[None], -_vector_matrix(d, arm_i.D)[None]),
-        2 * _join_blocks(d[None], _vector_matrix(d, arm_j.D)[None]),
+        2 * _join_blocks(-d[None], -apply_transposed(arm_i.D, d)[None]),
+        2 * _join_blocks(d[None], apply_transposed(arm_j.D, d)[None]),
         gamma[None],
     )
-
-
-def displacement_row(i: BodyKinematics, j: BodyKinematics, data: Data, form: Form) -> Row:
-    """Displacement s_i . d along the axis, the row of a driver, which subtracts its motion."""
-    return n2_row(i, j, data, form)
 
 
 def driven_angle_row(i: BodyKinematics, j: BodyKinematics, data: Data, form: Form) -> Row:
@@ -293,6 +274,6 @@ def couple(dependent: Row, mate: Row, ratio: Any, offset: Any, period: Any) -> R
 
 PRIMITIVES: dict[str, Callable[[BodyKinematics, BodyKinematics, Data, Form], Row]] = {
     "point": point_rows, "n1": n1_row, "n2": n2_row,
-    "distance": distance, "angle": driven_angle_row, "displacement": displacement_row,
+    "distance": distance, "angle": driven_angle_row, "displacement": n2_row,
     "screw": screw,
 }  # fmt: skip

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..analysis.mass_properties import Moments, mass_moments
 from ..analysis.sensors import gravity_of
 from ..checks.errors import SettingError
 from ..checks.numbers import check_nonnegative, check_positive
@@ -32,28 +33,11 @@ from ..math.rotation import rotation_matrix, skew
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .allocation import wrench_map
-from .flight_controller import FlightController, FlightMemory, MassProperties, UavController
+from .flight_controller import FlightController, FlightMemory, UavController, central_properties
 from .motion_estimator import MotionEstimate
 from .motor import MotorRotors, only_rotors
 from .panel_servo import PanelBodies
 from .rotor import hover_speed_squared
-
-
-class Moments(NamedTuple):
-    """Moments of a machine's masses about the base's centre of mass O, base axes.
-
-    Attributes:
-        mass: m [kg].
-        first: p = m c (3,) [kg m]. first_rate: its rate against the base (3,) [kg m/s].
-        inertia: J (3, 3) [kg m^2].
-        momentum: H of the parts that move against the base (3,) [N m s].
-    """
-
-    mass: Float[Array, ""]
-    first: Float[Array, "3"]
-    first_rate: Float[Array, "3"]
-    inertia: Float[Array, "3 3"]
-    momentum: Float[Array, "3"]
 
 
 class Carrier(NamedTuple):
@@ -90,27 +74,6 @@ def payload_of(numbers: Float[Array, "7"]) -> Payload:
     return Payload(numbers[0], numbers[1:4], numbers[4:])
 
 
-def mass_moments(system: System, state: State) -> Moments:
-    """Moments of all bodies of a system at a state; the first body is the base."""
-    mass = system.bodies.mass
-    R_0w = rotation_matrix(state.p[0]).T
-    d = (state.r - state.r[0]) @ R_0w.T
-    d_rate = (state.v - state.v[0]) @ R_0w.T - jnp.cross(state.omega[0], d)
-    R = jnp.einsum("ij,njk->nik", R_0w, jax.vmap(rotation_matrix)(state.p))
-    body_inertias = jnp.einsum("nij,njk,nlk->nil", R, system.bodies.inertia, R)
-    spin = jnp.einsum("nij,nj->ni", R, state.omega) - state.omega[0]
-    square = jnp.sum(mass * jnp.sum(d**2, axis=1))
-    return Moments(
-        jnp.sum(mass),
-        mass @ d,
-        mass @ d_rate,
-        jnp.sum(body_inertias, axis=0)
-        + square * jnp.eye(3)
-        - jnp.einsum("n,ni,nj->ij", mass, d, d),
-        mass @ jnp.cross(d, d_rate) + jnp.einsum("nij,nj->i", body_inertias, spin),
-    )
-
-
 def find_carrier_motion(state: State) -> Carrier:
     """Motion of the last body of a state against the first."""
     R_0w = rotation_matrix(state.p[0]).T
@@ -138,16 +101,6 @@ def add_payload(about: Moments, on: Carrier, payload: Payload) -> Moments:
         about.inertia + inertia,
         about.momentum + momentum,
     )
-
-
-def central_properties(about: Moments) -> MassProperties:
-    """Mass properties about the centre of mass, with a moment of zero."""
-    m, c = about.mass, about.first / about.mass
-    # The parallel axis theorem moves the inertia from the base's centre of mass, where everything is
-    # summed, to that of the whole machine.
-    J = about.inertia - m * (c @ c * jnp.eye(3) - jnp.outer(c, c))
-    h = about.momentum - jnp.cross(about.first, about.first_rate) / m
-    return MassProperties(m, c, J, h, jnp.zeros(3))
 
 
 def bodies_carrying(

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..analysis.mass_properties import centre_of_mass, inertia_about_centre, inner_momentum
+from ..analysis.mass_properties import Moments, mass_moments
 from ..analysis.sensors import gravity_of
 from ..checks.errors import ModelError, has_values
 from ..checks.numbers import array_module, as_floats, as_numpy, check_nonnegative, check_positive
@@ -531,6 +531,16 @@ def _wrench_pseudoinverse(wrenches: Float[Array, "4 k"]) -> Float[Array, "k 4"]:
     return lapack.pseudoinverse(wrenches, 1e-14)
 
 
+def central_properties(about: Moments, moment: Float[Array, "3"] | None = None) -> MassProperties:
+    """Mass properties about the centre of mass, from moments about the base's."""
+    m, c = about.mass, about.first / about.mass
+    # The parallel axis theorem moves the inertia from the base's centre of mass, where everything is
+    # summed, to that of the whole machine.
+    J = about.inertia - m * (c @ c * jnp.eye(3) - jnp.outer(c, c))
+    h = about.momentum - jnp.cross(about.first, about.first_rate) / m
+    return MassProperties(m, c, J, h, jnp.zeros(3) if moment is None else moment)
+
+
 @quick_jit
 def mass_properties(
     system: System, state: State, moment: Float[Array, "3"] | None = None
@@ -540,13 +550,7 @@ def mass_properties(
     Args:
         moment: moment that accelerates the other parts against the base (3,) [N m], by default zero.
     """
-    return MassProperties(
-        jnp.sum(system.bodies.mass),
-        centre_of_mass(system, state),
-        inertia_about_centre(system, state),
-        inner_momentum(system, state),
-        jnp.zeros(3) if moment is None else moment,
-    )
+    return central_properties(mass_moments(system, state), moment)
 
 
 class UavReference(NamedTuple):

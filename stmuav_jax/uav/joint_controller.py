@@ -28,7 +28,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..analysis.mass_properties import inner_momentum
 from ..checks.errors import ModelError, SettingError, nearest_names
 from ..checks.numbers import as_floats
 from ..control.references import Waypoint
@@ -262,7 +261,7 @@ class JointController(eqx.Module):
             v_rate, omega_rate = (x @ efforts for x in body_rates)
             # The rate of the inner momentum is the moment that moving joints exert on the base:
             # the rotors are told of it before it acts, and not by the error that it leaves.
-            moment = inner_momentum(system, State(state.r, state.p, v_rate, omega_rate))
+            moment = mass_properties(system, State(state.r, state.p, v_rate, omega_rate)).h
             mass = mass_properties(system, state, moment)
         assert isinstance(mass, MassProperties)
         squared, next_memory = self.flight.command(state, reference.waypoint, memory, mass)

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -30,7 +29,6 @@ from ..dynamics.statespace.tree import TreePoint, TreeSpace
 from ..math.compiler import kept_jit
 from ..math.derivative import value_and_jacobian
 from ..math.native.program import evaluate
-from ..math.rotation import conjugate, product, rotation_matrix
 from ..mechanics.forces import GroundContact
 from ..mechanics.inputs import inputs_of
 from ..mechanics.internal import internal_states
@@ -39,6 +37,7 @@ from ..mechanics.state import State
 from ..mechanics.system import System
 from .drag import AirframeDrag
 from .flight_controller import FlightController, FlightGains, UavController, UavReference
+from .inner_motion import BasePose, set_on_base
 from .joint_controller import JointController, JointMotions, JointReference, read_joints
 from .motor import MotorRotors
 from .panel_servo import PanelServo, StrokeServo, panel_motion
@@ -189,10 +188,8 @@ def _with_speeds(system: System, squared: Matrix) -> System:
 
 def _level(state: State) -> State:
     """State at rest with the base level, 1 km above the origin and any ground, in the same posture."""
-    p_0, R = conjugate(state.p[0]), rotation_matrix(state.p[0])
-    r = (state.r - state.r[:1]) @ R + jnp.array([[0.0, 0.0, 1e3]])
-    p = jax.vmap(lambda p: product(p_0, p))(state.p)
-    return State(r, p, jnp.zeros_like(state.v), jnp.zeros_like(state.omega))
+    rest, none = State(state.r, state.p, 0 * state.v, 0 * state.omega), jnp.zeros(3)
+    return set_on_base(rest, BasePose(jnp.array([0.0, 0.0, 1e3]), jnp.eye(4)[0], none, none))
 
 
 def _reference(pilot: Any, hover: State) -> Any:

@@ -184,3 +184,11 @@ def test_known_numbers_are_computed_outside_of_a_trace():
     inside = jax.jit(lambda y: y + compiler.compute_untraced(compute, X))(1.0)
     assert float(inside) == pytest.approx(1.0 + outside)
     assert threads[0] == threading.get_ident() != threads[1]
+
+
+def test_compiler_options_compile():
+    options = stm.math.compiler_options()
+    f = jax.jit(lambda x: jnp.sum(x[:, :, None] * x[:, None], axis=1), compiler_options=options)
+    x = jnp.ones((512, 8))
+    assert "__ynn_fusion" not in str(f.lower(x).compile().as_text())
+    np.testing.assert_array_equal(f(x), np.full((512, 8), 8.0))

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import stmuav_jax as stm
-from stmuav_jax.analysis.mass_properties import centre_of_mass
 from stmuav_jax.math.compiler import quick_jit
 from stmuav_jax.math.rotation import conjugate, product, to_rotation_vector
 from stmuav_jax.missions.controller import PanelMoves, References
@@ -41,7 +40,7 @@ def rolled(plant, pilot, wanted, moves):
     references = References(wanted.path, panel)
     signals = {
         "memory": lambda s: s.memory.flight,
-        "centre": lambda s: centre_of_mass(plant.system, s.state),
+        "centre": lambda s: stm.uav.mass_properties(plant.system, s.state).centre,
     }
     return control.rollout(
         plant, pilot, round(END * plant.rate) + 1, reference=references, memory=pilot.start(),

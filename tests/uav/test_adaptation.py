@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import stmuav_jax as stm
+from stmuav_jax.analysis import mass_moments
 from stmuav_jax.math.compiler import quick_jit
-from stmuav_jax.uav.adaptation import find_carrier_motion, mass_moments
+from stmuav_jax.uav.adaptation import find_carrier_motion
 
 control, sensing = stm.control, stm.analysis
 Instrument = control.Instrument

@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 
 import stmuav_jax as stm
+from stmuav_jax.analysis import mass_moments
 from stmuav_jax.math.compiler import quick_jit
 from stmuav_jax.missions.machine import table_carrying, tracker_carrying
 from stmuav_jax.missions.schema import PayloadEntry
-from stmuav_jax.uav.adaptation import (
-    add_payload,
-    central_properties,
-    find_carrier_motion,
-    mass_moments,
-)
+from stmuav_jax.uav.adaptation import add_payload, find_carrier_motion
+from stmuav_jax.uav.flight_controller import central_properties
 
 control, tracker = stm.control, stm.uav
 TABLE = stm.PART_II

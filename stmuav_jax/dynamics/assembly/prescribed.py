@@ -35,6 +35,8 @@ from ..formulations.independence import check_inertias
 from ..formulations.stabilisation import Unstabilised
 
 _MOST_STEPS = 30
+# Largest distance of a posture from its extrapolation, beyond which it is one of another branch [m] or [rad].
+_MOST_CHANGE = 0.2
 # Newton's steps are limited to this displacement [m] or rotation [rad].
 _LONGEST_STEP = 0.1
 # Singular values below this fraction of the largest count as zero.
@@ -97,13 +99,12 @@ def kinematic_path(
     *,
     hold: tuple[str, ...] = (),
     tolerance: float = 1e-12,
-    max_change: float = 0.2,
     throw: bool = True,
 ) -> KinematicPath:
     """Motion that a system's drivers determine, continued along the times ts.
 
     Newton's method computes every posture from the one before, extrapolated by its velocities and
-    accelerations. The result is accepted only if it is no further than `max_change` from the
+    accelerations. The result is accepted only if it is no further than 0.2 m or rad from the
     extrapolation and, for equal numbers of rows and unknowns, the determinant of the Jacobian
     keeps its sign: a path ends where that fails and never continues on another branch. The path
     is differentiable (implicit function theorem), and the function may be jitted.
@@ -111,7 +112,7 @@ def kinematic_path(
     Args:
         guess: state near the posture at ts[0]; it determines the branch.
         hold: bodies that keep their pose of the guess.
-        tolerance: bound of the residuals [m]. max_change: bound [m] or [rad].
+        tolerance: bound of the residuals [m].
         throw: raise an error if the path stops, for concrete values.
 
     Raises:
@@ -124,7 +125,7 @@ def kinematic_path(
         6 * b + k for b in range(system.n_bodies) if b not in held_bodies for k in range(6)
     )
     times = jnp.asarray(ts, dtype=guess.r.dtype)
-    path = _follow_path(system, guess, times, free, jnp.asarray(tolerance), jnp.asarray(max_change))
+    path = _follow_path(system, guess, times, free, jnp.asarray(tolerance))
     if throw and has_values(path):
         _check_path(system, path, guess, free)
     return path
@@ -169,7 +170,7 @@ class _At(NamedTuple):
 
 @kept_jit
 def _follow_path(
-    system: System, guess: State, ts: Any, free: tuple[int, ...], tolerance: Any, max_change: Any
+    system: System, guess: State, ts: Any, free: tuple[int, ...], tolerance: Any
 ) -> KinematicPath:
     model = prepare_rows(system)
     n = system.n_bodies
@@ -193,7 +194,7 @@ def _follow_path(
             (~(residual <= tolerance), PathReason.NOT_CONVERGED),
             (~(smallest > _SINGULAR), PathReason.SINGULAR),
             # Branches meet where the determinant changes its sign; a change between two times is a step across.
-            ((largest_change > max_change) | (sign * at.sign < 0), PathReason.BRANCH),
+            ((largest_change > _MOST_CHANGE) | (sign * at.sign < 0), PathReason.BRANCH),
         )
         is_accepted = reason == 0
         keep = lambda x, y: jax.tree.map(lambda a, b: jnp.where(is_accepted, a, b), x, y)

@@ -20,9 +20,9 @@ from ...checks.numbers import as_jax, as_numpy
 from ...math import lapack
 from ...math.linalg import (
     Factor,
-    Scaled,
-    factor_redundant,
-    factorise_scaled,
+    MinimumNorm,
+    factor_cholesky,
+    factor_minimum_norm,
     share_multipliers,
 )
 from ...math.native.program import native
@@ -190,7 +190,7 @@ class Augmented(AbstractFormulation):
         every: Equations,
         kin: Kinematics,
         weighed: Float[Array, "m k"],
-        factor: Factor | Scaled,
+        factor: Factor | MinimumNorm,
         accelerations: Accelerations,
     ) -> Accelerations:
         """Accelerations with multipliers of minimum norm in all rows, from those of the rows held."""
@@ -200,17 +200,13 @@ class Augmented(AbstractFormulation):
 
     def _factor_rows(
         self, model: AugmentedModel, eq: Equations, weighed: Float[Array, "m k"]
-    ) -> Factor | Scaled:
+    ) -> Factor | MinimumNorm:
         # J M^-1 J^T is symmetric positive definite for independent rows, which Cholesky's method uses and
         # checks.
         S = weighed @ eq.matrix.T
         if model.row_mask is not None:
             S = S + jnp.diag(1.0 - model.row_mask)
-        if self.redundant:
-            return factorise_scaled(S, redundant=True, rcond=self.rcond)
-        factor = factor_redundant(S, redundant=False, rcond=0.0)
-        assert isinstance(factor, Factor)
-        return factor
+        return factor_minimum_norm(S, self.rcond) if self.redundant else Factor(factor_cholesky(S))
 
     def at_step(
         self, model: AugmentedModel, t: Float[Array, ""], x: Float[Array, " k"]

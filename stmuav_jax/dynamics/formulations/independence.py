@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 from ...checks.errors import ModelError, has_values
 from ...checks.numbers import array_module, as_jax, as_numpy, stack_arrays
 from ...math.compiler import compute_untraced, kept_jit
+from ...mechanics.body import GROUND
 from ...mechanics.constraint import ROWS
 from ...mechanics.state import State, compute_kinematics
 from ...mechanics.system import System
@@ -352,23 +353,14 @@ def _remove_motions(rows: Constraints) -> Constraints:
 
 def _has_loops(system: System) -> bool:
     """True if the joints close a loop of bodies."""
-    place = {name: k for k, name in enumerate(system.names)}
-    # Union-find over the bodies: a joint between two bodies that are connected already closes a loop.
-    group = list(range(system.n_bodies + 1))
+    from scipy.sparse.csgraph import connected_components  # slow to import
 
-    def find_leader(body: int) -> int:
-        while group[body] != body:
-            body = group[body]
-        return body
-
+    names = (*system.names, GROUND)
+    edges = np.zeros((len(names), len(names)))
     for joint in system.joints:
-        i, j = (
-            find_leader(place.get(name, system.n_bodies)) for name in (joint.body_i, joint.body_j)
-        )
-        if i == j:
-            return True
-        group[i] = j
-    return False
+        edges[names.index(joint.body_i), names.index(joint.body_j)] = 1.0
+    # a forest has as many joints as bodies beyond one in each of its trees
+    return len(system.joints) > len(names) - connected_components(edges)[0]
 
 
 _memory: OrderedDict[Any, _Postures] = OrderedDict()

@@ -28,8 +28,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ...checks.shapes import StateVector
+from ...math import lapack
 from ...math.derivative import directional_derivative
-from ...math.linalg import invert_matrix
 from ...math.native.program import native
 
 
@@ -277,8 +277,8 @@ def _solve_stages(
     def attempt_iteration(now: tuple[Any, Memory, Any]) -> tuple[Any, Memory, Any]:
         _, (J, due), _ = now
         J = jax.lax.cond(due, lambda: _difference_jacobian(field, t, y, solver.n_state), lambda: J)
-        factor = invert_matrix(jnp.eye(y.shape[0], dtype=y.dtype) - h * gamma * J)
-        iteration = _iterate_stages(solver, field, start, factor, tolerances)
+        inverse = lapack.inverse(jnp.eye(y.shape[0], dtype=y.dtype) - h * gamma * J)
+        iteration = _iterate_stages(solver, field, start, inverse, tolerances)
         # what fails with the Jacobian of an earlier step is tried again with that of this one
         return iteration, Memory(J, ~iteration.converged), due | iteration.converged
 
@@ -304,7 +304,7 @@ def _difference_jacobian(field: Any, t: Any, y: StateVector, n: int) -> Float[Ar
 
 
 def _iterate_stages(
-    solver: NonDenseESDIRK, field: Any, start: Any, factor: Any, tolerances: Any
+    solver: NonDenseESDIRK, field: Any, start: Any, inverse: Any, tolerances: Any
 ) -> Iterated:
     """Simplified Newton iterations for all stages, one after the other, in one loop."""
     table, (t, h, y0) = stage_coefficients(solver.method), start
@@ -316,7 +316,7 @@ def _iterate_stages(
         y = y0 + h * jnp.sum(A[i][:, None] * slopes, axis=0)
         f = field(t + c[i] * h, y)
         k = slopes[i]
-        step = jnp.where(i == 0, f, factor.solve(f - k))
+        step = jnp.where(i == 0, f, inverse @ (f - k))
         length = solver.norm(h * table.diagonal * step, y, tolerances)
         # Rate of convergence as a quotient of successive steps (E. Hairer, G. Wanner, Solving Ordinary
         # Differential Equations II, IV.8).
@@ -370,7 +370,7 @@ def _solved_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
         identity = jnp.eye(y.shape[0], dtype=y.dtype)
         matrix = identity - h * implicit * jax.vmap(push, out_axes=1)(identity)
         # A derivative needs the exact Jacobian, whereas the iteration does with an old one.
-        tangent = invert_matrix(matrix).solve(change)
+        tangent = lapack.solve(matrix, change)
         return jax.lax.dynamic_update_index_in_dim(k_dot, tangent, number, 0), None
 
     rows = (table.A, table.c, np.arange(len(table.c)), np.diag(table.A))

@@ -82,22 +82,6 @@ class AbstractStateSpace(AbstractSpace):
         """
 
 
-def error_rates(
-    space: AbstractStateSpace,
-    x: Point,
-    v: Float[Array, " size"],
-    t: Time = 0.0,
-    system: System | None = None,
-    reference_system: System | None = None,
-) -> Float[Array, " size"]:
-    """Rate dv/dt of the error v between a motion from retract(x, v) and the motion from x.
-
-    Args:
-        system: system with the forces of the first motion. reference_system: that of the motion from x.
-    """
-    return _departure_rate(space, x, v, space.rates(x, t, reference_system), t, system)
-
-
 def error_rate_columns(
     space: AbstractStateSpace,
     x: Point,
@@ -105,9 +89,10 @@ def error_rate_columns(
     system: Callable[[Float[Array, " m"]], System],
     count: int,
 ) -> Float[Array, "size k"]:
-    """Derivatives of `error_rates` at v = 0 by v and by m more numbers z at zero, k = size + m.
+    """Derivatives of dv/dt at v = 0 by v and by m more numbers z at zero, k = size + m.
 
-    Both motions have the same rates there, which are therefore evaluated once.
+    v is the error between a motion from retract(x, v) and the motion from x. Both have the same rates there,
+    which are therefore evaluated once.
 
     Args:
         system: system with the forces of the first motion, of z; `system(0)` is that of the other.
@@ -136,19 +121,8 @@ def motion_rates(
     Args:
         system: system with the forces of the motion.
     """
-    return _departure_rate(space, x, v, jnp.zeros_like(v), t, system)
-
-
-def _departure_rate(
-    space: AbstractStateSpace,
-    x: Point,
-    v: Float[Array, " size"],
-    rate_x: Float[Array, " size"],
-    t: Time,
-    system: System | None,
-) -> Float[Array, " size"]:
-    """Rate dv/dt of the error v relative to a reference point x that moves at rate_x."""
-    return _separation_rate(space, x, v, space.rates(space.retract(x, v), t, system), rate_x)
+    rates = space.rates(space.retract(x, v), t, system)
+    return _separation_rate(space, x, v, rates, jnp.zeros_like(v))
 
 
 def _separation_rate(

@@ -567,7 +567,7 @@ def _evaluate_terms(
     """Terms of the equations of motion in a state of the tree, with the forces of a system."""
     parameters, tree = space.model.parameters, space.model.parameters.tree
     moving = compute_motion(parameters, at)
-    current_system = _with_internal(system, space._internal_states(at.q, z))
+    current_system = with_internal(system, space._internal_states(at.q, z))
     kin = make_kinematics(current_system, in_world(parameters, at, moving))
     load = total_load(current_system.forces, t, kin)
     # The last row is ground, whose loads move nothing. Moments come in body axes and forces in the
@@ -610,7 +610,3 @@ def _with_unit(label: str) -> tuple[str, str]:
     """Name and unit of an actuator state from its label, "name [unit]"."""
     name, _, unit = label.removesuffix("]").partition(" [")
     return name, unit
-
-
-def _with_internal(system: System, z: Array) -> System:
-    return with_internal(system, z) if z.shape[0] else system

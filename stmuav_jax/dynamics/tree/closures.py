@@ -20,11 +20,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ...math.derivative import held_constant
-from ...math.linalg import factor_cholesky, independent_rows, right_inverse, solve_lower
+from ...math.linalg import factor_cholesky, factor_saddle, independent_rows, solve_lower
 from ...math.rotation import cross, rotation_matrix
 from ...math.stacked import apply_matrix, apply_transposed, multiply_matrices
 from ...mechanics.body import GROUND
-from ...mechanics.constraint import ROWS, side_world
+from ...mechanics.constraint import ROWS, BodyKinematics
 from ...mechanics.state import Kinematics
 from ...mechanics.system import System
 from ..formulations.base import AbstractModel, Residuals, residuals_of
@@ -36,7 +36,6 @@ from .motion import (
     composite_inertia,
     compute_motion,
     mass_matrix,
-    right_inverse_branches,
 )
 from .parameters import TreeParameters
 from .topology import SpanningTree, align_axes, find_supported, motion_columns, pick_entries
@@ -156,7 +155,8 @@ def closure_rows(
 ) -> Rows:
     """Constraint rows of the loop-closing joints, from their primitives and the spatial axes."""
     tree = parameters.tree
-    sides = side_world(moving.c, moving.v, moving.R, moving.w)
+    twists = jnp.concatenate([moving.v, moving.w])
+    sides = BodyKinematics(moving.c, moving.v, moving.R, moving.w, twists)
     group_rows = [group.rows(sides, t, "world") for group in constraints.groups]
     batch = moving.c.shape[2:]
 
@@ -206,7 +206,6 @@ class TreeModel(AbstractModel):
 
     Attributes:
         constraints: constraints of the loop closures.
-        inverse: inverse mass matrix where it is constant, for a floating base alone; else None.
         row_mask: mask of the rows that the equations hold, if others depend on them in every posture, with
             those of points in the axes of body i; else None. See `formulations.independence`.
         step_rows: mask of the rows that are held through one step, see `at_step`.
@@ -215,7 +214,6 @@ class TreeModel(AbstractModel):
     system: System
     parameters: TreeParameters
     constraints: Constraints
-    inverse: Float[Array, "6 6"] | None
     row_mask: Bool[Array, " m"] | None = None
     step_rows: Bool[Array, " m"] | None = None
 
@@ -241,13 +239,8 @@ def close_loops(
     t: Float[Array, ""],
     at: TreeCoordinates,
     iterations: int,
-    small: Callable[[TreeModel], bool],
 ) -> tuple[TreeCoordinates, Rows]:
-    """Nearest coordinates that satisfy the loop closures, and the rows at their positions.
-
-    Args:
-        small: predicate, true if the equations are solved branch by branch.
-    """
+    """Nearest coordinates that satisfy the loop closures, and the rows at their positions."""
     tree = model.parameters.tree
 
     def rows_of(moving: TreeMotion) -> Rows:
@@ -263,7 +256,7 @@ def close_loops(
     rows = jax.lax.stop_gradient(evaluate_rows(moving))
     # One factorisation at the first iterate serves all iterations (simplified Newton): a step of the
     # integrator leaves so small a violation that the Jacobian hardly changes.
-    G = jax.lax.stop_gradient(_closing_inverse(model, moving, rows.J, small(model)))
+    G = jax.lax.stop_gradient(_closing_inverse(model, moving, rows.J))
     by_rows = lambda b: jnp.sum(G * b[None], axis=1)
 
     def newton_step(_: Any, now: TreeCoordinates) -> TreeCoordinates:
@@ -287,16 +280,18 @@ def close_loops(
 
 
 def _closing_inverse(
-    model: TreeModel, moving: TreeMotion, J: Float[Array, "m k *s"], small: bool
-) -> Float[Array, "k m *s"]:
+    model: TreeModel, moving: TreeMotion, J: Float[Array, "m k"]
+) -> Float[Array, "k m"]:
     """Right inverse G of J: u = G b solves J u = b with minimum norm in the mass metric."""
     tree = model.parameters.tree
     total = composite_inertia(model.parameters, moving, jnp.zeros_like(moving.V))
-    if small:
-        return right_inverse_branches(tree, moving.S, total, J, model.active_rows)
-    M, J = mass_matrix(tree, moving.S, total), all_columns(tree, J)
-    G = right_inverse(M, J, redundant=model.step_rows is not None, row_mask=model.active_rows)
-    return G[6 * tree.floating :]
+    saddle = factor_saddle(
+        mass_matrix(tree, moving.S, total),
+        all_columns(tree, J),
+        redundant="fast" if model.step_rows is not None else False,
+        row_mask=model.active_rows,
+    )
+    return saddle.right_inverse()[6 * tree.floating :]
 
 
 def rows_after(

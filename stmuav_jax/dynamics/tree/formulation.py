@@ -23,14 +23,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...checks.numbers import as_jax
-from ...math import lapack
 from ...math.compiler import kept_jit
 from ...math.derivative import directional_derivative
-from ...math.linalg import solve_saddle
+from ...math.linalg import Redundant, Saddle, factor_saddle
 from ...math.native.program import native
 from ...math.rotation import conjugate, cross, product, rotation_matrix
 from ...math.stacked import apply_matrix, apply_transposed, sum_columns
-from ...mechanics.constraint import ROWS
 from ...mechanics.load import Load, total_load
 from ...mechanics.state import Kinematics, State
 from ...mechanics.system import System
@@ -54,7 +52,6 @@ from .closures import (
     close_loops,
     closure_rows,
     compute_residuals,
-    held_rows,
     in_world,
     interpolate_posture,
     make_kinematics,
@@ -67,7 +64,6 @@ from .closures import (
 from .coordinates import (
     TreeCoordinates,
     coordinate_rates,
-    fill_coordinates,
     join_coordinates,
     normalise_vectors,
     read_coordinates,
@@ -76,17 +72,11 @@ from .coordinates import (
     with_unit_vectors,
 )
 from .motion import (
-    BranchElimination,
     TreeMotion,
     bias_force,
-    bias_of_base,
     body_accelerations,
     composite_inertia,
     compute_motion,
-    eliminate_branches,
-    first_solution,
-    further_solution,
-    has_small_blocks,
     mass_matrix,
     needed_wrenches,
     wrenches_by_frame,
@@ -158,7 +148,7 @@ def forward_dynamics(
     parameters: TreeParameters,
     constraints: Constraints,
     moving: TreeMotion,
-    load: Float[Array, "6 F *s"],
+    load: Float[Array, "6 F"],
     rows: Rows | None,
 ) -> Solution:
     """Accelerations (l,), in the order of `mass_matrix`, and multipliers (m,).
@@ -167,31 +157,38 @@ def forward_dynamics(
         load: wrenches on the frames, see `wrenches_by_frame`.
         rows: constraint rows of the loop closures; None without any.
     """
-    return first_solution(parameters.tree, _eliminate_loads(parameters, moving, load, rows))
+    saddle, h, gamma = _factor_equations(parameters, moving, load, rows)
+    return saddle.solve(-h, gamma)
 
 
 @forward_dynamics.def_jvp
 def _forward_dynamics_jvp(primals: Any, tangents: Any) -> tuple[Solution, Solution]:
     parameters, _, moving, load, rows = primals
-    # The derivative is not taken through the elimination: the tangents of the residuals M x + h - J^T y
-    # and gamma - J x cost one pass over the tree, and the blocks that solve for them exist already.
-    elimination = _eliminate_loads(parameters, moving, load, rows)
-    x, y = first_solution(parameters.tree, elimination)
+    # The derivative is not taken through the factorisation: the tangents of the residuals M x + h - J^T y
+    # and gamma - J x cost one pass over the tree, and the factors that solve for them exist already.
+    saddle, h, gamma = _factor_equations(parameters, moving, load, rows)
+    x, y = saddle.solve(-h, gamma)
     residual = lambda *setting: inverse_dynamics_residual(*setting, x, y)  # pyright: ignore[reportCallIssue]
-    _, residual_tangents = directional_derivative(residual, primals, tangents)
-    return (x, y), further_solution(parameters.tree, elimination, *residual_tangents)
+    _, (h_dot, gamma_dot) = directional_derivative(residual, primals, tangents)
+    return (x, y), saddle.solve(-h_dot, gamma_dot)
 
 
-def _eliminate_loads(
-    parameters: TreeParameters, moving: TreeMotion, load: Float[Array, "6 F *s"], rows: Rows | None
-) -> BranchElimination:
+def _factor_equations(
+    parameters: TreeParameters,
+    moving: TreeMotion,
+    load: Float[Array, "6 F"],
+    rows: Rows | None,
+    redundant: Redundant = False,
+) -> tuple[Saddle, Float[Array, " l"], Float[Array, " m"]]:
+    """Equations of motion M x - J^T y = -h, J x = gamma in factors, with h and gamma."""
     tree = parameters.tree
     total = composite_inertia(parameters, moving, load)
     h = bias_force(tree, moving.S, total)
-    if rows is None:
-        J = jnp.zeros((0, *moving.S.shape[1:]), h.dtype)
-        return eliminate_branches(tree, moving.S, total, J, h[:0], h)
-    return eliminate_branches(tree, moving.S, total, rows.J, rows.gamma, h, rows.row_mask)
+    J, gamma, row_mask = (
+        (moving.S[:0], h[:0], None) if rows is None else (rows.J, rows.gamma, rows.row_mask)
+    )
+    M, J = mass_matrix(tree, moving.S, total), all_columns(tree, J)
+    return factor_saddle(M, J, redundant=redundant, row_mask=row_mask), h, gamma
 
 
 def inverse_dynamics_residual(
@@ -279,17 +276,11 @@ class Tree(AbstractFormulation):
     def prepare(self, system: System) -> TreeModel:
         tree = spanning_tree(system, self.cut)
         parameters = tree_parameters(system, tree)
-        # The inverse mass matrix of a single rigid body is a constant in its own axes, and is found once per
-        # model.
-        alone = tree.floating and not tree.steps
-        inverse = _inverse_of_base(parameters) if alone else None
         # Rows that repeat others in every posture are found from the joints' geometry before any number is
         # traced: a mask keeps the shapes.
         row_mask = find_independent_rows(system, tree.cut).rows
         row_mask = None if row_mask is None else as_jax(row_mask)
-        return TreeModel(
-            system, parameters, group_constraints(system, joints=tree.cut), inverse, row_mask
-        )
+        return TreeModel(system, parameters, group_constraints(system, joints=tree.cut), row_mask)
 
     def to_vector(self, model: TreeModel, state: State) -> Float[Array, " k"]:
         return join_coordinates(read_coordinates(model.parameters, state))
@@ -362,10 +353,6 @@ class Tree(AbstractFormulation):
         if tree.floating:
             force = apply_transposed(rotation_matrix(at.p), force)
         wrench = wrenches_by_frame(tree, moving, force, moment)
-        # A free rigid body needs no solve.
-        if model.inverse is not None:
-            rate = -apply_matrix(model.inverse, bias_of_base(model.parameters, moving, wrench))
-            return Solved(moving, placement, None, load, rate, rate[:0])
         rows = None
         if model.constraints.groups:
             rows = closure_rows(model.parameters, model.constraints, t, moving)
@@ -374,33 +361,23 @@ class Tree(AbstractFormulation):
                 gamma=stabilisation.held_rows(rows.gamma, rows.value, rate_residuals)
             )
         shared = shared and rows is not None and (self.redundant or model.row_mask is not None)
-        if rows is not None:
-            rows = (turned_rows if shared else held_rows)(model, moving, rows)
-        # Blocks of at most six rows are solved in closed form: a call of a library costs more than their
-        # arithmetic, and closed forms fuse with what is around them.
-        if self._is_small(model) and not shared:
+        every = rows if rows is None else turned_rows(model, moving, rows)
+        rows = (
+            every
+            if every is None or model.active_rows is None
+            else every.with_mask(model.active_rows)
+        )
+        if not self.redundant and not shared:
             rate, multipliers = forward_dynamics(
                 model.parameters, model.constraints, moving, wrench, rows
             )
             return Solved(moving, placement, rows, load, rate, multipliers)
-        total = composite_inertia(model.parameters, moving, wrench)
-        h = bias_force(tree, moving.S, total)
-        J, gamma = (jnp.zeros((0, len(at.u))), h[:0]) if rows is None else (rows.J, rows.gamma)
-        rate, multipliers = solve_saddle(
-            mass_matrix(tree, moving.S, total),
-            all_columns(tree, J),
-            -h,
-            gamma,
-            redundant=self.redundant and ("minimum norm" if shared else "fast"),
-            row_mask=model.active_rows,
-            shared=shared,
-        )
+        choice = self.redundant and ("minimum norm" if shared else "fast")
+        saddle, h, gamma = _factor_equations(model.parameters, moving, wrench, rows, choice)
+        rate, multipliers = saddle.solve(-h, gamma)
+        if shared and every is not None:
+            multipliers = saddle.share_multipliers(all_columns(tree, every.J), multipliers)
         return Solved(moving, placement, rows, load, rate, multipliers)
-
-    def _is_small(self, model: TreeModel) -> bool:
-        """True if the equations are solved branch by branch."""
-        rows = sum(ROWS[group.kind] * len(group.i) for group in model.constraints.groups)
-        return not self.redundant and has_small_blocks(model.parameters.tree, rows)
 
     def at_step(self, model: TreeModel, t: Float[Array, ""], x: Float[Array, " k"]) -> TreeModel:
         """Model with the independent rows that are kept until the integrator's step ends.
@@ -427,7 +404,7 @@ class Tree(AbstractFormulation):
 
         def solve_displaced(by: Float[Array, " u"]) -> tuple[Float[Array, " u"], Float[Array, ""]]:
             closed_there = lambda: close_loops(
-                model, t, retract_coordinates(model.parameters.tree, at, by), 3, self._is_small
+                model, t, retract_coordinates(model.parameters.tree, at, by), 3
             )[0]
             solution = self._solve_coordinates(
                 model, t, jax.lax.cond(singular.is_near, closed_there, lambda: at), stabilisation
@@ -448,7 +425,7 @@ class Tree(AbstractFormulation):
         if not model.constraints.groups:
             return join_coordinates(at), compute_residuals(model, at, None)
         if not self._may_interpolate(model):
-            at, rows = close_loops(model, t, at, iterations, self._is_small)
+            at, rows = close_loops(model, t, at, iterations)
             return join_coordinates(at), compute_residuals(model, at, rows)
         model = self.at_step(model, t, x) if model.step_rows is None else model
 
@@ -456,7 +433,7 @@ class Tree(AbstractFormulation):
         # through a singular posture, unlike the coordinates themselves.
         def closure_change(by: Float[Array, " u"]) -> TreeCoordinates:
             start = retract_coordinates(tree, at, by)
-            end, _ = close_loops(model, t, start, iterations, self._is_small)
+            end, _ = close_loops(model, t, start, iterations)
             return jax.tree.map(jnp.subtract, end, start)
 
         moves = interpolate_posture(
@@ -491,15 +468,6 @@ def _vector_to_state(parameters: TreeParameters, x: Float[Array, " k"]) -> State
     p = product(at.p, p) if parameters.tree.floating else p
     bodies = lambda x: x[:, :-1].T
     return State(bodies(placement.r), p.T, bodies(placement.v), bodies(placement.omega))
-
-
-def _inverse_of_base(parameters: TreeParameters) -> Float[Array, "6 6"]:
-    """Inverse mass matrix of a floating base whose only joints are welds."""
-    tree = parameters.tree
-    at = fill_coordinates(tree, jnp.zeros)
-    moving = compute_motion(parameters, at._replace(p=at.p.at[0].set(1.0)))
-    total = composite_inertia(parameters, moving, jnp.zeros_like(moving.V))
-    return lapack.inverse(mass_matrix(tree, moving.S, total))
 
 
 def _closure_reactions(

@@ -1,34 +1,16 @@
-"""Velocities, velocity-product accelerations and inertias of a tree, and elimination from its branches to its base.
+"""Velocities, velocity-product accelerations, composite inertias and the mass matrix of a tree.
 
-Velocities on different branches have no common term in the mass matrix, which, apart from the
-rows of the base, is therefore block-diagonal with one small block D for each branch. With F the
-rows that couple the base to the branches, J those of the loop closures and W_xy = X D^-1 Y^T,
-
-    (A - W_FF) a       =  r - W_FJ y           r = -h_base + W_Fh
-    (W_JJ + W_JF (A - W_FF)^-1 W_FJ) y  =  g - W_Jf + W_JF (A - W_FF)^-1 r
-    u'                 =  D^-1 (-h - F^T a + J^T y),
-
-where A - W_FF is the articulated inertia of the base. No block has more than six rows, so the
-factorisations are written out and no library is called.
-
-Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 6.3 (branch-induced
-sparsity) and 7 (articulated inertias).
+Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 6.3 (branch-induced sparsity).
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ...math.rotation import cross, rotation_matrix
-from ...math.stacked import (
-    MOST_ROWS,
-    apply_matrix,
-    apply_transposed,
-    multiply_matrices,
-    solve_definite,
-)
+from ...math.stacked import apply_matrix, apply_transposed, multiply_matrices
 from .coordinates import TreeCoordinates
 from .parameters import Pose, TreeParameters, by_frame, place, root_pose, spatial_axes
 from .topology import (
@@ -192,16 +174,6 @@ def _bias_of_frames(
     return apply_matrix(tensor, A[:3]) + cross(w, apply_matrix(tensor, w)) + cross(c, f), f
 
 
-def bias_of_base(
-    parameters: TreeParameters, moving: TreeMotion, load: Float[Array, "6 F *s"]
-) -> Float[Array, "6 *s"]:
-    """Bias force h of M du/dt + h = 0 for a tree without steps."""
-    c, w = parameters.centre, moving.V[:3]
-    f = parameters.mass[None] * cross(w, cross(w, c))
-    needed = jnp.concatenate([cross(w, apply_matrix(parameters.inertia, w)) + cross(c, f), f])
-    return (needed - load)[:, 0]
-
-
 def needed_wrenches(
     parameters: TreeParameters, moving: TreeMotion, A: Float[Array, "6 F *s"]
 ) -> Float[Array, "6 F *s"]:
@@ -294,209 +266,3 @@ def body_accelerations(
     if tree.floating:
         a = apply_matrix(rotation_matrix(at.p), a)
     return a, apply_transposed(moving.R[:, :, :n], A[:3])
-
-
-def branch_columns(tree: SpanningTree) -> np.ndarray:
-    """Table of the columns of every branch (b, w), padded with the total number of columns."""
-    frame = motion_columns(tree).frame
-    first: list[int] = [0]
-    for f, step in enumerate(tree.steps, start=1):
-        first.append(f if step.parent == 0 else first[step.parent])
-    # All branches are padded to the longest one, so that their blocks are one array: shorter branches get
-    # unit diagonals, which change no solution.
-    groups = [
-        [k for k, f in enumerate(frame) if first[f] == root] for root in sorted(set(first[1:]))
-    ]
-    width = max((len(g) for g in groups), default=0)
-    fill = len(frame)
-    table = [g + [fill] * (width - len(g)) for g in groups]
-    return np.array(table, int).reshape(len(groups), width)
-
-
-def has_small_blocks(tree: SpanningTree, rows: int) -> bool:
-    """True if all blocks of the elimination have at most `MOST_ROWS` rows."""
-    return bool(tree.steps) and branch_columns(tree).shape[1] <= MOST_ROWS and rows <= MOST_ROWS
-
-
-class BranchElimination(NamedTuple):
-    """Equations of motion of a tree after elimination of the branches' velocities.
-
-    Attributes:
-        D: blocks of the branches (w, w, b, *s).
-        A: articulated inertia of the base (6, 6, *s); None where nothing floats.
-        Z: columns of D^-1 F^T, D^-1 J^T and, where a bias was given, D^-1 h (l, 6 + m + 1, *s),
-            rows in the order of the branches; the first six columns only where the base floats.
-        X, x: matrix (6, m, *s) and vector (6, *s) of the base's acceleration a = x - X y.
-        S, g: matrix (m, m, *s) and right-hand side (m, *s) of S y = g for the multipliers y.
-    """
-
-    D: Float[Array, "w w b *s"]
-    A: Float[Array, "6 6 *s"] | None
-    Z: Float[Array, "l r *s"]
-    X: Float[Array, "6 m *s"]
-    x: Float[Array, "6 *s"]
-    S: Float[Array, "m m *s"]
-    g: Float[Array, "m *s"]
-
-
-def eliminate_branches(
-    tree: SpanningTree,
-    S: Float[Array, "6 k *s"],
-    at: Inertia,
-    J: Float[Array, "m k *s"],
-    gamma: Float[Array, "m *s"],
-    h: Float[Array, "l *s"] | None = None,
-    row_mask: Bool[Array, " m"] | None = None,
-) -> BranchElimination:
-    """Articulated-body elimination of the velocities of all branches.
-
-    Args:
-        h: bias force in the order of `mass_matrix`; zero if None.
-        row_mask: mask of the rows that are held; the others are zero, and so are their multipliers.
-    """
-    base, m = 6 * tree.floating, J.shape[0]
-    table = branch_columns(tree)
-    flat = table.T.ravel()
-    frame = np.concatenate([motion_columns(tree).frame, [0]])[flat]
-    S = _pad_branches(S, flat)
-    F = spatial_momenta(frame, S, at)
-    row_blocks = [F] if base else []
-    row_blocks += (
-        [_pad_branches(J, flat)]
-        if h is None
-        else [_pad_branches(J, flat), _pad_branches(h[base:][None], flat)]
-    )
-    # columns first: sums over leading axes run along contiguous rows of the summands
-    # The base's coupling, the constraint rows and the bias are right-hand sides of one block solve: D is
-    # factorised once for all of them.
-    C = jnp.concatenate([jnp.swapaxes(rows, 0, 1) for rows in row_blocks], axis=1)
-    # Velocities of different branches have no common term in the mass matrix: it is block diagonal beside
-    # the base's rows, and each block is eliminated by itself.
-    D = _diagonal_blocks(tree, table, S, F)
-    Z = _solve_blocks(D, C)
-    # W holds all products X D^-1 Y^T at once: of base and base, base and rows, rows and rows, and of both
-    # with the bias.
-    W = jnp.sum(C[:, : base + m, None] * Z[:, None], axis=0)
-    rows, known_terms = W[base:], W[:, base + m] if h is not None else jnp.zeros_like(W[:, 0])
-    if row_mask is not None:
-        ones = jnp.zeros((m, rows.shape[1])).at[:, base : base + m].set(jnp.diag(1.0 - row_mask))
-        rows = rows + ones.reshape(*ones.shape, *(1,) * (rows.ndim - 2))
-    g = gamma + known_terms[base:]
-    if not base:
-        none = jnp.zeros((0, *gamma.shape), gamma.dtype)
-        x = none[:, 0] if len(gamma) else none.reshape(0)
-        return BranchElimination(D, None, Z, none, x, rows[:, :m], g)
-    right = known_terms[:6] if h is None else known_terms[:6] - h[:6]
-    right = jnp.concatenate([W[:6, 6 : 6 + m], right[:, None]], axis=1)
-    # What the branches leave of the base's inertia is its articulated inertia, which is positive definite
-    # as the Schur complement of the mass matrix.
-    A = base_inertia(at) - W[:6, :6]
-    X = solve_definite(A, right)
-    lift = multiply_matrices(rows[:, :6], X)
-    return BranchElimination(
-        D, A, Z, X[:, :m], X[:, m], rows[:, 6 : 6 + m] + lift[:, :m], g + lift[:, m]
-    )
-
-
-def _solve_blocks(D: Float[Array, "w w b *s"], C: Float[Array, "l r *s"]) -> Float[Array, "l r *s"]:
-    """Product D^-1 C, block by block."""
-    blocks = C.reshape(D.shape[0], 1, *D.shape[2:3], *C.shape[1:])
-    return solve_definite(D[:, :, :, None], blocks).reshape(C.shape)
-
-
-def _diagonal_blocks(
-    tree: SpanningTree, table: np.ndarray, S: Float[Array, "6 l *s"], F: Float[Array, "6 l *s"]
-) -> Float[Array, "w w b *s"]:
-    """Diagonal blocks of the mass matrix, padded with ones where a branch has fewer columns."""
-    count, width = table.shape
-    frame = np.concatenate([motion_columns(tree).frame, [0]])[table]
-    moves_with = find_supported(tree)
-    above = np.stack([moves_with[np.ix_(row, row)] & (row[:, None] > 0) for row in frame], axis=-1)
-    batch = 3 + S.ndim - 2
-    ones = align_axes(np.eye(width)[:, :, None] * (frame.T == 0), batch)
-    S, F = (x.reshape(6, width, count, *x.shape[2:]) for x in (S, F))
-    product = jnp.sum(S[:, :, None] * F[:, None], axis=0)
-    flipped = jnp.swapaxes(product, 0, 1)
-    below = jnp.where(align_axes(np.swapaxes(above, 0, 1), batch), flipped, ones)
-    return jnp.where(align_axes(above, batch), product, below)
-
-
-def _pad_branches(rows: Float[Array, "r k *s"], flat: np.ndarray) -> Float[Array, "r l *s"]:
-    """Columns of `rows` in the order of the branches, padded with zeros for shorter branches."""
-    if flat.max() == rows.shape[1]:
-        rows = jnp.concatenate([rows, jnp.zeros_like(rows[:, :1])], axis=1)
-    return pick_entries(rows, flat, 1)
-
-
-def first_solution(
-    tree: SpanningTree, elimination: BranchElimination
-) -> tuple[Float[Array, "l *s"], Float[Array, "m *s"]]:
-    """Accelerations and multipliers for the h and gamma that `eliminate_branches` was given."""
-    # Multipliers first, then the base, then the branches: the order of the elimination backwards.
-    y = (
-        solve_definite(elimination.S, elimination.g[:, None])[:, 0]
-        if len(elimination.g)
-        else elimination.g
-    )
-    a = elimination.x - apply_matrix(elimination.X, y)
-    factors = jnp.concatenate([-a, y, -jnp.ones_like(elimination.Z[:1, 0])])
-    u_rate = jnp.sum(factors[None] * elimination.Z, axis=1)
-    return jnp.concatenate([a, _in_order(tree, u_rate)]), y
-
-
-def further_solution(
-    tree: SpanningTree,
-    elimination: BranchElimination,
-    h: Float[Array, "l *s"],
-    gamma: Float[Array, "m *s"],
-) -> tuple[Float[Array, "l *s"], Float[Array, "m *s"]]:
-    """Accelerations and multipliers, linear in h and gamma, for another h and gamma."""
-    base, m = 6 * tree.floating, gamma.shape[0]
-    # Derivatives reuse the blocks of the first solution: the tangent equations have the same matrix and
-    # another right-hand side.
-    Z = elimination.Z[:, : base + m]
-    h_u = _pad_branches(h[base:][None], branch_columns(tree).T.ravel())[0]
-    known_terms = apply_transposed(Z, h_u)
-    bias_response = _solve_blocks(elimination.D, h_u[:, None])[:, 0]
-    g, a = gamma + known_terms[base:], h[:0]
-    if base:
-        assert elimination.A is not None
-        right = known_terms[:6] - h[:6]
-        a = solve_definite(elimination.A, right[:, None])[:, 0]
-        g = g + apply_transposed(elimination.X, right)
-    y = solve_definite(elimination.S, g[:, None])[:, 0] if m else g
-    if base:
-        a = a - apply_matrix(elimination.X, y)
-    u_rate = apply_matrix(Z, jnp.concatenate([-a, y])) - bias_response
-    return jnp.concatenate([a, _in_order(tree, u_rate)]), y
-
-
-def right_inverse_branches(
-    tree: SpanningTree,
-    S: Float[Array, "6 k *s"],
-    at: Inertia,
-    J: Float[Array, "m k *s"],
-    row_mask: Bool[Array, " m"] | None = None,
-) -> Float[Array, "k m *s"]:
-    """Right inverse G of J: u = G b solves J u = b with minimum norm in the metric of M.
-
-    The motion of a floating base, which is free, is taken along in this norm. With `row_mask` it is the
-    inverse for these rows; columns of the others are zero.
-    """
-    elimination = eliminate_branches(tree, S, at, J, jnp.zeros_like(J[:, 0]), row_mask=row_mask)
-    base = 6 * tree.floating
-    Y = elimination.Z[:, base:]
-    if base:
-        Y = Y + multiply_matrices(elimination.Z[:, :6], elimination.X)
-    return _in_order(tree, jnp.swapaxes(solve_definite(elimination.S, jnp.swapaxes(Y, 0, 1)), 0, 1))
-
-
-def _in_order(tree: SpanningTree, u: Float[Array, "l *s"]) -> Float[Array, "k *s"]:
-    """Rows in the order of the columns, from rows in the order of the branches."""
-    return pick_entries(
-        u,
-        np.argsort(branch_columns(tree).T.ravel(), kind="stable")[
-            : len(motion_columns(tree).frame)
-        ],
-        0,
-    )

@@ -26,7 +26,6 @@ from jaxtyping import Array, Float
 from ...checks.errors import has_values
 from ...checks.numbers import as_floats, as_jax, as_numpy, stack_arrays
 from ...math.compiler import compute_untraced, kept_jit
-from ...math.derivative import directional_derivative
 from ...math.native.program import native
 from ...math.native.structure import has_structure
 from ...math.rotation import conjugate, cross, from_matrix, product
@@ -39,7 +38,6 @@ from .topology import (
     SpanningTree,
     align_axes,
     find_supported,
-    forward_pass,
     motion_columns,
     motion_groups,
     pick_entries,
@@ -318,45 +316,8 @@ class Pose(NamedTuple):
     o: Float[Array, "3 f *s"]
 
 
-@eqx.filter_custom_jvp
 def place(parameters: TreeParameters, q: tuple[Float[Array, "..."], ...]) -> Pose:
     """Poses of all frames of a tree with at least one step, at positions q by class of motion."""
-    return _compose_poses(parameters, q)
-
-
-@place.def_jvp
-def _place_jvp(primals: Any, tangents: Any) -> tuple[Pose, Pose]:
-    """Derivative of `place`: dE = w x E, do = v + w x o, with (w, v) = sum S_k du_k."""
-    parameters, _ = primals
-    tree, groups = parameters.tree, motion_groups(parameters.tree)
-    change, q_dot = tangents
-    of_groups = zip(groups, q_dot, strict=True)
-    flat = all(dot is None or group.motion.flat for group, dot in of_groups)
-    if not flat or change.K is not None or change.pitch is not None:
-        # a change of K need not be a rotation, nor are the rates of q velocities
-        return directional_derivative(_compose_poses, primals, tangents)
-    pose = place(*primals)
-    zero = lambda group: jnp.zeros(
-        (*group.motion.velocities, len(group.steps), *pose.o.shape[2:]), pose.o.dtype
-    )
-    parts = tuple(
-        zero(group) if dot is None else dot for group, dot in zip(groups, q_dot, strict=True)
-    )
-    relative_twists = by_frame(
-        tree, spatial_axes(parameters, pose) * from_groups(tree, parts)[None]
-    )
-    if change.k is not None:
-        parent = np.array([step.parent for step in tree.steps])
-        offset_change = apply_matrix(pick_entries(pose.E, parent, 2), change.k)
-        relative_twists = relative_twists + jnp.concatenate(
-            [jnp.zeros_like(offset_change), offset_change]
-        )
-    V = forward_pass(tree, jnp.zeros_like(relative_twists[:, :1]), relative_twists)
-    w = V[:3]
-    return pose, Pose(cross(w[:, None], pose.E), V[3:] + cross(w, pose.o))
-
-
-def _compose_poses(parameters: TreeParameters, q: tuple[Float[Array, "..."], ...]) -> Pose:
     X, d = relative_poses(parameters, q)
     origin = root_pose(d.shape[2:], d.dtype)
     E, o = [origin.E], [origin.o]

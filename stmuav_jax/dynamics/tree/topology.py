@@ -23,7 +23,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...checks.errors import ModelError, nearest_names
-from ...math.stacked import sum_columns
 from ...mechanics.body import GROUND
 from ...mechanics.joint import CATALOGUE, Freedom
 from ...mechanics.motions import SPHERICAL, TRANSLATION, AbstractRelativeMotion
@@ -406,7 +405,6 @@ def align_axes(constant: np.ndarray, axes: int) -> np.ndarray:
 # --- recursions
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def forward_pass(tree: SpanningTree, root: Array, values: Array) -> Array:
     """Forward pass: sums of `values` from the root to every frame, (w, f + 1, *s).
 
@@ -423,15 +421,6 @@ def forward_pass(tree: SpanningTree, root: Array, values: Array) -> Array:
     return jnp.concatenate(parts, axis=1) if len(parts) > 1 else root
 
 
-@forward_pass.defjvp
-def _forward_pass_jvp(tree: SpanningTree, primals: Any, tangents: Any) -> Any:
-    # one sum, whose transpose is a sum too; level by level the transpose pads an array each time
-    return forward_pass(tree, *primals), sum_columns(
-        jnp.concatenate(tangents, axis=1), find_supported(tree)
-    )
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def backward_pass(tree: SpanningTree, values: Float[Array, "w f *s"]) -> Float[Array, "w f *s"]:
     """Backward pass: sums of `values` over every frame and all frames that it supports."""
     layers = [Level(slice(0, 1), np.zeros(1, int)), *tree_levels(tree)]
@@ -443,11 +432,6 @@ def backward_pass(tree: SpanningTree, values: Float[Array, "w f *s"]) -> Float[A
             children[parent].append(child)
         sums.insert(0, values[:, level.frames] + sum_entries(sums[0], children))
     return jnp.concatenate(sums, axis=1) if len(sums) > 1 else sums[0]
-
-
-@backward_pass.defjvp
-def _backward_pass_jvp(tree: SpanningTree, primals: Any, tangents: Any) -> Any:
-    return backward_pass(tree, *primals), sum_columns(tangents[0], find_supported(tree).T)
 
 
 def sum_entries(rows: Float[Array, "w k *s"], lists: list[list[int]]) -> Float[Array, "w m *s"]:
