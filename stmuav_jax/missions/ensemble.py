@@ -184,9 +184,9 @@ class MissionEvaluation(eqx.Module):
         plant = _plant_of(of.plant, mission.machine, scene, payloads)
         of = of._replace(speeds=_narrow_limits(of.speeds, scene))
         gauges = eqx.tree_at(
-            lambda g: (g.k_tau, g.payloads),
+            lambda g: (g.rotors, g.payloads),
             of.gauges,
-            (only_rotors(scene.system, "A mission").rotors.k_tau, payloads),
+            (only_rotors(scene.system, "A mission").rotors, payloads),
             is_leaf=lambda x: x is None,
         )
         if gauges.jointed is not None:

@@ -447,7 +447,7 @@ def _check_thrust(mission: Mission) -> None:
     # could fly is refused.
     needed = mass * np.linalg.norm(a - gravity, axis=1)
     limits = speeds.squared(machine.rotors.spin.shape[0])
-    least, most = (float(machine.rotors.k_f) * float(np.sum(np.asarray(x))) for x in limits)
+    least, most = (float(jnp.sum(machine.rotors.thrusts(x))) for x in limits)
     beyond = (needed > most) | (needed < least)
     if np.any(beyond):
         k = int(np.argmax(beyond))

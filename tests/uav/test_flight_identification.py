@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from problems.multirotor_flights import (
@@ -227,7 +228,9 @@ def test_the_identified_model_has_the_true_numbers(result, tmp_path):
     # the thrust's slope by the command at the mean one, and the torque of spinning up
     span = float(motors.limits.highest[0] - motors.limits.lowest[0])
     speed = float(motors.limits.lowest[0]) + span * result.hover
-    slope = 2 * float(motors.rotors.k_f) * speed * span
+    thrust = lambda speed: motors.rotors.thrusts(speed**2)
+    slope = float(jax.grad(thrust)(speed)) * span
+    assert float(thrust(speed)) == pytest.approx(0.027 * g / 4, rel=1e-9)
     assert slope == pytest.approx(2 * result.hover * e["force"].value, rel=1e-9)
     assert float(motors.inertia[0]) * span / 3e-5 == pytest.approx(e["spin_up"].value)
     # drag below the centre of mass makes both moments of horizontal speed
