@@ -1,6 +1,6 @@
 """Truth of a mission: the numbers of its machine, which its controller and estimator do not know."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -127,34 +127,39 @@ def find_target(table: Parameters, machine: Machine, name: str, relative: bool) 
     Raises:
         SettingError: a name that is unknown, or of no effect.
     """
-    unknown: Callable[[], str] = lambda: (
-        f"is no parameter of {machine.scene.name}."
-        f"{suggest_names(name.partition('[')[0][:SHOWN], list(table))}"
+    fault_of = lambda key, shown: (
+        _describe_fault(machine, shown, key) if key in machine.table else ""
     )
+
+    def unknown() -> str:
+        names = [key for key in table if not fault_of(key, key)]
+        return (
+            f"is no parameter of {machine.scene.name}."
+            f"{suggest_names(name.partition('[')[0][:SHOWN], names)}"
+        )
+
     target = table_entry(table, name, relative, unknown)
-    if target.name in machine.table:
-        _check_effect(machine, name, target.name)
+    fault = fault_of(target.name, name)
+    if fault:
+        raise SettingError(fault)
     return target
 
 
-def _check_effect(machine: Machine, factor: str, name: str) -> None:
-    """Raise `SettingError` for a number that no flight of the machine would have, or not rightly."""
+def _describe_fault(machine: Machine, factor: str, name: str) -> str:
+    """Why no flight of the machine would have a number, or not rightly; empty if it would."""
     scene, model = machine.scene, machine.model
     if model is None and name.startswith(_FIXED) and name not in _FREE:
-        raise SettingError(
+        return (
             f"{quote_name(factor)} can be no factor of a mission's study and no part of its truth: loops and limits "
             "of strokes are those of the mission's machine. Masses, inertias, centres of mass, rotors, "
             "drag and motors can be."
         )
     line: Mapping[str, Any] | None = scene.parameters.get(name)
     if (line is None) if model is None else (name not in model.used_parameters()):
-        raise SettingError(
-            f"{quote_name(factor)} has no effect on this mission: its machine does not use it."
-        )
+        return f"{quote_name(factor)} has no effect on this mission: its machine does not use it."
     if model is None and line != machine.table[name].plain():
-        raise SettingError(
-            f"'{name}' is given by the mission's options: it can be no factor and no part of the truth."
-        )
+        return f"'{name}' is given by the mission's options: it can be no factor and no part of the truth."
+    return ""
 
 
 def narrow_limits(speeds: RotorLimits | None, scene: Scene) -> RotorLimits | None:

@@ -203,6 +203,7 @@ def test_a_study_flies_what_single_flights_with_its_truth_do():
     }
     study = missions.make_mission_study(mission, factors, samples=3, design="table", lanes=8)
     table = study.compute(0, 3)
+    flight: Any = None
     for k, truth in enumerate(truths):
         flight = missions.fly(missions.make_mission(plain | {"truth": truth}))
         signals = flight.run.rollout.signals
