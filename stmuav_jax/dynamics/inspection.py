@@ -546,7 +546,8 @@ def _extrapolate_rank(
     change = float(np.max(changes, initial=0.0))
     if not change > 0:
         return rank, sigma, np.inf, ""
-    unit = units[np.flatnonzero(is_finite[1:])[np.argmax(changes)]]
+    places = np.flatnonzero(is_finite)[1:] - 1
+    unit = units[int(places[np.argmax(changes)])]
     return rank, sigma, sigma * _STEP / change, unit
 
 

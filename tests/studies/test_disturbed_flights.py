@@ -131,7 +131,7 @@ def test_a_factor_that_the_scene_does_not_use_is_refused_and_not_suggested():
     """The table is of all scenes of Part II: the bare hexacopter has a mass of its own."""
     flights = make_flights("hexacopter")
     with pytest.raises(
-        SettingError, match="'mass.hexacopter_1' has no effect on hexacopter"
+        SettingError, match=r"'mass\.hexacopter_1' has no effect on hexacopter"
     ) as told:
         flights.entry("mass.hexacopter_1")
     with pytest.raises(SettingError, match="neither a parameter of hexacopter") as asked:
