@@ -145,13 +145,19 @@ def _model_numbers(
         layout.highest_speed,
         0.0 if force is None else force.deviation / force.value,
     )
-    # curvature of the thrust by the command, halved
+    # curvature of the thrust by the command, halved, of the layout's shape; within two deviations of it another one
+    # is not told from it
     quadratic = slope / (1 - factor + 2 * factor * hover) * factor
-    if "thrust_quadratic" in estimates:
-        quadratic = max(mass * estimates["thrust_quadratic"].value, 0.0)
+    measured = estimates.get("thrust_quadratic")
+    has_curve = measured is not None and (
+        abs(measured.value - quadratic / mass) > 2 * measured.deviation
+    )
+    if measured is not None and has_curve:
+        # Noise may give a curve that falls at some command, which no rotor has.
+        quadratic = float(np.clip(mass * measured.value, 0.0, slope / (2 * hover)))
     # The curve is T(u) = offset + linear u + quadratic u^2.
     curve = {}
-    if factor == 1 and "thrust_quadratic" not in estimates:
+    if factor == 1 and not has_curve:
         # Of the thrust k_f span^2 (u + idle)^2 the value over the slope is (hover + idle) / 2. An idle
         # speed below zero would be a rotor that turns backwards.
         idle = max(2 * weight / slope - hover, 0.0)
@@ -159,12 +165,16 @@ def _model_numbers(
         k_f = slope / (2 * span**2 * (hover + idle))
         lowest = span * idle
     else:
-        linear = slope - 2 * quadratic * hover
+        linear = max(slope - 2 * quadratic * hover, 0.0)
         span, k_f = highest, quadratic / highest**2
         curve["thrust_linear"] = linear / highest, "N s/rad"
-        curve["thrust_offset"] = weight - (linear + quadratic * hover) * hover, "N"
-        # With a negative linear part the thrust rises from here on, beyond round-off.
-        lowest = 1.001 * max(-linear / (2 * quadratic), 0.0) * highest if quadratic else 0.0
+        if has_curve:
+            parts = (
+                estimates[f"thrust_{name}"].value for name in ("offset", "linear", "quadratic")
+            )
+            thrust = mass * float(np.polynomial.polynomial.polyval(hover, list(parts)))
+            curve["thrust_offset"] = thrust - (linear + quadratic * hover) * hover, "N"
+        lowest = 0.0
     text = f"slope of the thrust at the command {hover:.3g}, deviation {100 * relative:.2g} %"
     for name, (value, unit) in ({"k_f": (k_f, "N s^2/rad^2")} | curve).items():
         numbers[name] = _Number(value, unit, abs(value) * relative or None, f"{source}: {text}")
