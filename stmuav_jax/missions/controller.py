@@ -306,8 +306,8 @@ class MissionController(eqx.Module):
             share = jnp.where(t >= self.lost[:, fault], self.share[:, fault], share)
         rotors = share * inputs[:k]
         if self.rotors is not None:
-            kept = self.rotors.squared_speeds(share * self.rotors.thrusts(inputs[:k]))
-            rotors = jnp.where(share == 0, 0.0, jnp.where(share == 1, inputs[:k], kept))
+            weakened = self.rotors.squared_speeds(share * self.rotors.thrusts(inputs[:k]))
+            rotors = jnp.where(share == 0, 0.0, jnp.where(share == 1, inputs[:k], weakened))
         demanded_forces = inputs[k:]
         forces = jnp.clip(demanded_forces, -self.force, self.force)
         if self.jam is not None:

@@ -171,7 +171,7 @@ def load_mission(
     if true_states:
         content.pop("sensors", None)
     if truth:
-        content["truth"] = {**content.get("truth", {}), **truth}
+        content["truth"] = dict(content.get("truth", {})) | dict(truth)
     try:
         return make_mission(content, path.parent)
     except FileError:

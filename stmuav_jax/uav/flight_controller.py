@@ -468,7 +468,7 @@ class FlightController(eqx.Module):
         return self.rotors.thrusts(lower), self.rotors.thrusts(upper)
 
     def _allocated_to_working(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
-        """As `_allocate_wrench`, zero for lost rotors; whether they give thrust and tilt."""
+        """Squared speeds, or thrusts, those of lost rotors zero, and whether they give thrust and tilt."""
         places, count = jnp.array(self.working), self.wrenches.shape[1]
         lower, upper = (x[places] for x in self._bounds())
         u, is_attained = _allocate_tilt(self.inverse, wrench, lower, upper)
