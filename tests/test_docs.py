@@ -189,7 +189,7 @@ def test_links_lead_somewhere(page):
 TOML = {
     "control_and_missions": 1,
     "models": 3,
-    "multirotors": 3,
+    "multirotors": 4,
     "parameters": 1,
     "report_machine": 1,
     "studies": 2,

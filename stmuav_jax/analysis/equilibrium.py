@@ -33,6 +33,7 @@ from ..checks.numbers import array_module, as_floats, as_numpy, check_numbers
 from ..checks.shapes import Numbers
 from ..dynamics.actuation import (
     WEAK,
+    effort_unit,
     force_units,
     input_labels,
     input_scales,
@@ -429,8 +430,9 @@ def _check_efforts(problem: _Problem, efforts: Float[np.ndarray, " l"]) -> None:
             continue
         force: Any = problem.space.system.forces[k]
         limit = float(force.limit)
+        unit = effort_unit(problem.space.system, force.joint, force.coordinate)
         raise StateError(
-            f"The trim needs an effort of {ratio * limit:.6g} N or N m of the {type(force).__name__} in joint "
+            f"The trim needs an effort of {ratio * limit:.6g} {unit} of the {type(force).__name__} in joint "
             f"'{force.joint}', but its limit is {limit:.6g}: raise the limit, or choose another posture."
         )
 

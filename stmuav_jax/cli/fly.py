@@ -31,6 +31,8 @@ class Fly:
     t1: Annotated[float | None, END, shared_option("t1"), default_text("the mission's")] = None
     true_states: bool = False
     """Give the controller the true states in place of estimates from the mission's sensors."""
+    truth: Annotated[tuple[str, ...], default_text("the mission's")] = ()
+    """Numbers of the true machine that the controller does not know, such as bare.mass=2.9; names as in studies."""
     log: bool = False
     """Write log.csv too, the flight as its instruments and commands show it, which `identify` takes."""
     out: Annotated[Path | None, shared_option("out"), default_text("runs/MISSION")] = None
@@ -48,9 +50,13 @@ def run_fly(command: Fly) -> int:
     from ..missions.flight import fly
     from ..missions.mission import load_mission
     from ..missions.outcome import labelled_flight, verdict
+    from .models.point import scalars_by_name
 
     # All checks of a mission happen here, before the compilation.
-    mission = load_mission(command.mission, t1=command.t1, true_states=command.true_states)
+    mission = load_mission(
+        command.mission, t1=command.t1, true_states=command.true_states,
+        truth=scalars_by_name(command.truth, "--truth"),
+    )  # fmt: skip
     folder = results_folder(command.out, mission.file.name)
     name, end = mission.file.name, mission.file.t1
     with show_progress(f"{name}: compiling") as report:
@@ -92,6 +98,11 @@ def _print_flight(out: Console, data: Any, flight: "MissionFlight") -> None:
         allowed = "-" if measure.allowed is None else f"{measure.allowed:g}"
         mark = "" if measure.is_met else "  (not met)"
         add_row(measure_table, measure.name, measure.text, f"{allowed}{mark}")
+    for name, value in flight.mission.file.truth.items():
+        unit = flight.mission.table[name.partition("[")[0]].unit
+        add_row(
+            measure_table, f"True {name}, unknown to the controller", f"{value:.6g} {unit}", "-"
+        )
     certificate = flight.run.certificate
     seconds = f"{certificate.compile_seconds:.1f} s, {certificate.run_seconds:.1f} s"
     add_row(

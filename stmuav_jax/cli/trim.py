@@ -229,7 +229,7 @@ def rotor_speeds(
             continue
         force: Any = system.forces[entry.force]
         limits = force.limits if isinstance(force, MotorRotors) else None
-        thrust = float(force.rotors.k_f) * squared
+        thrust = float(force.rotors.thrusts(squared))
         highest = None if limits is None else float(np.asarray(limits.highest)[entry.place])
         speed = math.sqrt(squared)
         rotors[entry.name] = RotorSpeed(speed, thrust, None if highest is None else speed / highest)

@@ -91,6 +91,13 @@ def mechanism_weight(system: System) -> Float[Array, ""]:
     return jnp.sum(system.bodies.mass) * jnp.where(pull > 0, pull, STANDARD_GRAVITY)
 
 
+def effort_unit(system: System, joint_name: str, coordinate: str | None) -> str:
+    """Unit of an effort on a joint's coordinate, or on its only one: "N" or "N m"."""
+    coordinates = dict(coordinates_of(system.joints[system.joint_index(joint_name)].kind))
+    chosen = coordinates.get(coordinate or "", next(iter(coordinates.values()), ""))
+    return "N" if chosen == "m" else "N m"
+
+
 def force_units(system: System, inputs: Inputs) -> tuple[str, ...]:
     """Unit of each input: "N", "N m", or "" for another one, such as a servo's target."""
     units = []
@@ -98,9 +105,7 @@ def force_units(system: System, inputs: Inputs) -> tuple[str, ...]:
         unit = entry.unit
         for name, coordinate in system.forces[entry.force].acts_on().coordinates:
             if unit == "N or N m":
-                coordinates = dict(coordinates_of(system.joints[system.joint_index(name)].kind))
-                chosen = coordinates.get(coordinate or "", next(iter(coordinates.values()), ""))
-                unit = "N" if chosen == "m" else "N m"
+                unit = effort_unit(system, name, coordinate)
         units.append(unit if unit in ("N", "N m") else "")
     return tuple(units)
 

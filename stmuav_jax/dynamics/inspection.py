@@ -260,8 +260,8 @@ def _check_posture(system: System, state: State, t: float, inputs: Inputs) -> li
         _catch_fault("posture", lambda: check_consistent(system, model, residuals, rates, most))
     )
     if not posture_faults and system.joints:
-        value = f"{np.max(np.abs(residuals)):.2g} m or rad, "
-        value += f"rates {np.max(np.abs(rates)):.2g} m/s or rad/s"
+        angular = np.asarray(model.constraints.angular)
+        value = f"{_largest_by_unit(residuals, angular)}; rates {_largest_by_unit(rates, angular, '/s')}"
         limits = f"at most {np.min(most[0]):.1g} and {np.min(most[1]):.1g}"
         findings.append(Finding("note", "largest residual of the constraints", value, limits))
     rank = rank_of(system, model, state, t, matrix)
@@ -341,11 +341,25 @@ def _check_conditions(
         )  # fmt: skip
 
 
+def _largest_by_unit(rows: np.ndarray, angular: np.ndarray, per: str = "") -> str:
+    """Largest of the rows that are lengths, and of those that are angles."""
+    parts = {"m": rows[~angular], "rad": rows[angular]}
+    return ", ".join(
+        f"{np.max(np.abs(part)):.2g} {unit}{per}" for unit, part in parts.items() if part.size
+    )
+
+
+def _unit_of(motion: np.ndarray) -> str:
+    """Unit of the largest component of a motion of all bodies, v and omega (6 n,)."""
+    return "m" if np.argmax(np.abs(motion)) % 6 < 3 else "rad"
+
+
 def _check_nearness(
     system: System, model: AugmentedModel, state: State, t: float, rank: Rank, free: np.ndarray
 ) -> Iterator[Finding]:
     """Findings on dependent rows and singular postures, from postures beside this one."""
     names, at, change = ", ".join(rank.redundant), rank.smallest_singular_value, 0.0
+    unit = ""
     if rank.dof:
         nearby_rows = _evaluate_neighbours(model, state, t, free)
         # a motion that is not along a branch of the mechanism finds no posture beside it
@@ -360,7 +374,11 @@ def _check_nearness(
             )  # fmt: skip
             return
         # one-sided differences, since a singular value has a kink where it is zero
-        change = float(np.max(np.abs(values[:, rank.rank - 1] - at), initial=0.0))
+        changes = np.abs(values[:, rank.rank - 1] - at)
+        change = float(np.max(changes, initial=0.0))
+        if changes.size:
+            place = int(np.flatnonzero(closed_mask)[np.argmax(changes)])
+            unit = _unit_of(free[:, place // 2])
     if rank.redundant:
         yield Finding(
             "note", "dependent constraints", f"{rank.rows - rank.rank} rows, among those of {names}",
@@ -376,20 +394,23 @@ def _check_nearness(
         _, joints = weakest_rows(system, model, state, t, rank.rank)
         yield Finding(
             "warning", "distance to a singular posture",
-            f"a movement of about {distance:.2g} m or rad",
-            f"above {_NEAR:g}; lead the motion around it. Its rows are those of {', '.join(joints)}",
+            _format_distance(distance, unit),
+            f"above {_NEAR:g} {unit}; lead the motion around it. Its rows are those of {', '.join(joints)}",
         )  # fmt: skip
     else:
         yield Finding(
-            "note", "distance to a singular posture", _format_distance(distance), f"above {_NEAR:g}"
+            "note",
+            "distance to a singular posture",
+            _format_distance(distance, unit),
+            f"above {_NEAR:g}",
         )
 
 
-def _format_distance(distance: float) -> str:
-    """Words for a distance that is extrapolated from the posture's neighbours."""
+def _format_distance(distance: float, unit: str) -> str:
+    """Words for a distance that is extrapolated from the posture's neighbours, by the largest part of their motion."""
     if distance > _FAR:
         return "none near: no singular value changes"
-    return f"a movement of about {distance:.2g} m or rad"
+    return f"a movement of about {distance:.2g} {unit}"
 
 
 def _check_actuation(system: System, state: State, t: float, inputs: Inputs) -> Iterator[Finding]:
@@ -417,8 +438,10 @@ def _check_actuation(system: System, state: State, t: float, inputs: Inputs) -> 
     steps[1::2, :dof] = _STEP * directions / reach[:, None]
     steps[2::2, :dof] = -steps[1::2, :dof]
     neighbours = evaluate()
-    yield from _check_direct(system, state, inputs, neighbours)
-    yield from _check_inverse(system, state, inputs, neighbours)
+    motions = start.velocities[0] @ directions.T
+    units = [_unit_of(motion) for motion in np.repeat(motions.T, 2, axis=0)]
+    yield from _check_direct(system, state, inputs, neighbours, units)
+    yield from _check_inverse(system, state, inputs, neighbours, units)
 
 
 def _scaled_forces(
@@ -435,17 +458,17 @@ def _scaled_forces(
 
 
 def _check_direct(
-    system: System, state: State, inputs: Inputs, neighbours: Actuation
+    system: System, state: State, inputs: Inputs, neighbours: Actuation, units: list[str]
 ) -> Iterator[Finding]:
     """Findings on motions that the inputs do not hold."""
     scaled, in_weights = _scaled_forces(system, inputs, neighbours)
-    nearness = _extrapolate_rank(scaled)
+    nearness = _extrapolate_rank(scaled, units)
     if nearness is None:
         return
-    rank, sigma, distance = nearness
+    rank, sigma, distance, unit = nearness
     if not (distance < _NEAR or (sigma < WEAK and in_weights)):
         yield Finding(
-            "note", "distance to a singular posture of the inputs", _format_distance(distance),
+            "note", "distance to a singular posture of the inputs", _format_distance(distance, unit),
             f"above {_NEAR:g}; smallest singular value {sigma:.2g}",
         )  # fmt: skip
         return
@@ -457,15 +480,15 @@ def _check_direct(
     acting = names_of_largest(input_labels(system, inputs), column_vectors[weak].T)
     yield Finding(
         "warning", "singular posture of the inputs",
-        f"a movement of about {distance:.2g} m or rad; smallest singular value {sigma:.2g}",
-        f"above {_NEAR:g} m or rad and {WEAK:g}; direct singularity (type 2): the inputs "
+        f"{_format_distance(distance, unit)}; smallest singular value {sigma:.2g}",
+        f"above {_NEAR:g} {unit} and {WEAK:g}; direct singularity (type 2): the inputs "
         f"{', '.join(acting)} hardly hold the motion of the joints {', '.join(moving)}"
         + ("" if in_weights else "; inputs that are no forces are scaled to their largest effect"),
     )  # fmt: skip
 
 
 def _check_inverse(
-    system: System, state: State, inputs: Inputs, neighbours: Actuation
+    system: System, state: State, inputs: Inputs, neighbours: Actuation, units: list[str]
 ) -> Iterator[Finding]:
     """Findings on bodies of the most freedom, such as a platform, that lose a direction of motion."""
     size = float(neighbours.size[0])
@@ -473,7 +496,8 @@ def _check_inverse(
     metric = np.repeat([1.0, size], 3)[:, None]
     rows = np.split(np.asarray(neighbours.motions), len(system.names), axis=1)
     nearness = {
-        name: _extrapolate_rank(V * metric) for name, V in zip(system.names, rows, strict=True)
+        name: _extrapolate_rank(V * metric, units)
+        for name, V in zip(system.names, rows, strict=True)
     }
     freedom = max((measure[0] for measure in nearness.values() if measure), default=0)
     resting = {
@@ -496,24 +520,35 @@ def _check_inverse(
     )
     yield Finding(
         "note", "dead centre",
-        f"a movement of about {resting[first][2]:.2g} m or rad, of {', '.join(resting)}",
+        f"{_format_distance(*resting[first][2:])}, of {', '.join(resting)}",
         "inverse singularity (type 1): a direction of motion is lost, while the inputs "
         f"{', '.join(acting)} and the joints {', '.join(moving)} move",
     )  # fmt: skip
 
 
-def _extrapolate_rank(matrices: np.ndarray) -> tuple[int, float, float] | None:
-    """Rank beside the first of some matrices, its singular value of that place, and the distance to zero.
+def _extrapolate_rank(
+    matrices: np.ndarray, units: list[str]
+) -> tuple[int, float, float, str] | None:
+    """Rank beside the first of some matrices, its singular value of that place, the distance to zero and its unit.
 
     None where all vanish. Matrices that are not finite, of loops that do not close, are left out.
+
+    Args:
+        units: units of the steps to the others.
     """
-    values = np.linalg.svd(matrices[np.isfinite(matrices).all(axis=(1, 2))], compute_uv=False)
+    is_finite = np.isfinite(matrices).all(axis=(1, 2))
+    values = np.linalg.svd(matrices[is_finite], compute_uv=False)
     rank = int(np.max(np.sum(values > _GAINED * np.max(values, initial=0.0), axis=1), initial=0))
     if not rank:
         return None
     sigma = float(values[0, rank - 1])
-    change = float(np.max(np.abs(values[1:, rank - 1] - sigma), initial=0.0))
-    return rank, sigma, sigma * _STEP / change if change > 0 else np.inf
+    changes = np.abs(values[1:, rank - 1] - sigma)
+    change = float(np.max(changes, initial=0.0))
+    if not change > 0:
+        return rank, sigma, np.inf, ""
+    places = np.flatnonzero(is_finite)[1:] - 1
+    unit = units[int(places[np.argmax(changes)])]
+    return rank, sigma, sigma * _STEP / change, unit
 
 
 def _evaluate_neighbours(model: AugmentedModel, state: State, t: float, free: np.ndarray) -> RowsAt:

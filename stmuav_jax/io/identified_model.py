@@ -1,9 +1,11 @@
 """Model, mission and study of the multirotor that a flight has identified.
 
-A rotor's speed is omega = lowest + (highest - lowest) u by its command u, and its thrust k_f omega^2 agrees
-with the identified one in value and slope at the mean command of the flight.
+A rotor's speed is omega = lowest + (highest - lowest) u by its command u, and its thrust agrees with the
+identified one in value and slope at the mean command of the flight, and in curvature where the flight or
+the airframe's file has one; else it is k_f omega^2.
 """
 
+import itertools
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +26,9 @@ _FIRST, _STEP, _COUNT = 1.0, 0.3, 107
 # Largest share of the usual frequencies of the flight controller, and lag and delay by which it is that of a stable
 # loop [s].
 _SHARE, _SLOW_LAG, _SLOW_DELAY = 0.7, 0.045, 0.0056
+# Coefficients of the curves of thrust and of torque.
+_THRUST = ("k_f", "thrust_linear", "thrust_offset")
+_TORQUE = ("k_tau", "torque_linear", "torque_offset")
 # Largest correlation of factors.
 _CORRELATED = 0.99
 
@@ -136,31 +141,61 @@ def _model_numbers(
         slope = 2 * hover * force.value
     else:
         slope = (1 - factor + 2 * factor * hover) * force.value
-    # Of the thrust k_f span^2 (u + idle)^2 the value over the slope is (hover + idle) / 2. An idle
-    # speed below zero would be a rotor that turns backwards.
-    idle = max(2 * weight / slope - hover, 0.0)
-    span = layout.highest_speed / (1 + idle)
-    k_f = slope / (2 * span**2 * (hover + idle))
-    relative = 0.0 if force is None else force.deviation / force.value
-    numbers["k_f"] = _Number(
-        k_f, "N s^2/rad^2", k_f * relative or None,
-        f"{source}: slope of the thrust at the command {hover:.3g}, deviation {100 * relative:.2g} %",
-    )  # fmt: skip
+    highest, relative = (
+        layout.highest_speed,
+        0.0 if force is None else force.deviation / force.value,
+    )
+    # curvature of the thrust by the command, halved, of the layout's shape; within two deviations of it another one
+    # is not told from it
+    quadratic = slope / (1 - factor + 2 * factor * hover) * factor
+    measured = estimates.get("thrust_quadratic")
+    has_curve = measured is not None and (
+        abs(measured.value - quadratic / mass) > 2 * measured.deviation
+    )
+    if measured is not None and has_curve:
+        # Noise may give a curve that falls at some command, which no rotor has.
+        quadratic = float(np.clip(mass * measured.value, 0.0, slope / (2 * hover)))
+    # The curve is T(u) = offset + linear u + quadratic u^2.
+    curve = {}
+    if factor == 1 and not has_curve:
+        # Of the thrust k_f span^2 (u + idle)^2 the value over the slope is (hover + idle) / 2. An idle
+        # speed below zero would be a rotor that turns backwards.
+        idle = max(2 * weight / slope - hover, 0.0)
+        span = highest / (1 + idle)
+        k_f = slope / (2 * span**2 * (hover + idle))
+        lowest = span * idle
+    else:
+        linear = max(slope - 2 * quadratic * hover, 0.0)
+        span, k_f = highest, quadratic / highest**2
+        curve["thrust_linear"] = linear / highest, "N s/rad"
+        if has_curve:
+            parts = (
+                estimates[f"thrust_{name}"].value for name in ("offset", "linear", "quadratic")
+            )
+            thrust = mass * float(np.polynomial.polynomial.polyval(hover, list(parts)))
+            curve["thrust_offset"] = thrust - (linear + quadratic * hover) * hover, "N"
+        lowest = 0.0
+    text = f"slope of the thrust at the command {hover:.3g}, deviation {100 * relative:.2g} %"
+    for name, (value, unit) in ({"k_f": (k_f, "N s^2/rad^2")} | curve).items():
+        numbers[name] = _Number(value, unit, abs(value) * relative or None, f"{source}: {text}")
     origin = "value and slope of the thrust at the mean command"
-    numbers["lowest"] = _Number(float(span * idle), "rad/s", None, origin)
+    numbers["lowest"] = _Number(float(lowest), "rad/s", None, origin)
     add("highest", layout.highest_speed, "rad/s", None)
     for axis, name in enumerate("xyz"):
         e = estimates.get(f"inertia_{name}")
         value = e.value if e else layout.inertia[axis]  # pyright: ignore[reportOptionalSubscript]
         add(f"inertia_{name}", value, "kg m^2", e)
     Jz, yaw = numbers["inertia_z"].value, estimates.get("yaw")
-    if yaw is None:
-        add("k_tau", layout.torque_ratio * k_f, "N m s^2/rad^2", None)  # pyright: ignore
-    else:
-        # torque and thrust of a rotor have the same shape
-        per_shape = slope / (1 - factor + 2 * factor * hover)
-        scale = Jz * k_f / per_shape
-        add("k_tau", yaw.value * scale, "N m s^2/rad^2", yaw, scale)
+    # torque and thrust of a rotor have the same shape
+    per_shape = slope / (1 - factor + 2 * factor * hover)
+    for name in ("k_f", *curve):
+        torque, unit = name.replace("thrust", "torque").replace("k_f", "k_tau"), numbers[name].unit
+        value, unit = numbers[name].value, unit.replace("N", "N m")
+        if yaw is None:
+            add(torque, layout.torque_ratio * value, unit, None)  # pyright: ignore
+        else:
+            scale = Jz * value / per_shape
+            add(torque, yaw.value * scale, unit, yaw, scale)
     spin_up = estimates.get("spin_up")
     # Within two deviations of zero, an inertia of the rotors is not told from none.
     if spin_up is not None and spin_up.value > 2 * spin_up.deviation:
@@ -232,7 +267,8 @@ def _model(
     centre = [f"centre_{x}" for x in "xyz"]
     motors = {
         "kind": "motors", "body": "frame", "arms": layout.positions.tolist(), "spin": layout.spin.tolist(),
-        "k_f": "k_f", "k_tau": "k_tau", "time_constant": "time_constant", "lowest": "lowest", "highest": "highest",
+        "time_constant": "time_constant", "lowest": "lowest", "highest": "highest",
+        **{name: name for name in (*_THRUST, *_TORQUE) if name in numbers},
     }  # fmt: skip
     if "rotor_inertia" in numbers:
         motors["inertia"] = "rotor_inertia"
@@ -299,11 +335,18 @@ def _study(
     }
     # J = F l / B: the thrust's error is that of both moments, and the lag's error that of both B
     square = lambda name: (numbers[name].deviation / numbers[name].value) ** 2  # pyright: ignore
-    pairs = [("k_f", name) for name in ("inertia_x", "inertia_y")]
+    sign = lambda *names: float(np.prod([np.sign(numbers[name].value) for name in names]))
+    thrust, torque = ([name for name in names if name in factors] for names in (_THRUST, _TORQUE))
+    # One scale is unknown, that of the whole curve.
     correlation = [
-        [*pair, float(np.sqrt(square(pair[0]) / square(pair[1])))]
-        for pair in pairs
-        if set(pair) <= set(factors)
+        [a, b, sign(a, b)]
+        for group in (thrust, torque)
+        for a, b in itertools.combinations(group, 2)
+    ]
+    correlation += [
+        [a, b, sign(a) * float(np.sqrt(square(a) / square(b)))]
+        for a, b in itertools.product(thrust, ("inertia_x", "inertia_y"))
+        if b in factors
     ]
     ratio = result.estimates.get("inertia_ratio")
     if ratio is not None and {"inertia_x", "inertia_y"} <= set(factors):

@@ -128,6 +128,10 @@ class Robot:
         del table
         return self.scene.system
 
+    def used_parameters(self) -> frozenset[str]:
+        """No names."""
+        return frozenset()
+
     def of_start(self) -> frozenset[str]:
         """No names."""
         return frozenset()

@@ -10,11 +10,14 @@ import operator
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
+import equinox as eqx
+import numpy as np
 import pydantic
 from pydantic import AfterValidator, Field
 
 from ..analysis.sensors import SENSORS
 from ..checks.errors import SettingError, has_values, nearest_names
+from ..checks.numbers import as_floats
 from ..checks.schema import (
     SHOWN,
     Count,
@@ -37,7 +40,7 @@ from ..mechanics.parameters import Parameter
 from ..uav.allocation import RotorLimits
 from ..uav.drag import AirframeDrag
 from ..uav.motor import MotorRotors
-from ..uav.rotor import Rotors, hover_speed_squared, rotor_layout
+from ..uav.rotor import Rotors, fit_rotor_curves, rotor_layout
 from .air_entries import BatteryEntry, WindEntry
 
 # Formats that are read; the second has what `SECOND` names.
@@ -217,10 +220,12 @@ def _make_rotors(
     layout: Any = "x",
     coaxial: Any = None,
     height: Any = 0.0,
-    k_f: Any,
-    k_tau: Any,
+    k_f: Any = None,
+    k_tau: Any = None,
+    points: Any = None,
     speed_squared: Any = None,
     carried: Any = None,
+    **curves: Any,
 ) -> Rotors:
     """Rotors at places of their own, or of a layout; without speeds they hover with mass and gravity `carried`."""
     if (arms is None) != (spin is None) or (arms is None) == (number is None):
@@ -231,10 +236,19 @@ def _make_rotors(
         if radius is None:
             raise SettingError("A layout of rotors needs 'radius', the length of its arms.")
         arms, spin = rotor_layout(number, radius, layout=layout, coaxial=coaxial, height=height)
+    coefficients = {"k_f": k_f, "k_tau": k_tau, **curves}
+    if points is not None:
+        if any(value is not None for value in coefficients.values()):
+            raise SettingError(
+                "Rotors have either 'points' of a test stand or coefficients such as 'k_f', and not both."
+            )
+        coefficients = fit_rotor_curves(points)
+    elif k_f is None or k_tau is None:
+        raise SettingError("Rotors need 'k_f' and 'k_tau', or 'points' of a test stand.")
+    rotors = Rotors(body, arms=arms, spin=spin, **coefficients, speed_squared=np.zeros(len(spin)))
     if speed_squared is None:
-        mass, gravity = carried
-        speed_squared = hover_speed_squared(mass, gravity, k_f, len(spin))
-    return Rotors(body, arms=arms, spin=spin, k_f=k_f, k_tau=k_tau, speed_squared=speed_squared)
+        speed_squared = rotors.hover(*carried)
+    return eqx.tree_at(lambda r: r.speed_squared, rotors, as_floats(speed_squared))
 
 
 def _make_motors(
@@ -268,7 +282,10 @@ _ROTORS = {
     "arms": Entry(Triples, "m", needed=False), "spin": Entry(Several, "1", needed=False),
     "number": Entry(Count, needed=False), "radius": _LENGTH,
     "layout": Entry(Literal["x", "plus"], needed=False), "coaxial": _LENGTH, "height": _LENGTH,
-    "k_f": Entry(Finite, "N s^2/rad^2"), "k_tau": Entry(Finite, "N m s^2/rad^2"),
+    "k_f": Entry(Finite, "N s^2/rad^2", needed=False), "k_tau": Entry(Finite, "N m s^2/rad^2", needed=False),
+    "thrust_linear": Entry(Finite, "N s/rad", needed=False), "thrust_offset": Entry(Finite, "N", needed=False),
+    "torque_linear": Entry(Finite, "N m s/rad", needed=False), "torque_offset": Entry(Finite, "N m", needed=False),
+    "points": Entry(Triples, needed=False),
     "speed_squared": Entry(Several, "rad^2/s^2", needed=False),
 }  # fmt: skip
 # Kinds of sets of rotors.

@@ -141,7 +141,7 @@ def rotor_table(system: System, saved: Saved, held_inputs: Held | None = None) -
         return {}
     squared = [_squared_speeds(k, system, saved, held_inputs) for k in range(len(sets))]
     plain = [rotors for _, rotors in sets]
-    thrust = [np.asarray(rotors.k_f) * u for rotors, u in zip(plain, squared, strict=True)]
+    thrust = [np.asarray(rotors.thrusts(u)) for rotors, u in zip(plain, squared, strict=True)]
     over_time = ("time", "rotor")
     joined = lambda parts, axis=0: np.concatenate([np.asarray(x) for x in parts], axis=axis)
     return {

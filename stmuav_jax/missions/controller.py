@@ -19,6 +19,7 @@ from ..uav.adaptation import AdaptiveController, AdaptiveMemory
 from ..uav.flight_controller import FlightController, FlightMemory, UavController, UavReference
 from ..uav.joint_controller import JointController, JointMotions, JointReference
 from ..uav.panel_servo import panel_motion
+from ..uav.rotor import Rotors
 from ..uav.tracker.geometry import TrackerGeometry
 from ..uav.tracker.kinematics import PairMotion, panel_angles, stroke_motion
 
@@ -261,6 +262,7 @@ class MissionController(eqx.Module):
         lost: rising times of the faults of each rotor (k, f) [s], infinite for none.
         share: share of its thrust that it keeps from each on (k, f).
         jam: faults of the sliders, or None.
+        rotors: rotors with curves, of whose thrust a share is kept; None for a share of the squared speed.
         force: largest force of each actuator of the tracker, or effort of each driven joint of a model,
             either way (a,) [N] or [N m], infinite for no limit.
     """
@@ -270,6 +272,7 @@ class MissionController(eqx.Module):
     share: Float[Array, "k f"]
     jam: Jam | None
     force: Float[Array, " a"]
+    rotors: Rotors | None = None
     pilot_changes: tuple[PilotChange, ...] = ()
 
     def start(self) -> MissionMemory:
@@ -302,6 +305,9 @@ class MissionController(eqx.Module):
         for fault in range(faults):
             share = jnp.where(t >= self.lost[:, fault], self.share[:, fault], share)
         rotors = share * inputs[:k]
+        if self.rotors is not None:
+            weakened = self.rotors.squared_speeds(share * self.rotors.thrusts(inputs[:k]))
+            rotors = jnp.where(share == 0, 0.0, jnp.where(share == 1, inputs[:k], weakened))
         demanded_forces = inputs[k:]
         forces = jnp.clip(demanded_forces, -self.force, self.force)
         if self.jam is not None:

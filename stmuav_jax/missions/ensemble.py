@@ -18,32 +18,25 @@ from jaxtyping import Array, Float
 
 from ..checks.errors import SettingError
 from ..checks.numbers import as_floats
-from ..checks.schema import SHOWN, quote_name, validate_model
+from ..checks.schema import validate_model
 from ..control.closed_loop import LoopReason, Rollout, rollout
-from ..control.plant import Plant, PlantState
-from ..dynamics.simulation import Scene
-from ..mechanics.parameters import Parameter, Parameters
+from ..control.plant import PlantState
+from ..mechanics.parameters import Parameters
 from ..studies.columns import FINE, Column, column_name
 from ..studies.disturbed_flights import (
-    FactorTarget,
     digest_table,
     drawn_table,
     factor_columns,
     is_possible,
-    suggest_names,
-    table_entry,
 )
 from ..studies.study import Study
 from ..studies.study_file import check_study, factors_of, study_settings
-from ..uav.allocation import RotorLimits
-from ..uav.motor import MotorRotors, only_rotors
 from .controller import AT_ONCE
-from .machine import Machine, input_names, scene_of
+from .flight import drain_samples
 from .mission import Mission, load_mission, make_mission
 from .outcome import AT_LIMIT, list_unreached
-from .payloads import Payloads
 from .schema import MissionFile, MissionStudyFile
-from .signals import Gauges
+from .truth import Truth, find_target, make_truth
 
 # Flights side by side in one program, of which a sample always has the same place.
 LANES = 16
@@ -51,9 +44,6 @@ LANES = 16
 CHUNK = 1.0
 NOT_PHYSICAL = 2 + len(LoopReason)
 _DEGREE = np.pi / 180
-# Factors of these would be lengths on which loops, limits of strokes and controller agree.
-_FIXED = ("geometry.", "posture.", "mount.", "workspace.", "stop.", "spin.", "case_")
-_FREE = ("geometry.panel_com", "geometry.post_com", "geometry.rod_com")
 
 _QUANTITIES: dict[str, tuple[str, str]] = {
     "position_error": ("m", "largest position error"),
@@ -64,6 +54,7 @@ _QUANTITIES: dict[str, tuple[str, str]] = {
     "force_margin": ("1", "smallest margin of the actuators' forces, share of the range"),
     "effort_margin": ("1", "smallest margin of the joints' efforts, share of the range"),
     "energy": ("J", "electrical energy used"),
+    "state_of_charge": ("1", "state of charge of the battery at the end"),
     "kept": ("1", "whether all tolerances and limits were met"),
 }
 
@@ -71,11 +62,9 @@ _QUANTITIES: dict[str, tuple[str, str]] = {
 class _Nominal(NamedTuple):
     """Parts of the mission that all of its flights have, whose arrays are arguments of the program."""
 
-    plant: Plant
+    truth: Truth
     controller: Any
     references: Any
-    gauges: Gauges
-    speeds: Any
     limits: Any
 
 
@@ -86,7 +75,8 @@ class Worst(NamedTuple):
         position [m], tilt, panel [rad]: largest errors from the times of the tolerances on.
         joints: largest errors of the driven joints (n,) [rad] or [m].
         rotors, strokes, forces, efforts: smallest distances from the limits, as shares of the range.
-        energy: electrical energy used [J].
+        energy: electrical energy used [J]. charge: state of charge at the last sample [1].
+        next_charge: after it. is_drained: True once the battery is empty or asked for more than it can give.
         reason: code of `LoopReason`. end: time of the last valid sample [s].
     """
 
@@ -99,6 +89,9 @@ class Worst(NamedTuple):
     forces: Float[Array, ""]
     efforts: Float[Array, ""]
     energy: Float[Array, ""]
+    charge: Float[Array, ""]
+    next_charge: Float[Array, ""]
+    is_drained: Array
     reason: Array
     end: Float[Array, ""]
 
@@ -121,11 +114,10 @@ class MissionEvaluation(eqx.Module):
     def __init__(self, mission: Mission, relative: frozenset[str] = frozenset()) -> None:
         machine = mission.machine
         self.nominal = _Nominal(
-            mission.plant, mission.controller, mission.references, mission.gauges, machine.speeds,
-            machine.limits,
-        )  # fmt: skip
+            mission.truth, mission.controller, mission.references, machine.limits
+        )
         self.mission, self.relative = mission, relative
-        self.table = _factor_table(mission)
+        self.table = mission.table
 
     def __reduce__(self) -> Any:
         """State as entries of the mission's file, from which it is made again."""
@@ -148,7 +140,7 @@ class MissionEvaluation(eqx.Module):
         valid = possible & (worst.reason == LoopReason.VALID)
         hide = lambda x: jnp.where(valid, x, jnp.nan)
         joints = self.mission.machine.joints
-        values = worst.position, worst.tilt, worst.panel, *worst[4:9]
+        values = worst.position, worst.tilt, worst.panel, *worst[4:10]
         measures = dict(zip(_QUANTITIES, values, strict=False))
         measures |= {
             f"{column_name(drive.name)}_error": worst.joints[k] for k, drive in enumerate(joints)
@@ -163,7 +155,7 @@ class MissionEvaluation(eqx.Module):
         """True if a flight kept the tolerances and limits of the mission."""
         target = self.mission.file.tolerances
         margins = (worst.rotors, worst.strokes, worst.forces, worst.efforts)
-        is_compliant = jnp.min(jnp.stack(margins)) >= -AT_LIMIT
+        is_compliant = (jnp.min(jnp.stack(margins)) >= -AT_LIMIT) & ~worst.is_drained
         for k, drive in enumerate(self.mission.machine.joints):
             most = target.joints.get(drive.name, np.inf) * (_DEGREE if drive.unit == "rad" else 1.0)
             is_compliant &= worst.joints[k] <= most
@@ -174,22 +166,10 @@ class MissionEvaluation(eqx.Module):
 
     def _fly(self, table: Parameters, key: Array) -> Worst:
         """Largest errors and smallest margins of one flight, by the numbers of a table."""
-        of, mission, seeds = self.nominal, self.mission, jax.random.key_data(key)
-        scene = scene_of(mission.file, table, seeds[0], mission.machine.model)
-        payloads = of.gauges.payloads
-        if payloads is not None:
-            masses = [table.value(f"payload_{k + 1}.mass") for k in range(len(payloads.bodies))]
-            payloads = eqx.tree_at(lambda p: p.mass, payloads, as_floats(masses))
-        plant = _plant_of(of.plant, mission.machine, scene, payloads)
-        of = of._replace(speeds=_narrow_limits(of.speeds, scene))
-        gauges = eqx.tree_at(
-            lambda g: (g.k_tau, g.payloads),
-            of.gauges,
-            (only_rotors(scene.system, "A mission").rotors.k_tau, payloads),
-            is_leaf=lambda x: x is None,
-        )
-        if gauges.jointed is not None:
-            gauges = eqx.tree_at(lambda g: g.jointed, gauges, plant.system)
+        mission, seeds = self.mission, jax.random.key_data(key)
+        truth = make_truth(mission.file, mission.machine, self.nominal.truth, table, seeds[0])
+        of = self.nominal._replace(truth=truth)
+        plant, gauges = truth.plant, truth.gauges
         # Worst values are joined chunk by chunk: rows of whole flights, of all lanes, would not
         # fit in memory. The last chunk goes beyond the end by less than one sample per chunk.
         chunks = -(-mission.samples // max(round(CHUNK * plant.rate), 2))
@@ -210,7 +190,10 @@ class MissionEvaluation(eqx.Module):
         zero, top = jnp.zeros(()), jnp.ones(())
         reason = jnp.zeros((), jnp.int8)
         joints = jnp.zeros(len(mission.machine.joints))
-        initial_worst = Worst(zero, zero, zero, joints, top, top, top, top, zero, reason, zero)
+        charge = top if truth.battery is None else truth.battery.charge
+        initial_worst = Worst(
+            zero, zero, zero, joints, top, top, top, top, zero, charge, charge, jnp.zeros((), bool), reason, zero
+        )  # fmt: skip
         start = plant.reset(jax.random.key(seeds[1]))
         first = (start, jax.tree.map(jnp.asarray, of.controller.start()), initial_worst)
         (_, _, worst), _ = jax.lax.scan(fly_chunk, first, length=chunks)
@@ -241,36 +224,24 @@ def _check_judged(mission_file: MissionFile) -> None:
         )
 
 
-def _narrow_limits(speeds: RotorLimits | None, scene: Scene) -> RotorLimits | None:
-    """Limits of the rotor speeds within those of a scene's motors."""
-    limits = [f.limits for f in scene.system.forces if isinstance(f, MotorRotors)]
-    if speeds is None or not limits or limits[0] is None:
-        return speeds
-    return RotorLimits(
-        jnp.maximum(as_floats(speeds.lowest), as_floats(limits[0].lowest)),
-        jnp.minimum(as_floats(speeds.highest), as_floats(limits[0].highest)),
-    )
-
-
-def _plant_of(nominal: Plant, machine: Machine, scene: Scene, payloads: Payloads | None) -> Plant:
-    """Plant of another scene with the instruments, estimator and inputs of a mission's plant."""
-    rate, method = nominal.rate, nominal.motion.problem.method
-    scene = scene if payloads is None else payloads.load(scene)
-    changes = () if payloads is None else payloads.changes(scene.system)
-    plant = Plant(
-        scene, rate=rate, changes=changes, observe=nominal.observe, inputs=input_names(machine), before=nominal.before,
-        delay=nominal.late / rate, standing=nominal.stood / rate,
-        sensors=nominal.bench.instruments, estimator=nominal.estimator, memory=nominal.memory,
-        steps=nominal.motion.steps,
-    )  # fmt: skip
-    return plant.with_motions(lambda motion: motion.with_method(formulation=method.formulation))
-
-
 def _join_worst(mission: Mission, of: _Nominal, worst: Worst, chunk_rollout: Rollout) -> Worst:
     """Largest errors and smallest margins after further samples."""
     entries, gauges, ts = mission.file, chunk_rollout.signals["gauges"], chunk_rollout.ts
     target = entries.tolerances
     flight_mask = ts <= entries.t1 + AT_ONCE
+    charge, next_charge, is_drained = worst.charge, worst.next_charge, worst.is_drained
+    ends_here = jnp.zeros_like(flight_mask)
+    if of.truth.battery is not None:
+        battery, demand = of.truth.battery.battery, gauges["electric_power"]
+        charges, currents, _, next_charge = drain_samples(
+            battery, next_charge, demand, jnp.asarray(1.0 / mission.plant.rate)
+        )
+        is_over = (charges <= battery.reserve) | (jnp.isfinite(demand) & ~jnp.isfinite(currents))
+        # the sample at which the battery ends is the last of the flight
+        flight_mask &= (jnp.cumsum(is_over) - is_over == 0) & ~is_drained
+        ends_here = flight_mask & is_over
+        is_drained = is_drained | jnp.any(ends_here)
+        charge = jnp.minimum(charge, jnp.min(jnp.where(flight_mask, charges, 1.0)))
     base = flight_mask & (ts >= target.after - AT_ONCE)
     if "gear_load" in gauges:
         # as in a verdict, what the ground carries is not in flight
@@ -292,11 +263,15 @@ def _join_worst(mission: Mission, of: _Nominal, worst: Worst, chunk_rollout: Rol
     last = mission.samples - 1
     # Energy is a sum of rectangles, which begins at each sample: the last one begins none.
     power = jnp.where(
-        flight_mask & (ts < (last - 0.5) / mission.plant.rate), gauges["electric_power"], 0.0
+        flight_mask & ~ends_here & (ts < (last - 0.5) / mission.plant.rate),
+        gauges["electric_power"],
+        0.0,
     )
     rotors, strokes, forces = worst.rotors, worst.strokes, worst.forces
-    if of.speeds is not None:
-        low, high = (jnp.sqrt(x) for x in of.speeds.squared(mission.machine.rotors.spin.shape[0]))
+    if of.truth.speeds is not None:
+        low, high = (
+            jnp.sqrt(x) for x in of.truth.speeds.squared(mission.machine.rotors.spin.shape[0])
+        )
         # a rotor that has failed is within no limits
         counted = flight_mask[:, None] & (ts[:, None] < of.controller.lost[:, 0])
         rotors = jnp.minimum(rotors, _smallest_margin(gauges["rotor_speed"], low, high, counted))
@@ -316,7 +291,7 @@ def _join_worst(mission: Mission, of: _Nominal, worst: Worst, chunk_rollout: Rol
         counted = base[:, None]
         errors = jnp.where(counted, jnp.abs(gauges["joint_error"]), 0.0)
         joints = jnp.maximum(joints, jnp.max(errors, axis=0))
-        top = of.gauges.efforts
+        top = of.truth.gauges.efforts
         is_limited = np.isfinite(mission.machine.efforts)
         counted = flight_mask[:, None] & is_limited
         efforts = jnp.minimum(
@@ -329,7 +304,7 @@ def _join_worst(mission: Mission, of: _Nominal, worst: Worst, chunk_rollout: Rol
         jnp.maximum(worst.position, most(distances, base)),
         jnp.maximum(worst.tilt, most(gauges["tilt_error"], base)),
         panel_error, joints, rotors, strokes, forces, efforts,
-        worst.energy + jnp.sum(power) / mission.plant.rate, reason,
+        worst.energy + jnp.sum(power) / mission.plant.rate, charge, next_charge, is_drained, reason,
         jnp.maximum(worst.end, jnp.max(jnp.where(valid, ts, 0.0))),
     )  # fmt: skip
 
@@ -347,16 +322,6 @@ def _remake_evaluation(
         return MissionEvaluation(make_mission(entries, folder), relative)
 
 
-def _factor_table(mission: Mission) -> Parameters:
-    """Parameters of the mission's machine, and the masses of its payloads."""
-    table = mission.machine.table
-    payloads = {
-        f"payload_{k}.mass": Parameter(payload.mass, "kg", "the mission's payload")
-        for k, payload in enumerate(mission.file.payloads, 1)
-    }
-    return Parameters(table.name, {name: table[name] for name in table} | payloads)
-
-
 def make_mission_study(
     mission: Mission,
     factors: Mapping[str, Any],
@@ -368,34 +333,34 @@ def make_mission_study(
     """Study of a mission, flown by many machines, each in its own gusts and noise.
 
     Args:
-        mission: the mission, without a battery.
+        mission: the mission.
         factors: distributions by name: of lines of the parameter table of the scene or of the model's file, and
-            of the masses `payload_1.mass`, ... of the mission's payloads [kg].
+            of the masses `payload_1.mass`, ... of the mission's payloads [kg], and of `battery.capacity` [C],
+            `battery.resistance` [ohm] and `battery.state_of_charge` at the start [1].
         relative: names of factors that multiply the mission's value.
         lanes: flights computed together, default 16 on any device.
         settings: samples, seed, design, name and others of `stmuav_jax.Study`.
 
     Raises:
-        SettingError: a mission with a battery, entries that its flights do not come to,
-            factors that are unknown, lengths, or of no effect.
+        SettingError: entries that its flights do not come to, factors that are unknown, lengths, or of no effect.
     """
-    if mission.battery is not None:
-        raise SettingError("A study of a mission has no battery: leave [battery] out.")
     _check_judged(mission.file)
     evaluation = MissionEvaluation(mission, relative)
     model = mission.machine.model
     loop_reasons = {
         1 + int(reason): reason.label for reason in LoopReason if reason != LoopReason.VALID
     }
-    quantities = _list_quantities(mission.machine)
-    find_target = lambda factor: _find_target(evaluation, factor)
+    quantities = _list_quantities(mission)
+    target_of = lambda factor: find_target(
+        evaluation.table, mission.machine, factor, factor in relative
+    )
     columns = {
         name: Column("int8" if name == "kept" else "float64", unit, description)
         for name, (unit, description) in quantities.items()
     }
     columns["end"] = Column("float64", "s", "last time with valid numbers", "diagnostic")
     columns["status"] = Column("int8", "1", "how the flight ended", "status")
-    columns = factor_columns(factors, find_target, relative, columns)
+    columns = factor_columns(factors, target_of, relative, columns)
     return Study(
         evaluation, factors, columns=columns,
         reasons=loop_reasons | {NOT_PHYSICAL: "masses or inertias that no body can have"},
@@ -434,9 +399,11 @@ def load_mission_study(
     )
 
 
-def _list_quantities(machine: Machine) -> dict[str, tuple[str, str]]:
-    """Units and descriptions of the quantities that a machine's flights have."""
-    none = set()
+def _list_quantities(mission: Mission) -> dict[str, tuple[str, str]]:
+    """Units and descriptions of the quantities that a mission's flights have."""
+    machine, none = mission.machine, set()
+    if mission.battery is None:
+        none |= {"state_of_charge"}
     if machine.bodies is None:
         none |= {"panel_error", "stroke_margin"}
     if machine.speeds is None:
@@ -450,34 +417,3 @@ def _list_quantities(machine: Machine) -> dict[str, tuple[str, str]]:
         for drive in machine.joints
     }
     return {name: _QUANTITIES[name] for name in _QUANTITIES if name not in none} | of_joints
-
-
-def _find_target(evaluation: MissionEvaluation, factor: str) -> FactorTarget:
-    """Target of a factor, which the mission's machine uses."""
-    table, machine = evaluation.table, evaluation.mission.machine
-    unknown = lambda: (
-        f"is no parameter of {machine.scene.name}."
-        f"{suggest_names(factor.partition('[')[0][:SHOWN], list(table))}"
-    )
-    target = table_entry(table, factor, factor in evaluation.relative, unknown)
-    if target.name in machine.table:
-        _check_effect(machine, factor, target.name)
-    return target
-
-
-def _check_effect(machine: Machine, factor: str, name: str) -> None:
-    """Raise `SettingError` for a factor that no flight of the machine would have, or not rightly."""
-    scene, model = machine.scene, machine.model
-    if model is None and name.startswith(_FIXED) and name not in _FREE:
-        raise SettingError(
-            f"{quote_name(factor)} can be no factor of a mission's study: loops and limits of strokes "
-            "are those of the mission's machine. Masses, inertias, centres of mass, rotors, "
-            "drag and motors can be."
-        )
-    line = scene.parameters.get(name)
-    if (line is None) if model is None else (name not in model.used_parameters()):
-        raise SettingError(
-            f"{quote_name(factor)} has no effect on this mission: its machine does not use it."
-        )
-    if model is None and line != machine.table[name].plain():
-        raise SettingError(f"'{name}' is given by the mission's options: it can be no factor.")

@@ -60,8 +60,8 @@ class MissionFlight:
 
 def start_of(mission: Mission) -> FlightProgress:
     """Flight that has not begun."""
-    battery = mission.file.battery
-    return FlightProgress(None, 1.0 if battery is None else battery.state_of_charge, (0.0, 0.0))
+    battery = mission.truth.battery
+    return FlightProgress(None, 1.0 if battery is None else float(battery.charge), (0.0, 0.0))
 
 
 def fly(
@@ -238,7 +238,7 @@ def _join_rows(before: Rollout | None, after: Rollout) -> Rollout:
     return _replace_rows(after, **both)
 
 
-def _drain_samples(
+def drain_samples(
     battery: Battery, soc: Float[Array, ""], power: Float[Array, " k"], period: Float[Array, ""]
 ) -> tuple[Array, Array, Array, Array]:
     """State of charge, current and voltage at each sample, and the state of charge after the last.
@@ -269,7 +269,7 @@ def _discharge_battery(battery: Battery, soc: float, rows: Rollout, rate: float)
     power = jnp.asarray(rows.signals["electric_power"])
     arguments = (battery, jnp.asarray(soc), power, jnp.asarray(1.0 / rate))
     socs, currents, voltages, last = (
-        np.asarray(x) for x in cached_program(_drain_samples, *arguments)(*arguments)
+        np.asarray(x) for x in cached_program(drain_samples, *arguments)(*arguments)
     )
     signals = {"state_of_charge": socs, "battery_current": currents, "battery_voltage": voltages}
     empty = socs <= float(battery.reserve)

@@ -37,7 +37,7 @@ from ..uav.joint_controller import DrivenJoint, JointController, JointGains, dri
 from ..uav.motion_estimator import MotionEstimator
 from ..uav.motor import MotorRotors, only_rotors
 from ..uav.panel_servo import PanelBodies, PanelServo, StrokeServo, panel_bodies
-from ..uav.rotor import Rotors, hover_speed_squared
+from ..uav.rotor import Rotors
 from ..uav.scenes.registry import entry_of, make_scene, options_from_plain
 from ..uav.tracker.bodies import SLIDER_JOINTS, LinearActuator
 from ..uav.tracker.geometry import tracker_geometry
@@ -378,7 +378,7 @@ def plant_of(mission_file: MissionFile, machine: Machine) -> Plant:
         machine.rotors.spin.shape[0],
         float(np.sum(np.asarray(nominal_system.bodies.mass))),
     )
-    hover = hover_speed_squared(mass, gravity_of(system), machine.rotors.k_f, count)
+    hover = machine.rotors.hover(mass, gravity_of(system))
     rest = (
         inputs_of(system, names).values(system)[count:]
         if machine.joints
@@ -709,4 +709,5 @@ def _add_faults(entries: MissionFile, machine: Machine, pilot: Any) -> MissionCo
         for drive, x in zip(machine.joints, machine.efforts, strict=True)
     ]
     force = as_floats(np.full(2, most_force) if machine.bodies is not None else np.array(of_joints))
-    return MissionController(pilot, as_floats(lost), as_floats(share), jam, force)
+    rotors = machine.rotors if machine.rotors.has_curves else None
+    return MissionController(pilot, as_floats(lost), as_floats(share), jam, force, rotors)

@@ -29,6 +29,7 @@ from ..math.derivative import motion_along
 from ..math.rotation import rotation_matrix
 from ..math.sampled import Sampled
 from ..mechanics.forces import GroundContact
+from ..mechanics.parameters import Parameters
 from ..mechanics.state import State
 from ..uav.adaptation import AdaptiveController
 from ..uav.airframe import ENERGY
@@ -68,6 +69,7 @@ from .machine import (
 )
 from .schema import MissionFile, MoveEntry, PathEntry, SunEntry
 from .signals import Gauges
+from .truth import FlightBattery, Truth, make_truth, true_table, truth_table
 
 LIBRARY = Path(__file__).parent / "library"
 _DEGREE = math.pi / 180
@@ -87,22 +89,35 @@ class Mission:
 
     Attributes:
         file: its entries, with defaults filled in. machine: scene, rotors, tracker.
-        plant: sampled plant. controller: controller with faults. references: function of t [s].
-        gauges: function of a `Sample` that returns the signals.
-        battery: battery that ends the flight when it is empty, or None.
+        truth: plant, signals and battery, with the true numbers. table: these numbers.
+        controller: controller with faults. references: function of t [s].
         growth: factor by which small motions about hover grow in a second; up to 1 for a stable loop.
         folder: folder of the model's file.
     """
 
     file: MissionFile
     machine: Machine
-    plant: Plant
+    truth: Truth
+    table: Parameters
     controller: MissionController
     references: References
-    gauges: Gauges
-    battery: Battery | None
     growth: float = 0.0
     folder: Path = Path()
+
+    @property
+    def plant(self) -> Plant:
+        """Sampled plant."""
+        return self.truth.plant
+
+    @property
+    def gauges(self) -> Gauges:
+        """Function of a `Sample` that returns the signals."""
+        return self.truth.gauges
+
+    @property
+    def battery(self) -> Battery | None:
+        """Battery that ends the flight when it is empty, or None."""
+        return None if self.truth.battery is None else self.truth.battery.battery
 
     @property
     def samples(self) -> int:
@@ -116,13 +131,19 @@ def mission_names() -> tuple[str, ...]:
 
 
 def load_mission(
-    source: str | os.PathLike[str], *, t1: float | None = None, true_states: bool = False
+    source: str | os.PathLike[str],
+    *,
+    t1: float | None = None,
+    true_states: bool = False,
+    truth: Mapping[str, float] | None = None,
 ) -> Mission:
     """Mission from a TOML file, or one of `mission_names` by name.
 
     Args:
         t1: end of the flight [s] in place of the file's.
         true_states: leave the mission's sensors out, so that the controller knows the true states.
+        truth: numbers of the true machine, of which the controller does not know, beside the file's `truth`:
+            by the names that factors of a mission's study have.
 
     Raises:
         FileError: the file is missing or not valid TOML; an entry is unknown, missing or out of
@@ -149,6 +170,8 @@ def load_mission(
         content["t1"] = t1
     if true_states:
         content.pop("sensors", None)
+    if truth:
+        content["truth"] = dict(content.get("truth", {})) | dict(truth)
     try:
         return make_mission(content, path.parent)
     except FileError:
@@ -183,10 +206,14 @@ def make_mission(plain: Mapping[str, Any], folder: str | os.PathLike[str] = ".")
     plant = inspect_plant(plant_of(entries, machine))
     panel = _make_moves(entries, machine) if machine.bodies is not None else None
     _check_gear(entries, plant)
+    gauges = Gauges(machine, plant.system, payloads_of(entries, machine.scene))
+    believed, table = (
+        Truth(plant, gauges, machine.speeds, battery),
+        truth_table(entries, machine, battery),
+    )
     mission = Mission(
-        entries, machine, plant, controller_of(entries, machine, plant),
-        References(_make_path(entries.path, machine), panel, _joint_moves(entries, machine)),
-        Gauges(machine, plant.system, payloads_of(entries, machine.scene)), battery, folder=Path(folder),
+        entries, machine, believed, true_table(entries, machine, table), controller_of(entries, machine, plant),
+        References(_make_path(entries.path, machine), panel, _joint_moves(entries, machine)), folder=Path(folder),
     )  # fmt: skip
     assert mission.samples > 1
     # Checks go from cheap to expensive: the start, thrusts along the path, the linear loop, and
@@ -197,7 +224,11 @@ def make_mission(plain: Mapping[str, Any], folder: str | os.PathLike[str] = ".")
     if panel is not None:
         _check_panel(mission)
         check_forces(entries, machine, mission.references)
-    return mission
+    if not entries.truth:
+        return mission
+    # Checks are of the mission as the controller has it; from here on the truth flies.
+    truth = make_truth(entries, machine, believed, mission.table)
+    return dataclasses.replace(mission, truth=truth)
 
 
 def _check_moves(mission_file: MissionFile) -> None:
@@ -395,7 +426,9 @@ def _joint_moves(entries: MissionFile, machine: Machine) -> JointMoves | None:
     return JointMoves(tuple(moves))
 
 
-def _make_battery(entries: MissionFile, of_model: BatteryEntry | None = None) -> Battery | None:
+def _make_battery(
+    entries: MissionFile, of_model: BatteryEntry | None = None
+) -> FlightBattery | None:
     if entries.battery is None:
         return None
     battery_values = {} if of_model is None else of_model.model_dump(exclude_none=True)
@@ -409,7 +442,7 @@ def _make_battery(entries: MissionFile, of_model: BatteryEntry | None = None) ->
             f"'battery.state_of_charge' must be above its reserve of {reserve:g}, but it is {charge:g}: the "
             "battery would be empty at the start."
         )
-    return battery
+    return FlightBattery(battery, as_floats(charge))
 
 
 # Compiled once for all missions of a process.
@@ -447,7 +480,7 @@ def _check_thrust(mission: Mission) -> None:
     # could fly is refused.
     needed = mass * np.linalg.norm(a - gravity, axis=1)
     limits = speeds.squared(machine.rotors.spin.shape[0])
-    least, most = (float(machine.rotors.k_f) * float(np.sum(np.asarray(x))) for x in limits)
+    least, most = (float(jnp.sum(machine.rotors.thrusts(x))) for x in limits)
     beyond = (needed > most) | (needed < least)
     if np.any(beyond):
         k = int(np.argmax(beyond))

@@ -67,8 +67,9 @@ def labelled_flight(flight: MissionFlight) -> Labelled:
     )  # fmt: skip
     limits: dict[str, tuple[str, Any, str]] = {}
     names: dict[str, Any] = {"rotor": (("rotor",), np.arange(1, count + 1), {})}
-    if machine.speeds is not None:
-        low, high = (np.sqrt(np.asarray(x)) for x in machine.speeds.squared(count))
+    speeds = flight.mission.truth.speeds
+    if speeds is not None:
+        low, high = (np.sqrt(np.asarray(x)) for x in speeds.squared(count))
         limits |= {
             "lowest_speed": ("rotor", low, "rad/s"),
             "highest_speed": ("rotor", high, "rad/s"),
@@ -115,7 +116,7 @@ def to_flight_record(flight: MissionFlight) -> FlightRecord:
     """
     rollout, speeds, rotors = (
         flight.run.rollout,
-        flight.mission.machine.speeds,
+        flight.mission.truth.speeds,
         flight.mission.machine.rotors,
     )
     if "gyroscope" not in rollout.signals:

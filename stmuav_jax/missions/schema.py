@@ -270,6 +270,7 @@ class MissionFile(Entries):
     title: str = ""
     t1: Annotated[float, Field(gt=0, le=LONGEST)]
     machine: MachineEntry
+    truth: dict[str, Finite] = Field(default_factory=dict)
     rates: RatesEntry = RatesEntry()
     sensors: SensorsEntry | None = None
     controller: ControllerEntry = ControllerEntry()

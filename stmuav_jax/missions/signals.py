@@ -20,7 +20,7 @@ from ..uav.airframe import ENERGY
 from ..uav.joint_controller import DrivenJoint, joint_errors, read_joints
 from ..uav.motion_estimator import MotionEstimate
 from ..uav.panel_servo import PanelBodies, panel_motion
-from ..uav.rotor import drag_power
+from ..uav.rotor import Rotors
 from ..uav.tracker.kinematics import PairMotion, panel_normal, stroke_motion
 from .controller import MissionReference, compute_panel_reference
 from .machine import Machine
@@ -76,7 +76,7 @@ class Gauges(eqx.Module):
     """Function of a `Sample` that returns the signals of `GAUGES` that a machine has.
 
     Attributes:
-        k_tau: drag torque coefficient of the rotors [N m s^2/rad^2]. rotors: their number.
+        rotors: their curves.
         bodies: of the tracker, and home: strokes at the start (2,) [m]; None without a tracker.
         gravity: acceleration of free fall (3,) [m/s^2].
         efficiency: of the motors [1]. other: power of everything else [W].
@@ -87,7 +87,7 @@ class Gauges(eqx.Module):
         efforts: largest efforts of the joints (n,).
     """
 
-    k_tau: Float[Array, ""]
+    rotors: Rotors
     bodies: PanelBodies | None
     home: Float[Array, "2"] | None
     gravity: Float[Array, "3"]
@@ -100,19 +100,17 @@ class Gauges(eqx.Module):
     payloads: Payloads | None
     base: str = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
-    rotors: int = eqx.field(static=True)
     joints: tuple[DrivenJoint, ...] = eqx.field(static=True)
 
     def __init__(self, machine: Machine, system: System, payloads: Payloads | None = None) -> None:
         self.payloads = payloads
-        self.k_tau, self.bodies = machine.rotors.k_tau, machine.bodies
+        self.rotors, self.bodies = machine.rotors, machine.bodies
         self.home = None if machine.limits is None else machine.limits.home
         self.gravity, self.mass = gravity_of(system), system.bodies.mass
         self.efficiency = jnp.asarray(ENERGY.value("rotor.efficiency"), dtype=float)
         self.other = jnp.asarray(ENERGY.value("other.power"), dtype=float)
         self.base, names = system.names[0], internal_names(system)
         self.places = tuple(k for k, name in enumerate(names) if ": speed of rotor " in name)
-        self.rotors = machine.rotors.spin.shape[0]
         has_gear = any(isinstance(force, GroundContact) for force in system.forces)
         self.grounded = system if has_gear else None
         self.jointed, self.joints = system if machine.joints else None, machine.joints
@@ -121,13 +119,13 @@ class Gauges(eqx.Module):
     def __call__(self, sample: Sample) -> dict[str, Any]:
         """Signals by name."""
         state, targets = sample.state, sample.reference.waypoint
-        R = rotation_matrix(state.p[0])
+        R, count = rotation_matrix(state.p[0]), self.rotors.spin.shape[0]
         yaw = jnp.arctan2(R[1, 0], R[0, 0]) - targets.heading
         if self.places:
             squared = sample.internal[jnp.array(self.places)] ** 2
         else:
-            squared = sample.held_inputs[: self.rotors]
-        power = jnp.sum(drag_power(squared, self.k_tau))
+            squared = sample.held_inputs[:count]
+        power = jnp.sum(self.rotors.power(squared))
         result = {
             "reference_position": targets.r,
             "position_error": state.r[0] - targets.r,
@@ -148,9 +146,7 @@ class Gauges(eqx.Module):
             result |= self._payload_signals(sample.t, state, flight)
         pushing = jnp.zeros(())
         if self.bodies is not None:
-            panel_signals = self._panel_signals(
-                state, sample.reference, sample.held_inputs[self.rotors :]
-            )
+            panel_signals = self._panel_signals(state, sample.reference, sample.held_inputs[count:])
             panel_signals["commanded_force"] = sample.memory.commanded
             # each actuator of its own: what one brakes does not drive the other
             pushing = jnp.sum(jnp.maximum(panel_signals.pop("powers"), 0.0))
@@ -181,7 +177,8 @@ class Gauges(eqx.Module):
     ) -> tuple[dict[str, Any], Float[Array, " n"]]:
         """Signals of the driven joints, and the powers of their efforts (n,) [W]."""
         values, rates = read_joints(system, self.joints, sample.state)
-        targets, commands = sample.reference.joints.value, sample.held_inputs[self.rotors :]
+        targets = sample.reference.joints.value
+        commands = sample.held_inputs[self.rotors.spin.shape[0] :]
         efforts = []
         for k, drive in enumerate(self.joints):
             force = system.forces[drive.force]

@@ -235,7 +235,7 @@ class AbstractFlights(abc.ABC):
 
     Attributes:
         scene: name. table: parameters. own_factors: factors beside the table's, with their units.
-        relative: names of factors that multiply the table's value.
+        relative: names of factors that multiply the table's value. unused_names: of the table, of no effect.
         inputs: "case" for the scene's own; "trim" for constant ones that hold it at its start.
     """
 
@@ -243,6 +243,7 @@ class AbstractFlights(abc.ABC):
     table: Parameters
     own_factors: Mapping[str, str]
     relative: frozenset[str]
+    unused_names: frozenset[str]
     inputs: Literal["case", "trim"]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -286,11 +287,18 @@ class AbstractFlights(abc.ABC):
             if factor in self.relative:
                 raise SettingError(f"'{factor}' has no value in the table that it could multiply.")
             return FactorTarget(factor, (), self.own_factors[factor])
+        suggest = lambda: suggest_names(
+            factor.partition("[")[0][:SHOWN],
+            [*self.own_factors, *(name for name in self.table if name not in self.unused_names)],
+        )
         unknown = lambda: (
-            f"is neither a parameter of {self.scene} nor part of its start or inputs."
-            f"{suggest_names(factor.partition('[')[0][:SHOWN], [*self.own_factors, *self.table])}"
+            f"is neither a parameter of {self.scene} nor part of its start or inputs.{suggest()}"
         )
         target = table_entry(self.table, factor, factor in self.relative, unknown)
+        if target.name in self.unused_names:
+            raise SettingError(
+                f"{quote_name(factor)} has no effect on {self.scene}, which does not use it.{suggest()}"
+            )
         self._check_parameter(target.name)
         return target
 
@@ -340,7 +348,8 @@ class Flights(AbstractFlights):
         scene, case: see `stmuav list`. table: of its parameters.
         own_factors: factors beside the table's, with their units.
         options: of the scene, plain data as `options_from_plain` takes. option_names: names of the table
-            whose values the options replace, which can be no factors.
+            whose values the options replace, which can be no factors. unused_names: of the table, that have no
+            effect.
         relative: names of factors that multiply the table's value.
         inputs: "case" for the scene's own; "trim" for constant rotor speeds and actuator forces
             that hold the table's machine at its initial posture (uav_tracker, case 2).
@@ -356,6 +365,7 @@ class Flights(AbstractFlights):
     own_factors: Mapping[str, str]
     options: Mapping[str, Any] = field(default_factory=dict)
     option_names: frozenset[str] = frozenset()
+    unused_names: frozenset[str] = frozenset()
     relative: frozenset[str] = frozenset()
     inputs: Literal["case", "trim"] = "case"
     drag: bool = False
@@ -503,10 +513,16 @@ def make_flights(
     option_parameters = frozenset(
         name for name, line in built.parameters.items() if line != table[name].plain()
     )
+    # A scene lists what it is built from; the study itself adds drag and its wind. One of a user may list nothing.
+    of_air = (("drag.", "wind.") if settings.drag else ()) + (("gust.",) if settings.gusts else ())
+    unused = {
+        name for name in table if name not in built.parameters and not name.startswith(of_air)
+    }
     settings = replace(
         settings,
         own_factors=_list_own_factors(settings, built.system),
         option_names=option_parameters,
+        unused_names=frozenset(unused if built.parameters else ()),
     )
     if settings.inputs == "trim":
         if scene == "uav_tracker":
@@ -565,6 +581,11 @@ class ModelFlights(AbstractFlights):
     def table(self) -> Parameters:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Parameters of the model."""
         return self.model.table
+
+    @property
+    def unused_names(self) -> frozenset[str]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Names of the parameters to which no entry of the model refers."""
+        return frozenset(self.model.table) - self.model.used_parameters()
 
     @property
     def system(self) -> System:

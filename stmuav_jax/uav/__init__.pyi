@@ -147,6 +147,7 @@ from .quadrotor.model import (
 from .rotor import (
     Rotors as Rotors,
     drag_power as drag_power,
+    fit_rotor_curves as fit_rotor_curves,
     hover_power as hover_power,
     hover_speed_squared as hover_speed_squared,
     rotor_layout as rotor_layout,

@@ -32,12 +32,16 @@ from ..estimation.inertial import update_sequentially
 from ..math.rotation import rotation_matrix, skew
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .allocation import wrench_map
-from .flight_controller import FlightController, FlightMemory, UavController, central_properties
+from .flight_controller import (
+    FlightController,
+    FlightMemory,
+    UavController,
+    central_properties,
+)
 from .motion_estimator import MotionEstimate
 from .motor import MotorRotors, only_rotors
 from .panel_servo import PanelBodies
-from .rotor import hover_speed_squared
+from .rotor import Rotors
 
 
 class Carrier(NamedTuple):
@@ -174,7 +178,8 @@ class PayloadFilter(eqx.Module):
     """
 
     system: System
-    wrenches: Float[Array, "4 k"]
+    rotors: Rotors
+    centre: Float[Array, "3"]
     before: Float[Array, " k"]
     lag: Float[Array, " k"] | None
     period: Float[Array, ""]
@@ -206,11 +211,10 @@ class PayloadFilter(eqx.Module):
         self.system, motors = system, only_rotors(system, "A payload's filter")
         rotors = motors.rotors
         # moments about the base's centre of mass, which is O
-        self.wrenches = wrench_map(rotors, system.bodies.com[0])
-        count = rotors.spin.shape[0]
+        self.rotors, self.centre = rotors, system.bodies.com[0]
         # Commands that are on their way at the start are those of a hover, which the first periods then use.
         total_mass = jnp.sum(system.bodies.mass)
-        self.before = hover_speed_squared(total_mass, gravity_of(system), rotors.k_f, count)
+        self.before = rotors.hover(total_mass, gravity_of(system))
         self.late = whole_periods(delay, rate, "The delay of the inputs")
         self.period = h = jnp.asarray(1.0 / rate)
         constant = motors.time_constant if isinstance(motors, MotorRotors) else None
@@ -360,15 +364,19 @@ class PayloadFilter(eqx.Module):
         by_mass = jnp.zeros(10).at[3].set(-lift / total_moments.mass)
         return jnp.append(W, lift), jnp.concatenate([rates, by_mass[None]])
 
+    def wrench_of(self, squared: Float[Array, " k"]) -> Float[Array, "4"]:
+        """Thrust [N] and moments about O [N m] of squared rotor speeds [rad^2/s^2]."""
+        return self.rotors.wrench(squared, self.centre)[2:]
+
     def _mean_wrench(self, memory: PayloadMemory) -> tuple[Float[Array, " k"], Float[Array, "4"]]:
         """Speeds of the rotors at the end of the period, and their mean wrench in it."""
         squared_speeds = memory.sent[0]
         if self.lag is None:
-            return memory.speeds, self.wrenches @ squared_speeds
+            return memory.speeds, self.wrench_of(squared_speeds)
         goal = jnp.sqrt(squared_speeds)
         # The first-order lag of the motors is integrated exactly over a period with a held command.
         end_speeds = goal + self.lag * (memory.speeds - goal)
-        return end_speeds, self.wrenches @ ((memory.speeds + end_speeds) / 2) ** 2
+        return end_speeds, self.wrench_of(((memory.speeds + end_speeds) / 2) ** 2)
 
 
 def _invert_cofactors(J: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

@@ -1,8 +1,8 @@
 """Rotor speeds and the wrench that they give.
 
-The squared speeds u = omega^2 of k rotors give thrust and moments linearly: w = B u,
+The squared speeds u = omega^2 of k rotors without curves give thrust and moments linearly: w = B u,
 w = (f_z, tau_x, tau_y, tau_z) about a point. `minimum_norm` is the minimum-norm u with B u = w, whose
-speeds therefore differ least.
+speeds therefore differ least. Of rotors with curves B is the derivative at given speeds.
 
 Source: report Part II, Eq. 4.10, with B_M built from the arms themselves (corrected).
 """
@@ -26,10 +26,25 @@ _ROWS = (2, 3, 4, 5)
 
 
 @quick_jit
-def wrench_map(rotors: Rotors, about: Float[Array, "3"]) -> Float[Array, "4 k"]:
-    """Allocation matrix B: thrust [N] and moments [N m] about a point of the body per unit of u."""
-    rows = lambda u: rotors.wrench(u, about)[jnp.array(_ROWS)]
-    return jax.jacfwd(rows)(jnp.zeros_like(rotors.arms[:, 0]))
+def wrench_map(
+    rotors: Rotors, about: Float[Array, "3"], at: Float[Array, " k"] | None = None
+) -> Float[Array, "4 k"]:
+    """Allocation matrix B: thrust [N] and moments [N m] about a point of the body per unit of u.
+
+    Args:
+        at: squared speeds at which the derivative is taken; only rotors with curves need them.
+
+    Raises:
+        ModelError: rotors with curves, but no speeds.
+    """
+    if at is None:
+        if rotors.has_curves:
+            raise ModelError(
+                f"The rotors of body '{rotors.body}' have curves: their wrench is not linear in the squared "
+                "speeds, so that wrench_map needs the speeds 'at' which to take its derivative."
+            )
+        at = jnp.zeros_like(rotors.arms[:, 0])
+    return jax.jacfwd(lambda u: rotors.wrench(u, about)[jnp.array(_ROWS)])(at)
 
 
 def minimum_norm(B: Float[Array, "4 k"], wrench: Float[Array, "4"]) -> Float[Array, " k"]:
@@ -80,8 +95,12 @@ def check_lift(
     Raises:
         ModelError: the weight lies outside; the message has the required and available thrust.
     """
-    k_f, *bounds = as_numpy((rotors.k_f, *limits.squared(rotors.spin.shape[0])))
-    smallest, largest = (as_floats(k_f * bound.sum()) for bound in bounds)
+    if rotors.has_curves:
+        bounds = limits.squared(rotors.spin.shape[0])
+        smallest, largest = (jnp.sum(rotors.thrusts(bound)) for bound in bounds)
+    else:
+        k_f, *bounds = as_numpy((rotors.k_f, *limits.squared(rotors.spin.shape[0])))
+        smallest, largest = (as_floats(k_f * bound.sum()) for bound in bounds)
     if not has_values(smallest, largest, weight):
         return smallest, largest
     range_of = (

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..analysis.equilibrium import TOLERANCE, FlightCondition, trim_condition
+from ..analysis.sensors import gravity_of
 from ..checks.errors import AbstractReason, ModelError, StateError, first_reason, has_values
 from ..checks.numbers import as_floats
 from ..checks.shapes import Numbers
@@ -318,7 +319,8 @@ def _trim_flight(uav: Uav, condition: FlightCondition, limits: TrimLimits) -> Fl
     state = uav.state(angles)
     weight = mechanism_weight(uav.system)
     # about the centre of mass, thrust and moments are decoupled
-    B = wrench_map(uav.rotors, uav.system.com(state))
+    hovering = uav.rotors.hover(jnp.sum(uav.system.bodies.mass), gravity_of(uav.system))
+    B = wrench_map(uav.rotors, uav.system.com(state), hovering)
     columns = jax.vmap(minimum_norm, in_axes=(None, 0), out_axes=1)(B, jnp.eye(4))
     directions = weight * jax.scipy.linalg.block_diag(columns, jnp.eye(2))
     # Thrusts are redundant with more than four rotors: the search is along four wrenches and two forces,

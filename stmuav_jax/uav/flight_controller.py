@@ -44,6 +44,7 @@ from .allocation import RotorLimits, check_lift, wrench_map
 from .motion_estimator import MotionEstimate, state_of
 from .motor import only_rotors
 from .panel_servo import PanelServo, StrokeServo, facing, panel_motion
+from .rotor import Rotors
 from .tracker.kinematics import PairMotion
 
 
@@ -221,17 +222,18 @@ def working_rotors(lost: Sequence[int], count: int) -> tuple[int, ...] | None:
 def inverse_without_yaw(
     wrenches: Float[Array, "4 k"],
     working: tuple[int, ...],
-    limits: RotorLimits | None,
+    limits: tuple[Float[Array, " k"], Float[Array, " k"]] | None,
     weight: Float[Array, ""],
+    quantity: tuple[str, str] = ("squared speeds", "rad^2/s^2"),
 ) -> Float[Array, "w 4"]:
-    """Squared speeds of the working rotors per unit of thrust and moments.
+    """Squared speeds, or thrusts, of the working rotors per unit of thrust and moments.
 
     Those of thrust and tilt are of minimum norm without regard to yaw; those of yaw change neither
     thrust nor tilt, and are zero where there are none such.
 
     Args:
-        wrenches: thrust and moments per unit of the squared speeds.
-        limits: limits of the speeds. weight: thrust in hover [N].
+        wrenches: thrust and moments per unit of them.
+        limits: lower and upper ones of them. weight: thrust in hover [N]. quantity: their name and unit.
 
     Raises:
         ModelError: no limits, or limits within which the working rotors do not hover.
@@ -248,13 +250,14 @@ def inverse_without_yaw(
     # Roll, pitch and thrust have priority: without them the machine falls, while a turning machine still
     # holds its place.
     inverse = np.linalg.pinv(working_wrenches[:3])
-    lower, upper = (np.asarray(x)[list(working)] for x in limits.squared(wrenches.shape[1]))
+    lower, upper = (np.asarray(x)[list(working)] for x in limits)
     u = inverse[:, 0] * float(weight)
     is_right_inverse = np.allclose(working_wrenches[:3] @ inverse, np.eye(3), atol=1e-9)
     if not is_right_inverse or np.any(inverse[:, 0] <= 0) or np.any((u <= lower) | (u >= upper)):
+        name, unit = quantity
         raise ModelError(
-            f"Thrust and tilt cannot be held {loss_text}: the hover would take squared speeds of "
-            f"{np.array2string(u, precision=3)} rad^2/s^2, and the limits are "
+            f"Thrust and tilt cannot be held {loss_text}: the hover would take {name} of "
+            f"{np.array2string(u, precision=3)} {unit}, and the limits are "
             f"{np.array2string(lower, precision=3)} to {np.array2string(upper, precision=3)}."
         )
     # The part of the yaw moment in the null space of thrust and tilt slows the turning without a cost to
@@ -282,6 +285,11 @@ def as_it_turns(target: Waypoint, base: BaseMotion) -> Waypoint:
 
 # Round-off of squared speeds, as a share.
 _ROUND_OFF = 1e-9
+
+
+# Repetitions of the allocation to rotors with curves: each multiplies the error of yaw by the relative change
+# of the slope of torque by thrust, which is zero where both curves have one shape.
+_YAW_STEPS = 6
 
 
 class FlightMemory(NamedTuple):
@@ -318,6 +326,9 @@ class FlightController(eqx.Module):
     while a foot of the base's landing gear (`GroundContact`) is below the ground's height by the estimate, the
     integral of the position error stands still.
 
+    Rotors with curves are allocated thrusts, whose wrench is linear but for yaw, and turn with the speeds that
+    their curve has for these.
+
     Args:
         system: machine with one set of rotors and with gravity.
         rate: control rate [Hz], for the integral.
@@ -340,6 +351,7 @@ class FlightController(eqx.Module):
     wrenches: Float[Array, "4 k"]
     inverse: Float[Array, "k 4"]
     limits: RotorLimits | None
+    rotors: Rotors | None
     period: Float[Array, ""]
     feet: Feet | None
     working: tuple[int, ...] | None = eqx.field(static=True)
@@ -369,8 +381,13 @@ class FlightController(eqx.Module):
         if limits is not None:
             check_lift(rotors, limits, weight)
             _check_reached(limits, motor_limits, rotors.spin.shape[0])
+        hovering = rotors.hover(xp.sum(mass_of_all), g)
         # moments are about the base's centre of mass: the map does not change with the posture
-        self.wrenches = wrench_map(rotors, system.bodies.com[0])
+        self.wrenches = wrench_map(rotors, system.bodies.com[0], hovering)
+        self.rotors, self.limits = None, limits
+        if rotors.has_curves:
+            self.rotors = rotors
+            self.wrenches = self.wrenches / jax.grad(lambda u: jnp.sum(rotors.thrusts(u)))(hovering)
         self.working = working_rotors(lost, rotors.spin.shape[0])
         if self.working is None:
             self.inverse = _wrench_pseudoinverse(self.wrenches)
@@ -380,9 +397,13 @@ class FlightController(eqx.Module):
                     "controller: not every rotor adds to the thrust where its moments balance."
                 )
         else:
-            self.inverse = inverse_without_yaw(self.wrenches, self.working, limits, weight)
+            bounds = None if limits is None else self._bounds()
+            quantity = () if self.rotors is None else (("thrusts", "N"),)
+            self.inverse = inverse_without_yaw(
+                self.wrenches, self.working, bounds, weight, *quantity
+            )
         self.gains = FlightGains() if gains is None else gains
-        self.limits, self.period = limits, as_floats(1.0 / rate)
+        self.period = as_floats(1.0 / rate)
         self.mass = mass_properties(system, system.reference) if mass is None else mass
         self.feet = feet_of(system)
 
@@ -410,11 +431,20 @@ class FlightController(eqx.Module):
         lever = jnp.cross(mass.centre, jnp.array([0.0, 0.0, 1.0]) * demand.wrench[0])
         wrench = demand.wrench.at[1:].add(lever)
         if self.working is None:
-            squared, is_attained = self._allocate_wrench(wrench)
+            allocate = self._allocate_wrench
         else:
             # Without control of yaw its rate is only damped.
             wrench = wrench.at[3].add(-self.gains.rate * mass.J[2, 2] * base.omega[2])
-            squared, is_attained = self._allocated_to_working(wrench)
+            allocate = self._allocated_to_working
+        squared, is_attained = allocate(wrench)
+        if self.rotors is not None:
+            thrusts = squared
+            for _ in range(_YAW_STEPS):
+                squared = self.rotors.squared_speeds(thrusts)
+                yaw = -self.rotors.spin @ self.rotors.torques(squared)
+                beside_tangent = yaw - self.wrenches[3] @ thrusts
+                thrusts, is_attained = allocate(wrench.at[3].add(-beside_tangent))
+            squared = self.rotors.squared_speeds(thrusts)
         # The integral stands still while the rotors saturate or a foot carries weight: it would wind up
         # against a force that it cannot overcome.
         error = base.r - reference.r
@@ -424,18 +454,23 @@ class FlightController(eqx.Module):
         return squared, FlightMemory(integral)
 
     def _allocate_wrench(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
-        """Squared speeds, and whether they give the wrench."""
-        least = self.inverse @ wrench
+        """Squared speeds, or thrusts of rotors with curves, and whether they give the wrench."""
         if self.limits is None:
-            return least, jnp.ones((), bool)
-        lower, upper = self.limits.squared(least.shape[0])
-        return within_limits(self.inverse, wrench, lower, upper)
+            return self.inverse @ wrench, jnp.ones((), bool)
+        return within_limits(self.inverse, wrench, *self._bounds())
+
+    def _bounds(self) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+        """Lower and upper squared speeds (k,), or thrusts of rotors with curves."""
+        assert self.limits is not None
+        lower, upper = self.limits.squared(self.wrenches.shape[1])
+        if self.rotors is None:
+            return lower, upper
+        return self.rotors.thrusts(lower), self.rotors.thrusts(upper)
 
     def _allocated_to_working(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
-        """Squared speeds, those of lost rotors zero, and whether they give thrust and tilt."""
-        assert self.limits is not None
+        """Squared speeds, or thrusts, those of lost rotors zero, and whether they give thrust and tilt."""
         places, count = jnp.array(self.working), self.wrenches.shape[1]
-        lower, upper = (x[places] for x in self.limits.squared(count))
+        lower, upper = (x[places] for x in self._bounds())
         u, is_attained = _allocate_tilt(self.inverse, wrench, lower, upper)
         # yaw is what the others leave of it, and is changed where the limits still allow it
         turn = self.inverse[:, 3] * (wrench[3] - self.wrenches[3, places] @ u)

@@ -81,6 +81,7 @@ class MotorRotors(AbstractInternalForce):
             _check_least(self.inertia, f"The inertia {owner_text}", "kg m^2", strictly=False)
         if limits is not None:
             self.squared_limits = limits.squared(count)
+            _check_rising(rotors, self.squared_limits[0])
         self.internal = jnp.zeros((0,))
         if time_constant is None:
             if start is not None:
@@ -207,6 +208,20 @@ def _per_rotor(value: Numbers, count: int, quantity: str, unit: str) -> Float[Ar
             f"{quantity} must be one number or one for each of {count} rotors, but the shape is {values.shape}."
         )
     return jnp.broadcast_to(values, (count,))
+
+
+def _check_rising(rotors: Rotors, lowest: Float[Array, " k"]) -> None:
+    """Raise `ModelError` for a thrust that falls as a rotor turns faster than its lowest squared speed."""
+    linear = rotors.thrust_linear
+    if linear is None or not has_values(rotors.k_f, linear, lowest) or float(linear) >= 0:
+        return
+    k_f, slowest = float(rotors.k_f), float(np.sqrt(np.min(np.asarray(lowest))))
+    if 2 * k_f * slowest + float(linear) < 0:
+        turning_point = f"{-float(linear) / (2 * k_f):.4g} rad/s" if k_f else "any speed"
+        raise ModelError(
+            f"The thrust of the rotors of body '{rotors.body}' falls with their speed below {turning_point}, but "
+            f"their lowest speed is {slowest:g} rad/s: the lowest speed must be where the thrust rises."
+        )
 
 
 def _check_least(value: Float[Array, " k"], quantity: str, unit: str, *, strictly: bool) -> None:

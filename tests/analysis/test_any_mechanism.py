@@ -343,7 +343,7 @@ def test_a_trim_begins_beyond_a_limit_and_keeps_it(kind):
 
     exact = 19.62 if kind == "effort" else 0.1962
     assert float(hold(25.0).values[0]) == pytest.approx(exact, rel=1e-12)
-    words = r"needs an effort of 19.62 N .* in joint 'slide', but its limit is 5"
+    words = r"needs an effort of 19.62 N of the .* in joint 'slide', but its limit is 5"
     with pytest.raises(stm.StateError, match=words):
         hold(5.0)
     refused = hold(5.0, throw=False)

@@ -34,6 +34,8 @@ def test_a_parallelogram_near_and_in_its_singular_posture():
     # the cranks are 0.01 rad from the flat posture
     assert near.severity == "warning"
     assert float(near.value.split()[4]) == pytest.approx(0.01, rel=0.06)
+    assert near.value.endswith(" rad")
+    assert found["largest residual of the constraints"].value.count(" rad") == 2
     flat = stm.check(parallelogram(0.0))
     assert flat.worst == "fault"
     assert (

@@ -261,7 +261,16 @@ def everything():
         ),
         stm.AppliedForce("b1", odd, frame="body", point=odd),
         stm.AppliedMoment("b1", odd),
-        Rotors("b2", arms=np.eye(3), spin=[1, -1, 1], k_f=1e-6, k_tau=1e-8, speed_squared=odd),
+        Rotors(
+            "b2",
+            arms=np.eye(3),
+            spin=[1, -1, 1],
+            k_f=1e-6,
+            k_tau=1e-8,
+            speed_squared=odd,
+            thrust_linear=1 / 3,
+            torque_offset=-0.7,
+        ),
         MotorRotors(
             Rotors("b3", arms=np.eye(3), spin=[1, -1, 1], k_f=1e-6, k_tau=1e-8, speed_squared=odd),
             time_constant=0.1 / 3,
@@ -396,6 +405,13 @@ def test_a_multirotor_of_a_file_hovers_in_its_wind(tmp_path):
         ("steady = [3.0, 0.0, 0.0]", "gusts = {}", "[wind]: Gusts pass at the speed of the steady wind"),
         ("format = 2", "format = 1", "'wind' needs format = 2"),
         ("highest = 1200.0", "lowest = 1300.0\nhighest = 1200.0", "must be 0 <= lowest < highest"),
+        ("k_tau = 2e-7\n", "", "Rotors need 'k_f' and 'k_tau', or 'points' of a test stand"),
+        ("k_tau = 2e-7\n", "points = [[1, 2, 3]]\n", "either 'points' of a test stand or coefficients"),
+        ("k_tau = 2e-7", "k_tau = 2e-7\nthrust_linear = -1e-3", "falls with their speed below 50 rad/s, but "
+         "their lowest speed is 0 rad/s"),
+        ("k_f = 1e-5\nk_tau = 2e-7\n", "points = [[1, 0, 0], [2, 1, 1], [3, 0, 0], [4, 1, 1]]\n",
+         "No quadratic curve of the speed fits the thrusts"),
+        ("k_f = 1e-5\nk_tau = 2e-7\n", "points = [[1, 0, 0], [2, 1, 1]]\n", "at three speeds or more"),
     ],
 )  # fmt: skip
 def test_errors_of_a_flying_model_name_the_place(old, new, words, tmp_path):
@@ -404,6 +420,34 @@ def test_errors_of_a_flying_model_name_the_place(old, new, words, tmp_path):
     path.write_text(FLYING.replace(old, new))
     with pytest.raises(FileError, match=re.escape(words)):
         load_model(path)
+
+
+CURVES = """k_f = 1e-5
+k_tau = 2e-7
+thrust_linear = -1e-3
+thrust_offset = 0.2
+torque_linear = 3e-5
+"""
+
+
+def test_rotors_of_a_file_have_curves_or_points(tmp_path):
+    """The hover's speed solves k_f w^2 + c w + T_0 = m g / 4; points of a quadratic curve give its coefficients."""
+    path = tmp_path / "flying.toml"
+    path.write_text(FLYING.replace("k_f = 1e-5\nk_tau = 2e-7\n", CURVES))
+    path.write_text(path.read_text().replace("highest", "lowest = 60.0\nhighest"))
+    forces: Any = load_model(path).system.forces
+    rotors = forces[0].rotors
+    speed = (1e-3 + np.sqrt(1e-6 + 4e-5 * (2.0 * 9.81 / 4 - 0.2))) / 2e-5
+    np.testing.assert_allclose(np.sqrt(rotors.speed_squared), speed, rtol=1e-14)
+    w = np.array([100.0, 400.0, 700.0, 1000.0])
+    points = np.stack([w, rotors.thrusts(w**2), rotors.torques(w**2)], axis=1).tolist()
+    path.write_text(FLYING.replace("k_f = 1e-5\nk_tau = 2e-7\n", f"points = {points}\n"))
+    path.write_text(path.read_text().replace("highest", "lowest = 60.0\nhighest"))
+    again: Any = load_model(path).system.forces
+    np.testing.assert_allclose(np.sqrt(again[0].rotors.speed_squared), speed, rtol=1e-12)
+    for name in ("k_f", "thrust_linear", "thrust_offset", "k_tau", "torque_linear"):
+        fitted, true = getattr(again[0].rotors, name), getattr(rotors, name)
+        assert float(fitted) == pytest.approx(float(true), rel=1e-9), name
 
 
 def test_wind_without_drag_and_gusts_are_refused(tmp_path):

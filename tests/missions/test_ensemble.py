@@ -1,12 +1,15 @@
 """Monte Carlo studies of a mission: flights side by side, resumed, and refused before they begin."""
 
 import pickle
+import re
+from typing import Any
 
 import numpy as np
 import pytest
 
 import stmuav_jax as stm
-from stmuav_jax.missions.ensemble import LANES, NOT_PHYSICAL, _narrow_limits
+from stmuav_jax.missions.ensemble import LANES, NOT_PHYSICAL
+from stmuav_jax.missions.truth import narrow_limits
 
 missions = stm.missions
 MISSION = {
@@ -159,8 +162,6 @@ def test_studies_that_cannot_be_flown_are_refused(tmp_path):
     ):
         with pytest.raises((stm.SettingError, stm.io.FileError), match=words):
             missions.load_mission_study(plain | change, tmp_path)
-    with pytest.raises(stm.SettingError, match="has no battery"):
-        make_study(missions.make_mission(MISSION | {"battery": {}}))
     # what the flights of a study do not come to, and what it does not judge
     late = r"end at t = 2 s, before "
     for change, words in (
@@ -176,12 +177,70 @@ def test_studies_that_cannot_be_flown_are_refused(tmp_path):
             make_study(missions.make_mission(MISSION | change))
 
 
+def test_a_study_flies_what_single_flights_with_its_truth_do():
+    """Errors, energy and charge of three machines, the last of which empties its battery on the way."""
+    plain = {
+        **{key: MISSION[key] for key in ("format", "name", "machine", "rates")},
+        "t1": 1.5,
+        "wind": {"steady": [3.0, 0.0, 0.0]},
+        "payloads": MISSION["payloads"],
+        "battery": {"state_of_charge": 0.9, "capacity": 5000.0},
+        "tolerances": {"position": 0.2},
+    }
+    truths = [
+        {"bare.mass": 5.0, "battery.capacity": 4000.0},
+        {"payload_1.mass": 0.06, "bare.inertia[0, 0]": 0.06},
+        {"battery.state_of_charge": 0.203, "rotor.k_f": 6.4e-6},
+    ]
+    mission = missions.make_mission(plain)
+    usual = {
+        name: mission.table.value(name) for truth in truths for name in truth if "[" not in name
+    }
+    usual |= {"bare.inertia[0, 0]": mission.table.value("bare.inertia")[0][0]}
+    rows = {name: [truth.get(name, usual[name]) for truth in truths] for name in usual}
+    factors = {
+        name: {"distribution": "empirical", "values": values} for name, values in rows.items()
+    }
+    study = missions.make_mission_study(mission, factors, samples=3, design="table", lanes=8)
+    table = study.compute(0, 3)
+    flight: Any = None
+    for k, truth in enumerate(truths):
+        flight = missions.fly(missions.make_mission(plain | {"truth": truth}))
+        signals = flight.run.rollout.signals
+        errors = np.linalg.norm(signals["position_error"], axis=1)
+        assert table["position_error"][k] == pytest.approx(np.max(errors), rel=1e-9)
+        charge, power = signals["state_of_charge"][-1], signals["electric_power"]
+        assert table["state_of_charge"][k] == pytest.approx(charge, rel=1e-12)
+        assert table["energy"][k] == pytest.approx(np.sum(power[:-1]) / 200.0, rel=1e-9)
+        assert table["end"][k] == pytest.approx(flight.run.ts[-1])
+        assert (flight.ending == "battery empty") == (k == 2)
+        assert bool(table["kept"][k]) == (k < 2)
+    assert flight.run.ts[-1] < 1.4
+    # the controller goes on with the mission's numbers
+    pilot: Any = lambda mission: mission.controller.pilot
+    assert float(pilot(flight.mission).mass.mass) == pytest.approx(float(pilot(mission).mass.mass))
+
+
+@pytest.mark.parametrize(
+    ("truth", "words"),
+    [
+        ({"bare.mas": 3.0}, "'bare.mas' is no parameter of hexacopter. Did you mean 'bare.mass'?"),
+        ({"bare.inertia[0, 0]": 9.0}, "'bare.inertia' breaks the triangle inequality"),
+        ({"bare.inertia": 3.0}, "name one entry, such as bare.inertia[0, 0]"),
+        ({"mass.panel_7": 3.0}, "'mass.panel_7' has no effect on this mission"),
+    ],
+)
+def test_a_truth_that_no_flight_has_is_refused(truth, words):
+    with pytest.raises((stm.SettingError, stm.ModelError), match=re.escape(words)):
+        missions.make_mission(MISSION | {"truth": truth})
+
+
 def test_margins_of_a_study_are_those_of_the_motors_that_are_drawn():
     """The truth's motors give less than the controller believes."""
     motor = {"motor.highest": 1500.0, "motor.lowest": 100.0}
     table = stm.PART_II.replaced(motor)
     scene = stm.make_scene("hexacopter", parameters=table, motor=stm.uav.Motor())
-    found = _narrow_limits(stm.uav.RotorLimits(200.0, 1900.0), scene)
+    found = narrow_limits(stm.uav.RotorLimits(200.0, 1900.0), scene)
     assert found is not None
     low, high = found.squared(6)
     np.testing.assert_allclose(low, 200.0**2)

@@ -127,6 +127,24 @@ def test_unknown_factors(factor, words):
         make_flights("uav_tracker").entry(factor)
 
 
+def test_a_factor_that_the_scene_does_not_use_is_refused_and_not_suggested():
+    """The table is of all scenes of Part II: the bare hexacopter has a mass of its own."""
+    flights = make_flights("hexacopter")
+    with pytest.raises(
+        SettingError, match=r"'mass\.hexacopter_1' has no effect on hexacopter"
+    ) as told:
+        flights.entry("mass.hexacopter_1")
+    with pytest.raises(SettingError, match="neither a parameter of hexacopter") as asked:
+        flights.entry("mass.hexacopter")
+    for caught in (told, asked):
+        suggestion = str(caught.value).partition("Names like it: ")[2]
+        assert "bare.mass" in suggestion
+        assert "_1," not in suggestion.replace("rotor_1", "")
+    with pytest.raises(SettingError, match=r"'wind.mean\[0\]' has no effect"):
+        flights.entry("wind.mean[0]")
+    assert make_flights("hexacopter", drag=True).entry("wind.mean[0]").unit == "m/s"
+
+
 def test_refusals():
     with pytest.raises(SettingError, match="no scene 'spim'"):
         make_flights("spim")

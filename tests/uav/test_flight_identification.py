@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from problems.multirotor_flights import (
@@ -225,7 +226,13 @@ def test_thrust_that_fades_is_said_and_widens_the_deviation():
     assert "give the mass" in result.describe()
 
 
-def test_the_identified_model_has_the_true_numbers(result, tmp_path):
+@pytest.mark.parametrize("is_curved", [False, True])
+def test_the_identified_model_has_the_true_numbers(result, tmp_path, is_curved):
+    """A curve that differs from the layout's shape by more than its deviation is the model's."""
+    if is_curved:
+        curve = {f"thrust_{x}": result.estimates[f"thrust_{x}"] for x in ("linear", "quadratic")}
+        curve["thrust_quadratic"] = curve["thrust_quadratic"]._replace(deviation=1e-3)
+        result = result._replace(estimates=result.estimates | curve)
     files = write_identified_model(result, tmp_path / "own.toml", source="a flight")
     scene = load_model(files.model)
     body = scene.system.bodies
@@ -240,7 +247,16 @@ def test_the_identified_model_has_the_true_numbers(result, tmp_path):
     # the thrust's slope by the command at the mean one, and the torque of spinning up
     span = float(motors.limits.highest[0] - motors.limits.lowest[0])
     speed = float(motors.limits.lowest[0]) + span * result.hover
-    slope = 2 * float(motors.rotors.k_f) * speed * span
+    thrust = lambda speed: motors.rotors.thrusts(speed**2)
+    slope = float(jax.grad(thrust)(speed)) * span
+    assert (motors.rotors.thrust_linear is not None) == is_curved
+    if is_curved:
+        parts = [e[f"thrust_{x}"].value for x in ("offset", "linear", "quadratic")]
+        level = 0.027 * np.polynomial.polynomial.polyval(result.hover, parts)
+        assert float(thrust(speed)) == pytest.approx(level, rel=1e-9)
+        ratios = [float(motors.rotors.torques(w**2) / thrust(w)) for w in (900.0, 2000.0)]
+        assert ratios[0] == pytest.approx(ratios[1], rel=1e-9)
+        missions.load_mission_study(tomllib.loads(files.study.read_text()), tmp_path)
     assert slope == pytest.approx(2 * result.hover * e["force"].value, rel=1e-9)
     assert float(motors.inertia[0]) * span / 3e-5 == pytest.approx(e["spin_up"].value)
     # drag below the centre of mass makes both moments of horizontal speed

@@ -76,7 +76,7 @@ def test_the_angular_momentum_obeys_the_filters_equation(machines, tumbling):
     L, L_rate = jax.jvp(momentum, (0.0,), (1.0,))
     R = stm.rotation.rotation_matrix(at.p)
     felt = R.T @ (rates[8:11] - jnp.array([0.0, 0.0, -9.81]))
-    torque = (stm.uav.PayloadFilter(uav.system, 400.0).wrenches @ squared)[1:]
+    torque = stm.uav.PayloadFilter(uav.system, 400.0).wrench_of(squared)[1:]
     p = mass_moments(uav.system, uav.state(rates=RATES, **tumbling)).first
     expected = torque - jnp.cross(p, felt) - jnp.cross(at.omega, L)
     assert np.linalg.norm(L_rate) > 0.1

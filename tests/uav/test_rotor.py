@@ -1,5 +1,6 @@
 """Rotors and actuators against the report's formulas and hand-made sums."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -110,6 +111,73 @@ def test_actuator_power_is_force_times_sliding_rate():
     load = LinearActuator("hull", "slider", axis_point=(0.11, 0.0, 0.06), force=3.0).load(T, kin)
     by_hand = jnp.sum(load.force * kin.v) + jnp.sum(load.moment * kin.omega)
     assert float(load.power) == pytest.approx(float(by_hand), rel=1e-13)
+
+
+LIMITS = stm.uav.RotorLimits(150.0, 1400.0)
+
+
+def curved(**curves):
+    """Hexacopter of 4 kg whose rotors have curves of their own."""
+    arms, spin = stm.uav.rotor_layout(6, 0.35, height=0.03)
+    coefficients = {"k_f": 8e-6, "k_tau": 1.4e-7} | curves
+    rotors = Rotors("hull", arms=arms, spin=spin, **coefficients, speed_squared=np.full(6, 5e5))
+    motors = stm.uav.MotorRotors(rotors, limits=LIMITS)
+    body = Body("hull", 4.0, [0.06, 0.06, 0.1], com=[0.01, -0.005, 0.0], free=True)
+    return System([body], [], [stm.Gravity(), motors]), rotors
+
+
+@pytest.mark.parametrize(
+    "curves",
+    [
+        {"thrust_linear": 2e-3, "thrust_offset": -0.3, "torque_linear": 1e-5},
+        {"thrust_linear": -1e-3, "torque_offset": 0.01},
+        {"thrust_linear": 7e-3, "k_f": 0.0},
+        {"torque_linear": 2e-5},
+        {"thrust_offset": 0.2, "torque_offset": 0.01, "torque_linear": -1e-5},
+    ],
+)
+def test_speeds_of_curves_give_the_thrust_and_the_wrench(curves):
+    """The inverse curve, its derivative, and speeds of a controller for thrust, tilt and yaw."""
+    system, rotors = curved(**curves)
+    thrusts = jnp.array([0.5, 3.0, 6.54, 9.0])
+    squared = rotors.squared_speeds(thrusts)
+    np.testing.assert_allclose(rotors.thrusts(squared), thrusts, rtol=1e-13)
+    slopes = jax.vmap(jax.grad(rotors.thrusts))(squared)
+    inverse_slopes = jax.vmap(jax.grad(rotors.squared_speeds))(thrusts)
+    np.testing.assert_allclose(inverse_slopes, 1 / slopes, rtol=1e-11)
+    pilot = stm.uav.FlightController(system, 400.0)
+    base = stm.uav.BaseMotion(
+        jnp.zeros(3), jnp.eye(3), jnp.array([0.1, -0.1, 0.3]), jnp.array([0.2, -0.15, 0.1])
+    )
+    target = stm.control.at_point([0.0, 0.0, 0.0])
+    mass = stm.uav.mass_properties(system, system.reference)
+    demand = stm.uav.wrench_for(base, target, mass, pilot.gains, pilot.gravity, jnp.zeros(3))
+    u, _ = pilot(base, target, pilot.start())
+    lever = np.cross(mass.centre, [0.0, 0.0, float(demand.wrench[0])])
+    expected = np.asarray(demand.wrench) + np.array([0.0, *lever])
+    wrench = np.asarray(rotors.wrench(u, system.bodies.com[0]))
+    np.testing.assert_allclose(wrench[2:], expected, rtol=1e-5, atol=1e-7)
+    assert np.ptp(np.sqrt(u)) > 50.0
+
+
+def test_a_standing_rotor_with_offset_gives_nothing():
+    _, rotors = curved(thrust_offset=0.3, torque_offset=0.01)
+    assert not np.any(rotors.wrench(jnp.zeros(6), jnp.zeros(3)))
+
+
+def test_the_hover_of_curves_has_the_derivative_of_its_closed_form():
+    """w = (s - c) / (2 k), s^2 = c^2 + 4 k (m g / 6 - T_0); its derivative by the linear part is -w / s."""
+    weight = 4.0 * 9.81 / 6
+    speed = lambda c: (np.sqrt(c**2 + 3.2e-5 * (weight + 0.3)) - c) / 1.6e-5
+
+    def hover(c):
+        _, rotors = curved(thrust_linear=c, thrust_offset=-0.3)
+        return jnp.sqrt(rotors.hover(4.0, [0.0, 0.0, -9.81])[0])
+
+    value, slope = jax.value_and_grad(hover)(2e-3)
+    assert float(value) == pytest.approx(speed(2e-3), rel=1e-14)
+    root = np.sqrt(4e-6 + 3.2e-5 * (weight + 0.3))
+    assert float(slope) == pytest.approx(-speed(2e-3) / root, rel=1e-12)
 
 
 def test_unknown_couple_is_refused():
