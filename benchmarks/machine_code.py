@@ -34,6 +34,7 @@ from stmuav_jax.dynamics.integration.problem import (
 )
 from stmuav_jax.math.native import llvm
 from stmuav_jax.math.native.graph import MOVES, make_graph
+from stmuav_jax.math.native.structure import find_structure, read_structure
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,8 @@ def count_operations(function: Callable[..., Any], model: Any, x: jax.Array) -> 
     stm.math.use_native_code(False)
     traced = jax.make_jaxpr(flat)(x, *leaves)
     stm.math.use_native_code(True)
-    graph, outputs = make_graph(traced, llvm.MOST_NODES)
+    known = read_structure(find_structure((x, model)), (x, model))
+    graph, outputs = make_graph(traced, llvm.MOST_NODES, known)
     graph, _ = llvm.fuse(graph, [n for out in outputs for n in out.ravel().tolist()])
     kept = sum(op not in ("input", "constant") for op in graph.ops)
     return {"traced": count_traced(traced.jaxpr), "left": kept}

@@ -102,20 +102,26 @@ def _agrees(structure: Structure, other: Structure) -> bool:
     return all(((b == _NUMBER) | (a == b)).all() for a, b in codes)
 
 
+def read_structure(structure: Structure, args: Any) -> list[Known]:
+    """Known entries of the arrays among arguments."""
+    codes, known = dict(structure), []
+    for place, leaf in enumerate(jax.tree.leaves(args)):
+        if place in codes:
+            code = np.frombuffer(codes[place], np.int8).reshape(leaf.shape)
+            known.append(np.where(code == _NUMBER, np.nan, code))
+        elif eqx.is_array(leaf):
+            known.append(None)
+    return known
+
+
 def rely_on(function: Callable[..., Any], structure: Structure) -> Callable[..., Any]:
     """Function to be compiled, for arguments of this structure and with that of its constants."""
 
     @wraps(function)
     def run(*args: Any, **keywords: Any) -> Any:
-        leaves = jax.tree.leaves((args, keywords))
-        known: dict[int, Known] = {}
-        for place, codes in structure:
-            code = np.frombuffer(codes, np.int8).reshape(leaves[place].shape)
-            known[place] = np.where(code == _NUMBER, np.nan, code)
         traced, shapes, static = eqx.filter_make_jaxpr(function)(*args, **keywords)
-        places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
-        folded = fold_structure(traced, [known.get(k) for k in places])
-        values = jaxpr_as_fun(folded)(*(leaves[k] for k in places))
+        folded = fold_structure(traced, read_structure(structure, (args, keywords)))
+        values = jaxpr_as_fun(folded)(*filter(eqx.is_array, jax.tree.leaves((args, keywords))))
         outputs = [_as_array(*of) for of in zip(values, traced.out_avals, strict=True)]
         return eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), outputs), static)
 
