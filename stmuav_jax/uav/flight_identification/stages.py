@@ -956,9 +956,9 @@ def _identify_rotation(
             elif not fit.free[-1]:
                 del new["delay"]
                 refusals["delay"] = (
-                    f"The delay is not determined: it ends at the bound of {1e3 * fit.values[-1]:g} ms. Time "
-                    "stamps of the commands that are late or early against the gyroscope's would bias lag and "
-                    "effectiveness too."
+                    f"The delay ends at the bound of {1e3 * fit.values[-1]:g} ms, which has no deviation. Commands "
+                    "without a delay do so; commands whose time stamps are late or early against the gyroscope's do "
+                    "so too, and then lag and effectiveness are biased."
                 )
             estimates |= new
             return evaluation
