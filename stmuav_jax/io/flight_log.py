@@ -426,8 +426,8 @@ def _hold_commands(flight: FlightLog, grid: np.ndarray, rate: float) -> tuple[np
         late = 1 / channel.rate
     gaps = [(gap.start, gap.end) for gap in flight.gaps if gap.channel == "motor_commands"]
     # The mean over the step has the same integral as the commands: a mean around its start would act half a step late.
-    held = _on_grid(grid + 0.5 / rate, 1 / rate, ts - 0.5 * late, values, True, gaps)
-    return held, late / 12**0.5
+    held_commands = _on_grid(grid + 0.5 / rate, 1 / rate, ts - 0.5 * late, values, True, gaps)
+    return held_commands, late / 12**0.5
 
 
 def read_flight_log(

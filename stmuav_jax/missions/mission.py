@@ -160,7 +160,7 @@ def load_mission(
                 "A file's name ends in .toml."
             )
         path = LIBRARY / f"{text}.toml"
-    content = {"name": path.stem} | read_toml(path)
+    content: dict[str, Any] = {"name": path.stem} | read_toml(path)
     if "bodies" in content:
         raise FileError(
             f'{path} is a model, not a mission: a mission names it with model = "{path.name}" in its '
@@ -171,7 +171,7 @@ def load_mission(
     if true_states:
         content.pop("sensors", None)
     if truth:
-        content["truth"] = dict(content.get("truth", {})) | dict(truth)
+        content["truth"] = {**content.get("truth", {}), **truth}
     try:
         return make_mission(content, path.parent)
     except FileError:

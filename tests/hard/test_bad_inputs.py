@@ -256,10 +256,10 @@ def test_records_that_say_two_things_are_refused(text, words, tmp_path):
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        ("0,1,2,3,5,1,2,3\n", "four numbers in each line"),
-        ("0,1\n2,3\n", "four numbers in each line"),
+        ("0,1,2,3,5,1,2,3\n", "line 2: 8 cells, but the header has 4"),
+        ("0,1\n2,3\n", "line 2: 2 cells, but the header has 4"),
         ("0,1,2,3\n0,1,2,3\n", "times that increase"),
-        ("0,1,2,inf\n", "finite numbers"),
+        ("0,1,2,inf\n", "line 2: 'inf' in column 'yaw' is not a finite number"),
         ("0,1,2,1e300\n", "angles beyond 1e.09 degrees"),
     ],
 )

@@ -132,12 +132,28 @@ def test_a_study_counts_the_same_forces():
     )
     zero, one = jnp.zeros(()), jnp.ones(())
     none_yet, reason = jnp.zeros(0), jnp.zeros((), jnp.int8)
-    begun = ensemble.Worst(zero, zero, zero, none_yet, one, one, one, one, zero, reason, zero)
+    begun = ensemble.Worst(
+        zero,
+        zero,
+        zero,
+        none_yet,
+        one,
+        one,
+        one,
+        one,
+        zero,
+        one,
+        one,
+        jnp.array(False),
+        reason,
+        zero,
+    )
     joined = inspect.unwrap(ensemble._join_worst)
     for at, margin in ((jnp.inf, -1 / 6), (0.5, 0.125)):
         jam = SimpleNamespace(at=jnp.array([jnp.inf, at]))
+        truth = SimpleNamespace(battery=None, speeds=None)
         of: Any = SimpleNamespace(
-            speeds=None, limits=None, controller=SimpleNamespace(force=jnp.full(2, 6.0), jam=jam)
+            truth=truth, limits=None, controller=SimpleNamespace(force=jnp.full(2, 6.0), jam=jam)
         )
         worst = joined(mission, of, begun, found)
         assert float(worst.forces) == pytest.approx(margin)

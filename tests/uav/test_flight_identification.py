@@ -592,7 +592,7 @@ def test_commands_hold_over_the_steps_of_a_record(tmp_path):
 
 def test_filters_of_firmware_have_the_delay_of_a_digital_clock():
     for cutoff in (30.0, 80.0):
-        _, delay = group_delay(butter(2, cutoff, fs=1000.0), [1e-3])
+        _, delay = group_delay(butter(2, cutoff, fs=1000.0), np.array([1e-3]))  # pyright: ignore[reportArgumentType]
         assert filter_delay(cutoff, 1e-3) == pytest.approx(delay[0] / 1000, rel=1e-4)
         assert filter_delay(cutoff, 0.0) == pytest.approx(2**0.5 / (2 * np.pi * cutoff))
 

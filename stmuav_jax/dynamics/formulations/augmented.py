@@ -275,7 +275,7 @@ def prepare_rows(system: System) -> AugmentedModel:
     """System prepared for its constraint rows, of which none is left out of the equations."""
     inertia = as_numpy(system.bodies.inertia)
     # NumPy's compiles nothing
-    invert = np.linalg.inv if isinstance(inertia, np.ndarray) else lapack.inverse
+    invert: Any = np.linalg.inv if isinstance(inertia, np.ndarray) else lapack.inverse
     return AugmentedModel(system, group_constraints(system), as_jax(invert(inertia)))
 
 

@@ -1063,12 +1063,12 @@ def is_scalar(aval: Any) -> bool:
 
 
 def make_operands(
-    graph: Graph, avals: Sequence[Any], known: Sequence[np.ndarray | None] = ()
+    graph: Graph, avals: Sequence[Any], known_entries: Sequence[np.ndarray | None] = ()
 ) -> list[Nodes]:
     """Inputs of a graph for arguments of these shapes; `NotScalarError` for types without scalar form.
 
     Args:
-        known: values of entries that are known, those of the others NaN; None for none.
+        known_entries: values of entries that are known, those of the others NaN; None for none.
     """
     operands = []
     for number, aval in enumerate(avals):
@@ -1076,10 +1076,10 @@ def make_operands(
             raise NotScalarError(f"an argument of type {aval.dtype}")
         kind = "b" if aval.dtype == np.bool_ else "f"
         nodes = graph.add_inputs(number, math.prod(aval.shape), kind).reshape(aval.shape)
-        values = known[number] if number < len(known) else None
+        values = known_entries[number] if number < len(known_entries) else None
         if values is not None:
             for place in map(tuple, np.argwhere(~np.isnan(values))):
-                nodes[place] = graph.constant(values[place])
+                nodes[place] = graph.constant(float(values[place]))
         operands.append(Nodes(nodes))
     return operands
 
@@ -1089,18 +1089,18 @@ _SUMS = 8
 
 
 def make_graph(
-    jaxpr: Any, most_nodes: int, known: Sequence[np.ndarray | None] = ()
+    jaxpr: Any, most_nodes: int, known_entries: Sequence[np.ndarray | None] = ()
 ) -> tuple[Graph, list[np.ndarray]]:
     """Scalar program of a closed jaxpr: its graph, and the nodes of its outputs.
 
     Args:
-        known: see `make_operands`.
+        known_entries: see `make_operands`.
 
     Where NaN and infinities of inputs could be lost in products with 0, and the function itself does
     not look for them, 0 times those inputs is added to all outputs that are numbers.
     """
     graph = Graph(most_nodes)
-    operands = make_operands(graph, [v.aval for v in jaxpr.jaxpr.invars], known)
+    operands = make_operands(graph, [v.aval for v in jaxpr.jaxpr.invars], known_entries)
     outputs = scalarise(graph, jaxpr, operands)
     for aval in jaxpr.out_avals:
         if not is_scalar(aval):

@@ -52,7 +52,7 @@ class Program:
 
     Attributes:
         jaxpr: traced function, whose constants are known. groups: number of the argument to which each
-            operand belongs. known: entries of operands that machine code may rely on, those of the others
+            operand belongs. known_entries: entries of operands that machine code may rely on, those of the others
             NaN; None where there are none. See `structure`.
     """
 
@@ -60,9 +60,9 @@ class Program:
         self,
         jaxpr: Any,
         groups: Sequence[int] | None = None,
-        known: Sequence[np.ndarray | None] = (),
+        known_entries: Sequence[np.ndarray | None] = (),
     ) -> None:
-        self.jaxpr, self.known = jaxpr, known
+        self.jaxpr, self.known_entries = jaxpr, known_entries
         self.groups = tuple(groups or [0] * len(jaxpr.in_avals))
         self._derived: dict[Any, Program] = {}
         self._lock = threading.RLock()
@@ -88,7 +88,7 @@ class Program:
             # attempt takes as long as a success.
             if self._graph is None and self._reason is None:
                 try:
-                    self._graph = make_graph(self.jaxpr, llvm.MOST_NODES, self.known)
+                    self._graph = make_graph(self.jaxpr, llvm.MOST_NODES, self.known_entries)
                 except NotScalarError as error:
                     self._reason = str(error)
             return self._graph
@@ -149,10 +149,10 @@ class Program:
                 self._derived[key] = make()
             return self._derived[key]
 
-    def fold(self, known: Sequence[np.ndarray | None]) -> "Program":
+    def fold(self, known_entries: Sequence[np.ndarray | None]) -> "Program":
         """Program for operands some of whose entries are known."""
-        key = tuple(None if x is None else x.tobytes() for x in known)
-        return self.derived(("known", key), lambda: Program(self.jaxpr, self.groups, known))
+        key = tuple(None if x is None else x.tobytes() for x in known_entries)
+        return self.derived(("known", key), lambda: Program(self.jaxpr, self.groups, known_entries))
 
     def push_forward(self, tangent_mask: tuple[bool, ...]) -> "Program":
         """Program of (arguments, tangents of those that move) for the tangents of the results."""
@@ -233,10 +233,10 @@ class Recursion(Program):
     def graph(self) -> Any:
         return self.body.graph()
 
-    def fold_loop(self, known: Sequence[np.ndarray | None], jaxpr: Any) -> "Recursion":
+    def fold_loop(self, known_entries: Sequence[np.ndarray | None], jaxpr: Any) -> "Recursion":
         """Loop for operands some of whose entries are known, with the traced loop for batches."""
         # the last operand begins as zeros and is filled by the passes
-        body = self.body.fold([*known[:-1], *[None] * (1 + len(self.tables))])
+        body = self.body.fold([*known_entries[:-1], *[None] * (1 + len(self.tables))])
         return Recursion(jaxpr, self.groups, body, self.tables)
 
     def layout(self, shared: tuple[bool, ...], rows: int) -> Layout:

@@ -10,7 +10,7 @@ derivatives and batches have been taken, with every entry a variable: none is lo
 import math
 from collections.abc import Callable, Sequence
 from functools import cache, wraps
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -30,6 +30,8 @@ MOST_ENTRIES = 4096
 # Leaves of arguments by number, with the codes of all their entries: their value, or 2 for any.
 Structure = tuple[tuple[int, bytes], ...]
 
+Kind = TypeVar("Kind", bound=type)
+
 # Fields of classes by the values that are structure in them.
 _FIELDS: dict[type, dict[str, tuple[float, ...]]] = {}
 
@@ -37,14 +39,14 @@ _ZERO, _UNIT = (0.0,), (0.0, 1.0, -1.0)
 _NUMBER = 2
 
 
-def has_structure(*, zero: Sequence[str] = (), unit: Sequence[str] = ()) -> Callable[[type], type]:
+def has_structure(*, zero: Sequence[str] = (), unit: Sequence[str] = ()) -> Callable[[Kind], Kind]:
     """Decorator of a class of pytrees whose arrays in the fields have structure.
 
     Args:
         zero: fields whose zeros are structure. unit: those of frames and axes, whose 1 and -1 are, too.
     """
 
-    def mark(kind: type) -> type:
+    def mark(kind: Kind) -> Kind:
         _FIELDS[kind] = dict.fromkeys(zero, _ZERO) | dict.fromkeys(unit, _UNIT)
         return kind
 
@@ -104,14 +106,14 @@ def _agrees(structure: Structure, other: Structure) -> bool:
 
 def read_structure(structure: Structure, args: Any) -> list[Known]:
     """Known entries of the arrays among arguments."""
-    codes, known = dict(structure), []
+    codes, known_entries = dict(structure), []
     for place, leaf in enumerate(jax.tree.leaves(args)):
         if place in codes:
             code = np.frombuffer(codes[place], np.int8).reshape(leaf.shape)
-            known.append(np.where(code == _NUMBER, np.nan, code))
+            known_entries.append(np.where(code == _NUMBER, np.nan, code))
         elif eqx.is_array(leaf):
-            known.append(None)
-    return known
+            known_entries.append(None)
+    return known_entries
 
 
 def rely_on(function: Callable[..., Any], structure: Structure) -> Callable[..., Any]:
@@ -136,39 +138,41 @@ def _as_array(value: Any, aval: Any) -> Any:
     return jnp.asarray(kind(value)) if aval.weak_type and kind else jnp.asarray(value, aval.dtype)
 
 
-def fold_structure(jaxpr: Any, known: Sequence[Known]) -> Any:
+def fold_structure(jaxpr: Any, known_entries: Sequence[Known]) -> Any:
     """Closed jaxpr whose machine code is made for the known entries of its arguments."""
-    return _Fold().fold_closed(jaxpr, known)[0]
+    return _Fold().fold_closed(jaxpr, known_entries)[0]
 
 
 class _Fold:
     """Pass through a jaxpr and those within it; each is done once for the same known entries."""
 
     def __init__(self) -> None:
-        self._done: dict[Any, tuple[Any, list[Known], Any]] = {}
+        self._folded: dict[Any, tuple[Any, list[Known], Any]] = {}
 
-    def fold_closed(self, closed: Any, known: Sequence[Known]) -> tuple[Any, list[Known]]:
+    def fold_closed(self, closed: Any, known_entries: Sequence[Known]) -> tuple[Any, list[Known]]:
         """Closed jaxpr made for its known arguments, and what is known of its results."""
-        jaxpr, results = self.fold(closed.jaxpr, [_read_units(c) for c in closed.consts], known)
+        jaxpr, results = self.fold(
+            closed.jaxpr, [_read_units(c) for c in closed.consts], known_entries
+        )
         return (closed if jaxpr is closed.jaxpr else closed.replace(jaxpr=jaxpr)), results
 
     def fold(
-        self, jaxpr: Any, constants: Sequence[Known], known: Sequence[Known]
+        self, jaxpr: Any, constants: Sequence[Known], known_entries: Sequence[Known]
     ) -> tuple[Any, list[Known]]:
         """Jaxpr made for its known constants and arguments, and what is known of its results."""
-        given = [*constants, *known]
-        if all(x is None for x in given):
+        entries = [*constants, *known_entries]
+        if all(x is None for x in entries):
             return jaxpr, [None] * len(jaxpr.outvars)
-        key = (id(jaxpr), tuple(None if x is None else x.tobytes() for x in given))
-        if key not in self._done:
+        key = (id(jaxpr), tuple(None if x is None else x.tobytes() for x in entries))
+        if key not in self._folded:
             # the jaxpr is kept with its result, so that no other gets its identity
-            self._done[key] = (*self._fold_equations(jaxpr, given), jaxpr)
-        return self._done[key][:2]
+            self._folded[key] = (*self._fold_equations(jaxpr, entries), jaxpr)
+        return self._folded[key][:2]
 
-    def _fold_equations(self, jaxpr: Any, given: Sequence[Known]) -> tuple[Any, list[Known]]:
+    def _fold_equations(self, jaxpr: Any, entries: Sequence[Known]) -> tuple[Any, list[Known]]:
         values = {
             variable: x
-            for variable, x in zip([*jaxpr.constvars, *jaxpr.invars], given, strict=True)
+            for variable, x in zip([*jaxpr.constvars, *jaxpr.invars], entries, strict=True)
             if x is not None
         }
 
@@ -189,33 +193,35 @@ class _Fold:
         results = [read(atom) for atom in jaxpr.outvars]
         return (jaxpr.replace(eqns=equations) if has_changed else jaxpr), results
 
-    def _fold_equation(self, equation: Any, known: list[Known]) -> tuple[Any, list[Known]]:
+    def _fold_equation(self, equation: Any, known_entries: list[Known]) -> tuple[Any, list[Known]]:
         """Parameters of an equation made for its known operands, and what is known of its results."""
         params, name = equation.params, equation.primitive.name
         unknown: list[Known] = [None] * len(equation.outvars)
-        if all(x is None for x in known):
+        if all(x is None for x in known_entries):
             return params, unknown
         if equation.primitive is native_p:
-            params = _fold_native(params, known)
+            params = _fold_native(params, known_entries)
             return params, _read_results(params)
         if name == "while":
-            return self._fold_while(params, known)
+            return self._fold_while(params, known_entries)
         if name == "scan":
-            return self._fold_scan(params, known)
+            return self._fold_scan(params, known_entries)
         if name == "cond":
-            branches = [self.fold_closed(branch, known[1:]) for branch in params["branches"]]
+            branches = [
+                self.fold_closed(branch, known_entries[1:]) for branch in params["branches"]
+            ]
             results = [_meet(xs) for xs in zip(*(results for _, results in branches), strict=True)]
             return {**params, "branches": tuple(branch for branch, _ in branches)}, results
         for key in ("jaxpr", "call_jaxpr"):
             inner = params.get(key)
-            if hasattr(inner, "consts") and len(inner.jaxpr.invars) == len(known):
-                folded, results = self.fold_closed(inner, known)
-            elif hasattr(inner, "eqns") and len(inner.invars) == len(known):
-                folded, results = self.fold(inner, [], known)
+            if hasattr(inner, "consts") and len(inner.jaxpr.invars) == len(known_entries):
+                folded, results = self.fold_closed(inner, known_entries)
+            elif hasattr(inner, "eqns") and len(inner.invars) == len(known_entries):
+                folded, results = self.fold(inner, [], known_entries)
             else:
                 continue
             return (params if folded is inner else {**params, key: folded}), results
-        return params, _evaluate(equation, known) or unknown
+        return params, _evaluate(equation, known_entries) or unknown
 
     def _fold_body(
         self, body: Any, fixed: list[Known], carried: list[Known], rows: list[Known]
@@ -230,19 +236,19 @@ class _Fold:
                 return folded, carried, results[count:]
             carried = meet
 
-    def _fold_while(self, params: Any, known: list[Known]) -> tuple[Any, list[Known]]:
+    def _fold_while(self, params: Any, known_entries: list[Known]) -> tuple[Any, list[Known]]:
         conditions, fixed = params["cond_nconsts"], params["body_nconsts"]
-        first, middle = known[:conditions], known[conditions : conditions + fixed]
-        start = known[conditions + fixed :]
+        first, middle = known_entries[:conditions], known_entries[conditions : conditions + fixed]
+        start = known_entries[conditions + fixed :]
         body, carried, _ = self._fold_body(params["body_jaxpr"], middle, start, [])
         condition, _ = self.fold_closed(params["cond_jaxpr"], [*first, *carried])
         return {**params, "body_jaxpr": body, "cond_jaxpr": condition}, carried
 
-    def _fold_scan(self, params: Any, known: list[Known]) -> tuple[Any, list[Known]]:
-        fixed, carried = count_carried(params, known)
-        rows = [_meet_rows(x, 1) for x in known[fixed + carried :]]
-        start = known[fixed : fixed + carried]
-        body, carry, results = self._fold_body(params["jaxpr"], known[:fixed], start, rows)
+    def _fold_scan(self, params: Any, known_entries: list[Known]) -> tuple[Any, list[Known]]:
+        fixed, carried = count_carried(params, known_entries)
+        rows = [_meet_rows(x, 1) for x in known_entries[fixed + carried :]]
+        start = known_entries[fixed : fixed + carried]
+        body, carry, results = self._fold_body(params["jaxpr"], known_entries[:fixed], start, rows)
         length = params["length"]
         stacked: list[Known] = [
             None if x is None else np.broadcast_to(x, (length, *x.shape)) for x in results
@@ -250,9 +256,9 @@ class _Fold:
         return {**params, "jaxpr": body}, [*carry, *stacked]
 
 
-def _fold_native(params: Any, known: list[Known]) -> Any:
+def _fold_native(params: Any, known_entries: list[Known]) -> Any:
     program, rank = params["program"], len(params["lead"])
-    rows = [_meet_rows(x, rank) for x in known]
+    rows = [_meet_rows(x, rank) for x in known_entries]
     if isinstance(program, Recursion):
         # batches of a loop are XLA's, with the machine code that it calls
         jaxpr = fold_structure(program.jaxpr, rows)
@@ -272,13 +278,13 @@ def _read_results(params: Any) -> list[Known]:
     return [None if x is None else np.broadcast_to(x, (*lead, *x.shape)) for x in rows]
 
 
-def _evaluate(equation: Any, known: list[Known]) -> list[Known] | None:
+def _evaluate(equation: Any, known_entries: list[Known]) -> list[Known] | None:
     """Entries of the results of a small operation that are known; None where it has no scalar form."""
     avals = [v.aval for v in (*equation.invars, *equation.outvars)]
     if sum(math.prod(a.shape) for a in avals) > MOST_ENTRIES or not all(map(is_scalar, avals)):
         return None
     graph = Graph(MOST_ENTRIES)
-    operands: list[Any] = make_operands(graph, [v.aval for v in equation.invars], known)
+    operands: list[Any] = make_operands(graph, [v.aval for v in equation.invars], known_entries)
     for k, atom in enumerate(equation.invars):
         if hasattr(atom, "val"):
             operands[k] = np.asarray(atom.val)
@@ -310,7 +316,7 @@ def _read_units(value: Any) -> Known:
 
 
 def _meet_rows(x: Known, rank: int) -> Known:
-    """What is known of all entries of the first `rank` dimensions alike."""
+    """Entries that are known and equal along the first `rank` dimensions."""
     if x is None or not x.size:
         return None
     return _meet([*map(np.asarray, x.reshape(-1, *x.shape[rank:]))])
