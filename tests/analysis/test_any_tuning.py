@@ -86,7 +86,11 @@ def test_a_motion_in_parts_is_that_in_one_piece(pushed):
 
 @pytest.mark.slow
 def test_a_cart_is_moved_with_its_pole_upright(cart):
-    """A force history after which the cart rests half a metre further on, to 1e-8."""
+    """A force history after which the cart rests half a metre further on.
+
+    To the error of the integration: flights of the same history with and without derivatives, whose steps
+    differ, end up to 2e-8 apart, since differences grow as the pole falls.
+    """
     space, x = cart
     target = space.retract(x, jnp.array([0.5, 0.0, 0.0, 0.0]))
     tuning = stm.analysis.tune_inputs(
@@ -96,7 +100,7 @@ def test_a_cart_is_moved_with_its_pole_upright(cart):
     found = tuning.search()
     motion = tuning.motion(found.values)
     end = jax.tree.map(lambda leaf: leaf[-1], motion.points)
-    assert float(jnp.max(jnp.abs(space.difference(end, target)))) < 1e-8
+    assert float(jnp.max(jnp.abs(space.difference(end, target)))) < 4e-8
     assert motion.inputs.shape == (200, 1)
     assert tuning.inputs(found.values)(jnp.asarray(0.3)).shape == (1,)
 
