@@ -32,11 +32,11 @@ def mass_moments(system: System, state: State) -> Moments:
     """Moments of all bodies of a system at a state; the first body is the base."""
     mass = system.bodies.mass
     R_0w = rotation_matrix(state.p[0]).T
-    d = (state.r - state.r[0]) @ R_0w.T
-    d_rate = (state.v - state.v[0]) @ R_0w.T - jnp.cross(state.omega[0], d)
+    d = (state.r - state.r[:1]) @ R_0w.T
+    d_rate = (state.v - state.v[:1]) @ R_0w.T - jnp.cross(state.omega[:1], d)
     R = jnp.einsum("ij,njk->nik", R_0w, jax.vmap(rotation_matrix)(state.p))
     body_inertias = jnp.einsum("nij,njk,nlk->nil", R, system.bodies.inertia, R)
-    spin = jnp.einsum("nij,nj->ni", R, state.omega) - state.omega[0]
+    spin = jnp.einsum("nij,nj->ni", R, state.omega) - state.omega[:1]
     square = jnp.sum(mass * jnp.sum(d**2, axis=1))
     return Moments(
         jnp.sum(mass),

@@ -154,11 +154,11 @@ def set_on_base(state: State, base: BasePose) -> State:
     # motion against the base does not depend on where that is or how it moves.
     R = rotation_matrix(state.p[0])
     turn, R_new = product(base.p, conjugate(state.p[0])), rotation_matrix(base.p)
-    arms = (state.r - state.r[0]) @ R
+    arms = (state.r - state.r[:1]) @ R
     omega_0 = jnp.broadcast_to(state.omega[0], arms.shape)
     # Velocities against the base, in its axes; the new base adds its own velocity and rotation to
     # them.
-    v = (state.v - state.v[0]) @ R - jnp.cross(omega_0, arms)
+    v = (state.v - state.v[:1]) @ R - jnp.cross(omega_0, arms)
     R_b = jax.vmap(lambda p: R.T @ rotation_matrix(p))(state.p)
     into_body = lambda x: jnp.einsum("nji,j->ni", R_b, x)
     omega = state.omega - into_body(state.omega[0]) + into_body(base.omega)

@@ -353,14 +353,13 @@ def _remove_motions(rows: Constraints) -> Constraints:
 
 def _has_loops(system: System) -> bool:
     """True if the joints close a loop of bodies."""
-    from scipy.sparse.csgraph import connected_components  # slow to import
-
     names = (*system.names, GROUND)
-    edges = np.zeros((len(names), len(names)))
-    for joint in system.joints:
-        edges[names.index(joint.body_i), names.index(joint.body_j)] = 1.0
-    # a forest has as many joints as bodies beyond one in each of its trees
-    return len(system.joints) > len(names) - connected_components(edges)[0]
+    incidence = np.zeros((len(system.joints), len(names)))
+    for row, joint in zip(incidence, system.joints, strict=True):
+        row[names.index(joint.body_i)] += 1.0
+        row[names.index(joint.body_j)] -= 1.0
+    # the edges of a forest are independent
+    return bool(np.linalg.matrix_rank(incidence) < len(incidence)) if len(incidence) else False
 
 
 _memory: OrderedDict[Any, _Postures] = OrderedDict()

@@ -97,7 +97,7 @@ _CARRYING = 0.3
 # Radii of gyration of multirotors over their mean arms: possible and usual ones.
 _GYRATION, _USUAL = (0.1, 5.0), (0.3, 1.3)
 # Mean specific force along the vertical in flight [m/s^2], change of the speed along it, and largest speed [m/s].
-_VERTICAL, _SPEED_CHANGE, _FASTEST = (9.4, 10.2), 2.0, 300.0
+_VERTICAL, _SPEED_CHANGE, _FASTEST = (7.0, 13.0), 2.0, 300.0
 # Level of the verdict and of variants that the record rejects.
 _LEVEL = 0.01
 # Lowest rate of commands [Hz].
@@ -498,6 +498,7 @@ def _observe_signals(
 
 def _check_gravity(signals: _Signals) -> None:
     """Refuse a specific force that on average is not gravity along the vertical which the gyroscope carries on."""
+    # The observer's vertical may be wrong by tens of degrees in wild flights, so the limits are wide.
     record = signals.record
     vertical = float(np.mean(np.sum(signals.force * -signals.gravity, axis=1))) / GRAVITY
     # The observer counts the mean horizontal force as a bias. It may be a tilt in wind instead.
