@@ -164,4 +164,4 @@ def set_on_base(state: State, base: BasePose) -> State:
     omega = state.omega - into_body(state.omega[0]) + into_body(base.omega)
     carried_v = v + jnp.cross(jnp.broadcast_to(base.omega, arms.shape), arms)
     p = jax.vmap(lambda p: product(turn, p))(state.p)
-    return State(base.r + arms @ R_new.T, p, base.v + carried_v @ R_new.T, omega)
+    return State(base.r[None] + arms @ R_new.T, p, base.v[None] + carried_v @ R_new.T, omega)
