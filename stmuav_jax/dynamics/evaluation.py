@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from ..checks.numbers import as_jax
 from ..checks.shapes import Numbers
 from ..math.compiler import in_blocks, kept_jit
+from ..math.native.program import native
 from ..mechanics.body import check_bodies
 from ..mechanics.internal import internal_states, with_internal
 from ..mechanics.load import Load, no_load
@@ -120,18 +121,20 @@ class Saved(NamedTuple):
 def _evaluate_dynamics(
     formulation: AbstractFormulation, model: Any, saved: Saved, reacting: bool
 ) -> tuple[Accelerations, Reactions | None]:
-    def dynamics_at(at: Saved) -> tuple[Accelerations, Reactions | None]:
-        current_model = at_internal(model, at.internal) if at.internal.shape[0] else model
-        body_accelerations = formulation.accelerations(
-            current_model, at.ts, at.states, Unstabilised()
-        )
-        return body_accelerations, formulation.reactions(
-            current_model, at.ts, at.states, body_accelerations
-        ) if reacting else None
-
     # One state after the other and not all at once: saved states are many, and a batch of all
     # would take memory in proportion.
-    return jax.lax.map(dynamics_at, saved)
+    return jax.lax.map(lambda at: _get_dynamics(formulation, model, at, reacting), saved)
+
+
+@native
+def _get_dynamics(
+    formulation: AbstractFormulation, model: Any, at: Saved, reacting: bool
+) -> tuple[Accelerations, Reactions | None]:
+    current_model = at_internal(model, at.internal) if at.internal.shape[0] else model
+    accelerations = formulation.accelerations(current_model, at.ts, at.states, Unstabilised())
+    if not reacting:
+        return accelerations, None
+    return accelerations, formulation.reactions(current_model, at.ts, at.states, accelerations)
 
 
 @kept_jit
