@@ -121,9 +121,9 @@ def _jit_with_options(function: Callable[..., Any], *, quick: bool) -> Callable[
         if not is_on():
             return make_outermost(options, None)
         structure = find_structure(args)
-        if structure:
-            structure = choose_structure(first, jax.tree.structure(args), structure)
-        return make_outermost(options, structure)
+        sizes = tuple((place, len(codes)) for place, codes in structure)
+        form = jax.tree.structure(args), sizes
+        return make_outermost(options, choose_structure(first, form, structure))
 
     @wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
@@ -201,7 +201,7 @@ def cached_program(function: Callable[..., Any], *args: Any) -> Callable[..., An
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return function
-    form, structure = _argument_form(args), find_structure(args) if is_on() else ()
+    form, structure = _argument_form(args), find_structure(args)
     with _lock:
         structure = choose_structure(_structures, (function, form), structure)
         key = (function, form, structure)
@@ -259,11 +259,12 @@ def compile_for_shapes(
     options, arrays = compiler_options(quick=quick), [leaves[k] for k in places]
     outermost, result = run_arrays, None
     programs = _Command.programs
-    about = [sorted(options.items()), [(place, codes.hex()) for place, codes in structure]]
-    if programs is not None and (key := programs.next_key(run_arrays.__name__, args, about)):
-        outermost, result = programs.load(key) or _export_program(
-            programs, key, run_arrays, arrays, result_places
-        )
+    if programs is not None:
+        about = [sorted(options.items()), [(place, codes.hex()) for place, codes in structure]]
+        if key := programs.next_key(name, args, about):
+            outermost, result = programs.load(key) or _export_program(
+                programs, key, run_arrays, arrays, result_places
+            )
     compiled = jax.jit(outermost, compiler_options=options).lower(arrays).compile()
     result = result_places[0] if result is None else result
 

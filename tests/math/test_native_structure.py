@@ -58,6 +58,16 @@ def test_the_structure_of_arguments_is_their_zeros_and_units_in_marked_fields():
     assert find_structure((X, {"a": X})) == ()
 
 
+@pytest.mark.parametrize("jit", [kept_jit, outer_jit])
+def test_arrays_of_other_shapes_have_programs_of_their_own(jit, machine_code):
+    machine_code(True)
+    program = jit(jax.vmap(turn, in_axes=(0, None)))
+    for count in (2, 3):
+        frames = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), make_frame())
+        expected = jnp.stack([turn(make_frame(), X)] * count)
+        np.testing.assert_allclose(program(frames, X), expected, rtol=1e-15)
+
+
 def test_arrays_without_entries_have_no_structure(operations):
     empty = eqx.tree_at(lambda f: f.axes, make_frame(), jnp.zeros((3, 0)))
     assert [place for place, _ in find_structure(empty)] == [1]

@@ -8,6 +8,7 @@ derivatives and batches have been taken, with every entry a variable: none is lo
 """
 
 import math
+import weakref
 from collections.abc import Callable, Sequence
 from functools import cache, wraps
 from typing import Any, TypeVar
@@ -19,7 +20,7 @@ import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
 from .graph import Graph, NotScalarError, count_carried, is_scalar, make_operands, translate
-from .program import Recursion, native_p
+from .program import Recursion, is_on, native_p
 
 # Values of the entries of an array that are known, those of the others NaN; None where none is known.
 Known = np.ndarray | None
@@ -68,19 +69,34 @@ def _find_places(tree: Any) -> dict[int, tuple[float, ...]]:
 
 
 def find_structure(args: Any) -> Structure:
-    """Entries of arguments' arrays that are structure."""
+    """Entries of arguments' arrays that are structure; none where machine code is turned off."""
+    if not is_on():
+        return ()
     leaves, tree = jax.tree.flatten(args)
-    structure = []
-    for place, values in _find_places(tree).items():
-        leaf = leaves[place]
-        if not eqx.is_array(leaf) or leaf.dtype != np.float64 or not leaf.size:
-            continue
-        array = np.asarray(leaf)
-        codes = np.full(array.shape, _NUMBER, np.int8)
-        for value in values:
-            codes[array == value] = value
-        structure.append((place, codes.tobytes()))
-    return tuple(structure)
+    places = _find_places(tree).items()
+    codes = ((place, _encode(leaves[place], values)) for place, values in places)
+    return tuple((place, code) for place, code in codes if code)
+
+
+# Codes of JAX's arrays, which do not change, by identity and values: the same model comes with every call.
+_codes: dict[tuple[int, tuple[float, ...]], tuple[weakref.ref[Any], bytes]] = {}
+
+
+def _encode(leaf: Any, values: tuple[float, ...]) -> bytes:
+    """Codes of an array's entries; empty for a leaf without structure."""
+    key = (id(leaf), values)
+    entry = _codes.get(key)
+    if entry is not None and entry[0]() is leaf:
+        return entry[1]
+    if not eqx.is_array(leaf) or leaf.dtype != np.float64:
+        return b""
+    array = np.asarray(leaf)
+    codes = np.full(array.shape, _NUMBER, np.int8)
+    for value in values:
+        codes[array == value] = value
+    if isinstance(leaf, jax.Array):
+        _codes[key] = weakref.ref(leaf, lambda _: _codes.pop(key, None)), codes.tobytes()
+    return codes.tobytes()
 
 
 def choose_structure(first: dict[Any, Structure], key: Any, structure: Structure) -> Structure:
@@ -89,7 +105,7 @@ def choose_structure(first: dict[Any, Structure], key: Any, structure: Structure
     So there are two programs for a form of arguments at most.
 
     Args:
-        first: structures of the first numbers by key.
+        first: structures of the first numbers by key. key: what has the same leaves and sizes of arrays.
     """
     chosen = first.setdefault(key, structure)
     return chosen if _agrees(structure, chosen) else ()
@@ -224,17 +240,14 @@ class _Fold:
         return params, _evaluate(equation, known_entries) or unknown
 
     def _fold_body(
-        self, body: Any, fixed: list[Known], carried: list[Known], rows: list[Known]
+        self, body: Any, fixed: list[Known], start: list[Known], rows: list[Known]
     ) -> tuple[Any, list[Known], list[Known]]:
         """Pass of a loop, what is known of its carry in every pass, and of its other results."""
-        while True:
-            folded, results = self.fold_closed(body, [*fixed, *carried, *rows])
-            count = len(carried)
-            meet = [_meet(pair) for pair in zip(carried, results[:count], strict=True)]
-            # every pass knows less than the one before, or the same
-            if all(_is_same(a, b) for a, b in zip(carried, meet, strict=True)):
-                return folded, carried, results[count:]
-            carried = meet
+        # of a carry, what every pass hands on as it is
+        inputs, outputs = body.jaxpr.invars[len(fixed) :], body.jaxpr.outvars
+        carried = [x if a is b else None for x, a, b in zip(start, inputs, outputs, strict=False)]
+        folded, results = self.fold_closed(body, [*fixed, *carried, *rows])
+        return folded, carried, results[len(start) :]
 
     def _fold_while(self, params: Any, known_entries: list[Known]) -> tuple[Any, list[Known]]:
         conditions, fixed = params["cond_nconsts"], params["body_nconsts"]
@@ -330,9 +343,3 @@ def _meet(arrays: Sequence[Known]) -> Known:
             return None
         first = np.where(first == other, first, np.nan)
     return None if first is None or np.isnan(first).all() else first
-
-
-def _is_same(a: Known, b: Known) -> bool:
-    if a is None or b is None:
-        return a is b
-    return np.array_equal(a, b, equal_nan=True)
