@@ -149,8 +149,6 @@ def test_an_own_multirotor_flies_from_a_file_to_a_film(tmp_path, monkeypatch):
             continue
         quick = ["--figures", "none"] if words[0] == "fly" else []
         quick += ["--span", "0", "0.2"] if words[0] == "view" else []
-        # the page's numbers are those of the flight without it
-        quick += ["--out", "runs/truth"] if "--truth" in words else []
         assert cli.main([*words, *quick]) == 0, line
     assert (tmp_path / "survey.gif").stat().st_size > 10_000
     data = stm.missions.outcome.measures(stm.io.load("runs/survey/flight.nc"))

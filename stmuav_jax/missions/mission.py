@@ -69,7 +69,7 @@ from .machine import (
 )
 from .schema import MissionFile, MoveEntry, PathEntry, SunEntry
 from .signals import Gauges
-from .truth import FlightBattery, Truth, make_truth, true_table, truth_table
+from .truth import FlightBattery, Truth, apply_truth, list_truth_parameters, make_truth
 
 LIBRARY = Path(__file__).parent / "library"
 _DEGREE = math.pi / 180
@@ -209,10 +209,10 @@ def make_mission(plain: Mapping[str, Any], folder: str | os.PathLike[str] = ".")
     gauges = Gauges(machine, plant.system, payloads_of(entries, machine.scene))
     believed, table = (
         Truth(plant, gauges, machine.speeds, battery),
-        truth_table(entries, machine, battery),
+        list_truth_parameters(entries, machine, battery),
     )
     mission = Mission(
-        entries, machine, believed, true_table(entries, machine, table), controller_of(entries, machine, plant),
+        entries, machine, believed, apply_truth(entries, machine, table), controller_of(entries, machine, plant),
         References(_make_path(entries.path, machine), panel, _joint_moves(entries, machine)), folder=Path(folder),
     )  # fmt: skip
     assert mission.samples > 1

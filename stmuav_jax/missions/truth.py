@@ -53,7 +53,7 @@ class Truth(NamedTuple):
     battery: FlightBattery | None
 
 
-def truth_table(
+def list_truth_parameters(
     entries: MissionFile, machine: Machine, battery: FlightBattery | None
 ) -> Parameters:
     """Parameters of a mission's machine, of its payloads and its battery, as the controller has them."""
@@ -72,7 +72,7 @@ def truth_table(
     return Parameters(table.name, {name: table[name] for name in table} | extra)
 
 
-def true_table(entries: MissionFile, machine: Machine, table: Parameters) -> Parameters:
+def apply_truth(entries: MissionFile, machine: Machine, table: Parameters) -> Parameters:
     """Table with the mission's `truth`.
 
     Raises:
