@@ -97,7 +97,9 @@ _CARRYING = 0.3
 # Radii of gyration of multirotors over their mean arms: possible and usual ones.
 _GYRATION, _USUAL = (0.1, 5.0), (0.3, 1.3)
 # Mean specific force along the vertical in flight [m/s^2], change of the speed along it, and largest speed [m/s].
-_VERTICAL, _SPEED_CHANGE, _FASTEST = (7.0, 13.0), 2.0, 300.0
+_VERTICAL, _SPEED_CHANGE, _FASTEST = (9.4, 10.2), 2.0, 300.0
+# Equal parts of the flight whose median counts beside the mean.
+_PARTS = 8
 # Level of the verdict and of variants that the record rejects.
 _LEVEL = 0.01
 # Lowest rate of commands [Hz].
@@ -498,18 +500,24 @@ def _observe_signals(
 
 def _check_gravity(signals: _Signals) -> None:
     """Refuse a specific force that on average is not gravity along the vertical which the gyroscope carries on."""
-    # The observer's vertical may be wrong by tens of degrees in wild flights, so the limits are wide.
     record = signals.record
-    vertical = float(np.mean(np.sum(signals.force * -signals.gravity, axis=1))) / GRAVITY
+    along = np.sum(signals.force * -signals.gravity, axis=1) / GRAVITY
+    # In a wild manoeuvre the observer may lose the vertical for seconds, which the median of parts of
+    # the flight does not see. A part alone says little in a short flight, where the mean says more.
+    # So both must be wrong.
+    parts = np.array([np.mean(part) for part in np.array_split(along, _PARTS)])
+    vertical, median = float(np.mean(along)), float(np.median(parts))
     # The observer counts the mean horizontal force as a bias. It may be a tilt in wind instead.
-    most = float(np.hypot(vertical, np.linalg.norm(np.mean(signals.force[:, :2], axis=0))))
-    low, high = _VERTICAL
+    horizontal = float(np.linalg.norm(np.mean(signals.force[:, :2], axis=0)))
     change = _SPEED_CHANGE / float(record.ts[-1] - record.ts[0])
-    if not (most >= low - change and vertical <= high + change):
+    low, high = _VERTICAL[0] - change, _VERTICAL[1] + change
+    if not any(
+        np.hypot(value, horizontal) >= low and value <= high for value in (vertical, median)
+    ):
         raise SettingError(
             f"The accelerometer measures {vertical:.3g} m/s^2 on average along the vertical that the gyroscope tells; "
-            f"{low - change:.3g} to {high + change:.3g} m/s^2 would be valid: is the unit or the scale of the "
-            "gyroscope or of the accelerometer another?"
+            f"{low:.3g} to {high:.3g} m/s^2 would be valid: is the unit or the scale of the gyroscope or of the "
+            "accelerometer another?"
         )
 
 
