@@ -501,12 +501,12 @@ def _observe_signals(
 def _check_gravity(signals: _Signals) -> None:
     """Refuse a specific force that on average is not gravity along the vertical which the gyroscope carries on."""
     record = signals.record
-    along = np.sum(signals.force * -signals.gravity, axis=1) / GRAVITY
+    vertical_force = np.sum(signals.force * -signals.gravity, axis=1) / GRAVITY
     # In a wild manoeuvre the observer may lose the vertical for seconds, which the median of parts of
     # the flight does not see. A part alone says little in a short flight, where the mean says more.
     # So both must be wrong.
-    parts = np.array([np.mean(part) for part in np.array_split(along, _PARTS)])
-    vertical, median = float(np.mean(along)), float(np.median(parts))
+    parts = np.array([np.mean(part) for part in np.array_split(vertical_force, _PARTS)])
+    vertical, median = float(np.mean(vertical_force)), float(np.median(parts))
     # The observer counts the mean horizontal force as a bias. It may be a tilt in wind instead.
     horizontal = float(np.linalg.norm(np.mean(signals.force[:, :2], axis=0)))
     change = _SPEED_CHANGE / float(record.ts[-1] - record.ts[0])
