@@ -126,6 +126,7 @@ def test_bad_input_is_one_paragraph_and_exit_code_two(arguments, words, capsys, 
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_run_that_cannot_go_on_keeps_what_was_reached(tmp_path, capsys):
     code = run(
         "simulate", "hexacopter", "--t1", "0.1", "--max-steps", "2", "--figures", "none",

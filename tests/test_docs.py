@@ -246,6 +246,7 @@ def test_the_page_of_studies_has_each_distribution_with_all_its_parameters():
     assert rows == {name: set(kind.parameters) for name, kind in KINDS.items()}
 
 
+@pytest.mark.slow
 def test_model_of_the_page_is_read(tmp_path):
     _, text, air = fenced(DOCS / "models.md", "toml")
     (tmp_path / "model.toml").write_text(text)

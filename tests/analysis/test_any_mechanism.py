@@ -75,6 +75,7 @@ def test_matrices_of_a_cart_pole_in_closed_form(cart):
     assert np.min(found.controllability()) > 1e-2
 
 
+@pytest.mark.slow
 def test_trim_of_an_accelerating_cart(cart):
     """A pole that leans into a constant acceleration a: tan(angle) = a / g, F = (M + m) a."""
     space, x = cart
@@ -162,6 +163,7 @@ def test_four_bar_against_its_twin(bars):
         assert float(held.values[0]) == pytest.approx(float(slope), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_loops_that_do_not_close_give_no_numbers():
     """A rocker turned beyond its reach: no accelerations, and words instead of a linearisation."""
     space = stm.TreeSpace(four_bar(), independent=["D.angle"])
@@ -198,6 +200,7 @@ def test_a_singular_posture_is_reported():
 # --- the hexacopter in hover, against the rigid body's closed form
 
 
+@pytest.mark.slow
 def test_matrices_of_a_hexacopter_in_closed_form():
     """Level, with errors (r, turn in body axes, v, omega): v' = g turn x z + lift z / m, J omega' = M u."""
     scene = stm.make_scene("hexacopter")

@@ -71,6 +71,7 @@ def test_a_filter_of_a_four_bar_is_that_of_its_twin(bars):
 # --- a pendulum whose centre of mass and inertia are states too, against its equation by hand
 
 
+@pytest.mark.slow
 def test_centre_of_mass_and_inertia_of_a_pendulum():
     """States beside the motion: the filter is that of (J + m c^2) a'' = torque - m g c sin(a)."""
     mass, true = 1.2, np.array([0.35, 0.03])

@@ -57,6 +57,7 @@ def start(many):
     return jax.tree.map(lambda x: x[0], many[1])
 
 
+@pytest.mark.slow
 def test_hover_speeds(many):
     """The trimmed speeds at the initial posture, by a program written apart from this one."""
     angles, found = many
@@ -107,6 +108,7 @@ def test_refused(uav):
         Uav(uav.space.with_system(bare), uav.geometry, uav.displacement)
 
 
+@pytest.mark.slow
 def test_outside_the_workspace(uav, many):
     """Each limit has its reason; the values stay, and are those of a trim without the limit."""
     angles, found = many[0][16:], jax.tree.map(lambda x: x[16:], many[1])
@@ -151,6 +153,7 @@ def test_other_things_in_place_of_a_flight(uav):
         steady_turn(1.0, np.nan, START)
 
 
+@pytest.mark.slow
 def test_within_rotor_limits(uav, start):
     """Speeds of least norm beyond a limit are refused with both; the values stay."""
     slowest, fastest = float(jnp.min(start.speeds)), float(jnp.max(start.speeds))
@@ -183,6 +186,7 @@ def linear(uav, start):
     return linearize(uav.space, start.point, uav.inputs, start.values)
 
 
+@pytest.mark.slow
 def test_linear_model_of_an_earlier_commit(uav, start, linear):
     """It was in the panel's angles (phi, theta) instead of those of the joint at its post."""
     of = lambda v: uav.panel_angles(uav.space.retract(start.point, v))
@@ -271,6 +275,7 @@ def test_panel_at_the_sun(uav):
         trim_flight(uav, hover(sun=[1.0, 0.0, 0.05]))
 
 
+@pytest.mark.slow
 def test_steady_turn_stays_steady(uav):
     """Flown for half a second, the base moves on its circle; its attitude turns with it."""
     speed, rate = 3.0, 0.8

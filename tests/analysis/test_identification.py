@@ -107,6 +107,7 @@ def test_turns_of_an_angle_may_be_recorded_or_not(spun, by_encoder):
         assert float(each.start.mean.u[0]) == pytest.approx(20.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_missing_readings_are_left_out(spun, by_encoder):
     """NaN and a mask say the same: 30 % of single readings and a gap of 0.3 s."""
     holes = np.random.default_rng(5).random(spun.shape) < 0.3
@@ -305,6 +306,7 @@ def test_what_no_mechanism_has_is_named():
     assert physical_faults(SYSTEM) == ()
 
 
+@pytest.mark.slow
 def test_rotations_are_compared_as_rotations():
     """A body that turns three times: a rate from unit quaternions of either sign, and from rotation vectors."""
     ts, rate, noise = np.linspace(0.0, 4.0, 80), 5.0, 0.02

@@ -58,6 +58,7 @@ def test_a_path_of_a_passive_joint_has_the_efforts_of_the_actuator():
     np.testing.assert_allclose(np.asarray(run["slide"]) * speed, power, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_path_that_is_not_determined_is_refused():
     with pytest.raises(stm.ModelError, match="degree"):
         inverse_dynamics(three_rps(0.45), {"P0": lambda t: 0.0 * t}, [0.0, 0.1])

@@ -104,6 +104,7 @@ def test_survey_of_a_five_bar_linkage():
     np.testing.assert_allclose(heavy.values[inside], 2 * found.values[inside], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_a_survey_refuses():
     with pytest.raises(stm.SettingError, match="names of two coordinates"):
         stm.analysis.survey(five_bar(), ["A.angle"], [(-1, 1)])

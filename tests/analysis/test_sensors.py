@@ -89,6 +89,7 @@ def test_sensors_of_a_turning_body(copter):
     np.testing.assert_allclose(seen.omega_rate[0], rates[9:], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_readings_along_a_run():
     """The same sensors on a simulated pendulum: the encoder is the joint's own angle."""
     system = pendulum()

@@ -159,6 +159,7 @@ def test_every_peer_has_a_case_and_settings_from_coarse_to_fine():
             assert size == sorted(size, reverse=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("peer", some(TOLD))
 def test_accelerations_at_the_start(peer, scene):
     one, expected = (

@@ -57,6 +57,7 @@ def wanted(t):
     return jnp.stack([0.05 * jnp.sin(3.0 * t), 0.15 * jnp.cos(3.0 * t)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, None])
 def test_a_loop_is_the_exact_sampled_system(steps):
     """A spring's mass under a delayed feedback, by the matrix exponential."""
@@ -88,6 +89,7 @@ def stiff_loop(method=None, steps=None):
 TIGHT = {"rtol": HELD, "atol": HELD, "steps": "state"}
 
 
+@pytest.mark.slow
 def test_an_implicit_loop_is_the_exact_sampled_system():
     run = stiff_loop(stm.Method(solver=stm.dynamics.kvaerno5(), **TIGHT))
     exact = by_hand(31, 0, lambda t: np.zeros(2), 1e5, 50.0)

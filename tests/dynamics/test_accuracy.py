@@ -42,6 +42,7 @@ def reference():
 
 
 # At 1e-4 and 1e-6 every interval of saved times is one step, whatever the tolerance.
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-13])
 def test_the_estimate_is_within_a_factor_of_three_of_the_error(reference, tolerance):
     found = run(tolerance=tolerance)

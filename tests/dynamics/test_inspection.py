@@ -61,6 +61,7 @@ def pendulum(mass=1.0, inertia=(0.1, 0.1, 0.01), gravity=9.81, stiffness=0.0):
     return stm.System([body], [pin], [stm.Gravity((0, 0, -gravity)), spring])
 
 
+@pytest.mark.slow
 def test_wrong_units_show():
     assert stm.check(pendulum()).worst == "note"
     changes: list[tuple[dict[str, Any], str, str]] = [
@@ -101,6 +102,7 @@ def test_what_cannot_be_simulated_is_a_fault():
         stm.check(stm.make_scene("spin"), start)
 
 
+@pytest.mark.slow
 def test_the_command_says_by_its_exit_code_what_is_wrong(tmp_path, capsys):
     text = (MODELS / "pendulum.toml").read_text()
     good, odd = tmp_path / "good.toml", tmp_path / "odd.toml"

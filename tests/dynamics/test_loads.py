@@ -75,6 +75,7 @@ def test_every_body_is_in_equilibrium(short_run):
         assert np.max(np.abs(left)) < 1e-11 * max(size, 1.0)
 
 
+@pytest.mark.slow
 def test_joints_carry_nothing_along_what_they_leave_free(short_run):
     """Sliders along z, hinges about z, universal joints about x or y of one body, balls none."""
     found = stm.dynamics.run_loads(short_run)

@@ -34,6 +34,7 @@ def test_a_slider_crank_and_its_derivatives_are_those_by_xla(formulation, machin
         np.testing.assert_allclose(mine, others, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_number_of_the_state_that_is_not_finite_is_seen_wherever_xla_sees_it(machine_code):
     system, formulation = slider_crank(0.8, "O"), stm.Tree()
     model = formulation.prepare(system)

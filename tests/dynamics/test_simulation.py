@@ -260,6 +260,7 @@ def test_what_a_run_holds(run):
     np.testing.assert_allclose(snapshot.reactions.force[:, 0], expected, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_states_between_saved_times_are_as_accurate_as_on_them(run):
     """A run saved rarely, between its times, against the one that saves there."""
     rare = stm.simulate(SCENE, method=stm.Method(rtol=1e-10, atol=1e-10), ts=[0.0, 0.16, 0.4])
@@ -303,6 +304,7 @@ def failed():
     return error.value
 
 
+@pytest.mark.slow
 def test_a_load_that_turns_bad_is_named(failed):
     assert "load of AppliedForce on bob is not finite" in str(failed)
     assert "stopped at t = 0.3" in str(failed)
@@ -363,6 +365,7 @@ def test_a_full_certificate_needs_the_analysis():
         stm.simulate(SCENE, analysis=False, certificate="full")
 
 
+@pytest.mark.slow
 def test_too_few_steps():
     run = stm.simulate(SCENE, method=stm.Method(max_steps=2, rtol=1e-12, atol=1e-12), throw=False)
     assert run.certificate.result == "max_steps reached"

@@ -66,6 +66,7 @@ def minimal(parameters, t, event=None):
     return solve_ivp(f, (0, t), [0.7, rate], method="DOP853", rtol=1e-13, atol=1e-14, events=event)
 
 
+@pytest.mark.slow
 def test_values_under_jit_and_vmap(batched):
     """The minimal-coordinate pendulum says the same."""
     for parameters, value in zip(BATCH, batched[0], strict=True):
@@ -84,6 +85,7 @@ def test_a_batch_in_reverse_is_its_members_in_forward_mode(batched, forward):
             assert float(rate) == pytest.approx(float(gradient[k]), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_equal_finite_differences(batched, forward):
     for k, direction in enumerate(jnp.eye(3)):
         value = lambda h, d=direction: forward(BATCH[0] + h * d, d)[0]
@@ -178,6 +180,7 @@ def test_masses_that_are_none_are_flagged_and_leave_the_others_alone(formulation
             stm.simulate(system, swung(system, 0.7), t1=0.1)
 
 
+@pytest.mark.slow
 def test_output_times_may_go_back():
     """To 0.5 s and back to 0.2 s and the start, as a run that goes straight there."""
     through = jax.jit(lambda ts: run((1.0, 2.0, 9.81), ts, adjoint=diffrax.ForwardMode()))

@@ -75,6 +75,7 @@ def run():
     return stm.simulate(system, state, ts=TS, method=method, error_estimate=False)
 
 
+@pytest.mark.slow
 def test_a_spring_wound_by_a_thousand_radians_is_an_oscillator(run):
     exact = oscillation(TS, 0.0, 1000.0)
     np.testing.assert_allclose(run.joint("wound").angle, exact, atol=1e-6, rtol=1e-9)
@@ -160,6 +161,7 @@ def preloaded():
     return space, space.from_state(stm.state_from_joints(system, {"hinge": 1.0}))
 
 
+@pytest.mark.slow
 def test_trim_and_linearisation_count_turns(preloaded):
     """k (10 - x) + Q = 0 with Q = -15 N m: x = 7 rad, more than half a turn away; A = [0 1; -k/I 0]."""
     space, x = preloaded
@@ -189,6 +191,7 @@ def test_a_process_model_counts_turns(preloaded):
     assert float(flown.internal[-1, 0]) == pytest.approx(exact, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_sampled_loop_counts_turns():
     """A held target that a controller moves by 40 rad at once: half an oscillation later it is at 80."""
     servo = JointServo("hinge", stiffness=STIFFNESS, damping=0.0, target=0.0)

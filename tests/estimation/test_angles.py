@@ -38,6 +38,7 @@ TURNED = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "deviations", "form"),
     [
@@ -104,6 +105,7 @@ def test_first_reading_of_an_unknown_angle():
         np.testing.assert_allclose(out.covariance[0, 0, 0], variance, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_likelihood_of_rotations_has_gradients():
     """By the size of P0, where points are nearer (1.5) and where not (0.2); central differences."""
     sensor = Sensor(lambda x, u: x["p"], 0.01 * np.eye(3), space=Rotation())

@@ -44,6 +44,7 @@ def test_figures_of_a_saved_run_are_those_of_the_run(short_run, saved):
     np.testing.assert_allclose(loads.moment, exact.moment, atol=1e-13 * size)
 
 
+@pytest.mark.slow
 def test_report_of_a_run(short_run, saved):
     path = saved / "page" / "report.html"
     assert main(["view", str(saved), "--report", str(path)]) == 0

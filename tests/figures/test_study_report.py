@@ -58,6 +58,7 @@ def whole(tmp_path_factory):
     return dataset, *report(dataset, tmp_path_factory.mktemp("report"))
 
 
+@pytest.mark.slow
 def test_every_figure_is_there_and_drawn(whole):
     _, page, _ = whole
     assert len(page.sources) == 6

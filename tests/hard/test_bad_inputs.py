@@ -75,6 +75,7 @@ def test_nothing_happens_at_a_pitch_of_ninety_degrees(pitch):
         np.testing.assert_allclose(energy, energy[0], rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pitch", [-np.pi / 2, np.pi / 2])
 def test_rotations_at_a_pitch_of_ninety_degrees(pitch):
     """Rotation matrix -> Euler parameters -> rotation matrix, to round-off, and its derivative."""

@@ -42,6 +42,7 @@ def test_the_same_inputs_give_the_same_bits():
     assert bits(flown(1.7)) == first
 
 
+@pytest.mark.slow
 def test_other_numbers_trace_and_compile_nothing():
     """Nothing is traced again either, which would take longer than a short run."""
     flown(1.7)

@@ -73,6 +73,7 @@ def test_a_period_of_the_pendulum_by_the_command_line(tmp_path, monkeypatch):
     assert np.abs(r[len(r) // 2] - r[0]).max() > 0.8
 
 
+@pytest.mark.slow
 def test_the_cart_and_pole_accelerate_as_published(gallery):
     scene = gallery["cart_pole"]
     found = evaluated(scene.system, scene.state0).accelerations
@@ -179,6 +180,7 @@ def test_the_slung_load_swings_below_a_quadrotor_that_gives_way(gallery):
     assert wanted == pytest.approx(-3.2439183, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_the_tracker_of_the_file_is_that_of_the_report(gallery):
     scene, own = gallery["tracker"], stm.make_scene("tracker", 2)
     found = evaluated(scene.system, scene.state0, formulation=stm.Tree()).accelerations

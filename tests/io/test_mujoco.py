@@ -269,6 +269,7 @@ def test_what_is_saved_moves_alike_when_it_is_loaded(mujoco, tmp_path, what, tre
     np.testing.assert_allclose(again[1], found[1], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_the_import_made_is_not_held_against_the_user(mujoco, tmp_path):
     """Its links of nearly no mass are a note; a mass that the user wrote so is a warning."""
     text = f"""<mujoco><worldbody><body name="arm">{SHAPE.format(2.5)}<joint axis="0 1 0"/>

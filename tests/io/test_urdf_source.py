@@ -109,6 +109,7 @@ def dial(more, kind="continuous"):
     return four_bar(link("dial") + pin("g", "plate", "dial", "0 .1 0", more, kind))
 
 
+@pytest.mark.slow
 def test_a_mimic_couples_both_joints(tmp_path):
     """Of the four joints of the open chains one follows another, from a start that fulfils it."""
     scene = robot(tmp_path, dial('<mimic joint="a" multiplier="-0.5" offset="0.3"/>'))

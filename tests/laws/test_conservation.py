@@ -99,6 +99,7 @@ def floating():
     return summed, per_body, moved
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_momentum_of_a_floating_pair(floating, kind):
     (linear, angular, _), (each, _, _), moved = floating
@@ -110,6 +111,7 @@ def test_momentum_of_a_floating_pair(floating, kind):
     assert (exchanged > 1e-2) == (kind != "free")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_energy_of_a_floating_pair(floating, kind):
     (_, _, kinetic), _, _ = floating
@@ -219,6 +221,7 @@ def drifts():
     }
 
 
+@pytest.mark.slow
 def test_without_stabilisation_it_drifts(drifts):
     early, late = drifts["none"]
     assert late[0] > 3 * early[0] > 1e-8
@@ -226,6 +229,7 @@ def test_without_stabilisation_it_drifts(drifts):
     assert late[2] > 1e-8
 
 
+@pytest.mark.slow
 def test_feedback_keeps_it_bounded(drifts):
     early, late = drifts["feedback"]
     for kind in range(3):
@@ -236,6 +240,7 @@ def test_feedback_keeps_it_bounded(drifts):
     assert late[2] < 0.6 * drifts["none"][1][2]
 
 
+@pytest.mark.slow
 def test_projection_keeps_it_at_round_off(drifts):
     for position, velocity, norm in drifts["projection"]:
         assert position < 1e-14

@@ -86,6 +86,7 @@ def compiled(function):
     return jax.jit(native(function)), jax.jit(function)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_values_and_derivatives_are_those_of_xla(function):
     ours, theirs = compiled(function)

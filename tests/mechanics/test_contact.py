@@ -184,6 +184,7 @@ def run():
     return system, found
 
 
+@pytest.mark.slow
 def test_energy_balance_of_a_run(run):
     z = np.asarray(run[1].states.r)[:, :, 2]
     found, speed = run[1], np.asarray(run[1].states.v)

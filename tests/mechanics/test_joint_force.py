@@ -349,6 +349,7 @@ def run():
     return system, found
 
 
+@pytest.mark.slow
 def test_energy_balance_of_a_run(run):
     """Motor, dampers, friction and stops: what they give and take is all that changes."""
     system, found = run

@@ -48,6 +48,7 @@ def test_a_geared_pair_turns_with_the_reduced_inertia_through_whole_turns():
         np.testing.assert_allclose(mate, -RATIO * I_B * RATIO * expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_ratio_without_whole_turns_stops_at_half_a_turn_and_says_so():
     system = wheels(stm.JointEffort("A", TORQUE), ratio=np.sqrt(2.0))
     words = "joint 'B' has come to half a turn, within which the coupling 'gear' holds: its ratio of 1.41421 is no"

@@ -130,6 +130,7 @@ def test_a_sample_does_not_depend_on_others_and_a_study_is_resumed(study, column
     assert again.columns == study.columns
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("factor", "relative", "words"),
     [
@@ -177,6 +178,7 @@ def test_studies_that_cannot_be_flown_are_refused(tmp_path):
             make_study(missions.make_mission(MISSION | change))
 
 
+@pytest.mark.slow
 def test_a_study_flies_what_single_flights_with_its_truth_do():
     """Errors, energy and charge of three machines, the last of which empties its battery on the way."""
     plain = {

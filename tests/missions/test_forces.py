@@ -50,6 +50,7 @@ def asked():
     return given, machine, references, ts, needed
 
 
+@pytest.mark.slow
 def test_forces_along_a_reference_by_hand(asked):
     """The quintic and its derivatives, on a base that leans as its climb needs."""
     _, machine, _, ts, needed = asked

@@ -99,6 +99,7 @@ def data(flight):
     return missions.to_data(flight)
 
 
+@pytest.mark.slow
 def test_a_hexacopter_flies_along_its_waypoints(flight, data):
     assert flight.ending == ""
     assert data.sizes["time"] == 441
@@ -203,6 +204,7 @@ def test_an_empty_battery_ends_the_flight_with_its_results():
     assert np.all(np.isfinite(data.position))
 
 
+@pytest.mark.slow
 def test_a_rotor_that_fails_is_not_known_to_the_controller(data):
     # the second fault, listed first, leaves a share of the whole thrust too
     faults = [{"rotor": 2, "share": 0.3, "at": 1.5}, {"rotor": 2, "share": 0.5, "at": 1.0}]

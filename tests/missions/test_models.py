@@ -90,6 +90,7 @@ def changed(**changes):
     return {key: value for key, value in (MISSION | changes).items() if value is not None}
 
 
+@pytest.mark.slow
 def test_an_own_machine_flies_in_gusts_and_moves_its_gimbal(flight, data):
     kept, words = missions.verdict(data)
     assert kept, words

@@ -30,6 +30,7 @@ def flight():
     return missions.fly(missions.make_mission(PLAIN | {"payloads": [payload]}))
 
 
+@pytest.mark.slow
 def test_a_payload_weighs_from_its_pick_up_to_its_drop(flight):
     """Thrust of the weight alone: a jump of -g m / (M + m) and +g m / M; sag of g m / (k M) between them."""
     run, system = flight.run, flight.mission.machine.scene.system

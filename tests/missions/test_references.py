@@ -87,6 +87,7 @@ def test_a_move_may_have_a_shape_of_its_own():
     )
 
 
+@pytest.mark.slow
 def test_a_panel_that_faces_a_moving_direction_from_a_turning_base():
     """Rates and accelerations against derivatives of the angles along the motion itself."""
     omega = jnp.array([0.3, -0.5, 0.7])

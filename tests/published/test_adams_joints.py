@@ -110,6 +110,7 @@ def rows(name: str, quantity: str) -> np.ndarray:
     return np.array(TABLE["cases"][name][quantity])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_motion_is_that_of_adams(run: stm.Run, name: str) -> None:
     """Published class: 2e-5 m, 2e-5 and 1e-3 rad/s, and half of the last printed digit."""
@@ -125,6 +126,7 @@ def test_motion_is_that_of_adams(run: stm.Run, name: str) -> None:
     np.testing.assert_allclose(sign * p, adams, rtol=LAST_DIGIT, atol=quaternion)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_reactions_are_those_of_adams(run: stm.Run, name: str) -> None:
     """Published class: 1e-3 N and N m, and half of the last printed digit.
@@ -147,6 +149,7 @@ def test_reactions_are_those_of_adams(run: stm.Run, name: str) -> None:
         np.testing.assert_allclose(moment, rows(name, "Rtorque"), rtol=LAST_DIGIT, atol=atol)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_reactions_balance_the_motion(run: stm.Run, name: str) -> None:
     """Exact class: the joint's force on the body is m (a - g), to 1e-9 N of some 30 N."""
@@ -157,6 +160,7 @@ def test_reactions_balance_the_motion(run: stm.Run, name: str) -> None:
     np.testing.assert_allclose(force, needed, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_joints_and_energy_are_kept(run: stm.Run) -> None:
     """1e-8 m and 1e-7 m/s over all steps; energy to 1e-8 of the largest."""
     assert run.certificate.rank == run.certificate.rows

@@ -64,6 +64,7 @@ def test_it_moves_as_without_the_dependent_row(run: stm.Run, twin: stm.Run) -> N
     np.testing.assert_allclose(corner(run), corner(twin), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_rows_are_chosen_by_data() -> None:
     """No row acts that depends on others, whichever it is, off the manifold too."""
     import jax

@@ -175,6 +175,7 @@ def test_attitude_is_consistent(attitude):
     np.testing.assert_allclose(np.linalg.norm(mean["p"], axis=1), 1.0, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("q", "r"), [(1.0, 4.0), (1.0, 0.25), (4.0, 1.0), (0.25, 1.0)])
 def test_wrong_noise_is_seen(attitude, q, r):
     """The power check: Q or R wrong by a factor of four must fail the same tests."""

@@ -71,6 +71,7 @@ def run() -> stm.Run:
     )
 
 
+@pytest.mark.slow
 def test_rank_and_redundant_joints(run: stm.Run) -> None:
     """Exact class: 5 rows a revolute, rank 6 n - 1, and joints named that own dependent rows."""
     system = run.scene.system
@@ -84,6 +85,7 @@ def test_rank_and_redundant_joints(run: stm.Run) -> None:
     assert certificate.redundant == found.redundant
 
 
+@pytest.mark.slow
 def test_tip_follows_the_closed_form(run: stm.Run) -> None:
     """Solver class: 1e-5 m for 10 s at rtol 1e-8; the library's "high precision" is 1e-3."""
     got, expected = tip(run), closed_form(2, run.ts)
@@ -92,6 +94,7 @@ def test_tip_follows_the_closed_form(run: stm.Run) -> None:
     np.testing.assert_allclose(got[:, 2:], expected[:, 2:], rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_tip_is_where_other_codes_put_it(run: stm.Run) -> None:
     """Published class: exact values to 1e-5 m, EXUDYN's end to its own distance from them."""
     got = tip(run)
@@ -102,6 +105,7 @@ def test_tip_is_where_other_codes_put_it(run: stm.Run) -> None:
     np.testing.assert_allclose(got[-1], EXUDYN, rtol=0, atol=EXUDYN_ERROR)
 
 
+@pytest.mark.slow
 def test_energy_is_kept(run: stm.Run) -> None:
     """1e-3 J; the published limit is 0.1 J, EXUDYN has 1.8e-5 J at h = 1.25e-4 s."""
     assert run.snapshot.kinetic[0] == pytest.approx(1.5, rel=1e-12)
@@ -109,6 +113,7 @@ def test_energy_is_kept(run: stm.Run) -> None:
     assert run.certificate.position_violation <= 1e-8
 
 
+@pytest.mark.slow
 def test_cranks_stay_parallel(run: stm.Run) -> None:
     """Solver class: no branch is lost in the singular postures; all angles equal to 1e-6 rad."""
     turned = turned_about_z(run)

@@ -45,6 +45,7 @@ def is_fast(run: stm.Run) -> bool:
     return float(run.scene.state0.omega[0, 1]) == FAST[1]
 
 
+@pytest.mark.slow
 def test_position_is_the_converged_one(run: stm.Run) -> None:
     """Solver class: 1e-5 m at 0.1 and 0.2 s at rtol 1e-8, after 30 rad of spin."""
     if not is_fast(run):

@@ -49,6 +49,7 @@ def free_body() -> stm.Run:
     return stm.simulate(scene(system, t1=10.0, save_every=1.0))
 
 
+@pytest.mark.slow
 def test_free_body(free_body: stm.Run) -> None:
     """Published class: the file's own error of 1.7e-4 in metres and rad/s."""
     frame = free_body.states.r[-1, 0] - attitude(free_body, 0)[-1].apply([0.2, 0.0, 0.0])
@@ -103,6 +104,7 @@ def minimal(t: float, y: np.ndarray) -> np.ndarray:
     return np.array([a_rate, b_rate, *np.linalg.solve(mass, force)])
 
 
+@pytest.mark.slow
 def test_double_pendulum(double_pendulum: stm.Run) -> None:
     """Solver class, 1e-6: converged values of joint 1, and both angles by SciPy's DOP853.
 

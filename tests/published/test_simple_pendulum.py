@@ -67,6 +67,7 @@ def run() -> stm.Run:
     return stm.simulate(scene(pendulum(GRAVITY, LENGTH), t1=10.0, save_every=0.25))
 
 
+@pytest.mark.slow
 def test_path_is_the_closed_form(run: stm.Run) -> None:
     """Solver class, 100 rtol: 1e-6 m for 10 s at rtol 1e-8."""
     theta = angle(run.ts)

@@ -73,6 +73,7 @@ def run() -> stm.Run:
     )
 
 
+@pytest.mark.slow
 def test_rank(run: stm.Run) -> None:
     """Exact class: 50 rows of spatial joints, rank 6 * 7 - 1, three dependent rows a loop."""
     found = stm.dynamics.rank(run.scene.system, run.scene.state0)
@@ -94,6 +95,7 @@ def test_initial_accelerations() -> None:
     np.testing.assert_allclose(found.accelerations.omega_rate[:, :2], 0, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_angles_at_the_end(run: stm.Run) -> None:
     """Solver class: 1e-8 relative at rtol 1e-8, where 1e-6 is asked.
 
@@ -104,12 +106,14 @@ def test_angles_at_the_end(run: stm.Run) -> None:
     np.testing.assert_allclose(got, PSIDE_Q, rtol=1e-8, atol=2e-9)
 
 
+@pytest.mark.slow
 def test_rates_at_the_end(run: stm.Run) -> None:
     """Solver class: PSIDE's rates to 1e-6 relative; printed, they are good to 5e-8."""
     got = relative(np.asarray(run.states.omega[-1, :, 2]))
     np.testing.assert_allclose(got, PSIDE_V, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_energy_balance(run: stm.Run) -> None:
     """T + V - E_0 - torque (beta - beta_0) vanishes to 1e-7 J, of 1.1 J that flow."""
     work = TORQUE * turned_about_z(run)[:, 0]

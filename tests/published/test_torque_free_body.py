@@ -60,6 +60,7 @@ def closed_form(t: np.ndarray) -> np.ndarray:
     return np.stack([A1 * cn, A2 * sn, A3 * dn], axis=1)
 
 
+@pytest.mark.slow
 def test_angular_velocity_is_the_closed_form(run: stm.Run, sharp: stm.Run) -> None:
     """Solver class: 1e-6 rad/s for five periods at rtol 1e-8, 1e-9 at 1e-12."""
     exact = closed_form(run.ts)

@@ -115,6 +115,7 @@ def test_a_cluster_of_our_own(tmp_path, whole, monkeypatch):
     assert len(firsts) <= 30 + 4
 
 
+@pytest.mark.slow
 def test_workers_that_come_later(whole, outside):
     """No worker at first, which is said; then one, and two that are sent the work as the first was."""
     assert outside.seen[0] == StudyProgress(0, 900, f"Waiting for a worker of {outside.address}.")
@@ -142,6 +143,7 @@ def test_a_worker_is_killed(tmp_path, whole, outside):
     assert set(pids) >= {worker.pid for worker in outside.workers[1:]}
 
 
+@pytest.mark.slow
 def test_each_worker_makes_the_work_once(tmp_path, outside):
     """Unpickled once in a process, also for a second study of the same work."""
     work = Precise(log=str(tmp_path / "log"))
@@ -152,6 +154,7 @@ def test_each_worker_makes_the_work_once(tmp_path, outside):
     assert len(made) == len(set(made)) <= 3
 
 
+@pytest.mark.slow
 def test_double_precision_goes_along(tmp_path, outside):
     """The workers run in single precision by themselves; arrays and results come out double."""
     path = tmp_path / "study.zarr"
@@ -162,6 +165,7 @@ def test_double_precision_goes_along(tmp_path, outside):
     assert contents(path) == contents(tmp_path / "here.zarr")
 
 
+@pytest.mark.slow
 def test_a_lack_of_memory_on_a_worker_halves_its_chunks(tmp_path, outside):
     path = tmp_path / "study.zarr"
     work = Toy(seed=7, together=600, most=300, words="RESOURCE_EXHAUSTED: no room")
@@ -171,6 +175,7 @@ def test_a_lack_of_memory_on_a_worker_halves_its_chunks(tmp_path, outside):
     assert contents(path) == contents(tmp_path / "here.zarr")
 
 
+@pytest.mark.slow
 def test_a_work_that_fails(tmp_path, outside):
     """The workers' error is the user's; what was stored is kept."""
     work = Toy(seed=7, most=0, words="a bug")
@@ -179,6 +184,7 @@ def test_a_work_that_fails(tmp_path, outside):
     assert open_store(tmp_path / "s.zarr").finished == 0
 
 
+@pytest.mark.slow
 def test_other_versions_are_refused(tmp_path, outside):
     path = tmp_path / "study.zarr"
     create_store(path, WORK, 20, 5, computing_versions() | {"jax": "0.0.1"}).close()
@@ -202,6 +208,7 @@ def test_no_scheduler(tmp_path):
     assert not path.exists()
 
 
+@pytest.mark.slow
 def test_settings_that_cannot_be(tmp_path, outside, monkeypatch):
     path = tmp_path / "study.zarr"
     with pytest.raises(SettingError, match="1 worker or more, not 0"):

@@ -102,6 +102,7 @@ def test_as_flights_one_by_one(turning):
     assert 0 < np.isinf(found["over"]).sum() < COUNT
 
 
+@pytest.mark.slow
 def test_a_crossing_can_stop_a_flight(turning):
     _, found = turning
     fine = found["status"] == FINE

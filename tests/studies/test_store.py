@@ -197,6 +197,7 @@ def test_folders_that_are_no_stores(tmp_path, use):
     assert (tmp_path / "note.txt").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_damage_is_found_and_the_file_named(copy, tmp_path):
     for name in contents(copy):
         damaged = Path(shutil.copytree(copy, tmp_path / "damaged.zarr"))

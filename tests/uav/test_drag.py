@@ -34,6 +34,7 @@ def fall():
 ZERO = np.zeros(3)
 
 
+@pytest.mark.slow
 def test_terminal_velocity_of_quadratic_drag(fall):
     """v = -v_t tanh(g t / v_t), v_t = sqrt(m g / d)."""
     d = 0.12

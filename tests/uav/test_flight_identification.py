@@ -87,6 +87,7 @@ def calm():
     return simulate_flights([2], 12.0, TRUTH._replace(manoeuvres=(0.0, 0.0, 0.0, 0.0)))[0]
 
 
+@pytest.mark.slow
 def test_a_flight_in_closed_loop_gives_the_true_numbers(result):
     assert result.verdict.status == "consistent"
     assert set(VALUES) <= set(result.estimates)
@@ -226,6 +227,7 @@ def test_thrust_that_fades_is_said_and_widens_the_deviation():
     assert "give the mass" in result.describe()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_curved", [False, True])
 def test_the_identified_model_has_the_true_numbers(result, tmp_path, is_curved):
     """A curve that differs from the layout's shape by more than its deviation is the model's."""
@@ -391,6 +393,7 @@ def test_a_filter_of_the_centre_ends_where_the_whole_record_does(record, result)
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "spin", "words"),
     [
@@ -472,6 +475,7 @@ def test_what_a_flight_tells_of_other_axes_is_named(manoeuvres, known, signs):
         assert value == pytest.approx(TRUTH.thrust, rel=0.05)
 
 
+@pytest.mark.slow
 def test_records_that_cannot_be_identified_are_refused(record):
     held = record.commands[np.arange(len(record.ts)) // 50 * 50]
     with pytest.raises(SettingError, match=r"commands change 9\.96 times a second"):
@@ -691,6 +695,7 @@ def test_thrust_manoeuvres_of_a_real_flight_give_the_curve_and_no_roll(tmp_path)
     np.testing.assert_allclose(thrust, np.polyval([0.1229, -0.0074, 0.0221], duty), rtol=0.06)
 
 
+@pytest.mark.slow
 def test_a_hover_balances_about_the_centre_of_mass(calm):
     estimates = identify_hover_centre(calm.ts, calm.commands, LAYOUT)
     for e, value in zip(estimates, TRUTH.centre, strict=True):

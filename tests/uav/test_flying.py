@@ -135,6 +135,7 @@ def test_machines_that_the_controller_cannot_fly_are_refused():
         control.at_point([0.0, 1.0])
 
 
+@pytest.mark.slow
 def test_the_integral_stands_still_on_the_ground():
     """A foot at the ground's height counts by the attitude; without a gear nothing does."""
     tilted = [np.cos(0.1), np.sin(0.1), 0.0, 0.0]

@@ -30,6 +30,7 @@ def test_a_chain_is_placed_where_it_was_read():
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_machine_that_is_set_on_a_base_has_velocities_that_are_rates_of_its_poses():
     state = moving(machine())
     turn = jnp.array([0.3, -0.2, 0.5])

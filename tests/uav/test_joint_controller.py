@@ -136,6 +136,7 @@ def test_the_moment_of_a_move_is_fed_forward():
     assert turning[True] < 1e-9
 
 
+@pytest.mark.slow
 def test_a_servo_of_the_machine_gets_its_target_and_pd_control_its_errors():
     system = machine(servo=True)
     state = moving(system)

@@ -72,6 +72,7 @@ def flights():
     return jax.tree.map(np.asarray, quick_jit(jax.vmap(flown))(jnp.arange(12)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [400, 800, 1200])
 def test_the_pose_is_as_good_as_the_estimator_says(flights, at):
     """NEES of the pose over 12 flights, within its 95 % interval; NumPy's own solution."""
@@ -284,6 +285,7 @@ def test_fixes_that_all_lie_beyond_the_gate_are_taken_in_the_end(inertial):
     assert np.max(np.abs(error[:, -1, 3] + 1.5)) < 0.2
 
 
+@pytest.mark.slow
 def test_errors_move_as_the_kinematics_do():
     """The matrix of the errors against automatic derivatives of the motion."""
     keys = jax.random.split(jax.random.key(5), 6)

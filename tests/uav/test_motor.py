@@ -64,6 +64,7 @@ def spun_at(omega):
     return state_of([[0, 0, 0]], [[1, 0, 0, 0]], None, [omega])
 
 
+@pytest.mark.slow
 def test_step_response_and_thrust_in_closed_form(run):
     """omega = c + (s - c) exp(-t / T); the vertical speed is the integral of its thrust."""
     path = run(lagging(inertia=np.full(3, 1e9), k_tau=0.0), spun_at(np.zeros(3)), TS, 1e-11)
@@ -105,6 +106,7 @@ def twin(t1, start, omega0, spin, command):
     return found.y[:3, -1], found.y[3:, -1]
 
 
+@pytest.mark.slow
 def test_tumbling_body_against_scipy(run):
     """Commands that vary in time, unequal spins, all torques; in both formulations."""
     made, omega0 = lagging(0.2), np.array([0.5, -1.0, 2.0])
@@ -116,6 +118,7 @@ def test_tumbling_body_against_scipy(run):
         np.testing.assert_allclose(path.internal[-1], w, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_gyroscopic_precession_in_closed_form():
     """A symmetric body: W_x + i W_y = W_0 exp(i l t), l = ((C - A) W_z + h) / A."""
     A, C, spin = 0.02, 0.035, np.ones(4)

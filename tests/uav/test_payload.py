@@ -40,6 +40,7 @@ def tumbling():
 RATES = (1.7, -1.3)
 
 
+@pytest.mark.slow
 def test_the_moments_of_a_payload_are_those_of_the_loaded_machine(machines, tumbling):
     """Against functions that know no payload; what the filter leaves out is added by hand."""
     empty, loaded = machines

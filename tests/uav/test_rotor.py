@@ -126,6 +126,7 @@ def curved(**curves):
     return System([body], [], [stm.Gravity(), motors]), rotors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "curves",
     [

@@ -52,6 +52,7 @@ def stood():
     return jax.tree.map(np.asarray, quick_jit(jax.vmap(one))(jnp.arange(SEEDS)))
 
 
+@pytest.mark.slow
 def test_all_errors_after_standing_are_as_small_as_the_estimator_says(stood):
     """NEES of all 15 errors over the draws, within its 99 % interval, and its parts as well."""
     error, P = stood

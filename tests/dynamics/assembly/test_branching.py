@@ -36,6 +36,7 @@ def flat(rate=0.0, coupler=0.0, *, gravity=(0.0, 0.0, -9.81), pushes=(0.0, 0.0))
     return system, state_of(rest.r, rest.p, v, omega)
 
 
+@pytest.mark.slow
 def test_a_start_at_rest_in_a_singular_posture_is_refused():
     """Before anything is integrated, by the same words whatever the method."""
     messages = set()
@@ -60,6 +61,7 @@ def test_a_start_at_rest_in_a_singular_posture_is_refused():
         stm.simulate(*flat(1e-7), t1=0.2)
 
 
+@pytest.mark.slow
 def test_singular_postures_of_any_size_are_found():
     for size in (1e-4, 1.0, 1e5):
         start = lambda angle, size=size: parallelogram(angle, size=size)

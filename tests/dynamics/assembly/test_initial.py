@@ -50,6 +50,7 @@ def residuals(system, state, t=0.0):
     return tuple(map(np.asarray, _residuals(system, state, jnp.asarray(t))))
 
 
+@pytest.mark.slow
 def test_a_consistent_state_is_left_alone(bars):
     system, state = bars
     found = stm.assemble(system, state)

@@ -68,6 +68,7 @@ def test_an_open_chain_takes_all_coordinates_and_rates(chain):
         np.testing.assert_allclose(found.rates, np.atleast_1d(U[name]), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_the_rows_that_hold_coordinates_of_closed_loops_say_the_same(chain):
     state = stm.state_from_joints(chain, Q, U)
     given, rates = (
@@ -76,6 +77,7 @@ def test_the_rows_that_hold_coordinates_of_closed_loops_say_the_same(chain):
     assert max(misfit(with_drivers(chain, given, rates, jnp.zeros(())), state)) < 1e-14
 
 
+@pytest.mark.slow
 def test_what_is_not_named_stays_as_at_the_start(chain):
     """A base that floats moves on, and joints keep their coordinates and rates."""
     floating = stm.System([body("a", free=True), body("b"), body("c")], [

@@ -58,6 +58,7 @@ def test_positions_as_in_closed_form(path):
     assert np.ptp(np.asarray(jax.vmap(angles)(path.ts)), axis=0).min() > 0.3
 
 
+@pytest.mark.slow
 def test_rates_and_accelerations_as_in_closed_form(path):
     expected, rates = jax.vmap(exact)(path.ts)
     for found, right in (

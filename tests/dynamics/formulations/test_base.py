@@ -103,6 +103,7 @@ def test_a_users_formulation_passes_through_simulate():
     assert own.certificate.position_error < 1e-8
 
 
+@pytest.mark.slow
 def test_one_that_cannot_allow_for_dependent_rows_is_refused_where_there_are():
     system = four_bar()
     scene = scene_of(system, four_bar_state(system, 2.0))

@@ -394,6 +394,7 @@ def test_a_run_whose_joints_come_open_is_not_successful(monkeypatch):
     assert np.all(np.isnan(found.states.r[1]))
 
 
+@pytest.mark.slow
 def test_a_linkage_is_movable_or_a_structure_by_one_threshold():
     """What is neither, but for rounded numbers, is refused by name before the first step."""
     for off, dof in ((0.0, 1), (1e-10, 1), (1e-7, 0), (1e-6, 0), (1e-2, 0)):

@@ -89,6 +89,7 @@ def test_it_differentiates():
     assert float(forward) == pytest.approx(float(difference), rel=1e-8)
 
 
+@pytest.mark.slow
 def test_a_jacobian_that_no_longer_fits_is_computed_again():
     """Van der Pol with 1e4 1/s: its fast jumps change df/dy by orders of magnitude in a step."""
     start, rate = jnp.array([2.0, 0.0]), 1e4
@@ -112,6 +113,7 @@ def test_stiffness_costs_no_steps_and_no_accuracy(rate):
     assert abs(final(run)[0] - np.cos(10.0)) < 1e-5
 
 
+@pytest.mark.slow
 def test_many_side_by_side_are_those_one_by_one():
     xs = jnp.array([0.5, 1.0, 2.0])
     together = jax.jit(jax.vmap(lambda x: fixed(x, 0.1)))(xs)
@@ -157,6 +159,7 @@ def rail():
     return stm.System([body], [joint], [stm.Gravity(), servo])
 
 
+@pytest.mark.slow
 def test_the_spectrum_of_a_servo(rail):
     """m x'' + c x' + k x = 0: the roots of m s^2 + c s + k."""
     values = stm.dynamics.spectrum(rail, rail.reference)
@@ -164,6 +167,7 @@ def test_the_spectrum_of_a_servo(rail):
     np.testing.assert_allclose(values[:2], expected, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_spectrum_of_a_pendulum_hanging():
     system = pendulum()
     values = stm.dynamics.spectrum(system, swung(system, 0.0))
@@ -171,6 +175,7 @@ def test_the_spectrum_of_a_pendulum_hanging():
     assert np.min(np.abs(values)) < 1e-6 or len(values) == 2
 
 
+@pytest.mark.slow
 def test_auto_takes_the_implicit_method_where_it_pays(rail):
     assert isinstance(stm.dynamics.choose_solver(rail, rail.reference), diffrax.Kvaerno5)
     soft = eqx.tree_at(

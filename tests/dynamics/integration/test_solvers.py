@@ -66,6 +66,7 @@ def test_every_step_ends_on_the_constraints(solver):
     assert float(worst.norm[-1]) < 1e-15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("solver", "error"), [("Tsit5", 1e-9), ("Kvaerno3", 1e-3)])
 def test_projected_solvers_agree_with_dopri8(solver, error):
     assert relative_error(reached(solver).states, reached("Dopri8").states) < error

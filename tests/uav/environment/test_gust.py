@@ -123,6 +123,7 @@ def test_paths_repeat_and_longer_ones_begin_alike():
     assert np.max(np.abs(np.asarray(other.values - short.values))) > 0.1
 
 
+@pytest.mark.slow
 def test_smooth_in_time_and_exact_at_samples():
     gusts = dryden(1, AIR, airspeed=V, duration=1.0, dt=DT, mean=[0.0, 5.0, 0.0])
     times = DT * np.arange(51)

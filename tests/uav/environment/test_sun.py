@@ -141,6 +141,7 @@ def test_derivatives_with_respect_to_the_place():
             assert np.abs(by - (s_w(at + shift) - s_w(at - shift)) / 2e-5).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_where_angles_are_not_defined():
     """At the poles, at the zenith and at the nadir, in elevation and azimuth too."""
 

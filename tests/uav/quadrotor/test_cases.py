@@ -33,6 +33,7 @@ def thrust_by_hand(case, t):
     }[case]
 
 
+@pytest.mark.slow
 def test_single_precision_runs_without_warnings():
     """Warnings are errors here: JAX has one for every number that it must shorten."""
     with jax.enable_x64(False):
@@ -41,6 +42,7 @@ def test_single_precision_runs_without_warnings():
     assert np.all(np.isfinite(record.y))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [4, 6])
 def test_truth_by_scipy(case):
     """Rates and attitude (rotation matrix here) after 0.2 s by DOP853, thrusts held."""
@@ -79,6 +81,7 @@ def test_substeps_are_one_loop():
     assert lines(8) <= lines(2)
 
 
+@pytest.mark.slow
 def test_noise_is_as_the_table_says():
     """Per-step variances of wandering offset and measured rates (statistical, 5 sigma)."""
     record = simulate_case(1, seeds=20, t1=0.5)

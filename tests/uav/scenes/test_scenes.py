@@ -61,6 +61,7 @@ def test_two_seconds_with_default_settings(name, case):
     assert c.smallest_singular_value > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "case"), CASES)
 def test_energy_balance(name, case):
     """At rtol 1e-10: at most 1e-8 of the largest energy, work of rotors and actuators counted."""

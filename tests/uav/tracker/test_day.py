@@ -54,6 +54,7 @@ def day():
 # --- pointing
 
 
+@pytest.mark.slow
 def test_panel_faces_the_sun_within_reach(day):
     """R_x(phi) R_y(theta) e_z in NumPy, turned by the attitude, is the sun's direction."""
     assert 5 < day.hours_of(day.facing) < 10

@@ -40,6 +40,7 @@ def inside():
     return jnp.asarray(x[:, :10000])
 
 
+@pytest.mark.slow
 def test_inverse_then_forward(inside):
     found = solve(G, strokes(G, inside))
     assert np.all(np.asarray(found.reason) == Reason.VALID)
@@ -80,6 +81,7 @@ def test_derivatives_in_strokes(inside):
     assert np.max(np.abs(again.acceleration - acceleration)) < 1e-12
 
 
+@pytest.mark.slow
 def test_derivative_in_lengths(inside):
     """Held strokes: J dx = -dq, by reverse mode."""
     x = inside[:, 0]
@@ -121,6 +123,7 @@ def path(start, end, count=60):
 along = jax.jit(follow)
 
 
+@pytest.mark.slow
 def test_a_path_is_followed():
     x = path([-10.0, -17.0], [25.0, 30.0])
     found = along(G, strokes(G, x), x[:, 0])

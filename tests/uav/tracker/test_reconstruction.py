@@ -57,6 +57,7 @@ def test_adopted_lengths_reproduce_the_printed_centres():
     assert 1e3 * np.linalg.norm(errors, axis=1).max() == pytest.approx(1.08, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_the_fit_reaches_its_figure(best):
     assert best.converged
     assert best.rms() <= 0.65e-3
