@@ -172,6 +172,19 @@ def test_a_logged_voltage_explains_thrust_that_falls_with_it():
 
 
 @pytest.mark.slow
+def test_rotors_with_an_idle_speed_have_the_true_centre_of_mass():
+    """Speed 0.25 + 0.75 u: by a thrust through zero that has the slope at hover, the centre is 1.3 mm off."""
+    truth = TRUTH._replace(centre=(0.003, -0.002))
+    record = simulate_flights([70], 16.0, truth)[0]
+    record = record._replace(commands=(record.commands - 0.25) / 0.75)
+    result = identify_flight(record, LAYOUT)
+    for x, value in zip("xy", truth.centre, strict=True):
+        for e in (result.estimates[f"centre_{x}"], result.estimates[f"free_centre_{x}"]):
+            assert abs(e.value - value) < 3 * e.deviation
+        assert result.estimates[f"centre_{x}"].deviation < 0.25e-3
+
+
+@pytest.mark.slow
 def test_voltage_and_commands_that_change_together_are_not_told_apart():
     """A hover, in which the commands rise as the battery empties."""
     truth = TRUTH._replace(discharge=0.12, dip=0.15, manoeuvres=(0.0, 0.0, 0.0, 0.0))
