@@ -304,7 +304,6 @@ def observe_motion(
         # With these weights the mean is the slope of a straight line through the speed along the vertical, on which
         # its values at the start and the end alone have little effect.
         weights = share * (1 - share) / np.sum(share * (1 - share))
-        upward = -gravity / GRAVITY
-        vertical = float(weights @ np.sum(push[::sign] * upward, axis=1))
-        excess += (vertical - GRAVITY) / float(weights @ upward[:, 2])
+        vertical = np.sum(push[::sign] * -gravity, axis=1) / GRAVITY
+        excess += float(weights @ vertical) - GRAVITY
     return velocity, gravity
