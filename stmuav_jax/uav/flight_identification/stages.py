@@ -7,8 +7,9 @@ About the centre of mass c, with lagged commands s and thrust shapes T_i(s_i) (s
     q' = -B_y sum (x_i - c_x) T_i / l_y + d_y q + h_y p r + m_y v_x + G_y p sum e_i s_i + ...,
     r' = -B_z sum e_i T_i - S sum e_i s_i' + d_z r + h_z p q + ...,
 
-where the angular momentum of the rotors makes S and, as it turns with the body, G; an accelerometer at b from the
-centre of mass reads
+where the shapes T_i are those of the layout plus an offset, so that the thrust with the slope that manoeuvres show
+carries the vehicle; the angular momentum of the rotors makes S and, as it turns with the body, G; an accelerometer at
+b from the centre of mass reads
 
     a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + E (q, -p, 0) + forces that nobody knows,
 
@@ -189,13 +190,31 @@ class FlightIdentification(NamedTuple):
 
 
 class _Signals(NamedTuple):
-    """Record with what all regressions need: force at the centre of mass, velocity and gravity in body axes."""
+    """Record with what all regressions need: force at the centre of mass, velocity and gravity in body axes.
+
+    The slope is that of a rotor's thrust over mass by the command at the mean command, None if it is not determined.
+    """
 
     record: FlightRecord
     layout: RotorLayout
     force: np.ndarray
     velocity: np.ndarray
     gravity: np.ndarray
+    slope: float | None = None
+
+    def compute_thrusts(
+        self, states: Float[np.ndarray, "k n"], factor: float
+    ) -> Float[np.ndarray, "k n"]:
+        """Thrusts over their coefficient that follow the layout's shape about the mean, and on average carry."""
+        shape = compute_thrust_shape(states, factor)
+        if self.slope is None:
+            return shape
+        hover = float(np.mean(self.record.commands))
+        coefficient = self.slope / (1 - factor + 2 * factor * hover)
+        # The moment of the centre of mass takes the whole thrust, of which a shape through zero has another
+        # share by its slope than a curve with an offset or with an idle speed.
+        level = float(np.mean(self.record.accelerometer[:, 2])) / states.shape[1]
+        return shape + level / coefficient - np.mean(shape)
 
 
 class _Variant(NamedTuple):
@@ -254,7 +273,7 @@ def _rotation_regression(
 
     def build(lags: np.ndarray) -> Regression:
         s = compute_rotor_states(record.commands, dt, *lags)
-        T = compute_thrust_shape(s, factor)
+        T = signals.compute_thrusts(s, factor)
         momentum = apply_filter(b, a, s @ layout.spin)[:, None] * w[:, :2]
         gyroscopic = filter_columns(np.convolve(boxes, [0.5, 0.5]), [1.0], momentum)[first::n]
         parts = []
@@ -498,8 +517,12 @@ def _observe_signals(
     return signals, observe(imu, drag, _OTHER_PACE), observe(imu, drag + spread)
 
 
-def _check_gravity(signals: _Signals) -> None:
-    """Refuse a specific force that on average is not gravity along the vertical which the gyroscope carries on."""
+def _check_gravity(signals: _Signals) -> float:
+    """Refuse a specific force that on average is not gravity along the vertical which the gyroscope carries on.
+
+    Returns:
+        Its difference from gravity, of the mean or the median of parts the smaller one [m/s^2].
+    """
     record = signals.record
     vertical_force = np.sum(signals.force * -signals.gravity, axis=1) / GRAVITY
     # In a wild manoeuvre the observer may lose the vertical for seconds, which the median of parts of
@@ -519,6 +542,19 @@ def _check_gravity(signals: _Signals) -> None:
             f"{low:.3g} to {high:.3g} m/s^2 would be valid: is the unit or the scale of the gyroscope or of the "
             "accelerometer another?"
         )
+    return min(abs(vertical - GRAVITY), abs(median - GRAVITY))
+
+
+def _compute_slope(
+    layout: RotorLayout, hover: float, estimates: dict[str, ParameterEstimate]
+) -> float | None:
+    """Slope of a rotor's thrust over mass by the command at the mean one; None if it is not determined."""
+    if "thrust_slope" in estimates:
+        return 2 * hover * estimates["thrust_slope"].value
+    if "thrust" in estimates:
+        factor = layout.thrust_model_factor
+        return (1 - factor + 2 * factor * hover) * estimates["thrust"].value
+    return None
 
 
 def _double_noise(record: FlightRecord) -> FlightRecord:
@@ -654,7 +690,7 @@ def identify_flight(
     # Forces come first: they give the lever of the IMU and the drag, without which the moments'
     # regression lacks the velocity.
     signals, faster, shifted = _observe_signals(record, layout)
-    _check_gravity(signals)
+    bias = _check_gravity(signals)
     other = [] if further is None else [signals._replace(record=further)]
     report(0.2)
     hover = float(np.mean(record.commands))
@@ -663,10 +699,18 @@ def identify_flight(
         signals, [faster, shifted, noisy, *other], hover, estimates, refusals
     )
     report(0.35)
+    slope = _compute_slope(signals.layout, hover, estimates)
+    signals, *shifted = (x._replace(slope=slope) for x in (signals, faster, *other))
+    if slope is not None:
+        # The accelerometer's bias along z is an error of the thrust that carries, as the slope's is.
+        relative = np.hypot(
+            estimates["thrust"].deviation / estimates["thrust"].value, bias / GRAVITY
+        )
+        shifted.append(signals._replace(slope=slope * (1 + float(relative))))
     axes = _screen_axes(signals, refusals)
     excited = list(axes)
     report(0.4)
-    rotation = _identify_rotation(signals, [faster, *other], axes, hover, estimates, refusals)
+    rotation = _identify_rotation(signals, shifted, axes, hover, estimates, refusals)
     _name_combinations(signals, excited, estimates, refusals)
     report(0.8)
     if {"roll", "pitch"} <= set(estimates):
@@ -705,7 +749,8 @@ def explain_rotation(
     drag, imu = result.translation.values[3:5], result.translation.values[:3]
     force = record.accelerometer - _lever_columns(record) @ imu
     drag = np.maximum(drag, 0.1 * _DRAG)
-    signals = _Signals(record, layout, force, *observe_motion(record, force, drag))
+    slope = _compute_slope(layout, result.hover, result.estimates)
+    signals = _Signals(record, layout, force, *observe_motion(record, force, drag), slope)
     n, first = _sample_step(record, _FORCE_RATE), round(_SETTLING / record.dt)
     build = _rotation_regression(signals, [0, 1], _Variant(_FORCE_RATE))
     X = build(result.rotation.lags).X
