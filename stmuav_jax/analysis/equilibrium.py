@@ -74,7 +74,8 @@ class Trim(eqx.Module):
     Attributes:
         point: point of the state space.
         values: values of the inputs (m,).
-        residual: largest difference from the target accelerations [m/s^2] or [rad/s^2].
+        residuals: differences from the target accelerations, rates of the forces' states, and further
+            conditions (e,), in `residual_units`.
         conditioning: smallest over largest singular value of the Jacobian with scaled unknowns;
             near zero, other trims lie near. A ratio does not show inputs that all lose their hold
             together: see `notes`.
@@ -87,11 +88,12 @@ class Trim(eqx.Module):
             inputs of one scale (dof, m).
         labels, coordinates: names of the inputs with what they act on, and of the coordinates.
         units: unit of each input, "N", "N m" or "" for another one.
+        residual_units: unit of each residual.
     """
 
     point: Point
     values: Float[Array, " m"]
-    residual: Float[Array, ""]
+    residuals: Float[Array, " e"]
     conditioning: Float[Array, ""]
     converged: Bool[Array, ""]
     steps: Int[Array, ""]
@@ -101,6 +103,12 @@ class Trim(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
     coordinates: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
+    residual_units: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def residual(self) -> Float[Array, "*n"]:
+        """Largest of the residuals, each in its unit."""
+        return jnp.max(jnp.abs(self.residuals), axis=-1)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -139,6 +147,18 @@ class Trim(eqx.Module):
                     "direct singularity (type 2) is near."
                 )
         return tuple(sentences)
+
+
+def find_largest_residuals(residuals: Numbers, units: Sequence[str]) -> dict[str, float]:
+    """Largest absolute residual of each unit."""
+    values, labels = np.abs(np.asarray(residuals)), np.asarray(units)
+    return {unit: float(np.max(values[labels == unit])) for unit in dict.fromkeys(units)}
+
+
+def format_residuals(residuals: Numbers, units: Sequence[str]) -> str:
+    """Text with the largest absolute residual of each unit."""
+    largest = find_largest_residuals(residuals, units)
+    return ", ".join(f"{value:.1e} {unit}".removesuffix(" 1") for unit, value in largest.items())
 
 
 class _FreeStates(eqx.Module):
@@ -270,7 +290,6 @@ def _solve_equations(problem: _Problem) -> tuple[Any, ...]:
     # no further evaluation, and have no derivative.
     last = jax.lax.stop_gradient(solution.state)
     values = lapack.singular_values(last.J)
-    residual = jnp.max(jnp.abs(last.r))
     # accelerations by inputs, in the scales of the mechanism's weight and size
     space = problem.space
     weight = mechanism_weight(space.system)
@@ -285,7 +304,7 @@ def _solve_equations(problem: _Problem) -> tuple[Any, ...]:
     effect = jnp.stack(lengths)[:, None] * columns * scales[None] / g if lengths else columns
     conditioning, steps = values[-1] / values[0], solution.stats["num_steps"]
     z = solution.value[:count]
-    measures = residual, conditioning, steps, scales, effect, problem.efforts(z)
+    measures = last.r, conditioning, steps, scales, effect, problem.efforts(z)
     return z, *jax.lax.stop_gradient(measures)
 
 
@@ -396,7 +415,10 @@ def _solve_trim(
             f"({chosen or 'none'}): add inputs, or name free states among "
             f"{', '.join(name for name, _ in space.names[: 2 * space.dof])}."
         )
-    z, residual, conditioning, steps, weights, effect, efforts = _solve_equations(problem)
+    z, residuals, conditioning, steps, weights, effect, efforts = _solve_equations(problem)
+    residual = jnp.max(jnp.abs(residuals))
+    rates = [f"{unit}^2" if unit.endswith("/s") else f"{unit}/s" for _, unit in space.names]
+    units = (*rates[space.dof :], *["1"] * (residuals.shape[-1] - space.size + space.dof))
     # A point that did not converge is returned as NaN and never as a guess that looks like a trim.
     converged = residual <= TOLERANCE
     if throw and has_values(efforts) and bool(converged):
@@ -404,22 +426,23 @@ def _solve_trim(
     converged = converged & jnp.all(jnp.abs(efforts) <= 1 + _LIMIT_ROUND_OFF)
     if throw and has_values(residual) and not bool(converged):
         hint = ""
-        residual_text = f"{float(residual):.3g}" if np.isfinite(residual) else "no finite value"
+        is_finite = np.isfinite(residual)
+        residual_text = format_residuals(residuals, units) if is_finite else "no finite value"
         if not float(conditioning) > 1e-12:
             hint = (
                 " The equations are singular there: these unknowns do not reach all accelerations."
             )
         raise StateError(
-            "No trim was found near the start: Newton's method stopped with a residual acceleration of "
+            "No trim was found near the start: Newton's method stopped with residual accelerations of "
             f"{residual_text} left (tolerance {TOLERANCE:.0e}) over the unknowns {chosen}.{hint}"
         )
     keep = lambda tree: jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), tree)
     point, trim_values = keep(problem.at(z))
     return Trim(
-        point, trim_values, residual, conditioning, converged, steps, inputs, weights, effect,
+        point, trim_values, residuals, conditioning, converged, steps, inputs, weights, effect,
         tuple(input_labels(space.system, inputs)),
         tuple(name for name, _ in space.names[: space.dof]),
-        force_units(space.system, inputs),
+        force_units(space.system, inputs), units,
     )  # fmt: skip
 
 
