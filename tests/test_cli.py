@@ -280,7 +280,12 @@ def test_trim_command(tmp_path, capsys):
     slopes = dict(zip(found["values"], found["sensitivities"]["mass.panel_7"], strict=True))
     # more panel, more thrust
     assert slopes["speed_1"] > 0
-    assert "Trim" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "Trim" in output
+    assert "per minute" in output
+    assert " or rad/s^2" not in output
+    assert set(found["residuals"]) == {"m/s^2", "rad/s^2", "1"}
+    assert found["rotors"]["speed_squared_1"]["speed"] == found["values"]["speed_1"]
     assert main([*given, "--highest", "1300"]) == 2
     assert "N are required" in " ".join(capsys.readouterr().err.split())
     assert main([*given, "--phi", "3"]) == 2
