@@ -231,6 +231,9 @@ class _Problem(eqx.Module):
         system = self.space.system
         for k in self.limited:
             system = eqx.tree_at(lambda s, k=k: s.forces[k].limit, system, None)
+        for k in {entry.force for entry in self.inputs.entries}:
+            if getattr(system.forces[k], "squared_limits", None) is not None:
+                system = eqx.tree_at(lambda s, k=k: s.forces[k].squared_limits, system, None)
         return system
 
     def efforts(self, z: Float[Array, " k"]) -> Float[Array, " l"]:
@@ -344,8 +347,8 @@ def trim(
         throw: raise where there is no trim, if values are known.
 
     Raises:
-        StateError: no trim was found, it needs more than the limit of an actuator, or the posture is
-            singular for the independent coordinates.
+        StateError: no trim was found, it needs more than the limit of an actuator or of a rotor's speed, or
+            the posture is singular for the independent coordinates.
         SettingError: an unknown name, or fewer unknowns than equations.
         ModelError: numbers of another shape, or not finite.
     """
@@ -436,8 +439,13 @@ def _solve_trim(
             "No trim was found near the start: Newton's method stopped with residual accelerations of "
             f"{residual_text} left (tolerance {TOLERANCE:.0e}) over the unknowns {chosen}.{hint}"
         )
+    point, trim_values = problem.at(z)
+    lowest, highest = _find_speed_limits(space.system, inputs)
+    if throw and has_values(trim_values, lowest, highest):
+        _check_speeds(inputs, np.asarray(trim_values), np.asarray(lowest), np.asarray(highest))
+    converged = converged & jnp.all((trim_values >= lowest) & (trim_values <= highest))
     keep = lambda tree: jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), tree)
-    point, trim_values = keep(problem.at(z))
+    point, trim_values = keep((point, trim_values))
     return Trim(
         point, trim_values, residuals, conditioning, converged, steps, inputs, weights, effect,
         tuple(input_labels(space.system, inputs)),
@@ -458,6 +466,35 @@ def _check_efforts(problem: _Problem, efforts: Float[np.ndarray, " l"]) -> None:
             f"The trim needs an effort of {ratio * limit:.6g} {unit} of the {type(force).__name__} in joint "
             f"'{force.joint}', but its limit is {limit:.6g}: raise the limit, or choose another posture."
         )
+
+
+def _find_speed_limits(
+    system: System, inputs: Inputs
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Smallest and largest squared speeds of rotors with limits, with room for round-off; else infinite."""
+    lowest, highest = [], []
+    for entry in inputs.entries:
+        limits: Any = getattr(system.forces[entry.force], "squared_limits", None)
+        low, high = (-jnp.inf, jnp.inf) if limits is None else (x[entry.place] for x in limits)
+        lowest.append(low * (1 - _LIMIT_ROUND_OFF))
+        highest.append(high * (1 + _LIMIT_ROUND_OFF))
+    return jnp.array(lowest), jnp.array(highest)
+
+
+def _check_speeds(
+    inputs: Inputs,
+    values: Float[np.ndarray, " m"],
+    lowest: Float[np.ndarray, " m"],
+    highest: Float[np.ndarray, " m"],
+) -> None:
+    """Raise `StateError` where a trim needs a rotor beyond the limits of its speed."""
+    for entry, value, low, high in zip(inputs.entries, values, lowest, highest, strict=True):
+        if not low <= value <= high:
+            text = f"{np.sqrt(value):.6g} rad/s" if value >= 0 else "a thrust downwards"
+            raise StateError(
+                f"The trim needs {text} of the rotor with the input '{entry.name}', but its limits are "
+                f"{np.sqrt(low):.6g} to {np.sqrt(high):.6g} rad/s."
+            )
 
 
 # --- steady flight
