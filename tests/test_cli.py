@@ -276,12 +276,17 @@ def test_trim_command(tmp_path, capsys):
     given = ["trim", "--sun", "150", "70", "--out", str(tmp_path), "--no-cache"]
     assert main([*given, "--by", "mass.panel_7"]) == 0
     found = json.loads((tmp_path / "trim.json").read_text())
-    assert found["residual"] < 1e-10
+    assert max(found["residuals"].values()) < 1e-10
     assert found["units"]["speed_1"] == "rad/s"
     slopes = dict(zip(found["values"], found["sensitivities"]["mass.panel_7"], strict=True))
     # more panel, more thrust
     assert slopes["speed_1"] > 0
-    assert "Trim" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "Trim" in output
+    assert "per minute" in output
+    assert " or rad/s^2" not in output
+    assert set(found["residuals"]) == {"m/s^2", "rad/s^2", "1"}
+    assert found["rotors"]["speed_squared_1"]["speed"] == found["values"]["speed_1"]
     assert main([*given, "--highest", "1300"]) == 2
     assert "N are required" in " ".join(capsys.readouterr().err.split())
     assert main([*given, "--phi", "3"]) == 2

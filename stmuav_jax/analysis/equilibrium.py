@@ -74,7 +74,8 @@ class Trim(eqx.Module):
     Attributes:
         point: point of the state space.
         values: values of the inputs (m,).
-        residual: largest difference from the target accelerations [m/s^2] or [rad/s^2].
+        residuals: differences from the target accelerations, rates of the forces' states, and further
+            conditions (e,), in `residual_units`.
         conditioning: smallest over largest singular value of the Jacobian with scaled unknowns;
             near zero, other trims lie near. A ratio does not show inputs that all lose their hold
             together: see `notes`.
@@ -87,11 +88,12 @@ class Trim(eqx.Module):
             inputs of one scale (dof, m).
         labels, coordinates: names of the inputs with what they act on, and of the coordinates.
         units: unit of each input, "N", "N m" or "" for another one.
+        residual_units: unit of each residual.
     """
 
     point: Point
     values: Float[Array, " m"]
-    residual: Float[Array, ""]
+    residuals: Float[Array, " e"]
     conditioning: Float[Array, ""]
     converged: Bool[Array, ""]
     steps: Int[Array, ""]
@@ -101,6 +103,12 @@ class Trim(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
     coordinates: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
+    residual_units: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def residual(self) -> Float[Array, "*n"]:
+        """Largest of the residuals, each in its unit."""
+        return jnp.max(jnp.abs(self.residuals), axis=-1)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -139,6 +147,18 @@ class Trim(eqx.Module):
                     "direct singularity (type 2) is near."
                 )
         return tuple(sentences)
+
+
+def find_largest_residuals(residuals: Numbers, units: Sequence[str]) -> dict[str, float]:
+    """Largest absolute residual of each unit."""
+    values, labels = np.abs(np.asarray(residuals)), np.asarray(units)
+    return {unit: float(np.max(values[labels == unit])) for unit in dict.fromkeys(units)}
+
+
+def format_residuals(residuals: Numbers, units: Sequence[str]) -> str:
+    """Text with the largest absolute residual of each unit."""
+    largest = find_largest_residuals(residuals, units)
+    return ", ".join(f"{value:.1e} {unit}".removesuffix(" 1") for unit, value in largest.items())
 
 
 class _FreeStates(eqx.Module):
@@ -211,6 +231,9 @@ class _Problem(eqx.Module):
         system = self.space.system
         for k in self.limited:
             system = eqx.tree_at(lambda s, k=k: s.forces[k].limit, system, None)
+        for k in {entry.force for entry in self.inputs.entries}:
+            if getattr(system.forces[k], "squared_limits", None) is not None:
+                system = eqx.tree_at(lambda s, k=k: s.forces[k].squared_limits, system, None)
         return system
 
     def efforts(self, z: Float[Array, " k"]) -> Float[Array, " l"]:
@@ -270,7 +293,6 @@ def _solve_equations(problem: _Problem) -> tuple[Any, ...]:
     # no further evaluation, and have no derivative.
     last = jax.lax.stop_gradient(solution.state)
     values = lapack.singular_values(last.J)
-    residual = jnp.max(jnp.abs(last.r))
     # accelerations by inputs, in the scales of the mechanism's weight and size
     space = problem.space
     weight = mechanism_weight(space.system)
@@ -285,7 +307,7 @@ def _solve_equations(problem: _Problem) -> tuple[Any, ...]:
     effect = jnp.stack(lengths)[:, None] * columns * scales[None] / g if lengths else columns
     conditioning, steps = values[-1] / values[0], solution.stats["num_steps"]
     z = solution.value[:count]
-    measures = residual, conditioning, steps, scales, effect, problem.efforts(z)
+    measures = last.r, conditioning, steps, scales, effect, problem.efforts(z)
     return z, *jax.lax.stop_gradient(measures)
 
 
@@ -325,8 +347,8 @@ def trim(
         throw: raise where there is no trim, if values are known.
 
     Raises:
-        StateError: no trim was found, it needs more than the limit of an actuator, or the posture is
-            singular for the independent coordinates.
+        StateError: no trim was found, it needs more than the limit of an actuator or of a rotor's speed, or
+            the posture is singular for the independent coordinates.
         SettingError: an unknown name, or fewer unknowns than equations.
         ModelError: numbers of another shape, or not finite.
     """
@@ -396,7 +418,10 @@ def _solve_trim(
             f"({chosen or 'none'}): add inputs, or name free states among "
             f"{', '.join(name for name, _ in space.names[: 2 * space.dof])}."
         )
-    z, residual, conditioning, steps, weights, effect, efforts = _solve_equations(problem)
+    z, residuals, conditioning, steps, weights, effect, efforts = _solve_equations(problem)
+    residual = jnp.max(jnp.abs(residuals))
+    rates = [f"{unit}^2" if unit.endswith("/s") else f"{unit}/s" for _, unit in space.names]
+    units = (*rates[space.dof :], *["1"] * (residuals.shape[-1] - space.size + space.dof))
     # A point that did not converge is returned as NaN and never as a guess that looks like a trim.
     converged = residual <= TOLERANCE
     if throw and has_values(efforts) and bool(converged):
@@ -404,22 +429,28 @@ def _solve_trim(
     converged = converged & jnp.all(jnp.abs(efforts) <= 1 + _LIMIT_ROUND_OFF)
     if throw and has_values(residual) and not bool(converged):
         hint = ""
-        residual_text = f"{float(residual):.3g}" if np.isfinite(residual) else "no finite value"
+        is_finite = np.isfinite(residual)
+        residual_text = format_residuals(residuals, units) if is_finite else "no finite value"
         if not float(conditioning) > 1e-12:
             hint = (
                 " The equations are singular there: these unknowns do not reach all accelerations."
             )
         raise StateError(
-            "No trim was found near the start: Newton's method stopped with a residual acceleration of "
+            "No trim was found near the start: Newton's method stopped with residual accelerations of "
             f"{residual_text} left (tolerance {TOLERANCE:.0e}) over the unknowns {chosen}.{hint}"
         )
+    point, trim_values = problem.at(z)
+    lowest, highest = _find_speed_limits(space.system, inputs)
+    if throw and has_values(trim_values, lowest, highest):
+        _check_speeds(inputs, np.asarray(trim_values), np.asarray(lowest), np.asarray(highest))
+    converged = converged & jnp.all((trim_values >= lowest) & (trim_values <= highest))
     keep = lambda tree: jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), tree)
-    point, trim_values = keep(problem.at(z))
+    point, trim_values = keep((point, trim_values))
     return Trim(
-        point, trim_values, residual, conditioning, converged, steps, inputs, weights, effect,
+        point, trim_values, residuals, conditioning, converged, steps, inputs, weights, effect,
         tuple(input_labels(space.system, inputs)),
         tuple(name for name, _ in space.names[: space.dof]),
-        force_units(space.system, inputs),
+        force_units(space.system, inputs), units,
     )  # fmt: skip
 
 
@@ -435,6 +466,35 @@ def _check_efforts(problem: _Problem, efforts: Float[np.ndarray, " l"]) -> None:
             f"The trim needs an effort of {ratio * limit:.6g} {unit} of the {type(force).__name__} in joint "
             f"'{force.joint}', but its limit is {limit:.6g}: raise the limit, or choose another posture."
         )
+
+
+def _find_speed_limits(
+    system: System, inputs: Inputs
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Smallest and largest squared speeds of rotors with limits, with room for round-off; else infinite."""
+    lowest, highest = [], []
+    for entry in inputs.entries:
+        limits: Any = getattr(system.forces[entry.force], "squared_limits", None)
+        low, high = (-jnp.inf, jnp.inf) if limits is None else (x[entry.place] for x in limits)
+        lowest.append(low * (1 - _LIMIT_ROUND_OFF))
+        highest.append(high * (1 + _LIMIT_ROUND_OFF))
+    return jnp.array(lowest), jnp.array(highest)
+
+
+def _check_speeds(
+    inputs: Inputs,
+    values: Float[np.ndarray, " m"],
+    lowest: Float[np.ndarray, " m"],
+    highest: Float[np.ndarray, " m"],
+) -> None:
+    """Raise `StateError` where a trim needs a rotor beyond the limits of its speed."""
+    for entry, value, low, high in zip(inputs.entries, values, lowest, highest, strict=True):
+        if not low <= value <= high:
+            text = f"{np.sqrt(value):.6g} rad/s" if value >= 0 else "a thrust downwards"
+            raise StateError(
+                f"The trim needs {text} of the rotor with the input '{entry.name}', but its limits are "
+                f"{np.sqrt(low):.6g} to {np.sqrt(high):.6g} rad/s."
+            )
 
 
 # --- steady flight

@@ -217,9 +217,13 @@ def _rotor_table(rotors: Mapping[str, RotorSpeed]) -> Table:
 
 
 def rotor_speeds(
-    system: "System", inputs: "Inputs", values: Sequence[float]
+    system: "System", inputs: "Inputs", values: Sequence[float], highest: float | None = None
 ) -> dict[str, RotorSpeed]:
-    """Speeds of the rotors whose squares are inputs, by the name of the input; none of a negative square."""
+    """Speeds of the rotors whose squares are inputs, by the name of the input; none of a negative square.
+
+    Args:
+        highest: highest speed of all rotors [rad/s], by default that of their motors, if they have one.
+    """
     from ..uav.motor import MotorRotors
 
     rotors = {}
@@ -230,9 +234,12 @@ def rotor_speeds(
         force: Any = system.forces[entry.force]
         limits = force.limits if isinstance(force, MotorRotors) else None
         thrust = float(force.rotors.thrusts(squared))
-        highest = None if limits is None else float(np.asarray(limits.highest)[entry.place])
+        if highest is None and limits is not None:
+            most = float(np.asarray(limits.highest)[entry.place])
+        else:
+            most = highest
         speed = math.sqrt(squared)
-        rotors[entry.name] = RotorSpeed(speed, thrust, None if highest is None else speed / highest)
+        rotors[entry.name] = RotorSpeed(speed, thrust, None if most is None else speed / most)
     return rotors
 
 
@@ -274,11 +281,14 @@ def count_modes_at_zero(modes: Sequence[Any]) -> str:
 def write_trim(
     out: Console, result: "Trim | FlightTrim", content: dict[str, Any], folder: Path
 ) -> None:
-    """Write trim.json: the content, with what all trims have, and the versions."""
+    """Print the residuals, and write trim.json: the content, with what all trims have, and the versions."""
+    from ..analysis.equilibrium import find_largest_residuals, format_residuals
     from ..io.netcdf import list_versions, write_atomically
 
+    residuals = result.residuals, result.residual_units
+    print_line(out, f"Residual accelerations: {format_residuals(*residuals)}.")
     content |= {
-        "residual": float(result.residual),
+        "residuals": find_largest_residuals(*residuals),
         "conditioning": float(result.conditioning),
         "versions": list_versions(),
     }
@@ -358,7 +368,6 @@ def _write_scene_trim(
         out.print(unknown_table)
     if rotors:
         out.print(_rotor_table(rotors))
-    print_line(out, f"Residual acceleration: {float(trim_result.residual):.1e} m/s^2 or rad/s^2.")
     for note in trim_result.notes:
         print_line(out, f"Note: {note}")
     content = {
@@ -441,17 +450,23 @@ def _run_uav(command: TrimCommand) -> int:
     uav, trim_result, slopes = _solve_uav(command, parameters, _trim_limits(command))
     unknowns, labels = np.asarray(trim_result.vector), trim_result.names
     out = Console()
-    out.print(trim_table(unknowns, labels))
+    rotors = rotor_speeds(
+        uav.system, uav.inputs, np.asarray(trim_result.values).tolist(), command.highest
+    )
+    places = [k for k, (name, _) in enumerate(labels) if not name.startswith("speed_")]
+    out.print(trim_table(unknowns[places], [labels[k] for k in places]))
+    out.print(_rotor_table(rotors))
     degrees = [math.degrees(float(a)) for a in np.asarray(trim_result.angles)]
     angles = ", ".join(f"{a:.4f}" for a in degrees)
     print_line(
         out,
-        f"Panel angles {angles} degrees. Residual acceleration: {float(trim_result.residual):.1e} m/s^2 or rad/s^2; "
-        f"{trim_result.null_space_dimension} dimensions of choice among the rotors' speeds, taken nearest each other.",
+        f"Panel angles {angles} degrees; {trim_result.null_space_dimension} dimensions of choice among the rotors' "
+        "speeds, taken nearest each other.",
     )
     content = {
         "values": {name: float(v) for (name, _), v in zip(labels, unknowns, strict=True)},
         "units": dict(labels),
+        "rotors": {name: rotor._asdict() for name, rotor in rotors.items()},
         "panel_angles_deg": degrees,
     }
     if slopes:

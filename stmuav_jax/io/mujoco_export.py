@@ -27,6 +27,8 @@ from ..mechanics.joint_forces import JointEffort, JointServo
 from ..mechanics.joint_states import joint_motion
 from ..mechanics.state import State
 from ..mechanics.system import System
+from ..uav.motor import MotorRotors
+from ..uav.rotor import Rotors
 from .netcdf import write_atomically
 
 Element = ElementTree.Element
@@ -84,6 +86,7 @@ class _Draft(NamedTuple):
     tendons: Element
     equalities: Element
     actuators: Element
+    controls: list[float]
     left_out: LeftOut
 
     def site(self, body: str, name: str, pos: Any, frame: Any = None) -> str:
@@ -98,8 +101,9 @@ def save_mjcf(scene: Scene, path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Write a scene's system as an MJCF file; the sentences on what is left out.
 
     MuJoCo's `qpos0` has all joint coordinates of the spanning tree at zero. Joints keep their names;
-    a universal or a cylindrical joint becomes two, with _1 and _2. Efforts and servos are actuators.
-    A start that is not the reference posture at rest is the keyframe "start".
+    a universal or a cylindrical joint becomes two, with _1 and _2. Efforts, servos and rotors are actuators,
+    whose controls are the inputs. A start that is not the reference posture at rest, with inputs of zero,
+    is the keyframe "start".
 
     Raises:
         SettingError: a joint has no counterpart: a driver, a screw, or a loop that is closed by
@@ -111,7 +115,10 @@ def save_mjcf(scene: Scene, path: str | os.PathLike[str]) -> tuple[str, ...]:
 
 
 def _write_document(scene: Scene) -> tuple[str, tuple[str, ...]]:
-    system, tree = scene.system, spanning_tree(scene.system)
+    system = scene.system
+    # MuJoCo's free body comes first when the file is read, where missions look for the rotors
+    carriers = [f.rotors.body for f in system.forces if isinstance(f, Rotors | MotorRotors)]
+    tree = spanning_tree(system, base=next(iter(carriers), None))
     cut = [system.joints[k] for k in tree.cut]
     tree_joints = [system.joints[link.joint] for link in tree.links if link.joint is not None]
     for joints, kinds, where in (
@@ -133,7 +140,7 @@ def _write_document(scene: Scene) -> tuple[str, tuple[str, ...]]:
     tendons, equalities, actuators = (
         ElementTree.SubElement(root, name) for name in ("tendon", "equality", "actuator")
     )
-    draft = _Draft(system, {GROUND: world}, {}, tendons, equalities, actuators, LeftOut({}, []))
+    draft = _Draft(system, {GROUND: world}, {}, tendons, equalities, actuators, [], LeftOut({}, []))
     if tree.floating:
         _add_free(draft, tree.root)
     for link in tree.links:
@@ -148,7 +155,7 @@ def _write_document(scene: Scene) -> tuple[str, tuple[str, ...]]:
         if not isinstance(force, Gravity) and not (write and write(draft, force)):
             force_name = f"{type(force).__name__} on {force.acts_on()}"
             draft.left_out.add("force elements", force_name)
-    _add_keyframe(root, scene)
+    _add_keyframe(root, scene, draft.controls)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n", draft.left_out.sentences()
 
@@ -217,11 +224,11 @@ def _add_linked(draft: _Draft, link: Link) -> None:
         draft.axes.setdefault(joint.name + coordinate_suffix, joint_element)
 
 
-def _add_keyframe(root: Element, scene: Scene) -> None:
-    """Add the start as a keyframe, in MuJoCo's order of the joints, unless it is the reference at rest."""
+def _add_keyframe(root: Element, scene: Scene, controls: list[float]) -> None:
+    """Add start and controls as a keyframe, in MuJoCo's order, unless it is the reference at rest without them."""
     system, state, rest = scene.system, scene.state0, scene.system.reference
     same = jax.tree.map(lambda a, b: bool(np.all(np.abs(a - b) <= _SAME)), state, rest)
-    if all(jax.tree.leaves(same)):
+    if all(jax.tree.leaves(same)) and not any(controls):
         return
     place: list[float] = []
     speed: list[float] = []
@@ -249,10 +256,11 @@ def _add_keyframe(root: Element, scene: Scene) -> None:
                 number = motion.coordinates.shape[0] - 1 - number
             place.append(float(motion.coordinates[number]))
             speed.append(float(motion.rates[number]))
+    key = {"name": "start", "qpos": xml_numbers(place), "qvel": xml_numbers(speed)}
+    if any(controls):
+        key["ctrl"] = xml_numbers(controls)
     frame = ElementTree.SubElement(root, "keyframe")
-    ElementTree.SubElement(
-        frame, "key", name="start", qpos=xml_numbers(place), qvel=xml_numbers(speed)
-    )
+    ElementTree.SubElement(frame, "key", key)
 
 
 def _relative_turn(
@@ -375,15 +383,47 @@ def _add_actuator(
             "forcerange": xml_numbers([-force.limit, force.limit]),
         }
     ElementTree.SubElement(draft.actuators, tag, attributes)
-    _note_value(draft, name, value)
+    _set_control(draft, name, value)
     return True
 
 
-def _note_value(draft: _Draft, name: str, value: Any) -> None:
-    """Note the value of an input that is not zero: MJCF has none for an actuator's control."""
-    if callable(value) or float(value) != 0:
-        value_text = "a function of time" if callable(value) else repr(float(value))
-        draft.left_out.add("values of controls", f"{name} = {value_text}")
+def _set_control(draft: _Draft, name: str, value: Any) -> None:
+    """Add the value of an actuator's control to the keyframe; note a function of time, which MJCF lacks."""
+    if callable(value):
+        draft.left_out.add("values of controls", f"{name} = a function of time")
+    draft.controls.append(0.0 if callable(value) else float(value))
+
+
+def _add_rotors(draft: _Draft, force: Rotors | MotorRotors) -> bool:
+    """Write an actuator for each rotor, whose control is the squared speed, at a site of its body."""
+    rotors = force.rotors
+    if rotors.has_curves:
+        # both parts of an actuator's wrench grow alike with its one control
+        draft.left_out.add(
+            "rotors whose thrust or torque is not proportional to the squared speed", rotors.body
+        )
+        return True
+    limits = None
+    if isinstance(force, MotorRotors):
+        limits = force.squared_limits
+        if force.time_constant is not None or force.inertia is not None:
+            draft.left_out.add("lag and inertia of the motors of rotors", rotors.body)
+    first = len(draft.bodies[rotors.body].findall("site"))
+    for k, (arm, spin) in enumerate(zip(np.asarray(rotors.arms), rotors.spin, strict=True)):
+        number = f"{rotors.body}_{first + k + 1}"
+        u = rotors.speed_squared
+        name, gear = (
+            f"speed_squared_{number}",
+            [0.0, 0.0, rotors.k_f, 0.0, 0.0, -spin * rotors.k_tau],
+        )
+        attributes = {"name": name, "site": draft.site(rotors.body, f"rotor_{number}", arm)}
+        attributes["gear"] = xml_numbers([float(x) for x in gear])
+        if limits is not None:
+            attributes["ctrllimited"] = "true"
+            attributes["ctrlrange"] = xml_numbers([limits[0][k], limits[1][k]])
+        ElementTree.SubElement(draft.actuators, "motor", attributes)
+        _set_control(draft, name, u if callable(u) else np.asarray(u)[k])
+    return True
 
 
 _WRITERS: dict[type, Callable[[_Draft, Any], bool]] = {
@@ -392,4 +432,6 @@ _WRITERS: dict[type, Callable[[_Draft, Any], bool]] = {
     LinearSpringDamper: _add_line,
     JointEffort: _add_effort,
     JointServo: _add_servo,
+    Rotors: _add_rotors,
+    MotorRotors: _add_rotors,
 }

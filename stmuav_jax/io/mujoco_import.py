@@ -28,6 +28,8 @@ from ..mechanics.joint import Joint
 from ..mechanics.joint_forces import JointEffort, JointServo
 from ..mechanics.load import AbstractForce
 from ..mechanics.system import System
+from ..uav.allocation import RotorLimits
+from ..uav.motor import MotorRotors
 from ..uav.rotor import Rotors
 from .mujoco_export import LeftOut
 from .netcdf import FileError, regular_file
@@ -414,7 +416,10 @@ def _make_scene(
     actuators = [_make_actuator(model, a, joints_by_number, left_out) for a in every]
     driven = [(a, entry) for a, entry in enumerate(actuators) if entry is not None]
     forces += [force for _, entry in driven for force in entry.forces]
-    thrusters, thruster_notes = _thrusters(reader, every, left_out)
+    weight = sum(body.mass for body in bodies) * np.linalg.norm(
+        [0.0, 0.0, 0.0] if "GRAVITY" in disabled_flags else model.opt.gravity
+    )
+    thrusters, thruster_notes = _thrusters(reader, every, float(weight), left_out)
     forces += thrusters
     fixed = sum(float(model.body_mass[b]) for b in range(1, model.nbody) if reader.root(b) == 0)
     if not bodies:
@@ -577,7 +582,8 @@ def _add_left_out(model: Any, left_out: LeftOut, disabled_flags: set[str]) -> No
     for k in range(model.nu):
         is_damper = model.actuator_biasprm[k, 1] == 0 and model.actuator_biasprm[k, 2] != 0
         is_lost = model.actuator_forcelimited[k] and (is_damper or _effort_limit(model, k) is None)
-        if model.actuator_ctrllimited[k] or is_lost:
+        # those of a site are left to the rotors, which keep limits of their speeds
+        if is_lost or (model.actuator_ctrllimited[k] and model.actuator_trntype[k] != _AT_SITE):
             left_out.add("limits of actuators", model.actuator(k).name)
     if model.opt.density or model.opt.viscosity:
         left_out.add("forces of the surrounding medium", "")
@@ -864,9 +870,12 @@ def _make_actuator(
 
 
 def _thrusters(
-    reader: _Reader, actuators: range, left_out: LeftOut
+    reader: _Reader, actuators: range, weight: float, left_out: LeftOut
 ) -> tuple[list[AbstractForce], list[str]]:
-    """Rotors of the actuators that push along z at sites of a body, with equal coefficients; and notes on them."""
+    """Rotors of the actuators that push along z at sites of a body, with equal coefficients; and notes on them.
+
+    As in a model's file they balance the weight [N] with equal thrusts, since a trim needs speeds to start from.
+    """
     model = reader.model
     by_body: dict[str, list[tuple[int, np.ndarray, float, float]]] = {}
     for a in actuators:
@@ -888,7 +897,9 @@ def _thrusters(
             continue
         body = reader.body(int(model.site_bodyid[site]))
         by_body.setdefault(body, []).append((a, pose.r, float(push[2]), float(push[5])))
-    forces, notes = [], []
+    forces: list[AbstractForce] = []
+    notes: list[str] = []
+    count = sum(map(len, by_body.values()))
     for body, entries in by_body.items():
         numbers, arms, k_f, moments = zip(*entries, strict=True)
         names = ", ".join(model.actuator(a).name or f"actuator_{a}" for a in numbers)
@@ -900,12 +911,22 @@ def _thrusters(
         spin = -np.sign(moments) if k_tau[0] else np.ones(len(entries))
         rotors = Rotors(
             body, arms=np.array(arms), spin=spin, k_f=k_f[0], k_tau=k_tau[0],
-            speed_squared=np.zeros(len(entries)),
+            speed_squared=np.full(len(entries), weight / (count * k_f[0])),
         )  # fmt: skip
-        forces.append(rotors)
+        low, high = model.actuator_ctrlrange[list(numbers)].T
+        is_limited = np.asarray(model.actuator_ctrllimited)[list(numbers)] != 0
+        has_limits = bool(np.all(is_limited & (low >= 0)))
+        if has_limits:
+            limits = RotorLimits(np.sqrt(low), np.sqrt(high))
+            forces.append(MotorRotors(rotors, limits=limits))
+        else:
+            forces.append(rotors)
+            for a in np.array(numbers)[is_limited]:
+                left_out.add("limits of actuators", model.actuator(a).name or f"actuator_{a}")
         notes.append(
             f"The actuators {names} at sites of '{body}' are its rotors: their controls are the inputs "
-            f"speed_squared, each with a thrust of {k_f[0]:.6g} N and a moment of {k_tau[0]:.6g} N m."
+            f"speed_squared, each with a thrust of {k_f[0]:.6g} N and a moment of {k_tau[0]:.6g} N m per unit. "
+            "At the start, equal thrusts of all rotors balance the weight."
         )
     return forces, notes
 

@@ -5,10 +5,10 @@ speeds are the minimum-norm ones that give thrust and moments,
 
     u = B^T (B B^T)^-1 w,
 
-so that the unknowns are roll and pitch, the wrench w and two actuator forces: as many as the degrees
-of freedom. The rotors' speeds are then compared with their limits, and the panel's posture with
-the workspace of the tracker; a code says which limit the flight breaks. Derivatives are those of the
-implicit function.
+with the derivative B of the wrench at hovering speeds if the rotors have curves, so that the unknowns
+are roll and pitch, the wrench w and two actuator forces: as many as the degrees of freedom. The rotors'
+speeds are then compared with their limits, and the panel's posture with the workspace of the tracker; a
+code says which limit the flight breaks. Derivatives are those of the implicit function.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..analysis.equilibrium import TOLERANCE, FlightCondition, trim_condition
+from ..analysis.equilibrium import TOLERANCE, FlightCondition, format_residuals, trim_condition
 from ..analysis.sensors import gravity_of
 from ..checks.errors import AbstractReason, ModelError, StateError, first_reason, has_values
 from ..checks.numbers import as_floats
@@ -212,7 +212,7 @@ class FlightTrim(eqx.Module):
         values: values of the UAV's inputs: squared rotor speeds [rad^2/s^2], two actuator forces [N] (m,).
         speeds: rotor speeds (k,) [rad/s], zero for a negative square. A speed of zero has no derivative:
             it is NaN.
-        residual: largest residual acceleration [m/s^2] or [rad/s^2].
+        residuals: residual accelerations and conditions (e,), in `residual_units`.
         conditioning: smallest over largest singular value of the Jacobian, in units of a
             radian, the weight, and the weight times a metre; near zero, other trims lie near.
         reason: code of `TrimReason`.
@@ -223,10 +223,16 @@ class FlightTrim(eqx.Module):
     angles: Float[Array, "2"]
     values: Float[Array, " m"]
     speeds: Float[Array, " k"]
-    residual: Float[Array, ""]
+    residuals: Float[Array, " e"]
     conditioning: Float[Array, ""]
     reason: Int[Array, ""]
     steps: Int[Array, ""]
+    residual_units: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def residual(self) -> Float[Array, "*n"]:
+        """Largest of the residuals, each in its unit."""
+        return jnp.max(jnp.abs(self.residuals), axis=-1)
 
     @property
     def speed_squared(self) -> Float[Array, "*n k"]:
@@ -333,7 +339,7 @@ def _trim_flight(uav: Uav, condition: FlightCondition, limits: TrimLimits) -> Fl
     if sun is not None:
         angles = jnp.where(trim.converged, uav.panel_angles(trim.point), angles)
     # Squared speeds are the unknowns, as the wrench is linear in them; negative ones are found below.
-    squared, residual = trim.values[:count], trim.residual
+    squared = trim.values[:count]
     values, speeds = trim.values, sharp_sqrt(squared)
     lower, upper = (0.0, jnp.inf) if limits.rotors is None else limits.rotors.squared(count)
     assert limits.workspace is not None
@@ -343,14 +349,22 @@ def _trim_flight(uav: Uav, condition: FlightCondition, limits: TrimLimits) -> Fl
     outside = reasons(margins)
     reason = first_reason(
         (~(jnp.isfinite(jnp.sum(strokes)) & is_held), TrimReason.POSTURE),
-        (~(residual <= TOLERANCE), TrimReason.NOT_CONVERGED),
+        (~(trim.residual <= TOLERANCE), TrimReason.NOT_CONVERGED),
         (jnp.min(squared) < 0, TrimReason.ROTOR_STOPPED),
         (jnp.any((squared < lower) | (squared > upper)), TrimReason.ROTOR_LIMIT),
         (jnp.max(jnp.abs(values[count:])) > limits.actuator, TrimReason.ACTUATOR_LIMIT),
         *((outside == workspace_reason, code) for code, workspace_reason in _OUTSIDE.items()),
     )
     return FlightTrim(
-        trim.point, angles, values, speeds, residual, trim.conditioning, reason, trim.steps
+        trim.point,
+        angles,
+        values,
+        speeds,
+        trim.residuals,
+        trim.conditioning,
+        reason,
+        trim.steps,
+        trim.residual_units,
     )
 
 
@@ -416,8 +430,8 @@ def _raise_reason(reason: TrimReason, trim: FlightTrim, uav: Uav, limits: TrimLi
         cause = f"the tracker cannot take the panel angles {angles}"
     elif reason is TrimReason.NOT_CONVERGED:
         cause = (
-            f"Newton's method has stopped with accelerations of {float(trim.residual):.3g} left "
-            f"(tolerance {TOLERANCE:.0e})"
+            "Newton's method has stopped with residual accelerations of "
+            f"{format_residuals(trim.residuals, trim.residual_units)} left (tolerance {TOLERANCE:.0e})"
         )
     elif reason is TrimReason.ROTOR_STOPPED:
         cause = "a rotor would have to push downwards"

@@ -70,6 +70,32 @@ def test_hover_speeds(many):
     assert len(angles) == 22
 
 
+def test_rotors_with_curves_give_the_wrench_of_rotors_without(uav, start):
+    """Thrusts of linear and quadratic parts, and speeds by the roots of the curve in closed form."""
+    plain, (c, offset) = uav.rotors, (4e-3, -0.4)
+    rotors = stm.uav.Rotors(
+        plain.body, arms=plain.arms, spin=plain.spin, k_f=5e-6, k_tau=5e-6 * plain.k_tau / plain.k_f,
+        thrust_linear=c, thrust_offset=offset, torque_linear=c * plain.k_tau / plain.k_f,
+        torque_offset=offset * plain.k_tau / plain.k_f, speed_squared=np.full(6, 1e6),
+    )  # fmt: skip
+    forces = [rotors if force is plain else force for force in uav.system.forces]
+    space = uav.space.with_system(replace(uav.system, forces=tuple(forces)))
+    curved = Uav(space, uav.geometry, uav.displacement, uav.limits)
+    found = trim_flight(curved, hover(START))
+    assert found.residual < 1e-10
+    thrusts = rotors.thrusts(found.speed_squared)
+    # torques are in proportion to thrusts, so that moments are linear in them
+    B = wrench_map(plain, curved.system.com(curved.space.to_state(found.point))) / plain.k_f
+    weight = 9.81 * float(jnp.sum(curved.system.bodies.mass))
+    np.testing.assert_allclose(jnp.sum(thrusts), weight, rtol=1e-12)
+    np.testing.assert_allclose(B @ thrusts, [weight, 0, 0, 0], atol=1e-10 * weight)
+    np.testing.assert_allclose(found.forces, start.forces, rtol=1e-9)
+    roots = (np.sqrt(c**2 + 4 * 5e-6 * (np.asarray(thrusts) - offset)) - c) / (2 * 5e-6)
+    np.testing.assert_allclose(found.speeds, roots, rtol=1e-12)
+    # thrusts of rotors of minimum norm differ from these by the curvature between the speeds alone
+    np.testing.assert_allclose(thrusts, plain.k_f * start.speed_squared, rtol=1e-4)
+
+
 def test_trims_of_an_earlier_commit(many):
     """Before the package was rebuilt, at the first six of the panel's angles."""
     found = many[1]

@@ -89,3 +89,23 @@ def test_lag_has_states_of_its_own(pair):
     # speeding up takes a moment only while it lasts
     quasi = B[:16] + A[:16, 16:] @ followed[:, 16:]
     np.testing.assert_allclose(quasi, plain.B, atol=1e-7 * np.max(np.abs(plain.B)))
+
+
+@pytest.mark.parametrize(("lowest", "highest"), [(100, 500), (900, 1400)])
+def test_a_trim_names_the_limit_of_a_rotor(lowest, highest):
+    """Hover needs 700 rad/s; the search starts within the limits, or below them."""
+    arms, spin = stm.uav.rotor_layout(4, 0.3)
+    rotors = stm.uav.Rotors(
+        "frame", arms=arms, spin=spin, k_f=9.81 / (4 * 700**2), k_tau=1e-7, speed_squared=[1e5] * 4
+    )
+    limits = stm.uav.RotorLimits(lowest, highest)
+    motors = stm.uav.MotorRotors(rotors, time_constant=0.03, limits=limits)
+    frame = stm.Body("frame", 1.0, [0.02, 0.02, 0.03], free=True)
+    space = stm.TreeSpace(stm.System([frame], [], [stm.Gravity(), motors]))
+    at = space.from_state(space.system.reference)
+    limits_text = f"limits are {lowest} to {highest} rad/s"
+    with pytest.raises(stm.StateError, match=f"needs 700 rad/s of the rotor .* {limits_text}"):
+        stm.analysis.trim_condition(space, hover(), at=at)
+    found = stm.analysis.trim_condition(space, hover(), at=at, throw=False)
+    assert not found.converged
+    assert np.all(np.isnan(found.values))

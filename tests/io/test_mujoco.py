@@ -251,10 +251,10 @@ def test_what_is_saved_moves_alike_when_it_is_loaded(mujoco, tmp_path, what, tre
         q = {joint.name: rng.normal(size=shape(joint)) for joint in system.joints}
         state = stm.state_from_joints(system, q, q)
     values = {e.name: float(x) for e, x in zip(inputs.entries, inputs.values(system), strict=True)}
-    shown = ", ".join(
-        f"{'effort_rail' if k == 'effort' else k} = {x}" for k, x in values.items() if x
-    )
-    assert left_out == ((f"Left out, values of controls: {shown}.",) if shown else ())
+    assert left_out == ()
+    if any(values.values()):
+        keys = mujoco.MjModel.from_xml_path(str(path)).key_ctrl
+        np.testing.assert_array_equal(keys, [list(values.values())])
     other = with_inputs(other, values)
     moved = jax.tree.map(
         lambda x, y: x.at[np.array(theirs)].set(y[np.array(mine)]), other.reference, state
@@ -321,10 +321,61 @@ def test_limits_of_efforts_come_back_and_cut_off_as_here(mujoco, tmp_path):
     assert data.actuator_force.tolist() == [-1.5, 0.7]
 
 
+def test_rotors_are_actuators_at_sites(mujoco, tmp_path):
+    """Accelerations of MuJoCo at the start's controls; read again, the same rotors on the first body."""
+    bodies = [
+        stm.Body("frame", 3.2, [0.055, 0.055, 0.1], free=True),
+        stm.Body("yoke", 0.15, [3e-4, 3e-4, 2e-4], position=[0, 0, -0.08]),
+        stm.Body("camera", 0.45, [6e-4, 5e-4, 6e-4], position=[0, 0, -0.14], com=[0.01, 0, 0]),
+    ]
+    # two joints at the yoke, which would be the base of the tree
+    joints = [
+        stm.revolute("roll", "frame", "yoke", point=[0, 0, -0.08], axis=[1, 0, 0]),
+        stm.revolute("pitch", "yoke", "camera", point=[0, 0, -0.14], axis=[0, 1, 0]),
+    ]
+    arms, spin = stm.uav.rotor_layout(4, 0.35, height=0.03)
+    u = 1e5 * np.array([9.0, 10.0, 11.0, 12.5])
+    make_rotors = lambda **curves: stm.uav.Rotors(
+        "frame", arms=arms, spin=spin, k_f=8.5e-6, k_tau=1.4e-7, speed_squared=u, **curves
+    )
+    limits = stm.uav.RotorLimits(150.0, 1400.0)
+    motors = stm.uav.MotorRotors(make_rotors(), time_constant=0.03, inertia=1e-5, limits=limits)
+    forces = [stm.Gravity(), motors, stm.JointEffort("pitch", 0.02)]
+    system = stm.System(bodies, joints, forces)
+    path = tmp_path / "quadrotor.xml"
+    left_out = save_mjcf(Scene("four", "", system, system.reference), path)
+    assert left_out == ("Left out, lag and inertia of the motors of rotors: frame.",)
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    found = evaluated(system, system.reference).accelerations
+    np.testing.assert_allclose(data.qacc[:3], found.v_rate[0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(data.qacc[3:6], found.omega_rate[0], rtol=1e-9, atol=1e-9)
+
+    again = load_robot(path)
+    assert again.system.names[0] == "frame"
+    read: Any = again.system.forces[-1]
+    for name in ("arms", "spin", "k_f", "k_tau"):
+        np.testing.assert_array_equal(getattr(read.rotors, name), getattr(motors.rotors, name))
+    assert np.asarray(read.limits) == pytest.approx(np.asarray(motors.limits))
+    hover = motors.rotors.hover(3.8, [0.0, 0.0, -9.81])
+    np.testing.assert_allclose(read.rotors.speed_squared, hover, rtol=1e-12)
+    assert not any("limits of actuators" in note for note in again.notes)
+
+    forces = (stm.Gravity(), make_rotors(thrust_linear=1e-3))
+    curved = dataclasses.replace(system, forces=forces)
+    assert save_mjcf(Scene("four", "", curved, curved.reference), path) == (
+        "Left out, rotors whose thrust or torque is not proportional to the squared speed: frame.",
+    )
+
+
 @pytest.mark.slow
 def test_a_start_is_a_keyframe(mujoco, tmp_path, tree):
     """Positions and velocities of MuJoCo's bodies at the keyframe are those of the start."""
-    save_mjcf(tree, tmp_path / "rest.xml")
+    rest = with_inputs(tree.system, {"target_a": 0.0, "target_b": 0.0})
+    save_mjcf(dataclasses.replace(tree, system=rest), tmp_path / "rest.xml")
     assert "keyframe" not in (tmp_path / "rest.xml").read_text()
     rng, scene = np.random.default_rng(5), tree
     free = stm.Body("free", 1.0, np.diag([1.0, 1.1, 1.2]), com=[0.1, 0, 0], free=True)

@@ -125,11 +125,14 @@ def order_of(motion: AbstractRelativeMotion) -> tuple[int, str]:
     return math.prod(motion.positions), type(motion).__name__
 
 
-def spanning_tree(system: System, cut: Sequence[str] = ()) -> SpanningTree:
+def spanning_tree(
+    system: System, cut: Sequence[str] = (), *, base: str | None = None
+) -> SpanningTree:
     """Choose the spanning tree of a system.
 
     Args:
         cut: names of joints that must close loops; others are added as the module describes.
+        base: body of frame 0 of a floating system; by default one that gives short chains.
 
     Raises:
         ModelError: `cut` names an unknown joint.
@@ -140,7 +143,7 @@ def spanning_tree(system: System, cut: Sequence[str] = ()) -> SpanningTree:
             raise ModelError(f"There is no joint '{name}' to cut.{nearest_names(name, joints)}")
     ends = _joint_ends(system)
     tree_joints = _choose_joints(system, ends, set(cut))
-    links, root = _sort_links(system, ends, tree_joints)
+    links, root = _sort_links(system, ends, tree_joints, base)
     steps, frame = _sort_steps(system, links, root)
     rest = tuple(k for k in range(len(joints)) if k not in tree_joints)
     return SpanningTree((*system.names, GROUND), tuple(joints), root, links, rest, steps, frame)
@@ -195,7 +198,7 @@ def _choose_joints(system: System, ends: list[tuple[int, int]], cut: set[str]) -
 
 
 def _sort_links(
-    system: System, ends: list[tuple[int, int]], tree_joints: set[int]
+    system: System, ends: list[tuple[int, int]], tree_joints: set[int], base: str | None
 ) -> tuple[tuple[Link, ...], int]:
     """Joints of the tree, from the root outwards, and the root."""
     ground = system.n_bodies
@@ -216,7 +219,7 @@ def _sort_links(
                         todo.append(neighbour)
 
     if system.floating and len(tree_joints) == system.n_bodies - 1:
-        root = _choose_base(system, ends, tree_joints)
+        root = _choose_base(system, ends, tree_joints) if base is None else system.index(base)
         grow_tree(root)
         return tuple(links), root
     grow_tree(ground)
