@@ -469,7 +469,7 @@ def test_the_table_of_flights_is_that_of_its_script(data):
     largest = np.linalg.norm(data.position_error.values, axis=1).max()
     assert cells[:2] == ["`gusts`", "2.2 s"]
     assert cells[2] == f"{100 * largest:.2g} cm"
-    assert cells[4::2] == ["", ""]
+    assert cells[4::2] == ["-", "-"]
     assert cells[-1] == "met"
     changed = table.with_rows(page, rows | {"gusts": own})
     assert table.rows_of(changed) == rows | {"gusts": own}
