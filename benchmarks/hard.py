@@ -45,7 +45,8 @@ The branch of the motion is undetermined, so the start must raise an error that 
 BESIDE = """### Other programs
 
 The table gives error, run time and setting (fixed step or tolerance) of other programs at their finest setting, for
-cases with position errors. "Not in our adapter" marks a limit of our adapters in `benchmarks/peers`, not of the program.
+cases with position errors. "Not in our adapter" marks a limit of our adapters (`benchmarks/peers`), not of the
+program.
 """
 LIMITS = """### Limits
 

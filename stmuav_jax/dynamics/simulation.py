@@ -307,7 +307,7 @@ class Run:
         """
         if self.model is None:
             raise SettingError(
-                "This run was made with analysis=False and has no accelerations, reactions or energies."
+                "This run has no accelerations, reactions or energies: simulate it with analysis=True."
             )
         return evaluate_snapshots(
             self.method.formulation, self.model, saved_states(self.trajectory)

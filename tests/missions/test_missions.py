@@ -284,7 +284,7 @@ def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
         ({"machine__model": "x.toml"}, "a scene or a model's file, and not both"),
         ({"machine__options": {}}, "options.drag"),
         ({"machine__options": {"drga": {}}}, "no drga"),
-        ({"path__position": [0.0, 0.0, 0.0]}, "neither position nor heading"),
+        ({"path__position": [0.0, 0.0, 0.0]}, "either waypoints or a position, heading"),
         ({"path__waypoints": [{"t": 0.0, "position": [0.0] * 3}]}, "two or more, with times"),
         (
             {"path__waypoints": [
