@@ -37,7 +37,7 @@ BENCHMARKS: dict[str, tuple[str, ...]] = {
     **{name: (f"{name}.py",) for name in SCRIPTS},
 }
 # Parts of a result that no script measures any more: their question is settled, and they stay as
-# they were measured (docs/failure.md and docs/simulation.md name the commits of their scripts).
+# they were measured (docs/validation.md names the commits of their scripts).
 FINISHED = {
     "failure": {"trials", "stiffness", "long", "alignment", "nature", "collapses"},
     "long_horizon": {"symmetric"},

@@ -5,7 +5,7 @@ to 0.5 s and blames "high stiff" equations. This script runs the report's dense 
 corrected, with Table 4.1 of Part II as printed, from the Euler parameters as printed, and with rows
 chosen once. The whole investigation (more integrators,
 eigenvalues along the path, other geometries, long times) was made once: docs/failure.md has its
-results, which stay in `failure.json`, and says by which commit's scripts.
+results, which stay in `failure.json`; docs/validation.md names the commit of its scripts.
 """
 
 import json

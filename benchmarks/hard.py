@@ -31,7 +31,7 @@ HEAD = """## Hard cases
 
 Each case has a known motion. The table compares the error of a run with the required error and with the run's own
 estimate; run times are without compilation. Settings are the defaults of `simulate` unless stated otherwise.
-`python benchmarks/hard.py` makes this section, and `tests/hard` repeats the cases.
+[Evidence](#evidence) names the script.
 """
 SWEEP = """### All tolerances
 
@@ -44,13 +44,14 @@ The branch of the motion is undetermined, so the start must raise an error that 
 """
 BESIDE = """### Other programs
 
-The table has error, run time and setting (fixed step or tolerance) of other programs at their finest setting, for cases
-with position errors. "Not in our adapter" marks a limit of our adapters in `benchmarks/peers`, not of the program.
+The table gives error, run time and setting (fixed step or tolerance) of other programs at their finest setting, for
+cases with position errors. "Not in our adapter" marks a limit of our adapters (`benchmarks/peers`), not of the
+program.
 """
 LIMITS = """### Limits
 
 - **Distance from the origin.** A mechanism that is connected to ground only by rods or loop-closing joints stops with
-  "step size collapsed" 1,000 km or more from the origin. Put the origin near the mechanism, or use
+  "the step size fell to round-off" 1,000 km or more from the origin. Put the origin near the mechanism, or set
   `formulation=stm.Augmented()`. A mechanism with a tree joint to ground has no such limit.
 - **Size.** The absolute tolerance is a length in metres. For sliding or floating bodies much smaller than a millimetre
   the default of 1e-8 m is too coarse: set a smaller tolerance. Motion in angles only, such as that of rods on
@@ -193,11 +194,10 @@ def page(content: dict[str, Any]) -> str:
         ("error", None, with_unit("reached")),
         ("estimated by the run", None, with_unit("estimated")),
     )
-    about = content["environment"]
     rows = [*content["cases"], *content["tolerances"]]
     missed = [row["name"] for row in rows if not holds(row)]
     verdict = f"Missed: {', '.join(missed)}." if missed else "All meet the required error."
-    where = f"Commit {about['commit'][:10]}, {about['date'][:10]}, run times on one core."
+    where = "Run times are for one core."
     cases = titled(
         "### Cases", content["cases"], ("case", "name"), ("difficulty", "why"),
         ("compared with", "truth"), *reached, *drift, *effort,

@@ -2,7 +2,7 @@
 
 Six problems, 60 s each. Projected, unstabilised and Baumgarte-stabilised Dopri8 and Tsit5 at
 tolerances 1e-4 to 1e-12. Gauss-Legendre methods of order 2 and 4, which are symmetric, were compared
-with them once; their runs and the comparison stay in the record, and docs/simulation.md says by
+with them once; their runs and the comparison stay in the record, and docs/validation.md says by
 which commit's scripts they were made.
 
 Trajectories of the tracker diverge whatever the method, so energies are compared, not states. The

@@ -29,8 +29,8 @@ COLUMNS = {
     "position": "Largest position error",
     "tilt": "Largest tilt error",
     "panel": "Largest panel error",
-    "rotor speeds' margin": "Smallest margin of the rotor speeds",
-    "strokes' margin": "Smallest margin of the strokes",
+    "rotor-speed margin": "Smallest margin of the rotor speeds",
+    "stroke margin": "Smallest margin of the strokes",
 }
 HEAD = (
     f"| mission | time flown | {' | '.join(COLUMNS)} | verdict |\n|{'---|' * (len(COLUMNS) + 3)}\n"
@@ -61,7 +61,7 @@ def row(name: str, data: object) -> str:
     cells = []
     for begins in COLUMNS.values():
         own = [one for one in found if one.name.startswith(begins)]
-        cells.append(shown(own[0]) if own else "")
+        cells.append(shown(own[0]) if own else "-")
     falls = found[0].value > FALLS
     judged = "met" if kept else "it falls" if falls else ending or "not met"
     cells = [] if falls else cells

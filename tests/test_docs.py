@@ -29,17 +29,18 @@ ROOMS = sorted(stub.parent.name for stub in Path(stm.__file__).parent.glob("*/__
 # Parts of pages whose Python runs here, each by itself: the page, its first block of the part and the block
 # after its last; and which of them take long.
 PARTS = {
-    "contact": ("simulation", 2, 3),
+    "contact": ("simulation", 3, 4),
     "dynamics": ("theory", 0, 1),
     "filters": ("estimation", 3, 8),
     "gpu": ("studies", 3, 4),
     "own_study": ("studies", 1, 2),
     "index": ("index", 0, 2),
     "own_data": ("estimation", 0, 3),
-    "parallel_robot": ("trim_and_tuning", 0, 1),
+    "trim": ("trim_and_tuning", 0, 1),
+    "parallel_robot": ("trim_and_tuning", 1, 3),
     "parameters": ("parameters", 0, 1),
-    "results": ("simulation", 1, 2),
-    "solver": ("simulation", 0, 1),
+    "results": ("simulation", 2, 3),
+    "solver": ("simulation", 0, 2),
     "sun": ("sun", 0, 1),
     "viewer": ("viewer", 0, 3),
 }
@@ -57,7 +58,7 @@ LONG = {
 # Blocks of Python that run in other tests.
 ELSEWHERE = {
     "control_and_missions": 6,  # tests/control/test_page.py, tests/missions/test_ready_missions.py
-    "models": 9,  # tests/test_readme.py
+    "models": 11,  # tests/test_readme.py
     "multirotors": 4,  # below, tests/test_readme.py, tests/uav/test_battery.py
     "studies": 2,  # below: one block needs a SLURM cluster
 }
@@ -87,6 +88,7 @@ api_pages = functools.cache(hooks.api_pages)
 )
 def test_python_of_a_page_runs(part, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "docs").symlink_to(DOCS)
     page, first, end = PARTS[part]
     names: dict = {}
     exec("\n".join(blocks(DOCS / f"{page}.md")[first:end]), names)
@@ -109,9 +111,11 @@ CHECKS = {
             atol=1e-6,
         )
         and n["run"].certificate.relative_energy_error < 1e-6
+        and "Converged" in n["result"].describe()
     ),
     "parameters": lambda n: n["scene"].parameters["mass.panel_7"]["value"] == 0.95,
     "results": lambda n: len(Path("panel.csv").read_text().splitlines()) == len(n["data"].time) + 1,
+    "trim": lambda n: n["linear"].A.shape == (2, 2),
     "sun": lambda n: 8.9 < n["day"].energy["tracker"] / 3.6e6 < 9.1,
     "solver": lambda n: n["run"].certificate.position_error < 1e-5,
 }  # fmt: skip
@@ -188,6 +192,7 @@ def test_links_lead_somewhere(page):
 # docs/models.md is a study that tests/cli/test_model_commands.py carries out.
 TOML = {
     "control_and_missions": 1,
+    "estimation": 1,
     "models": 3,
     "multirotors": 4,
     "parameters": 1,
@@ -205,6 +210,13 @@ def fenced(page: Path, kinds: str) -> list[str]:
 def test_every_block_of_toml_is_known():
     found = {page.stem: len(fenced(page, "toml")) for page in PAGES if fenced(page, "toml")}
     assert found == TOML
+
+
+def test_airframe_of_the_page_is_read(tmp_path):
+    (text,) = fenced(DOCS / "estimation.md", "toml")
+    (tmp_path / "crazyflie.toml").write_text(text)
+    layout = stm.io.read_rotor_layout(tmp_path / "crazyflie.toml")
+    assert layout.spin.tolist() == [1, -1, 1, -1]
 
 
 @pytest.mark.parametrize("name", ["report_machine", "parameters"])

@@ -66,20 +66,20 @@ def figure(content: Row) -> Figure:
 def write_page(result: Path, page: Path) -> Path:
     """Write page and figure; the page's path."""
     content = json.loads(result.read_text())
-    about, rows, cores = content["environment"], content["rows"], content["cores"]
+    rows, cores = content["rows"], content["cores"]
     tried, one = content["tried"], "{:.1f}".format
     (picture,) = save({"lanes": figure(content)}, page.parent / "figures" / "benchmarks")
-    dirty = " with changes" if about["dirty"] else ""
     rate, error = max(row["per_second"] for row in rows), tried[-1]["largest_error"]
     spent = lambda r: f"{100 * r['per_second'] / (r['devices'] * cores[0]['per_second']):.0f} %"
-    peers: list[Row] = [dict(zip(PROGRAM, of_peer(r), strict=True)) for r in content["peers"]]
+    peers: list[Row] = [
+        dict(zip(PROGRAM, (cell or "-" for cell in of_peer(r)), strict=True))
+        for r in content["peers"]
+    ]
     lines = [
         "## Throughput", "",
-        f"The tables have medians over {content['flights']} flights of {content['what'].split(', ')[1]} to "
-        f"{content['t1']:g} s with Dopri8 at {content['tolerance']:g} and equations compiled by "
-        f"{about['versions'].get('equations', 'XLA')} (`python benchmarks/montecarlo.py`, "
-        f"[result](../benchmarks/results/montecarlo.json), {about['cores']} cores, commit "
-        f"{about['commit'][:10]}{dirty}, {about['date'][:10]}).",
+        f"The tables give medians over {content['flights']} flights ({content['t1']:g} s of "
+        f"{content['what'].split(', ')[1]}) with Dopri8 at {content['tolerance']:g}, and with a different initial "
+        "state in each flight ([provenance](benchmarks.md#provenance)).",
         "", f"![lanes]({picture.relative_to(page.parent)})", "", "### One core", "",
         *listed(rows, "lanes", ("flights per second", "per_second", one),
                 ("us per step and flight", "microseconds_per_step", one),
@@ -90,13 +90,15 @@ def write_page(result: Path, page: Path) -> Path:
                 ("median [m]", "median_error", "{:.1e}".format),
                 ("largest [m]", "largest_error", "{:.1e}".format)),
         "", "### Other programs, one core", "", *listed(peers, *PROGRAM), "",
-        "The next table has the fastest setting of each program with at most twice our error:", "",
+        "The next table gives the fastest setting of each program with at most twice our error:", "",
         *listed([{"program": "stmuav_jax", "per_second": rate, "largest_error": error},
                  *({"program": p["method"]} | p for p in comparable(content))],
                 "program", ("per second", "per_second", one),
                 ("largest [m]", "largest_error", "{:.1e}".format),
                 ("time per flight, relative to ours", None, lambda p: f"{rate / p['per_second']:.2f}")),
         "", "### More cores, and the store", "",
+        "The overhead of study and store is the median over pairs of runs, one with and one without them. It can "
+        "therefore differ from the ratio of the two rates.", "",
         *listed(cores, ("cores", "devices"), "flights", ("per second", "per_second", one),
                 ("efficiency", None, spent), ("with study and store", "per_second_stored", one),
                 ("overhead", "overhead", lambda x: f"{100 * x:.1f} %")),

@@ -37,13 +37,13 @@ INTERPRETER = "STMUAV_FLIGHT_PEERS"
 # What is run, and what is left out or done differently.
 PEERS = {
     "crazyflow": ("`Sim` of cf21B_500, dynamics from first principles, commands of rotor speeds.",
-                  "A quadrotor with its motors' lag, drag and the rotors' momentum."),
+                  "A quadrotor with its motor lag, drag and the rotors' momentum."),
     "rotorpy": ("`BatchedMultirotor` of a Crazyflie, commands of rotor speeds, PyTorch on one thread.",
-                "A quadrotor with its motors' lag and the rotors' drag; some arrays are single precision."),
+                "A quadrotor with its motor lag and the rotors' drag; some arrays are single precision."),
 }  # fmt: skip
 MACHINES: dict[str, dict[str, Any]] = {
     "hexacopter": {"scene": "hexacopter"},
-    "hexacopter with motors' lag and drag": {
+    "hexacopter with motor lag and drag": {
         "scene": "hexacopter", "options": {"drag": {}, "motor": {}},
     },
     "UAV with tracker": {"scene": "uav_tracker"},

@@ -127,8 +127,8 @@ class Trim(eqx.Module):
                 scale = "weight" if unit == "N" else "weight times size"
                 sentences.append(
                     f"The input {self.labels[k]} is {values[k]:.4g} {unit}, {abs(values[k]) / scales[k]:.2g} "
-                    f"times the mechanism's {scale} of {scales[k]:.4g} {unit}: the posture may be near a "
-                    "singular one of the inputs."
+                    f"times the mechanism's {scale} of {scales[k]:.4g} {unit}: the posture may be near an "
+                    "actuation singularity."
                 )
         columns = [k for k, unit in enumerate(self.units) if unit]
         effect = np.asarray(self.effect)[:, columns]

@@ -34,7 +34,9 @@ class IdentifySettings(PointSettings):
     """Parameters of the model's file with a start for the search, such as mass=0.3."""
     sigma: Annotated[tuple[str, ...], default_text("none")] = ()
     """Standard deviation of each column of the record, such as A.angle=0.001."""
-    spreads: Annotated[tuple[str, ...], default_text("from the first readings of each state")] = ()
+    start_deviations: Annotated[
+        tuple[str, ...], default_text("from the first readings of each state")
+    ] = ()
     """Standard deviations of states at the start, such as A.angle=0.02; 0 for one that is exact."""
     bounds: Annotated[tuple[str, ...], default_text("none")] = ()
     """Intervals that parameters cannot leave, such as mass=0,inf."""
@@ -116,12 +118,12 @@ def _identify_parameters(
     deviations = np.array(list(sigma.values()))
     state = space.to_state(x)
     values = {name: float(output.of(scene.system, state)) for name, output in every.items()}
-    step, spreads = start_from_readings(
+    step, start_deviations = start_from_readings(
         space, list(sigma), ts, record, deviations, values, readings, without=parameter_states
     )
-    chosen = scalars_by_name(settings.spreads, "--spreads")
+    chosen = scalars_by_name(settings.start_deviations, "--start-deviations")
     # Deviations that the user gives replace those from the readings, state by state.
-    spreads |= chosen
+    start_deviations |= chosen
 
     def evaluate_outputs(run_space: Any, now: Any) -> Any:
         state = run_space.to_state(now)
@@ -133,7 +135,7 @@ def _identify_parameters(
 
     predict = motion_model(
         from_table(make_point, model.table, unknowns), None, ts, evaluate_outputs, inputs=input_signals, space=space,
-        start_deviations=spreads, readings=readings,
+        start_deviations=start_deviations, readings=readings,
     )  # fmt: skip
     sizes = np.array([unknown.size for unknown in unknowns])
     bounds = _parse_bounds(settings.bounds, start)
@@ -153,9 +155,11 @@ def _identify_parameters(
             *(f"{value:.6g}" for value in (*numbers, white)),
             model.table[name].unit,
         )
-    free = [f"{name} to {value:.3g}" for name, value in spreads.items() if value > 0]
+    free = [f"{name} to {value:.3g}" for name, value in start_deviations.items() if value > 0]
     exact = [
-        name for name, _ in space.names if not spreads.get(name) and name not in parameter_states
+        name
+        for name, _ in space.names
+        if not start_deviations.get(name) and name not in parameter_states
     ]
     parameter_table.caption = (
         f"chi-squared per degree of freedom {fit_result.reduced_chi_square:.3g}; start estimated: "

@@ -111,7 +111,9 @@ def _make_study(command: Montecarlo) -> "Study":
 def run_montecarlo(command: Montecarlo) -> int:
     """Run the command; return the exit code."""
     if command.scheduler is not None and command.workers is not None:
-        raise SettingError("Give --scheduler or --workers, not both.")
+        raise SettingError(
+            "The options --scheduler and --workers exclude each other: give one of them."
+        )
     from ..studies.schema import check_count
 
     for name in ("samples", "chunk", "workers"):

@@ -72,7 +72,9 @@ def run_sun(command: SunDay) -> int:
     from ..uav.tracker.day import Imperfections, best_heading, track_day
 
     if command.attitude is not None and (command.roll or command.pitch or command.yaw is not None):
-        raise SettingError("Give --attitude or --roll, --pitch and --yaw, not both.")
+        raise SettingError(
+            "The option --attitude excludes --roll, --pitch and --yaw: give one or the others."
+        )
     day_of, zone = parse_date(command.date), day_zone(command.timezone, command.lon)
     place = Place.degrees(command.lat, command.lon, command.altitude)
     settings: dict[str, Any] = {

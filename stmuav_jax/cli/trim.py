@@ -185,7 +185,9 @@ def trim_space(space: "TreeSpace", x: Any, settings: TrimSettings, t: float) -> 
             space, at=x, free=settings.free, inputs=inputs, values=values, accelerations=target, t=t,
         )  # fmt: skip
     if settings.accelerations:
-        raise SettingError("--accelerations are for mechanisms on the ground; others fly steadily.")
+        raise SettingError(
+            "--accelerations needs a mechanism on the ground; a floating one flies steadily (--climb, --speed, --turn)."
+        )
     return trim_condition(
         space, flight_of(settings), at=x, free=settings.free, inputs=inputs, values=values
     )
@@ -326,7 +328,7 @@ def _run_scene(command: Any) -> int:
 
 def _run_postures(scene: "Scene", settings: TrimSettings) -> int:
     if settings.path is not None and settings.survey:
-        raise SettingError("Give --path or --survey, not both.")
+        raise SettingError("The options --path and --survey exclude each other: give one of them.")
     trim_options = (settings.free, settings.accelerations, settings.outputs)
     flying = (settings.climb, settings.speed, settings.turn, settings.yaw)
     if settings.linear != "none" or any(trim_options) or any(flying):
@@ -389,7 +391,7 @@ def compute_flight_target(settings: SteadyFlight, values: "Parameters") -> Any:
     from .view import towards_sun
 
     if settings.sun is not None and (settings.phi is not None or settings.theta is not None):
-        raise SettingError("Give --sun or --phi and --theta, not both.")
+        raise SettingError("The option --sun excludes --phi and --theta: give one or the others.")
     if settings.sun is not None:
         if settings.turn:
             raise SettingError(

@@ -375,7 +375,7 @@ def close_loop(
     if balances:
         if plant.changed:
             raise SettingError(
-                "The energy balance is of a plant whose numbers stay: with 'changes' set balances to False."
+                "The energy balance needs constant parameters: set balances=False for a plant with 'changes'."
             )
         # Work is one more state of the integration; a loop that is not certified does not pay for
         # it.

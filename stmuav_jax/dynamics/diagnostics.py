@@ -82,7 +82,7 @@ class Certificate:
     round-off in a run that is wrong by a centimetre. None stands for a value that was not computed.
 
     Attributes:
-        result: "successful", or the reason for the stop, or "joints came open". t_end: last time reached [s].
+        result: "successful", or the reason for the stop, or "constraints violated". t_end: last time reached [s].
         position_error, angle_error, velocity_error, angular_velocity_error: estimated distance from
             the exact motion, the largest over all bodies and saved times [m], [rad], [m/s],
             [rad/s]; see `ErrorEstimate`.

@@ -468,7 +468,7 @@ def _check_direct(
     rank, sigma, distance, unit = nearness
     if not (distance < _NEAR or (sigma < WEAK and in_weights)):
         yield Finding(
-            "note", "distance to a singular posture of the inputs", _format_distance(distance, unit),
+            "note", "distance to an actuation singularity", _format_distance(distance, unit),
             f"above {_NEAR:g}; smallest singular value {sigma:.2g}",
         )  # fmt: skip
         return
@@ -479,7 +479,7 @@ def _check_direct(
     moving = joints_in_motion(system, state, lost, float(neighbours.size[0]))
     acting = names_of_largest(input_labels(system, inputs), column_vectors[weak].T)
     yield Finding(
-        "warning", "singular posture of the inputs",
+        "warning", "actuation singularity",
         f"{_format_distance(distance, unit)}; smallest singular value {sigma:.2g}",
         f"above {_NEAR:g} {unit} and {WEAK:g}; direct singularity (type 2): the inputs "
         f"{', '.join(acting)} hardly hold the motion of the joints {', '.join(moving)}"

@@ -270,7 +270,7 @@ _OUTCOMES = {
     "successful": "successful",
     "event_occurred": "event occurred",
     "max_steps_reached": "max_steps reached",
-    "dt_min_reached": "step size collapsed",
+    "dt_min_reached": "the step size fell to round-off",
 }
 
 
@@ -307,7 +307,7 @@ class Run:
         """
         if self.model is None:
             raise SettingError(
-                "This run was made with analysis=False and has no accelerations, reactions or energies."
+                "This run has no accelerations, reactions or energies: simulate it with analysis=True."
             )
         return evaluate_snapshots(
             self.method.formulation, self.model, saved_states(self.trajectory)
@@ -655,7 +655,7 @@ def _carried_out(
     result = integration.stopped or _name_result(first, _OUTCOMES)
     opened = describe_open_joints(problem, rows, first, checked.worst)
     if opened and result in SUCCESSFUL:
-        result = "joints came open"
+        result = "constraints violated"
     certificate = make_certificate(
         scene.system, first, checked, errors, start.rank, result, seconds
     )
@@ -778,7 +778,7 @@ def _describe_failure(run: Run, end: float, start: Start, opened: str) -> str:
     t = run.certificate.t_end
     state = jax.tree.map(lambda x: jnp.asarray(x[-1]), run.states)
     reason = {
-        "step size collapsed": (
+        "the step size fell to round-off": (
             "the step size fell to round-off: the motion cannot be followed with these tolerances"
         ),
         "max_steps reached": (

@@ -138,7 +138,9 @@ class GaussianFilter(AbstractFilter):
 
     def __check_init__(self) -> None:
         if self.form not in get_args(Form):
-            raise SettingError(f"'{self.form}' is not one of {get_args(Form)}.")
+            raise SettingError(
+                f"form must be one of {', '.join(get_args(Form))}, not '{self.form}'."
+            )
 
     def predict(
         self, model: StateSpaceModel, prior: Gaussian, u: Inputs = None, dt: Any = 1.0

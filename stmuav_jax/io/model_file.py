@@ -350,7 +350,7 @@ def _in_bodies(name: str, table: Mapping[str, Any], parameters: Table, subject: 
                 f"it is {frame.tolist()}."
             )
     if i == j:
-        raise ModelError(f"Joint '{name}' joins body '{i}' to itself.")
+        raise ModelError(f"Joint '{name}' joins body '{i}' to itself: name two different bodies.")
     if entry_values["length"] < 0 and table["kind"] != "screw":
         raise SettingError(f"'length' must not be negative, but it is {entry_values['length']} m.")
     geometry: Any = {key: as_floats(value) for key, value in entry_values.items()}

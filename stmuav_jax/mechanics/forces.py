@@ -290,7 +290,9 @@ def _check_frame(frame: str) -> Literal["world", "body"]:
 
 def _two_bodies(element_name: str, body_i: str, body_j: str) -> None:
     if body_i == body_j:
-        raise ModelError(f"{element_name} joins body '{body_i}' to itself.")
+        raise ModelError(
+            f"{element_name} joins body '{body_i}' to itself: name two different bodies."
+        )
     if not body_i or not body_j:
         raise ModelError(f"{element_name} needs two bodies; the fixed one is called '{GROUND}'.")
 

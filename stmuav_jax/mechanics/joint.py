@@ -297,7 +297,9 @@ def _make_joint(
     # share.
     points = check_vector(point_i, subject, "m"), check_vector(point_j, subject, "m")
     if body_i == body_j:
-        raise ModelError(f"Joint '{name}' joins body '{body_i}' to itself.")
+        raise ModelError(
+            f"Joint '{name}' joins body '{body_i}' to itself: name two different bodies."
+        )
     return Joint(
         name=name,
         kind=kind,

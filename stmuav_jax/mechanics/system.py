@@ -333,7 +333,7 @@ def _check_joints(names: Sequence[str], joints: Sequence[Joint]) -> None:
         for name in coupled:
             if name not in joint_names:
                 raise ModelError(
-                    f"The coupling '{joint.name}' is of the joint '{name}', which is not in the system."
+                    f"The coupling '{joint.name}' names the unknown joint '{name}'."
                     f"{nearest_names(name, joint_names)}"
                 )
         for name in (joint.body_i, joint.body_j):

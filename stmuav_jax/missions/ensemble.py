@@ -52,7 +52,7 @@ _QUANTITIES: dict[str, tuple[str, str]] = {
     "rotor_margin": ("1", "smallest margin of the rotor speeds, share of the range"),
     "stroke_margin": ("1", "smallest margin of the strokes, share of the range"),
     "force_margin": ("1", "smallest margin of the actuators' forces, share of the range"),
-    "effort_margin": ("1", "smallest margin of the joints' efforts, share of the range"),
+    "effort_margin": ("1", "smallest margin of the joint efforts, share of the range"),
     "energy": ("J", "electrical energy used"),
     "state_of_charge": ("1", "state of charge of the battery at the end"),
     "kept": ("1", "whether all tolerances and limits were met"),

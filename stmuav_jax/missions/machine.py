@@ -276,7 +276,7 @@ def _check_joints(entries: MissionFile, joints: tuple[DrivenJoint, ...]) -> None
     controller, tolerances = entries.controller, entries.tolerances
     if entries.machine.model is not None and controller.feedforward is not None and not joints:
         raise SettingError(
-            "'controller.feedforward' is of joints that move, which this model does not have."
+            "'controller.feedforward' needs a model with moving joints, which this model does not have: leave it out."
         )
     names = [drive.name for drive in joints]
     used = {
@@ -630,7 +630,9 @@ def check_faults(mission_file: MissionFile) -> None:
             _check_sensor_fault(mission_file, fault)
             continue
         if fault.bias is not None or fault.until is not None:
-            raise SettingError("'bias' and 'until' are for faults of sensors.")
+            raise SettingError(
+                "'bias' and 'until' are for faults of sensors: leave them out of a fault of a rotor or slider."
+            )
         if fault.slider is not None and fault.share is not None:
             raise SettingError("'share' is for faults of rotors: a jammed slider does not move.")
         if fault.known and (fault.rotor is None or fault.share):
@@ -659,7 +661,9 @@ def _check_sensor_fault(entries: MissionFile, fault: FaultEntry) -> None:
     if entries.sensors is None:
         raise SettingError("A fault of a sensor needs a mission with [sensors].")
     if fault.known or fault.share is not None:
-        raise SettingError("'known' and 'share' are for faults of rotors.")
+        raise SettingError(
+            "'known' and 'share' are for faults of rotors: leave them out of a fault of a sensor."
+        )
     if fault.until is not None and fault.until <= fault.at:
         raise SettingError(
             f"A fault of a sensor must end after it begins, but it lasts from {fault.at:g} to {fault.until:g} s."
@@ -698,7 +702,7 @@ def _add_faults(entries: MissionFile, machine: Machine, pilot: Any) -> MissionCo
     if np.any(np.isfinite(jammed)):
         if entries.sensors is not None:
             raise SettingError(
-                "A jammed slider is held by its true stroke, which only a mission without [sensors] has."
+                "A jammed slider needs true states: leave [sensors] out of the mission."
             )
         assert machine.bodies is not None
         jam = Jam(machine.bodies.geometry, jnp.asarray(jammed))

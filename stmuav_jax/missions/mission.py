@@ -274,7 +274,7 @@ def _make_path(entry: PathEntry, machine: Machine) -> HeldPath | WaypointPath:
     if entry.waypoints is not None:
         if (entry.position, entry.heading, entry.acceleration) != (None, None, None):
             raise SettingError(
-                "'path' has waypoints, and then neither position nor heading nor acceleration."
+                "'path' must have either waypoints or a position, heading and acceleration, and not both."
             )
         ts = np.array([point.t for point in entry.waypoints])
         rows = [(*point.position, _DEGREE * point.heading) for point in entry.waypoints]

@@ -29,7 +29,7 @@ MARGINS = (
     ("rotor_speed", "rotor speeds", "speed"),
     ("displacement", "strokes", "displacement"),
     ("commanded_force", "actuators' forces", "force"),
-    ("commanded_effort", "joints' efforts", "effort"),
+    ("commanded_effort", "joint efforts", "effort"),
 )
 # Round-off of speeds that are held at a limit, as a share of the range.
 AT_LIMIT = 1e-9

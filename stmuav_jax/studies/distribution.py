@@ -192,7 +192,7 @@ def as_distribution(source: Any, factor: str = "") -> Distribution:
             return Distribution("constant", {"value": source})
         if "distribution" not in source:
             raise SettingError(
-                f"An entry 'distribution' with its name is missing.{nearest_names('', KINDS)}"
+                f"A factor needs the entry 'distribution' with a name.{nearest_names('', KINDS)}"
             )
         rest = {name: value for name, value in source.items() if name != "distribution"}
         name = source["distribution"]

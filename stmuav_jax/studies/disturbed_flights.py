@@ -500,7 +500,7 @@ def make_flights(
     if settings.inputs == "trim" and "motor" in settings.options:
         raise SettingError("Inputs of a trim are steady speeds of the rotors: leave motor out.")
     if settings.drag and "drag" not in entry.options:
-        raise SettingError(f"The scene {scene} has no airframe to drag.")
+        raise SettingError(f"The scene {scene} has no airframe for drag: leave drag out.")
     if settings.gusts and not settings.drag:
         raise SettingError("Gusts act through the airframe's drag: set drag too.")
     if settings.drag and "wind" in settings.options:

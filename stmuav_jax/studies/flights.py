@@ -69,7 +69,9 @@ class Quantity:
             level_rule = "needs a level" if crossing else "has no level"
             raise SettingError(f"'{self.take}' of signal {quote_name(self.signal)} {level_rule}.")
         if self.stop and not crossing:
-            raise SettingError(f"Only a crossing can stop a flight, not '{self.take}'.")
+            raise SettingError(
+                f"'stop' needs take = \"when_above\" or \"when_below\", not '{self.take}'."
+            )
 
     def column(self, of: Signal) -> tuple[str, str]:
         """Unit and description of the column that holds the quantity."""
@@ -142,7 +144,7 @@ class FlightEvaluation(AbstractBatch):
             raise SettingError("The study has no quantities: give it at least one.")
         if self.every is not None and self.every > self.t1:
             raise SettingError(
-                f"Times {self.every:g} s apart do not fit into a flight of {self.t1:g} s."
+                f"The spacing 'every' must be at most t1 = {self.t1:g} s, but it is {self.every:g} s."
             )
         if self.every is not None and self.t1 / self.every > MOST_TIMES:
             raise SettingError(

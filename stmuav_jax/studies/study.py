@@ -316,7 +316,7 @@ class Study:
                 raise
             if count == 1:
                 raise SimulationError(
-                    f"Sample {first} does not fit in memory, though alone."
+                    f"Sample {first} alone does not fit in memory: let the function return smaller arrays."
                 ) from error
         # Halving finds a size that fits after a few attempts, without an estimate of the memory that a
         # program needs.

@@ -81,7 +81,9 @@ def make_study(plain: Mapping[str, Any], table: Parameters | None = None, **sett
         )
     if kind == "estimation":
         if table is not None:
-            raise SettingError("Studies of estimation take no other parameters yet.")
+            raise SettingError(
+                "A study of estimation cannot have a table of parameters: leave it out."
+            )
         entries = validate_model(EstimationFile, plain, "A study of estimation")
         return make_estimation_study(entries, **settings)
     entries = validate_model(FlightsFile, plain, "A study")

@@ -152,7 +152,7 @@ _AIR = {
     "gear.depth": Parameter(0.2, "m", _CHOICE),
     # a start at the origin stands on it, its feet at the depth zero
     "gear.ground": Parameter(-0.2, "m", _CHOICE + ", at the feet of a start at the origin"),
-    "gear.stiffness": Parameter(2e4, "N/m", _CHOICE + ", 0.9 mm under the weight of the UAV"),
+    "gear.stiffness": Parameter(2e4, "N/m", _CHOICE + ", 1.4 mm under the weight of the UAV"),
     "gear.damping": Parameter(150.0, "N s/m", _CHOICE + ", about 40 % of critical damping"),
     "gear.width": Parameter(1e-3, "m", _CHOICE),
     "gear.friction": Parameter(0.6, "1", _CHOICE),

@@ -88,7 +88,7 @@ class Uav(eqx.Module):
             )
         if tuple(name for name, _ in space.names[6:8]) != PANEL_COORDINATES or space.dof != 8:
             raise ModelError(
-                f"The independent coordinates of the UAV are its base's and {', '.join(PANEL_COORDINATES)}."
+                f"The independent coordinates of the UAV must be those of its base and {', '.join(PANEL_COORDINATES)}."
             )
         self.space, self.geometry = space, geometry
         self.displacement, self.limits = as_floats(displacement), limits

@@ -368,7 +368,9 @@ class FlightController(eqx.Module):
     ) -> None:
         motors, self.gravity = only_rotors(system, "A flight controller"), gravity_of(system)
         if not np.any(as_numpy(self.gravity) != 0):
-            raise ModelError("A flight controller needs gravity, which the system has not.")
+            raise ModelError(
+                "A flight controller needs gravity: add Gravity() to the forces of the system."
+            )
         rotors = motors.rotors
         motor_limits = getattr(motors, "squared_limits", None)
         # The motors clip commands beyond their range; the controller has to know these limits to keep tilt

@@ -184,7 +184,7 @@ def test_a_start_is_identified_from_a_file_with_blank_cells(tmp_path, capsys):
     assert "Consistent: none of" in shown
     assert "is missing and was left out" in shown
     # a start that is said to be exact, at rest, is none: the verdict and the exit code say so
-    words += ["--spreads", "pin.angle_rate=0"]
+    words += ["--start-deviations", "pin.angle_rate=0"]
     assert main([*words, "--out", str(tmp_path)]) == 3
     assert "Inconsistent" in said(capsys)
 

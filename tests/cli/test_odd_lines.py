@@ -29,7 +29,7 @@ OPTIONS = {
     "trim": ("--phi", "--theta", "--sun", "--climb", "--speed", "--course", "--turn", "--yaw",
              "--highest", "--lowest", "--force", "--by", "--params", "--linear", "--outputs"),
     "tune": ("--to", "--t1", "--limit", "--reaction", "--segments", "--knots", "--inputs", "--steps"),
-    "identify": ("--record", "--parameters", "--sigma", "--spreads", "--bounds", "--steps"),
+    "identify": ("--record", "--parameters", "--sigma", "--start-deviations", "--bounds", "--steps"),
     "estimate": ("--case", "--tuning", "--model", "--seeds", "--seed", "--t1"),
     "fly": ("--t1", "--true-states", "--figures", "--out"),
     "montecarlo": ("--samples", "--seed", "--chunk", "--devices", "--lanes", "--workers"),

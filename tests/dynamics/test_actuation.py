@@ -43,7 +43,7 @@ def test_inputs_have_the_scales_of_weight_and_size():
 def test_a_platform_in_the_plane_of_its_base_is_a_direct_singularity():
     """At 1e-6 m the forces are right, and said to be large; at 0 and at 1e-6 m check names the joints."""
     for height in (0.0, 1e-6):
-        warning = by_name(stm.check(three_rps(height)))["singular posture of the inputs"]
+        warning = by_name(stm.check(three_rps(height)))["actuation singularity"]
         assert warning.severity == "warning"
         assert "direct singularity (type 2)" in warning.valid
         words = warning.valid.split("the inputs ")[1]
@@ -67,7 +67,7 @@ def test_a_platform_above_its_base_has_no_warning():
     report = stm.check(system)
     assert report.worst == "note"
     found = by_name(report)
-    assert found["distance to a singular posture of the inputs"].severity == "note"
+    assert found["distance to an actuation singularity"].severity == "note"
     # the level platform moves its heads straight up to first order: no dead centre of the platform
     assert "dead centre" not in found
     space = stm.TreeSpace(system)
@@ -79,14 +79,14 @@ def test_a_platform_above_its_base_has_no_warning():
 @pytest.mark.slow
 def test_a_slider_crank_in_line_is_a_dead_centre_for_one_input_and_singular_for_the_other():
     found = by_name(stm.check(slider_crank(0.0, "O")))
-    assert "singular posture of the inputs" not in found
+    assert "actuation singularity" not in found
     assert found["dead centre"].value.endswith("of slider")
     assert "inverse singularity (type 1)" in found["dead centre"].valid
     assert "effort (O)" in found["dead centre"].valid
     found = by_name(stm.check(slider_crank(0.0, "slide")))
     assert "dead centre" not in found
     assert "effort (slide) hardly hold the motion of the joints" in (
-        found["singular posture of the inputs"].valid
+        found["actuation singularity"].valid
     )
     found = by_name(stm.check(slider_crank(0.8, "slide")))
-    assert not {"dead centre", "singular posture of the inputs"} & set(found)
+    assert not {"dead centre", "actuation singularity"} & set(found)

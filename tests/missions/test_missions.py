@@ -286,7 +286,7 @@ def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
         ({"machine__model": "x.toml"}, "a scene or a model's file, and not both"),
         ({"machine__options": {}}, "options.drag"),
         ({"machine__options": {"drga": {}}}, "no drga"),
-        ({"path__position": [0.0, 0.0, 0.0]}, "neither position nor heading"),
+        ({"path__position": [0.0, 0.0, 0.0]}, "either waypoints or a position, heading"),
         ({"path__waypoints": [{"t": 0.0, "position": [0.0] * 3}]}, "two or more, with times"),
         (
             {"path__waypoints": [
@@ -471,7 +471,7 @@ def test_the_table_of_flights_is_that_of_its_script(data):
     largest = np.linalg.norm(data.position_error.values, axis=1).max()
     assert cells[:2] == ["`gusts`", "2.2 s"]
     assert cells[2] == f"{100 * largest:.2g} cm"
-    assert cells[4::2] == ["", ""]
+    assert cells[4::2] == ["-", "-"]
     assert cells[-1] == "met"
     changed = table.with_rows(page, rows | {"gusts": own})
     assert table.rows_of(changed) == rows | {"gusts": own}

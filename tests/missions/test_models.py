@@ -110,7 +110,7 @@ def test_an_own_machine_flies_in_gusts_and_moves_its_gimbal(flight, data):
     )
     assert (pitch.unit, pitch.allowed) == ("degrees", 0.5)
     effort = data.commanded_effort.values
-    margin = measures["Smallest margin of the joints' efforts"].value
+    margin = measures["Smallest margin of the joint efforts"].value
     assert margin == pytest.approx(100 * np.min((2.0 - np.abs(effort[:, 1])) / 4.0))
     # the servo's law, and that the gusts are the mission's and the battery the model's
     lag = (data.joint_position - data.reference_joint_position).values[:, 0]
@@ -233,7 +233,7 @@ def test_a_flight_of_the_study_is_that_of_the_mission_alone(study, folder):
         ("Largest position error from 0.5 s on", columns["position_error"][0]),
         ("Largest pitch error from 0.5 s on", np.degrees(columns["pitch_error"][0])),
         ("Largest roll error from 0.5 s on", np.degrees(columns["roll_error"][0])),
-        ("Smallest margin of the joints' efforts", 100 * columns["effort_margin"][0]),
+        ("Smallest margin of the joint efforts", 100 * columns["effort_margin"][0]),
         ("Energy used, electrical", columns["energy"][0] / 3600),
     ):
         assert value == pytest.approx(found[name], rel=1e-6), name

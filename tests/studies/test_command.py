@@ -126,7 +126,10 @@ def test_a_name_is_no_path(study, tmp_path, monkeypatch, capsys):
     [
         (["montecarlo", "colapse"], "Did you mean 'collapse'"),
         (["montecarlo", "nowhere.toml"], "There is no file"),
-        (["montecarlo", "hover", "--scheduler", "tcp://x:1", "--workers", "2"], "not both"),
+        (
+            ["montecarlo", "hover", "--scheduler", "tcp://x:1", "--workers", "2"],
+            "exclude each other",
+        ),
         (["montecarlo", "estimate_1", "--params", "x.toml"], "has no scene"),
         (["view", "nowhere.zarr", "--report", "a.html"], "nowhere.zarr"),
     ],

@@ -70,7 +70,7 @@ def test_plain_form_goes_through_json(one):
 
 REFUSED = {
     "unknown": ({"distribution": "norml"}, "no distribution 'norml'. Did you mean 'normal'"),
-    "no name": ({"mean": 0.0}, "'distribution' with its name is missing"),
+    "no name": ({"mean": 0.0}, "A factor needs the entry 'distribution'"),
     "parameter": (
         {"distribution": "normal", "mean": 0.0, "standard_deviatoin": 1.0},
         "no entry 'standard_deviatoin'. Did you mean 'standard_deviation'",

@@ -37,9 +37,9 @@ class EstimateSettings(PointSettings):
     ] = None
     rate: Annotated[float | None, _RATE, default_text("the sensors' highest, else 100")] = None
     """Rate of the filter [Hz]; sensors' own rates are whole parts of it."""
-    spread: Annotated[float, _SIZE] = 0.05
+    start_deviation: Annotated[float, _SIZE] = 0.05
     """Standard deviation of every state at the start, in its unit."""
-    spreads: Annotated[tuple[str, ...], default_text("none")] = ()
+    start_deviations: Annotated[tuple[str, ...], default_text("none")] = ()
     """Standard deviations of states at the start, such as A.angle=0.02; 0 for one that is exact."""
     process: Annotated[float, _SIZE] = 0.01
     """Standard deviation of the random change of every velocity in one second, in its unit."""
@@ -145,13 +145,13 @@ def _start_deviations(space: "TreeSpace", settings: EstimateSettings) -> np.ndar
     """Standard deviations of the states at the start (n,)."""
     from ...dynamics.statespace.base import places_of
 
-    spread_by_name = scalars_by_name(settings.spreads, "--spreads")
-    result = np.full(space.size, settings.spread)
-    result[list(places_of(space, list(spread_by_name), "The spreads"))] = list(
-        spread_by_name.values()
+    deviation_by_name = scalars_by_name(settings.start_deviations, "--start-deviations")
+    result = np.full(space.size, settings.start_deviation)
+    result[list(places_of(space, list(deviation_by_name), "The start deviations"))] = list(
+        deviation_by_name.values()
     )
     if not np.all(result > 0):
-        raise SettingError("The standard deviations of --spreads must be positive.")
+        raise SettingError("The standard deviations of --start-deviations must be positive.")
     return result
 
 
@@ -189,14 +189,14 @@ def _estimate_records(
         system_model(space, sensors, Q=wander**2, R=noise**2, substeps=substeps)
         for substeps in (1, _FINER)
     )
-    spread, s = _start_deviations(space, settings), settings.seeds
+    deviations, s = _start_deviations(space, settings), settings.seeds
     rng = np.random.default_rng(settings.seed)
-    prior = gaussian(x, np.diag(spread**2))
+    prior = gaussian(x, np.diag(deviations**2))
     normal_sample = lambda deviations, *shape: jnp.asarray(
         deviations[:, None] * rng.standard_normal((*shape, len(deviations), s))
     )
     stack = jax.tree.map(lambda a: a[:, None], x)
-    first = space.retract(stack, normal_sample(spread))
+    first = space.retract(stack, normal_sample(deviations))
 
     def next_sample(now: Any, w: Any) -> Any:
         now = truth_model.space.retract(truth_model(now, None, 1.0 / rate), w)

@@ -252,7 +252,7 @@ def reaction_on(
     ends = (system.joints[k].body_i, system.joints[k].body_j)
     if body not in ends:
         raise ModelError(
-            f"Joint '{joint}' joins '{ends[0]}' and '{ends[1]}', and exerts nothing on '{body}'."
+            f"Joint '{joint}' joins '{ends[0]}' and '{ends[1]}', and not '{body}': name one of them."
         )
     # Action and reaction: one load is stored for both bodies.
     sign = 1.0 if body == ends[1] else -1.0

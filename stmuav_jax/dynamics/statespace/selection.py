@@ -205,7 +205,9 @@ def select_velocities(
     values = np.linalg.svd(J[np.ix_(rows, dependent)], compute_uv=False)
     if values[-1] <= DEPENDENT * np.linalg.norm(J, 2):
         listed = ", ".join(names[k] for k in required)
-        raise ModelError(f"The velocities {listed} depend on each other in this posture.")
+        raise ModelError(
+            f"The velocities {listed} depend on each other in this posture: choose others."
+        )
     independent = tuple(k for k in range(n) if k not in dependent)
     return Selection(independent, tuple(map(int, dependent)), tuple(map(int, rows)))
 

@@ -133,7 +133,7 @@ class Air(eqx.Module):
             np.all(np.asarray(self.pressure) >= 0) and np.all(np.asarray(self.temperature) > 0)
         ):
             raise SettingError(
-                "The air's pressure must not be below zero and its temperature must be above, but "
+                "The air's pressure must not be negative and its temperature must be positive, but "
                 f"they are {self.pressure} Pa and {self.temperature} K."
             )
 

@@ -422,7 +422,8 @@ def reachable_grid(geometry: TrackerGeometry, limits: Limits) -> ReachableGrid:
     inside, normals = map(np.asarray, _surveyed(geometry, limits, grid))
     if not np.any(inside):
         raise ModelError(
-            "The tracker reaches no posture at all with these lengths and limits of strokes."
+            "The tracker reaches no posture with these lengths and limits of strokes: widen the limits "
+            "or change the lengths."
         )
     return ReachableGrid(grid[:, inside], normals[:, inside])
 

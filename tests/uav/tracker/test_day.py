@@ -290,7 +290,7 @@ def test_days_of_other_lengths():
         ({"R_wb": 2 * np.eye(3)}, stm.StateError, "must be a rotation"),
         ({"R_wb": np.zeros((3, 3, 5))}, stm.StateError, r"for each of the 97 times"),
         ({"parameters": stm.PART_II.replaced({"stop.lower": (0.5, 0.5), "stop.upper": (0.6, 0.6)})},
-         stm.ModelError, "no posture at all"),
+         stm.ModelError, "reaches no posture with"),
     ],
 )  # fmt: skip
 def test_bad_input_is_named(change, error, words):
