@@ -335,7 +335,7 @@ def _solid_mass(
         return check_positive(mass, f"The mass of {shape_name}", "kg")
     if density is not None and mass is None:
         return check_positive(density, f"The density of {shape_name}", "kg/m^3") * volume
-    raise ModelError(f"The {shape_name} needs either a mass or a density, and not both.")
+    raise ModelError(f"{shape_name.capitalize()} needs either a mass or a density, and not both.")
 
 
 def _span_points(

@@ -111,7 +111,7 @@ def test_derivatives_by_numbers_of_the_parts():
             "point mass has no inertia",
         ),
         (lambda: stm.mechanics.rod(1.0, [1.0, 0, 0], [1.0, 0, 0]), "two ends of a rod must differ"),
-        (lambda: stm.mechanics.sphere(0.1), "The sphere needs either a mass or a density"),
+        (lambda: stm.mechanics.sphere(0.1), "A sphere needs either a mass or a density"),
         (
             lambda: stm.mechanics.sphere(0.1, mass=1.0, density=2.0),
             "either a mass or a density",
