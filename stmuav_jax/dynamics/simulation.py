@@ -51,9 +51,8 @@ from .formulations.independence import compare_clearance, find_extreme_bodies
 from .integration.advance import CHUNK, March, Trajectory, integrate_times, same_result
 from .integration.problem import (
     MASSES_REFUSED,
-    IntegrationState,
     Problem,
-    compiled_begin,
+    begin_integration,
     fit_first_step,
     prepare_problem,
 )
@@ -184,11 +183,7 @@ def integrate(
             f"they are {np.asarray(ts).tolist()} s."
         )
     ts = jnp.asarray(ts, dtype=state0.r.dtype)
-    # The default first step is made for seconds: a run of microseconds would step over its whole
-    # span.
-    problem = fit_first_step(problem, ts[-1] - ts[0])
-    start = compiled_begin(problem, ts[0], state0)
-    trajectory = _compiled_path(problem, start, ts)
+    trajectory = _compiled_path(problem, state0, ts)
     # Reverse mode through a loop for forward mode fails deep inside of JAX; marked here, it fails
     # with a sentence that says what to do.
     if isinstance(problem.method.adjoint, diffrax.ForwardMode):
@@ -252,9 +247,11 @@ def _mark_unreached(problem: Problem, trajectory: Trajectory, ts: Float[Array, "
     return eqx.tree_at(where, trajectory, jax.tree.map(mark, where(trajectory)))
 
 
-def _integrate_path(
-    problem: Problem, start: IntegrationState, ts: Float[Array, " k"]
-) -> Trajectory:
+def _integrate_path(problem: Problem, state0: State, ts: Float[Array, " k"]) -> Trajectory:
+    # The default first step is made for seconds: a run of microseconds would step over its whole
+    # span.
+    problem = fit_first_step(problem, ts[-1] - ts[0])
+    start = begin_integration(problem, ts[0], state0)
     return _mark_unreached(problem, integrate_times(problem, start, ts)[1], ts)
 
 

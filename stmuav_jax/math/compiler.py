@@ -144,11 +144,17 @@ _lock = threading.Lock()
 def _argument_form(args: Any) -> tuple[Hashable, ...]:
     """Structure of arguments, kinds of their leaves and settings of JAX, on which a program depends."""
     leaves, structure = jax.tree.flatten(args)
-    # A program compiled in one precision must not be found in the other, though the arguments have the
-    # same shapes.
+    return structure, _read_setting(), tuple(map(_leaf_key, leaves))
+
+
+def _read_setting() -> tuple[Hashable, ...]:
+    """Settings of JAX on which a program depends.
+
+    A program compiled in one precision must not be found in the other, though its arguments have the same
+    shapes.
+    """
     config: Any = jax.config
-    setting = (config.jax_enable_x64, config.jax_default_device, is_on())
-    return structure, setting, tuple(map(_leaf_key, leaves))
+    return config.jax_enable_x64, config.jax_default_device, is_on()
 
 
 def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -340,6 +346,41 @@ def compute_untraced(function: Callable[..., Any], *args: Any) -> Any:
 
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(compute_values).result()
+
+
+# Results of `remember_results`, and how many are kept.
+_results: OrderedDict[Hashable, tuple[Any, Any]] = OrderedDict()
+MOST_RESULTS = 32
+
+
+def remember_results(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Function whose last results are returned again for the same arrays, structure and numbers.
+
+    JAX's arrays do not change, so they are compared by identity. Arguments with other arrays, which may
+    change, and calls within a transformation are computed each time.
+    """
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        leaves, structure = jax.tree.flatten(args)
+        is_fixed = all(isinstance(x, jax.Array | float | int) or callable(x) for x in leaves)
+        if not is_fixed or is_transformed(args):
+            return function(*args)
+        keys = tuple(id(x) if isinstance(x, jax.Array) else (type(x), x) for x in leaves)
+        key = (function, structure, _read_setting(), keys)
+        with _lock:
+            if entry := _results.get(key):
+                _results.move_to_end(key)
+                return entry[1]
+        result = function(*args)
+        with _lock:
+            # The leaves are kept with the result, so that no later array has the identity of one of them.
+            _results[key] = leaves, result
+            while len(_results) > MOST_RESULTS:
+                _results.popitem(last=False)
+        return result
+
+    return call
 
 
 def memory_maps() -> tuple[int, int] | None:

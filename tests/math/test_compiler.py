@@ -13,7 +13,14 @@ import pytest
 
 import stmuav_jax as stm
 from stmuav_jax.math import compiler
-from stmuav_jax.math.compiler import check_maps, in_blocks, is_transformed, kept_jit, memory_maps
+from stmuav_jax.math.compiler import (
+    check_maps,
+    in_blocks,
+    is_transformed,
+    kept_jit,
+    memory_maps,
+    remember_results,
+)
 
 traced: list[str] = []
 
@@ -171,6 +178,27 @@ def test_blocks_have_one_size(count):
     assert set(sizes) == {4}
     np.testing.assert_array_equal(found["sum"], x[:, 0] + y)
     np.testing.assert_array_equal(found["double"], 2 * x)
+
+
+def test_results_are_remembered_for_the_same_arrays_only():
+    calls = []
+
+    @remember_results
+    def double(x, factor):
+        calls.append(factor)
+        return factor * x
+
+    x, changing = jnp.arange(3.0), np.arange(3.0)
+    assert double(x, 2.0) is double(x, 2.0)
+    assert len(calls) == 1
+    np.testing.assert_array_equal(double(x, 3.0), [0.0, 3.0, 6.0])
+    np.testing.assert_array_equal(double(jnp.ones(3), 2.0), [2.0, 2.0, 2.0])
+    # NumPy's array may have other numbers at the next call, and a traced result is not kept
+    np.testing.assert_array_equal(double(changing, 2.0), [0.0, 2.0, 4.0])
+    changing[:] = 1.0
+    np.testing.assert_array_equal(double(changing, 2.0), [2.0, 2.0, 2.0])
+    np.testing.assert_array_equal(jax.jit(lambda: double(x, 4.0))(), [0.0, 4.0, 8.0])
+    assert not isinstance(double(x, 4.0), jax.core.Tracer)
 
 
 def test_known_numbers_are_computed_outside_of_a_trace():

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from ...checks.numbers import as_jax, as_numpy
 from ...math import lapack
+from ...math.compiler import remember_results
 from ...math.linalg import (
     Factor,
     MinimumNorm,
@@ -91,6 +92,7 @@ class Augmented(AbstractFormulation):
     def allowing_dependent_rows(self) -> "Augmented":
         return self if self.redundant else dataclasses.replace(self, redundant=True)
 
+    @remember_results
     def prepare(self, system: System) -> AugmentedModel:
         row_mask = find_independent_rows(system).rows
         row_mask = None if row_mask is None else as_jax(row_mask)
@@ -271,6 +273,7 @@ def evaluate_equations(model: AugmentedModel, t: Float[Array, ""], state: State)
     return model.constraints.equations(t, model.system.kinematics(state))
 
 
+@remember_results
 def prepare_rows(system: System) -> AugmentedModel:
     """System prepared for its constraint rows, of which none is left out of the equations."""
     inertia = as_numpy(system.bodies.inertia)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from ...checks.errors import ModelError, has_values
 from ...checks.numbers import array_module, as_jax, as_numpy, stack_arrays
-from ...math.compiler import compute_untraced, kept_jit
+from ...math.compiler import compute_untraced, kept_jit, remember_results
 from ...mechanics.body import GROUND
 from ...mechanics.constraint import ROWS
 from ...mechanics.state import State, compute_kinematics
@@ -208,6 +208,7 @@ def find_independent_rows(system: System, joints: Sequence[int] | None = None) -
     return compute_untraced(_find_independent, system, joints)
 
 
+@remember_results
 def _find_independent(system: System, joints: Sequence[int] | None) -> Independence:
     rows = group_constraints(system)
     undriven_rows = _remove_motions(rows)

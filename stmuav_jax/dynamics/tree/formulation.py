@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...checks.numbers import as_jax
-from ...math.compiler import kept_jit
+from ...math.compiler import kept_jit, remember_results
 from ...math.derivative import directional_derivative
 from ...math.linalg import Redundant, Saddle, factor_saddle
 from ...math.native.program import native
@@ -273,6 +273,8 @@ class Tree(AbstractFormulation):
     def allowing_dependent_rows(self) -> "Tree":
         return self if self.redundant else dataclasses.replace(self, redundant=True)
 
+    # The search for dependent rows takes longer than a short run.
+    @remember_results
     def prepare(self, system: System) -> TreeModel:
         tree = spanning_tree(system, self.cut)
         parameters = tree_parameters(system, tree)
