@@ -330,7 +330,7 @@ def test_without_analysis_there_is_no_snapshot(run):
     np.testing.assert_allclose(found.states.r, run[0].states.r, rtol=0, atol=1e-12)
     assert np.isnan(found.certificate.energy_error)
     assert found.certificate.rank == 5
-    with pytest.raises(stm.SettingError, match="analysis=False"):
+    with pytest.raises(stm.SettingError, match="analysis=True"):
         _ = found.snapshot
     with pytest.raises(stm.StateError, match="positions do not fit"):
         stm.simulate(with_start(r=START.r + 1e-5), analysis=False)

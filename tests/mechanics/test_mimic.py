@@ -105,7 +105,8 @@ def test_rows_are_derivatives_of_each_other():
     assert np.all(np.abs(np.asarray(speed)[coupled]) > 1e-3)
 
 
-@pytest.mark.parametrize("kinds", [KINDS[1], pytest.param(KINDS[2], marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kinds", KINDS[1:3])
 def test_both_formulations_agree_on_a_moving_floating_machine(kinds):
     bodies, first, second, couple = cylinders()
     system = stm.System(bodies, [first, second, couple(*kinds)], [stm.Gravity()])

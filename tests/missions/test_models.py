@@ -153,6 +153,7 @@ resolver = {kind = "encoder", joint = "pitch", noise = 1e-3}
     assert 1e-3 < np.max(error[:, 1]) < 0.5
 
 
+@pytest.mark.slow
 def test_a_tighter_tolerance_and_an_early_end_are_not_kept(data):
     content = json.loads(data.attrs["mission"])
     content["tolerances"]["joints"]["roll"] = 1e-3

@@ -290,7 +290,7 @@ def test_a_place_off_the_earth_is_refused(arguments, words):
     [
         (lambda: Air(np.nan), "air's pressure must be finite"),
         (lambda: Air(-1.0), "pressure must not be negative"),
-        (lambda: Air(1e5, 0.0), "temperature must be above"),
+        (lambda: Air(1e5, 0.0), "temperature must be positive"),
         (lambda: Air.standard(1e5), "from -500 to 11000 m, not at 100000"),
         (lambda: Air.standard(np.nan), "altitude must be finite"),
     ],
