@@ -153,7 +153,13 @@ def load_model(path: str | os.PathLike[str]) -> Scene:
 
 def read_model(path: str | os.PathLike[str]) -> ParametricModel:
     """Model of a TOML file, see `load_model`, from whose parameters systems can be made."""
-    source, content = Path(path), read_toml(path)
+    source = Path(path)
+    if source.suffix in (".xml", ".mjcf", ".urdf"):
+        raise FileError(
+            f"{source} is the file of a robot, where a model's TOML file is needed: write one by "
+            f'save_model(load_robot("{source.name}"), "{source.stem}.toml").'
+        )
+    content = read_toml(source)
     with _locate_errors(f"{source}"):
         model_data = validate_model(ModelFile, content, "A model")
     entries_of = model_data.parameters.items()

@@ -605,6 +605,11 @@ def test_frames_of_saved_joints_are_checked(tmp_path):
         load_model(path)
 
 
+def test_the_file_of_a_robot_is_refused_with_the_way_to_a_model():
+    with pytest.raises(FileError, match=r'save_model\(load_robot\("arm.urdf"\), "arm.toml"\)'):
+        load_model("robots/arm.urdf")
+
+
 def test_the_command_line_refuses_what_a_model_has_not(tmp_path, capsys):
     path = tmp_path / "bad.toml"
     assert main(["simulate", str(path), "--no-cache"]) == 2
