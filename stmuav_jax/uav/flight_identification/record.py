@@ -304,6 +304,7 @@ def observe_motion(
         # With these weights the mean is the slope of a straight line through the speed along the vertical, on which
         # its values at the start and the end alone have little effect.
         weights = share * (1 - share) / np.sum(share * (1 - share))
-        vertical = np.sum(push[::sign] * -gravity, axis=1) / GRAVITY
-        excess += float(weights @ vertical) - GRAVITY
+        upward = -gravity / GRAVITY
+        vertical = float(weights @ np.sum(push[::sign] * upward, axis=1))
+        excess += (vertical - GRAVITY) / float(weights @ upward[:, 2])
     return velocity, gravity
