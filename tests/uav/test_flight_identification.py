@@ -554,13 +554,12 @@ def test_the_lag_is_exact_for_commands_that_hold():
 
 
 @pytest.mark.parametrize(
-    ("rise", "start", "climb", "bounds"),
-    # gravity by Euler's method would be off by 0.018 m/s^2; a start that counts as level and at rest, by 2 m/s^2;
-    # climbs that are forgotten within 3 s make errors of 0.08 m/s
-    [(4.0, 0.0, 0.0, (0.01, 0.004)), (1e-9, 0.5, 0.0, (0.1, 0.03)), (4.0, 0.0, 0.4, (0.04, 0.004))],
-    ids=["level", "moving", "climbing"],
+    ("rise", "start", "bounds"),
+    # gravity by Euler's method would be off by 0.018 m/s^2; a start that counts as level and at rest, by 2 m/s^2
+    [(4.0, 0.0, (0.01, 0.004)), (1e-9, 0.5, (0.1, 0.03))],
+    ids=["level", "moving"],
 )
-def test_velocity_and_gravity_of_a_quick_motion_are_observed(rise, start, climb, bounds):
+def test_velocity_and_gravity_of_a_quick_motion_are_observed(rise, start, bounds):
     """Tilts of 20 degrees within a quarter of a second, from the first sample on or rising from a hover."""
     ts = np.arange(0, 20, 0.002)
     angles = lambda t: np.array([1.2 * np.sin(1.5 * t), 0.35 * np.sin(7 * t), 0.35 * np.cos(6 * t)])
@@ -570,9 +569,9 @@ def test_velocity_and_gravity_of_a_quick_motion_are_observed(rise, start, climb,
     drag, up = np.array([0.45, 0.5, 0.4]), np.array([0.0, 0.0, 1.0])
 
     def push(t, v):
-        """Specific force in body axes of a vehicle that holds its height, or climbs and sinks again."""
+        """Specific force in body axes of a vehicle that holds its height."""
         R = tilt(t)
-        lift = (g - 3 * (v[..., 2] - climb * np.sin(0.7 * t))) / R.as_matrix()[..., 2, 2]
+        lift = (g - 3 * v[..., 2]) / R.as_matrix()[..., 2, 2]
         return lift[..., None] * up - drag * R.inv().apply(v)
 
     slope = lambda t, v: tilt(t).apply(push(t, v)) - g * up
@@ -583,9 +582,6 @@ def test_velocity_and_gravity_of_a_quick_motion_are_observed(rise, start, climb,
     for part in (ts > 10, ts < 5):
         assert np.all(np.std((velocity - v)[part], axis=0) < bounds[0])
         assert np.all(np.std((gravity - turn.inv().apply(-g * up))[part], axis=0) < bounds[1])
-    # a bias along z makes little velocity; by a mean over three seconds it would be 0.57 m/s
-    biased, _ = observe_motion(record, force + 0.2 * up, drag[:2])
-    assert np.max(np.abs(biased - velocity)) < 0.15
 
 
 def test_commands_hold_over_the_steps_of_a_record(tmp_path):

@@ -20,7 +20,7 @@ from ...checks.errors import SettingError
 from ...checks.shapes import Numbers
 
 # Natural frequency [rad/s] and damping of the observer of velocity, and time in which it forgets that along z [s].
-_OBSERVER, _DAMPING, _CLIMB = 0.4, 0.7, 12.0
+_OBSERVER, _DAMPING, _CLIMB = 0.4, 0.7, 3.0
 # Shortest record that is identified [s].
 SHORTEST_RECORD = 10.0
 # Rotors closer than this to an axis have no side of it, as a share of the largest arm.
@@ -253,8 +253,7 @@ def observe_motion(
 
     It integrates v' = f + g - w x v and g' = -w x g with the specific force f at the centre of mass.
     The drag tells the horizontal velocity, -f / D, which draws both within seconds; along z the velocity
-    forgets slowly, as nothing tells it but that on average the vertical force carries. The state at the start is
-    that of a pass backwards in time.
+    forgets, as nothing tells it. The state at the start is that of a pass backwards in time.
 
     Args:
         force: f. drag: D along x and y [1/s]. pace: factor of the usual speed at which it is drawn.
@@ -270,13 +269,9 @@ def observe_motion(
     quick, slow = 2 * _DAMPING * frequency, frequency**2
     forget = pace / _CLIMB
     state, velocity, gravity = (0.0,) * 5, np.zeros_like(force), np.zeros_like(force)
-    excess, share = 0.0, np.linspace(0.0, 1.0, len(force))
     # A record may start tilted and in motion, which nothing measures: in reversed time, where rates and
     # velocity change their signs, a pass comes to the start as settled as the pass before it to the end.
     for sign in (1, -1, 1):
-        # A bias along z would make a velocity that turns with the body, which the drag would follow. What is
-        # missing of a climb that is forgotten does so too.
-        push[:, 2] = force[:, 2] - excess
         rows = np.concatenate([sign * record.gyroscope, push, sign * target], axis=1)[::sign]
         now, before = state, None
         # plain numbers: a loop over arrays of three would take twenty times as long
@@ -301,10 +296,4 @@ def observe_motion(
             )
             before = slope
         state = (*(-velocity[-1]).tolist(), *gravity[-1, :2].tolist())
-        # With these weights the mean is the slope of a straight line through the speed along the vertical, on which
-        # its values at the start and the end alone have little effect.
-        weights = share * (1 - share) / np.sum(share * (1 - share))
-        upward = -gravity / GRAVITY
-        vertical = float(weights @ np.sum(push[::sign] * upward, axis=1))
-        excess += (vertical - GRAVITY) / float(weights @ upward[:, 2])
     return velocity, gravity
