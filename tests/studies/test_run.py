@@ -209,7 +209,7 @@ def test_a_second_signal_ends_a_run_at_once(tmp_path):
         process.send_signal(signal.SIGINT)
         assert "Stopping" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=30)
+        _, errors = process.communicate(timeout=300)
     assert process.returncode != 0
     assert "KeyboardInterrupt" in errors
     assert open_store(path).finished == 0
