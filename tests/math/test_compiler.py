@@ -198,7 +198,7 @@ def test_results_are_remembered_for_the_same_arrays_only():
     changing[:] = 1.0
     np.testing.assert_array_equal(double(changing, 2.0), [2.0, 2.0, 2.0])
     np.testing.assert_array_equal(jax.jit(lambda: double(x, 4.0))(), [0.0, 4.0, 8.0])
-    assert not isinstance(double(x, 4.0), jax.core.Tracer)
+    np.testing.assert_array_equal(double(x, 4.0), [0.0, 4.0, 8.0])
 
 
 def test_known_numbers_are_computed_outside_of_a_trace():
