@@ -236,12 +236,10 @@ def rotor_speeds(
         force: Any = system.forces[entry.force]
         limits = force.limits if isinstance(force, MotorRotors) else None
         thrust = float(force.rotors.thrusts(squared))
-        if highest is None and limits is not None:
-            most = float(np.asarray(limits.highest)[entry.place])
-        else:
-            most = highest
-        speed = math.sqrt(squared)
-        rotors[entry.name] = RotorSpeed(speed, thrust, None if most is None else speed / most)
+        speed, limit = math.sqrt(squared), highest
+        if limit is None and limits is not None:
+            limit = float(np.asarray(limits.highest)[entry.place])
+        rotors[entry.name] = RotorSpeed(speed, thrust, None if limit is None else speed / limit)
     return rotors
 
 

@@ -412,12 +412,13 @@ def _add_rotors(draft: _Draft, force: Rotors | MotorRotors) -> bool:
     for k, (arm, spin) in enumerate(zip(np.asarray(rotors.arms), rotors.spin, strict=True)):
         number = f"{rotors.body}_{first + k + 1}"
         u = rotors.speed_squared
-        name, gear = (
-            f"speed_squared_{number}",
-            [0.0, 0.0, rotors.k_f, 0.0, 0.0, -spin * rotors.k_tau],
-        )
-        attributes = {"name": name, "site": draft.site(rotors.body, f"rotor_{number}", arm)}
-        attributes["gear"] = xml_numbers([float(x) for x in gear])
+        name = f"speed_squared_{number}"
+        gear = [0.0, 0.0, float(rotors.k_f), 0.0, 0.0, float(-spin * rotors.k_tau)]
+        attributes = {
+            "name": name,
+            "site": draft.site(rotors.body, f"rotor_{number}", arm),
+            "gear": xml_numbers(gear),
+        }
         if limits is not None:
             attributes["ctrllimited"] = "true"
             attributes["ctrlrange"] = xml_numbers([limits[0][k], limits[1][k]])

@@ -356,16 +356,9 @@ def _trim_flight(uav: Uav, condition: FlightCondition, limits: TrimLimits) -> Fl
         *((outside == workspace_reason, code) for code, workspace_reason in _OUTSIDE.items()),
     )
     return FlightTrim(
-        trim.point,
-        angles,
-        values,
-        speeds,
-        trim.residuals,
-        trim.conditioning,
-        reason,
-        trim.steps,
+        trim.point, angles, values, speeds, trim.residuals, trim.conditioning, reason, trim.steps,
         trim.residual_units,
-    )
+    )  # fmt: skip
 
 
 def trim_slopes(

@@ -200,7 +200,7 @@ def test_a_signal_ends_a_run_after_its_chunk(tmp_path):
 @pytest.mark.slow
 def test_a_second_signal_ends_a_run_at_once(tmp_path):
     path = tmp_path / "study.zarr"
-    code = INTERRUPTED.format(tests=str(HERE.parent), path=str(path), pause=60.0)
+    code = INTERRUPTED.format(tests=str(HERE.parent), path=str(path), pause=600.0)
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:

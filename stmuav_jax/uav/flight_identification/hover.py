@@ -4,8 +4,8 @@ On average a hovering vehicle does not turn, so its centre of mass is that of th
 
     c = sum_k sum_i T_i(u_ik) a_i / sum_k sum_i T_i(u_ik),
 
-if the motors are equal. A battery's voltage that scales all thrusts alike cancels. Of a thrust whose relative
-slope at hover is another than that of the layout's shape, c has the ratio of the two as a factor.
+if the motors are equal. A battery's voltage that scales all thrusts alike cancels. If the relative slope
+of the thrust at hover differs from that of the layout's shape, c is wrong by the ratio of the two.
 """
 
 import numpy as np
