@@ -7,6 +7,7 @@ the most recently used programs and releases the others.
 """
 
 import itertools
+import os
 import threading
 import warnings
 from collections import OrderedDict
@@ -127,6 +128,7 @@ def _jit_with_options(function: Callable[..., Any], *, quick: bool) -> Callable[
 
     @wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
+        _check_process()
         transformed = is_transformed((args, keywords))
         jitted = nested if transformed else outermost((args, keywords))
         return jitted(*args, **keywords)
@@ -139,6 +141,22 @@ _programs: OrderedDict[tuple[Any, Any, Structure], Callable[..., Any]] = Ordered
 # structure of the first program of a function and form of arguments
 _structures: dict[Hashable, Structure] = {}
 _lock = threading.Lock()
+
+
+_processes: list[int] = []
+
+
+def _check_process() -> None:
+    """Refuse to compute in a fork of a process that has computed: without JAX's threads it would wait forever."""
+    process = os.getpid()
+    if not _processes:
+        _processes.append(process)
+    if _processes[0] != process:
+        raise RuntimeError(
+            f"This process ({process}) was forked from one in which JAX had already computed "
+            f"({_processes[0]}), whose threads a fork does not have, so it would wait forever; start processes "
+            "by multiprocessing.get_context('spawn') or 'forkserver'."
+        )
 
 
 def _argument_form(args: Any) -> tuple[Hashable, ...]:
@@ -207,6 +225,7 @@ def cached_program(function: Callable[..., Any], *args: Any) -> Callable[..., An
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return function
+    _check_process()
     form, structure = _argument_form(args), find_structure(args)
     with _lock:
         structure = choose_structure(_structures, (function, form), structure)

@@ -121,6 +121,24 @@ def test_threads_compile_different_programs_at_once():
     assert [bits(chained(count)) for count in range(1, 4)] == together
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="This system cannot fork.")
+def test_a_fork_after_the_first_computation_is_refused():
+    """JAX's threads are not copied: without the refusal the fork would wait forever."""
+    code = (
+        "import os, warnings; warnings.simplefilter('ignore'); import jax.numpy as jnp\n"
+        "from stmuav_jax.math.compiler import kept_jit\n"
+        "double = kept_jit(lambda x: x + x)\n"
+        "double(jnp.ones(2))\n"
+        "if os.fork():\n    os.wait()\n"
+        "else:\n"
+        "    try: double(jnp.ones(2))\n"
+        "    except RuntimeError as error: print(error, flush=True)\n"
+        "    os._exit(0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, timeout=60)
+    assert "multiprocessing.get_context('spawn')" in done.stdout
+
+
 @pytest.mark.slow
 def test_importing_leaves_the_settings_of_jax_alone():
     code = (
