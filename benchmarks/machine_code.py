@@ -4,7 +4,8 @@
 
 uav_tracker case 2 by spanning-tree coordinates: right-hand side, projection, and flights of one second
 at 1e-9 by lanes. Both kinds of code are measured in one process, in seconds of the processor; states are
-of a motion near the start, flights agree to their tolerance. The figure stands in docs/theory.md.
+of a motion near the start, flights agree to their tolerance. The processor's limit is the time of as many
+fused multiplications and additions that need no table or order. The figure stands in docs/theory.md.
 """
 
 import json
@@ -34,6 +35,7 @@ from stmuav_jax.dynamics.integration.problem import (
 )
 from stmuav_jax.math.native import llvm
 from stmuav_jax.math.native.graph import MOVES, make_graph
+from stmuav_jax.math.native.program import native
 from stmuav_jax.math.native.structure import find_structure, read_structure
 
 
@@ -123,6 +125,27 @@ def evaluated(
     return {"us_per_state": best, "compile_seconds": seconds, "last": np.asarray(last)}
 
 
+# Operations in a row, each of which waits for the one before. They are so few that a processor, which looks a
+# few hundred operations ahead, finds enough that wait for nothing.
+_PASSES = 16
+
+
+@native
+def multiply_and_add(factor: jax.Array, x: jax.Array) -> jax.Array:
+    """Numbers after some operations x * factor + 1 on each."""
+    for _ in range(_PASSES):
+        x = x * factor + 1.0
+    return x
+
+
+def measure_limit(operations: int, lanes: int, size: Size) -> float:
+    """Microseconds per state of this many operations at the rate of a processor's arithmetic units."""
+    chains = operations // _PASSES
+    starts = jnp.ones((lanes, chains))
+    cost = evaluated(multiply_and_add, jnp.asarray(0.5), starts, size)["us_per_state"]
+    return cost * operations / (chains * _PASSES)
+
+
 def both(measured: Callable[[], dict[str, Any]], key: str) -> dict[str, Any]:
     """A measurement by machine code and by XLA, and the largest difference relative to the largest value."""
     found = {}
@@ -159,6 +182,10 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
         "operations": {k: count_operations(f, model, start) for k, f in made.items()}, "rows": rows,
         "flights": [],
     }  # fmt: skip
+    left = content["operations"]["right-hand side"]["left"]
+    content["limit"] = [
+        {"lanes": lanes, "us_per_state": measure_limit(left, lanes, size)} for lanes in size.lanes
+    ]
     for name, function in made.items():
         for lanes in size.lanes:
             starts = start + 1e-2 * rng.normal(size=(lanes, len(start)))
@@ -188,6 +215,8 @@ def show(path: Path, folder: Path) -> Path:
     for key, label in (("xla", "XLA"), ("machine_code", "machine code")):
         times = [row[key]["us_per_state"] for row in rows]
         right.loglog([row["lanes"] for row in rows], times, "o-", label=label)
+    limits = [row["us_per_state"] for row in content["limit"]]
+    right.loglog([row["lanes"] for row in rows], limits, "k--", label="processor's limit")
     right.set_xticks([row["lanes"] for row in rows], [str(row["lanes"]) for row in rows])
     right.set_xticks([], minor=True)
     right.set_xlabel("states at once")

@@ -7,6 +7,7 @@ these numbers as leaves, like an `equinox.Module` written for the purpose.
 
 import dataclasses
 import functools
+import inspect
 import types
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -131,6 +132,9 @@ CONTROL: dict[str, Any] = {
     "safety": 0.8,
     "factormax": 5.0,
 }
+
+# Without its own `jit`, whose cache would keep a trace of thousands of objects for every mechanism.
+_diffeqsolve = inspect.unwrap(diffrax.diffeqsolve)
 
 # Result of a run that was not started, as a mass or a tensor of inertia is not positive or not finite.
 MASSES_REFUSED = diffrax.RESULTS.nonfinite_input
@@ -348,7 +352,7 @@ class Problem(eqx.Module):
         event: diffrax.Event | None = None,
     ) -> diffrax.Solution:
         """Integrate from the carry to t1 [s], where the last step ends; `dense` keeps all steps."""
-        return diffrax.diffeqsolve(
+        return _diffeqsolve(
             self.term(),
             self.solver(),
             carry.t,
