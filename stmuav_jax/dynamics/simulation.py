@@ -562,7 +562,7 @@ def simulate(
     # Dependent rows are rarely known beforehand: the cheaper equations are tried first, and those that
     # choose rows anew only if the run stops at such a posture.
     outcome = _carried_out(scene, method, times, progress, run_options)
-    if not outcome.run.successful and _held_rows_fail(outcome):
+    if not outcome.run.successful and _selected_rows_fail(outcome):
         allowing = method.formulation.allowing_dependent_rows()
         changed = dataclasses.replace(method, formulation=allowing)
         second = _carried_out(scene, changed, times, progress, run_options)
@@ -588,12 +588,12 @@ class _Outcome(NamedTuple):
     opened: str
 
 
-def _held_rows_fail(outcome: _Outcome) -> bool:
-    """True if a run stopped where rows that its equations hold throughout become dependent."""
+def _selected_rows_fail(outcome: _Outcome) -> bool:
+    """True if a run stopped where rows that its equations select for all times become dependent."""
     model: Any = outcome.problem.model
     row_mask, formulation = getattr(model, "row_mask", None), outcome.problem.method.formulation
     # A run that stops for another reason, such as stiffness, would stop with the dearer equations
-    # too: rows are chosen anew only where those that are held have become dependent.
+    # too: rows are selected again only where the selected ones have become dependent.
     stopped = outcome.run.certificate.result != "interrupted"
     if row_mask is None or not stopped or formulation.allowing_dependent_rows() is formulation:
         return False

@@ -262,7 +262,7 @@ class MissionController(eqx.Module):
         lost: rising times of the faults of each rotor (k, f) [s], infinite for none.
         share: share of its thrust that it keeps from each on (k, f).
         jam: faults of the sliders, or None.
-        rotors: rotors with curves, of whose thrust a share is kept; None for a share of the squared speed.
+        rotors: rotors with curves, which keep a share of their thrust; None for a share of the squared speed.
         force: largest force of each actuator of the tracker, or effort of each driven joint of a model,
             either way (a,) [N] or [N m], infinite for no limit.
     """

@@ -55,7 +55,7 @@ _QUANTITIES: dict[str, tuple[str, str]] = {
     "effort_margin": ("1", "smallest margin of the joint efforts, share of the range"),
     "energy": ("J", "electrical energy used"),
     "state_of_charge": ("1", "state of charge of the battery at the end"),
-    "kept": ("1", "whether all tolerances and limits were met"),
+    "met": ("1", "whether all tolerances and limits were met"),
 }
 
 
@@ -146,13 +146,13 @@ class MissionEvaluation(eqx.Module):
             f"{column_name(drive.name)}_error": worst.joints[k] for k, drive in enumerate(joints)
         }
         return {name: hide(x) for name, x in measures.items()} | {
-            "kept": valid & self._check_compliance(worst),
+            "met": valid & self._check_compliance(worst),
             "end": jnp.where(possible, worst.end, 0.0),
             "status": jnp.where(possible, FINE + worst.reason, NOT_PHYSICAL),
         }
 
     def _check_compliance(self, worst: Worst) -> Array:
-        """True if a flight kept the tolerances and limits of the mission."""
+        """True if a flight met the tolerances and limits of the mission."""
         target = self.mission.file.tolerances
         margins = (worst.rotors, worst.strokes, worst.forces, worst.efforts)
         is_compliant = (jnp.min(jnp.stack(margins)) >= -AT_LIMIT) & ~worst.is_drained
@@ -355,7 +355,7 @@ def make_mission_study(
         evaluation.table, mission.machine, factor, factor in relative
     )
     columns = {
-        name: Column("int8" if name == "kept" else "float64", unit, description)
+        name: Column("int8" if name == "met" else "float64", unit, description)
         for name, (unit, description) in quantities.items()
     }
     columns["end"] = Column("float64", "s", "last time with valid numbers", "diagnostic")
@@ -368,7 +368,7 @@ def make_mission_study(
             "kind": "missions",
             "mission": json.loads(mission.file.model_dump_json(exclude={"title"})),
             "parameters": digest_table(evaluation.table, "" if model is None else model.digest),
-            "relative": sorted(relative), "failure": {"quantity": "kept", "below": 0.5},
+            "relative": sorted(relative), "failure": {"quantity": "met", "below": 0.5},
         },
         lanes=LANES if lanes is None else lanes, **settings,
     )  # fmt: skip

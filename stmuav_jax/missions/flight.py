@@ -69,7 +69,7 @@ def fly(
     *,
     progress: Callable[[float], object] | None = None,
 ) -> MissionFlight:
-    """Fly a mission to its end, to an empty battery, or until Ctrl-C; what was flown is kept.
+    """Fly a mission to its end, to an empty battery, or until Ctrl-C; the samples so far are returned.
 
     Args:
         mission: mission, from `load_mission` or `make_mission`.

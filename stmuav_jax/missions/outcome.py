@@ -138,7 +138,7 @@ def to_flight_record(flight: MissionFlight) -> FlightRecord:
 
 
 class Measure(NamedTuple):
-    """Number in the table of a flight: name, value, unit, allowed value or None, and whether kept."""
+    """Number in the table of a flight: name, value, unit, allowed value or None, and whether met."""
 
     name: str
     value: float
