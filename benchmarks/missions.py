@@ -61,7 +61,7 @@ def make_study(t1: float) -> stm.Study:
 
 
 def share(columns: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Share of the flights that met all tolerances and limits, with its interval, and quantiles of the largest errors."""
+    """Share of the flights that met tolerances and limits, with its interval, and quantiles of the largest errors."""
     found = probability(int(np.sum(columns["met"])), len(columns["met"]))
     fine = columns["status"] == 1
     tilt = np.degrees(columns["tilt_error"][fine])

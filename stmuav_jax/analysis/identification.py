@@ -311,7 +311,9 @@ def _start_spread(
     """Number s of the start's errors, and the root (n, s) of their covariance in a state space."""
     if isinstance(start, Gaussian):
         if deviations is not None:
-            raise SettingError("The start is a Gaussian: it needs no start_deviations beside it.")
+            raise SettingError(
+                "The start is a Gaussian, which contains its deviations: leave start_deviations out."
+            )
         factor = np.asarray(start.factor)
     elif deviations is None:
         return 0, lambda space: np.zeros((space.size, 0))

@@ -304,7 +304,7 @@ def linearize(
     if not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
         raise StateError(
             "The motion cannot be linearised at this point: the accelerations or their derivatives "
-            "are not finite. Either the point is not, or a force jumps there."
+            "are not finite. The point itself is not finite, or a force is discontinuous there."
         )
     C = np.eye(len(names))[list(chosen)]
     return Linear(

@@ -243,7 +243,7 @@ def name_fault(name: str) -> str | None:
 def _check_name(name: str) -> str:
     if fault := name_fault(name):
         raise ValueError(
-            f"must {fault}, since a folder has it too, but it is {format_value(name)}."
+            f"must {fault}, since it also names a folder, but it is {format_value(name)}."
         )
     return name
 

@@ -331,7 +331,8 @@ def _run_postures(scene: "Scene", settings: TrimSettings) -> int:
     flying = (settings.climb, settings.speed, settings.turn, settings.yaw)
     if settings.linear != "none" or any(trim_options) or any(flying):
         raise SettingError(
-            "--path and --survey go without a linear model, --free, --accelerations, and the options of a flight."
+            "--path and --survey exclude --linear, --free, --accelerations and the options of a flight: "
+            "leave those out."
         )
     write = write_survey if settings.survey else write_path
     folder = results_folder(settings.out, f"trim_{scene.name}")

@@ -111,8 +111,8 @@ def count_periods(reading_rate: float, rate: float, owner: str) -> int:
     if whole < 1 or abs(ratio - whole) > _WHOLE * ratio:
         floor_count, ceiling_count = max(int(ratio), 1), max(int(ratio), 1) + 1
         raise SettingError(
-            f"{owner} reads at {reading_rate:g} Hz, which is not a whole part of the control rate of "
-            f"{rate:g} Hz: near it are {rate / floor_count:.6g} Hz (every {floor_count} periods) and "
+            f"{owner} reads at {reading_rate:g} Hz, which does not divide the control rate of "
+            f"{rate:g} Hz: the nearest valid rates are {rate / floor_count:.6g} Hz (every {floor_count} periods) and "
             f"{rate / ceiling_count:.6g} Hz (every {ceiling_count} periods)."
         )
     return whole

@@ -297,7 +297,7 @@ class Plant(eqx.Module):
         self.starts = tuple(math.ceil(at * rate * (1 - 1e-12)) for at, _ in changes)
         if any(after <= first for first, after in itertools.pairwise((0, *self.starts))):
             raise SettingError(
-                "The times of a plant's changes must rise, by whole control periods from the start on, but they are "
+                "The times of a plant's changes must increase by whole control periods from the start on, but they are "
                 f"{[float(at) for at, _ in changes]} s."
             )
         # Each change is prepared like the first system: they share a structure, so that a sample
@@ -490,7 +490,7 @@ def _check_standing(bench: Bench, start: State) -> None:
     """
     if not bench.instruments:
         raise SettingError(
-            "'standing' must be 0 for a plant without sensors, which reads nothing while it stands."
+            "'standing' must be 0 for a plant without sensors, because it has no readings to align with."
         )
     if not has_values(start.v, start.omega):
         return
@@ -498,7 +498,7 @@ def _check_standing(bench: Bench, start: State) -> None:
     fastest = max(float(np.max(np.abs(np.asarray(x)), initial=0.0)) for x in (start.v, start.omega))
     if fastest > 0:
         raise SettingError(
-            "The plant cannot stand before its first sample, because its start moves, with up to "
+            "The plant cannot be held before its first sample, because its start moves, with up to "
             f"{fastest:.4g} m/s or rad/s: set 'standing' to 0."
         )
 

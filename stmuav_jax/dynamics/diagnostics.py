@@ -172,7 +172,7 @@ def check_start(system: System, state: State) -> None:
     """Raise an error unless the state fits the system, is finite and has unit Euler parameters."""
     if not has_values(system, state):
         raise SettingError(
-            "simulate looks at values and cannot be differentiated, batched or compiled by JAX: "
+            "simulate needs known values and cannot be differentiated, batched or compiled by JAX: "
             "its scene holds traced numbers. Use stmuav_jax.integrate(system, state, ts, method)."
         )
     check_state(system, state)
@@ -649,10 +649,10 @@ def check_rounded(system: System, rows: AugmentedModel) -> None:
         return
     names = ", ".join(name_owners(rows, independence.shares))
     raise ModelError(
-        f"The mechanism is overconstrained up to rounded numbers: the joints {names} repeat constraints of "
+        f"The mechanism is nearly overconstrained: the joints {names} repeat constraints of "
         f"others to a relative difference of {independence.weakest:.1g} in every posture, which double "
         f"precision cannot resolve (it needs at least {WEAK:.0e}, or below {DEPENDENT:.0e} for dependent "
-        "rows). Give axes and points to all digits, or use a joint with fewer constraints, such as a "
+        "rows). Give axes and points with all digits, or use a joint with fewer constraints, such as a "
         "spherical one."
     )
 

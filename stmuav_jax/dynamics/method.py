@@ -92,7 +92,7 @@ class DiscreteAdjoint(diffrax.AbstractAdjoint):
     def __check_init__(self) -> None:
         if self.recorded_steps is not None and self.recorded_steps < 1:
             raise SettingError(
-                f"A DiscreteAdjoint keeps at least one step attempt, not {self.recorded_steps}."
+                f"A DiscreteAdjoint must record at least one step attempt, not {self.recorded_steps}."
             )
 
     def loop(self, **how: Any) -> Any:
@@ -215,8 +215,8 @@ def spectrum(
     if not np.all(np.isfinite(matrix)):
         raise StateError(
             "The motion cannot be linearised at this state: the accelerations or their derivatives "
-            "are not finite. Either the state is not, or a force jumps there, as that of a spring "
-            "with a length does where its ends meet."
+            "are not finite. The state itself is not finite, or a force is discontinuous there, such "
+            "as that of a spring with a rest length whose ends meet."
         )
     # The fastest eigenvalue decides whether the stability of an explicit method, and not its accuracy,
     # limits the steps.

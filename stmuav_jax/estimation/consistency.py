@@ -275,7 +275,7 @@ def verdict(filtered: Filtered, **options: Any) -> Verdict:
             used.
     """
     if np.ndim(filtered.ok) != 1:
-        raise SettingError("verdict judges one record; use verdicts for a bank of filters.")
+        raise SettingError("verdict takes one record; use verdicts for a bank of filters.")
     as_bank = lambda tree: jax.tree.map(lambda a: np.asarray(a)[..., None], tree)
     innovations, ok = as_bank((filtered.innovations, filtered.ok))
     return _judge_filter(innovations, ok, filtered, options)[0]

@@ -206,7 +206,7 @@ def _check_judged(mission_file: MissionFile) -> None:
     for name in ("touchdown", "sink"):
         if getattr(tolerances, name) is not None:
             raise SettingError(
-                f"A study of a mission does not judge 'tolerances.{name}': leave it out."
+                f"A study of a mission does not support 'tolerances.{name}': leave it out."
             )
     late = list_unreached(json.loads(mission_file.model_dump_json()), mission_file.t1)
     late += [

@@ -174,9 +174,7 @@ def machine_of(mission_file: MissionFile, folder: Path) -> Machine:
     # A scene's own options and a mission's tables would set the same thing twice.
     for name, instead in (("wind", "[wind]"), ("strokes", "[[panel]]"), ("case", "[push]")):
         if name in entry.options:
-            raise SettingError(
-                f"'machine.options' of a mission has no {name}: {instead} takes its place."
-            )
+            raise SettingError(f"'machine.options' of a mission has no {name}: use {instead}.")
     # One table for scene, controller and limits: a mass that is changed is changed in all of them,
     # unless it is drawn for the true machine alone.
     table = entry_of(entry.scene).parameters.replaced(entry.parameters)
@@ -256,7 +254,7 @@ def _model_machine(entries: MissionFile, path: Path) -> Machine:
     _without_tracker(entries, "A model's file")
     if entries.machine.options:
         raise SettingError(
-            "'machine.options' is for ready scenes (machine.scene): a model's file has drag, motors and landing "
+            "'machine.options' is for built-in scenes (machine.scene): a model's file has drag, motors and landing "
             "gear as forces of its own."
         )
     model = read_model(path)
@@ -638,7 +636,7 @@ def check_faults(mission_file: MissionFile) -> None:
         if fault.known and (fault.rotor is None or fault.share):
             raise SettingError(
                 "A fault that is 'known' must be the loss of a rotor, without a share of its thrust: "
-                "the controller has no law for a jammed slider or a weak rotor."
+                "the controller cannot compensate a jammed slider or a weak rotor."
             )
         place = f"Rotor {fault.rotor}" if fault.rotor is not None else f"Slider {fault.slider}"
         # Faults of one part are looked at in the order of time: one after a final fault, or at the

@@ -636,7 +636,7 @@ def check_forces(mission_file: MissionFile, machine: Machine, references: Refere
         f"The panel cannot follow its reference: at t = {ts[k]:.4g} s slider {slider + 2} needs a force of "
         f"{forces[k, slider]:.4g} N, but its actuator gives at most {machine.force:g} N either way "
         f"('controller.force'). The largest force is {most:.4g} N, at t = {ts[late]:.4g} s: give the move "
-        "more time, or another goal."
+        "more time, or another target."
     )
 
 

@@ -95,7 +95,7 @@ def table_entry(
         place = tuple(int(k) for k in match[2].split(",")) if match[2] else ()
     except ValueError:
         raise SettingError(
-            f"{quote_name(factor)} names no entry; one is written such as {name}[0, 1]."
+            f"{quote_name(factor)} must name one entry, such as {name}[0, 1]."
         ) from None
     value = np.asarray(table.value(name), dtype=float)
     if place and (
@@ -274,7 +274,7 @@ class AbstractFlights(abc.ABC):
 
     @abc.abstractmethod
     def _check_parameter(self, name: str) -> None:
-        """Raise `SettingError` for a parameter that can be no factor."""
+        """Raise `SettingError` for a parameter that cannot be a factor."""
 
     def entry(self, factor: str) -> FactorTarget:
         """Target of a factor.
@@ -285,7 +285,9 @@ class AbstractFlights(abc.ABC):
         """
         if factor in self.own_factors:
             if factor in self.relative:
-                raise SettingError(f"'{factor}' has no value in the table that it could multiply.")
+                raise SettingError(
+                    f"'{factor}' has no default value in the table to multiply: leave 'relative' out."
+                )
             return FactorTarget(factor, (), self.own_factors[factor])
         suggest = lambda: suggest_names(
             factor.partition("[")[0][:SHOWN],
@@ -389,7 +391,7 @@ class Flights(AbstractFlights):
 
     def _check_parameter(self, name: str) -> None:
         if name in self.option_names:
-            raise SettingError(f"'{name}' is given by the study's options: it can be no factor.")
+            raise SettingError(f"'{name}' is set by the study's options: it cannot be a factor.")
 
     def build(self, sample: Mapping[str, Any], seed: Any = 0) -> tuple[System, State]:
         """System and initial state of one run, NaN for an impossible start; may be traced."""

@@ -421,7 +421,7 @@ def resume_store(
                     f"{source} was computed by other code, whose samples cannot be mixed with this "
                     f"code's: {differences} Resume it by that code, or give another name."
                 )
-            raise FileError(f"{source} is of another study: {differences}")
+            raise FileError(f"{source} belongs to another study: {differences}")
         # chunks of a killed process
         for file in source.rglob("*.partial"):
             file.unlink()

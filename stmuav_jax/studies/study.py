@@ -178,8 +178,8 @@ class Study:
         self.lanes = LANES.get(kind, LANES_ELSEWHERE) if lanes is None else lanes
         if self.lanes % TOGETHER:
             raise SettingError(
-                f"lanes must be a multiple of {TOGETHER}, but it is {lanes}: a processor computes so "
-                "many together, and a sample's numbers may not depend on its lane."
+                f"lanes must be a multiple of {TOGETHER}, but it is {lanes}: a vector "
+                "register holds that many, and results must not depend on the lane."
             )
         most = MOST_DEVICES if kind == "cpu" else len(jax.local_devices())
         if devices is not None and devices > most:

@@ -256,7 +256,7 @@ def inverse_without_yaw(
     if not is_right_inverse or np.any(inverse[:, 0] <= 0) or np.any((u <= lower) | (u >= upper)):
         name, unit = quantity
         raise ModelError(
-            f"Thrust and tilt cannot be held {loss_text}: the hover would take {name} of "
+            f"Thrust and tilt cannot be held {loss_text}: the hover needs {name} of "
             f"{np.array2string(u, precision=3)} {unit}, and the limits are "
             f"{np.array2string(lower, precision=3)} to {np.array2string(upper, precision=3)}."
         )

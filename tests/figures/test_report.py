@@ -174,7 +174,7 @@ def test_files_that_have_no_report_are_told_apart(saved, tmp_path, capsys):
         return " ".join(capsys.readouterr().err.split())
 
     assert "There is no file or folder" in said(tmp_path / "nope")
-    assert "holds no result. A report is made of run.nc (of stmuav simulate)" in said(tmp_path)
+    assert "contains no result. A report needs run.nc (of stmuav simulate)" in said(tmp_path)
     (tmp_path / "notes.txt").write_text("hello there")
     assert "damaged or no result" in said(tmp_path / "notes.txt")
     np.savez(tmp_path / "linear.npz", A=np.eye(2))

@@ -174,7 +174,7 @@ def test_many_changes_at_once(scenes_made_once):
         ({"factors": {"start.p": NORMAL | {"standard_deviation": 10**400}}}, "of about 401 digits"),
         ({"factors": {"start.p": {"distribution": "uniform", "low": -1e308, "high": 1e308}}},
          "draws that are not finite"),
-        ({"factors": {"bare.inertia[0,]": 1.0}, "correlation": []}, "names no entry"),
+        ({"factors": {"bare.inertia[0,]": 1.0}, "correlation": []}, "must name one entry"),
         ({"factors": {"bare.inertia[0, 1]": 0.0, "bare.inertia[1, 0]": 0.0}, "correlation": []},
          "are the same number"),
         ({"factors": {"bare.inertia[0, 1]": 0.0, "bare.inertia[0,1]": 0.0}, "correlation": []},

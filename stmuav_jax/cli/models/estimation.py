@@ -131,7 +131,7 @@ def _choose_instruments(scene: "Scene", names: Sequence[str]) -> list[Any]:
     for instrument in result:
         if instrument.delay:
             raise SettingError(
-                f"The filter takes readings without delay, but the sensor '{instrument.name}' is late by "
+                f"The filter takes readings without delay, but the sensor '{instrument.name}' has a delay of "
                 f"{instrument.delay:g} s; leave it out with --sensors, or set its delay to 0."
             )
         if instrument.noise is None or not np.all(np.asarray(instrument.noise) > 0):

@@ -154,7 +154,7 @@ def _check_turns(system: System, q: dict[str, Array]) -> None:
         if np.round((counted - angle) / (2 * np.pi)) != 0:
             raise ModelError(
                 f"The angle of joint '{name}' is to be {angle:.6g} rad, but a spring, servo or end stop "
-                f"counts its turns from {counted:.6g} rad, which a state does not say. Give this function "
+                f"counts its turns from {counted:.6g} rad, which a state does not contain. Give this function "
                 f"and the simulation the system with_start_angles(system, {{'{name}': {angle:.6g}}}), or an "
                 f"angle from {counted - np.pi:.4g} to {counted + np.pi:.4g} rad."
             )
@@ -313,7 +313,7 @@ def _close_loops(
     state, rate_residual = _project_rates(with_drivers(system, now, u, t), closed_posture, t)
     if has_values(rate_residual) and not bool(rate_residual <= _RATE_TOLERANCE):
         raise StateError(
-            f"The joint rates {_format_values(u)} are inconsistent in this posture: they violate each other, "
+            f"The joint rates {_format_values(u)} are inconsistent in this posture: they contradict each other, "
             f"or the constraints, by {float(rate_residual):.3g}. Name fewer "
             "rates, or values that fit together."
         )

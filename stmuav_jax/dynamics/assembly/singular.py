@@ -148,7 +148,7 @@ def singular_posture(
         f"the mechanism comes to a singular posture of {format_joints(system, state, names)}: the "
         f"smallest singular value of the constraint Jacobian is {smallest:.3g} there and "
         f"{values[0, rank - 1]:.3g} at the start. What these joints or drivers demand takes "
-        "unbounded velocities or forces; lead the motion around that posture"
+        "unbounded velocities or forces; plan the motion around that posture"
     )
 
 

@@ -56,9 +56,9 @@ from .closures import (
     interpolate_posture,
     make_kinematics,
     measure_nearness,
+    rotate_rows,
     row_frames,
     step_rows,
-    rotate_rows,
     way_along,
 )
 from .coordinates import (
@@ -319,7 +319,9 @@ class Tree(AbstractFormulation):
         # Only a formulation that allows dependent rows pays for postures beside the present one.
         if self._may_interpolate(model):
             u_rate, driven = self._solve_interpolated(model, t, x, scheme)
-        rate = with_unit_vectors(tree, coordinate_rates(tree, at, u_rate), scheme.add_norm_feedback, at)
+        rate = with_unit_vectors(
+            tree, coordinate_rates(tree, at, u_rate), scheme.add_norm_feedback, at
+        )
         load, placement = solved.loads, solved.placement
         # Flows of energy and momentum are integrated beside the state, so that the balances of a run's
         # accuracy report have the error of the integrator and not that of a quadrature afterwards.

@@ -306,7 +306,7 @@ def check_attitude(R_wb: Numbers) -> None:
     worst = int(np.argmax(error + mirrored))
     if error[worst] > _ROTATION or mirrored[worst]:
         raise StateError(
-            f"R_wb must be a rotation (body to world), but at sample {worst} its columns are off "
-            f"unit and right angles by {error[worst]:.2g}"
-            + (" and it mirrors." if mirrored[worst] else ".")
+            f"R_wb must be a rotation (body to world), but at sample {worst} its columns "
+            f"deviate from unit length and right angles by {error[worst]:.2g}"
+            + (", and it is a reflection." if mirrored[worst] else ".")
         )

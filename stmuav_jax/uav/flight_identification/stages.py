@@ -538,9 +538,8 @@ def _check_gravity(signals: _Signals) -> float:
         np.hypot(value, horizontal) >= low and value <= high for value in (vertical, median)
     ):
         raise SettingError(
-            f"The accelerometer measures {vertical:.3g} m/s^2 on average along the vertical that the gyroscope tells; "
-            f"{low:.3g} to {high:.3g} m/s^2 would be valid: is the unit or the scale of the gyroscope or of the "
-            "accelerometer another?"
+            f"The accelerometer measures {vertical:.3g} m/s^2 on average along the vertical propagated by the "
+            f"gyroscope; {low:.3g} to {high:.3g} m/s^2 would be valid: check unit and scale of both sensors."
         )
     return min(abs(vertical - GRAVITY), abs(median - GRAVITY))
 
@@ -908,7 +907,7 @@ def _check_spin(layout: RotorLayout, fit: PredictionErrorFit) -> None:
     if is_clear and np.any(spin != layout.spin):
         raise SettingError(
             f"The motors' responses about yaw are those of the spin {spin.tolist()}, but the layout has "
-            f"{layout.spin.astype(int).tolist()}; the first would be valid, or the other sign of the gyroscope's z."
+            f"{layout.spin.astype(int).tolist()}; use the first, or change the sign of the gyroscope's z."
         )
 
 
@@ -1092,7 +1091,7 @@ def _identify_translation(
         raise SettingError(
             "The vehicle does not follow its motors: by the collective commands a rotor's thrust over mass at the "
             f"command 1 is {thrust.value:.2g} +- {thrust.deviation:.2g} m/s^2, where {usual:.2g} m/s^2 would carry the "
-            "vehicle. Was it held, or on the ground, or have commands and IMU different clocks?"
+            "vehicle. Was it held, or on the ground, or do commands and IMU have different clocks?"
         )
     if effect >= _EXCITED / 4 and thrust.deviation <= _DETERMINED * thrust.value:
         estimates["thrust"] = thrust

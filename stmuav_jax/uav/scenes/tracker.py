@@ -78,7 +78,7 @@ def tracker(
         },
         notes=(
             "Joint positions are reconstructed, not printed (docs/report_machine.md).",
-            "J'_7 of Table 6.2 breaks the triangle inequality by 0.7 % through rounding; admitted.",
+            "J'_7 of Table 6.2 violates the triangle inequality by 0.7 % through rounding; admitted.",
             f"{drive.note} No gravity, as printed.",
             *((STARTED,) if start is not None else ()),
         ),
