@@ -1,4 +1,4 @@
-"""Inverse dynamics of any mechanism along a path, and how far clearances of its joints move it.
+"""Inverse dynamics of any mechanism along a path, and the effect of joint clearances on its pose.
 
 Along a path with known accelerations a, the inputs u balance the generalised forces on all independent motions N,
 

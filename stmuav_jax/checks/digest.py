@@ -1,4 +1,4 @@
-"""Digest of a function with all that it refers to, which tells a study of it from another study."""
+"""Digest of a function with all that it refers to, which identifies the function that a study evaluates."""
 
 import dataclasses
 import dis

@@ -1,4 +1,4 @@
-"""The command line, `stmuav`: what its words mean, which command runs, and how errors are said.
+"""The command line, `stmuav`: its arguments, its commands, and its error messages.
 
 The modules of a command are imported when it runs.
 """

@@ -27,7 +27,7 @@ class SensorFault(NamedTuple):
     """Outage of an instrument, whose readings are NaN, or a step of its bias, for a time.
 
     Attributes:
-        at, until: first time of a reading that has it, and first one that has not [s].
+        at, until: times of the first reading with the fault, and of the first one without it [s].
         bias: error that is added, as `Instrument.bias`; None for an outage.
     """
 
@@ -46,7 +46,7 @@ class Instrument(eqx.Module):
             component (c,), in the units of the sensor's errors. A noise density [unit/sqrt(Hz)]
             becomes one by multiplication with sqrt(rate).
         bias: constant error of every reading, as `noise`.
-        delay: time from the motion to the controller's sight of it [s], whole control periods.
+        delay: time from the motion to the arrival of its reading at the controller [s], whole control periods.
         faults: outages and steps of the bias, each a `SensorFault`; several add up.
 
     Raises:
@@ -92,7 +92,7 @@ class Instrument(eqx.Module):
         """Number of control periods between readings at a control rate [Hz].
 
         Raises:
-            SettingError: the rates do not divide.
+            SettingError: the control rate is not a multiple of the sensor's.
         """
         if self.rate is None:
             return 1
@@ -131,7 +131,7 @@ def whole_periods(time: float, rate: float, subject: str) -> int:
 
 
 class Reading(NamedTuple):
-    """Reading of an instrument as the estimator sees it.
+    """Reading of an instrument, as passed to the estimator.
 
     Attributes:
         value: the last reading that has arrived.

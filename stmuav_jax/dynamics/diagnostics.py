@@ -87,8 +87,8 @@ class Certificate:
             the exact motion, the largest over all bodies and saved times [m], [rad], [m/s],
             [rad/s]; see `ErrorEstimate`.
         position_error_end, angle_error_end: the largest over all bodies at the last saved time.
-        error_e_folding_time, predictability_horizon: those of `ErrorEstimate` [s]. error_words: both
-            in words, and that the start was a singular posture, if the motion has left one.
+        error_e_folding_time, predictability_horizon: those of `ErrorEstimate` [s]. error_words: both as text,
+            with a sentence if the motion has left a singular posture.
         position_violation, angle_violation: largest residual of constraints that are lengths [m],
             and of those that are cosines or angles [rad], over all accepted steps.
         velocity_violation, angular_velocity_violation: those of their rates [m/s], [rad/s].

@@ -80,8 +80,8 @@ class Finding(NamedTuple):
 
     Attributes:
         severity: "fault" if the mechanism cannot be simulated so, "warning" if it probably is not
-            what is meant or is near its limits, "note" for what is good to know.
-        quantity: quantity or thing. value: its value with its unit, or what was found, in words.
+            what is meant or is near its limits, "note" for information.
+        quantity: quantity or object. value: its value with its unit, or a description.
         valid: what would be valid, or advice; may be empty.
     """
 
@@ -113,9 +113,9 @@ def check(
     *,
     inputs: Inputs | None = None,
 ) -> Inspection:
-    """Inspect a mechanism in one posture: everything that can be said before a run.
+    """Inspect a mechanism in one posture before a run.
 
-    These are looked at: masses, inertia tensors, sizes and gravity, which show wrong units; residuals
+    The inspection covers masses, inertia tensors, sizes and gravity, which reveal wrong units; residuals
     of the posture and its velocities; degrees of freedom, dependent and contradictory constraints by
     the names of their joints; conditions of the mass matrix and of the constraint Jacobian; the
     distance to a singular posture of the constraints and of the inputs; the eigenvalues of the linearised

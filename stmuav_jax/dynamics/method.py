@@ -113,13 +113,12 @@ class Method(eqx.Module):
         first_step: length of the first step [s]; at most a hundredth of the run's time.
         max_steps: accepted and rejected steps between two output times.
         adjoint: reverse-mode derivatives: any adjoint of diffrax, or the default, a
-            `DiscreteAdjoint`. An explicit method without events then keeps accepted steps with
-            their slopes and goes back through them; a longer run is kept in windows whose steps
-            are taken again on the way back. Anything else is differentiated by diffrax's
-            `RecursiveCheckpointAdjoint`, which takes adaptive steps again; they then differ by
-            round-off in their sizes, which costs a gradient digits.
+            `DiscreteAdjoint`. An explicit method without events then records accepted steps with their slopes;
+            the backward pass of a longer run recomputes its steps window by window. Other methods use diffrax's
+            `RecursiveCheckpointAdjoint`, which repeats adaptive steps; round-off changes their sizes, so that
+            gradients are less accurate.
         event: (t, state) -> a number whose change of sign ends the integration, at that
-            time; or a truth value, which ends it after the first step that makes it true. A run
+            time; or a boolean, which ends it after the first step that makes it true. A run
             that starts where the number is zero starts after that event. An `equinox.Module`
             with numbers as leaves is not compiled again for other numbers. A value of
             NaN ends the run with the result `diffrax.RESULTS.nonfinite`.
@@ -132,7 +131,7 @@ class Method(eqx.Module):
             estimate, the modes of the linearised motion bound them, so that derivatives with
             respect to the start and to constant numbers are as accurate at rest as in
             motion; see `integration.stepping`. It takes eleven more right-hand sides every
-            twelve steps. "state": the error estimate alone, for runs that nobody differentiates.
+            twelve steps. "state": the error estimate alone, for runs without derivatives.
         max_step: largest step [s]. It makes derivatives accurate with respect to inputs that are
             zero in the run itself but would vary faster than the system does.
 
@@ -241,8 +240,8 @@ def choose_solver(
 ) -> diffrax.AbstractSolver:
     """`kvaerno5()` if the largest |eigenvalue| at the state exceeds `EXPLICIT_LIMIT`, else `Dopri8()`.
 
-    Only the given state counts, which misleads if a system is stiff for moments: a stop that is hit
-    later is not seen, and friction is stiff at rest but not in motion.
+    Only the given state is evaluated, which misleads if a system is stiff only briefly: an end stop that is
+    reached later is not detected, and friction is stiff at rest but not in motion.
     """
     fastest = np.abs(spectrum(system, state, t, formulation=formulation)[0])
     return kvaerno5() if fastest > EXPLICIT_LIMIT else diffrax.Dopri8()

@@ -76,7 +76,7 @@ def nees(
 ) -> Float[Array, "*s"]:
     """Normalised estimation error squared, chi-squared with n degrees if the filter is consistent.
 
-    A component that is known exactly counts nothing if it is right, and makes NEES infinite if not.
+    A component that is known exactly contributes zero if it is correct, and infinity otherwise.
 
     Args:
         only: consecutive components of the error, with their marginal covariance; None for all.

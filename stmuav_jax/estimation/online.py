@@ -85,7 +85,7 @@ class OnlineEstimate:
 
     @property
     def mean(self) -> Any:
-        """Mean as NumPy arrays, views that cost no time."""
+        """Mean as NumPy arrays, without a copy."""
         return self._layout.unpack(self._numbers).mean
 
     @property

@@ -1,4 +1,4 @@
-"""Figures of a multirotor that was identified from its flight log: from what was flown to what is determined."""
+"""Figures of a multirotor that was identified from its flight log: the flight, the fit, and the estimates."""
 
 from collections.abc import Callable, Mapping
 from textwrap import fill

@@ -212,7 +212,7 @@ def joints_of(motion: Motion) -> tuple[Any, ...]:
 
 
 def balances(run: "Run | xr.Dataset") -> Figure | None:
-    """Figure of energies, and of the estimated error, energy drift and violations, a unit an axis.
+    """Figure of energies, and of the estimated error, energy drift and violations, with one axis per unit.
 
     None for a run that was saved without its analysis. Violations are NaN in files that lack them.
     """

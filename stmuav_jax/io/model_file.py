@@ -1,4 +1,4 @@
-"""Models of mechanisms as TOML files: read as scenes, and scenes written so that they come back."""
+"""Models of mechanisms as TOML files: read as scenes, and written so that they round-trip exactly."""
 
 import contextlib
 import dataclasses
@@ -89,7 +89,7 @@ class ParametricModel:
 
     @property
     def digest(self) -> str:
-        """Text that tells models with other entries apart."""
+        """Text that identifies the entries of the model."""
         text = json.dumps(self.file.model_dump(mode="json"), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -504,7 +504,7 @@ def save_model(scene: Scene, path: str | os.PathLike[str]) -> Path:
 
 
 def model_to_text(scene: Scene) -> str:
-    """TOML text of a scene, from which `load_model` makes the same system and state to the last bit.
+    """TOML text of a scene, which `load_model` reads back exactly, bit for bit.
 
     Numbers are written out in the bodies' reference frames: nothing refers to the parameters, which
     are kept as a record.

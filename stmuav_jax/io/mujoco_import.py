@@ -59,15 +59,15 @@ def load_robot(
 ) -> Scene:
     """Scene of a robot's MJCF or URDF file, at the posture of its `qpos0`, at rest.
 
-    A URDF's `loop_joint` (Drake, RigidBodyDynamics.jl) closes its loop. What is lost of the file, such as
-    an incomplete loop, is in `scene.warnings`, all else that is left out in `scene.notes`.
+    A URDF's `loop_joint` (Drake, RigidBodyDynamics.jl) closes its loop. Losses that change the motion, such as
+    an incomplete loop, are in `scene.warnings`, all else that is left out in `scene.notes`.
 
     Args:
         link_share: mass and inertia of a link between two joints of one body, as a share of the
             body's own; by default 1e-12. If it is given, links without mass that move get this share of
             the robot's mass, and its moment at 0.1 m.
         floating: of a URDF, True lets its root link float, False fixes it to ground; by default it is
-            fixed, and a note says so. MJCF says it by its own joints.
+            fixed, with a note. In MJCF its joints determine this.
         loops: kind of joint ("spherical", "weld", "revolute" or "translational", about or along z) that holds
             each pair of links or bodies together by their frames, which closes loops that the file leaves open.
 

@@ -1,4 +1,4 @@
-"""Content of a URDF file that MuJoCo's reader drops without a word: loop joints, mimics, unknown elements.
+"""Content of a URDF file that MuJoCo's reader drops silently: loop joints, mimics, unknown elements.
 
 The XML is read here by expat, which opens no other file; a file that declares entities is refused.
 """

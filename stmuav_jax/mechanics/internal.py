@@ -127,8 +127,8 @@ def with_start_angles(system: System, angles: Mapping[str, Numbers]) -> System:
     """System whose springs, servos and end stops count the turns of hinges from other angles.
 
     A state of the bodies gives a hinge's angle in (-pi, pi], and elements that depend on it start from
-    there. A hinge that has turned further at the start, such as a wound clock spring, is told here;
-    the whole turns of these angles count, the rest is that of the state.
+    there. Give the total angle of a hinge that has turned further, such as that of a wound clock spring; only
+    its whole turns count, and the state determines the remainder.
 
     Args:
         angles: angle at the start by joint [rad].

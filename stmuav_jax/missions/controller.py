@@ -316,7 +316,7 @@ class MissionController(eqx.Module):
 
 
 def _command_pilot(pilot: Any, estimate: Any, reference: MissionReference, memory: Any) -> Any:
-    inner_pilot = pilot.pilot if isinstance(pilot, AdaptiveController) else pilot
+    inner_pilot = pilot.controller if isinstance(pilot, AdaptiveController) else pilot
     if isinstance(inner_pilot, FlightController):
         return pilot(estimate, reference.waypoint, memory)
     if isinstance(inner_pilot, JointController):

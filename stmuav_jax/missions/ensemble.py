@@ -97,7 +97,7 @@ class Worst(NamedTuple):
 
 
 class MissionEvaluation(eqx.Module):
-    """Function of a sample that flies a mission by a machine with its numbers and returns the worst of the flight.
+    """Function of a sample that flies a mission with its parameters and returns the worst values of the flight.
 
     The sample's key gives the seeds of gusts and of noise.
 
@@ -342,7 +342,8 @@ def make_mission_study(
         settings: samples, seed, design, name and others of `stmuav_jax.Study`.
 
     Raises:
-        SettingError: entries that its flights do not come to, factors that are unknown, lengths, or of no effect.
+        SettingError: entries later than the end of its flights, or factors that are unknown, lengths, or
+            without effect.
     """
     _check_judged(mission.file)
     evaluation = MissionEvaluation(mission, relative)

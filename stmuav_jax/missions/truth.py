@@ -1,4 +1,4 @@
-"""Truth of a mission: the numbers of its machine, which its controller and estimator do not know."""
+"""Truth of a mission: parameters of the true machine, unknown to its controller and estimator."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple

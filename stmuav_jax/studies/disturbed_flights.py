@@ -270,7 +270,7 @@ class AbstractFlights(abc.ABC):
 
     @abc.abstractmethod
     def plain(self) -> dict[str, Any]:
-        """Plain data of what tells the scene from others, without its table."""
+        """Plain data that identify the scene, without its table."""
 
     @abc.abstractmethod
     def _check_parameter(self, name: str) -> None:
@@ -350,7 +350,7 @@ class Flights(AbstractFlights):
         scene, case: see `stmuav list`. table: of its parameters.
         own_factors: factors beside the table's, with their units.
         options: of the scene, plain data as `options_from_plain` takes. option_names: names of the table
-            whose values the options replace, which can be no factors. unused_names: of the table, that have no
+            whose values the options replace, which cannot be factors. unused_names: of the table, that have no
             effect.
         relative: names of factors that multiply the table's value.
         inputs: "case" for the scene's own; "trim" for constant rotor speeds and actuator forces
@@ -408,7 +408,7 @@ class Flights(AbstractFlights):
         return self._drive_inputs(scene.system, sample), scene.state0
 
     def plain(self) -> dict[str, Any]:
-        """Plain data of what tells the scene from others, without its table."""
+        """Plain data that identify the scene, without its table."""
         names = ("scene", "case", "inputs", "drag", "gusts")
         options = {"options": self.options} if self.options else {}
         return {name: getattr(self, name) for name in names} | options
@@ -660,7 +660,7 @@ class ModelFlights(AbstractFlights):
         )
 
     def plain(self) -> dict[str, Any]:
-        """Plain data of what tells the model from others."""
+        """Plain data that identify the model."""
         return {"model": self.scene, "digest": self.model.digest, "inputs": self.inputs}
 
 

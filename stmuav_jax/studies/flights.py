@@ -42,7 +42,7 @@ OWN = {"status", "sample", "time", "end", "steps", "rejected", "residual", "reco
 
 @dataclass(frozen=True)
 class Quantity:
-    """Quantity, a number or a history, that is kept of each run.
+    """Quantity, a number or a history, that is stored for each run.
 
     Attributes:
         signal: name of a signal, see `stmuav_jax.studies.signal`.
@@ -54,7 +54,7 @@ class Quantity:
             step, and paths are NaN from there on.
 
     Raises:
-        SettingError: an unknown take, a level where none belongs or none where one does.
+        SettingError: an unknown take, or a level that is missing or superfluous.
     """
 
     signal: str
@@ -116,14 +116,13 @@ class FlightEvaluation(AbstractBatch):
         t1: final time [s].
         every: spacing of the kept times of paths [s]; default one thirtieth of t1.
         method: how the runs are integrated: by `diffrax.Dopri8()` or `diffrax.Tsit5()`, with at most
-            `max_steps` steps, after which a run has failed. Nothing differentiates the runs: its
-            `adjoint` and `steps` are not used.
+            `max_steps` steps, after which a run has failed. The runs have no derivatives: its `adjoint` and
+            `steps` are not used.
         direction: unit vector that the panel should face, world; default its direction at the
             start.
 
     Raises:
-        SettingError: no quantities, names that are no names, impossible numbers, a method that many runs
-            at once cannot have.
+        SettingError: no quantities, invalid names or numbers, or a method that cannot run in batches.
     """
 
     flights: AbstractFlights

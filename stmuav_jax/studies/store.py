@@ -197,9 +197,9 @@ class Store:
         self._is_stored[first:last] = True
 
     def check_folder(self) -> None:
-        """Refuse to go on where the folder is no longer the one that was opened.
+        """Raise an error if the folder is no longer the one that was opened.
 
-        Zarr would make missing folders anew, and what is written then belongs to no study.
+        Zarr would create missing folders again, for chunks that belong to no study.
 
         Raises:
             FileError: the folder was removed, renamed or replaced, or samples in it were.

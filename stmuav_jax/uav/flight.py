@@ -367,7 +367,7 @@ def trim_slopes(
     condition: FlightCondition,
     limits: TrimLimits | None = None,
 ) -> tuple[FlightTrim, dict[str, Float[Array, "..."]]]:
-    """Trim of a UAV, and the derivatives of `FlightTrim.vector` by values that it is built from.
+    """Trim of a UAV, and the derivatives of `FlightTrim.vector` with respect to values of its construction.
 
     Args:
         build: function from values by name, traced by JAX, to the UAV.

@@ -1,4 +1,4 @@
-"""Motion of the other bodies of a flying machine against its base, as estimators see it by encoders.
+"""Motion of the other bodies of a flying machine relative to its base, for estimators, from encoders.
 
 A machine's tracker is moved by two panel angles and seen by the strokes of its sliders; an open chain of
 joints is moved by their coordinates, which encoders read.

@@ -1,4 +1,4 @@
-"""Closing the loops of a mechanism by one small program: on the way of joint coordinates, nearest, moving.
+"""Closing the loops of a mechanism by one small program: along coordinates, at the nearest posture, in motion.
 
 One loop does all of it, since the equations are what takes long to compile. Its steps are the smallest in
 the mass metric that close the linearised constraints, seen from one of two places: from the present

@@ -83,8 +83,8 @@ def state_from_joints(
         ModelError: a joint is unknown, a driver or without coordinates; the values have a wrong number
             or are not finite; or a force counts the turns of a hinge from another angle, see
             `with_start_angles`.
-        StateError: no state of the mechanism has all coordinates or rates together, or none on the way
-            there from the start, but one beyond; raised only for concrete values, not inside `jit`.
+        StateError: no state of the mechanism has all coordinates or rates together, or the loops do not stay
+            closed on the path from the start; raised only for concrete values, not inside `jit`.
     """
     start = system.reference if start is None else start
     check_state(system, start)

@@ -1,4 +1,4 @@
-"""Singular postures and jumping drivers: what a mechanism's constraints fail at, in words, and which branches meet.
+"""Singular postures and jumping drivers: messages on failures of the constraints, and the branches that meet.
 
 In a singular posture rows of the constraint Jacobian J are dependent that are independent beside it.
 With W the combinations of rows that vanish there, and N the free velocities, both orthonormal, the

@@ -1,4 +1,4 @@
-"""Independence of constraint rows: one scaling, one threshold, and the rows that repeat others always.
+"""Independence of constraint rows: one scaling, one threshold, and rows that are dependent in every posture.
 
 The rows J of a constraint Jacobian have units of a length or none, and its columns belong to velocities
 [m/s] or angular velocities [rad/s]. With the longest arm L of the joints, rows that are lengths divided

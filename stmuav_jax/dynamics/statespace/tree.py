@@ -206,7 +206,7 @@ class TreeSpace(AbstractStateSpace):
 
     @property
     def counted(self) -> tuple[_Counted, ...]:
-        """Places of the counted angles that are coordinates of the tree."""
+        """Indices of the counted angles that are coordinates of the tree."""
         return _counted_angles(self.system, self.model.parameters.tree)
 
     @property

@@ -260,8 +260,7 @@ class Tree(AbstractFormulation):
     Args:
         cut: names of joints that close loops; by default those with the fewest rows. See
             `spanning_tree` for the tree that results.
-        redundant: allow rows to become dependent in some postures, and choose the rows anew for
-            every step.
+        redundant: allow rows to become dependent in some postures, and select the rows again in every step.
     """
 
     cut: tuple[str, ...] = eqx.field(static=True, default=())

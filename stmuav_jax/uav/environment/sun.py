@@ -1,4 +1,4 @@
-"""Sun as a tracker on a UAV uses it: position at place and time by series or SPA, direction sensed on board.
+"""Direction to the sun for a tracker on a UAV: from place and time by series or SPA, or sensed on board.
 
 Scenario 1: a sensor on the UAV measures the direction in body axes, `s_b`. Scenario 2: position
 and time give the direction in the world (x east, y north, z up), and the known attitude turns it:

@@ -1,4 +1,4 @@
-"""Centre of mass of a multirotor as states of a filter over a flight, beside the answer of the whole record.
+"""Centre of mass of a multirotor as states of a filter over a flight, beside the estimate of the whole record.
 
 About roll and pitch, with what the identified numbers explain of the angular acceleration, a_k, its change g_k
 by the centre of mass c, and moments m that nobody knows,

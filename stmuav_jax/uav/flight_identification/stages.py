@@ -137,10 +137,10 @@ class FlightVerdict(NamedTuple):
     """Verdict on an identification.
 
     Attributes:
-        status: "consistent"; "inconsistent": a test speaks against the model; "undecided": nothing was
+        status: "consistent"; "inconsistent": a test rejects the model; "undecided": nothing was
             identified.
         p_values: p-value of every test by its name.
-        explanation: sentences on what was found.
+        explanation: sentences on the findings.
     """
 
     status: Literal["consistent", "inconsistent", "undecided"]
@@ -169,7 +169,7 @@ class FlightIdentification(NamedTuple):
     hover: float
 
     def correct_voltage(self, record: FlightRecord) -> FlightRecord:
-        """The identified record with commands as the motors feel them, where the voltage's exponent is determined."""
+        """The identified record with commands corrected for the voltage, if its exponent is determined."""
         exponent = self.estimates.get("voltage_exponent")
         return record.correct_voltage(0.0 if exponent is None else exponent.value)
 

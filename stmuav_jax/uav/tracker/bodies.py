@@ -50,7 +50,7 @@ Target = Numbers | Callable[..., object]
 
 @dataclass(frozen=True)
 class Servo:
-    """Position servo in each slider joint, beside the forces that a scene has anyway.
+    """Position servo in each slider joint, in addition to the forces of the scene.
 
     Attributes:
         stiffness: [N/m]. damping: [N s/m].

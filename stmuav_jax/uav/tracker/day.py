@@ -356,7 +356,7 @@ def track_day(
             out of reach.
 
     Raises:
-        SettingError: a date, zone, step, turbidity, albedo or flaw that makes no sense, a day that
+        SettingError: an invalid date, zone, step, turbidity, albedo or flaw, a day that
             the zone skipped, or several places.
         StateError: a sun that does not rise that day, or an attitude that is no rotation.
         ModelError: a tracker that reaches no posture.

@@ -287,8 +287,7 @@ def aim(
     transformation, or throw=False gives NaN and a reason code instead.
 
     Raises:
-        StateError: a direction outside the workspace; the message says which limit it breaks, and
-            by how much.
+        StateError: a direction outside the workspace; the message says which limit it exceeds, and by how much.
 
     Source: report Part II, Eq. 3.9, 3.13 and 3.20, corrected.
     """
