@@ -471,7 +471,7 @@ def _check_efforts(problem: _Problem, efforts: Float[np.ndarray, " l"]) -> None:
 def _find_speed_limits(
     system: System, inputs: Inputs
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Smallest and largest squared speeds of rotors with limits, with room for round-off; else infinite."""
+    """Smallest and largest squared speeds of rotors with limits, with a margin for round-off; else infinite."""
     lowest, highest = [], []
     for entry in inputs.entries:
         limits: Any = getattr(system.forces[entry.force], "squared_limits", None)
@@ -508,7 +508,7 @@ class FlightCondition(NamedTuple):
         sun: direction to the sun, world (3,), or None.
         yaw: heading [rad]. v: velocity of the base, world (3,) [m/s].
         rate: rate of turn about the vertical [rad/s].
-        acceleration: acceleration of the base beside that of the turn, world (3,) [m/s^2].
+        acceleration: acceleration of the base in addition to that of the turn, world (3,) [m/s^2].
     """
 
     angles: Float[Array, "2"] | None

@@ -419,7 +419,7 @@ def judge_fit(
     faults: tuple[str, ...] = (),
     is_start_exact: bool = False,
 ) -> FitVerdict:
-    """Verdict on a fit, in words.
+    """Verdict on a fit, with its explanation.
 
     Args:
         bound_labels: parameters that ended at a bound. faults: sentences on physical bounds that the

@@ -214,7 +214,7 @@ class Bench(eqx.Module):
         return _advance_queues(self, queues, motion, system, k, self._draw_noise(k, key))
 
     def oldest_readings(self, queues: tuple[Any, ...]) -> dict[str, Reading]:
-        """Readings that the estimator sees now, by the sensor's name."""
+        """Readings passed to the estimator at this sample, by the sensor's name."""
         oldest_readings = [jax.tree.map(lambda x: x[0], queue) for queue in queues]
         return {
             instrument.name: reading

@@ -1,4 +1,4 @@
-"""Sampled plant: a mechanism whose inputs are held from sample to sample, as a controller sees it.
+"""Sampled plant: a mechanism whose inputs are constant between samples, for controllers.
 
     x_k+1 = motion over a period 1/rate from x_k with inputs u_(k-d) held,   d samples of delay
 

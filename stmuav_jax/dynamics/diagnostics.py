@@ -342,7 +342,7 @@ class ErrorEstimate:
 
 
 class SecondRun:
-    """Second run, at other tolerances beside the first run.
+    """Second run, at other tolerances than the first run.
 
     Args:
         problem: problem of the first run. t0: initial time [s]. state0: state at t0.
@@ -762,7 +762,7 @@ def make_certificate(
     """Assemble the certificate of a finished run.
 
     Args:
-        rank: rank at the start. result: outcome of the run in words.
+        rank: rank at the start. result: outcome of the run as text.
     """
     drift, relative_drift, momentum = _compute_balances(system, trajectory, checked.balances)
     position, angle, velocity, angular_velocity = (

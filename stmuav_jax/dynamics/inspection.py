@@ -356,7 +356,7 @@ def _unit_of(motion: np.ndarray) -> str:
 def _check_nearness(
     system: System, model: AugmentedModel, state: State, t: float, rank: Rank, free: np.ndarray
 ) -> Iterator[Finding]:
-    """Findings on dependent rows and singular postures, from postures beside this one."""
+    """Findings on dependent rows and singular postures, from neighbouring postures."""
     names, at, change = ", ".join(rank.redundant), rank.smallest_singular_value, 0.0
     unit = ""
     if rank.dof:

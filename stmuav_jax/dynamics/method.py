@@ -105,8 +105,8 @@ class Method(eqx.Module):
 
     Args:
         formulation: formulation of the equations of motion.
-        solver: any diffrax solver with an error estimate. `kvaerno5()` is for stiff systems; for
-            `simulate`, which knows the initial state, the text "auto" applies `choose_solver`.
+        solver: any diffrax solver with an error estimate. `kvaerno5()` is for stiff systems; for `simulate`,
+            which has the initial state, the text "auto" applies `choose_solver`.
         rtol, atol: tolerances of a step, on positions [m], Euler parameters, velocities
             [m/s] and angular velocities [rad/s] alike.
         stabilisation: stabilisation of the constraints.
@@ -125,7 +125,7 @@ class Method(eqx.Module):
         direction: direction of the event's change of sign: True up, False down, None both.
         jump_ts: times at which forces jump (j,) [s]. A step ends just before each, and the
             next begins just after it; a force is not evaluated at the jump itself.
-        balances: integrate work and impulse beside the state, for the balances of energy
+        balances: integrate work and impulse with the state, for the balances of energy
             and momentum; it adds about a tenth to the computing time.
         steps: control of the step lengths. "sensitivities", the default: besides the state's error
             estimate, the modes of the linearised motion bound them, so that derivatives with

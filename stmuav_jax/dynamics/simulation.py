@@ -82,7 +82,7 @@ class Scene:
         t0, t1: time span [s]. save_every: spacing of the saved times [s].
         parameters: numbers from which the scene was built, by name: each a mapping with "value",
             "unit" and "source"; kept with the results.
-        notes: facts that the reader of a result must know, one sentence each.
+        notes: facts that affect the interpretation of results, one sentence each.
         warnings: differences that change the motion from that of the source, such as a constraint that an
             import lost; `check` lists them as warnings.
         watch: names of the bodies that figures show.
@@ -296,7 +296,7 @@ class Run:
 
     @functools.cached_property
     def snapshot(self) -> Snapshot:
-        """Accelerations, reactions, energies at the saved times, computed when first asked for.
+        """Accelerations, reactions, energies at the saved times, computed at first use.
 
         Raises:
             SettingError: the run was made with analysis=False.
@@ -579,7 +579,7 @@ def simulate(
 
 
 class _Outcome(NamedTuple):
-    """Run with its problem, what was found at its start, and a text on joints that have come open."""
+    """Run with its problem, the findings at its start, and a text on joints that have separated."""
 
     run: Run
     problem: Problem
@@ -741,7 +741,7 @@ def _estimate_errors(
 
 
 def _describe_method(method: Method) -> dict[str, Any]:
-    """Description of the method in words and numbers, as results keep it."""
+    """Description of the method as text, saved with results."""
     settings = {
         "formulation": str(method.formulation),
         "solver": type(method.solver).__name__,

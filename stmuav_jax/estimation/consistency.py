@@ -599,7 +599,7 @@ def _decide_verdict(of: dict[str, Any], level: float, names: tuple[str, ...]) ->
 def _explain_findings(
     of: dict[str, Any], significant: set[str], name: Callable[[int], str]
 ) -> list[str]:
-    """Sentences on what was found in an inconsistent record, and on its usual causes."""
+    """Sentences on the findings in an inconsistent record, and on their usual causes."""
     wrong_size = bool(significant & {"size", "sliding"})
     lines = []
     # a start that is like the rest is no sign of a wrong prior

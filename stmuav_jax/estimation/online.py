@@ -1,4 +1,4 @@
-"""Online filter, one measurement at a time from Python, for use beside a running machine.
+"""Online filter, one measurement at a time from Python, for use with a running machine.
 
 A call of a compiled function costs some microseconds for each array that goes in or comes out, more
 than the arithmetic of a small filter: all numbers of a step go in as two arrays (estimate; step,

@@ -147,7 +147,7 @@ def positions(
     Args:
         run: run, or dataset of a saved run.
         bodies: names of the bodies, from top to bottom.
-        detail: end of the start that a left column shows beside the whole run [s]; default no such column.
+        detail: end of the interval that an additional left column shows [s]; default no such column.
 
     Raises:
         StateError: a name that no body of the run has.

@@ -117,7 +117,7 @@ class Robot:
 
     @property
     def digest(self) -> str:
-        """Text that tells systems and starts with other numbers apart."""
+        """Text that identifies systems and starts by their numbers."""
         digest = hashlib.sha256(repr(self.scene.system.names).encode())
         for leaf in jax.tree.leaves((self.scene.system, self.scene.state0)):
             digest.update(np.asarray(leaf).tobytes())
@@ -443,7 +443,7 @@ def _read_instrument(
 
 
 def _read_start(system: System, model_data: ModelFile, parameters: Table) -> State:
-    """State of the file's start; at the reference posture, at rest, if it says nothing."""
+    """State of the file's start; by default the reference posture at rest."""
     state, start = system.reference, model_data.start
     names = {"r": "com_position", "p": "orientation", "v": "velocity", "omega": "angular_velocity"}
     arrays = {field: [*as_numpy(getattr(state, field))] for field in names}

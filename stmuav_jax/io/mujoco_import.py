@@ -348,7 +348,7 @@ def scene_from_mujoco(model: Any, name: str = "robot", *, link_share: float = LI
     """Scene of a compiled `mujoco.MjModel`; what cannot be carried over is in its notes.
 
     Actuators with a fixed gain on a hinge or slide are inputs: efforts, or targets of position
-    servos. The notes say which input is which actuator, and in which units of its control.
+    servos. The notes list the actuator of each input, and the unit of its control.
 
     Args:
         name: name of the scene. link_share: see `load_robot`.
@@ -942,7 +942,7 @@ def _effort_limit(model: Any, a: int) -> float | None:
 def _describe_inputs(
     system: System, model: Any, driven: list[tuple[int, _Actuator]], first: int
 ) -> list[str]:
-    """Sentences that say which input is which actuator."""
+    """Sentences that give the actuator of each input."""
     names = {entry.force: (entry.name, entry.unit) for entry in inputs_of(system).entries}
     sentences = []
     for a, actuator in driven:

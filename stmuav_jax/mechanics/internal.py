@@ -1,8 +1,8 @@
 """Forces with states of their own: motors that lag, and elements that count turns of a hinge.
 
 Such a force holds its actuator states z as a leaf: the initial values when it is made, and the
-present values that an integrator sets during a run (`with_internal`). The states are integrated
-beside those of the bodies and count in the error that controls the step size; the constraints do
+present values that an integrator sets during a run (`with_internal`). The states are integrated with those of
+the bodies and count in the error that controls the step size; the constraints do
 not depend on them. A system without such forces has none, at no cost.
 
 A posture determines the angle of a hinge up to whole turns. An element whose law depends on that angle

@@ -85,8 +85,8 @@ class AbstractJointForce(AbstractTurnCounter):
     Subclasses define the law and its potential, both of scalars. The power on the bodies is
     Q x_rate = -dV/dt + power, which defines the power of the part without potential.
 
-    The angle of a hinge counts whole turns, as that of `Run.joint` does: it starts in (-pi, pi], or
-    near the angle that `with_start_angles` tells, and goes on from there.
+    The angle of a hinge counts whole turns, as that of `Run.joint` does: it starts in (-pi, pi], or near the
+    angle of `with_start_angles`, and is continuous from there.
 
     Attributes:
         joint: name of the joint.

@@ -254,7 +254,7 @@ def _field_path(force: AbstractForce, field: str) -> tuple[str, ...]:
 
 
 def _rebuild_part(part: Any, path: tuple[str, ...], value: Any) -> Any:
-    """Part made anew, and so checked, with another value of a field."""
+    """Part constructed again, and so checked, with another value of a field."""
     arguments = {n: getattr(part, n, None) for n in inspect.signature(type(part)).parameters}
     # States of actuators are no parameters: a new part starts with its own.
     arguments.pop("internal", None)

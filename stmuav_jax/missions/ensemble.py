@@ -76,7 +76,7 @@ class Worst(NamedTuple):
         joints: largest errors of the driven joints (n,) [rad] or [m].
         rotors, strokes, forces, efforts: smallest distances from the limits, as shares of the range.
         energy: electrical energy used [J]. charge: state of charge at the last sample [1].
-        next_charge: after it. is_drained: True once the battery is empty or asked for more than it can give.
+        next_charge: after it. is_drained: True once the battery is empty or the demand exceeds its power.
         reason: code of `LoopReason`. end: time of the last valid sample [s].
     """
 

@@ -265,7 +265,7 @@ class _Discharge(NamedTuple):
 
 
 def _discharge_battery(battery: Battery, soc: float, rows: Rollout, rate: float) -> _Discharge:
-    """Discharge by samples: until its reserve is used up, or it is asked for more than it can give."""
+    """Discharge by samples: until its reserve is used up, or the demand exceeds its power."""
     power = jnp.asarray(rows.signals["electric_power"])
     arguments = (battery, jnp.asarray(soc), power, jnp.asarray(1.0 / rate))
     socs, currents, voltages, last = (

@@ -529,7 +529,7 @@ def controller_of(mission_file: MissionFile, machine: Machine, plant: Plant) -> 
 def _make_pilot(
     entries: MissionFile, machine: Machine, plant: Plant, lost: tuple[int, ...]
 ) -> Pilot:
-    """Controller of a machine that knows of lost rotors."""
+    """Controller of a machine whose model has the lost rotors."""
     entry = entries.controller
     system = machine.scene.system if machine.nominal is None else machine.nominal
     gains = FlightGains(**entry.gains.model_dump(exclude_none=True))

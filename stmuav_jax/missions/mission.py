@@ -141,7 +141,7 @@ def load_mission(
 
     Args:
         t1: end of the flight [s] in place of the file's.
-        true_states: leave the mission's sensors out, so that the controller knows the true states.
+        true_states: leave the mission's sensors out, so that the controller receives the true states.
         truth: parameters of the true machine that differ from the controller's model, in addition to the file's
             `truth`, by the names of factors of a mission's study.
 
@@ -494,7 +494,7 @@ def _check_stability(mission: Mission) -> float:
     """Factor by which small motions about hover grow in a second, with the mission's gains, rate and delay.
 
     It raises `SettingError` where this is more than tenfold.
-    The controllers that are told of lost rotors are checked too, as if the machine did not turn. The
+    The controllers for lost rotors are checked too, as if the machine did not turn. The
     estimator, limits and drag are left out.
     """
     pilots = [

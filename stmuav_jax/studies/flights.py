@@ -1,4 +1,4 @@
-"""Studies of simulated motions: systems with drawn numbers, their runs, and the quantities kept of each.
+"""Studies of simulated motions: systems with drawn numbers, their runs, and the quantities stored for each.
 
 The runs go through batch slots, each with its own step sizes; see `dynamics.integration.lanes`.
 """
@@ -114,7 +114,7 @@ class FlightEvaluation(AbstractBatch):
         flights: what all runs have in common: scene or model, inputs, wind.
         quantities: quantities by the names of their columns.
         t1: final time [s].
-        every: spacing of the kept times of paths [s]; default one thirtieth of t1.
+        every: spacing of the saved times of paths [s]; default one thirtieth of t1.
         method: how the runs are integrated: by `diffrax.Dopri8()` or `diffrax.Tsit5()`, with at most
             `max_steps` steps, after which a run has failed. The runs have no derivatives: its `adjoint` and
             `steps` are not used.
@@ -347,7 +347,7 @@ def make_flight_study(
     """Study of simulated motions.
 
     Args:
-        evaluation: what is simulated and kept of each run. factors: distributions by name.
+        evaluation: simulation of each run, and its stored quantities. factors: distributions by name.
         failure: condition under which completed runs count as failures; default none.
         settings: samples, seed, design, lanes and others of `Study`.
 

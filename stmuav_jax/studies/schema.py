@@ -87,7 +87,7 @@ Pair = tuple[str, str, Annotated[float, Field(gt=-1, lt=1)]]
 
 
 class QuantityEntry(Entries):
-    """Entry for a quantity that is kept of each run."""
+    """Entry for a quantity that is stored for each run."""
 
     signal: str
     take: Take

@@ -165,7 +165,7 @@ class Store:
             arrays: columns (count, ...) by name.
 
         Raises:
-            SettingError: columns of other names, shapes or types than the study says.
+            SettingError: columns of other names, shapes or types than the study declares.
             FileError: the disk is full or fails, or the folder is gone; chunks written before are kept.
         """
         if self._lock is None:
@@ -456,7 +456,7 @@ def _lock_folder(path: Path) -> int:
 
 
 def _describe_study(study: Any, versions: Mapping[str, str]) -> dict[str, Any]:
-    """Attributes of a store that say what study it is; checks that its columns can be stored.
+    """Attributes of a store that identify its study; checks that its columns can be stored.
 
     Raises:
         SettingError: an identity that is no plain data, or columns that a store cannot hold.

@@ -7,8 +7,8 @@ speeds are the minimum-norm ones that give thrust and moments,
 
 with the derivative B of the wrench at hovering speeds if the rotors have curves, so that the unknowns
 are roll and pitch, the wrench w and two actuator forces: as many as the degrees of freedom. The rotors'
-speeds are then compared with their limits, and the panel's posture with the workspace of the tracker; a
-code says which limit the flight breaks. Derivatives are those of the implicit function.
+speeds are then compared with their limits, and the panel's posture with the workspace of the tracker; a code
+gives the limit that the flight exceeds. Derivatives are those of the implicit function.
 """
 
 from collections.abc import Callable, Mapping

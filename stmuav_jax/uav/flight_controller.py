@@ -273,7 +273,7 @@ def inverse_without_yaw(
 
 
 def as_it_turns(target: Waypoint, base: BaseMotion) -> Waypoint:
-    """Waypoint whose heading is that of the base, and goes on turning as it does."""
+    """Waypoint whose heading and turn rate are those of the base."""
     # A heading that cannot be controlled is taken from the machine itself, else its error would saturate
     # the rotors.
     x, rate = base.R[:, 0], (base.R @ skew(base.omega))[:, 0]
@@ -303,7 +303,7 @@ class FlightMemory(NamedTuple):
 
 
 class Feet(eqx.Module):
-    """Feet of the base of a machine, as its controller knows them.
+    """Feet of the base of a machine, in its controller's model.
 
     Attributes:
         places: from the base's centre of mass, its axes (k, 3) [m].

@@ -2,7 +2,7 @@
 
 Gyroscope and accelerometer drive the kinematics of the base, so that no forces need to be known, and
 position and attitude fixes correct it, at their own rates and late by their delays
-(`stm.estimation.inertial`). The panel angles are estimated beside it from the encoders of the strokes, or the
+(`stm.estimation.inertial`). The panel angles are estimated separately from the encoders of the strokes, or the
 coordinates of any other chain of joints from theirs, with accelerations taken as white noise.
 
 Source: J. Sola, Quaternion kinematics for the error-state Kalman filter, arXiv:1711.02508 (2017),

@@ -180,7 +180,7 @@ def test_files_that_have_no_report_are_told_apart(saved, tmp_path, capsys):
     np.savez(tmp_path / "linear.npz", A=np.eye(2))
     assert "it holds A, and lacks states, t" in said(tmp_path / "linear.npz")
     xr.Dataset({"rain": ("day", [1.0])}).to_netcdf(tmp_path / "w.nc", engine="h5netcdf")
-    assert "of another program" in said(tmp_path / "w.nc")
+    assert "from another program" in said(tmp_path / "w.nc")
     whole = (saved / "run.nc").read_bytes()
     (tmp_path / "run.nc").write_bytes(whole[:-_SEAL_LENGTH])
     assert "is damaged, cut" in said(tmp_path / "run.nc")

@@ -307,7 +307,7 @@ def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
         ({"wind__steady": [0.0, 0.0, 0.0]}, "must not be zero"),
         ({"tolerances__sink": 0.01}, "'tolerances.sink' needs a landing gear"),
         ({"tolerances__touchdown": 0.0}, "'tolerances.touchdown' must be greater than 0"),
-        ({"sensors": {"position": {"rate": 33.0}}}, "not a whole part"),
+        ({"sensors": {"position": {"rate": 33.0}}}, "does not divide"),
         ({"payload": {"mass": 0.1, "position": [0.0, 0.0, 0.0]}}, r"\[payload\] needs the tracker"),
         ({"controller__payload": "known"}, r"known, but the mission has no \[payload\]"),
         ({"controller__payload": "estimated"}, "from gyroscope and accelerometer"),

@@ -1,6 +1,6 @@
 """Singular postures and jumping drivers: messages on failures of the constraints, and the branches that meet.
 
-In a singular posture rows of the constraint Jacobian J are dependent that are independent beside it.
+In a singular posture, rows of the constraint Jacobian J are dependent that are independent nearby.
 With W the combinations of rows that vanish there, and N the free velocities, both orthonormal, the
 rank that a free velocity u gains is, to first order, that of
 
@@ -199,7 +199,7 @@ Look = Callable[[State], Float[np.ndarray, "k m v"]]
 
 
 class Branching(NamedTuple):
-    """Rank that the constraint Jacobian gains beside a posture.
+    """Rank that the constraint Jacobian gains near a posture.
 
     Attributes:
         gained: largest rank that is gained along a free motion; zero unless the posture is singular.
@@ -224,7 +224,7 @@ class Branching(NamedTuple):
 def find_branches(
     model: AugmentedModel, state: State, matrix: Float[np.ndarray, "m v"], look: Look
 ) -> Branching:
-    """Rank gained beside a posture, along its velocities and along any.
+    """Rank gained near a posture, along its velocities and along any.
 
     Args:
         model: system prepared for maximal coordinates, with the rows of all joints.

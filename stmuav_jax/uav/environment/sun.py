@@ -184,7 +184,7 @@ def sun_at(when: Any, place: Place, *, air: Air | None = None, night: bool = Fal
 
     Args:
         when: a datetime with a time zone, or text such as 2024-03-21T09:00+07:00, in the years 1950
-            to 2110. Of a time that clocks show twice, `fold` of the datetime tells which is meant.
+            to 2110. Of a time that clocks show twice, `fold` of the datetime selects one.
         air: air that refracts the light; by default there is none.
         night: accept a sun below the horizon.
 

@@ -11,7 +11,7 @@ where the shapes T_i are those of the layout plus an offset, so that the thrust 
 carries the vehicle; the angular momentum of the rotors makes S and, as it turns with the body, G; an accelerometer at
 b from the centre of mass reads
 
-    a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + E (q, -p, 0) + forces that nobody knows,
+    a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + E (q, -p, 0) + unknown forces,
 
 where drag that acts above or below the centre of mass makes E. The velocity v is not logged. By v' = f + g - w x v,
 with gravity g in body axes by the gyroscope,

@@ -47,7 +47,7 @@ def tracker(
 
     Args:
         case: 1 slider forces, 2 panel force, 3 panel moment.
-        servo: holds both sliders, beside the case's forces; the report has none.
+        servo: holds both sliders, in addition to the case's forces; the report has none.
         stops: at the ends of both sliders' strokes. friction: in both slider joints.
         strokes: prescribe both sliders' displacements from the initial posture: a `Strokes`, or
             functions of t [s] to [m] (see `stmuav_jax.uav.tracker.bodies.stroke_drivers`); the

@@ -324,7 +324,7 @@ def aim(
 
 
 def why_outside(geometry: TrackerGeometry, limits: Limits, margins: Margins, reason: Reason) -> str:
-    """Text that says which limit of the workspace one posture breaks, and by how much."""
+    """Text that names the limit of the workspace that a posture exceeds, and by how much."""
     if reason == Reason.TILT:
         limit, excess = np.degrees(float(limits.tilt)), -np.degrees(float(margins.tilt))
         return (
