@@ -244,7 +244,9 @@ def capacity_of(
     explicit = isinstance(problem.solver().solver, NonDenseRungeKutta)
     steps = adjoint.recorded_steps or max((KEPT if explicit else CHECKPOINTS) // segments, 64)
     if explicit:
-        return RecordCapacity.of(min(most, steps), most, segments, problem.n_state + problem.n_internal)
+        return RecordCapacity.of(
+            min(most, steps), most, segments, problem.n_state + problem.n_internal
+        )
     return diffrax.RecursiveCheckpointAdjoint(checkpoints=min(most, steps))
 
 

@@ -25,7 +25,7 @@ from ...math.newton import EventBisection
 from ...mechanics.state import State
 from ..formulations.base import Residuals
 from ..method import DiscreteAdjoint
-from .adjoint import RecordCapacity, integrate_recorded, capacity_of
+from .adjoint import RecordCapacity, capacity_of, integrate_recorded
 from .problem import (
     Counts,
     IntegrationState,
