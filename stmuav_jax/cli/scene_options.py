@@ -34,7 +34,7 @@ def scene_command(
     """
     scene = named_scene(settings, arguments)
     scene_argument = tyro.conf.arg(
-        help="Name of a scene, as `stmuav list` has it, or a model's file: .toml, .xml, .urdf."
+        help="Name of a scene (see `stmuav list`), or a model's file: .toml, .xml, .urdf."
     )
     model = () if scene is None or scene in SCENES else (scene,)
     fields: list[Any] = [

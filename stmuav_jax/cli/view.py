@@ -49,7 +49,7 @@ class View:
     """Write a report of the result to this file, a page with verdict, tables and figures, which works without
     network."""
     beside: Annotated[Path | None, default_text("none")] = None
-    """A second run, shown beside the first."""
+    """A second run, shown next to the first."""
     html: Annotated[Path | None, default_text("a temporary file, which the browser opens")] = None
     """File for the page, which works without network; the browser is then not opened."""
     sun: Annotated[

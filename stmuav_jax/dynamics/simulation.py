@@ -718,7 +718,7 @@ def _estimate_errors(
     """Error estimate, by a run at larger tolerances if the second run has stopped early."""
     first, second = integration.trajectory, integration.second
     if second is None:
-        return empty_estimate(first, "none was asked for")
+        return empty_estimate(first, "none was requested")
     rates = None
     happened = same_result(first.result, diffrax.RESULTS.event_occurred)
     if analysis and happened:

@@ -507,9 +507,7 @@ def _assemble_log(source: Path, draft: LogDraft) -> FlightLog:
     gaps = tuple(gap for name, channel in channels.items() for gap in _find_gaps(name, channel))
     duration = max(float(channel.ts[-1]) for channel in channels.values())
     if draft.is_simulated:
-        draft.notes.append(
-            "The log was written by a simulator, so it says nothing of a real vehicle."
-        )
+        draft.notes.append("The log was written by a simulator, not by a real vehicle.")
     switches = {}
     for name, (ticks, states) in draft.switches.items():
         order = np.argsort(ticks, kind="stable")

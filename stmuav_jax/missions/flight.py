@@ -130,14 +130,14 @@ def describe_failure(mission: Mission, rows: Rollout, run: LoopRun) -> str:
     if machine.force is not None:
         note_first(
             np.abs(signals["commanded_force"]) > machine.force,
-            lambda k: f"the servo asked slider {k[1] + 2} for more than {machine.force:g} N",
+            lambda k: f"the servo commanded slider {k[1] + 2} more than {machine.force:g} N",
         )
     note_first(signals["tilt_error"] > np.pi / 2, lambda k: "the base was upside down")
     # A flight that diverges passes limits long before its numbers overflow: the first of them is
     # the useful message.
     t_end = run.certificate.t_end
     if rows.ts[-1] < t_end:
-        exits.append((len(rows.ts), "it asked its battery for more than that can give"))
+        exits.append((len(rows.ts), "its power demand exceeded that of the battery"))
     if not exits:
         return run.failure
     k, exit_text = min(exits)

@@ -131,7 +131,7 @@ class Machine(NamedTuple):
         nominal: system of the controller's model, without the unknown payload; None where it is
             that of the scene. `bodies` are those of the controller's model.
         force: largest force of each of the tracker's actuators, either way [N]; None for no limit.
-        model: the model's file; None for a ready scene. joints: its driven joints.
+        model: the model's file; None for a built-in scene. joints: its driven joints.
     """
 
     scene: Scene
@@ -214,7 +214,7 @@ def scene_of(
     """Scene of a mission's machine in its air, with a table of parameters, which may be traced.
 
     Args:
-        gusts: seed of the gusts in place of the mission's. model: a model's file; None for a ready scene.
+        gusts: seed of the gusts in place of the mission's. model: a model's file; None for a built-in scene.
 
     Raises:
         SettingError: wind without drag, gusts without wind, options that the scene does not have.

@@ -1,4 +1,4 @@
-"""Missions from TOML files: read, checked before the flight, and made ready to fly."""
+"""Missions from TOML files: read, checked before the flight, and prepared to fly."""
 
 import dataclasses
 import itertools

@@ -102,5 +102,5 @@ def ready(name: str) -> dict[str, Any]:
         SettingError: an unknown name.
     """
     if name not in READY:
-        raise SettingError(f"There is no ready study '{name}'.{nearest_names(name, READY)}")
+        raise SettingError(f"There is no built-in study '{name}'.{nearest_names(name, READY)}")
     return {"name": name} | READY[name]

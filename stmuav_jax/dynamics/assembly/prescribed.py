@@ -148,7 +148,7 @@ def _check_path(system: System, path: KinematicPath, guess: State, free: tuple[i
     explanation = {
         PathReason.NOT_CONVERGED: "no posture satisfies the joints and drivers near the one before",
         PathReason.SINGULAR: "the mechanism is in a singular posture",
-        PathReason.BRANCH: "the posture found belongs to another branch",
+        PathReason.BRANCH: "the posture belongs to another branch",
     }[code]
     raise StateError(
         f"The path stops at t = {float(path.ts[k]):.6g} s: {explanation} (largest residual "

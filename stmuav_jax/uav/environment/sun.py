@@ -240,7 +240,7 @@ def sensed_sun(s_b: Numbers) -> Float[Array, "3"]:
         raise StateError(f"The sun's direction must be three numbers, not {direction.shape}.")
     check_finite(direction, "The sun's direction", "", StateError)
     if has_values(direction) and not np.any(np.asarray(direction)):
-        raise StateError("The sun's direction has no length: the sensor sees no sun.")
+        raise StateError("The sun's direction has zero length: the sensor does not detect the sun.")
     return sensed_direction(direction).s_b
 
 
