@@ -57,11 +57,11 @@ class Montecarlo:
 
 def plain_of(command: Montecarlo) -> dict[str, Any]:
     """Plain data of the study, with the changes by the options."""
-    from ..studies.examples import ready
+    from ..studies.examples import load_builtin_study
     from ..studies.study_file import load_study
 
     is_file = command.study.endswith(".toml") or os.sep in command.study
-    plain = load_study(command.study) if is_file else ready(command.study)
+    plain = load_study(command.study) if is_file else load_builtin_study(command.study)
     if command.seed is not None:
         plain["seed"] = command.seed
     return plain

@@ -95,7 +95,7 @@ READY |= {
 }
 
 
-def ready(name: str) -> dict[str, Any]:
+def load_builtin_study(name: str) -> dict[str, Any]:
     """Plain data of a predefined study.
 
     Raises:
