@@ -183,7 +183,7 @@ def test_files_that_have_no_report_are_told_apart(saved, tmp_path, capsys):
     assert "from another program" in said(tmp_path / "w.nc")
     whole = (saved / "run.nc").read_bytes()
     (tmp_path / "run.nc").write_bytes(whole[:-_SEAL_LENGTH])
-    assert "is damaged, cut" in said(tmp_path / "run.nc")
+    assert "is damaged, truncated" in said(tmp_path / "run.nc")
     (tmp_path / "run.nc").write_bytes(whole[:5000] + b"x" + whole[5001:])
     assert "damaged" in said(tmp_path / "run.nc")
     (tmp_path / "flight.nc").write_bytes(b"")
