@@ -61,13 +61,13 @@ def make_study(t1: float) -> stm.Study:
 
 
 def share(columns: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Share of the flights that kept all, with its interval, and quantiles of the largest errors."""
-    found = probability(int(np.sum(columns["kept"])), len(columns["kept"]))
+    """Share of the flights that met tolerances and limits, with its interval, and quantiles of the largest errors."""
+    found = probability(int(np.sum(columns["met"])), len(columns["met"]))
     fine = columns["status"] == 1
     tilt = np.degrees(columns["tilt_error"][fine])
     quantiles = lambda x: {f"{q:g}": float(np.quantile(x, q)) for q in (0.5, 0.95, 0.99, 1.0)}
     return {
-        "flights": len(fine), "kept": int(np.sum(columns["kept"])), "not_finite": int(np.sum(~fine)),
+        "flights": len(fine), "kept": int(np.sum(columns["met"])), "not_finite": int(np.sum(~fine)),
         "share": found.value, "share_low": found.low, "share_high": found.high,
         "position_m": quantiles(columns["position_error"][fine]) if np.any(fine) else {},
         "tilt_degrees": quantiles(tilt) if np.any(fine) else {},
@@ -85,7 +85,7 @@ def measure(size: Size) -> Iterator[dict[str, Any]]:
         times.append(time.perf_counter() - clock)
         columns = {k: np.concatenate([part[k] for part in parts]) for k in parts[0]}
         steady = times[1:] or times
-        rate = (len(columns["kept"]) - (of.unit if times[1:] else 0)) / sum(steady)
+        rate = (len(columns["met"]) - (of.unit if times[1:] else 0)) / sum(steady)
         yield {
             "t1": size.t1, "deviation": DEVIATION, "factors": list(FACTORS), **share(columns),
             "first_block_s": times[0], "flights_per_second": rate,

@@ -240,7 +240,7 @@ def step_rates(content: Row) -> str:
 
 def gradient_costs(content: Row) -> str:
     """Time and error of derivatives at a tolerance of 1e-8."""
-    head = ["mode", "run", "in simulations", "relative error", "compile [s]"]
+    head = ["mode", "run", "run / simulation", "relative error", "compile [s]"]
     rows = [
         [row["mode"], duration(row["seconds"]["median"]), f"{row['cost_in_simulations']:.1f}", power(row["error"]),
          number(row["compile_seconds"])]

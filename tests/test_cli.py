@@ -99,7 +99,7 @@ def test_parameters_and_solver_reach_the_run(tmp_path, capsys):
     certificate = json.loads((tmp_path / "certificate.json").read_text())["certificate"]
     assert certificate["position_error"] is None
     assert certificate["estimate_seconds"] == 0.0
-    assert "There is no error estimate: none was asked for." in capsys.readouterr().out
+    assert "There is no error estimate: none was requested." in capsys.readouterr().out
     data = load(tmp_path / "run.nc")
     assert json.loads(data.attrs["parameters"])["bare.lift_factor"]["value"] == 1.2
     assert json.loads(data.attrs["settings"])["solver"] == "Tsit5"

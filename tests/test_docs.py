@@ -104,7 +104,7 @@ CHECKS = {
     "own_data": lambda n: abs(n["out"].mean[-1, 1] + 9.81 * 0.5) < 0.5,
     "parallel_robot": lambda n: (
         n["distance"] < 1e-7
-        and abs(n["held"].values[0] - 36.14202518) < 1e-6
+        and abs(n["trim"].values[0] - 36.14202518) < 1e-6
         and np.allclose(
             jax.jacfwd(n["find_place"])(0.45),
             (n["find_place"](0.4501) - n["find_place"](0.4499)) / 2e-4,

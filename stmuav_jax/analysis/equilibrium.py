@@ -77,8 +77,8 @@ class Trim(eqx.Module):
         residuals: differences from the target accelerations, rates of the forces' states, and further
             conditions (e,), in `residual_units`.
         conditioning: smallest over largest singular value of the Jacobian with scaled unknowns;
-            near zero, other trims lie near. A ratio does not show inputs that all lose their hold
-            together: see `notes`.
+            near zero, other trims are close. The ratio does not reveal inputs that all lose their effect: see
+            `notes`.
         converged: true if the residual is below `TOLERANCE`; point and values are NaN otherwise.
         steps: number of steps of Newton's method.
         inputs: names and units of the values.
@@ -112,9 +112,9 @@ class Trim(eqx.Module):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on inputs that are large beside the weight, and on inputs without hold.
+        """Sentences on inputs that are large compared with the weight, and on inputs with little effect.
 
-        A note says where an input exceeds `LARGE` times the weight, in N m weight times size, and where
+        A note names inputs above `LARGE` times the weight (for moments, times the weight and the size), and says where
         the smallest singular value of `effect` falls below `WEAK`: a direct singularity (type 2) is near.
         For a single trim, not for a stack. A trim that was not found has no notes.
         """
@@ -340,7 +340,7 @@ def trim(
             be met by free states; a module or function made once, since it is compiled in.
         sizes: changes of the unknowns that count as equally far from the start, free states first,
             then inputs (k,); default one for states, and for inputs their starts or one.
-        directions: combinations of inputs that may be chosen (m, d), such as those of least norm for a
+        directions: combinations of inputs that may be chosen (m, d), such as those of minimum norm for a
             wrench; `sizes` are then those of the states and of the d combinations, which are one by
             default. Default: every input by itself.
         t: time [s], where forces or joints depend on it.
@@ -471,7 +471,7 @@ def _check_efforts(problem: _Problem, efforts: Float[np.ndarray, " l"]) -> None:
 def _find_speed_limits(
     system: System, inputs: Inputs
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Smallest and largest squared speeds of rotors with limits, with room for round-off; else infinite."""
+    """Smallest and largest squared speeds of rotors with limits, with a margin for round-off; else infinite."""
     lowest, highest = [], []
     for entry in inputs.entries:
         limits: Any = getattr(system.forces[entry.force], "squared_limits", None)
@@ -508,7 +508,7 @@ class FlightCondition(NamedTuple):
         sun: direction to the sun, world (3,), or None.
         yaw: heading [rad]. v: velocity of the base, world (3,) [m/s].
         rate: rate of turn about the vertical [rad/s].
-        acceleration: acceleration of the base beside that of the turn, world (3,) [m/s^2].
+        acceleration: acceleration of the base in addition to that of the turn, world (3,) [m/s^2].
     """
 
     angles: Float[Array, "2"] | None

@@ -1,4 +1,4 @@
-"""Statistics of a least-squares fit to a record in time: honest deviations, and a verdict in words.
+"""Statistics of a least-squares fit to a record in time: deviations for correlated residuals, and a verdict.
 
 With whitened residuals r (k rows in time, m columns) and their Jacobian J, errors of the estimates
 have the covariance A^-1, A = J^T J, if r is white with deviations of one. If r is correlated, sums of the
@@ -92,7 +92,7 @@ class Fit(NamedTuple):
 
 @dataclass(frozen=True)
 class Deviations:
-    """Standard deviations of the estimates, by what they are made of.
+    """Standard deviations of the estimates, with their parts.
 
     The combination is scale * white where the residuals are white, else blocks; the scatter of the
     windows is added to it as an independent error.
@@ -100,7 +100,7 @@ class Deviations:
     Attributes:
         white: those of white residuals with the given deviations (p,).
         scale: square root of the reduced chi-squared where that is larger than chance allows, else 1.
-        blocks: those by blocks of correlated residuals (p,); None where the residuals are white.
+        blocks: those from blocks of correlated residuals (p,); None where the residuals are white.
         block_rows: rows of a block. correlation_rows: rows over which residuals are correlated.
         windows: scatter of the parameters between windows beyond their deviations (p,); zero where the
             windows agree.
@@ -134,8 +134,8 @@ class FitVerdict(NamedTuple):
             deviations of the record; "undecided": too few numbers; "failed": not at a minimum.
         p_values: p-value of every test that was made, by its name.
         chi_square_interval: interval of the reduced chi-squared at the level of its test.
-        level: probability with which a right model is called inconsistent.
-        explanation: sentences on what was found and what it points to.
+        level: probability with which a correct model is called inconsistent.
+        explanation: sentences on the findings and their usual causes.
     """
 
     status: Status
@@ -419,7 +419,7 @@ def judge_fit(
     faults: tuple[str, ...] = (),
     is_start_exact: bool = False,
 ) -> FitVerdict:
-    """Verdict on a fit, in words.
+    """Verdict on a fit, with its explanation.
 
     Args:
         bound_labels: parameters that ended at a bound. faults: sentences on physical bounds that the

@@ -1,4 +1,4 @@
-"""Parameters from the record of a motion of any mechanism: values, their uncertainty, and what cannot be told.
+"""Parameters from the record of a motion of any mechanism: values, uncertainty, unidentifiable combinations.
 
 With predictions h(q, e) of a record y whose errors have standard deviations sigma, the estimates
 minimise the sum of squares of
@@ -107,7 +107,7 @@ class Identified:
         covariance: covariance of their errors (p, p): of white residuals, or by blocks where residuals are
             correlated, with the scatter between windows; `deviations` has the parts.
         standard_deviations: standard deviations of their errors (p,), from `covariance`.
-        deviations: what the standard deviations are made of.
+        deviations: parts of the standard deviations.
         singular_values: singular values of J in units of the sizes, largest first (p,): reciprocals of
             the standard deviations of white residuals along each direction, relative to the parameters'
             sizes, with an unknown start.
@@ -185,7 +185,7 @@ class MotionModel(eqx.Module):
         readings: function (p + s,) -> space of a row of the record.
         start: function (p + s,) -> state space, mean of the start, and the start itself.
         spread: function of the state space -> root (n, s) of the covariance of the start's errors.
-        faults: function (p + s,) -> sentences on what no mechanism can be, such as a negative mass.
+        faults: function (p + s,) -> sentences on unphysical values, such as a negative mass.
         start_count: number s of the start's errors, zero for an exact start.
     """
 
@@ -219,7 +219,7 @@ def motion_model(
     """Predictions (k, c) of the record of a motion, as a function of parameters (p,).
 
     A start with deviations, or a `Gaussian` on the state space, is a prior: its errors become unknowns of
-    `identify`. A start without is taken as exact, and every error of it goes into the parameters.
+    `identify`. A start without deviations is taken as exact, so that its errors bias the parameters.
 
     Args:
         make: function parameters -> make_space: a state space, or a system, whose coordinates are
@@ -239,7 +239,7 @@ def motion_model(
     Raises:
         SettingError: times that do not increase, an unknown name, a sensor whose readings are no
             array, one component of a rotation vector without the others, a system without `space`, or two
-            priors of the start. ModelError: a covariance that is none.
+            priors of the start. ModelError: an invalid covariance.
     """
     if has_values(ts):
         increasing_times(ts, "The times of the record")
@@ -311,7 +311,9 @@ def _start_spread(
     """Number s of the start's errors, and the root (n, s) of their covariance in a state space."""
     if isinstance(start, Gaussian):
         if deviations is not None:
-            raise SettingError("The start is a Gaussian: it needs no start_deviations beside it.")
+            raise SettingError(
+                "The start is a Gaussian, which contains its deviations: leave start_deviations out."
+            )
         factor = np.asarray(start.factor)
     elif deviations is None:
         return 0, lambda space: np.zeros((space.size, 0))
@@ -358,15 +360,15 @@ def start_from_readings(
     *,
     without: Collection[str] = (),
 ) -> tuple[Float[np.ndarray, " n"], dict[str, float]]:
-    """Step (n,) from a supposed start to that of the first readings, and wide deviations of it by state.
+    """Step (n,) from an assumed start to that of the first readings, and its wide deviations by state.
 
     A state whose column is in the record starts at its first reading, a rate whose coordinate is there at the
-    slope of the first two; other states keep the supposed start, as exact. Deviations are ten times those of
-    the readings, so that readings that are used twice count for a hundredth more.
+    slope of the first two; other states keep the assumed start, as exact. Deviations are ten times those of the
+    readings, so that using readings twice adds only a hundredth of their information.
 
     Args:
         names: names of the columns. ts: times (k,) [s]. record: (k, c). sigma: deviations of a row (c,).
-        values: values of columns and states at the supposed start, by name.
+        values: values of columns and states at the assumed start, by name.
         readings: space of a row; by default a vector.
         without: states that are left as they are.
     """

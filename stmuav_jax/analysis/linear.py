@@ -79,7 +79,7 @@ class Linear:
     outputs: tuple[tuple[str, str], ...]
 
     def modes(self) -> list[Mode]:
-        """Modes by falling real part, with the states that take part in each.
+        """Modes in order of decreasing real part, with the dominant states of each.
 
         The share of a state is |d s / d a_jj| over the sum of these, with the participation factors
 
@@ -87,7 +87,7 @@ class Linear:
 
         of left and right eigenvectors l, r. No matrix of eigenvectors is inverted: that of a machine with
         rigid-body modes is singular. The shares of an eigenvalue in a cluster, such as those at zero of a
-        free body or those of two equal pendulums, are not determined; `refusal` says so.
+        free body or those of two equal pendulums, are not determined; `refusal` gives the reason.
 
         Source: I. J. Perez-Arriaga, G. C. Verghese, F. C. Schweppe, Selective modal analysis, IEEE Trans.
         Power Apparatus and Systems 101 (1982) 3117-3125.
@@ -304,7 +304,7 @@ def linearize(
     if not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
         raise StateError(
             "The motion cannot be linearised at this point: the accelerations or their derivatives "
-            "are not finite. Either the point is not, or a force jumps there."
+            "are not finite. The point itself is not finite, or a force is discontinuous there."
         )
     C = np.eye(len(names))[list(chosen)]
     return Linear(

@@ -46,7 +46,7 @@ _GROUP = 4
 
 
 class SegmentStart(NamedTuple):
-    """State of the bodies and actuators that a flight goes on from.
+    """State of the bodies and actuators from which a flight continues.
 
     Attributes:
         state: state of all bodies.
@@ -328,7 +328,7 @@ class Shooting(eqx.Module):
         return self.residuals(unknowns)
 
     def evaluated(self, unknowns: Any, *, columns: bool = True) -> tuple[Any, Any]:
-        """Residuals, and the columns of their Jacobian, which are wrong where they are not wanted.
+        """Residuals, and the columns of their Jacobian, which are valid only where they are requested.
 
         All segments of all motions of a search are flown by one program, with and without derivatives.
         """

@@ -1,4 +1,4 @@
-"""Inverse dynamics of any mechanism along a path, and how far clearances of its joints move it.
+"""Inverse dynamics of any mechanism along a path, and the effect of joint clearances on its pose.
 
 Along a path with known accelerations a, the inputs u balance the generalised forces on all independent motions N,
 
@@ -184,7 +184,7 @@ def compare_clearances(
     if np.sum(rank_mask) < J.shape[1]:
         raise SettingError(
             f"With {', '.join(locked) or 'nothing'} locked the mechanism keeps {J.shape[1] - int(np.sum(rank_mask))} "
-            "degrees of freedom: lock as many joints as it has, away from singular postures."
+            "degrees of freedom: lock one joint for each, away from singular postures."
         )
     # The pseudoinverse is taken from the singular values at hand; rows that repeat others share an
     # error, as in a real overconstrained mechanism.

@@ -287,7 +287,7 @@ def sensed_motion_at(
 
     Args:
         system: system with the same mechanism and other forces; by default the space's own.
-        accelerations: false for accelerations of NaN, which cost nothing.
+        accelerations: false to leave accelerations out, which are then NaN.
     """
     sensed_system = space.system if system is None else system
     if not accelerations:
@@ -350,7 +350,7 @@ def check_sensors(sensors: tuple[AbstractSensor, ...]) -> None:
 
 
 class Output(NamedTuple):
-    """Scalar output of a mechanism: a function of (system, state), with its unit and words."""
+    """Scalar output of a mechanism: a function of (system, state), with its unit and label."""
 
     of: Callable[[System, State], Float[Array, ""]]
     unit: str

@@ -42,7 +42,7 @@ from .multiple_shooting import Shooting, make_shooting
 
 
 class TunedMotion(NamedTuple):
-    """A motion under inputs that are tuned, as residuals see it.
+    """A motion under tuned inputs, the argument of residuals.
 
     Attributes:
         ts: times after the start (m,) [s].
@@ -123,11 +123,11 @@ def roughness(motion: TunedMotion) -> Float[Array, "m k"]:
 
 
 class Limit(eqx.Module):
-    """Penalty residuals: zero where a limit is kept, else proportional to the excess over it.
+    """Penalty residuals: zero where a limit is met, else proportional to the excess over it.
 
-    The motion is looked at where it is known: its states at the output times, its inputs at all times
+    The limit is evaluated where the motion is known: its states at the output times, its inputs at all times
     through `TunedMotion.extremes`. A penalty is no guarantee: where a limit conflicts with the other
-    residuals, the best motion passes it. `InputTuning.search` checks that and says so.
+    residuals, the best motion exceeds it. `InputTuning.search` checks and reports this.
 
     Attributes:
         excess: function motion -> excess over the limit, negative inside, as a share of some size:
@@ -212,7 +212,7 @@ class InputTuning:
     """A least-squares problem whose values are inputs; see `tune_inputs`.
 
     Attributes:
-        name: name that tells the problem from others in files.
+        name: name that identifies the problem in files.
         residuals: residuals for `search`.
         start: initial unknowns of the search.
     """
@@ -223,7 +223,7 @@ class InputTuning:
     _motions: dict[Any, TunedMotion] = field(default_factory=dict, repr=False, compare=False)
 
     def inputs(self, values: Any) -> Any:
-        """The inputs that the values of a search stand for: numbers (k,), or a history of them."""
+        """Inputs of the values of a search: numbers (k,), or a history of them."""
         return self.residuals.cost.driven.signals(values["values"])  # pyright: ignore
 
     def search(self, method: SearchMethod | None = None, **options: Any) -> Search:

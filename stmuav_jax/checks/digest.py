@@ -1,4 +1,4 @@
-"""Digest of a function with all that it refers to, which tells a study of it from another study."""
+"""Digest of a function with all that it refers to, which identifies the function that a study evaluates."""
 
 import dataclasses
 import dis
@@ -23,7 +23,7 @@ def digest_value(value: Any) -> str:
     What belongs to this package or to an installed one enters by its name; its version is recorded apart.
 
     Raises:
-        SettingError: a value whose content cannot be told, such as an open file.
+        SettingError: a value whose content cannot be read, such as an open file.
     """
     digest = hashlib.sha256()
     _feed_value(digest.update, value, {})
@@ -85,7 +85,7 @@ def _feed_value(feed: Callable[[bytes], object], value: Any, visited: dict[int, 
     else:
         raise SettingError(
             f"The content of a value of type {module}.{type(value).__name__}, to which the function refers, "
-            "cannot be told: give it as a number, an array or a dataclass of these, or state the identity."
+            "cannot be read: give it as a number, an array or a dataclass of these, or state the identity."
         )
 
 

@@ -174,9 +174,9 @@ def check_inertia(inertia: Numbers, owner: str, tolerance: float) -> None:
     excess = moments[2] / (moments[0] + moments[1]) - 1
     if excess > max(tolerance, _ROUND_OFF):
         raise ModelError(
-            f"The inertia tensor of {owner} breaks the triangle inequality: of its principal moments "
+            f"The inertia tensor of {owner} violates the triangle inequality: of its principal moments "
             f"{listed} kg m^2 the largest exceeds the sum of the other two by "
-            f"{100 * excess:.3g} %. Correct the entry, or admit a rounded table by "
+            f"{100 * excess:.3g} %. Correct the entry, or accept a rounded table by "
             f"triangle_tolerance={excess * 1.01:.2g}."
         )
 
@@ -215,7 +215,7 @@ def check_unit(p: Numbers, subject: str, error: type[Exception]) -> None:
         raise error(f"The Euler parameters of {subject} are all zero, but a rotation needs norm 1.")
     raise error(
         f"The Euler parameters of {subject} must have norm 1, but {values.tolist()} has norm "
-        f"{norm:.12g}. If they are right up to scale, divide them by their norm "
+        f"{norm:.12g}. If only their scale is wrong, divide them by their norm "
         "(stmuav_jax.rotation.normalise); if they were printed with few digits, find the nearest posture "
         "that the joints allow with stmuav_jax.assemble."
     )

@@ -1,4 +1,4 @@
-"""Checks of what users write in files and options, with errors in the users' own words.
+"""Checks of entries in files and options, with errors that name the entry, its value and the valid values.
 
 A pydantic model states the names, types and ranges of a file's entries; `validate_model` validates plain data by
 it. An option of a scene is a dataclass whose fields `quantity` describes; `option_from_plain` makes one.
@@ -243,7 +243,7 @@ def name_fault(name: str) -> str | None:
 def _check_name(name: str) -> str:
     if fault := name_fault(name):
         raise ValueError(
-            f"must {fault}, since a folder has it too, but it is {format_value(name)}."
+            f"must {fault}, since it also names a folder, but it is {format_value(name)}."
         )
     return name
 

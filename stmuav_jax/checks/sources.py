@@ -1,4 +1,4 @@
-"""Digest of the package's sources, which tells the code that computes a number from code that is a little different.
+"""Digest of the package's sources, which identifies the code that computed a number.
 
 Two states of a checkout have one version number, so results that are to be continued later hold it as well.
 """

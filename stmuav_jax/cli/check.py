@@ -28,11 +28,11 @@ class CheckSettings:
     cache: Cache = True
 
 
-ABOUT = """Inspect a scene, or a model's file, at its start: what is wrong, and what a run will demand.
+ABOUT = """Inspect a scene, or a model's file, at its start: faults, and requirements of a run.
 
 Example: stmuav check model.toml; stmuav check uav_tracker --case 2. Units and magnitudes, inertia,
-degrees of freedom, dependent and contradictory constraints, residuals, conditions, singular postures,
-stiffness, formulation and solver. Exit codes: 0 notes at most, 1 warnings, 2 faults or bad input.
+degrees of freedom, dependent and contradictory constraints, residuals, condition numbers, singular
+postures, stiffness, formulation and solver. Exit codes: 0 notes at most, 1 warnings, 2 faults or bad input.
 """
 
 

@@ -33,8 +33,7 @@ class Estimate:
     estimated by `stmuav estimate model.toml`; `stmuav estimate model.toml --help` describes that.
 
     Exit code: 0 all filters are consistent with their innovations; 1 a filter lost its covariance;
-    2 wrong input; 3 done, but a filter's own account of its errors cannot be trusted. The report's
-    tuning is of this kind in all eight cases."""
+    2 wrong input; 3 a filter is inconsistent, as with the report's tuning in all eight cases."""
 
     case: Annotated[int | None, _CASE, shared_option("case"), default_text("all 8")] = None
     tuning: Literal["both", "report", "consistent"] = "both"

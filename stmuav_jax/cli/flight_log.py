@@ -37,7 +37,7 @@ class IdentifyLog:
     flight: Annotated[int | None, default_text("the longest")] = None
     """Number of the stretch in flight, from 0."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"]), default_text("none")] = None
-    """Model file to write, with a mission and a study beside it, for check, trim, simulate, fly and montecarlo."""
+    """Model file to write, with its mission and study, for check, trim, simulate, fly and montecarlo."""
     out: Annotated[Path | None, shared_option("out"), default_text("no figures")] = None
     figures: Figures = "png"
     list: bool = False

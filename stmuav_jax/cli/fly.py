@@ -20,27 +20,27 @@ if TYPE_CHECKING:
 class Fly:
     """Fly a mission under control; write flight.nc and figures.
 
-    A mission is a TOML file (docs/control_and_missions.md) or a ready one: hover, case-1 to case-3,
+    A mission is a TOML file (docs/control_and_missions.md) or built in: hover, case-1 to case-3,
     sun-slew, sun-day, waypoints, wind-step, gusts, rotor-weak, rotor-lost, rotor-lost-known,
     slider-jammed, slew-30, battery, takeoff-and-land.
     Example: stmuav fly case-1 --t1 5. Exit code: 0 all tolerances and limits were met; 1 the flight
-    failed; 2 wrong input; 3 flown, but not as the mission asks."""
+    failed; 2 wrong input; 3 a tolerance or a limit was exceeded."""
 
     mission: tyro.conf.Positional[str]
-    """TOML file, or the name of a ready mission."""
+    """TOML file, or the name of a built-in mission."""
     t1: Annotated[float | None, END, shared_option("t1"), default_text("the mission's")] = None
     true_states: bool = False
     """Give the controller the true states in place of estimates from the mission's sensors."""
     truth: Annotated[tuple[str, ...], default_text("the mission's")] = ()
-    """Numbers of the true machine that the controller does not know, such as bare.mass=2.9; names as in studies."""
+    """True parameters that differ from the controller's model, such as bare.mass=2.9; names as in studies."""
     log: bool = False
-    """Write log.csv too, the flight as its instruments and commands show it, which `identify` takes."""
+    """Also write log.csv, the readings and commands of the flight, which `identify` reads."""
     out: Annotated[Path | None, shared_option("out"), default_text("runs/MISSION")] = None
     figures: Figures = "png"
     cache: Cache = True
 
 
-# Exit code of a flight that was flown, but not as the mission asks.
+# Exit code of a flight that exceeded a tolerance or a limit.
 NOT_KEPT = 3
 
 

@@ -1,4 +1,4 @@
-"""The command line, `stmuav`: what its words mean, which command runs, and how errors are said.
+"""The command line, `stmuav`: its arguments, its commands, and its error messages.
 
 The modules of a command are imported when it runs.
 """
@@ -90,7 +90,7 @@ def cache_folder() -> Path | None:
 
 
 def private_folder(path: Path) -> Path | None:
-    """The real path of a folder, made if it is missing, that nobody else can exchange; else None.
+    """The real path of a folder, made if it is missing, that no other user can replace; else None.
 
     JAX reads code from there that becomes part of the process. So the folder is the user's own, its
     parents are the user's or root's, and others may write to none of them; where they may, as in

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass
 class Montecarlo:
-    """Fly a study: a TOML file, or the name of a ready one; write a store, a summary and figures.
+    """Run a study: a TOML file, or the name of a built-in one; write a store, a summary and figures.
 
-    Example: stmuav montecarlo collapse --samples 256; stmuav montecarlo study.toml --resume --figures none. The ready
+    Example: stmuav montecarlo collapse --samples 256; stmuav montecarlo study.toml --resume --figures none. Built-in
     studies are collapse, hover, case_1 to case_3 and estimate_1 to estimate_8. With --figures none only the store is
     written.
     """
 
     study: tyro.conf.Positional[str]
-    """TOML file (docs/studies.md), or the name of a ready study."""
+    """TOML file (docs/studies.md), or the name of a built-in study."""
     samples: Annotated[int | None, count_range("samples", 1e9), default_text("the study's")] = None
     """Number of samples. A larger number extends a finished store."""
     seed: Annotated[int | None, SEED, shared_option("seed"), default_text("the study's")] = None
@@ -57,11 +57,11 @@ class Montecarlo:
 
 def plain_of(command: Montecarlo) -> dict[str, Any]:
     """Plain data of the study, with the changes by the options."""
-    from ..studies.examples import ready
+    from ..studies.examples import load_builtin_study
     from ..studies.study_file import load_study
 
     is_file = command.study.endswith(".toml") or os.sep in command.study
-    plain = load_study(command.study) if is_file else ready(command.study)
+    plain = load_study(command.study) if is_file else load_builtin_study(command.study)
     if command.seed is not None:
         plain["seed"] = command.seed
     return plain

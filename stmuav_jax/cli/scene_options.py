@@ -34,7 +34,7 @@ def scene_command(
     """
     scene = named_scene(settings, arguments)
     scene_argument = tyro.conf.arg(
-        help="Name of a scene, as `stmuav list` has it, or a model's file: .toml, .xml, .urdf."
+        help="Name of a scene (see `stmuav list`), or a model's file: .toml, .xml, .urdf."
     )
     model = () if scene is None or scene in SCENES else (scene,)
     fields: list[Any] = [
@@ -151,7 +151,7 @@ def chosen_scene(command: Any) -> "Scene":
     name, settings = command.scene, command.settings
     floating = getattr(settings, "floating", False)
     if floating and (name in SCENES or name.endswith(".toml")):
-        raise SettingError(f"--floating is for a robot's URDF, and {name} is none.")
+        raise SettingError(f"--floating is for a robot's URDF, which {name} is not.")
     if name in SCENES:
         from ..io.netcdf import load_parameters
 
@@ -161,7 +161,7 @@ def chosen_scene(command: Any) -> "Scene":
     for option in ("case", "params"):
         if getattr(settings, option) is not None:
             raise SettingError(
-                f"--{option} is for the report's scenes; a model's file holds its own numbers."
+                f"--{option} is for the report's scenes; a model's file has its own parameters."
             )
     if name.endswith(".toml"):
         from ..io.model_file import load_model

@@ -81,15 +81,15 @@ class Settings(CheckSettings):
     max_step: Annotated[float | None, LARGEST, default_text("none")] = None
     """Largest step [s]; no step goes beyond a saved time either."""
     jump_times: Annotated[tuple[float, ...], JUMP, default_text("none")] = ()
-    """Times at which forces jump [s]: a step ends before each, the next begins behind it."""
+    """Times at which forces jump [s]: a step ends just before each, the next begins just after it."""
     error_estimate: bool = True
-    """Estimate the run's error by a second run beside it."""
+    """Estimate the run's error by a second run."""
     certificate: Literal["standard", "full"] = "standard"
     """With full, the accelerations are also compared with those of another formulation, which compiles longer."""
     out: Annotated[Path | None, shared_option("out"), default_text("runs/SCENE")] = None
     figures: Figures = "png"
     verbose: bool = False
-    """Print all entries of the accuracy report; without it the six that decide."""
+    """Print all entries of the accuracy report; by default the six main ones."""
     loads: bool = False
     """Also write the reaction loads of the joints, with their peaks between saved times, to loads.csv and a figure."""
 

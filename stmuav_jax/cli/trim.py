@@ -121,7 +121,7 @@ class TrimSettings(LinearSettings, FlightSettings, PostureSettings):
     free: Annotated[tuple[str, ...], default_text("none")] = ()
     """States that may differ from the start, such as hinge.angle."""
     accelerations: Annotated[tuple[str, ...], default_text("zero")] = ()
-    """Wanted rates of velocities, such as rail.displacement_rate=2 [m/s^2, rad/s^2]."""
+    """Target rates of velocities, such as rail.displacement_rate=2 [m/s^2, rad/s^2]."""
     out: Annotated[Path | None, shared_option("out"), default_text("runs/trim_SCENE")] = None
 
 
@@ -331,7 +331,8 @@ def _run_postures(scene: "Scene", settings: TrimSettings) -> int:
     flying = (settings.climb, settings.speed, settings.turn, settings.yaw)
     if settings.linear != "none" or any(trim_options) or any(flying):
         raise SettingError(
-            "--path and --survey go without a linear model, --free, --accelerations, and the options of a flight."
+            "--path and --survey exclude --linear, --free, --accelerations and the options of a flight: "
+            "leave those out."
         )
     write = write_survey if settings.survey else write_path
     folder = results_folder(settings.out, f"trim_{scene.name}")
@@ -530,8 +531,8 @@ def measures_of(linear: "Linear") -> str:
     """Sentence on the modes that inputs move and outputs show."""
     observability_text = f"of observability {np.min(linear.observability()):.2g}"
     if not linear.B.shape[1]:
-        return f"There are no inputs. Least measure {observability_text} (1: seen fully, 0: not at all)."
+        return f"There are no inputs. Smallest measure {observability_text} (1: fully observable, 0: unobservable)."
     return (
-        f"Least measure of controllability {np.min(linear.controllability()):.2g}, {observability_text}, of all modes "
-        "(1 is full, 0 is none)."
+        f"Smallest measure of controllability {np.min(linear.controllability()):.2g}, {observability_text}, over all "
+        "modes (1 is full, 0 is none)."
     )

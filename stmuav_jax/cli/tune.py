@@ -73,8 +73,8 @@ def run_tune(command: Any) -> int:
     search, input_table, is_done, figures = _tune_inputs(command, scene, folder)
     if has_converged(search) and not is_done:
         failure_text = (
-            f"no inputs were found that hold the start: the best leave a loss of {search.loss:.3g}, and "
-            f"below {HOLDS:g} counts as held. {folder} has them."
+            f"no inputs hold the start: the smallest loss is {search.loss:.3g}, but at most {HOLDS:g} is "
+            f"required. {folder} contains the best inputs."
         )
     else:
         failure_text = (

@@ -49,7 +49,7 @@ class View:
     """Write a report of the result to this file, a page with verdict, tables and figures, which works without
     network."""
     beside: Annotated[Path | None, default_text("none")] = None
-    """A second run, shown beside the first."""
+    """A second run, shown next to the first."""
     html: Annotated[Path | None, default_text("a temporary file, which the browser opens")] = None
     """File for the page, which works without network; the browser is then not opened."""
     sun: Annotated[
@@ -227,7 +227,7 @@ def find_result(path: Path) -> Path:
 
     valid = ", ".join(f"{name} (of stmuav {command})" for name, command in NAMES.items())
     if not path.exists():
-        raise FileError(f"There is no file or folder {path}. A report is made of {valid}.")
+        raise FileError(f"There is no file or folder {path}. A report needs {valid}.")
     if not path.is_dir() or (path / "zarr.json").exists():
         return path
     # The folder of a command's results names the file for the user, unless it holds several.
@@ -238,7 +238,7 @@ def find_result(path: Path) -> Path:
         raise FileError(
             f"{path} holds several results: {', '.join(results)}. Name one, such as {path / results[0]}."
         )
-    raise FileError(f"{path} holds no result. A report is made of {valid}.")
+    raise FileError(f"{path} contains no result. A report needs {valid}.")
 
 
 def _load_dataset(source: Path) -> "xr.Dataset":
@@ -262,7 +262,7 @@ def _load_dataset(source: Path) -> "xr.Dataset":
         ) from error
     if data.attrs.get("format", "") != FORMAT:
         raise FileError(
-            f"{source} is damaged, cut or of another program. A report is made of {', '.join(NAMES)}."
+            f"{source} is damaged, truncated or from another program. A report needs {', '.join(NAMES)}."
         )
     return data
 

@@ -61,8 +61,8 @@ class Sample(NamedTuple):
 
     Attributes:
         t: time [s]. state: true state. internal: true states of force elements (z,).
-        estimate, reference, memory: what the controller had, and its memory afterwards.
-        inputs: what it returned (m,). applied, held_inputs: inputs that are held until this sample and from it
+        estimate, reference, memory: arguments of the controller, and its memory afterwards. inputs: its result
+        (m,). applied, held_inputs: inputs that are held until this sample and from it
             on (m,), late by the plant's delay.
         readings: readings by the sensor's name.
     """
@@ -128,8 +128,8 @@ def rollout(
 ) -> Rollout:
     """Close the loop for a number of samples.
 
-    The function is pure: it may be jitted, vmapped and differentiated; reverse derivatives keep the
-    state at each sample and take its steps again. It raises no error for values: `Rollout.reason`
+    The function is pure: it may be jitted, vmapped and differentiated; reverse derivatives store the state at
+    each sample and recompute its steps. It raises no error for values: `Rollout.reason`
     says whether, when and why numbers stopped being finite.
 
     Args:
@@ -258,7 +258,7 @@ class LoopCertificate:
             steps' own error is about 16/15 of it for a method of order 4.
         steps: number of steps that were taken. rejected_steps: of adaptive ones.
         compile_seconds, run_seconds: times of the loop.
-        speed: time simulated per time of computing.
+        speed: simulated time divided by run time.
     """
 
     result: str

@@ -27,7 +27,7 @@ class SensorFault(NamedTuple):
     """Outage of an instrument, whose readings are NaN, or a step of its bias, for a time.
 
     Attributes:
-        at, until: first time of a reading that has it, and first one that has not [s].
+        at, until: times of the first reading with the fault, and of the first one without it [s].
         bias: error that is added, as `Instrument.bias`; None for an outage.
     """
 
@@ -46,7 +46,7 @@ class Instrument(eqx.Module):
             component (c,), in the units of the sensor's errors. A noise density [unit/sqrt(Hz)]
             becomes one by multiplication with sqrt(rate).
         bias: constant error of every reading, as `noise`.
-        delay: time from the motion to the controller's sight of it [s], whole control periods.
+        delay: time from the motion to the arrival of its reading at the controller [s], whole control periods.
         faults: outages and steps of the bias, each a `SensorFault`; several add up.
 
     Raises:
@@ -92,7 +92,7 @@ class Instrument(eqx.Module):
         """Number of control periods between readings at a control rate [Hz].
 
         Raises:
-            SettingError: the rates do not divide.
+            SettingError: the control rate is not a multiple of the sensor's.
         """
         if self.rate is None:
             return 1
@@ -111,8 +111,8 @@ def count_periods(reading_rate: float, rate: float, owner: str) -> int:
     if whole < 1 or abs(ratio - whole) > _WHOLE * ratio:
         floor_count, ceiling_count = max(int(ratio), 1), max(int(ratio), 1) + 1
         raise SettingError(
-            f"{owner} reads at {reading_rate:g} Hz, which is not a whole part of the control rate of "
-            f"{rate:g} Hz: near it are {rate / floor_count:.6g} Hz (every {floor_count} periods) and "
+            f"{owner} reads at {reading_rate:g} Hz, which does not divide the control rate of "
+            f"{rate:g} Hz: the nearest valid rates are {rate / floor_count:.6g} Hz (every {floor_count} periods) and "
             f"{rate / ceiling_count:.6g} Hz (every {ceiling_count} periods)."
         )
     return whole
@@ -131,7 +131,7 @@ def whole_periods(time: float, rate: float, subject: str) -> int:
 
 
 class Reading(NamedTuple):
-    """Reading of an instrument as the estimator sees it.
+    """Reading of an instrument, as passed to the estimator.
 
     Attributes:
         value: the last reading that has arrived.
@@ -214,7 +214,7 @@ class Bench(eqx.Module):
         return _advance_queues(self, queues, motion, system, k, self._draw_noise(k, key))
 
     def oldest_readings(self, queues: tuple[Any, ...]) -> dict[str, Reading]:
-        """Readings that the estimator sees now, by the sensor's name."""
+        """Readings passed to the estimator at this sample, by the sensor's name."""
         oldest_readings = [jax.tree.map(lambda x: x[0], queue) for queue in queues]
         return {
             instrument.name: reading

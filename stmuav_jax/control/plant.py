@@ -1,4 +1,4 @@
-"""Sampled plant: a mechanism whose inputs are held from sample to sample, as a controller sees it.
+"""Sampled plant: a mechanism whose inputs are constant between samples, for controllers.
 
     x_k+1 = motion over a period 1/rate from x_k with inputs u_(k-d) held,   d samples of delay
 
@@ -168,12 +168,11 @@ class PlantState(eqx.Module):
     Attributes:
         k: number of the sample. t: its time [s]. t0: time of the first sample [s].
         state: true state of all bodies. internal: true states of force elements (z,).
-        estimate: what a controller sees.
-        applied: inputs that were held until this sample (m,).
+        estimate: argument of a controller. applied: inputs that were held until this sample (m,).
         readings: readings by the sensor's name.
         motion: state of the integration.
-        pending: inputs on their way, the next first (d, m).
-        queues: readings on their way, by instrument.
+        pending: delayed inputs, the next first (d, m).
+        queues: delayed readings, by instrument.
         memory: memory of the estimator.
         key: random key of the noise.
     """
@@ -209,23 +208,23 @@ class Plant(eqx.Module):
             system's own values.
         delay: time from a sample to the effect of its command [s], whole periods.
         standing: time [s], whole periods, for which the instruments read before the first sample, while
-            the machine is held at its start. The estimator so finds biases and pose before the
-            loop is closed.
+            the machine is held at its start. The estimator thus estimates biases and pose before the loop is
+            closed.
         sensors: sensors, or `Instrument`s with rates and noise.
         estimator: function (readings by name, inputs held until now, memory) -> (estimate,
-            memory). Without one the estimate is the readings by name; without sensors either, it is
-            what `observe` makes of the truth.
+            memory). Without one the estimate is the readings by name; without sensors either, it is `observe`
+            of the true state.
         memory: first memory of the estimator, any pytree of arrays.
         observe: function (t, state, internal states) -> estimate; by default the `State`.
         method: method of integration; by default the classical Runge-Kutta method of order 4 for
             fixed steps, Dopri8 for others. Its `steps` count where their length is not fixed.
         steps: steps in a period; None for steps whose length the method's tolerances choose.
-        changes: times [s], rising, and systems with other numbers that take over from the first sample at
-            each time on, such as the machine without a payload that it drops.
+        changes: increasing times [s], and systems with other parameters that replace it from the first sample
+            at each time on, such as the machine without a payload that it drops.
 
     Raises:
         SettingError: rates or delays that do not divide; a rate or a number of steps that is not
-            positive; times of changes that do not rise; fixed steps together with "auto" or an event;
+            positive; times of changes that do not increase; fixed steps together with "auto" or an event;
             names of inputs that are unknown;
             a time of standing that is negative, without sensors, or of a machine whose start moves.
         ModelError: values before the first command that do not fit the inputs.
@@ -297,7 +296,7 @@ class Plant(eqx.Module):
         self.starts = tuple(math.ceil(at * rate * (1 - 1e-12)) for at, _ in changes)
         if any(after <= first for first, after in itertools.pairwise((0, *self.starts))):
             raise SettingError(
-                "The times of a plant's changes must rise, by whole control periods from the start on, but they are "
+                "The times of a plant's changes must increase by whole control periods from the start on, but they are "
                 f"{[float(at) for at, _ in changes]} s."
             )
         # Each change is prepared like the first system: they share a structure, so that a sample
@@ -490,7 +489,7 @@ def _check_standing(bench: Bench, start: State) -> None:
     """
     if not bench.instruments:
         raise SettingError(
-            "'standing' must be 0 for a plant without sensors, which reads nothing while it stands."
+            "'standing' must be 0 for a plant without sensors, because it has no readings to align with."
         )
     if not has_values(start.v, start.omega):
         return
@@ -498,7 +497,7 @@ def _check_standing(bench: Bench, start: State) -> None:
     fastest = max(float(np.max(np.abs(np.asarray(x)), initial=0.0)) for x in (start.v, start.omega))
     if fastest > 0:
         raise SettingError(
-            "The plant cannot stand before its first sample, because its start moves, with up to "
+            "The plant cannot be held before its first sample, because its start moves, with up to "
             f"{fastest:.4g} m/s or rad/s: set 'standing' to 0."
         )
 

@@ -73,8 +73,8 @@ def regulator(linear: Linear, Q: Numbers, R: Numbers, *, rate: float | None = No
         rate: control rate [Hz], for gains of the system with held inputs; None for continuous ones.
 
     Raises:
-        ModelError: Q or R of another shape or sign; a mode that does not decay and that the inputs
-            cannot move, or that Q does not see (the message names the mode); a Riccati equation
+        ModelError: Q or R of another shape or sign; a mode that does not decay and is uncontrollable, or not
+            penalised by Q (the message names the mode); a Riccati equation
             without solution.
     """
     A, B = linear.A, linear.B
@@ -135,16 +135,15 @@ def _check_weights(weights: Numbers, size: int, name: str, *, least: float | Non
 
 
 def check_observable(linear: Linear) -> None:
-    """Check that the outputs of a linear system see each of its modes that does not decay by itself.
+    """Check that each mode of a linear system that does not decay by itself is observable by the outputs.
 
-    An estimator of the state cannot find a mode that they do not see.
+    An estimator cannot determine an unobservable mode.
 
     Args:
         linear: matrices of `stmuav_jax.linearize`, with the measured `outputs`.
 
     Raises:
-        ModelError: a mode that does not decay and that the outputs do not see; the message names the
-            states in it.
+        ModelError: an unobservable mode that does not decay; the message names the states in it.
 
     Source: M. L. J. Hautus, Controllability and observability conditions of linear autonomous systems,
     Indagationes Mathematicae 31 (1969) 443-448.

@@ -21,7 +21,7 @@ from ..math.derivative import motion_along
 
 
 class Waypoint(NamedTuple):
-    """Wanted motion of a flying machine at one time.
+    """Target motion of a flying machine at one time.
 
     Attributes:
         r, v, a: position, velocity, acceleration of the base, world (3,) [m], [m/s], [m/s^2].

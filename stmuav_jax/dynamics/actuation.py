@@ -212,7 +212,7 @@ def input_labels(system: System, inputs: Inputs) -> list[str]:
 
 
 def names_of_largest(names: list[str], components: np.ndarray) -> tuple[str, ...]:
-    """Names of the components (k,), or rows of them (k, c), that are not small beside the largest."""
+    """Names of the components (k,), or rows of them (k, c), that are not small compared with the largest."""
     sizes = np.linalg.norm(components.reshape(len(names), -1), axis=1)
     order = [k for k in np.argsort(-sizes, kind="stable") if sizes[k] > _NAMED * np.max(sizes)]
     return tuple(names[k] for k in order[:_MOST_NAMES])

@@ -1,4 +1,4 @@
-"""Names in words of the parts of a `Method`, and its default numbers; loaded without JAX.
+"""Names of the parts of a `Method`, and its defaults; loaded without JAX.
 
 The command line, study files and their checks name solvers, formulations and stabilisations by
 these words. The object behind a word is imported when it is built.

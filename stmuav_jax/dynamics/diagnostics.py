@@ -87,8 +87,8 @@ class Certificate:
             the exact motion, the largest over all bodies and saved times [m], [rad], [m/s],
             [rad/s]; see `ErrorEstimate`.
         position_error_end, angle_error_end: the largest over all bodies at the last saved time.
-        error_e_folding_time, predictability_horizon: those of `ErrorEstimate` [s]. error_words: both
-            in words, and that the start was a singular posture, if the motion has left one.
+        error_e_folding_time, predictability_horizon: those of `ErrorEstimate` [s]. error_words: both as text,
+            with a sentence if the motion has left a singular posture.
         position_violation, angle_violation: largest residual of constraints that are lengths [m],
             and of those that are cosines or angles [rad], over all accepted steps.
         velocity_violation, angular_velocity_violation: those of their rates [m/s], [rad/s].
@@ -172,7 +172,7 @@ def check_start(system: System, state: State) -> None:
     """Raise an error unless the state fits the system, is finite and has unit Euler parameters."""
     if not has_values(system, state):
         raise SettingError(
-            "simulate looks at values and cannot be differentiated, batched or compiled by JAX: "
+            "simulate needs known values and cannot be differentiated, batched or compiled by JAX: "
             "its scene holds traced numbers. Use stmuav_jax.integrate(system, state, ts, method)."
         )
     check_state(system, state)
@@ -342,7 +342,7 @@ class ErrorEstimate:
 
 
 class SecondRun:
-    """Second run, at other tolerances beside the first run.
+    """Second run, at other tolerances than the first run.
 
     Args:
         problem: problem of the first run. t0: initial time [s]. state0: state at t0.
@@ -649,10 +649,10 @@ def check_rounded(system: System, rows: AugmentedModel) -> None:
         return
     names = ", ".join(name_owners(rows, independence.shares))
     raise ModelError(
-        f"The mechanism is overconstrained up to rounded numbers: the joints {names} repeat constraints of "
+        f"The mechanism is nearly overconstrained: the joints {names} repeat constraints of "
         f"others to a relative difference of {independence.weakest:.1g} in every posture, which double "
         f"precision cannot resolve (it needs at least {WEAK:.0e}, or below {DEPENDENT:.0e} for dependent "
-        "rows). Give axes and points to all digits, or use a joint with fewer constraints, such as a "
+        "rows). Give axes and points with all digits, or use a joint with fewer constraints, such as a "
         "spherical one."
     )
 
@@ -762,7 +762,7 @@ def make_certificate(
     """Assemble the certificate of a finished run.
 
     Args:
-        rank: rank at the start. result: outcome of the run in words.
+        rank: rank at the start. result: outcome of the run as text.
     """
     drift, relative_drift, momentum = _compute_balances(system, trajectory, checked.balances)
     position, angle, velocity, angular_velocity = (

@@ -80,8 +80,8 @@ class Finding(NamedTuple):
 
     Attributes:
         severity: "fault" if the mechanism cannot be simulated so, "warning" if it probably is not
-            what is meant or is near its limits, "note" for what is good to know.
-        quantity: quantity or thing. value: its value with its unit, or what was found, in words.
+            what is meant or is near its limits, "note" for information.
+        quantity: quantity or object. value: its value with its unit, or a description.
         valid: what would be valid, or advice; may be empty.
     """
 
@@ -113,9 +113,9 @@ def check(
     *,
     inputs: Inputs | None = None,
 ) -> Inspection:
-    """Inspect a mechanism in one posture: everything that can be said before a run.
+    """Inspect a mechanism in one posture before a run.
 
-    These are looked at: masses, inertia tensors, sizes and gravity, which show wrong units; residuals
+    The inspection covers masses, inertia tensors, sizes and gravity, which reveal wrong units; residuals
     of the posture and its velocities; degrees of freedom, dependent and contradictory constraints by
     the names of their joints; conditions of the mass matrix and of the constraint Jacobian; the
     distance to a singular posture of the constraints and of the inputs; the eigenvalues of the linearised
@@ -216,7 +216,7 @@ def _check_magnitudes(system: System, state: State, between: Sequence[str]) -> I
         yield Finding(
             "note", "links between several joints of a body",
             f"{len(between)}, of at most {largest:.2g} kg",
-            "the import made them; the tree's coordinates carry them (formulation Tree)",
+            "made by the import; use the formulation Tree",
         )  # fmt: skip
     body_indices = [k for k, name in enumerate(system.names) if name not in between]
     mass = np.asarray(system.bodies.mass)[body_indices]
@@ -224,8 +224,7 @@ def _check_magnitudes(system: System, state: State, between: Sequence[str]) -> I
         light, heavy = (system.names[body_indices[k]] for k in (np.argmin(mass), np.argmax(mass)))
         yield Finding(
             "warning", "ratio of masses", f"{max(mass) / min(mass):.2g} ({heavy} to {light})",
-            f"below {_RATIO:g}; a light body between heavy ones is best carried by the tree's "
-            "coordinates (formulation Tree)",
+            f"below {_RATIO:g}; use the formulation Tree for a light body between heavy ones",
         )  # fmt: skip
     # Lengths in millimetres make a mechanism of 100 m, which no check of single numbers would notice.
     size = float(mechanism_size(system, state))
@@ -337,7 +336,7 @@ def _check_conditions(
         bad = not condition < _CONDITION
         yield Finding(
             "warning" if bad else "note", subject, f"{condition:.2g}",
-            f"below {_CONDITION:g}; as many digits as this number has are lost" if bad else "",
+            f"below {_CONDITION:g}; results lose as many digits as this number has" if bad else "",
         )  # fmt: skip
 
 
@@ -357,7 +356,7 @@ def _unit_of(motion: np.ndarray) -> str:
 def _check_nearness(
     system: System, model: AugmentedModel, state: State, t: float, rank: Rank, free: np.ndarray
 ) -> Iterator[Finding]:
-    """Findings on dependent rows and singular postures, from postures beside this one."""
+    """Findings on dependent rows and singular postures, from neighbouring postures."""
     names, at, change = ", ".join(rank.redundant), rank.smallest_singular_value, 0.0
     unit = ""
     if rank.dof:
@@ -369,8 +368,8 @@ def _check_nearness(
         values = np.linalg.svd(nearby_rows.matrix[closed_mask], compute_uv=False)
         if np.any(values[:, rank.rank :][:, :1] > _GAINED * values[:, :1]):
             yield Finding(
-                "warning", "singular posture", f"rank {rank.rank} here, more beside it",
-                f"start beside it; here the rows of {names} depend on others",
+                "warning", "singular posture", f"rank {rank.rank} here, higher nearby",
+                f"start in a nearby posture; here the rows of {names} depend on others",
             )  # fmt: skip
             return
         # one-sided differences, since a singular value has a kink where it is zero
@@ -382,8 +381,8 @@ def _check_nearness(
     if rank.redundant:
         yield Finding(
             "note", "dependent constraints", f"{rank.rows - rank.rank} rows, among those of {names}",
-            "the motion is as without them, but how reactions are shared is not determined; a "
-            "joint that holds less, such as a spherical one, would not repeat them",
+            "the motion does not depend on them, but reactions are not unique; a joint with fewer "
+            "constraints, such as a spherical one, would avoid them",
         )  # fmt: skip
     if not rank.dof:
         return
@@ -395,7 +394,7 @@ def _check_nearness(
         yield Finding(
             "warning", "distance to a singular posture",
             _format_distance(distance, unit),
-            f"above {_NEAR:g} {unit}; lead the motion around it. Its rows are those of {', '.join(joints)}",
+            f"above {_NEAR:g} {unit}; plan the motion around it. Its rows are those of {', '.join(joints)}",
         )  # fmt: skip
     else:
         yield Finding(
@@ -580,7 +579,7 @@ def _check_motion(system: System, state: State, t: float, rank: Rank) -> list[Fi
     sizes = np.abs(values)
     sizes = sizes[sizes > _ZERO * max(sizes[0], 1e-3)]
     if not sizes.size:
-        return [Finding("note", "solver", "no eigenvalue but zero", "Dopri8")]
+        return [Finding("note", "solver", "all eigenvalues are zero", "Dopri8")]
     findings = [
         Finding("note", "rates of the linearised motion",
                 f"{sizes[-1]:.3g} to {sizes[0]:.3g} 1/s, ratio {sizes[0] / sizes[-1]:.2g}"),

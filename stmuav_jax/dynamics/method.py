@@ -92,7 +92,7 @@ class DiscreteAdjoint(diffrax.AbstractAdjoint):
     def __check_init__(self) -> None:
         if self.recorded_steps is not None and self.recorded_steps < 1:
             raise SettingError(
-                f"A DiscreteAdjoint keeps at least one step attempt, not {self.recorded_steps}."
+                f"A DiscreteAdjoint must record at least one step attempt, not {self.recorded_steps}."
             )
 
     def loop(self, **how: Any) -> Any:
@@ -105,34 +105,33 @@ class Method(eqx.Module):
 
     Args:
         formulation: formulation of the equations of motion.
-        solver: any diffrax solver with an error estimate. `kvaerno5()` is for stiff systems; for
-            `simulate`, which knows the initial state, the text "auto" applies `choose_solver`.
+        solver: any diffrax solver with an error estimate. `kvaerno5()` is for stiff systems; for `simulate`,
+            which has the initial state, the text "auto" applies `choose_solver`.
         rtol, atol: tolerances of a step, on positions [m], Euler parameters, velocities
             [m/s] and angular velocities [rad/s] alike.
         stabilisation: stabilisation of the constraints.
         first_step: length of the first step [s]; at most a hundredth of the run's time.
         max_steps: accepted and rejected steps between two output times.
         adjoint: reverse-mode derivatives: any adjoint of diffrax, or the default, a
-            `DiscreteAdjoint`. An explicit method without events then keeps accepted steps with
-            their slopes and goes back through them; a longer run is kept in windows whose steps
-            are taken again on the way back. Anything else is differentiated by diffrax's
-            `RecursiveCheckpointAdjoint`, which takes adaptive steps again; they then differ by
-            round-off in their sizes, which costs a gradient digits.
+            `DiscreteAdjoint`. An explicit method without events then records accepted steps with their slopes;
+            the backward pass of a longer run recomputes its steps window by window. Other methods use diffrax's
+            `RecursiveCheckpointAdjoint`, which repeats adaptive steps; round-off changes their sizes, so that
+            gradients are less accurate.
         event: (t, state) -> a number whose change of sign ends the integration, at that
-            time; or a truth value, which ends it after the first step that makes it true. A run
+            time; or a boolean, which ends it after the first step that makes it true. A run
             that starts where the number is zero starts after that event. An `equinox.Module`
             with numbers as leaves is not compiled again for other numbers. A value of
             NaN ends the run with the result `diffrax.RESULTS.nonfinite`.
         direction: direction of the event's change of sign: True up, False down, None both.
         jump_ts: times at which forces jump (j,) [s]. A step ends just before each, and the
             next begins just after it; a force is not evaluated at the jump itself.
-        balances: integrate work and impulse beside the state, for the balances of energy
+        balances: integrate work and impulse with the state, for the balances of energy
             and momentum; it adds about a tenth to the computing time.
         steps: control of the step lengths. "sensitivities", the default: besides the state's error
             estimate, the modes of the linearised motion bound them, so that derivatives with
             respect to the start and to constant numbers are as accurate at rest as in
             motion; see `integration.stepping`. It takes eleven more right-hand sides every
-            twelve steps. "state": the error estimate alone, for runs that nobody differentiates.
+            twelve steps. "state": the error estimate alone, for runs without derivatives.
         max_step: largest step [s]. It makes derivatives accurate with respect to inputs that are
             zero in the run itself but would vary faster than the system does.
 
@@ -215,8 +214,8 @@ def spectrum(
     if not np.all(np.isfinite(matrix)):
         raise StateError(
             "The motion cannot be linearised at this state: the accelerations or their derivatives "
-            "are not finite. Either the state is not, or a force jumps there, as that of a spring "
-            "with a length does where its ends meet."
+            "are not finite. The state itself is not finite, or a force is discontinuous there, such "
+            "as that of a spring with a rest length whose ends meet."
         )
     # The fastest eigenvalue decides whether the stability of an explicit method, and not its accuracy,
     # limits the steps.
@@ -241,8 +240,8 @@ def choose_solver(
 ) -> diffrax.AbstractSolver:
     """`kvaerno5()` if the largest |eigenvalue| at the state exceeds `EXPLICIT_LIMIT`, else `Dopri8()`.
 
-    Only the given state counts, which misleads if a system is stiff for moments: a stop that is hit
-    later is not seen, and friction is stiff at rest but not in motion.
+    Only the given state is evaluated, which misleads if a system is stiff only briefly: an end stop that is
+    reached later is not detected, and friction is stiff at rest but not in motion.
     """
     fastest = np.abs(spectrum(system, state, t, formulation=formulation)[0])
     return kvaerno5() if fastest > EXPLICIT_LIMIT else diffrax.Dopri8()

@@ -82,14 +82,13 @@ class Scene:
         t0, t1: time span [s]. save_every: spacing of the saved times [s].
         parameters: numbers from which the scene was built, by name: each a mapping with "value",
             "unit" and "source"; kept with the results.
-        notes: facts that the reader of a result must know, one sentence each.
-        warnings: facts that make the motion another one than the source's, such as a constraint that an
-            import lost; `check` has them as warnings.
+        notes: facts that affect the interpretation of results, one sentence each.
+        warnings: differences that change the motion from that of the source, such as a constraint that an
+            import lost; `check` lists them as warnings.
         watch: names of the bodies that figures show.
-        links_between: names of the bodies of nearly no mass that an import put between several
-            joints of one body.
+        links_between: names of nearly massless bodies that an import placed between several joints of one body.
         sensors: instruments of the mechanism (`stmuav_jax.control.Instrument`) by name.
-        frames: links without joints of their own by name, with the body that each is part of.
+        frames: links without joints by name, with the body of which each is a part.
     """
 
     name: str
@@ -110,7 +109,7 @@ class Scene:
     def with_(
         self, *forces: Any, parameters: Mapping[str, Any] | None = None, **fields: Any
     ) -> "Scene":
-        """Scene with forces added, other numbers of its system, or other fields such as t1.
+        """Scene with additional forces, other parameters of its system, or other fields such as t1.
 
         Args:
             forces: as of `System.with_forces`. parameters: as of `System.with_parameters`; the frames of the
@@ -151,12 +150,12 @@ def integrate(
     `simulate` adds checks, progress and a certificate. Times that a failed run did not reach have
     NaN states and derivatives, so that a sum over runs reveals it. A run that ended at an event
     keeps the state there. With a mass or a principal moment of inertia that is not positive the motion
-    does not start; `describe_result` says so in words. A run whose joints have come open, by more than
-    its tolerances and the size of the mechanism allow, has the result
+    does not start; `describe_result` gives the reason. A run whose joints separate by more than its tolerances
+    and the size of the mechanism allow has the result
     `diffrax.RESULTS.nonlinear_divergence` and NaN from then on.
 
     Rows of closed loops that depend on others in every posture, as those of planar loops of hinges do,
-    are left out, if the joints' geometry holds known numbers; masses, loads and the state may be traced.
+    are left out, if the joints' geometry is known; masses, loads and the state may be traced.
     With traced geometry such a loop takes `Tree(redundant=True)`, which chooses rows in every step.
 
     Args:
@@ -192,7 +191,7 @@ def integrate(
 
 
 def describe_result(system: System, path: Trajectory) -> str:
-    """Outcome of one run of `integrate` in words, "successful" or the reason why it ended.
+    """Outcome of one run of `integrate` as text: "successful" or the reason why it ended.
 
     Args:
         system: system of the run. path: its trajectory; of a batch, that of one member.
@@ -282,7 +281,7 @@ class Run:
             None if it was left out.
         errors: estimated errors at the saved times.
         certificate: summary of the run's quality.
-        settings: description of the method in words, kept with the results.
+        settings: text that describes the method, saved with the results.
         failure: reason why the end was not reached, in one paragraph; empty if it was.
     """
 
@@ -297,7 +296,7 @@ class Run:
 
     @functools.cached_property
     def snapshot(self) -> Snapshot:
-        """Accelerations, reactions, energies at the saved times, computed when first asked for.
+        """Accelerations, reactions, energies at the saved times, computed at first use.
 
         Raises:
             SettingError: the run was made with analysis=False.
@@ -511,9 +510,9 @@ def simulate(
         scene: a scene; or a system, which then takes `state` and `t1` or `ts`.
         state: initial state of the system, at t = 0 or at ts[0].
         method: method of integration; default `Method()`. If constraint rows become dependent in the
-            posture of the start, or in one that the run comes to and cannot pass, the formulation is
+            posture of the start, or in one that the run reaches and cannot pass, the formulation is
             replaced by one that allows for them. The solver "auto" is chosen at the start. Three
-            fields are for `integrate` alone, as nobody differentiates a `Run`: here `adjoint` is always
+            fields are for `integrate` alone, because a `Run` has no derivatives: here `adjoint` is always
             `diffrax.ForwardMode()`, `steps` always "state", and `balances` is `analysis`.
         t1: end [s]; default the scene's.
         save_every: spacing of the saved times [s]; default the scene's, or a hundredth of the span
@@ -524,17 +523,17 @@ def simulate(
             first; it needs no further compilation.
         analysis: check energies, momenta and ranks at the saved times, and let the run compute its
             `snapshot`. Without it there is less to compile.
-        certificate: "full" also looks at the rows of all joints at every saved time, and compares
+        certificate: "full" also checks the rows of all joints at every saved time, and compares
             the accelerations with those by another formulation, which has to be compiled.
         throw: raise an error if the end was not reached; otherwise the run's certificate says so.
         progress: function that is called with the completed fraction.
 
     Returns:
-        A `Run`. Ctrl-C ends it early with what was reached.
+        A `Run`. Ctrl-C ends it early with the results so far.
 
     Raises:
-        SettingError: tolerances, span, saved times or kinds of arguments are invalid, or a full
-            certificate is wanted without the analysis.
+        SettingError: tolerances, span, saved times or kinds of arguments are invalid, or a full certificate is
+            requested without the analysis.
         StateError: the initial state is not finite, not unit or not consistent, or a singular posture
             at rest from which loads set the system in motion: its branch is not determined.
         ModelError: constraints are contradictory, or a load is not finite at the start.
@@ -562,7 +561,7 @@ def simulate(
     # Dependent rows are rarely known beforehand: the cheaper equations are tried first, and those that
     # choose rows anew only if the run stops at such a posture.
     outcome = _carried_out(scene, method, times, progress, run_options)
-    if not outcome.run.successful and _held_rows_fail(outcome):
+    if not outcome.run.successful and _selected_rows_fail(outcome):
         allowing = method.formulation.allowing_dependent_rows()
         changed = dataclasses.replace(method, formulation=allowing)
         second = _carried_out(scene, changed, times, progress, run_options)
@@ -580,7 +579,7 @@ def simulate(
 
 
 class _Outcome(NamedTuple):
-    """Run with its problem, what was found at its start, and a text on joints that have come open."""
+    """Run with its problem, the findings at its start, and a text on joints that have separated."""
 
     run: Run
     problem: Problem
@@ -588,12 +587,12 @@ class _Outcome(NamedTuple):
     opened: str
 
 
-def _held_rows_fail(outcome: _Outcome) -> bool:
-    """True if a run stopped where rows that its equations hold throughout become dependent."""
+def _selected_rows_fail(outcome: _Outcome) -> bool:
+    """True if a run stopped where rows that its equations select for all times become dependent."""
     model: Any = outcome.problem.model
     row_mask, formulation = getattr(model, "row_mask", None), outcome.problem.method.formulation
     # A run that stops for another reason, such as stiffness, would stop with the dearer equations
-    # too: rows are chosen anew only where those that are held have become dependent.
+    # too: rows are selected again only where the selected ones have become dependent.
     stopped = outcome.run.certificate.result != "interrupted"
     if row_mask is None or not stopped or formulation.allowing_dependent_rows() is formulation:
         return False
@@ -719,7 +718,7 @@ def _estimate_errors(
     """Error estimate, by a run at larger tolerances if the second run has stopped early."""
     first, second = integration.trajectory, integration.second
     if second is None:
-        return empty_estimate(first, "none was asked for")
+        return empty_estimate(first, "none was requested")
     rates = None
     happened = same_result(first.result, diffrax.RESULTS.event_occurred)
     if analysis and happened:
@@ -742,7 +741,7 @@ def _estimate_errors(
 
 
 def _describe_method(method: Method) -> dict[str, Any]:
-    """Description of the method in words and numbers, as results keep it."""
+    """Description of the method as text, saved with results."""
     settings = {
         "formulation": str(method.formulation),
         "solver": type(method.solver).__name__,

@@ -76,7 +76,7 @@ def nees(
 ) -> Float[Array, "*s"]:
     """Normalised estimation error squared, chi-squared with n degrees if the filter is consistent.
 
-    A component that is known exactly counts nothing if it is right, and makes NEES infinite if not.
+    A component that is known exactly contributes zero if it is correct, and infinity otherwise.
 
     Args:
         only: consecutive components of the error, with their marginal covariance; None for all.
@@ -275,7 +275,7 @@ def verdict(filtered: Filtered, **options: Any) -> Verdict:
             used.
     """
     if np.ndim(filtered.ok) != 1:
-        raise SettingError("verdict judges one record; use verdicts for a bank of filters.")
+        raise SettingError("verdict takes one record; use verdicts for a bank of filters.")
     as_bank = lambda tree: jax.tree.map(lambda a: np.asarray(a)[..., None], tree)
     innovations, ok = as_bank((filtered.innovations, filtered.ok))
     return _judge_filter(innovations, ok, filtered, options)[0]
@@ -599,7 +599,7 @@ def _decide_verdict(of: dict[str, Any], level: float, names: tuple[str, ...]) ->
 def _explain_findings(
     of: dict[str, Any], significant: set[str], name: Callable[[int], str]
 ) -> list[str]:
-    """Sentences on what was found in an inconsistent record, and on its usual causes."""
+    """Sentences on the findings in an inconsistent record, and on their usual causes."""
     wrong_size = bool(significant & {"size", "sliding"})
     lines = []
     # a start that is like the rest is no sign of a wrong prior

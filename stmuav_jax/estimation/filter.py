@@ -75,8 +75,8 @@ class Innovation(NamedTuple):
         factor: root Ls of the innovation's covariance (m, m, *s); a missing measurement has the
             row and column of the unit matrix.
         measured: True for components that are not missing (m, *s).
-        predicted: predicted measurement, a point of the sensor's space; None if a filter of one's
-            own does not tell.
+        predicted: predicted measurement, a point of the sensor's space; None if a user-defined filter does not
+            provide it.
     """
 
     error: Float[Array, "m *s"]

@@ -40,7 +40,7 @@ _FEW, _FEW_NATIVE = 3, 16
 def triangularise_rows(rows: Float[Array, "r k *s"]) -> Root:
     """Lower triangular L with diagonal >= 0 and L L^T = rows^T rows.
 
-    The rows are never squared, so parts of L that are small beside others keep their digits.
+    The rows are never squared, so parts of L that are small compared with others keep their digits.
     """
     r, k = rows.shape[:2]
     if rows.ndim == 2 and k > (_FEW_NATIVE if is_on() else _FEW):

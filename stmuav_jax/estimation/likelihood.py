@@ -40,7 +40,7 @@ class Tuned(NamedTuple):
         values: best parameters, a pytree like the start.
         log_likelihood: log-likelihood of the records with them.
         history: log-likelihood at every step, that of the start first.
-        reason: "converged", "steps" (all used) or "stalled" (nothing is gained along the slope).
+        reason: "converged", "steps" (all used) or "stalled" (no gain along the gradient).
     """
 
     values: Any

@@ -1,4 +1,4 @@
-"""Observability of the state by measurements along a path, with a report in words.
+"""Observability of the state by measurements along a path, with an explanation.
 
 The rows of the observability matrix are the derivatives of the measurements, in units of their
 noise, with respect to the error of the first state, in units of the scales L_0 if these are given:

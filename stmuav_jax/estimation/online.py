@@ -1,4 +1,4 @@
-"""Online filter, one measurement at a time from Python, for use beside a running machine.
+"""Online filter, one measurement at a time from Python, for use with a running machine.
 
 A call of a compiled function costs some microseconds for each array that goes in or comes out, more
 than the arithmetic of a small filter: all numbers of a step go in as two arrays (estimate; step,
@@ -85,7 +85,7 @@ class OnlineEstimate:
 
     @property
     def mean(self) -> Any:
-        """Mean as NumPy arrays, views that cost no time."""
+        """Mean as NumPy arrays, without a copy."""
         return self._layout.unpack(self._numbers).mean
 
     @property

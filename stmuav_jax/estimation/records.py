@@ -1,4 +1,4 @@
-"""Records as users have them, read and checked in one place for all filters.
+"""Records of measurements, read and checked in one place for all filters.
 
 Measurements (tables, masked arrays, lists) may be missing, by NaN or by a mask; inputs and times may
 not. The functions of a model are traced with `jax.eval_shape`, which computes nothing: arrays that

@@ -48,7 +48,7 @@ def clock_time(day: Day, hours: float) -> str:
 
 
 def day_title(day: Day) -> str:
-    """Title with place and date in words."""
+    """Title with place and date."""
     lat, lon = math.degrees(float(day.place.latitude)), math.degrees(float(day.place.longitude))
     where = (
         f"{abs(lat):.4g}° {'N' if lat >= 0 else 'S'}, {abs(lon):.5g}° {'E' if lon >= 0 else 'W'}"
@@ -69,7 +69,7 @@ def _format_span(values: np.ndarray, unit: str, digits: int = 1) -> str:
 
 
 def day_rows(day: Day) -> list[tuple[str, str]]:
-    """Main results of the day as rows (quantity, value) in words."""
+    """Main results of the day as rows (quantity, value) of text."""
     lit = day.lit
     error = np.degrees(lit.pointing_error)
     up = ", ".join(f"{clock_time(day, a)} to {clock_time(day, b)}" for a, b in day.daylight)

@@ -1,4 +1,4 @@
-"""Figures of a multirotor that was identified from its flight log: from what was flown to what is determined."""
+"""Figures of a multirotor that was identified from its flight log: the flight, the fit, and the estimates."""
 
 from collections.abc import Callable, Mapping
 from textwrap import fill
@@ -366,7 +366,7 @@ def draw_table(subject: IdentifiedFlight) -> Figure:
 def draw_filtered_centre(
     filtered: FilteredCentre, estimates: Mapping[str, ParameterEstimate] | None = None
 ) -> Figure:
-    """Centre of mass over a flight with bands of two deviations, and estimates of the whole record beside it."""
+    """Centre of mass over a flight with bands of two deviations, and the estimates of the whole record."""
     figure, axes = grid(2, 1, 4.2, sharex=True)
     for axis, name in enumerate("xy"):
         ax = axes[axis, 0]

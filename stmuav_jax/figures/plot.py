@@ -53,7 +53,7 @@ def grid(rows: int, columns: int, height: float, **more: Any) -> tuple[Figure, n
 def look(k: int) -> dict[str, Any]:
     """Colour, dash and marker of the k-th of many curves, as keyword arguments of `plot`.
 
-    The colours are Okabe and Ito's; dash or marker alone tells the curves apart in grey print.
+    The colours are Okabe and Ito's; dash or marker alone distinguishes the curves in grey print.
 
     Args:
         k: number of the curve, from zero.

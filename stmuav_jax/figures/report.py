@@ -1,7 +1,7 @@
 """Report page of a result in one self-contained HTML file: verdict, tables of numbers and settings, figures.
 
 A result is the dataset of a run, a closed loop, filters with known truth or a study, or a `FilterRecord`. The
-template `report.html` beside this module is the same for all.
+template `report.html` next to this module serves all results.
 """
 
 import base64

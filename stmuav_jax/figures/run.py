@@ -147,7 +147,7 @@ def positions(
     Args:
         run: run, or dataset of a saved run.
         bodies: names of the bodies, from top to bottom.
-        detail: end of the start that a left column shows beside the whole run [s]; default no such column.
+        detail: end of the interval that an additional left column shows [s]; default no such column.
 
     Raises:
         StateError: a name that no body of the run has.
@@ -212,7 +212,7 @@ def joints_of(motion: Motion) -> tuple[Any, ...]:
 
 
 def balances(run: "Run | xr.Dataset") -> Figure | None:
-    """Figure of energies, and of the estimated error, energy drift and violations, a unit an axis.
+    """Figure of energies, and of the estimated error, energy drift and violations, with one axis per unit.
 
     None for a run that was saved without its analysis. Violations are NaN in files that lack them.
     """

@@ -143,7 +143,7 @@ def _darken(colour: str) -> Any:
 
 
 def _place_labels(figure: Figure) -> None:
-    """Move the names of a sketch beside their points, without overlap as far as there is space.
+    """Move the names of a sketch next to their points, without overlap as far as there is space.
 
     Each name takes the nearest free place among a few directions and distances (greedy point-feature labelling);
     a line leads to its point from farther ones. Where no place is free, it takes the one with the least overlap.

@@ -138,7 +138,7 @@ def certificate_table(run: "Run", *, verbose: bool = False) -> Table:
 
     Args:
         run: run.
-        verbose: True for all entries, False for the six that decide.
+        verbose: True for all entries, False for the six main ones.
     """
     rows = (certificate_rows if verbose else summary_rows)(run.certificate)
     return make_pairs(run.scene.title, rows)

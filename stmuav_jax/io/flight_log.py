@@ -109,7 +109,7 @@ class FlightLog:
     """Log of a multirotor in SI units, forward-left-up body axes and a z-up world.
 
     Attributes:
-        name: name of the file. format: kind of file. vehicle: vehicle in words.
+        name: name of the file. format: kind of file. vehicle: description of the vehicle.
         start: the vehicle's clock at the log's start [s]; all times count from there.
         duration: length of the log [s].
         channels: those that the log has of `motor_commands` (0 to 1), `thrust_commands` (before
@@ -122,7 +122,7 @@ class FlightLog:
             channels went through, `filter_rate` [Hz] of the filters' clock, `rotor_positions` (n, 3) [m],
             `rotor_spin` (n,) as in `Rotors`, and `thrust_model_factor` f of thrust f u^2 + (1 - f) u; those
             that are known.
-        notes: sentences on what was read, cut or is doubtful, and on what counts in place of missing settings.
+        notes: sentences on data that were cut or are doubtful, and on values assumed for missing settings.
         refusals: sentences, which are among the notes, why no multirotor can be identified.
         is_simulated: true if the file says that a simulator wrote it.
     """
@@ -198,7 +198,7 @@ class FlightLog:
         sample on the grid is kept exactly. A channel that is at least a tenth faster than the grid is
         averaged over each step, which keeps its phase; slower ones are interpolated, commands held.
         Values in a gap, and before or after a channel's samples, are NaN. Quaternions have unit length,
-        and Euler angles go on beyond half a turn.
+        and Euler angles continue beyond half a turn.
 
         Args:
             rate: samples per second of the grid [Hz].
@@ -238,9 +238,8 @@ class FlightLog:
         """Record of one stretch in flight, by default the longest, for `stm.uav.identify_flight`.
 
         It leaves out a second after take-off and half a second before landing, has the rate of the IMU
-        but at most 500 Hz, and bridges gaps of up to 50 ms; from a longer one on it ends, or begins there,
-        whichever is longer. Where the log has rotor speeds only, commands are shares of
-        the highest speed in the log.
+        but at most 500 Hz, and bridges gaps of up to 50 ms; a longer gap splits it, and the longer part is
+        returned. If the log has rotor speeds only, commands are fractions of the highest speed in the log.
 
         Raises:
             SettingError: the log has refusals or no such flight, lacks commands and speeds, gyroscope or
@@ -508,9 +507,7 @@ def _assemble_log(source: Path, draft: LogDraft) -> FlightLog:
     gaps = tuple(gap for name, channel in channels.items() for gap in _find_gaps(name, channel))
     duration = max(float(channel.ts[-1]) for channel in channels.values())
     if draft.is_simulated:
-        draft.notes.append(
-            "The log was written by a simulator, so it says nothing of a real vehicle."
-        )
+        draft.notes.append("The log was written by a simulator, not by a real vehicle.")
     switches = {}
     for name, (ticks, states) in draft.switches.items():
         order = np.argsort(ticks, kind="stable")
@@ -863,7 +860,7 @@ def read_rotor_layout(path: str | os.PathLike[str]) -> RotorLayout:
 
         mass = 0.027                        # [kg]; may be left out, then only ratios are identified
         positions = [[0.0283, -0.0283], [-0.0283, -0.0283], [-0.0283, 0.0283], [0.0283, 0.0283]]
-        spin = [1, -1, 1, -1]               # +1: to the left seen from above
+        spin = [1, -1, 1, -1]               # +1: anticlockwise seen from above
         thrust_model_factor = 1.0           # f of thrust f u^2 + (1 - f) u; by default 1
         inertia = [1.5e-5, 1.6e-5, 2.9e-5]  # [kg m^2]; for a model, about axes that the flight does not excite
         torque_ratio = 0.006                # of a rotor, over its thrust [m]; likewise

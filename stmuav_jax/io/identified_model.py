@@ -58,17 +58,17 @@ class _Number(NamedTuple):
 def write_identified_model(
     result: FlightIdentification, path: str | os.PathLike[str], *, source: str = "the flight"
 ) -> IdentifiedFiles:
-    """Write the identified multirotor as a model's file, with a mission and a study beside it.
+    """Write the identified multirotor as a model's file, with a mission and a study in the same folder.
 
     The study draws what the flight determines from normal distributions with the stated deviations; a common thrust
-    correlates them. Motors count as equal.
+    correlates them. Motors are assumed equal.
 
     Args:
         path: of the model's file, which ends in .toml. source: name of the log, for the file.
 
     Raises:
-        SettingError: neither the flight nor the layout has a number that the model needs: the sentence
-            names all of them.
+        SettingError: neither the flight nor the layout has a number that the model needs; the message names all
+            of them.
     """
     target = Path(path)
     if target.suffix != ".toml":

@@ -1,4 +1,4 @@
-"""Models of mechanisms as TOML files: read as scenes, and scenes written so that they come back."""
+"""Models of mechanisms as TOML files: read as scenes, and written so that they round-trip exactly."""
 
 import contextlib
 import dataclasses
@@ -89,7 +89,7 @@ class ParametricModel:
 
     @property
     def digest(self) -> str:
-        """Text that tells models with other entries apart."""
+        """Text that identifies the entries of the model."""
         text = json.dumps(self.file.model_dump(mode="json"), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -117,7 +117,7 @@ class Robot:
 
     @property
     def digest(self) -> str:
-        """Text that tells systems and starts with other numbers apart."""
+        """Text that identifies systems and starts by their numbers."""
         digest = hashlib.sha256(repr(self.scene.system.names).encode())
         for leaf in jax.tree.leaves((self.scene.system, self.scene.state0)):
             digest.update(np.asarray(leaf).tobytes())
@@ -443,7 +443,7 @@ def _read_instrument(
 
 
 def _read_start(system: System, model_data: ModelFile, parameters: Table) -> State:
-    """State of the file's start; at the reference posture, at rest, if it says nothing."""
+    """State of the file's start; by default the reference posture at rest."""
     state, start = system.reference, model_data.start
     names = {"r": "com_position", "p": "orientation", "v": "velocity", "omega": "angular_velocity"}
     arrays = {field: [*as_numpy(getattr(state, field))] for field in names}
@@ -504,7 +504,7 @@ def save_model(scene: Scene, path: str | os.PathLike[str]) -> Path:
 
 
 def model_to_text(scene: Scene) -> str:
-    """TOML text of a scene, from which `load_model` makes the same system and state to the last bit.
+    """TOML text of a scene, which `load_model` reads back exactly, bit for bit.
 
     Numbers are written out in the bodies' reference frames: nothing refers to the parameters, which
     are kept as a record.

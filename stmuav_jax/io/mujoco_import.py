@@ -59,15 +59,15 @@ def load_robot(
 ) -> Scene:
     """Scene of a robot's MJCF or URDF file, at the posture of its `qpos0`, at rest.
 
-    A URDF's `loop_joint` (Drake, RigidBodyDynamics.jl) closes its loop. What is lost of the file, such as
-    an incomplete loop, is in `scene.warnings`, all else that is left out in `scene.notes`.
+    A URDF's `loop_joint` (Drake, RigidBodyDynamics.jl) closes its loop. Losses that change the motion, such as
+    an incomplete loop, are in `scene.warnings`, all else that is left out in `scene.notes`.
 
     Args:
         link_share: mass and inertia of a link between two joints of one body, as a share of the
             body's own; by default 1e-12. If it is given, links without mass that move get this share of
             the robot's mass, and its moment at 0.1 m.
         floating: of a URDF, True lets its root link float, False fixes it to ground; by default it is
-            fixed, and a note says so. MJCF says it by its own joints.
+            fixed, with a note. In MJCF its joints determine this.
         loops: kind of joint ("spherical", "weld", "revolute" or "translational", about or along z) that holds
             each pair of links or bodies together by their frames, which closes loops that the file leaves open.
 
@@ -348,7 +348,7 @@ def scene_from_mujoco(model: Any, name: str = "robot", *, link_share: float = LI
     """Scene of a compiled `mujoco.MjModel`; what cannot be carried over is in its notes.
 
     Actuators with a fixed gain on a hinge or slide are inputs: efforts, or targets of position
-    servos. The notes say which input is which actuator, and in which units of its control.
+    servos. The notes list the actuator of each input, and the unit of its control.
 
     Args:
         name: name of the scene. link_share: see `load_robot`.
@@ -942,7 +942,7 @@ def _effort_limit(model: Any, a: int) -> float | None:
 def _describe_inputs(
     system: System, model: Any, driven: list[tuple[int, _Actuator]], first: int
 ) -> list[str]:
-    """Sentences that say which input is which actuator."""
+    """Sentences that give the actuator of each input."""
     names = {entry.force: (entry.name, entry.unit) for entry in inputs_of(system).entries}
     sentences = []
     for a, actuator in driven:

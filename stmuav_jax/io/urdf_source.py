@@ -1,4 +1,4 @@
-"""Content of a URDF file that MuJoCo's reader drops without a word: loop joints, mimics, unknown elements.
+"""Content of a URDF file that MuJoCo's reader drops silently: loop joints, mimics, unknown elements.
 
 The XML is read here by expat, which opens no other file; a file that declares entities is refused.
 """
@@ -62,7 +62,7 @@ class UrdfSource(NamedTuple):
     """Content of a URDF beyond what MuJoCo reads.
 
     Attributes:
-        root: name of the link that is nobody's child. loops: joints that close loops.
+        root: name of the link without a parent. loops: joints that close loops.
         mimics: joints that follow others. without_inertial: names of links without <inertial>.
         has_floating_joint: true if a joint of the file lets a link float.
         lost: sentences on constraints and unknown elements that are dropped. notes: others.

@@ -32,7 +32,7 @@ class NewtonState(eqx.Module):
 
 
 class AbstractNewton(optx.AbstractRootFinder):
-    """Newton solver whose state says when to end; its subclasses give the steps."""
+    """Newton solver whose state determines its end; its subclasses give the steps."""
 
     def terminate(
         self, fn: Any, y: Any, args: Any, options: Any, state: NewtonState, tags: Any

@@ -74,7 +74,7 @@ class Sampled(eqx.Module):
 def evaluate_piecewise(
     breaks: Float[Array, " k"], coefficients: Float[Array, "d p *m"], t: Float[Array, ""]
 ) -> Float[Array, "*m"]:
-    """Value at t of polynomials between breaks; outside, the first or the last one goes on.
+    """Value at t of polynomials between breaks; outside, the first or the last one continues.
 
     Args:
         coefficients: of the powers of t less the piece's first break, the highest power first.

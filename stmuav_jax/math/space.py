@@ -60,7 +60,7 @@ def half_turns(space: AbstractSpace, v: Error) -> Float[Array, "*s"] | None:
 
 
 def as_reading(space: AbstractSpace, y: Point) -> Point:
-    """Measured point as the filters use it, NaN where it says that nothing was measured.
+    """Measured point as the filters use it, NaN where the measurement is missing.
 
     Spaces whose points are measured with a rounding of their own have a method `as_reading(y)`.
     """

@@ -57,8 +57,8 @@ class AppliedForce(AbstractForce):
         point: point in the body's reference frame (3,) [m]; by default the centre of mass.
 
     Raises:
-        ModelError: a number is not finite, the shape or frame is another, a function has other
-            arguments; or, at its first evaluation, a function returns another shape.
+        ModelError: a number is not finite, a shape or the frame is invalid, or a function has the wrong
+            arguments or, at its first evaluation, returns the wrong shape.
     """
 
     inputs: ClassVar[tuple[tuple[str, str], ...]] = (("force", "N"),)

@@ -1,8 +1,8 @@
 """Forces with states of their own: motors that lag, and elements that count turns of a hinge.
 
 Such a force holds its actuator states z as a leaf: the initial values when it is made, and the
-present values that an integrator sets during a run (`with_internal`). The states are integrated
-beside those of the bodies and count in the error that controls the step size; the constraints do
+present values that an integrator sets during a run (`with_internal`). The states are integrated with those of
+the bodies and count in the error that controls the step size; the constraints do
 not depend on them. A system without such forces has none, at no cost.
 
 A posture determines the angle of a hinge up to whole turns. An element whose law depends on that angle
@@ -127,8 +127,8 @@ def with_start_angles(system: System, angles: Mapping[str, Numbers]) -> System:
     """System whose springs, servos and end stops count the turns of hinges from other angles.
 
     A state of the bodies gives a hinge's angle in (-pi, pi], and elements that depend on it start from
-    there. A hinge that has turned further at the start, such as a wound clock spring, is told here;
-    the whole turns of these angles count, the rest is that of the state.
+    there. Give the total angle of a hinge that has turned further, such as that of a wound clock spring; only
+    its whole turns count, and the state determines the remainder.
 
     Args:
         angles: angle at the start by joint [rad].

@@ -497,7 +497,7 @@ def mimic(
     the load of the mate.
 
     Args:
-        joint: the joint of x_b. mate: the joint of x_a. Both are in the system besides.
+        joint: the joint of x_b. mate: the joint of x_a. The system must contain both.
         ratio: dx_b / dx_a, between [rad] and [m]. offset: value of x_b where x_a is zero.
         coordinate, mate_coordinate: "angle" or "displacement" where a joint leaves both free.
 

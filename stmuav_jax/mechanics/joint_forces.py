@@ -85,8 +85,8 @@ class AbstractJointForce(AbstractTurnCounter):
     Subclasses define the law and its potential, both of scalars. The power on the bodies is
     Q x_rate = -dV/dt + power, which defines the power of the part without potential.
 
-    The angle of a hinge counts whole turns, as that of `Run.joint` does: it starts in (-pi, pi], or
-    near the angle that `with_start_angles` tells, and goes on from there.
+    The angle of a hinge counts whole turns, as that of `Run.joint` does: it starts in (-pi, pi], or near the
+    angle of `with_start_angles`, and is continuous from there.
 
     Attributes:
         joint: name of the joint.
@@ -193,7 +193,7 @@ class JointServo(AbstractJointForce):
         target: x_ref, a number [m] or [rad], or a function of t [s] alone that JAX can
             differentiate twice; JAX computes its rate.
         coordinate: "angle" or "displacement"; needed for a cylindrical joint or a screw only.
-        limit: largest |Q| > 0 [N] or [N m]; by default there is none. At the limit Q is cut off.
+        limit: largest |Q| > 0 [N] or [N m]; by default none. Q saturates at the limit.
 
     The potential is k (x - x_ref)^2 / 2; a moving target does work at the rate Q x_ref_rate, the
     damper dissipates c (x_rate - x_ref_rate)^2. Angle and target may differ by any number of turns.
@@ -407,19 +407,20 @@ def time_signal(
 
 
 class JointEffort(AbstractJointForce):
-    """Given effort Q(t) on one coordinate of a joint, acting on body j and oppositely on body i.
+    """Prescribed effort Q(t) on one coordinate of a joint, acting on body j and oppositely on body i.
 
     It is the counterpart of a driver (`stmuav_jax.drive`): the efforts that `driver_efforts`
-    computes repeat the driver's motion when they are applied by this class.
+    computes reproduce the driver's motion if this class applies them.
 
     Args:
         joint: name of a revolute, translational, cylindrical or screw joint.
         effort: [N] along a displacement, [N m] about an angle; a number or a function of t [s].
         coordinate: "angle" or "displacement"; needed for a cylindrical joint or a screw only.
-        limit: largest |Q| > 0 [N] or [N m], at which an effort is cut off; by default there is none.
+        limit: largest |Q| > 0 [N] or [N m], at which the effort saturates; by default none.
 
     Raises:
-        ModelError: the effort is not finite, or no function of t; or a limit that is not positive.
+        ModelError: the effort is not finite, or a function with other arguments than t; or a limit that is not
+            positive.
     """
 
     inputs: ClassVar[tuple[tuple[str, str], ...]] = (("effort", "N or N m"),)

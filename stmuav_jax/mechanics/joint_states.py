@@ -150,7 +150,7 @@ class JointMotion(eqx.Module):
         names = [coordinate_name for coordinate_name, _ in coordinates_of(self.kind)]
         if name not in names:
             raise ModelError(
-                f"Joint '{self.name}' is {self.kind} and has no {name} of its own; its coordinates "
+                f"Joint '{self.name}' is {self.kind} and has no coordinate {name}; its coordinates "
                 f"are: {', '.join(names)} (in this order in `coordinates`)."
             )
         return names.index(name)

@@ -279,7 +279,7 @@ class AbstractForce(eqx.Module):
         """Names of the bodies and joints on which this force acts."""
 
     def resolve(self, joints: "Sequence[Joint]") -> "AbstractForce":
-        """Force element as a system of these joints holds it; most need nothing of them."""
+        """Force element for a system with these joints; by default it is unchanged."""
         del joints
         return self
 

@@ -452,7 +452,7 @@ def reference_directions(
             and not (single and turns in ([0], [1], [2]) and not several)
         ):
             raise ModelError(
-                f"{subject} has more than two rotations in sequence: use `SPHERICAL`, the last that turns."
+                f"{subject} has more than two rotations in sequence: use `SPHERICAL` as the last rotation."
             )
         if not _told_apart(motion, axis, later):
             raise ModelError(

@@ -98,7 +98,7 @@ class Parameters(Mapping[str, Parameter]):
         return Parameters(self.name, entries)
 
     def to_dict(self) -> dict[str, dict[str, object]]:
-        """Plain numbers and strings, to be kept with results."""
+        """Plain numbers and strings, to be saved with results."""
         return {key: parameter.plain() for key, parameter in self._entries.items()}
 
 

@@ -32,7 +32,7 @@ class System(eqx.Module):
         joints: see `stmuav_jax.mechanics.joint`; geometry in the world at the bodies'
             reference posture.
         forces: see `stmuav_jax.mechanics.forces` and `stmuav_jax.mechanics.joint_forces`.
-        reference: reference posture of stacked bodies; that of `Body` objects is in them.
+        reference: reference posture of stacked bodies; `Body` objects contain theirs.
         allow_float32: accept single precision, in which closed loops lose most digits.
 
     Attributes:
@@ -109,14 +109,14 @@ class System(eqx.Module):
         return dataclasses.replace(self, forces=(*self.forces, *forces))
 
     def with_parameters(self, values: Mapping[str, Any]) -> "System":
-        """System with other numbers, by names such as "camera.mass", "pitch.stiffness" or "frame.k_f".
+        """System with other parameters, by names such as "camera.mass", "pitch.stiffness" or "frame.k_f".
 
         A name is OWNER.FIELD: mass, com or inertia of a body, or a field of the force that acts on this body or
-        in this joint; "Gravity.acceleration" names a force by its class. Numbers are checked as where they were
-        first given. The frames of bodies stay where they are at the reference posture.
+        in this joint; "Gravity.acceleration" names a force by its class. Values are checked as in the
+        constructors. The frames of bodies stay where they are at the reference posture.
 
         Raises:
-            ModelError: a name that is none, or that several forces have, or a number that does not fit.
+            ModelError: an unknown or ambiguous name, or an invalid value.
         """
         system = self
         for name, value in values.items():
@@ -254,7 +254,7 @@ def _field_path(force: AbstractForce, field: str) -> tuple[str, ...]:
 
 
 def _rebuild_part(part: Any, path: tuple[str, ...], value: Any) -> Any:
-    """Part made anew, and so checked, with another value of a field."""
+    """Part constructed again, and so checked, with another value of a field."""
     arguments = {n: getattr(part, n, None) for n in inspect.signature(type(part)).parameters}
     # States of actuators are no parameters: a new part starts with its own.
     arguments.pop("internal", None)

@@ -119,7 +119,7 @@ class PanelMoves(eqx.Module):
     shapes: tuple[Float[Array, " _"], ...] = ()
 
     def value(self, t: Float[Array, ""]) -> Float[Array, " n"]:
-        """Wanted angles [rad] or direction (n,) at a time [s]."""
+        """Target angles [rad] or direction (n,) at a time [s]."""
         result, shapes = self.start, self.shapes or (jnp.zeros(0),) * len(self.targets)
         for target, at, duration, shape in zip(
             self.targets, self.ats, self.durations, shapes, strict=True
@@ -132,7 +132,7 @@ class PanelMoves(eqx.Module):
         return result
 
     def __call__(self, t: Float[Array, ""]) -> PairMotion | DirectionMotion:
-        """Wanted motion of the angles [rad], or of the direction."""
+        """Target motion of the angles [rad], or of the direction."""
         motion = motion_along(self.value, t)
         return DirectionMotion(*motion) if self.world else PairMotion(*motion)
 
@@ -165,11 +165,11 @@ class JointMoves(eqx.Module):
     moves: tuple[PanelMoves, ...]
 
     def __call__(self, t: Float[Array, ""]) -> JointMotions:
-        """Wanted motion of all joints (n,)."""
+        """Target motion of all joints (n,)."""
         return JointMotions(*motion_along(self.value, t))
 
     def value(self, t: Float[Array, ""]) -> Float[Array, " n"]:
-        """Wanted values (n,) [rad] or [m] at a time [s]."""
+        """Target values (n,) [rad] or [m] at a time [s]."""
         return jnp.concatenate([of_joint.value(t) for of_joint in self.moves])
 
 
@@ -238,7 +238,7 @@ class MissionMemory(NamedTuple):
     Attributes:
         flight: memory of the pilot.
         held_strokes: strokes of jammed sliders (2,) [m], infinite for others.
-        commanded: forces that the servo last asked of the actuators, or inputs of a model's joints (a,).
+        commanded: forces that the servo last commanded, or inputs of a model's joints (a,).
     """
 
     flight: FlightMemory | AdaptiveMemory
@@ -247,22 +247,22 @@ class MissionMemory(NamedTuple):
 
 
 class PilotChange(NamedTuple):
-    """Controller that takes over at a time [s], because it is told of lost rotors."""
+    """Controller from a time [s] on, whose model has the lost rotors."""
 
     at: Float[Array, ""]
     pilot: Pilot
 
 
 class MissionController(eqx.Module):
-    """Controller of a mission whose commands go through the limits of its actuators, and through its
-    faults, of which it may be told.
+    """Controller of a mission whose commands pass the limits of its actuators and its faults, which its model
+    may include.
 
     Attributes:
         pilot: controller of the machine. pilot_changes: those that follow it, by rising times.
         lost: rising times of the faults of each rotor (k, f) [s], infinite for none.
         share: share of its thrust that it keeps from each on (k, f).
         jam: faults of the sliders, or None.
-        rotors: rotors with curves, of whose thrust a share is kept; None for a share of the squared speed.
+        rotors: rotors with curves, which keep a share of their thrust; None for a share of the squared speed.
         force: largest force of each actuator of the tracker, or effort of each driven joint of a model,
             either way (a,) [N] or [N m], infinite for no limit.
     """
@@ -316,7 +316,7 @@ class MissionController(eqx.Module):
 
 
 def _command_pilot(pilot: Any, estimate: Any, reference: MissionReference, memory: Any) -> Any:
-    inner_pilot = pilot.pilot if isinstance(pilot, AdaptiveController) else pilot
+    inner_pilot = pilot.controller if isinstance(pilot, AdaptiveController) else pilot
     if isinstance(inner_pilot, FlightController):
         return pilot(estimate, reference.waypoint, memory)
     if isinstance(inner_pilot, JointController):

@@ -55,7 +55,7 @@ _QUANTITIES: dict[str, tuple[str, str]] = {
     "effort_margin": ("1", "smallest margin of the joint efforts, share of the range"),
     "energy": ("J", "electrical energy used"),
     "state_of_charge": ("1", "state of charge of the battery at the end"),
-    "kept": ("1", "whether all tolerances and limits were met"),
+    "met": ("1", "whether all tolerances and limits were met"),
 }
 
 
@@ -76,7 +76,7 @@ class Worst(NamedTuple):
         joints: largest errors of the driven joints (n,) [rad] or [m].
         rotors, strokes, forces, efforts: smallest distances from the limits, as shares of the range.
         energy: electrical energy used [J]. charge: state of charge at the last sample [1].
-        next_charge: after it. is_drained: True once the battery is empty or asked for more than it can give.
+        next_charge: after it. is_drained: True once the battery is empty or the demand exceeds its power.
         reason: code of `LoopReason`. end: time of the last valid sample [s].
     """
 
@@ -97,7 +97,7 @@ class Worst(NamedTuple):
 
 
 class MissionEvaluation(eqx.Module):
-    """Function of a sample that flies a mission by a machine with its numbers and returns the worst of the flight.
+    """Function of a sample that flies a mission with its parameters and returns the worst values of the flight.
 
     The sample's key gives the seeds of gusts and of noise.
 
@@ -146,13 +146,13 @@ class MissionEvaluation(eqx.Module):
             f"{column_name(drive.name)}_error": worst.joints[k] for k, drive in enumerate(joints)
         }
         return {name: hide(x) for name, x in measures.items()} | {
-            "kept": valid & self._check_compliance(worst),
+            "met": valid & self._check_compliance(worst),
             "end": jnp.where(possible, worst.end, 0.0),
             "status": jnp.where(possible, FINE + worst.reason, NOT_PHYSICAL),
         }
 
     def _check_compliance(self, worst: Worst) -> Array:
-        """True if a flight kept the tolerances and limits of the mission."""
+        """True if a flight met the tolerances and limits of the mission."""
         target = self.mission.file.tolerances
         margins = (worst.rotors, worst.strokes, worst.forces, worst.efforts)
         is_compliant = (jnp.min(jnp.stack(margins)) >= -AT_LIMIT) & ~worst.is_drained
@@ -206,7 +206,7 @@ def _check_judged(mission_file: MissionFile) -> None:
     for name in ("touchdown", "sink"):
         if getattr(tolerances, name) is not None:
             raise SettingError(
-                f"A study of a mission does not judge 'tolerances.{name}': leave it out."
+                f"A study of a mission does not support 'tolerances.{name}': leave it out."
             )
     late = list_unreached(json.loads(mission_file.model_dump_json()), mission_file.t1)
     late += [
@@ -342,7 +342,8 @@ def make_mission_study(
         settings: samples, seed, design, name and others of `stmuav_jax.Study`.
 
     Raises:
-        SettingError: entries that its flights do not come to, factors that are unknown, lengths, or of no effect.
+        SettingError: entries later than the end of its flights, or factors that are unknown, lengths, or
+            without effect.
     """
     _check_judged(mission.file)
     evaluation = MissionEvaluation(mission, relative)
@@ -355,7 +356,7 @@ def make_mission_study(
         evaluation.table, mission.machine, factor, factor in relative
     )
     columns = {
-        name: Column("int8" if name == "kept" else "float64", unit, description)
+        name: Column("int8" if name == "met" else "float64", unit, description)
         for name, (unit, description) in quantities.items()
     }
     columns["end"] = Column("float64", "s", "last time with valid numbers", "diagnostic")
@@ -368,7 +369,7 @@ def make_mission_study(
             "kind": "missions",
             "mission": json.loads(mission.file.model_dump_json(exclude={"title"})),
             "parameters": digest_table(evaluation.table, "" if model is None else model.digest),
-            "relative": sorted(relative), "failure": {"quantity": "kept", "below": 0.5},
+            "relative": sorted(relative), "failure": {"quantity": "met", "below": 0.5},
         },
         lanes=LANES if lanes is None else lanes, **settings,
     )  # fmt: skip

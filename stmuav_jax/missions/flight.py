@@ -69,7 +69,7 @@ def fly(
     *,
     progress: Callable[[float], object] | None = None,
 ) -> MissionFlight:
-    """Fly a mission to its end, to an empty battery, or until Ctrl-C; what was flown is kept.
+    """Fly a mission to its end, to an empty battery, or until Ctrl-C; the samples so far are returned.
 
     Args:
         mission: mission, from `load_mission` or `make_mission`.
@@ -130,14 +130,14 @@ def describe_failure(mission: Mission, rows: Rollout, run: LoopRun) -> str:
     if machine.force is not None:
         note_first(
             np.abs(signals["commanded_force"]) > machine.force,
-            lambda k: f"the servo asked slider {k[1] + 2} for more than {machine.force:g} N",
+            lambda k: f"the servo commanded slider {k[1] + 2} more than {machine.force:g} N",
         )
     note_first(signals["tilt_error"] > np.pi / 2, lambda k: "the base was upside down")
     # A flight that diverges passes limits long before its numbers overflow: the first of them is
     # the useful message.
     t_end = run.certificate.t_end
     if rows.ts[-1] < t_end:
-        exits.append((len(rows.ts), "it asked its battery for more than that can give"))
+        exits.append((len(rows.ts), "its power demand exceeded that of the battery"))
     if not exits:
         return run.failure
     k, exit_text = min(exits)
@@ -265,7 +265,7 @@ class _Discharge(NamedTuple):
 
 
 def _discharge_battery(battery: Battery, soc: float, rows: Rollout, rate: float) -> _Discharge:
-    """Discharge by samples: until its reserve is used up, or it is asked for more than it can give."""
+    """Discharge by samples: until its reserve is used up, or the demand exceeds its power."""
     power = jnp.asarray(rows.signals["electric_power"])
     arguments = (battery, jnp.asarray(soc), power, jnp.asarray(1.0 / rate))
     socs, currents, voltages, last = (

@@ -131,7 +131,7 @@ class Machine(NamedTuple):
         nominal: system of the controller's model, without the unknown payload; None where it is
             that of the scene. `bodies` are those of the controller's model.
         force: largest force of each of the tracker's actuators, either way [N]; None for no limit.
-        model: the model's file; None for a ready scene. joints: its driven joints.
+        model: the model's file; None for a built-in scene. joints: its driven joints.
     """
 
     scene: Scene
@@ -174,9 +174,7 @@ def machine_of(mission_file: MissionFile, folder: Path) -> Machine:
     # A scene's own options and a mission's tables would set the same thing twice.
     for name, instead in (("wind", "[wind]"), ("strokes", "[[panel]]"), ("case", "[push]")):
         if name in entry.options:
-            raise SettingError(
-                f"'machine.options' of a mission has no {name}: {instead} takes its place."
-            )
+            raise SettingError(f"'machine.options' of a mission has no {name}: use {instead}.")
     # One table for scene, controller and limits: a mass that is changed is changed in all of them,
     # unless it is drawn for the true machine alone.
     table = entry_of(entry.scene).parameters.replaced(entry.parameters)
@@ -216,7 +214,7 @@ def scene_of(
     """Scene of a mission's machine in its air, with a table of parameters, which may be traced.
 
     Args:
-        gusts: seed of the gusts in place of the mission's. model: a model's file; None for a ready scene.
+        gusts: seed of the gusts in place of the mission's. model: a model's file; None for a built-in scene.
 
     Raises:
         SettingError: wind without drag, gusts without wind, options that the scene does not have.
@@ -256,7 +254,7 @@ def _model_machine(entries: MissionFile, path: Path) -> Machine:
     _without_tracker(entries, "A model's file")
     if entries.machine.options:
         raise SettingError(
-            "'machine.options' is for ready scenes (machine.scene): a model's file has drag, motors and landing "
+            "'machine.options' is for built-in scenes (machine.scene): a model's file has drag, motors and landing "
             "gear as forces of its own."
         )
     model = read_model(path)
@@ -531,7 +529,7 @@ def controller_of(mission_file: MissionFile, machine: Machine, plant: Plant) -> 
 def _make_pilot(
     entries: MissionFile, machine: Machine, plant: Plant, lost: tuple[int, ...]
 ) -> Pilot:
-    """Controller of a machine that knows of lost rotors."""
+    """Controller of a machine whose model has the lost rotors."""
     entry = entries.controller
     system = machine.scene.system if machine.nominal is None else machine.nominal
     gains = FlightGains(**entry.gains.model_dump(exclude_none=True))
@@ -638,7 +636,7 @@ def check_faults(mission_file: MissionFile) -> None:
         if fault.known and (fault.rotor is None or fault.share):
             raise SettingError(
                 "A fault that is 'known' must be the loss of a rotor, without a share of its thrust: "
-                "the controller has no law for a jammed slider or a weak rotor."
+                "the controller cannot compensate a jammed slider or a weak rotor."
             )
         place = f"Rotor {fault.rotor}" if fault.rotor is not None else f"Slider {fault.slider}"
         # Faults of one part are looked at in the order of time: one after a final fault, or at the

@@ -1,4 +1,4 @@
-"""Missions from TOML files: read, checked before the flight, and made ready to fly."""
+"""Missions from TOML files: read, checked before the flight, and prepared to fly."""
 
 import dataclasses
 import itertools
@@ -89,7 +89,7 @@ class Mission:
 
     Attributes:
         file: its entries, with defaults filled in. machine: scene, rotors, tracker.
-        truth: plant, signals and battery, with the true numbers. table: these numbers.
+        truth: plant, signals and battery, with the true parameters. table: these parameters.
         controller: controller with faults. references: function of t [s].
         growth: factor by which small motions about hover grow in a second; up to 1 for a stable loop.
         folder: folder of the model's file.
@@ -141,15 +141,15 @@ def load_mission(
 
     Args:
         t1: end of the flight [s] in place of the file's.
-        true_states: leave the mission's sensors out, so that the controller knows the true states.
-        truth: numbers of the true machine, of which the controller does not know, beside the file's `truth`:
-            by the names that factors of a mission's study have.
+        true_states: leave the mission's sensors out, so that the controller receives the true states.
+        truth: parameters of the true machine that differ from the controller's model, in addition to the file's
+            `truth`, by the names of factors of a mission's study.
 
     Raises:
         FileError: the file is missing or not valid TOML; an entry is unknown, missing or out of
             range; the machine cannot fly; or a reference is out of the machine's reach. The message
             names the file.
-        SettingError: a name that is none.
+        SettingError: an unknown name.
     """
     text = os.fspath(source)
     path = Path(text)
@@ -188,7 +188,7 @@ def make_mission(plain: Mapping[str, Any], folder: str | os.PathLike[str] = ".")
 
     Raises:
         SettingError: an entry is unknown, missing or out of range, or a reference is out of reach.
-        ModelError, StateError: the machine's numbers make no sense.
+        ModelError, StateError: invalid parameters of the machine.
     """
     entries = validate_model(MissionFile, plain, "A mission")
     # what the entries tell alone, before anything is compiled
@@ -494,7 +494,7 @@ def _check_stability(mission: Mission) -> float:
     """Factor by which small motions about hover grow in a second, with the mission's gains, rate and delay.
 
     It raises `SettingError` where this is more than tenfold.
-    The controllers that are told of lost rotors are checked too, as if the machine did not turn. The
+    The controllers for lost rotors are checked too, as if the machine did not turn. The
     estimator, limits and drag are left out.
     """
     pilots = [
@@ -507,7 +507,7 @@ def _check_stability(mission: Mission) -> float:
 def _check_pilot(mission: Mission, pilot: Pilot) -> float:
     """Growth of small motions in a second with one of the controllers of `_check_stability`."""
     machine, plant = mission.machine, mission.plant
-    pilot = pilot.pilot if isinstance(pilot, AdaptiveController) else pilot
+    pilot = pilot.controller if isinstance(pilot, AdaptiveController) else pilot
     system, start, observe = machine.scene.system, machine.scene.state0, None
     if machine.nominal is not None:
         observe = WithoutPayload(system, machine.nominal)
@@ -636,7 +636,7 @@ def check_forces(mission_file: MissionFile, machine: Machine, references: Refere
         f"The panel cannot follow its reference: at t = {ts[k]:.4g} s slider {slider + 2} needs a force of "
         f"{forces[k, slider]:.4g} N, but its actuator gives at most {machine.force:g} N either way "
         f"('controller.force'). The largest force is {most:.4g} N, at t = {ts[late]:.4g} s: give the move "
-        "more time, or another goal."
+        "more time, or another target."
     )
 
 

@@ -138,7 +138,7 @@ def to_flight_record(flight: MissionFlight) -> FlightRecord:
 
 
 class Measure(NamedTuple):
-    """Number in the table of a flight: name, value, unit, allowed value or None, and whether kept."""
+    """Number in the table of a flight: name, value, unit, allowed value or None, and whether met."""
 
     name: str
     value: float
@@ -148,7 +148,7 @@ class Measure(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Value with its unit for a table; 0 for errors of the arithmetic."""
+        """Value with its unit for a table; 0 for round-off."""
         is_round_off = self.unit in ("m", "degrees") and abs(self.value) < ROUND_OFF
         return f"{0.0 if is_round_off else self.value:.4g} {self.unit}"
 
@@ -331,9 +331,9 @@ def list_unreached(mission: Mapping[str, Any], end: float) -> list[str]:
 
 
 def verdict(data: "xr.Dataset") -> tuple[bool, str]:
-    """True if a flight did all that its mission asks for, and a sentence about it.
+    """True if a flight completed its mission and met all limits, and a sentence about it.
 
-    It did not if it ended before a waypoint, a move of the panel, a fault or a change of the wind.
+    A flight that ends before a waypoint, a move of the panel, a fault or a change of the wind fails.
     """
     mission = json.loads(data.attrs["mission"])
     end, t1 = float(data.time.values[-1]), mission["t1"]

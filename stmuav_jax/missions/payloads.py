@@ -126,7 +126,7 @@ class Payloads(eqx.Module):
         return [(t, at(t)) for t in times]
 
     def without(self, state: State) -> State:
-        """State of the machine without its payloads, as its controller sees it."""
+        """State of the machine without its payloads, for its controller."""
         keep = np.delete(np.arange(state.r.shape[0]), self._places)
         return State(*(x[keep] for x in _parts(state)))
 
@@ -136,7 +136,7 @@ def _parts(state: State) -> tuple[Array, ...]:
 
 
 class Unloaded(eqx.Module):
-    """Function of a plant's true motion that returns what the controller of a loaded machine sees.
+    """Function of a plant's true motion that returns the estimate for the controller of a loaded machine.
 
     Attributes:
         payloads: payloads of the machine. observe: what it sees of the machine without them, see `Plant`.

@@ -127,7 +127,7 @@ class PayloadEntry(Entries):
 
 class CarriedEntry(Entries):
     """Entry for a payload that is picked up, or dropped: a point mass [kg] on a body, at a position from its
-    centre of mass in its axes [m], from a time [s] on or until one. The controller is not told."""
+    centre of mass in its axes [m], from a time [s] on or until one. The controller's model omits it."""
 
     body: str
     mass: Positive
@@ -140,7 +140,7 @@ class ControllerEntry(Entries):
     """Entry for the controller; the limits of the rotor speeds are in rad/s, the largest force of each of
     the tracker's actuators in N.
 
-    Of the payload it knows nothing, or all, or it estimates it.
+    Its model omits the payload, contains it, or estimates it.
     """
 
     gains: GainsEntry = GainsEntry()
@@ -214,7 +214,7 @@ class JointMoveEntry(Entries):
 
 
 class PushEntry(Entries):
-    """Entry for sinusoidal forces on both sliders [N], which the controller does not know."""
+    """Entry for sinusoidal forces on both sliders [N], which are not in the controller's model."""
 
     force: Finite
     angular_frequency: Positive

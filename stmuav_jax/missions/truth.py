@@ -1,4 +1,4 @@
-"""Truth of a mission: the numbers of its machine, which its controller and estimator do not know."""
+"""Truth of a mission: parameters of the true machine, unknown to its controller and estimator."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -150,7 +150,7 @@ def _describe_fault(machine: Machine, factor: str, name: str) -> str:
     scene, model = machine.scene, machine.model
     if model is None and name.startswith(_FIXED) and name not in _FREE:
         return (
-            f"{quote_name(factor)} can be no factor of a mission's study and no part of its truth: loops and limits "
+            f"{quote_name(factor)} cannot be a factor of a mission's study or part of its truth: loops and limits "
             "of strokes are those of the mission's machine. Masses, inertias, centres of mass, rotors, "
             "drag and motors can be."
         )
@@ -158,7 +158,9 @@ def _describe_fault(machine: Machine, factor: str, name: str) -> str:
     if (line is None) if model is None else (name not in model.used_parameters()):
         return f"{quote_name(factor)} has no effect on this mission: its machine does not use it."
     if model is None and line != machine.table[name].plain():
-        return f"'{name}' is given by the mission's options: it can be no factor and no part of the truth."
+        return (
+            f"'{name}' is set by the mission's options: it cannot be a factor or part of the truth."
+        )
     return ""
 
 

@@ -16,7 +16,7 @@ from .disturbed_flights import (
 )
 from .examples import (
     READY as READY,
-    ready as ready,
+    load_builtin_study as load_builtin_study,
 )
 from .flights import (
     Failure as Failure,

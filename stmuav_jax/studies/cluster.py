@@ -1,4 +1,4 @@
-"""Workers of Dask distributed that compute a study's chunks; imported only where they are asked for.
+"""Workers of Dask distributed that compute a study's chunks; imported only when they are used.
 
 A chunk is a task, which brings the study's small pickle along; a worker keeps the last study that it has
 unpickled, with its compiled programs. Chunks come back to this process, which alone writes the store,

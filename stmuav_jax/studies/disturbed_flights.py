@@ -95,7 +95,7 @@ def table_entry(
         place = tuple(int(k) for k in match[2].split(",")) if match[2] else ()
     except ValueError:
         raise SettingError(
-            f"{quote_name(factor)} names no entry; one is written such as {name}[0, 1]."
+            f"{quote_name(factor)} must name one entry, such as {name}[0, 1]."
         ) from None
     value = np.asarray(table.value(name), dtype=float)
     if place and (
@@ -270,11 +270,11 @@ class AbstractFlights(abc.ABC):
 
     @abc.abstractmethod
     def plain(self) -> dict[str, Any]:
-        """Plain data of what tells the scene from others, without its table."""
+        """Plain data that identify the scene, without its table."""
 
     @abc.abstractmethod
     def _check_parameter(self, name: str) -> None:
-        """Raise `SettingError` for a parameter that can be no factor."""
+        """Raise `SettingError` for a parameter that cannot be a factor."""
 
     def entry(self, factor: str) -> FactorTarget:
         """Target of a factor.
@@ -285,7 +285,9 @@ class AbstractFlights(abc.ABC):
         """
         if factor in self.own_factors:
             if factor in self.relative:
-                raise SettingError(f"'{factor}' has no value in the table that it could multiply.")
+                raise SettingError(
+                    f"'{factor}' has no default value in the table to multiply: leave 'relative' out."
+                )
             return FactorTarget(factor, (), self.own_factors[factor])
         suggest = lambda: suggest_names(
             factor.partition("[")[0][:SHOWN],
@@ -348,7 +350,7 @@ class Flights(AbstractFlights):
         scene, case: see `stmuav list`. table: of its parameters.
         own_factors: factors beside the table's, with their units.
         options: of the scene, plain data as `options_from_plain` takes. option_names: names of the table
-            whose values the options replace, which can be no factors. unused_names: of the table, that have no
+            whose values the options replace, which cannot be factors. unused_names: of the table, that have no
             effect.
         relative: names of factors that multiply the table's value.
         inputs: "case" for the scene's own; "trim" for constant rotor speeds and actuator forces
@@ -389,7 +391,7 @@ class Flights(AbstractFlights):
 
     def _check_parameter(self, name: str) -> None:
         if name in self.option_names:
-            raise SettingError(f"'{name}' is given by the study's options: it can be no factor.")
+            raise SettingError(f"'{name}' is set by the study's options: it cannot be a factor.")
 
     def build(self, sample: Mapping[str, Any], seed: Any = 0) -> tuple[System, State]:
         """System and initial state of one run, NaN for an impossible start; may be traced."""
@@ -406,7 +408,7 @@ class Flights(AbstractFlights):
         return self._drive_inputs(scene.system, sample), scene.state0
 
     def plain(self) -> dict[str, Any]:
-        """Plain data of what tells the scene from others, without its table."""
+        """Plain data that identify the scene, without its table."""
         names = ("scene", "case", "inputs", "drag", "gusts")
         options = {"options": self.options} if self.options else {}
         return {name: getattr(self, name) for name in names} | options
@@ -658,7 +660,7 @@ class ModelFlights(AbstractFlights):
         )
 
     def plain(self) -> dict[str, Any]:
-        """Plain data of what tells the model from others."""
+        """Plain data that identify the model."""
         return {"model": self.scene, "digest": self.model.digest, "inputs": self.inputs}
 
 

@@ -95,12 +95,12 @@ READY |= {
 }
 
 
-def ready(name: str) -> dict[str, Any]:
+def load_builtin_study(name: str) -> dict[str, Any]:
     """Plain data of a predefined study.
 
     Raises:
         SettingError: an unknown name.
     """
     if name not in READY:
-        raise SettingError(f"There is no ready study '{name}'.{nearest_names(name, READY)}")
+        raise SettingError(f"There is no built-in study '{name}'.{nearest_names(name, READY)}")
     return {"name": name} | READY[name]

@@ -1,4 +1,4 @@
-"""Studies of simulated motions: systems with drawn numbers, their runs, and the quantities kept of each.
+"""Studies of simulated motions: systems with drawn numbers, their runs, and the quantities stored for each.
 
 The runs go through batch slots, each with its own step sizes; see `dynamics.integration.lanes`.
 """
@@ -42,7 +42,7 @@ OWN = {"status", "sample", "time", "end", "steps", "rejected", "residual", "reco
 
 @dataclass(frozen=True)
 class Quantity:
-    """Quantity, a number or a history, that is kept of each run.
+    """Quantity, a number or a history, that is stored for each run.
 
     Attributes:
         signal: name of a signal, see `stmuav_jax.studies.signal`.
@@ -54,7 +54,7 @@ class Quantity:
             step, and paths are NaN from there on.
 
     Raises:
-        SettingError: an unknown take, a level where none belongs or none where one does.
+        SettingError: an unknown take, or a level that is missing or superfluous.
     """
 
     signal: str
@@ -114,16 +114,15 @@ class FlightEvaluation(AbstractBatch):
         flights: what all runs have in common: scene or model, inputs, wind.
         quantities: quantities by the names of their columns.
         t1: final time [s].
-        every: spacing of the kept times of paths [s]; default one thirtieth of t1.
+        every: spacing of the saved times of paths [s]; default one thirtieth of t1.
         method: how the runs are integrated: by `diffrax.Dopri8()` or `diffrax.Tsit5()`, with at most
-            `max_steps` steps, after which a run has failed. Nothing differentiates the runs: its
-            `adjoint` and `steps` are not used.
+            `max_steps` steps, after which a run has failed. The runs have no derivatives: its `adjoint` and
+            `steps` are not used.
         direction: unit vector that the panel should face, world; default its direction at the
             start.
 
     Raises:
-        SettingError: no quantities, names that are no names, impossible numbers, a method that many runs
-            at once cannot have.
+        SettingError: no quantities, invalid names or numbers, or a method that cannot run in batches.
     """
 
     flights: AbstractFlights
@@ -348,7 +347,7 @@ def make_flight_study(
     """Study of simulated motions.
 
     Args:
-        evaluation: what is simulated and kept of each run. factors: distributions by name.
+        evaluation: simulation of each run, and its stored quantities. factors: distributions by name.
         failure: condition under which completed runs count as failures; default none.
         settings: samples, seed, design, lanes and others of `Study`.
 

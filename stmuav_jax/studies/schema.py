@@ -87,7 +87,7 @@ Pair = tuple[str, str, Annotated[float, Field(gt=-1, lt=1)]]
 
 
 class QuantityEntry(Entries):
-    """Entry for a quantity that is kept of each run."""
+    """Entry for a quantity that is stored for each run."""
 
     signal: str
     take: Take
@@ -165,7 +165,7 @@ class EstimationFile(Entries):
 
 
 class MissionStudyFile(Drawing):
-    """Entries of a Monte Carlo study of a mission, which is a ready one or a file beside the study's.
+    """Entries of a Monte Carlo study of a mission, which is built in or a file in the study's folder.
 
     Its end `t1` [s] takes the place of the mission's.
     """

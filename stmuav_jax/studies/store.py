@@ -165,7 +165,7 @@ class Store:
             arrays: columns (count, ...) by name.
 
         Raises:
-            SettingError: columns of other names, shapes or types than the study says.
+            SettingError: columns of other names, shapes or types than the study declares.
             FileError: the disk is full or fails, or the folder is gone; chunks written before are kept.
         """
         if self._lock is None:
@@ -197,9 +197,9 @@ class Store:
         self._is_stored[first:last] = True
 
     def check_folder(self) -> None:
-        """Refuse to go on where the folder is no longer the one that was opened.
+        """Raise an error if the folder is no longer the one that was opened.
 
-        Zarr would make missing folders anew, and what is written then belongs to no study.
+        Zarr would create missing folders again, for chunks that belong to no study.
 
         Raises:
             FileError: the folder was removed, renamed or replaced, or samples in it were.
@@ -421,7 +421,7 @@ def resume_store(
                     f"{source} was computed by other code, whose samples cannot be mixed with this "
                     f"code's: {differences} Resume it by that code, or give another name."
                 )
-            raise FileError(f"{source} is of another study: {differences}")
+            raise FileError(f"{source} belongs to another study: {differences}")
         # chunks of a killed process
         for file in source.rglob("*.partial"):
             file.unlink()
@@ -456,7 +456,7 @@ def _lock_folder(path: Path) -> int:
 
 
 def _describe_study(study: Any, versions: Mapping[str, str]) -> dict[str, Any]:
-    """Attributes of a store that say what study it is; checks that its columns can be stored.
+    """Attributes of a store that identify its study; checks that its columns can be stored.
 
     Raises:
         SettingError: an identity that is no plain data, or columns that a store cannot hold.

@@ -87,7 +87,7 @@ class StudyOutcome(NamedTuple):
 
 
 class AbstractBatch(abc.ABC):
-    """Function of a sample that has a quicker way for many than `jax.vmap`.
+    """Function of a sample with a faster batch evaluation than `jax.vmap`.
 
     Attributes:
         block: number of samples in one call of the compiled program, from which the lanes are filled;
@@ -123,7 +123,7 @@ class Study:
         evaluate: function (sample, key) -> outcomes that JAX can trace, evaluated for many samples at once
             in double precision. `sample` has a number by factor, `key` is the sample's own random key, and
             outcomes are a pytree of arrays, of which each leaf is a column of the results. An outcome
-            "status" tells how the sample ended: `FINE` (1), or a code of `reasons`; without one a sample
+            "status" is the result of the sample: `FINE` (1), or a code of `reasons`; without one a sample
             with a NaN has failed.
         factors: distributions by name: frozen ones of `scipy.stats`, numbers or plain forms.
         samples: number of samples.
@@ -133,8 +133,8 @@ class Study:
             among them, those of all columns.
         axes: axes of outcomes that are arrays; default numbers from 0.
         reasons: reasons of failed samples by their codes of "status", from 2 on.
-        identity: plain data of all on which the outcomes depend beside the factors; default the source of
-            `evaluate` and of the user's functions that it calls, and the values that they hold.
+        identity: plain data that identify everything else on which the outcomes depend; default the source of
+            `evaluate` and of the user's functions that it calls, and the values that they capture.
         lanes: samples evaluated together on a device, a multiple of 8; default 16 on a CPU and 4096
             elsewhere.
         block: for an `AbstractBatch`, samples in one call of the compiled program in place of its own.
@@ -178,8 +178,8 @@ class Study:
         self.lanes = LANES.get(kind, LANES_ELSEWHERE) if lanes is None else lanes
         if self.lanes % TOGETHER:
             raise SettingError(
-                f"lanes must be a multiple of {TOGETHER}, but it is {lanes}: a processor computes so "
-                "many together, and a sample's numbers may not depend on its lane."
+                f"lanes must be a multiple of {TOGETHER}, but it is {lanes}: a vector "
+                "register holds that many, and results must not depend on the lane."
             )
         most = MOST_DEVICES if kind == "cpu" else len(jax.local_devices())
         if devices is not None and devices > most:
@@ -222,7 +222,7 @@ class Study:
 
         Each chunk is stored whole or not at all: a run that is killed loses at most the chunks that are
         computed at that moment, and a run that resumes it ends with the same files. Ctrl-C, or SIGTERM,
-        ends the run after the present chunk; a second one ends it at once.
+        ends the run after the current chunk; a second one ends it immediately.
 
         A script that starts workers needs `if __name__ == "__main__":`, since new processes import it.
 
@@ -234,7 +234,7 @@ class Study:
             resume: continue the store if there is one.
             progress: function called with a `StudyProgress` at the start and after each chunk.
             scheduler: address of a Dask scheduler, such as "tcp://10.0.0.1:8786", whose workers compute.
-                They may join and leave at any time, and have a chunk in progress and one waiting each.
+                They may join and leave at any time; each has one chunk in progress and one waiting.
             workers: number of Dask workers to start on this machine, one thread each.
             patience: time for the scheduler to answer [s].
 

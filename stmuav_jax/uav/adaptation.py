@@ -157,20 +157,20 @@ class PayloadMemory(NamedTuple):
 class PayloadFilter(eqx.Module):
     """Estimator of a payload that is fixed to a machine's last body; the module has its equations.
 
-    It needs a `MotionEstimate` at each period, and the commands of the rotors. It knows the lag of the
+    It needs a `MotionEstimate` at each period, and the commands of the rotors. It models the lag of the
     system's motors, but not their inertia.
 
     Args:
         system: machine without the payload, with one set of rotors on its first body.
         rate: control rate [Hz]. delay: from a sample to the effect of its command [s].
-        mass, moment, inertia: standard deviations of the payload before the flight [kg], [kg m], [1].
+        mass, moment, inertia: prior standard deviations of the payload [kg], [kg m], [1].
         mass_drift, moment_drift: their random walks [kg/sqrt(s)], [kg m/sqrt(s)].
         torque: density of unknown moments [N m/sqrt(Hz)].
         thrust: density of unknown forces along the base's z axis [N/sqrt(Hz)].
         gyroscope: standard deviation of a reading's noise [rad/s].
         momentum: standard deviation of H by the estimated rates of the moving parts [N m s]; by default
             1e-3, and zero for a machine of one body.
-        bound: how much of the payload is fed forward at most, in standard deviations before the flight.
+        bound: largest payload that is fed forward, in prior standard deviations.
 
     Raises:
         ModelError: not one set of rotors on the first body, or a number that is negative, or a noise
@@ -244,7 +244,7 @@ class PayloadFilter(eqx.Module):
         self.bound = check_positive(bound, f"The bound {owner_text}", "1")
 
     def start(self) -> PayloadMemory:
-        """First memory: no payload, as the standard deviations before the flight have it."""
+        """First memory: no payload, with the prior standard deviations."""
         spread = jnp.concatenate([jnp.full(3, _UNKNOWN), self.prior])
         command_queue = jnp.tile(self.before, (self.late + 1, 1))
         # a machine that hovers
@@ -275,8 +275,8 @@ class PayloadFilter(eqx.Module):
     ) -> PayloadMemory:
         """Memory after the period that ends now.
 
-        Where the estimate has an angular velocity or a force of NaN, it measures nothing, and the motion goes on
-        by the smoothed ones.
+        Where the estimate has an angular velocity or a force of NaN, there is no measurement, and the smoothed
+        values propagate the motion.
 
         Args:
             about: moments of the machine without payload. on: motion of its last body.
@@ -392,7 +392,7 @@ class AdaptiveMemory(NamedTuple):
     """Memory of an `AdaptiveController`.
 
     Attributes:
-        flight: memory of the pilot. payload: memory of the filter.
+        flight: memory of the controller. payload: memory of the filter.
         centre: centre of mass that was fed forward, from the base's in its axes (3,) [m].
     """
 
@@ -402,14 +402,13 @@ class AdaptiveMemory(NamedTuple):
 
 
 class AdaptiveController(eqx.Module):
-    """Pilot whose mass, centre of mass and inertia are those of the machine with an estimated payload.
+    """Controller whose mass, centre of mass and inertia are those of the machine with an estimated payload.
 
-    At each sample the filter is carried on by what the rotors were last told, and the mass properties
-    with its payload, at the estimated posture, go to the pilot: to its thrust and moments, to the
-    allocation, and to the servo of a panel.
+    At each sample the filter predicts with the last rotor commands. The mass properties with its payload, at
+    the estimated posture, enter thrust and moments, the allocation, and the servo of a panel.
 
     Args:
-        pilot: controller of the rotors, or of a UAV with its tracker, for the machine without
+        controller: controller of the rotors, or of a UAV with its tracker, for the machine without
             payload.
         filter: filter of the payload, for the same machine.
 
@@ -418,11 +417,11 @@ class AdaptiveController(eqx.Module):
             `MotionEstimate` of the filter's machine.
     """
 
-    pilot: FlightController | UavController
+    controller: FlightController | UavController
     filter: PayloadFilter
 
     def __check_init__(self) -> None:
-        if isinstance(self.pilot, UavController) and not self.pilot.feedforward:
+        if isinstance(self.controller, UavController) and not self.controller.feedforward:
             raise SettingError(
                 "A payload is fed forward with the moving tracker: it needs a UavController with its "
                 "feedforward."
@@ -430,12 +429,12 @@ class AdaptiveController(eqx.Module):
 
     def start(self) -> AdaptiveMemory:
         """First memory."""
-        return AdaptiveMemory(self.pilot.start(), self.filter.start(), jnp.zeros(3))
+        return AdaptiveMemory(self.controller.start(), self.filter.start(), jnp.zeros(3))
 
     def __call__(
         self, estimate: Any, reference: Any, memory: AdaptiveMemory
     ) -> tuple[Float[Array, " m"], AdaptiveMemory]:
-        """Inputs of the pilot (m,), and the memory."""
+        """Inputs of the controller (m,), and the memory."""
         state = self._read_state(estimate)
         machine_moments, carrier_motion = (
             mass_moments(self.filter.system, state),
@@ -445,16 +444,16 @@ class AdaptiveController(eqx.Module):
             estimate, machine_moments, carrier_motion, memory.payload
         )
         payload = self.filter.payload(filter_memory)
-        mass, pilot = (
+        mass, controller = (
             central_properties(add_payload(machine_moments, carrier_motion, payload)),
-            self.pilot,
+            self.controller,
         )
-        if isinstance(pilot, UavController):
-            bodies = bodies_carrying(pilot.servo.bodies, payload)
-            servo = eqx.tree_at(lambda s: s.bodies, pilot.servo, bodies)
-            inputs, flight = pilot.command(state, reference, memory.flight, mass, servo)
+        if isinstance(controller, UavController):
+            bodies = bodies_carrying(controller.servo.bodies, payload)
+            servo = eqx.tree_at(lambda s: s.bodies, controller.servo, bodies)
+            inputs, flight = controller.command(state, reference, memory.flight, mass, servo)
         else:
-            inputs, flight = pilot.command(state, reference, memory.flight, mass)
+            inputs, flight = controller.command(state, reference, memory.flight, mass)
         payload_memory = self.filter.sent(filter_memory, inputs[: filter_memory.sent.shape[1]])
         return inputs, AdaptiveMemory(flight, payload_memory, mass.centre)
 

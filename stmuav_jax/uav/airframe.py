@@ -147,12 +147,12 @@ _AIR = {
     "motor.time_constant": Parameter(0.05, "s", _CHOICE),
     "motor.inertia": Parameter(1e-4, "kg m^2", _CHOICE + ", a rotor of about 0.3 m"),
     "motor.lowest": Parameter(200.0, "rad/s", _CHOICE),
-    "motor.highest": Parameter(1900.0, "rad/s", _CHOICE + ", about twice the weight"),
+    "motor.highest": Parameter(1900.0, "rad/s", _CHOICE + ", for a thrust of about twice the weight"),
     "gear.spread": Parameter(0.15, "m", _CHOICE),
     "gear.depth": Parameter(0.2, "m", _CHOICE),
     # a start at the origin stands on it, its feet at the depth zero
-    "gear.ground": Parameter(-0.2, "m", _CHOICE + ", at the feet of a start at the origin"),
-    "gear.stiffness": Parameter(2e4, "N/m", _CHOICE + ", 1.4 mm under the weight of the UAV"),
+    "gear.ground": Parameter(-0.2, "m", _CHOICE + ", where the feet touch it at the default start"),
+    "gear.stiffness": Parameter(2e4, "N/m", _CHOICE + ", 1.4 mm of deflection under the weight of the UAV"),
     "gear.damping": Parameter(150.0, "N s/m", _CHOICE + ", about 40 % of critical damping"),
     "gear.width": Parameter(1e-3, "m", _CHOICE),
     "gear.friction": Parameter(0.6, "1", _CHOICE),
@@ -226,7 +226,7 @@ PRINTED_ORIENTATIONS = {
 # fmt: off
 ENERGY = Parameters("ENERGY", {
     "air.density": Parameter(1.225, "kg/m^3", "ISO 2533, standard atmosphere at sea level"),
-    "rotor.radius": Parameter(0.15, "m", _CHOICE + ", a rotor of about 0.3 m; neighbours are 0.35 m apart"),
+    "rotor.radius": Parameter(0.15, "m", _CHOICE + ", a diameter of about 0.3 m; adjacent rotors are 0.35 m apart"),
     "rotor.efficiency": Parameter(0.8, "1", _CHOICE + ", of motor and its electronics"),
     # actuators that stand still are taken to need nothing
     "other.power": Parameter(10.0, "W", _CHOICE + ", flight computer, sensors, radio"),

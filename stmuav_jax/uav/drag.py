@@ -92,7 +92,7 @@ def with_wind(system: System, wind: Numbers | Callable[..., object]) -> System:
     if not any(isinstance(force, AirframeDrag) for force in forces):
         raise ModelError(
             "Wind acts through the drag of an airframe, which this machine does not have: add an AirframeDrag "
-            "(of a model's file a force of the kind 'drag', of a ready scene the option 'drag')."
+            "(of a model's file a force of the kind 'drag', of a built-in scene the option 'drag')."
         )
     air = wind if callable(wind) else check_vector(wind, "The wind", "m/s")
     blown = [dataclasses.replace(f, wind=air) if isinstance(f, AirframeDrag) else f for f in forces]

@@ -7,8 +7,8 @@ speeds are the minimum-norm ones that give thrust and moments,
 
 with the derivative B of the wrench at hovering speeds if the rotors have curves, so that the unknowns
 are roll and pitch, the wrench w and two actuator forces: as many as the degrees of freedom. The rotors'
-speeds are then compared with their limits, and the panel's posture with the workspace of the tracker; a
-code says which limit the flight breaks. Derivatives are those of the implicit function.
+speeds are then compared with their limits, and the panel's posture with the workspace of the tracker; a code
+gives the limit that the flight exceeds. Derivatives are those of the implicit function.
 """
 
 from collections.abc import Callable, Mapping
@@ -367,7 +367,7 @@ def trim_slopes(
     condition: FlightCondition,
     limits: TrimLimits | None = None,
 ) -> tuple[FlightTrim, dict[str, Float[Array, "..."]]]:
-    """Trim of a UAV, and the derivatives of `FlightTrim.vector` by values that it is built from.
+    """Trim of a UAV, and the derivatives of `FlightTrim.vector` with respect to values of its construction.
 
     Args:
         build: function from values by name, traced by JAX, to the UAV.

@@ -256,7 +256,7 @@ def inverse_without_yaw(
     if not is_right_inverse or np.any(inverse[:, 0] <= 0) or np.any((u <= lower) | (u >= upper)):
         name, unit = quantity
         raise ModelError(
-            f"Thrust and tilt cannot be held {loss_text}: the hover would take {name} of "
+            f"Thrust and tilt cannot be held {loss_text}: the hover needs {name} of "
             f"{np.array2string(u, precision=3)} {unit}, and the limits are "
             f"{np.array2string(lower, precision=3)} to {np.array2string(upper, precision=3)}."
         )
@@ -273,7 +273,7 @@ def inverse_without_yaw(
 
 
 def as_it_turns(target: Waypoint, base: BaseMotion) -> Waypoint:
-    """Waypoint whose heading is that of the base, and goes on turning as it does."""
+    """Waypoint whose heading and turn rate are those of the base."""
     # A heading that cannot be controlled is taken from the machine itself, else its error would saturate
     # the rotors.
     x, rate = base.R[:, 0], (base.R @ skew(base.omega))[:, 0]
@@ -303,7 +303,7 @@ class FlightMemory(NamedTuple):
 
 
 class Feet(eqx.Module):
-    """Feet of the base of a machine, as its controller knows them.
+    """Feet of the base of a machine, in its controller's model.
 
     Attributes:
         places: from the base's centre of mass, its axes (k, 3) [m].
@@ -323,11 +323,11 @@ class FlightController(eqx.Module):
 
     The estimate is a `State` of all bodies, a `MotionEstimate`, or the `BaseMotion` of the base; the
     reference is a `Waypoint`, the memory a `FlightMemory`. While the rotors cannot give the target wrench, and
-    while a foot of the base's landing gear (`GroundContact`) is below the ground's height by the estimate, the
-    integral of the position error stands still.
+    while the estimate has a foot of the base's landing gear (`GroundContact`) below the ground, the integral of
+    the position error is frozen.
 
-    Rotors with curves are allocated thrusts, whose wrench is linear but for yaw, and turn with the speeds that
-    their curve has for these.
+    Rotors with curves are allocated thrusts, whose wrench is linear except for yaw, and commanded the speeds
+    that give them.
 
     Args:
         system: machine with one set of rotors and with gravity.
@@ -336,9 +336,9 @@ class FlightController(eqx.Module):
         limits: limits of the rotor speeds, within those of the machine's motors, which are the default.
         mass: mass properties of all bodies, or a function of the estimate that returns them; by
             default those of the system's reference posture.
-        lost: numbers of rotors that are lost, the first being 1. The controller then gives up
-            yaw: thrust and tilt are allocated to the working rotors first, and with what is left
-            of their limits, which it needs, the turning about the base's z axis is slowed down.
+        lost: numbers of rotors that are lost, the first being 1. The controller then does not hold yaw: thrust
+            and tilt are allocated to the working rotors first, and the remaining margin to their limits, which
+            are required, reduces the yaw rate.
 
     Raises:
         ModelError: not one set of rotors, no gravity, limits that cannot carry the weight or that the
@@ -612,8 +612,7 @@ class UavController(eqx.Module):
     Attributes:
         system: machine whose masses the controller uses.
         flight: controller of the rotors. servo: servo of the panel.
-        feedforward: false for a controller that takes the tracker for a rigid part in the reference
-            posture.
+        feedforward: false for a controller that treats the tracker as a rigid part in the reference posture.
     """
 
     system: System

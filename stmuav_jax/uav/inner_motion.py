@@ -1,4 +1,4 @@
-"""Motion of the other bodies of a flying machine against its base, as estimators see it by encoders.
+"""Motion of the other bodies of a flying machine relative to its base, for estimators, from encoders.
 
 A machine's tracker is moved by two panel angles and seen by the strokes of its sliders; an open chain of
 joints is moved by their coordinates, which encoders read.
@@ -104,9 +104,9 @@ class JointChain(eqx.Module):
         wrong += [tree.joints[k] for k in tree.cut]
         if wrong or not tree.floating:
             raise SettingError(
-                "The motion of joints is estimated of an open chain of revolute and translational joints on a "
-                f"floating base, which this machine is not: {', '.join(wrong) or 'its base is fixed'}. Leave the "
-                "mission's [sensors] out, for true states."
+                "The estimator needs a floating base with an open chain of revolute and translational joints, which "
+                f"this machine is not: {', '.join(wrong) or 'its base is fixed'}. Leave the mission's [sensors] out, "
+                "for true states."
             )
         self.space = TreeSpace(system)
         self.home = self.space.from_state(system.reference)

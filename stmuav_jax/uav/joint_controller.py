@@ -164,7 +164,7 @@ class JointController(eqx.Module):
             left out.
         flight: controller of the rotors.
         gains: gains of joints with an effort, by name; of others `JointGains()`.
-        feedforward: False for a controller that takes the joints for locked in the reference posture.
+        feedforward: False for a controller that treats the joints as locked in the reference posture.
 
     Raises:
         SettingError: gains of a joint that has no effort. ModelError: see `driven_joints`.

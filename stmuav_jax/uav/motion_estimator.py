@@ -2,7 +2,7 @@
 
 Gyroscope and accelerometer drive the kinematics of the base, so that no forces need to be known, and
 position and attitude fixes correct it, at their own rates and late by their delays
-(`stm.estimation.inertial`). The panel angles are estimated beside it from the encoders of the strokes, or the
+(`stm.estimation.inertial`). The panel angles are estimated separately from the encoders of the strokes, or the
 coordinates of any other chain of joints from theirs, with accelerations taken as white noise.
 
 Source: J. Sola, Quaternion kinematics for the error-state Kalman filter, arXiv:1711.02508 (2017),
@@ -58,17 +58,17 @@ from .panel_servo import PanelBodies
 
 
 class MotionEstimate(NamedTuple):
-    """Estimate of a machine's motion, which the controllers of `stm.control` take for its `State`.
+    """Estimate of a machine's motion, which flight controllers accept in place of a `State`.
 
     Attributes:
         state: estimated state of base and tracker; without a tracker that of the base alone.
         base: mean and covariance of the base and of the biases.
         panel: those of the panel angles, or of the coordinates of the joints, and of their rates; None without.
-        nis: normalised innovation squared of the fixes that arrived now and were taken.
+        nis: normalised innovation squared of the fixes that arrived now and were accepted.
         components: number of their components, zero where none was.
         force: accelerometer's reading less its bias, base axes (3,) [m/s^2].
         missing: readings that were NaN, until now, of each instrument in the order of the estimator's names.
-        gated: readings that the gate has left out, until now, in the same order.
+        gated: readings that the gate has rejected, until now, in the same order.
     """
 
     state: State
@@ -108,13 +108,13 @@ class MotionEstimator(eqx.Module):
     """Estimator of pose, velocity and the biases of its sensors, and of the tracker's panel angles.
 
     It is a function (readings, inputs, memory) -> (`MotionEstimate`, memory) for a `Plant` with the
-    same instruments. The estimator uses their noise, rates and delays; their
-    biases are unknown to it. A fix's own bias cannot be told from the motion, and stays in it.
+    same instruments. The estimator uses their noise, rates and delays, and estimates the biases of gyroscope
+    and accelerometer. It cannot distinguish the bias of a fix from motion.
 
     A reading of NaN is missing, and counted: a fix or encoder is left out, gyroscope and accelerometer keep
-    their last reading, whose error grows by `turning_change` and `force_change`. A fix too far from
-    what is expected is left out, and counted, by a gate on its Mahalanobis distance. Of a start that is worse
-    than its deviations say, the first ten fixes may be lost by that: from then on they are taken.
+    their last reading, whose error grows by `turning_change` and `force_change`. A gate on the Mahalanobis
+    distance rejects, and counts, fixes too far from their prediction. If the start is worse than its
+    deviations, the gate may reject the first ten fixes; after that fixes are accepted.
 
     Args:
         system: machine, whose first body is the base.
@@ -127,14 +127,14 @@ class MotionEstimator(eqx.Module):
         gyroscope_drift: random walk of the gyroscope's bias [rad/s/sqrt(s)].
         accelerometer_drift: that of the accelerometer's bias [m/s^2/sqrt(s)].
         panel_noise: density of the accelerations of panel angles or joints [rad/s^2/sqrt(Hz)], [m/s^2/sqrt(Hz)].
-        gate: probability with which the gate leaves out a reading that is right; 0 for no gate.
+        gate: probability with which the gate rejects a correct reading; 0 for no gate.
         turning_change, force_change: how fast angular velocity [rad/s^2] and force [m/s^3] may change while a
             reading of them is missing.
 
     Raises:
         SettingError: an instrument that is missing or has no noise, a gyroscope or accelerometer that is
-            slow or late, an accelerometer off the centre of mass; fixes and encoders that do not see a
-            mode of the errors at rest (the message names the states in it).
+            slow or late, an accelerometer off the centre of mass; a mode of the errors at rest that is
+            unobservable by fixes and encoders (the message names its states).
     """
 
     inner: TrackerMotion | JointChain | None
@@ -228,7 +228,7 @@ class MotionEstimator(eqx.Module):
         panel: Numbers = 0.01,
         panel_rate: Numbers = 0.1,
     ) -> EstimatorMemory:
-        """First memory, from a supposed state and its standard deviations.
+        """First memory, from an assumed state and its standard deviations.
 
         Args:
             attitude: [rad]. position: [m]. velocity: [m/s]. gyroscope_bias: [rad/s], about zero.

@@ -175,7 +175,7 @@ class PanelServo(eqx.Module):
 
 
 class StrokeServo(eqx.Module):
-    """Servo of the strokes by proportional and derivative control, which knows no masses.
+    """Servo of the strokes by proportional and derivative control, without a model of masses.
 
     Args:
         bodies: the tracker's bodies; only their lengths are used.

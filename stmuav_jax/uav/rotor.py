@@ -200,9 +200,9 @@ def rotor_layout(
     coaxial: Numbers | None = None,
     height: Numbers = 0.0,
 ) -> tuple[Float[Array, "k 3"], Float[Array, " k"]]:
-    """Places (k, 3) [m] and turning senses (k,) of rotors on equal arms, for `Rotors`.
+    """Positions (k, 3) [m] and directions of rotation (k,) of rotors on equal arms, for `Rotors`.
 
-    Arms are counted against the clock seen from above, from the x axis on, which points forward.
+    Arms are numbered anticlockwise seen from above, from the x axis on, which points forward.
 
     Args:
         number: number of arms; an even one, at least 4, unless rotors are coaxial (then at least 3).

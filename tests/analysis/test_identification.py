@@ -301,7 +301,7 @@ def test_what_no_mechanism_has_is_named():
     bad = (jnp.array([-0.5]), jnp.diag(jnp.array([1.0, 1.0, 3.0]))[None], jnp.array(-0.1))
     words = " ".join(physical_faults(eqx.tree_at(parts, SYSTEM, bad)))
     assert "mass of body 'rod' must be finite and positive, but it is -0.5 kg" in words
-    assert "breaks the triangle inequality" in words
+    assert "violates the triangle inequality" in words
     assert "turning of JointDamping of pin must not be negative, but it is -0.1" in words
     assert physical_faults(SYSTEM) == ()
 

@@ -20,7 +20,7 @@ def test_its_study_draws_every_mass_and_inertia_and_its_flights_are_counted():
     assert given.sensors.standing == 3.0
     columns = {name: np.full(100, 0.1) for name in study.columns}
     columns["status"] = np.where(np.arange(100) < 98, 1, 3)
-    columns["kept"] = np.where(np.arange(100) < 97, 1, 0)
+    columns["met"] = np.where(np.arange(100) < 97, 1, 0)
     found = missions.share(columns)
     assert (found["kept"], found["not_finite"], found["share"]) == (97, 2, 0.97)
     # Wilson (1927), by hand: (p + z^2 / 2n -+ z sqrt(p q / n + z^2 / 4n^2)) / (1 + z^2 / n)

@@ -75,7 +75,7 @@ def test_efforts_along_a_path_and_a_survey_of_postures(tmp_path, capsys, monkeyp
         assert main(["trim", cart, "--path", path]) == 2
         assert message in said(capsys)
     assert main(["trim", cart, "--path", "motion.csv", "--climb", "1"]) == 2
-    assert "go without a linear model" in said(capsys)
+    assert "--path and --survey exclude --linear" in said(capsys)
     assert main(["trim", cart, "--survey", "hinge.angle=1", "rail.displacement=0,1"]) == 2
     assert "two coordinates with two limits each" in said(capsys)
 

@@ -288,7 +288,7 @@ def test_what_cannot_be_sampled_is_refused():
     with pytest.raises(stm.SettingError, match=r"noise of the sensor .* must not be negative"):
         control.Instrument(sensing.PositionFix("mass"), noise=[0.01, -0.01, 0.0])
     fast = control.Instrument(sensing.Encoder("rail"), rate=150.0)
-    with pytest.raises(stm.SettingError, match=r"150 Hz, which is not a whole part .* 400 Hz"):
+    with pytest.raises(stm.SettingError, match=r"150 Hz, which does not divide .* 400 Hz"):
         control.Plant(system, start, inputs=["effort"], sensors=[fast])
     with pytest.raises(stm.SettingError, match=r"The delay of the inputs .* 1\.2 periods"):
         control.Plant(system, start, inputs=["effort"], delay=3e-3)

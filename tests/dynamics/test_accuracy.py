@@ -83,7 +83,7 @@ def test_without_an_estimate_the_certificate_says_so(reference):
     c = reference.certificate
     assert np.isnan([c.position_error, c.position_error_end, c.angle_error]).all()
     assert c.to_dict()["position_error"] is None
-    assert c.error_words == "There is no error estimate: none was asked for."
+    assert c.error_words == "There is no error estimate: none was requested."
     assert np.all(np.isnan(reference.errors.position))
     assert c.estimate_seconds == 0.0
 

@@ -41,7 +41,7 @@ def test_a_parallelogram_near_and_in_its_singular_posture():
     assert (
         "nothing determines which one it follows" in by_name(flat)["singular posture at rest"].value
     )
-    assert by_name(flat)["singular posture"].value == "rank 16 here, more beside it"
+    assert by_name(flat)["singular posture"].value == "rank 16 here, higher nearby"
     assert by_name(flat)["degrees of freedom"].value.startswith("2 ")
     # cranks that turn against each other are the other branch's motion; equal rates are this one's,
     # and no motion through the flat posture has one crank at rest

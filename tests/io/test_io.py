@@ -139,7 +139,7 @@ def test_other_readers_open_a_run_and_find_changed_numbers(short_run, tmp_path):
 
 
 def test_a_run_without_analysis_has_no_reactions_in_its_file(short_run, tmp_path):
-    none = empty_estimate(short_run.trajectory, "none was asked for")
+    none = empty_estimate(short_run.trajectory, "none was requested")
     bare = dataclasses.replace(short_run, model=None, errors=none)
     found = load(save(bare, tmp_path / "run.nc"))
     assert "position" in found

@@ -140,7 +140,7 @@ def test_words_of_refusals():
     with pytest.raises(stm.ModelError, match=r"no joint 'axel'\. Did you mean 'axle'"):
         stm.mechanics.joint_motion(system, states, "axel")
     with pytest.raises(
-        stm.ModelError, match=r"is revolute and has no displacement of its own; .*: angle"
+        stm.ModelError, match=r"is revolute and has no coordinate displacement; .*: angle"
     ):
         _ = stm.mechanics.joint_motion(system, states, "axle").displacement
     with pytest.raises(stm.SettingError, match="5 states, but the times have shape"):

@@ -222,7 +222,7 @@ def test_a_scene_with_other_numbers_starts_with_its_frames_where_they_were():
     [
         ("camera.mas", 1.0, r"there is none of this name\. Did you mean 'camera\.mass'"),
         ("camera.mass", -1.0, "The mass of body 'camera' must be finite and positive"),
-        ("camera.inertia", [1.0, 1.0, 9.0], "breaks the triangle inequality"),
+        ("camera.inertia", [1.0, 1.0, 9.0], "violates the triangle inequality"),
         (
             "pitch.stiffness",
             -1.0,

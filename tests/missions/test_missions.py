@@ -307,7 +307,7 @@ def test_the_command_flies_a_file(tmp_path, capsys, monkeypatch):
         ({"wind__steady": [0.0, 0.0, 0.0]}, "must not be zero"),
         ({"tolerances__sink": 0.01}, "'tolerances.sink' needs a landing gear"),
         ({"tolerances__touchdown": 0.0}, "'tolerances.touchdown' must be greater than 0"),
-        ({"sensors": {"position": {"rate": 33.0}}}, "not a whole part"),
+        ({"sensors": {"position": {"rate": 33.0}}}, "does not divide"),
         ({"payload": {"mass": 0.1, "position": [0.0, 0.0, 0.0]}}, r"\[payload\] needs the tracker"),
         ({"controller__payload": "known"}, r"known, but the mission has no \[payload\]"),
         ({"controller__payload": "estimated"}, "from gyroscope and accelerometer"),
@@ -443,12 +443,12 @@ def test_a_failed_flight_names_the_first_limit_that_it_left():
         "after t = 0.05 s its motion had diverged: its numbers were no longer finite."
     )
     signals["commanded_force"][1, 0] = -9.5
-    assert "at t = 0.01 s the servo asked slider 2 for more than 9 N" in describe(
+    assert "at t = 0.01 s the servo commanded slider 2 more than 9 N" in describe(
         mission, rows, run
     )
     calm: Any = SimpleNamespace(ts=ts[:3], signals={name: x[:1] for name, x in signals.items()})
     # rows that end before the numbers do: the battery could not give the fourth
-    assert "at t = 0.03 s it asked its battery for more than that can give" in describe(
+    assert "at t = 0.03 s its power demand exceeded that of the battery" in describe(
         mission, calm, run
     )
     certificate.t_end = 0.02

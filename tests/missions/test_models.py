@@ -179,7 +179,7 @@ def test_a_tighter_tolerance_and_an_early_end_are_not_kept(data):
          "The moves of joint 'pitch' must follow one another"),
         ({"controller": {"highest": 1500.0}}, "the motors turn no faster than 1300 rad/s"),
         ({"machine": {"model": "own.toml", "parameters": {"camra": 1.0}}}, "no parameter 'camra'"),
-        ({"machine": {"model": "own.toml", "options": {"drag": {}}}}, "'machine.options' is for ready scenes"),
+        ({"machine": {"model": "own.toml", "options": {"drag": {}}}}, "'machine.options' is for built-in scenes"),
         ({"battery": {"state_of_charge": 0.3}}, "must be above its reserve of 0.3"),
         ({"controller": {"payload": "estimated"}, "sensors": {}}, "cannot be estimated by a machine with driven"),
         ({"panel": [{"angles": [1.0, 1.0]}]}, "needs the tracker of the scene uav_tracker"),

@@ -206,7 +206,7 @@ def test_a_posture_that_cannot_be_passed_is_named() -> None:
     assert run.certificate.t_end == pytest.approx(end, abs=1e-6)
     words = str(failed.value)
     assert f"A (at {run.certificate.t_end:.6g} rad)" in words
-    assert "lead the motion around" in words
+    assert "plan the motion around" in words
     # what is kept is a motion: B moves at 1 m/s, and what leads to C moves as B does along BC
     r, v = run.states.r[-1], run.states.v[-1]
     speed = np.linalg.norm(v, axis=1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stmuav_jax import SettingError
-from stmuav_jax.studies import READY, make_study, ready
+from stmuav_jax.studies import READY, load_builtin_study, make_study
 from stmuav_jax.studies.estimates import LANES
 from stmuav_jax.uav import consistent_tuning, study_case
 
@@ -13,7 +13,7 @@ from stmuav_jax.uav import consistent_tuning, study_case
     "name", ["collapse", "estimate_5", pytest.param("hover", marks=pytest.mark.slow)]
 )
 def test_every_kind_of_ready_study_is_a_study(name):
-    plain = ready(name)
+    plain = load_builtin_study(name)
     study = make_study(plain)
     assert study.identity["name"] == name
     assert study.samples == plain["samples"]
@@ -44,7 +44,7 @@ def test_estimation_is_that_of_the_case_study():
 
 def test_refusals():
     with pytest.raises(SettingError, match="Did you mean 'collapse'"):
-        ready("colapse")
+        load_builtin_study("colapse")
     with pytest.raises(SettingError, match="'case' must be at most 8, but it is 9"):
         make_study({"kind": "estimation", "case": 9})
     with pytest.raises(SettingError, match="no entry 'tunning'"):

@@ -180,11 +180,11 @@ class Doubled(AbstractStabilisation):
 
     inner: AbstractStabilisation = Baumgarte()
 
-    def held_rows(self, gamma, value, rate):
-        return self.inner.held_rows(gamma, 2 * value, 2 * rate)
+    def add_row_feedback(self, gamma, value, rate):
+        return self.inner.add_row_feedback(gamma, 2 * value, 2 * rate)
 
-    def held_norms(self, rate, p):
-        return self.inner.held_norms(rate, p)
+    def add_norm_feedback(self, rate, p):
+        return self.inner.add_norm_feedback(rate, p)
 
     def iterations_after_step(self):
         return 0

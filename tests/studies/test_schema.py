@@ -13,7 +13,7 @@ from stmuav_jax.checks.errors import ModelError, SettingError
 from stmuav_jax.checks.schema import format_value, name_fault
 from stmuav_jax.io.netcdf import FileError
 from stmuav_jax.studies import disturbed_flights
-from stmuav_jax.studies.examples import READY, ready
+from stmuav_jax.studies.examples import READY, load_builtin_study
 from stmuav_jax.studies.study_file import check_study, load_study, make_study
 from stmuav_jax.uav import make_scene
 
@@ -174,7 +174,7 @@ def test_many_changes_at_once(scenes_made_once):
         ({"factors": {"start.p": NORMAL | {"standard_deviation": 10**400}}}, "of about 401 digits"),
         ({"factors": {"start.p": {"distribution": "uniform", "low": -1e308, "high": 1e308}}},
          "draws that are not finite"),
-        ({"factors": {"bare.inertia[0,]": 1.0}, "correlation": []}, "names no entry"),
+        ({"factors": {"bare.inertia[0,]": 1.0}, "correlation": []}, "must name one entry"),
         ({"factors": {"bare.inertia[0, 1]": 0.0, "bare.inertia[1, 0]": 0.0}, "correlation": []},
          "are the same number"),
         ({"factors": {"bare.inertia[0, 1]": 0.0, "bare.inertia[0,1]": 0.0}, "correlation": []},
@@ -189,8 +189,8 @@ def test_words(change, words):
 
 def test_ready_studies_fit_the_schema():
     for name in READY:
-        check_study(ready(name))
-    assert ready("collapse")["failure"] == {"quantity": "collapse"}
+        check_study(load_builtin_study(name))
+    assert load_builtin_study("collapse")["failure"] == {"quantity": "collapse"}
 
 
 @pytest.mark.parametrize(

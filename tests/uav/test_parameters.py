@@ -59,7 +59,7 @@ def test_a_scene_is_differentiable_in_its_parameters():
 
 
 def test_printed_inertia_of_part_one_needs_its_stated_tolerance():
-    """J'_7 of Table 6.2 breaks the triangle inequality by 0.7 %; only the table admits it."""
+    """J'_7 of Table 6.2 violates the triangle inequality by 0.7 %; only the table admits it."""
     same = {"inertia.panel_7": PART_I.value("inertia.panel_7")}
     with pytest.raises(ModelError, match=r"panel_7.*triangle inequality.*0\.6"):
         make_scene("tracker", 1, PART_I.replaced(same))

@@ -52,12 +52,12 @@ ABOUT = """Estimate the motion of a model from the sensors of its file, over man
 
 Example: stmuav estimate model.toml --seeds 50 --sensors angle. The truth is the simulator's, with finer steps,
 with random starts and random changes of the velocities. The model's file has a table [sensors] (docs/models.md).
-Exit codes: 0 consistent, 1 a filter lost its covariance, 2 wrong input, 3 the filter's own account of its errors
-cannot be trusted. Without a model's file: the report's eight cases, stmuav estimate --help.
+Exit codes: 0 consistent, 1 a filter lost its covariance, 2 wrong input, 3 the filter is inconsistent. Without a
+model's file: the report's eight cases, stmuav estimate --help.
 """
 # Substeps of the truth in a step of the filter.
 _FINER = 4
-# Exit code of a completed run with a filter that cannot be trusted.
+# Exit code of a completed run with an inconsistent filter.
 UNTRUSTED = 3
 
 
@@ -131,7 +131,7 @@ def _choose_instruments(scene: "Scene", names: Sequence[str]) -> list[Any]:
     for instrument in result:
         if instrument.delay:
             raise SettingError(
-                f"The filter takes readings without delay, but the sensor '{instrument.name}' is late by "
+                f"The filter takes readings without delay, but the sensor '{instrument.name}' has a delay of "
                 f"{instrument.delay:g} s; leave it out with --sensors, or set its delay to 0."
             )
         if instrument.noise is None or not np.all(np.asarray(instrument.noise) > 0):

@@ -1,4 +1,4 @@
-"""Searches by gradients on the command line: progress, checkpoints, and what is said at the end."""
+"""Searches by gradients on the command line: progress, checkpoints, and the final message."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

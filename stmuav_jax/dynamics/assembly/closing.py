@@ -1,11 +1,11 @@
-"""Closing the loops of a mechanism by one small program: on the way of joint coordinates, nearest, moving.
+"""Closing the loops of a mechanism by one small program: along coordinates, at the nearest posture, in motion.
 
 One loop does all of it, since the equations are what takes long to compile. Its steps are the smallest in
 the mass metric that close the linearised constraints, seen from one of two places: from the present
 posture while joint coordinates are led to their values, and then from the guess, which makes the closed
 posture the nearest one. This method of Gauss and Newton converges at once where the coordinates
 determine the posture, and linearly, or not, where the guess is far away on the scale of the curvature of the
-constraints; `assemble` then goes on by Newton's method. At the end the velocities are found with
+constraints; `assemble` then continues with Newton's method. At the end the velocities are found with
 the rows at hand. Nothing here has a derivative.
 """
 

@@ -97,9 +97,9 @@ def assemble(
         k = int(np.nanargmax(np.where(np.isfinite(residuals), residuals, np.inf)))
         raise StateError(
             f"The mechanism could not be assembled from this guess: after {max_steps} steps at the "
-            f"most, joint '{names[k]}' is still open by {float(residuals[k]):.3g} m, or rad "
+            f"most, joint '{names[k]}' has a residual of {float(residuals[k]):.3g} m, or rad "
             f"in its angles (tolerance {tolerance:.3g}). Start nearer to a posture "
-            "that closes, hold less, or check the lengths."
+            "that closes, hold fewer coordinates, or check the lengths."
         )
     return result
 

@@ -83,8 +83,8 @@ def state_from_joints(
         ModelError: a joint is unknown, a driver or without coordinates; the values have a wrong number
             or are not finite; or a force counts the turns of a hinge from another angle, see
             `with_start_angles`.
-        StateError: no state of the mechanism has all coordinates or rates together, or none on the way
-            there from the start, but one beyond; raised only for concrete values, not inside `jit`.
+        StateError: no state of the mechanism has all coordinates or rates together, or the loops do not stay
+            closed on the path from the start; raised only for concrete values, not inside `jit`.
     """
     start = system.reference if start is None else start
     check_state(system, start)
@@ -154,7 +154,7 @@ def _check_turns(system: System, q: dict[str, Array]) -> None:
         if np.round((counted - angle) / (2 * np.pi)) != 0:
             raise ModelError(
                 f"The angle of joint '{name}' is to be {angle:.6g} rad, but a spring, servo or end stop "
-                f"counts its turns from {counted:.6g} rad, which a state does not say. Give this function "
+                f"counts its turns from {counted:.6g} rad, which a state does not contain. Give this function "
                 f"and the simulation the system with_start_angles(system, {{'{name}': {angle:.6g}}}), or an "
                 f"angle from {counted - np.pi:.4g} to {counted + np.pi:.4g} rad."
             )
@@ -313,7 +313,7 @@ def _close_loops(
     state, rate_residual = _project_rates(with_drivers(system, now, u, t), closed_posture, t)
     if has_values(rate_residual) and not bool(rate_residual <= _RATE_TOLERANCE):
         raise StateError(
-            f"The joint rates {_format_values(u)} are inconsistent in this posture: they violate each other, "
+            f"The joint rates {_format_values(u)} are inconsistent in this posture: they contradict each other, "
             f"or the constraints, by {float(rate_residual):.3g}. Name fewer "
             "rates, or values that fit together."
         )

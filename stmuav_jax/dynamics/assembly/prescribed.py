@@ -148,12 +148,12 @@ def _check_path(system: System, path: KinematicPath, guess: State, free: tuple[i
     explanation = {
         PathReason.NOT_CONVERGED: "no posture satisfies the joints and drivers near the one before",
         PathReason.SINGULAR: "the mechanism is in a singular posture",
-        PathReason.BRANCH: "the posture found belongs to another branch",
+        PathReason.BRANCH: "the posture belongs to another branch",
     }[code]
     raise StateError(
         f"The path stops at t = {float(path.ts[k]):.6g} s: {explanation} (largest residual "
         f"{float(path.residual[k]):.3g}, smallest singular value {float(path.singular_value_ratio[k]):.3g} of the "
-        "largest). Take closer times, another path, or throw=False to keep what was reached."
+        "largest). Take closer times, another path, or throw=False to keep the part before it."
     )
 
 

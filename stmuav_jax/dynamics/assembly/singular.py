@@ -1,6 +1,6 @@
-"""Singular postures and jumping drivers: what a mechanism's constraints fail at, in words, and which branches meet.
+"""Singular postures and jumping drivers: messages on failures of the constraints, and the branches that meet.
 
-In a singular posture rows of the constraint Jacobian J are dependent that are independent beside it.
+In a singular posture, rows of the constraint Jacobian J are dependent that are independent nearby.
 With W the combinations of rows that vanish there, and N the free velocities, both orthonormal, the
 rank that a free velocity u gains is, to first order, that of
 
@@ -148,7 +148,7 @@ def singular_posture(
         f"the mechanism comes to a singular posture of {format_joints(system, state, names)}: the "
         f"smallest singular value of the constraint Jacobian is {smallest:.3g} there and "
         f"{values[0, rank - 1]:.3g} at the start. What these joints or drivers demand takes "
-        "unbounded velocities or forces; lead the motion around that posture"
+        "unbounded velocities or forces; plan the motion around that posture"
     )
 
 
@@ -199,7 +199,7 @@ Look = Callable[[State], Float[np.ndarray, "k m v"]]
 
 
 class Branching(NamedTuple):
-    """Rank that the constraint Jacobian gains beside a posture.
+    """Rank that the constraint Jacobian gains near a posture.
 
     Attributes:
         gained: largest rank that is gained along a free motion; zero unless the posture is singular.
@@ -224,7 +224,7 @@ class Branching(NamedTuple):
 def find_branches(
     model: AugmentedModel, state: State, matrix: Float[np.ndarray, "m v"], look: Look
 ) -> Branching:
-    """Rank gained beside a posture, along its velocities and along any.
+    """Rank gained near a posture, along its velocities and along any.
 
     Args:
         model: system prepared for maximal coordinates, with the rows of all joints.

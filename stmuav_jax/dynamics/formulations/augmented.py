@@ -138,7 +138,7 @@ class Augmented(AbstractFormulation):
         # Angular velocities are the velocities, and not the rates of Euler parameters: the norm constraint
         # then needs no multiplier, and the system has 34 rows instead of 83.
         p_rate = jax.vmap(euler_parameter_rate)(state.p, state.omega)
-        p_rate = stabilisation.held_norms(p_rate.T, state.p.T).T
+        p_rate = stabilisation.add_norm_feedback(p_rate.T, state.p.T).T
         rates = State(r=state.v, p=p_rate, v=result.v_rate, omega=result.omega_rate)
         moment = jnp.cross(kin.r, load.force) + jnp.einsum("nab,nb->na", kin.R_wb, load.moment)
         flows = Flows(
@@ -176,7 +176,7 @@ class Augmented(AbstractFormulation):
         free = jnp.concatenate([free_v, free_omega], axis=1)
         weighed = model.weigh(eq.J).reshape(eq.matrix.shape)
         factor = self._factor_rows(model, eq, weighed)
-        gamma = stabilisation.held_rows(eq.gamma, eq.value, eq.matrix @ velocity - eq.target)
+        gamma = stabilisation.add_row_feedback(eq.gamma, eq.value, eq.matrix @ velocity - eq.target)
         multipliers = factor.solve(gamma - eq.matrix @ free.reshape(-1))
         total = free + (weighed.T @ multipliers).reshape(-1, 6)
         accelerations = Accelerations(total[:, :3], total[:, 3:], multipliers)

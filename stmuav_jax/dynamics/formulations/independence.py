@@ -1,4 +1,4 @@
-"""Independence of constraint rows: one scaling, one threshold, and the rows that repeat others always.
+"""Independence of constraint rows: one scaling, one threshold, and rows that are dependent in every posture.
 
 The rows J of a constraint Jacobian have units of a length or none, and its columns belong to velocities
 [m/s] or angular velocities [rad/s]. With the longest arm L of the joints, rows that are lengths divided
@@ -386,7 +386,7 @@ def _cached_postures(system: System, rows: Constraints, undriven_rows: Constrain
 
 
 def _sample_jacobians(system: System, rows: Constraints, undriven_rows: Constraints) -> _Postures:
-    """Jacobians at the reference posture and beside it, where the loops close."""
+    """Jacobians at the reference posture and near it, where the loops close."""
     n = system.n_bodies
     arm = float(longest_arm(system, rows))
     distance_in_arms = float(np.max(np.abs(np.asarray(system.reference.r)))) / arm

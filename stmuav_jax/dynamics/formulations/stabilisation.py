@@ -19,7 +19,7 @@ class AbstractStabilisation(eqx.Module):
     """Method that keeps the constraints satisfied at position and velocity level."""
 
     @abstractmethod
-    def held_rows(
+    def add_row_feedback(
         self, gamma: Float[Array, "m *s"], value: Float[Array, "m *s"], rate: Float[Array, "m *s"]
     ) -> Float[Array, "m *s"]:
         """Right-hand side of the rows J qddot = gamma, with the stabilising feedback.
@@ -30,7 +30,7 @@ class AbstractStabilisation(eqx.Module):
         """
 
     @abstractmethod
-    def held_norms(
+    def add_norm_feedback(
         self, rate: Float[Array, "4 *s"], p: Float[Array, "4 *s"]
     ) -> Float[Array, "4 *s"]:
         """Rates of Euler parameters [1/s], with the feedback that restores their unit norm.
@@ -48,11 +48,11 @@ class AbstractStabilisation(eqx.Module):
 class Unstabilised(AbstractStabilisation):
     """Index-1 equations without stabilisation; positions drift quadratically in time."""
 
-    def held_rows(self, gamma: Array, value: Array, rate: Array) -> Array:
+    def add_row_feedback(self, gamma: Array, value: Array, rate: Array) -> Array:
         del value, rate
         return gamma
 
-    def held_norms(self, rate: Array, p: Array) -> Array:
+    def add_norm_feedback(self, rate: Array, p: Array) -> Array:
         del p
         return rate
 
@@ -84,10 +84,10 @@ class Baumgarte(AbstractStabilisation):
                 )
         self.alpha, self.beta, self.norm = (jnp.asarray(g, dtype=float) for g in gains.values())
 
-    def held_rows(self, gamma: Array, value: Array, rate: Array) -> Array:
+    def add_row_feedback(self, gamma: Array, value: Array, rate: Array) -> Array:
         return gamma - (2 * self.alpha * rate + self.beta**2 * value)
 
-    def held_norms(self, rate: Array, p: Array) -> Array:
+    def add_norm_feedback(self, rate: Array, p: Array) -> Array:
         return rate + self.norm * (1 - jnp.sum(p**2, axis=0)) * p
 
     def iterations_after_step(self) -> int:
@@ -113,11 +113,11 @@ class Projection(AbstractStabilisation):
         if self.iterations < 1:
             raise SettingError(f"Projection needs at least 1 iteration, not {self.iterations}.")
 
-    def held_rows(self, gamma: Array, value: Array, rate: Array) -> Array:
+    def add_row_feedback(self, gamma: Array, value: Array, rate: Array) -> Array:
         del value, rate
         return gamma
 
-    def held_norms(self, rate: Array, p: Array) -> Array:
+    def add_norm_feedback(self, rate: Array, p: Array) -> Array:
         del p
         return rate
 

@@ -43,8 +43,8 @@ MORE = diffrax.RESULTS.max_steps_reached
 WINDOWS, ROOM = 256, 10_000_000
 
 
-class RecordRoom(NamedTuple):
-    """Room for the record of an integration to one output time.
+class RecordCapacity(NamedTuple):
+    """Capacity for the record of an integration to one output time.
 
     Attributes:
         steps: step attempts of a window.
@@ -56,8 +56,8 @@ class RecordRoom(NamedTuple):
     pieces: int
 
     @classmethod
-    def of(cls, steps: int, max_steps: int, segments: int, numbers: int) -> "RecordRoom":
-        """Room for all of max_steps attempts, in each of the segments, of a state of so many numbers."""
+    def of(cls, steps: int, max_steps: int, segments: int, numbers: int) -> "RecordCapacity":
+        """Capacity for all of max_steps attempts, in each of the segments, of a state of so many numbers."""
         needed = -(-max_steps // steps)
         # Arrays of a compiled program have fixed sizes, set aside for the largest number of steps
         # that a run may take, whether it takes them or not: hence the bound in numbers.
@@ -121,7 +121,7 @@ def _empty_rows(tree: Any, *rows: int) -> Any:
 def _repeat_parts(
     run: Callable[[Now], tuple[SegmentEnd, Any]],
     begin: Now,
-    room: int,
+    capacity: int,
     most: int,
     row: Callable[[Now, Any], Any],
     is_requested: Bool[Array, ""] | bool = True,
@@ -147,7 +147,7 @@ def _repeat_parts(
     # The shapes of the record are found by tracing, which runs nothing.
     _, rows, record = eqx.filter_eval_shape(integrate_part, begin)
     none, success = jnp.zeros((), int), diffrax.RESULTS.successful
-    state = (none, begin, success, (none, none), _empty_rows(rows, room), _empty_rows(record))
+    state = (none, begin, success, (none, none), _empty_rows(rows, capacity), _empty_rows(record))
     number, now, result, counts, rows, record = jax.lax.while_loop(is_unfinished, next_part, state)
     accepted, rejected = counts
     states = (now.solver_state, now.controller_state)
@@ -156,12 +156,12 @@ def _repeat_parts(
 
 
 def in_pieces(
-    problem: Problem, begin: Now, t1: Float[Array, ""], room: RecordRoom
+    problem: Problem, begin: Now, t1: Float[Array, ""], capacity: RecordCapacity
 ) -> tuple[SegmentEnd, RecordedPieces]:
-    """Integrate to t1 [s] piece by piece, each one window shorter than there is room for."""
-    run = lambda now: piece_of(problem, now, t1, room, room.windows - 1)
+    """Integrate to t1 [s] piece by piece, each one window shorter than there is capacity for."""
+    run = lambda now: piece_of(problem, now, t1, capacity, capacity.windows - 1)
     end, number, starts, last = _repeat_parts(
-        run, begin, room.pieces, room.pieces, lambda now, _: now
+        run, begin, capacity.pieces, capacity.pieces, lambda now, _: now
     )
     return end, RecordedPieces(number, starts, last)
 
@@ -170,14 +170,14 @@ def piece_of(
     problem: Problem,
     begin: Now,
     t1: Float[Array, ""],
-    room: RecordRoom,
+    capacity: RecordCapacity,
     most: int,
     is_recorded: Bool[Array, ""] | bool = True,
 ) -> tuple[SegmentEnd, Windows]:
     """Integrate towards t1 [s] by at most so many windows, with a record, if it is wanted at all."""
-    run = lambda now: _integrate_window(problem, now, t1, room.steps)
+    run = lambda now: _integrate_window(problem, now, t1, capacity.steps)
     row = lambda now, steps: (now.y, steps.accepted, steps.ts)
-    end, number, rows, last = _repeat_parts(run, begin, room.windows, most, row, is_recorded)
+    end, number, rows, last = _repeat_parts(run, begin, capacity.windows, most, row, is_recorded)
     ys, step_counts, ts = rows
     return end, Windows(number, ys, step_counts, ts, last)
 
@@ -236,29 +236,31 @@ KEPT = 1024
 CHECKPOINTS = 4096
 
 
-def room_of(
+def capacity_of(
     adjoint: DiscreteAdjoint, problem: Problem, segments: int
-) -> "diffrax.AbstractAdjoint | RecordRoom":
-    """Adjoint for a problem with this number of output times, or the room for its record."""
+) -> "diffrax.AbstractAdjoint | RecordCapacity":
+    """Adjoint for a problem with this number of output times, or the capacity for its record."""
     segments, most = max(segments, 1), problem.method.max_steps
     explicit = isinstance(problem.solver().solver, NonDenseRungeKutta)
     steps = adjoint.recorded_steps or max((KEPT if explicit else CHECKPOINTS) // segments, 64)
     if explicit:
-        return RecordRoom.of(min(most, steps), most, segments, problem.n_state + problem.n_internal)
+        return RecordCapacity.of(
+            min(most, steps), most, segments, problem.n_state + problem.n_internal
+        )
     return diffrax.RecursiveCheckpointAdjoint(checkpoints=min(most, steps))
 
 
 def integrate_recorded(
-    problem: Problem, carry: IntegrationState, t1: Float[Array, ""], room: RecordRoom
+    problem: Problem, carry: IntegrationState, t1: Float[Array, ""], capacity: RecordCapacity
 ) -> SegmentEnd:
-    """Integrate to t1 [s] with the discrete adjoint, which has this room for its record."""
+    """Integrate to t1 [s] with the discrete adjoint, which has this capacity for its record."""
     # Derivatives are with respect to the model's numbers, the start and the times. All else, such
     # as tolerances, is passed apart and made constant, so that no derivative is computed that
     # nobody reads.
     bare = eqx.tree_at(lambda p: p.model, problem, None)
     start = _Start(problem.model, carry.y, carry.t, t1)
     memory = (carry.step, carry.solver_state, carry.controller_state)
-    end = _integrate_recorded(start, _stop_gradients(bare), _stop_gradients(memory), room)
+    end = _integrate_recorded(start, _stop_gradients(bare), _stop_gradients(memory), capacity)
     y = end.y
     # the time reached depends on t1 only
     end, stop = _stop_gradients(end._replace(y=None)), jax.lax.stop_gradient
@@ -290,27 +292,27 @@ def _restore_start(
 
 @eqx.filter_custom_vjp
 def _integrate_recorded(
-    start: _Start, problem: Problem, memory: Any, room: RecordRoom
+    start: _Start, problem: Problem, memory: Any, capacity: RecordCapacity
 ) -> SegmentEnd:
-    del room
+    del capacity
     problem, carry = _restore_start(start, problem, memory)
     return read_end(problem.solve(carry, start.t1, diffrax.ForwardMode()))
 
 
 @_integrate_recorded.def_fwd
 def _record_pieces(
-    perturbed: Any, start: _Start, problem: Problem, memory: Any, room: RecordRoom
+    perturbed: Any, start: _Start, problem: Problem, memory: Any, capacity: RecordCapacity
 ) -> tuple[SegmentEnd, RecordedPieces]:
     """Integrate piece by piece, with a record of their starts and of the last one's windows."""
     del perturbed
     problem, carry = _restore_start(start, problem, memory)
     begin = Now(carry.t, carry.y, carry.solver_state, carry.controller_state)
-    if room.pieces == 1:
-        end, windows = piece_of(problem, begin, start.t1, room, room.windows)
+    if capacity.pieces == 1:
+        end, windows = piece_of(problem, begin, start.t1, capacity, capacity.windows)
         pieces = RecordedPieces(windows.number, None, windows)
     else:
-        end, pieces = in_pieces(problem, begin, start.t1, room)
-    # Windows end where there is room, not where the run's own limit is: that is applied to the
+        end, pieces = in_pieces(problem, begin, start.t1, capacity)
+    # Windows end where there is capacity, not where the run's own limit is: that is applied to the
     # sum.
     over = end.accepted + end.rejected > problem.method.max_steps
     end = end._replace(result=diffrax.RESULTS.where(over, MORE, end.result))
@@ -325,7 +327,7 @@ def _propagate_cotangents(
     start: _Start,
     problem: Problem,
     memory: Any,
-    room: RecordRoom,
+    capacity: RecordCapacity,
 ) -> _Start:
     del memory
     # of all numbers of the model only those that depend on what is differentiated by
@@ -343,7 +345,7 @@ def _propagate_cotangents(
 
     def back_piece(at: tuple[Any, ...]) -> tuple[Any, ...]:
         number, by_end, by_model = at
-        windows, reaches_end = _piece_again(whole, pieces, number, room)
+        windows, reaches_end = _piece_again(whole, pieces, number, capacity)
         by_end = jnp.where(reaches_end, by_end, jnp.nan)
         return number - 1, *_through_windows(whole, windows, arrays, rest, (by_end, by_model))
 
@@ -365,7 +367,7 @@ def _propagate_cotangents(
 
 
 def _piece_again(
-    problem: Problem, pieces: RecordedPieces, number: Int[Array, ""], room: RecordRoom
+    problem: Problem, pieces: RecordedPieces, number: Int[Array, ""], capacity: RecordCapacity
 ) -> tuple[Windows, Bool[Array, ""]]:
     """Windows of a piece, integrated again if it is not the last; False if they miss its end."""
     final = number == pieces.number - 1
@@ -373,7 +375,7 @@ def _piece_again(
 
     def integrate_again() -> tuple[Windows, Bool[Array, ""]]:
         # the condition is for batches, in which both branches are carried out
-        end, windows = piece_of(problem, now, later.t, room, room.windows, ~final)
+        end, windows = piece_of(problem, now, later.t, capacity, capacity.windows, ~final)
         return windows, end.result == diffrax.RESULTS.successful
 
     return jax.lax.cond(final, lambda: (pieces.last, jnp.array(True)), integrate_again)

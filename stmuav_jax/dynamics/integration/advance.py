@@ -1,7 +1,7 @@
 """Integration from output time to output time, through events and jumps of the forces, in chunks.
 
 Steps end at the output times, without interpolation, because diffrax's dense output is of lower
-order than its steps. Work and impulse are integrated beside the state for the energy and momentum
+order than its steps. Work and impulse are integrated with the state for the energy and momentum
 balances; they do not enter the control of the step size.
 
 A run that starts at a zero of its event function, such as the next arc of a bouncing ball, starts
@@ -25,7 +25,7 @@ from ...math.newton import EventBisection
 from ...mechanics.state import State
 from ..formulations.base import Residuals
 from ..method import DiscreteAdjoint
-from .adjoint import RecordRoom, integrate_recorded, room_of
+from .adjoint import RecordCapacity, capacity_of, integrate_recorded
 from .problem import (
     Counts,
     IntegrationState,
@@ -135,10 +135,10 @@ def _integrate_to(
     problem: Problem,
     carry: IntegrationState,
     t1: Float[Array, ""],
-    adjoint: diffrax.AbstractAdjoint | RecordRoom,
+    adjoint: diffrax.AbstractAdjoint | RecordCapacity,
 ) -> SegmentEnd:
     """Integrate from the carry to t1 [s], or to an event before it."""
-    if isinstance(adjoint, RecordRoom):
+    if isinstance(adjoint, RecordCapacity):
         return integrate_recorded(problem, carry, t1, adjoint)
     if problem.method.event is not None:
         return to_event(problem, carry, t1, adjoint)
@@ -188,7 +188,7 @@ def _integrate_segments(
     """Integrate through times [s], or pairs of a time and True if it is that of a jump."""
     adjoint: Any = problem.method.adjoint
     if isinstance(adjoint, DiscreteAdjoint):
-        adjoint = room_of(adjoint, problem, segments)
+        adjoint = capacity_of(adjoint, problem, segments)
     jumps = problem.method.jump_ts
     last = None if jumps is None else jnp.max(jnp.where(ts[1], -jnp.inf, ts[0]))
 

@@ -53,8 +53,8 @@ class AbstractStateSpace(AbstractSpace):
         """Point that belongs to a state of all bodies on the joints.
 
         Args:
-            internal: internal states of the forces (m,), as a run or a plant has them, which also say
-                the whole turns of hinges; by default those that the system's forces hold.
+            internal: internal states of the forces (m,), as a run or a plant has them, which include the whole
+                turns of hinges; by default those that the system's forces hold.
         """
 
     @abstractmethod

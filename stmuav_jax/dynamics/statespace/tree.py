@@ -82,7 +82,7 @@ class TreePoint(NamedTuple):
             one for each translation (3,) [m] and each spherical joint (4,).
         v: velocity of the base, world (3,) [m/s]. omega: angular velocity, base axes [rad/s].
         u: other independent velocities (k,). internal: actuator states of forces, and angles of
-            hinges whose turns forces count (m,); `TreeSpace.internal_at` gives the latter anew.
+            hinges whose turns forces count (m,); `TreeSpace.internal_at` recomputes the latter.
         displacement: displacement of the independent coordinates since the loops were closed (k,).
     """
 
@@ -206,7 +206,7 @@ class TreeSpace(AbstractStateSpace):
 
     @property
     def counted(self) -> tuple[_Counted, ...]:
-        """Places of the counted angles that are coordinates of the tree."""
+        """Indices of the counted angles that are coordinates of the tree."""
         return _counted_angles(self.system, self.model.parameters.tree)
 
     @property

@@ -223,14 +223,14 @@ class TreeModel(AbstractModel):
         return self.row_mask if self.step_rows is None else self.step_rows
 
 
-def turned_rows(model: TreeModel, moving: TreeMotion, rows: Rows) -> Rows:
+def rotate_rows(model: TreeModel, moving: TreeMotion, rows: Rows) -> Rows:
     """Rows with those of points in the axes of body i, where some rows are left out for good."""
     return rows if model.row_mask is None else rows.in_body_axes(model.constraints, moving.R)
 
 
-def held_rows(model: TreeModel, moving: TreeMotion, rows: Rows) -> Rows:
-    """`turned_rows` with zeros in the place of rows that are left out."""
-    rows = turned_rows(model, moving, rows)
+def mask_rows(model: TreeModel, moving: TreeMotion, rows: Rows) -> Rows:
+    """`rotate_rows` with zeros in the place of rows that are left out."""
+    rows = rotate_rows(model, moving, rows)
     return rows if model.active_rows is None else rows.with_mask(model.active_rows)
 
 
@@ -247,7 +247,7 @@ def close_loops(
         return closure_rows(model.parameters, model.constraints, t, moving)
 
     def evaluate_rows(moving: TreeMotion) -> Rows:
-        return held_rows(model, moving, rows_of(moving))
+        return mask_rows(model, moving, rows_of(moving))
 
     # The derivative of a converged iteration is that of its last step at constant G: the
     # neglected terms are of the size of the residual before that step.
@@ -269,7 +269,7 @@ def close_loops(
     at = _carry_derivatives(at, iterate)
     moving = compute_motion(model.parameters, at)
     every = rows_of(moving)
-    rows = held_rows(model, moving, every)
+    rows = mask_rows(model, moving, every)
     at = _carry_derivatives(retract_coordinates(tree, at, -by_rows(rows.value)), iterate)
     # Velocities satisfy linear equations, but G belongs to the first iterate: a second pass removes the
     # error of its factor.
@@ -300,7 +300,7 @@ def rows_after(
     """Rows J of the loop closures after a displacement `by` along the velocities."""
     moving = compute_motion(model.parameters, retract_coordinates(model.parameters.tree, at, by))
     rows = closure_rows(model.parameters, model.constraints, t, moving)
-    return turned_rows(model, moving, rows).J
+    return rotate_rows(model, moving, rows).J
 
 
 def all_columns(tree: SpanningTree, J: Float[Array, "m k"]) -> Float[Array, "m l"]:

@@ -56,9 +56,9 @@ from .closures import (
     interpolate_posture,
     make_kinematics,
     measure_nearness,
+    rotate_rows,
     row_frames,
     step_rows,
-    turned_rows,
     way_along,
 )
 from .coordinates import (
@@ -260,8 +260,7 @@ class Tree(AbstractFormulation):
     Args:
         cut: names of joints that close loops; by default those with the fewest rows. See
             `spanning_tree` for the tree that results.
-        redundant: allow rows to become dependent in some postures, and choose the rows anew for
-            every step.
+        redundant: allow rows to become dependent in some postures, and select the rows again in every step.
     """
 
     cut: tuple[str, ...] = eqx.field(static=True, default=())
@@ -319,7 +318,9 @@ class Tree(AbstractFormulation):
         # Only a formulation that allows dependent rows pays for postures beside the present one.
         if self._may_interpolate(model):
             u_rate, driven = self._solve_interpolated(model, t, x, scheme)
-        rate = with_unit_vectors(tree, coordinate_rates(tree, at, u_rate), scheme.held_norms, at)
+        rate = with_unit_vectors(
+            tree, coordinate_rates(tree, at, u_rate), scheme.add_norm_feedback, at
+        )
         load, placement = solved.loads, solved.placement
         # Flows of energy and momentum are integrated beside the state, so that the balances of a run's
         # accuracy report have the error of the integrator and not that of a quadrature afterwards.
@@ -360,10 +361,10 @@ class Tree(AbstractFormulation):
             rows = closure_rows(model.parameters, model.constraints, t, moving)
             rate_residuals = jnp.sum(rows.J * at.u[None], axis=1) - rows.target
             rows = rows._replace(
-                gamma=stabilisation.held_rows(rows.gamma, rows.value, rate_residuals)
+                gamma=stabilisation.add_row_feedback(rows.gamma, rows.value, rate_residuals)
             )
         shared = shared and rows is not None and (self.redundant or model.row_mask is not None)
-        every = rows if rows is None else turned_rows(model, moving, rows)
+        every = rows if rows is None else rotate_rows(model, moving, rows)
         rows = (
             every
             if every is None or model.active_rows is None

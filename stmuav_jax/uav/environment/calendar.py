@@ -159,7 +159,7 @@ def unix_time(when: Any) -> Float[np.ndarray, "*s"]:
 
     Args:
         when: a datetime, text in ISO 8601 such as 2024-03-21T05:00+07:00, or an iterable of them.
-            Of a time that clocks show twice, `fold` tells which is meant, by default the first.
+            Of a time that clocks show twice, `fold` selects one, by default the first.
 
     Raises:
         SettingError: another type, or a time without a time zone or that its zone's clocks skip.

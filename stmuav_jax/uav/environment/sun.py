@@ -1,4 +1,4 @@
-"""Sun as a tracker on a UAV uses it: position at place and time by series or SPA, direction sensed on board.
+"""Direction to the sun for a tracker on a UAV: from place and time by series or SPA, or sensed on board.
 
 Scenario 1: a sensor on the UAV measures the direction in body axes, `s_b`. Scenario 2: position
 and time give the direction in the world (x east, y north, z up), and the known attitude turns it:
@@ -184,7 +184,7 @@ def sun_at(when: Any, place: Place, *, air: Air | None = None, night: bool = Fal
 
     Args:
         when: a datetime with a time zone, or text such as 2024-03-21T09:00+07:00, in the years 1950
-            to 2110. Of a time that clocks show twice, `fold` of the datetime tells which is meant.
+            to 2110. Of a time that clocks show twice, `fold` of the datetime selects one.
         air: air that refracts the light; by default there is none.
         night: accept a sun below the horizon.
 
@@ -240,7 +240,7 @@ def sensed_sun(s_b: Numbers) -> Float[Array, "3"]:
         raise StateError(f"The sun's direction must be three numbers, not {direction.shape}.")
     check_finite(direction, "The sun's direction", "", StateError)
     if has_values(direction) and not np.any(np.asarray(direction)):
-        raise StateError("The sun's direction has no length: the sensor sees no sun.")
+        raise StateError("The sun's direction has zero length: the sensor does not detect the sun.")
     return sensed_direction(direction).s_b
 
 
@@ -306,7 +306,7 @@ def check_attitude(R_wb: Numbers) -> None:
     worst = int(np.argmax(error + mirrored))
     if error[worst] > _ROTATION or mirrored[worst]:
         raise StateError(
-            f"R_wb must be a rotation (body to world), but at sample {worst} its columns are off "
-            f"unit and right angles by {error[worst]:.2g}"
-            + (" and it mirrors." if mirrored[worst] else ".")
+            f"R_wb must be a rotation (body to world), but at sample {worst} its columns "
+            f"deviate from unit length and right angles by {error[worst]:.2g}"
+            + (", and it is a reflection." if mirrored[worst] else ".")
         )

@@ -181,7 +181,7 @@ def dryden(
             )
         if dt > float(jnp.min(times)):
             raise ModelError(
-                f"Samples {dt:g} s apart cannot show gusts that last {float(jnp.min(times)):.3g} s "
+                f"Samples {dt:g} s apart cannot resolve gusts that last {float(jnp.min(times)):.3g} s "
                 "(scale length over airspeed): give a smaller dt."
             )
     # A duration of whole spacings must not get one sample more by round-off.

@@ -1,7 +1,7 @@
-"""Centre of mass of a multirotor as states of a filter over a flight, beside the answer of the whole record.
+"""Centre of mass of a multirotor as states of a filter over a flight, beside the estimate of the whole record.
 
 About roll and pitch, with what the identified numbers explain of the angular acceleration, a_k, its change g_k
-by the centre of mass c, and moments m that nobody knows,
+by the centre of mass c, and unknown moments m,
 
     w_k = w_(k-1) + dt (a_k + g_k c_k + m_k),   m_k = rho m_(k-1) + noise,   c_k = c_(k-1) + drift,
 

@@ -33,7 +33,7 @@ class RotorLayout(NamedTuple):
     Attributes:
         positions: of the rotors in forward-left-up axes (n, 3) [m]; their origin is that of the centre
             of mass which is identified.
-        spin: +1 for a rotor that turns to the left seen from above, else -1 (n,).
+        spin: +1 for a rotor that turns anticlockwise seen from above, else -1 (n,).
         mass: mass of the vehicle [kg], None if unknown.
         thrust_model_factor: f of the thrust f s^2 + (1 - f) s.
         inertia: moments of inertia about x, y and z (3,) [kg m^2], for a model of what no flight determines.

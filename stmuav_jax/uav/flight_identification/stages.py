@@ -11,7 +11,7 @@ where the shapes T_i are those of the layout plus an offset, so that the thrust 
 carries the vehicle; the angular momentum of the rotors makes S and, as it turns with the body, G; an accelerometer at
 b from the centre of mass reads
 
-    a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + E (q, -p, 0) + forces that nobody knows,
+    a = f + w' x b + w x (w x b) + bias,   f = (0, 0, sum T_i k/m) - D v + E (q, -p, 0) + unknown forces,
 
 where drag that acts above or below the centre of mass makes E. The velocity v is not logged. By v' = f + g - w x v,
 with gravity g in body axes by the gyroscope,
@@ -137,10 +137,10 @@ class FlightVerdict(NamedTuple):
     """Verdict on an identification.
 
     Attributes:
-        status: "consistent"; "inconsistent": a test speaks against the model; "undecided": nothing was
+        status: "consistent"; "inconsistent": a test rejects the model; "undecided": nothing was
             identified.
         p_values: p-value of every test by its name.
-        explanation: sentences on what was found.
+        explanation: sentences on the findings.
     """
 
     status: Literal["consistent", "inconsistent", "undecided"]
@@ -169,7 +169,7 @@ class FlightIdentification(NamedTuple):
     hover: float
 
     def correct_voltage(self, record: FlightRecord) -> FlightRecord:
-        """The identified record with commands as the motors feel them, where the voltage's exponent is determined."""
+        """The identified record with commands corrected for the voltage, if its exponent is determined."""
         exponent = self.estimates.get("voltage_exponent")
         return record.correct_voltage(0.0 if exponent is None else exponent.value)
 
@@ -538,9 +538,8 @@ def _check_gravity(signals: _Signals) -> float:
         np.hypot(value, horizontal) >= low and value <= high for value in (vertical, median)
     ):
         raise SettingError(
-            f"The accelerometer measures {vertical:.3g} m/s^2 on average along the vertical that the gyroscope tells; "
-            f"{low:.3g} to {high:.3g} m/s^2 would be valid: is the unit or the scale of the gyroscope or of the "
-            "accelerometer another?"
+            f"The accelerometer measures {vertical:.3g} m/s^2 on average along the vertical propagated by the "
+            f"gyroscope; {low:.3g} to {high:.3g} m/s^2 would be valid: check unit and scale of both sensors."
         )
     return min(abs(vertical - GRAVITY), abs(median - GRAVITY))
 
@@ -908,7 +907,7 @@ def _check_spin(layout: RotorLayout, fit: PredictionErrorFit) -> None:
     if is_clear and np.any(spin != layout.spin):
         raise SettingError(
             f"The motors' responses about yaw are those of the spin {spin.tolist()}, but the layout has "
-            f"{layout.spin.astype(int).tolist()}; the first would be valid, or the other sign of the gyroscope's z."
+            f"{layout.spin.astype(int).tolist()}; use the first, or change the sign of the gyroscope's z."
         )
 
 
@@ -1092,7 +1091,7 @@ def _identify_translation(
         raise SettingError(
             "The vehicle does not follow its motors: by the collective commands a rotor's thrust over mass at the "
             f"command 1 is {thrust.value:.2g} +- {thrust.deviation:.2g} m/s^2, where {usual:.2g} m/s^2 would carry the "
-            "vehicle. Was it held, or on the ground, or have commands and IMU different clocks?"
+            "vehicle. Was it held, or on the ground, or do commands and IMU have different clocks?"
         )
     if effect >= _EXCITED / 4 and thrust.deviation <= _DETERMINED * thrust.value:
         estimates["thrust"] = thrust

@@ -1,7 +1,8 @@
 """Options of flying scenes: drag, wind, motors, landing gear, the start; and the forces that they build.
 
 Numbers left out are those of the scene's parameter table ("drag.", "wind.", "gust.", "motor.", "gear.");
-numbers given go into the table that is kept with the results. Each field says what it is, its unit and its
+given numbers replace those of the table that is saved with the results. Each field says what it is, its unit
+and its
 number of entries.
 """
 

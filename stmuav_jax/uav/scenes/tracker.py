@@ -47,7 +47,7 @@ def tracker(
 
     Args:
         case: 1 slider forces, 2 panel force, 3 panel moment.
-        servo: holds both sliders, beside the case's forces; the report has none.
+        servo: holds both sliders, in addition to the case's forces; the report has none.
         stops: at the ends of both sliders' strokes. friction: in both slider joints.
         strokes: prescribe both sliders' displacements from the initial posture: a `Strokes`, or
             functions of t [s] to [m] (see `stmuav_jax.uav.tracker.bodies.stroke_drivers`); the
@@ -78,7 +78,7 @@ def tracker(
         },
         notes=(
             "Joint positions are reconstructed, not printed (docs/report_machine.md).",
-            "J'_7 of Table 6.2 breaks the triangle inequality by 0.7 % through rounding; admitted.",
+            "J'_7 of Table 6.2 violates the triangle inequality by 0.7 % through rounding; admitted.",
             f"{drive.note} No gravity, as printed.",
             *((STARTED,) if start is not None else ()),
         ),

@@ -77,7 +77,7 @@ def uav_tracker(
             the parameter "lift_factor" (the report gives no number).
         actuators: "consistent" puts each actuator's force pair on its axis; "printed" is
             the report's, which adds a net couple.
-        servo: holds both sliders, beside the actuators' forces; the report has none.
+        servo: holds both sliders, in addition to the actuators' forces; the report has none.
         stops: at the ends of both sliders' strokes. friction: in both slider joints.
         strokes: prescribe both sliders' displacements from the initial posture: a `Strokes`, or
             functions of t [s] to [m] (see `stmuav_jax.uav.tracker.bodies.stroke_drivers`); the

@@ -50,7 +50,7 @@ Target = Numbers | Callable[..., object]
 
 @dataclass(frozen=True)
 class Servo:
-    """Position servo in each slider joint, beside the forces that a scene has anyway.
+    """Position servo in each slider joint, in addition to the forces of the scene.
 
     Attributes:
         stiffness: [N/m]. damping: [N s/m].
@@ -283,7 +283,7 @@ def tracker_bodies(
 
     Raises:
         ModelError: numbers that no body can have, or lengths with which the tracker cannot take
-            that posture; the message says which leg, or the post, does not reach.
+            that posture; the message names the leg, or the post, that does not reach.
     """
     placement = _place_tracker(parameters, displacement)
     return tuple(

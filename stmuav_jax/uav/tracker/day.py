@@ -1,6 +1,6 @@
 """Simulation of a day of pointing a panel at the sun: angles, strokes, errors and energy.
 
-What is said of the whole day is computed at times of its daylight (`Day.lit`), whatever the user's
+Results of the whole day are computed at times of its daylight (`Day.lit`), whatever the user's
 step. At each time the sun's apparent direction is rotated to the UAV's axes by the attitude, and gives
 panel angles and strokes. Where the tracker cannot face the sun, its panel faces the nearest
 direction that it can. At night there is nothing to point at: angles are NaN.
@@ -136,8 +136,8 @@ class Pointing:
 class Day(Pointing):
     """Results of a day of pointing at the sun: a table at n times, and what holds of the whole day.
 
-    The table has the times of the user's step. What is said of the day (daylight, energies, times
-    within reach, largest angles) comes from `lit` and does not depend on that step.
+    The table has the times of the user's step. Results of the whole day (daylight, energies, times within
+    reach, largest angles) come from `lit` and do not depend on that step.
 
     Attributes:
         place: place of the UAV.
@@ -347,7 +347,7 @@ def track_day(
         attitude: R_wb of the UAV: constant (3, 3), a history (3, 3, n) at the times of
             `day_times`, or a function of the time since midnight [s] that gives (3, 3).
         step: time between samples of the table [s], made a little shorter to fit the day.
-        samples: number of times in each interval of daylight for what is said of the whole day.
+        samples: number of times in each interval of daylight for results of the whole day.
         flaws: imperfections of the actuators and of the known attitude; by default none.
         parameters: table with the tracker's lengths and strokes.
         turbidity: Linke's turbidity [1]; by default the month's mean there.
@@ -356,7 +356,7 @@ def track_day(
             out of reach.
 
     Raises:
-        SettingError: a date, zone, step, turbidity, albedo or flaw that makes no sense, a day that
+        SettingError: an invalid date, zone, step, turbidity, albedo or flaw, a day that
             the zone skipped, or several places.
         StateError: a sun that does not rise that day, or an attitude that is no rotation.
         ModelError: a tracker that reaches no posture.

@@ -290,8 +290,8 @@ def angles_from_strokes(
     There is no closed form. Newton's method starts from `start`, takes steps of at most 0.2
     rad, and refuses those that leave the reach or pass det A = 0: the solution has the start's
     sign of det A. With the adopted lengths that posture is the only one up to 66
-    degrees of tilt; at 70 there are others on the same side, so that the start must be near the
-    wanted one (as it is in `follow`).
+    degrees of tilt; at 70 there are others on the same side, so that the start must be near the target (as it
+    is in `follow`).
 
     Derivatives by q and the lengths are right up to the third order.
 

@@ -287,8 +287,7 @@ def aim(
     transformation, or throw=False gives NaN and a reason code instead.
 
     Raises:
-        StateError: a direction outside the workspace; the message says which limit it breaks, and
-            by how much.
+        StateError: a direction outside the workspace; the message says which limit it exceeds, and by how much.
 
     Source: report Part II, Eq. 3.9, 3.13 and 3.20, corrected.
     """
@@ -325,7 +324,7 @@ def aim(
 
 
 def why_outside(geometry: TrackerGeometry, limits: Limits, margins: Margins, reason: Reason) -> str:
-    """Text that says which limit of the workspace one posture breaks, and by how much."""
+    """Text that names the limit of the workspace that a posture exceeds, and by how much."""
     if reason == Reason.TILT:
         limit, excess = np.degrees(float(limits.tilt)), -np.degrees(float(margins.tilt))
         return (

@@ -20,10 +20,10 @@ class Damped(AbstractStabilisation):
 
     rate: float = 8.0
 
-    def held_rows(self, gamma, value, rate):
+    def add_row_feedback(self, gamma, value, rate):
         return gamma - self.rate * rate
 
-    def held_norms(self, rate, p):
+    def add_norm_feedback(self, rate, p):
         return rate + self.rate * (1 - jnp.sum(p**2, axis=0)) * p
 
     def iterations_after_step(self):
@@ -58,11 +58,11 @@ def test_the_three_that_there_are():
     gamma, value, rate = (jnp.asarray([x]) for x in (1.0, 0.1, 0.01))
     p = jnp.array([[1.1, 0.0, 0.0, 0.0]]).T
     fed = stm.Baumgarte(alpha=2.0, beta=3.0, norm=5.0)
-    np.testing.assert_allclose(fed.held_rows(gamma, value, rate), 1 - 0.04 - 0.9, rtol=1e-14)
-    np.testing.assert_allclose(fed.held_norms(0 * p, p)[0], 5 * (1 - 1.21) * 1.1, rtol=1e-14)
+    np.testing.assert_allclose(fed.add_row_feedback(gamma, value, rate), 1 - 0.04 - 0.9, rtol=1e-14)
+    np.testing.assert_allclose(fed.add_norm_feedback(0 * p, p)[0], 5 * (1 - 1.21) * 1.1, rtol=1e-14)
     for how in (stm.Unstabilised(), stm.Projection(iterations=4)):
-        assert how.held_rows(gamma, value, rate) is gamma
-        assert how.held_norms(p, p) is p
+        assert how.add_row_feedback(gamma, value, rate) is gamma
+        assert how.add_norm_feedback(p, p) is p
     ways = (stm.Unstabilised(), fed, stm.Projection(iterations=4))
     assert [how.iterations_after_step() for how in ways] == [0, 0, 4]
 

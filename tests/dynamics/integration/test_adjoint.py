@@ -88,7 +88,7 @@ def test_pieces_of_few_windows(monkeypatch):
     monkeypatch.setattr(records, "ROOM", 0)
     adjoint = stm.dynamics.DiscreteAdjoint(recorded_steps=2)
     few = replace(KEEPING, adjoint=adjoint, max_steps=200)
-    assert records.room_of(adjoint, prepare_problem(pendulum(), few), 3) == (2, 3, 50)
+    assert records.capacity_of(adjoint, prepare_problem(pendulum(), few), 3) == (2, 3, 50)
     several = Q + jnp.linspace(0.0, 0.4, 2)[:, None]
     found = jax.jit(jax.vmap(jax.value_and_grad(lambda q: swing(q, few))))
     for q, value, gradient in zip(several, *found(several), strict=True):
@@ -103,12 +103,12 @@ def test_there_is_room_for_all_steps():
         (1, 64, 409, 4096), (1, 12, 1000, 100_000, 10**7), (1, 10, 64, 1000), (13, 400)
     ):
         kept = min(kept, most)
-        room = records.RecordRoom.of(kept, most, segments, size)
-        spare = 0 if room.pieces == 1 else 1
-        assert (room.windows - spare) * room.pieces * room.steps >= most
-        numbers = segments * room.windows * (kept + size)
+        capacity = records.RecordCapacity.of(kept, most, segments, size)
+        spare = 0 if capacity.pieces == 1 else 1
+        assert (capacity.windows - spare) * capacity.pieces * capacity.steps >= most
+        numbers = segments * capacity.windows * (kept + size)
         assert numbers <= max(records.ROOM, segments * records.WINDOWS * (kept + size))
-    assert records.RecordRoom.of(64, 100_000, 64, 28).pieces == 1
+    assert records.RecordCapacity.of(64, 100_000, 64, 28).pieces == 1
 
 
 @pytest.mark.slow

@@ -168,7 +168,7 @@ def test_a_run_past_the_path_says_so():
     [
         ({"airspeed": 0.0}, "airspeed of gusts must be positive"),
         ({"duration": -1.0}, "duration of gusts must be positive"),
-        ({"dt": 3.0}, "cannot show gusts that last 1.25 s"),
+        ({"dt": 3.0}, "cannot resolve gusts that last 1.25 s"),
         ({"mean": [1.0, np.inf, 0.0]}, "mean wind must be finite"),
         ({"turbulence": Turbulence(-AIR.lengths, AIR.intensities)}, "must be positive"),
     ],

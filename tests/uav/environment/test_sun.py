@@ -326,7 +326,7 @@ def test_a_sensor_without_direction_is_refused(direction, words):
 def test_an_attitude_that_is_no_rotation_is_refused():
     with pytest.raises(stm.StateError, match=r"by 0\.21"):
         check_attitude(1.1 * np.eye(3))
-    with pytest.raises(stm.StateError, match="mirrors"):
+    with pytest.raises(stm.StateError, match="is a reflection"):
         check_attitude(np.diag([1.0, 1.0, -1.0]))
     with pytest.raises(stm.StateError, match=r"shape \(3, 3"):
         sun_in_body(NOON, PHNOM_PENH, np.eye(4))
