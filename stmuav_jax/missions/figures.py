@@ -92,9 +92,9 @@ def flight_forces(data: xr.Dataset) -> Figure:
 def flight_joints(data: xr.Dataset) -> Figure:
     """Figure of the driven joints against their references, and of their errors; hinges and slides apart."""
     units = data.driven_joint_unit.values
-    shown = [(u, *x) for u, *x in (("rad", "degrees", _DEGREE), ("m", "m", 1.0)) if u in units]
-    figure, axes = grid(2 * len(shown), 1, 5.0 * len(shown))
-    for row, (unit, unit_text, scale) in enumerate(shown):
+    scales = [x for x in (("rad", "degrees", _DEGREE), ("m", "m", 1.0)) if x[0] in units]
+    figure, axes = grid(2 * len(scales), 1, 5.0 * len(scales))
+    for row, (unit, unit_text, scale) in enumerate(scales):
         places = np.flatnonzero(units == unit)
         names = [str(name) for name in data.driven_joint.values[places]]
         position, reference, error = (
