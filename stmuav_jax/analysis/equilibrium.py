@@ -417,6 +417,7 @@ def _solve_trim(
             f"state of a force and every condition, but only {problem.unknowns} unknowns "
             f"({chosen or 'none'}): add inputs, or name free states among "
             f"{', '.join(name for name, _ in space.names[: 2 * space.dof])}."
+            + _suggest_free_states(space, inputs, free)
         )
     z, residuals, conditioning, steps, weights, effect, efforts = _solve_equations(problem)
     residual = jnp.max(jnp.abs(residuals))
@@ -430,14 +431,15 @@ def _solve_trim(
     if throw and has_values(residual) and not bool(converged):
         hint = ""
         is_finite = np.isfinite(residual)
-        residual_text = format_residuals(residuals, units) if is_finite else "no finite value"
+        residual_text = format_residuals(residuals, units) if is_finite else "that are not finite"
         if not float(conditioning) > 1e-12:
             hint = (
                 " The equations are singular there: these unknowns do not reach all accelerations."
+                + _suggest_free_states(space, inputs, free)
             )
         raise StateError(
-            "No trim was found near the start: Newton's method stopped with residual accelerations of "
-            f"{residual_text} left (tolerance {TOLERANCE:.0e}) over the unknowns {chosen}.{hint}"
+            "No trim was found near the start: Newton's method stopped with residual accelerations "
+            f"{'of ' * bool(is_finite)}{residual_text} (tolerance {TOLERANCE:.0e}) over the unknowns {chosen}.{hint}"
         )
     point, trim_values = problem.at(z)
     lowest, highest = _find_speed_limits(space.system, inputs)
@@ -452,6 +454,22 @@ def _solve_trim(
         tuple(name for name, _ in space.names[: space.dof]),
         force_units(space.system, inputs), units,
     )  # fmt: skip
+
+
+def _suggest_free_states(space: AbstractStateSpace, inputs: Inputs, free: Sequence[str]) -> str:
+    """Sentence on the coordinates of joints without an input, whose posture a trim usually has to find."""
+    forces: Any = space.system.forces
+    driven = {getattr(forces[entry.force], "joint", None) for entry in inputs.entries}
+    names = [
+        name
+        for name, _ in space.names[: space.dof]
+        if "." in name and name.rpartition(".")[0] not in driven and name not in free
+    ]
+    if not names:
+        return ""
+    return (
+        f" No input acts in the joint of {', '.join(names)}: a free state usually is one of these."
+    )
 
 
 def _check_efforts(problem: _Problem, efforts: Float[np.ndarray, " l"]) -> None:

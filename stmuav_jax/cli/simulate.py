@@ -86,7 +86,9 @@ class Settings(CheckSettings):
     """Estimate the run's error by a second run."""
     certificate: Literal["standard", "full"] = "standard"
     """With full, the accelerations are also compared with those of another formulation, which compiles longer."""
-    out: Annotated[Path | None, shared_option("out"), default_text("runs/SCENE")] = None
+    out: Annotated[
+        Path | None, shared_option("out"), default_text("runs/SCENE_CASE or runs/MODEL")
+    ] = None
     figures: Figures = "png"
     verbose: bool = False
     """Print all entries of the accuracy report; by default the six main ones."""

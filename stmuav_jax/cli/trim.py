@@ -122,7 +122,9 @@ class TrimSettings(LinearSettings, FlightSettings, PostureSettings):
     """States that may differ from the start, such as hinge.angle."""
     accelerations: Annotated[tuple[str, ...], default_text("zero")] = ()
     """Target rates of velocities, such as rail.displacement_rate=2 [m/s^2, rad/s^2]."""
-    out: Annotated[Path | None, shared_option("out"), default_text("runs/trim_SCENE")] = None
+    out: Annotated[
+        Path | None, shared_option("out"), default_text("runs/trim_SCENE_CASE or runs/trim_MODEL")
+    ] = None
 
 
 ABOUT = """Find the inputs, and optionally states, of a steady motion of any mechanism; write trim.json.

@@ -39,7 +39,11 @@ class TuneSettings(PointSettings):
     segments: Annotated[int, count_range("segments", 1000), shared_option("segments")] = 1
     steps: Annotated[int, count_range("steps", 1e6), shared_option("steps")] = 60
     resume: Resume = False
-    out: Annotated[Path | None, shared_option("out"), default_text("runs/tune_WHAT_SCENE")] = None
+    out: Annotated[
+        Path | None,
+        shared_option("out"),
+        default_text("runs/tune_WHAT_SCENE_CASE or runs/tune_WHAT_MODEL"),
+    ] = None
     figures: Figures = "png"
 
 

@@ -44,7 +44,8 @@ class View:
     """
 
     result: tyro.conf.Positional[Path]
-    """File of simulate, fly, estimate or montecarlo, or its folder; or a scene or a model's file."""
+    """File of simulate, fly, estimate or montecarlo, or its folder; or a scene or a model's file, whose sketch has
+    options of its own (stmuav view SCENE --help)."""
     report: Annotated[Path | None, default_text("none")] = None
     """Write a report of the result to this file, a page with verdict, tables and figures, which works without
     network."""
@@ -82,13 +83,18 @@ class View:
 class SketchSettings(CheckSettings):
     """Options of a sketch, which all scenes share."""
 
-    out: Annotated[Path | None, shared_option("out"), default_text("runs/NAME")] = None
+    out: Annotated[
+        Path | None,
+        shared_option("out"),
+        default_text("that of simulate: runs/SCENE_CASE or runs/MODEL"),
+    ] = None
     figures: Annotated[Literal["png", "pdf", "svg"], shared_option("figures")] = "png"
 
 
 SKETCH = """Draw a scene or a model's file: bodies, joints, frames, and the graph of the joints.
 
-Example: stmuav view uav_tracker; stmuav view docs/models/four_bar.toml --out runs/four_bar. The table lists the joints,
+Example: stmuav view uav_tracker writes runs/uav_tracker_2/mechanism.png, beside the results of simulate (2 is the
+case); stmuav view docs/models/four_bar.toml --out sketches writes sketches/mechanism.png. The table lists the joints,
 and says which of them close loops of the mechanism.
 """
 

@@ -52,6 +52,7 @@ from .integration.advance import CHUNK, March, Trajectory, integrate_times, same
 from .integration.problem import (
     MASSES_REFUSED,
     Problem,
+    at_internal,
     begin_integration,
     fit_first_step,
     prepare_problem,
@@ -382,17 +383,19 @@ def interpolate_states(run: Run, times: Numbers) -> tuple[State, np.ndarray]:
     )
     method = dataclasses.replace(run.method, event=None)
     spans = as_jax(np.stack([run.ts[before], ts], axis=1))
-    end_values = _end_states(run.scene.system, method, starts, spans)
+    # Prepared outside the program: dependent rows of loops are found from known numbers alone.
+    end_values = _end_states(prepare_problem(run.scene.system, method), starts, spans)
     return jax.tree.map(np.asarray, end_values)
 
 
 @kept_jit
 def _end_states(
-    system: System, method: Method, starts: tuple[State, Array], spans: Float[Array, "k 2"]
+    problem: Problem, starts: tuple[State, Array], spans: Float[Array, "k 2"]
 ) -> tuple[State, Float[Array, "k m"]]:
     def end_state(start: tuple[tuple[State, Array], Array]) -> tuple[State, Array]:
         (state, z), span = start
-        path = integrate(with_internal(system, z), state, span, method)
+        model = at_internal(problem.model, z)
+        path = _integrate_path(eqx.tree_at(lambda p: p.model, problem, model), state, span)
         # a saved state is returned unchanged, not by way of the formulation's coordinates
         same = span[0] == span[1]
         path_values = (path.states, path.internal)

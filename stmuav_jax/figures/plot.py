@@ -66,7 +66,7 @@ def look(k: int) -> dict[str, Any]:
 def plot_histories(ax: Axes, ts: np.ndarray, values: np.ndarray, labels: tuple[str, ...]) -> None:
     """Plot histories (k, labels) over times (k,) [s], each in its own style."""
     for k, label in enumerate(labels):
-        color, dash = STYLES[k]
+        color, dash = (cycle[k % len(cycle)] for cycle in (_COLORS, _DASHES))
         ax.plot(ts, values[:, k], label=label, linewidth=1.4, color=color, linestyle=dash)
     ax.set_xlabel("time [s]", fontsize=9)
 

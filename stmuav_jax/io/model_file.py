@@ -566,15 +566,19 @@ def _plain_values(value: Any) -> Any:
 
 
 def _floating_rows(system: System) -> set[int]:
-    """Rows of the bodies that no chain of joints connects to ground."""
-    # Without ground at one end a tree of joints floats: the loader must be told that this is
-    # meant.
-    attached_names, has_grown = {GROUND}, True
+    """Rows of the bodies declared free, and of those that no chain of joints connects to them or to ground."""
+    # Joints that were taken away may leave bodies that float undeclared: the loader must be told that this
+    # is meant.
+    attached_names, has_grown = {GROUND, *system.bodies.free}, True
     while has_grown:
         ends = [{joint.body_i, joint.body_j} for joint in system.joints]
         new = set().union(*(pair for pair in ends if pair & attached_names)) - attached_names
         attached_names, has_grown = attached_names | new, bool(new)
-    return {k for k, name in enumerate(system.names) if name not in attached_names}
+    return {
+        k
+        for k, name in enumerate(system.names)
+        if name in system.bodies.free or name not in attached_names
+    }
 
 
 def _body_table(system: System, k: int) -> dict[str, Any]:

@@ -19,6 +19,8 @@ from .derivative import directional_derivative, held_constant, value_and_jacobia
 
 # Residuals below this that no longer halve are taken for round-off.
 _ROUND_OFF = 1e-6
+# Singular values of a Jacobian up to this fraction of the largest are those of dependent equations.
+_DEPENDENT = 1e-11
 
 
 class NewtonState(eqx.Module):
@@ -92,7 +94,9 @@ class Newton(AbstractNewton):
         now = NewtonState(y, r, J, size, has_ended)
         best = jax.tree.map(lambda a, b: jnp.where(worse, a, b), state, now)
         best = eqx.tree_at(lambda s: s.has_ended, best, has_ended)
-        next_y = best.y - lapack.solve(best.J, best.r)
+        # Equations may repeat each other, as those of a pendulum below a machine that hovers level: the shortest
+        # step meets them all, and the residuals tell where they contradict each other.
+        next_y = best.y - lapack.pseudoinverse(best.J, _DEPENDENT) @ best.r
         return jnp.where(has_ended, best.y, next_y), best, aux
 
 
@@ -130,22 +134,19 @@ class NearestNewton(AbstractNewton):
         del fn, options, tags
         z = y[: self.count]
         r, J = value_and_jacobian(lambda z: self.equations(z, args), z)
-        # The minimum-norm solution comes from the QR factorisation of J^T and not from J J^T, whose condition
-        # is the square of that of J.
-        Q, R = lapack.factor_qr(J.T)
+        # From the singular values of J and not from J J^T, whose condition is the square of that of J; rows may
+        # depend on others, as in `Newton`.
+        P = lapack.pseudoinverse(J, _DEPENDENT)
         # A point on the constraints is not enough: its part outside the row space of J has to vanish too,
         # else it is not the nearest point.
-        size = jnp.maximum(self.norm(r), self.norm(z - Q @ (Q.T @ z)))
+        size = jnp.maximum(self.norm(r), self.norm(z - P @ (J @ z)))
         # The part outside the rows converges linearly where the constraints are curved, so that the factor is
         # closer to one than for `Newton`.
         stalled = (state.size < _ROUND_OFF) & ~(size < 0.9 * state.size)
         has_ended = (size <= self.atol) | stalled | ~jnp.isfinite(size)
-        multipliers = lapack.solve(R.T, J @ z - r)
         # where it ends, z stays; the multipliers are those of its own J
-        multipliers = jnp.where(has_ended, Q.T @ z, multipliers)
-        next_y = jnp.concatenate(
-            [jnp.where(has_ended, z, Q @ multipliers), lapack.solve(R, multipliers)]
-        )
+        next_z = jnp.where(has_ended, z, P @ (J @ z - r))
+        next_y = jnp.concatenate([next_z, P.T @ next_z])
         return next_y, NewtonState(y, r, J, size, has_ended), None
 
 

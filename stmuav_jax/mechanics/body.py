@@ -116,12 +116,13 @@ class Body(eqx.Module):
 
 @has_structure(zero=("com", "inertia"))
 class Bodies(eqx.Module):
-    """Moving bodies of a system, stacked: mass (n,), com (n, 3), inertia (n, 3, 3)."""
+    """Moving bodies of a system, stacked: mass (n,), com (n, 3), inertia (n, 3, 3); names of those declared free."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     mass: Float[Array, " n"]
     com: Float[Array, "n 3"]
     inertia: Float[Array, "n 3 3"]
+    free: tuple[str, ...] = eqx.field(static=True, default=())
 
 
 def stack_bodies(bodies: tuple[Body, ...]) -> Bodies:
@@ -131,6 +132,7 @@ def stack_bodies(bodies: tuple[Body, ...]) -> Bodies:
         mass=stack_arrays([b.mass for b in bodies]),
         com=stack_arrays([b.com for b in bodies]),
         inertia=stack_arrays([b.inertia for b in bodies]),
+        free=tuple(b.name for b in bodies if b.free),
     )
 
 

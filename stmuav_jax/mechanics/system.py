@@ -138,6 +138,12 @@ class System(eqx.Module):
         """True if no joint names ground, so that only forces change the total momentum."""
         return all(GROUND not in (j.body_i, j.body_j) for j in self.joints)
 
+    @property
+    def base(self) -> int:
+        """Row of the base: the first body that is declared free, else the first body."""
+        free = self.bodies.free
+        return next((k for k, name in enumerate(self.names) if name in free), 0)
+
     def index(self, name: str) -> int:
         """Row of the named moving body in a state; raises `ModelError` if unknown."""
         if name not in self.names:

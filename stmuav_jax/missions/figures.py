@@ -90,19 +90,23 @@ def flight_forces(data: xr.Dataset) -> Figure:
 
 
 def flight_joints(data: xr.Dataset) -> Figure:
-    """Figure of the driven joints against their references, and of their errors."""
-    turning = data.driven_joint_unit.values == "rad"
-    scale, unit = np.where(turning, _DEGREE, 1.0), "degrees" if np.all(turning) else "degrees or m"
-    figure, axes = grid(2, 1, 5.0)
-    names = [str(name) for name in data.driven_joint.values]
-    both = np.concatenate(
-        [data.joint_position.values, data.reference_joint_position.values], axis=1
-    )
-    labels = (*names, *(f"{name} reference" for name in names))
-    plot_histories(axes[0, 0], data.time.values, both / np.tile(scale, 2), labels)
-    _label_axes(axes[0, 0], f"joints [{unit}]")
-    plot_histories(axes[1, 0], data.time.values, data.joint_error.values / scale, tuple(names))
-    _label_axes(axes[1, 0], f"error [{unit}]")
+    """Figure of the driven joints against their references, and of their errors; hinges and slides apart."""
+    units = data.driven_joint_unit.values
+    scales = [x for x in (("rad", "degrees", _DEGREE), ("m", "m", 1.0)) if x[0] in units]
+    figure, axes = grid(2 * len(scales), 1, 5.0 * len(scales))
+    for row, (unit, unit_text, scale) in enumerate(scales):
+        places = np.flatnonzero(units == unit)
+        names = [str(name) for name in data.driven_joint.values[places]]
+        position, reference, error = (
+            data[signal].values[:, places] / scale
+            for signal in ("joint_position", "reference_joint_position", "joint_error")
+        )
+        labels = (*names, *(f"{name} reference" for name in names))
+        both = np.concatenate([position, reference], axis=1)
+        plot_histories(axes[2 * row, 0], data.time.values, both, labels)
+        _label_axes(axes[2 * row, 0], f"joints [{unit_text}]")
+        plot_histories(axes[2 * row + 1, 0], data.time.values, error, tuple(names))
+        _label_axes(axes[2 * row + 1, 0], f"error [{unit_text}]")
     return _add_title(figure, data)
 
 

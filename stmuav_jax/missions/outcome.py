@@ -14,7 +14,7 @@ from ..uav.flight_identification.record import FlightRecord
 from .controller import AT_ONCE
 from .flight import MissionFlight
 from .schema import TolerancesEntry
-from .signals import GAUGES
+from .signals import EFFORT_UNIT, GAUGES, JOINT_UNIT
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -50,16 +50,14 @@ def labelled_flight(flight: MissionFlight) -> Labelled:
     machine, entries = flight.mission.machine, flight.mission.file
     count = machine.rotors.spin.shape[0]
     labels = GAUGES | _BATTERY
-    # Angles and displacements of joints share a variable, whose unit is one where all of them have it.
-    effort_unit = "N m or N"
-    if len(kinds := {drive.unit for drive in machine.joints}) == 1:
-        unit = kinds.pop()
-        effort_unit = {"rad": "N m", "m": "N"}[unit]
-        units = {"rad or m": unit, "N m or N": effort_unit}
-        labels = {
-            name: (dims, units.get(label_unit, label_unit), description)
-            for name, (dims, label_unit, description) in labels.items()
-        }
+    units = [drive.unit for drive in machine.joints]
+    effort_units = [{"rad": "N m", "m": "N"}[unit] for unit in units]
+    # One unit of all joints is named where the reader looks first, several in coordinates.
+    one_unit = {JOINT_UNIT: units[0], EFFORT_UNIT: effort_units[0]} if len({*units}) == 1 else {}
+    labels = {
+        name: (dims, one_unit.get(unit, unit), description)
+        for name, (dims, unit, description) in labels.items()
+    }
     loop = labelled_loop(
         flight.run, labels, title=entries.title, ending=flight.ending,
         mission=json.loads(entries.model_dump_json()), scene=machine.scene.name,
@@ -89,12 +87,10 @@ def labelled_flight(flight: MissionFlight) -> Labelled:
         names["panel_angle"] = (("panel_angle",), ["phi", "theta"], {})
     if machine.joints:
         names["driven_joint"] = (("driven_joint",), [drive.name for drive in machine.joints], {})
-        names["driven_joint_unit"] = (
-            ("driven_joint",),
-            [drive.unit for drive in machine.joints],
-            {},
-        )
+        names["driven_joint_unit"] = (("driven_joint",), units, {})
+        names["driven_joint_effort_unit"] = (("driven_joint",), effort_units, {})
         if np.any(np.isfinite(machine.efforts)):
+            effort_unit = one_unit.get(EFFORT_UNIT, EFFORT_UNIT)
             limits["lowest_effort"] = ("driven_joint", -machine.efforts, effort_unit)
             limits["highest_effort"] = ("driven_joint", machine.efforts, effort_unit)
     limit_variables = {

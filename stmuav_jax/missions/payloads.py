@@ -84,6 +84,7 @@ class Payloads(eqx.Module):
             inserted(bodies.mass, mass),
             inserted(bodies.com, jnp.zeros_like(self.position)),
             inserted(bodies.inertia, mass[:, None, None] * _RADIUS**2 * jnp.eye(3)),
+            bodies.free,
         )
 
         def extended(state: State) -> State:

@@ -29,6 +29,8 @@ from .payloads import Payloads
 _AXES, _ROTORS = ("time", "axis"), ("time", "rotor")
 _JOINTS = ("time", "driven_joint")
 _ANGLES, _SLIDERS, _TIME = ("time", "panel_angle"), ("time", "slider"), ("time",)
+# Units of the signals of joints: coordinates with the unit of each joint, where hinges and slides have several.
+JOINT_UNIT, EFFORT_UNIT = "see driven_joint_unit", "see driven_joint_effort_unit"
 # Dimensions, unit and description of each signal.
 GAUGES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "reference_position": (_AXES, "m", "reference of the base, world axes"),
@@ -56,10 +58,10 @@ GAUGES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "displacement": (_SLIDERS, "m", "of the sliders from the initial posture"),
     "commanded_force": (_SLIDERS, "N", "that the servo asks of the actuators, before their limits"),
     "actuator_power": (_TIME, "W", "mechanical power of both actuators"),
-    "joint_position": (_JOINTS, "rad or m", "coordinates of driven joints"),
-    "reference_joint_position": (_JOINTS, "rad or m", "reference of the driven joints"),
-    "joint_error": (_JOINTS, "rad or m", "of the driven joints from their reference"),
-    "commanded_effort": (_JOINTS, "N m or N", "efforts in joints, before their limits"),
+    "joint_position": (_JOINTS, JOINT_UNIT, "coordinates of driven joints"),
+    "reference_joint_position": (_JOINTS, JOINT_UNIT, "reference of the driven joints"),
+    "joint_error": (_JOINTS, JOINT_UNIT, "of the driven joints from their reference"),
+    "commanded_effort": (_JOINTS, EFFORT_UNIT, "efforts in joints, before their limits"),
     "joint_power": (_TIME, "W", "mechanical power of the efforts in joints, within their limits"),
     "gear_load": (_TIME, "N", "of the ground on all feet of the landing gear, upwards"),
     "gear_depth": (_TIME, "m", "of the lowest foot below the ground's height, negative in flight"),

@@ -55,10 +55,15 @@ class RunPoint:
         x = self.y[: self.problem.n_state]
         return self.problem.method.formulation.to_state(self.model, x)
 
+    @property
+    def base(self) -> int:
+        """Row of the base."""
+        return self.system.base
+
     @cached_property
     def R_wb(self) -> Float[Array, "3 3"]:
         """Attitude of the base; the world's axes where the mechanism stands on the ground."""
-        return rotation_matrix(self.state.p[0]) if self.system.floating else jnp.eye(3)
+        return rotation_matrix(self.state.p[self.base]) if self.system.floating else jnp.eye(3)
 
     @cached_property
     def normal_w(self) -> Float[Array, "3"]:
@@ -82,7 +87,11 @@ class RunPoint:
     def stroke(self, name: str) -> Float[Array, ""]:
         """Height of a slider above its place in the reference posture, base axes [m]."""
         k, now, reference = self.system.index(name), self.state, self.system.reference
-        base = (now.r[0], reference.r[0]) if self.system.floating else (jnp.zeros(3), jnp.zeros(3))
+        base = (
+            (now.r[self.base], reference.r[self.base])
+            if self.system.floating
+            else (jnp.zeros(3), jnp.zeros(3))
+        )
         return (self.R_wb.T @ (now.r[k] - base[0]))[2] - (reference.r[k] - base[1])[2]
 
 
@@ -111,12 +120,14 @@ def angle_between(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""
 _UP = (0.0, 0.0, 1.0)
 
 _BASE = {
-    "x": Signal(lambda v: v.state.r[0, 0], "m", "base, x"),
-    "y": Signal(lambda v: v.state.r[0, 1], "m", "base, y"),
-    "z": Signal(lambda v: v.state.r[0, 2], "m", "base, height"),
-    "distance": Signal(lambda v: safe_norm(v.state.r[0]), "m", "base, distance from the origin"),
-    "speed": Signal(lambda v: safe_norm(v.state.v[0]), "m/s", "base, speed"),
-    "spin": Signal(lambda v: safe_norm(v.state.omega[0]), "rad/s", "base, angular velocity"),
+    "x": Signal(lambda v: v.state.r[v.base, 0], "m", "base, x"),
+    "y": Signal(lambda v: v.state.r[v.base, 1], "m", "base, y"),
+    "z": Signal(lambda v: v.state.r[v.base, 2], "m", "base, height"),
+    "distance": Signal(
+        lambda v: safe_norm(v.state.r[v.base]), "m", "base, distance from the origin"
+    ),
+    "speed": Signal(lambda v: safe_norm(v.state.v[v.base]), "m/s", "base, speed"),
+    "spin": Signal(lambda v: safe_norm(v.state.omega[v.base]), "rad/s", "base, angular velocity"),
     "tilt": Signal(
         lambda v: angle_between(v.R_wb[:, 2], jnp.array(_UP, v.y.dtype)), "rad", "base, tilt"
     ),

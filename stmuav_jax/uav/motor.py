@@ -195,7 +195,8 @@ def only_rotors(system: System, owner: str) -> Rotors | MotorRotors:
     body = rotor_sets[0].rotors.body
     if system.index(body) != 0:
         raise ModelError(
-            f"{owner} needs its rotors on the first body, '{system.names[0]}', but they are on '{body}'."
+            f"{owner} needs its rotors on the first body, '{system.names[0]}', but they are on '{body}': "
+            f"list '{body}' first."
         )
     return rotor_sets[0]
 

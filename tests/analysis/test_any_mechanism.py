@@ -92,9 +92,44 @@ def test_trim_of_an_accelerating_cart(cart):
     assert float(jax.grad(of)(jnp.asarray(a))) == pytest.approx(exact, rel=1e-10)
 
 
+@pytest.mark.parametrize("kind", ["revolute", "spherical"])
+def test_a_load_that_hangs_from_a_machine_in_hover(kind):
+    """Its equations repeat those of the machine: a hinge has no angle to find, a ball turns about the cable."""
+    bodies = [
+        stm.Body("frame", 1.2, [0.012, 0.012, 0.022], free=True),
+        stm.Body("load", 0.4, [3e-4] * 3, position=[0.05, 0.0, -0.1], com=[0, 0, -0.8]),
+    ]
+    point = {"point": [0.05, 0.0, -0.1]}
+    cable = (
+        stm.revolute("cable", "frame", "load", axis=[0, 1, 0], **point)
+        if kind == "revolute"
+        else stm.spherical("cable", "frame", "load", **point)
+    )
+    count = 6 if kind == "revolute" else 4
+    arms, spin = stm.uav.rotor_layout(count, 0.2)
+    rotors = stm.uav.Rotors(
+        "frame", arms=arms, spin=spin, k_f=1e-5, k_tau=2e-7, speed_squared=[3e5] * count
+    )
+    space = stm.TreeSpace(stm.System(bodies, [cable], [stm.Gravity(), rotors]))
+    x, free = space.from_state(space.system.reference), []
+    if kind == "spherical":
+        free = [f"cable.rotation_{axis}" for axis in "xyz"]
+        x = space.retract(x, jnp.zeros(space.size).at[7].set(0.2))
+        with pytest.raises(stm.SettingError, match=f"No input acts in the joint of {free[0]}, "):
+            stm.analysis.trim_condition(space, stm.analysis.hover(), at=x)
+    trim = stm.analysis.trim_condition(space, stm.analysis.hover(), at=x, free=free)
+    assert bool(trim.converged)
+    assert float(jnp.sum(trim.values)) * 1e-5 == pytest.approx(1.6 * 9.81, rel=1e-12)
+    # the load pulls at its hinge, 5 cm in front of the frame's centre of mass
+    moment = -jnp.sum(trim.values * 1e-5 * arms[:, 0])
+    assert float(moment) == pytest.approx(-0.05 * 0.4 * 9.81, rel=1e-9)
+    assert space.to_state(trim.point).r[1] == pytest.approx([0.05, 0.0, -0.9], abs=1e-9)
+
+
 def test_what_a_trim_refuses(cart):
     space, x = cart
-    with pytest.raises(stm.SettingError, match=r"2 equations here.* only 1 unknowns \(effort\)"):
+    words = r"2 equations here.* only 1 unknowns \(effort\).* in the joint of hinge.angle: "
+    with pytest.raises(stm.SettingError, match=words):
         stm.trim(space, at=x)
     with pytest.raises(stm.SettingError, match=r"name 'hinge', .*Did you mean 'hinge.angle'"):
         stm.trim(space, at=x, free=["hinge"])

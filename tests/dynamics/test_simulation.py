@@ -5,7 +5,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import pendulum, relative_error, scene_of, state_of, swung, turn
+from helpers import (
+    four_bar,
+    four_bar_state,
+    pendulum,
+    relative_error,
+    scene_of,
+    state_of,
+    swung,
+    turn,
+)
 
 import stmuav_jax as stm
 from stmuav_jax.dynamics import diagnostics
@@ -272,6 +281,20 @@ def test_states_between_saved_times_are_as_accurate_as_on_them(run):
     np.testing.assert_array_equal(found.r[8], np.asarray(rare.states.r)[1])
     with pytest.raises(stm.SettingError, match=r"covers 0 s to 0\.4 s, but a state at 0\.6 s"):
         stm.dynamics.states_at(rare, [0.2, 0.6])
+
+
+def test_loads_between_saved_times_of_a_planar_loop():
+    """A four-bar of hinges, three of whose rows depend on others: stored rarely, and at every time."""
+    system = four_bar()
+    scene = stm.Scene("four-bar", "Four-bar", system, four_bar_state(system, 2.0), t1=0.04)
+    rare, dense = (stm.simulate(scene, ts=np.linspace(0, 0.04, count)) for count in (3, 9))
+    between = stm.dynamics.states_at(rare, dense.ts)
+    np.testing.assert_allclose(between.r, dense.states.r, atol=1e-9)
+    resolved, loads = stm.dynamics.resolved_loads(rare, 0.5), stm.dynamics.run_loads(dense)
+    at = np.searchsorted(resolved.ts, np.asarray(dense.ts) - 1e-9)
+    largest = np.max(np.abs(loads.force))
+    np.testing.assert_allclose(resolved.force[at], loads.force, atol=1e-6 * largest)
+    assert np.all(np.isfinite(resolved.force))
 
 
 def test_ctrl_c_keeps_what_was_reached(run):

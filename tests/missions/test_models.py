@@ -126,6 +126,41 @@ def test_an_own_machine_flies_in_gusts_and_moves_its_gimbal(flight, data):
 
 
 @pytest.mark.slow
+def test_hinges_and_slides_have_their_units_and_any_number_of_joints_is_drawn(tmp_path):
+    parts = [(MODEL.split("[joints]")[0], "", "")]
+    for k in range(3):
+        body = f"bodies = ['frame', 'ballast_{k}']"
+        parts.append((
+            f"ballast_{k} = {{mass = 0.1, inertia = [2e-4, 2e-4, 2e-4], position = [0, 0, {0.1 * k}]}}",
+            f"rail_{k} = {{kind = 'translational', {body}, axis = [0, {k % 2}, {(k + 1) % 2}]}}",
+            f"rail_motor_{k} = {{kind = 'effort', joint = 'rail_{k}', effort = 0.0, limit = 9.0}}",
+        ))  # fmt: skip
+    bodies, joints, forces = ("\n".join(lines) for lines in zip(*parts, strict=True))
+    text = MODEL.replace(parts[0][0], f"{bodies}\n")
+    text = text.replace("[joints]", f"[joints]{joints}").replace("[forces]", f"[forces]{forces}", 1)
+    (tmp_path / "own.toml").write_text(text)
+    moves = [{"joint": "rail_1", "to": 0.05, "at": 0.0}]
+    flight = missions.fly(missions.make_mission(changed(t1=0.1, joints=moves), tmp_path))
+    data = missions.to_data(flight)
+    order = ["m", "m", "m", "rad", "rad"]
+    assert list(data.driven_joint_unit.values) == order
+    efforts = [{"m": "N", "rad": "N m"}[unit] for unit in order]
+    assert list(data.driven_joint_effort_unit.values) == efforts
+    assert data.joint_error.units == "see driven_joint_unit"
+    assert (
+        data.commanded_effort.units == data.highest_effort.units == "see driven_joint_effort_unit"
+    )
+    axes = missions.flight_figures(data)["joints"].axes
+    assert [ax.get_ylabel() for ax in axes] == [
+        "joints [degrees]", "error [degrees]", "joints [m]", "error [m]",
+    ]  # fmt: skip
+    assert [len(ax.lines) for ax in axes] == [4, 2, 6, 3]
+    curve = axes[2].lines[1]
+    assert curve.get_label() == "rail_1"
+    np.testing.assert_array_equal(curve.get_ydata(), data.joint_position.values[:, 1])
+
+
+@pytest.mark.slow
 def test_the_gimbal_is_estimated_by_its_encoders_with_the_sensors_of_the_model(folder, data):
     sensors = """
 [sensors]

@@ -3,9 +3,9 @@
 The tree keeps the joints with the most rows, so that the loop-closing joints leave the fewest
 constraints (Kruskal's method); among equals it prefers those nearer to the root, for short
 chains. A part of the system that no joint with relative coordinates ties to ground floats: the
-six motions of one of its bodies are coordinates, and if this is the whole system, that body is
-the base. Frame 0 is the root; the frames of the steps are numbered from 1. The module holds no
-numerical parameters.
+six motions of one of its bodies are coordinates, the one declared free or else its first, and if
+this is the whole system, that body is the base. Frame 0 is the root; the frames of the steps are
+numbered from 1. The module holds no numerical parameters.
 
 Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 4; J. B. Kruskal, Proc.
 Amer. Math. Soc. 7 (1956) 48-50.
@@ -132,7 +132,7 @@ def spanning_tree(
 
     Args:
         cut: names of joints that must close loops; others are added as the module describes.
-        base: body of frame 0 of a floating system; by default one that gives short chains.
+        base: body of frame 0 of a floating system; by default `System.base`, the one declared free.
 
     Raises:
         ModelError: `cut` names an unknown joint.
@@ -142,8 +142,11 @@ def spanning_tree(
         if name not in joints:
             raise ModelError(f"There is no joint '{name}' to cut.{nearest_names(name, joints)}")
     ends = _joint_ends(system)
-    tree_joints = _choose_joints(system, ends, set(cut))
-    links, root = _sort_links(system, ends, tree_joints, base)
+    # The user's body, even if another one gave shorter chains: names, gains, postures and exported
+    # models count from it.
+    base_row = system.base if base is None else system.index(base)
+    tree_joints = _choose_joints(system, ends, set(cut), base_row)
+    links, root = _sort_links(system, ends, tree_joints, base_row)
     steps, frame = _sort_steps(system, links, root)
     rest = tuple(k for k in range(len(joints)) if k not in tree_joints)
     return SpanningTree((*system.names, GROUND), tuple(joints), root, links, rest, steps, frame)
@@ -154,11 +157,11 @@ def _joint_ends(system: System) -> list[tuple[int, int]]:
     return [(place[joint.body_i], place[joint.body_j]) for joint in system.joints]
 
 
-def _joint_distances(system: System, ends: list[tuple[int, int]]) -> list[int]:
-    """Distance of every body in joints from ground, or from body 0 if no joint is on ground."""
+def _joint_distances(system: System, ends: list[tuple[int, int]], base: int) -> list[int]:
+    """Distance of every body in joints from ground, or from the base if no joint is on ground."""
     n = system.n_bodies
     distances = [n + 1] * (n + 1)
-    start = n if any(n in pair for pair in ends) else 0
+    start = n if any(n in pair for pair in ends) else base
     distances[start], todo = 0, [start]
     for at in todo:
         for pair in ends:
@@ -169,9 +172,11 @@ def _joint_distances(system: System, ends: list[tuple[int, int]]) -> list[int]:
     return distances
 
 
-def _choose_joints(system: System, ends: list[tuple[int, int]], cut: set[str]) -> set[int]:
+def _choose_joints(
+    system: System, ends: list[tuple[int, int]], cut: set[str], base: int
+) -> set[int]:
     """Numbers of the joints of the tree."""
-    distances = _joint_distances(system, ends)
+    distances = _joint_distances(system, ends, base)
     able = [
         k
         for k, joint in enumerate(system.joints)
@@ -198,7 +203,7 @@ def _choose_joints(system: System, ends: list[tuple[int, int]], cut: set[str]) -
 
 
 def _sort_links(
-    system: System, ends: list[tuple[int, int]], tree_joints: set[int], base: str | None
+    system: System, ends: list[tuple[int, int]], tree_joints: set[int], base: int
 ) -> tuple[tuple[Link, ...], int]:
     """Joints of the tree, from the root outwards, and the root."""
     ground = system.n_bodies
@@ -219,25 +224,17 @@ def _sort_links(
                         todo.append(neighbour)
 
     if system.floating and len(tree_joints) == system.n_bodies - 1:
-        root = _choose_base(system, ends, tree_joints) if base is None else system.index(base)
-        grow_tree(root)
-        return tuple(links), root
+        grow_tree(base)
+        return tuple(links), base
     grow_tree(ground)
+    free = {system.index(name) for name in system.bodies.free}
     while len(reached_bodies) <= system.n_bodies:
-        start = min(set(range(ground)) - reached_bodies)
+        rest = set(range(ground)) - reached_bodies
+        start = min(rest & free or rest)
         # A part that no joint ties to ground gets six free motions of its own.
         links.append(Link(None, ground, start, True))
         grow_tree(start)
     return tuple(links), ground
-
-
-def _choose_base(system: System, ends: list[tuple[int, int]], tree_joints: set[int]) -> int:
-    """Body with the most tree joints, the first among equals, which gives short chains."""
-    count = [0] * system.n_bodies
-    for k in tree_joints:
-        for body in ends[k]:
-            count[body] += 1
-    return count.index(max(count))
 
 
 def _sort_steps(

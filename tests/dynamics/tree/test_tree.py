@@ -170,6 +170,27 @@ def test_the_uavs_tree():
     assert "hexacopter_1 (floats)" in str(tree)
 
 
+@pytest.mark.parametrize("free", ["frame", "camera"])
+def test_the_base_of_a_floating_machine_is_the_body_declared_free(free):
+    """Not the yoke, which has the most joints: a joint's coordinate leaves the free body where it is."""
+    names = ("frame", "yoke", "camera")
+    bodies = [stm.Body(name, 1.0, [0.02, 0.03, 0.04], free=name == free) for name in names]
+    joints = [stm.revolute("roll", "frame", "yoke", point=-0.1 * Z, axis=X)]
+    joints.append(stm.revolute("pitch", "yoke", "camera", point=-0.2 * Z, axis=Y))
+    system = stm.System(bodies, joints, [stm.Gravity()]).with_forces()
+    tree, k = stm.dynamics.spanning_tree(system), names.index(free)
+    assert tree.bodies[tree.root] == free
+    assert stm.dynamics.spanning_tree(system, base="yoke").root == 1
+    state = stm.state_from_joints(system, {"roll": 0.3, "pitch": -0.4})
+    assert jnp.array_equal(state.p[k], system.reference.p[k])
+    assert float(jnp.abs(state.p[1, 1:]).max()) > 0.1
+    point = stm.TreeSpace(system).from_state(state)
+    assert jnp.allclose(point.r, state.r[k])
+    text = stm.io.model_to_text(stm.Scene("gimbal", "Gimbal", system, state))
+    assert text.count("free = true") == 1
+    assert text.split("free = true")[0].rpartition("[bodies.")[2].startswith(free)
+
+
 @pytest.mark.parametrize(
     ("name", "case", "velocities", "rows"),
     [("tracker", 1, 8, 6), ("hexacopter", None, 6, 0), ("spin", None, 3, 0)],
