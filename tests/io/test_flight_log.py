@@ -406,6 +406,14 @@ def test_gaps_that_leave_too_little_of_a_flight_are_named(tmp_path):
         log.to_record()
 
 
+def test_slow_commands_in_the_rows_of_a_fast_logger_are_refused(tmp_path):
+    parts = flight()
+    commands = parts["motor_commands"][np.arange(len(parts["t"])) // 8 * 8]
+    log = read_flight_log(csv_file(tmp_path / "log", parts | {"motor_commands": commands}))
+    with pytest.raises(SettingError, match="change at 25 Hz, which is slower than the lag"):
+        log.to_record()
+
+
 def test_windows_keep_the_log_s_times(tmp_path):
     log = read_flight_log(csv_file(tmp_path / "log", flight()))
     part = log.window(1.0, 3.0)

@@ -105,8 +105,8 @@ _VERTICAL, _SPEED_CHANGE, _FASTEST = (9.4, 10.2), 2.0, 300.0
 _PARTS = 8
 # Level of the verdict and of variants that the record rejects.
 _LEVEL = 0.01
-# Lowest rate of commands [Hz].
-_SLOWEST = 50.0
+# Lowest rate of commands [Hz], and smallest change of a channel: means over a grid's steps have errors of rounding.
+_SLOWEST, _SMALLEST = 50.0, 1e-9
 
 
 class ParameterEstimate(NamedTuple):
@@ -541,8 +541,8 @@ def _check_gravity(signals: _Signals) -> float:
     ):
         raise SettingError(
             f"The accelerometer measures {vertical:.3g} m/s^2 on average along the vertical that the gyroscope tells; "
-            f"{low:.3g} to {high:.3g} m/s^2 would be valid: is the unit or the scale of the gyroscope or of the "
-            "accelerometer another?"
+            f"{low:.3g} to {high:.3g} m/s^2 would be valid: are the unit, the scale or the axes of the gyroscope or "
+            "of the accelerometer others?"
         )
     return min(abs(vertical - GRAVITY), abs(median - GRAVITY))
 
@@ -790,14 +790,14 @@ def _check_record(record: FlightRecord, layout: RotorLayout) -> None:
         ("gyroscope's axis", record.gyroscope),
         ("accelerometer's axis", record.accelerometer),
     ):
-        constant = np.flatnonzero(np.ptp(columns, axis=0) == 0)
+        constant = np.flatnonzero(np.ptp(columns, axis=0) < _SMALLEST)
         if len(constant):
             label = constant[0] + 1 if name.endswith("motor") else "xyz"[constant[0]]
             raise SettingError(
                 f"The {name} {label} is {columns[0, constant[0]]:g} throughout the flight; values that change would "
                 "be valid."
             )
-    changes = np.sum(np.any(np.diff(record.commands, axis=0) != 0, axis=1)) / length
+    changes = np.sum(np.abs(np.diff(record.commands, axis=0)).max(axis=1) > _SMALLEST) / length
     if changes < _SLOWEST:
         raise SettingError(
             f"The commands change {changes:.3g} times a second, which is slower than the lag of motors; "
