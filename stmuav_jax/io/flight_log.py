@@ -257,7 +257,8 @@ class FlightLog:
                 raise SettingError(f"{self.name} has no {name}, which an identification needs.")
         rate = flight[motors].rate
         # A fast logger repeats slow commands. What never changes is said where the record is identified.
-        changes = rate * np.mean(np.any(np.diff(flight[motors].values, axis=0) != 0, axis=1))
+        steps = np.diff(flight[motors].values, axis=0)
+        changes = rate * np.count_nonzero(np.any(steps, axis=1)) / max(len(steps), 1)
         if rate < _SLOWEST_COMMANDS or 0 < changes < _SLOWEST_COMMANDS:
             fact = (
                 f"come at {rate:.3g} Hz"

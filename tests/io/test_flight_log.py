@@ -461,6 +461,31 @@ def test_damage_is_said(kind, tmp_path):
     assert any("damaged" in note for note in log.notes)
 
 
+@pytest.mark.parametrize(
+    ("kind", "change", "words"),
+    [
+        ("bin", lambda data: data[:3], "has no message; a whole file would be valid"),
+        # the quaternion of one row is all zeros
+        (
+            "ulog",
+            lambda data: data.replace(struct.pack("<4f", 0.5**0.5, 0, 0, 0.5**0.5), bytes(16), 1),
+            "quaternions have lengths of 0 to 1",
+        ),
+        ("csv", lambda data: data.rstrip(), "no end of line"),
+    ],
+    ids=["head only", "no length", "no end of line"],
+)
+def test_small_damage_is_named(kind, change, words, tmp_path):
+    """A flight of 16 s, whose channels are compared."""
+    path = written(kind, tmp_path, flight(t=4 * flight()["t"]))
+    path.write_bytes(change(path.read_bytes()))
+    try:
+        said = " ".join(read_flight_log(path).notes)
+    except FileError as error:
+        said = str(error)
+    assert words in said
+
+
 @pytest.mark.parametrize("kind", FORMATS)
 def test_any_damage_ends_in_a_log_or_in_words(kind, tmp_path):
     path = written(kind, tmp_path, flight())
