@@ -86,8 +86,9 @@ def _list_pairs(channels: Mapping[str, Any], grid: np.ndarray) -> Iterator[_Pair
     integral = lambda name: _integrate(grid, channels[name].ts, channels[name].values)
     attitude = channels.get("attitude")
     # quaternions without a length, which the log's check refuses, are no rotations
-    is_turn = attitude is not None and bool(np.all(np.any(attitude.values != 0, axis=1)))
-    turns = Rotation.from_quat(attitude.values, scalar_first=True) if is_turn else None
+    turns = None
+    if attitude is not None and np.all(np.any(attitude.values != 0, axis=1)):
+        turns = Rotation.from_quat(attitude.values, scalar_first=True)
     if attitude is not None and turns is not None and "gyroscope" in channels:
         # The sum of small turns in body axes is the integral of the rates: a wrong factor stays one, however large.
         steps = np.zeros((len(attitude.ts), 3))
