@@ -119,7 +119,7 @@ def read_csv_table(
     Args:
         separator: of cells; by default the most frequent of comma, semicolon and tab in the first line.
         decimal: sign of decimals; by default a comma is one unless it separates.
-        admits_cut: a last row that is not whole is left out, not refused.
+        admits_cut: a last row that is not whole, or has no end of line, is left out, not refused.
 
     Raises:
         FileError: the file is missing or is not text.
@@ -145,7 +145,12 @@ def read_csv_table(
     except csv.Error as error:
         raise FileError(f"{source} is not a readable CSV file: {error}.") from None
     heads = [cell.strip() for cell in entries[0][1]] if entries else []
-    is_cut = admits_cut and len(entries) > 1 and len(entries[-1][1]) < len(heads)
+    # without an end of its line the last number may have lost digits
+    is_cut = (
+        admits_cut
+        and len(entries) > 1
+        and (len(entries[-1][1]) < len(heads) or not text.endswith(("\n", "\r")))
+    )
     entries = entries[1 : len(entries) - is_cut]
     lines, rows = [line for line, _ in entries], [row for _, row in entries]
     # with another separator the comma is taken for the decimal sign

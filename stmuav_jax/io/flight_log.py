@@ -254,11 +254,19 @@ class FlightLog:
         for name in names:
             if name not in flight:
                 raise SettingError(f"{self.name} has no {name}, which an identification needs.")
-        if flight[motors].rate < _SLOWEST_COMMANDS:
+        rate = flight[motors].rate
+        # A fast logger repeats slow commands. What never changes is said where the record is identified.
+        steps = np.diff(flight[motors].values, axis=0)
+        changes = rate * np.count_nonzero(np.any(steps, axis=1)) / max(len(steps), 1)
+        if rate < _SLOWEST_COMMANDS or 0 < changes < _SLOWEST_COMMANDS:
+            fact = (
+                f"come at {rate:.3g} Hz"
+                if rate < _SLOWEST_COMMANDS
+                else f"change at {changes:.3g} Hz"
+            )
             raise SettingError(
-                f"{motors} of {self.name} come at {flight[motors].rate:.3g} Hz, which is slower "
-                f"than the lag of motors; {_SLOWEST_COMMANDS:g} Hz or more would be valid (a high-rate "
-                "logging profile)."
+                f"{motors} of {self.name} {fact}, which is slower than the lag of motors; {_SLOWEST_COMMANDS:g} Hz or "
+                "more would be valid (a high-rate logging profile)."
             )
         gaps = [
             (g.start, g.end)

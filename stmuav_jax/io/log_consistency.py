@@ -85,7 +85,10 @@ def _list_pairs(channels: Mapping[str, Any], grid: np.ndarray) -> Iterator[_Pair
     curves = lambda name: _interpolate(grid, channels[name].ts, channels[name].values)
     integral = lambda name: _integrate(grid, channels[name].ts, channels[name].values)
     attitude = channels.get("attitude")
-    turns = None if attitude is None else Rotation.from_quat(attitude.values, scalar_first=True)
+    # quaternions without a length, which the log's check refuses, are no rotations
+    turns = None
+    if attitude is not None and np.all(np.any(attitude.values != 0, axis=1)):
+        turns = Rotation.from_quat(attitude.values, scalar_first=True)
     if attitude is not None and turns is not None and "gyroscope" in channels:
         # The sum of small turns in body axes is the integral of the rates: a wrong factor stays one, however large.
         steps = np.zeros((len(attitude.ts), 3))

@@ -472,7 +472,12 @@ def _decode_bin(source: Path, data: bytes) -> LogDraft:
                 with contextlib.suppress(AttributeError, BufferError):
                     getattr(log, name).close()
     # The last message that was found tells whether the file ends within it.
-    begin, last = max((int(o[-1]), k) for k, o in enumerate(log.offsets) if len(o))
+    found_messages = [(int(o[-1]), k) for k, o in enumerate(log.offsets) if len(o)]
+    if not found_messages:
+        raise FileError(
+            f"{source} begins as an ArduPilot .BIN file, but has no message; a whole file would be valid."
+        )
+    begin, last = max(found_messages)
     is_known = last in log.formats
     end = begin + (log.formats[last].len if is_known else 0)
     if said.getvalue():
@@ -812,7 +817,9 @@ def decode_csv(source: Path, columns: Any) -> LogDraft:
     if _OTHER_WORDS.search(plan.vehicle):
         draft.refuse_vehicle(f"a {plan.vehicle} (the map's vehicle)")
     if cells.is_cut:
-        draft.notes.append("The file is truncated; its last row is not whole and was left out.")
+        draft.notes.append(
+            "The file is truncated: its last row is not whole or has no end of line, and was left out."
+        )
     if "axes" not in plan.model_fields_set and columns is not None:
         draft.assume(
             "x is forward, y left and z up",

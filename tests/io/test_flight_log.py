@@ -406,6 +406,14 @@ def test_gaps_that_leave_too_little_of_a_flight_are_named(tmp_path):
         log.to_record()
 
 
+def test_slow_commands_in_the_rows_of_a_fast_logger_are_refused(tmp_path):
+    parts = flight()
+    commands = parts["motor_commands"][np.arange(len(parts["t"])) // 8 * 8]
+    log = read_flight_log(csv_file(tmp_path / "log", parts | {"motor_commands": commands}))
+    with pytest.raises(SettingError, match="change at 25 Hz, which is slower than the lag"):
+        log.to_record()
+
+
 def test_windows_keep_the_log_s_times(tmp_path):
     log = read_flight_log(csv_file(tmp_path / "log", flight()))
     part = log.window(1.0, 3.0)
@@ -451,6 +459,31 @@ def test_damage_is_said(kind, tmp_path):
     log = read_flight_log(path)
     assert len(log["gyroscope"].ts) > 700
     assert any("damaged" in note for note in log.notes)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "words"),
+    [
+        ("bin", lambda data: data[:3], "has no message; a whole file would be valid"),
+        # the quaternion of one row is all zeros
+        (
+            "ulog",
+            lambda data: data.replace(struct.pack("<4f", 0.5**0.5, 0, 0, 0.5**0.5), bytes(16), 1),
+            "quaternions have lengths of 0 to 1",
+        ),
+        ("csv", lambda data: data.rstrip(), "no end of line"),
+    ],
+    ids=["head only", "no length", "no end of line"],
+)
+def test_small_damage_is_named(kind, change, words, tmp_path):
+    """A flight of 16 s, whose channels are compared."""
+    path = written(kind, tmp_path, flight(t=4 * flight()["t"]))
+    path.write_bytes(change(path.read_bytes()))
+    try:
+        said = " ".join(read_flight_log(path).notes)
+    except FileError as error:
+        said = str(error)
+    assert words in said
 
 
 @pytest.mark.parametrize("kind", FORMATS)

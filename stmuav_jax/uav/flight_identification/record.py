@@ -8,6 +8,7 @@ with the thrust model factor f of PX4. Where the battery's voltage V is logged, 
 without regulation of its speed feels the command times the voltage, p = 1, and one with it p = 0.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from ...checks.errors import SettingError
 from ...checks.shapes import Numbers
 
 # Natural frequency [rad/s] and damping of the observer of velocity, and time in which it forgets that along z [s].
-_OBSERVER, _DAMPING, _CLIMB = 0.4, 0.7, 3.0
+_OBSERVER, _DAMPING, _CLIMB = 0.4, 0.7, 12.0
 # Shortest record that is identified [s].
 SHORTEST_RECORD = 10.0
 # Rotors closer than this to an axis have no side of it, as a share of the largest arm.
@@ -253,7 +254,8 @@ def observe_motion(
 
     It integrates v' = f + g - w x v and g' = -w x g with the specific force f at the centre of mass.
     The drag tells the horizontal velocity, -f / D, which draws both within seconds; along z the velocity
-    forgets, as nothing tells it. The state at the start is that of a pass backwards in time.
+    forgets slowly, as nothing tells it but that on average the vertical force carries. The state at the start is
+    that of a pass backwards in time.
 
     Args:
         force: f. drag: D along x and y [1/s]. pace: factor of the usual speed at which it is drawn.
@@ -268,7 +270,8 @@ def observe_motion(
     frequency = pace * _OBSERVER
     quick, slow = 2 * _DAMPING * frequency, frequency**2
     forget = pace / _CLIMB
-    state, velocity, gravity = (0.0,) * 5, np.zeros_like(force), np.zeros_like(force)
+    state, velocity, gravity = (0.0,) * 5 + (-GRAVITY,), np.zeros_like(force), np.zeros_like(force)
+    share = np.linspace(0, 1, len(force))
     # A record may start tilted and in motion, which nothing measures: in reversed time, where rates and
     # velocity change their signs, a pass comes to the start as settled as the pass before it to the end.
     for sign in (1, -1, 1):
@@ -276,9 +279,10 @@ def observe_motion(
         now, before = state, None
         # plain numbers: a loop over arrays of three would take twenty times as long
         for k, (p, q, r, fx, fy, fz, tx, ty) in enumerate(rows.tolist()):
-            vx, vy, vz, gx, gy = now
-            # The length of gravity is known: two components give the third, without drift.
-            gz = -(max(GRAVITY**2 - gx * gx - gy * gy, 0.0) ** 0.5)
+            vx, vy, vz, gx, gy, gz = now
+            # The length of gravity is known; all three components turn, so that a flip does not fold them.
+            scale = GRAVITY / math.hypot(gx, gy, gz)
+            gx, gy, gz = scale * gx, scale * gy, scale * gz
             velocity[k], gravity[k] = (vx, vy, vz), (gx, gy, gz)
             ex, ey = tx - vx, ty - vy
             slope = (
@@ -287,13 +291,19 @@ def observe_motion(
                 fz + gz - p * vy + q * vx - forget * vz,
                 slow * ex - q * gz + r * gy,
                 slow * ey - r * gx + p * gz,
+                q * gx - p * gy,
             )
             # The method of Adams and Bashforth of second order: a step by Euler's would turn gravity by
-            # an angle that lags by half a step, and lengthen it with each turn.
+            # an angle that lags by half a step.
             now = tuple(
                 x + dt * (1.5 * c - 0.5 * o)
-                for x, c, o in zip(now, slope, before or slope, strict=True)
+                for x, c, o in zip((vx, vy, vz, gx, gy, gz), slope, before or slope, strict=True)
             )
             before = slope
-        state = (*(-velocity[-1]).tolist(), *gravity[-1, :2].tolist())
+        state = (*(-velocity[-1]).tolist(), *gravity[-1].tolist())
+        # A bias along z, or what is missing of a climb that is forgotten, makes a velocity that turns with the body
+        # and that the drag along z would follow. With these weights the mean is the slope of a straight line through
+        # the speed along the vertical.
+        vertical = -np.sum(push[::sign] * gravity, axis=1) / GRAVITY
+        push[:, 2] -= np.average(vertical, weights=share * (1 - share)) - GRAVITY
     return velocity, gravity

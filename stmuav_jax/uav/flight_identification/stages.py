@@ -60,6 +60,8 @@ AXES = ("roll", "pitch", "yaw")
 _FORCE_RATE = 100.0
 # Memories of the coloured forces and moments, block of scores, and stretch after the start that is left out [s].
 _MEMORY, _MOMENT_MEMORY, _BLOCK, _SETTLING = 0.25, 0.15, 1.0, 0.3
+# Block of the scores of the forces, in which the drag follows errors of the observed velocity that last as long [s].
+_FORCE_BLOCK = 2.0
 # Bounds of lag and delay, and their starts [s].
 _BOUNDS, _START = ((0.0005, 0.5), (0.0, 0.05)), (0.05, 0.004)
 # Shortest window, and most of them.
@@ -103,8 +105,8 @@ _VERTICAL, _SPEED_CHANGE, _FASTEST = (9.4, 10.2), 2.0, 300.0
 _PARTS = 8
 # Level of the verdict and of variants that the record rejects.
 _LEVEL = 0.01
-# Lowest rate of commands [Hz].
-_SLOWEST = 50.0
+# Lowest rate of commands [Hz], and smallest change of a channel: means over a grid's steps have errors of rounding.
+_SLOWEST, _SMALLEST = 50.0, 1e-9
 
 
 class ParameterEstimate(NamedTuple):
@@ -513,7 +515,7 @@ def _observe_signals(
             break
     assert fit is not None
     signals = observe(imu, drag)
-    spread = np.sqrt(np.diag(fit.compute_covariance(_BLOCK))[3:5])
+    spread = np.sqrt(np.diag(fit.compute_covariance(_FORCE_BLOCK))[3:5])
     return signals, observe(imu, drag, _OTHER_PACE), observe(imu, drag + spread)
 
 
@@ -539,7 +541,7 @@ def _check_gravity(signals: _Signals) -> float:
     ):
         raise SettingError(
             f"The accelerometer measures {vertical:.3g} m/s^2 on average along the vertical propagated by the "
-            f"gyroscope; {low:.3g} to {high:.3g} m/s^2 would be valid: check unit and scale of both sensors."
+            f"gyroscope; {low:.3g} to {high:.3g} m/s^2 would be valid: check unit, scale and axes of both sensors."
         )
     return min(abs(vertical - GRAVITY), abs(median - GRAVITY))
 
@@ -593,16 +595,17 @@ class _Evaluation:
         variants: Sequence[PredictionErrorFit],
         windows: int,
         shifted: Sequence[PredictionErrorFit] = (),
+        block: float = _FORCE_BLOCK,
     ) -> None:
         self.fit, self.shifted = fit, shifted
         # Scores are summed over blocks longer than the disturbances' correlation: their scatter
         # needs no model of it.
-        self.covariance = fit.compute_covariance(_BLOCK)
+        self.covariance = fit.compute_covariance(block)
         self.white = fit.white_covariance
         # effectiveness may drift, as a battery sags, but not the lag of motors
         self.windows = fit.fit_windows(windows, self.covariance, common_lags=True)
         self.lag_windows = fit.fit_windows(windows, self.covariance)
-        self.variants = [(v, v.compute_covariance(_BLOCK)) for v in variants]
+        self.variants = [(v, v.compute_covariance(block)) for v in variants]
 
     def estimate(
         self, name: str, unit: str, quantity: Callable[..., float], *others: float
@@ -666,7 +669,7 @@ def identify_flight(
 ) -> FlightIdentification:
     """Identify lag, thrust, effectiveness, IMU position, drag and centre of mass from a flight.
 
-    Deviations have three independent parts: sums of scores over blocks of one second, scatter between
+    Deviations have three independent parts: sums of scores over blocks of a second or two, scatter between
     windows, and variants of the model. Without a mass only ratios are determined.
 
     Args:
@@ -722,6 +725,8 @@ def identify_flight(
         refusals["mass"] = (
             "Masses, forces and inertias: the log determines ratios only; give the mass for SI values."
         )
+    if further is None:
+        _allow_for_sag(layout, estimates)
     verdict = _judge_estimates(signals, rotation, translation.fit, estimates)
     verdict = verdict._replace(explanation=verdict.explanation + size)
     fits = (rotation.fit if rotation else None, translation.fit)
@@ -784,14 +789,14 @@ def _check_record(record: FlightRecord, layout: RotorLayout) -> None:
         ("gyroscope's axis", record.gyroscope),
         ("accelerometer's axis", record.accelerometer),
     ):
-        constant = np.flatnonzero(np.ptp(columns, axis=0) == 0)
+        constant = np.flatnonzero(np.ptp(columns, axis=0) < _SMALLEST)
         if len(constant):
             label = constant[0] + 1 if name.endswith("motor") else "xyz"[constant[0]]
             raise SettingError(
                 f"The {name} {label} is {columns[0, constant[0]]:g} throughout the flight; values that change would "
                 "be valid."
             )
-    changes = np.sum(np.any(np.diff(record.commands, axis=0) != 0, axis=1)) / length
+    changes = np.sum(np.abs(np.diff(record.commands, axis=0)).max(axis=1) > _SMALLEST) / length
     if changes < _SLOWEST:
         raise SettingError(
             f"The commands change {changes:.3g} times a second, which is slower than the lag of motors; "
@@ -945,7 +950,7 @@ def _identify_rotation(
         further = [
             _fit_rotation(other, axes, _Variant(memory=memory), fit.lags) for other in shifted
         ]
-        evaluation = _Evaluation(fit, variants, _window_count(signals.record), further)
+        evaluation = _Evaluation(fit, variants, _window_count(signals.record), further, _BLOCK)
         # a thrust shape with another factor has another slope at hover
         # Effectiveness of two thrust shapes is compared at the hover, where the record is: its
         # number at the command 1 differs by the shape alone.
@@ -1226,7 +1231,7 @@ def _identify_free_centre(signals: _Signals, estimates: dict[str, ParameterEstim
             _Variant(memory=_MOMENT_MEMORY, factor=0.5 if factor > 0.75 else 1.0),
         )
     ]
-    evaluation = _Evaluation(fit, [common, *variants], _window_count(signals.record))
+    evaluation = _Evaluation(fit, [common, *variants], _window_count(signals.record), block=_BLOCK)
     levers = layout.positions - layout.centre
     mean = np.mean(np.abs(fit.values[:n])) / layout.arms[0]
 
@@ -1331,6 +1336,32 @@ def _scale_by_mass(
                 window_values=value * B.value / B.window_values,
                 window_deviations=value * B.window_deviations / B.value,
             )  # fmt: skip
+
+
+def _allow_for_sag(layout: RotorLayout, estimates: dict[str, ParameterEstimate]) -> None:
+    """Widen the deviations of what needs the thrust of differential commands and has that of collective ones.
+
+    Collective commands pull an unlogged voltage down, differential ones do not, and no log tells by how much the slopes
+    differ. A battery that changes the effectiveness through the flight may change it as much so.
+    """
+    # a straight line changes by the root of twelve times its standard deviation
+    change = max(
+        (np.sqrt(12) * estimates[name].windows / estimates[name].value for name in AXES if name in estimates),
+        default=0.0,
+    )  # fmt: skip
+    sizes = {
+        f"centre_{x}": estimates[f"centre_{x}"].value - layout.centre[k]
+        for k, x in enumerate("xy")
+        if f"centre_{x}" in estimates
+    }
+    sizes |= {
+        name: estimates[name].value for name in ("inertia_x", "inertia_y") if name in estimates
+    }
+    for name, size in sizes.items():
+        e, part = estimates[name], float(change * size)
+        estimates[name] = e._replace(
+            deviation=float(np.hypot(e.deviation, part)), variants=float(np.hypot(e.variants, part))
+        )
 
 
 def _scale_estimate(e: ParameterEstimate, scale: float, name: str, unit: str) -> ParameterEstimate:
