@@ -47,6 +47,12 @@ def test_the_panels_tolerance_may_hold_later_than_the_others():
     assert "largest position error" in words
 
 
+def test_a_flight_without_tolerances_is_not_said_to_meet_them():
+    is_met, words = missions.verdict(flown(4.0))
+    assert is_met
+    assert words.endswith("Limits were met; the mission has no tolerances.")
+
+
 def test_a_flight_that_ends_before_a_tolerance_holds_is_not_judged_by_it():
     asked = {"position": 0.02, "panel": 0.4, "panel_after": 2.0}
     kept, words = missions.verdict(flown(1.0, **asked))
