@@ -22,6 +22,7 @@ from ..math.compiler import in_blocks, kept_jit
 from ..math.derivative import safe_norm
 from ..mechanics.state import State
 from ..mechanics.system import System
+from .actuation import mechanism_size
 from .evaluation import Saved, evaluate_reactions
 from .formulations.base import AbstractFormulation, Reactions, in_joint_axes
 from .formulations.stabilisation import Unstabilised
@@ -150,6 +151,8 @@ def resolved_loads(run: Run, rtol: float = 0.01) -> JointLoads:
     first = run_loads(run)
     ts = np.asarray(run.ts)
     values = np.concatenate([np.asarray(first.force), np.asarray(first.moment)], axis=-1)
+    system = run.scene.system
+    arms = np.array([1.0, float(mechanism_size(system, system.reference))])
     todo = np.stack([ts[:-1], ts[1:]], axis=1)[: len(ts) * len(first.joints)]
     for turn in range(_ROUNDS):
         if not len(todo):
@@ -163,8 +166,10 @@ def resolved_loads(run: Run, rtol: float = 0.01) -> JointLoads:
         values = np.concatenate([values, fresh])[order]
         deviations = np.abs(fresh - ends.mean(axis=1)).reshape(*fresh.shape[:2], 2, 3)
         peak = np.linalg.norm(values.reshape(-1, *deviations.shape[1:]), axis=-1).max(axis=0)
-        # a joint whose load is mere round-off needs no further times
-        scale = np.maximum(peak, 1e-9 * peak.max(axis=0, initial=1e-300))[:, :, None]
+        # A load that is mere round-off beside the largest force, or its moment over the mechanism's size, needs
+        # no further times.
+        largest = (peak / arms).max(initial=1e-300)
+        scale = np.maximum(peak, 1e-9 * largest * arms)[:, :, None]
         # The first two rounds halve every interval: a load may cross the chord in the middle and depart from
         # it elsewhere.
         curved = np.any(deviations > rtol * scale, axis=(1, 2, 3)) | (turn < 2)

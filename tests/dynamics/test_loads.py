@@ -174,6 +174,8 @@ def test_peaks_between_saved_times_are_found():
         true, rel=1e-3
     )
     assert np.all(np.diff(np.asarray(resolved.ts)) > 0)
+    # the moments, which are round-off, are not resolved: with them it would be 16,000
+    assert resolved.ts.size < 1000
     assert set(np.asarray(run.ts)) <= set(np.asarray(resolved.ts))
     with pytest.raises(stm.SettingError, match="positive"):
         stm.dynamics.resolved_loads(run, 0.0)
