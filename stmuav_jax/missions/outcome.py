@@ -346,7 +346,9 @@ def verdict(data: "xr.Dataset") -> tuple[bool, str]:
         sentence += ". With lost rotors its closed loop was checked as if the machine did not turn"
     if broken:
         return False, f"{sentence}. Not met: {', '.join(broken)}."
-    if not _read_tolerances(data).model_dump(exclude={"after", "panel_after"}, exclude_defaults=True):
+    if not _read_tolerances(data).model_dump(
+        exclude={"after", "panel_after"}, exclude_defaults=True
+    ):
         return is_complete, f"{sentence}. Limits were met; the mission has no tolerances."
     base, panel = _tolerance_times(data)
     if not _has_reached(data, base):
