@@ -125,25 +125,28 @@ def evaluated(
     return {"us_per_state": best, "compile_seconds": seconds, "last": np.asarray(last)}
 
 
-# Operations in a row, each of which waits for the one before. They are so few that a processor, which looks a
-# few hundred operations ahead, finds enough that wait for nothing.
-_PASSES = 16
+# Numbers of a state in the measurement of a processor's limit, and operations in a row, each of which waits for
+# the one before. They are so few that a processor, which looks a few hundred operations ahead, finds enough
+# that wait for nothing.
+_NUMBERS, _PASSES = 16, 16
 
 
 @native
-def multiply_and_add(factor: jax.Array, x: jax.Array) -> jax.Array:
-    """Numbers after some operations x * factor + 1 on each."""
+def multiply_and_add(factor: jax.Array, chains: int, x: jax.Array) -> jax.Array:
+    """Sums of chains of operations y * factor + 1 that begin at x + 0, x + 1, and so on."""
+    y = x + np.arange(float(chains))[:, None]
     for _ in range(_PASSES):
-        x = x * factor + 1.0
-    return x
+        y = y * factor + 1.0
+    return jnp.sum(y, axis=0)
 
 
 def measure_limit(operations: int, lanes: int, size: Size) -> float:
     """Microseconds per state of this many operations at the rate of a processor's arithmetic units."""
-    chains = operations // _PASSES
-    starts = jnp.ones((lanes, chains))
-    cost = evaluated(multiply_and_add, jnp.asarray(0.5), starts, size)["us_per_state"]
-    return cost * operations / (chains * _PASSES)
+    chains = operations // (_NUMBERS * (_PASSES + 2))
+    function = lambda factor, x: multiply_and_add(factor, chains, x)
+    starts = jnp.ones((lanes, _NUMBERS))
+    cost = evaluated(function, jnp.asarray(0.5), starts, size)["us_per_state"]
+    return cost * operations / (chains * _NUMBERS * (_PASSES + 2))
 
 
 def both(measured: Callable[[], dict[str, Any]], key: str) -> dict[str, Any]:

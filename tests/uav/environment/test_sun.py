@@ -316,7 +316,7 @@ def test_a_sun_below_the_horizon_is_refused_by_name():
 
 @pytest.mark.parametrize(
     ("direction", "words"),
-    [((0, 0, 0), "no length"), ((np.nan, 0, 1), "finite"), ((1, 0), "three numbers")],
+    [((0, 0, 0), "zero length"), ((np.nan, 0, 1), "finite"), ((1, 0), "three numbers")],
 )
 def test_a_sensor_without_direction_is_refused(direction, words):
     with pytest.raises(stm.StateError, match=words):
