@@ -93,7 +93,7 @@ def test_what_is_not_named_stays_as_at_the_start(chain):
     assert float(hinge.angle) == pytest.approx(0.4)
     assert float(hinge.angle_rate) == pytest.approx(1.0)
     assert float(pivot.angle) == pytest.approx(-2.0)
-    np.testing.assert_allclose(second.v[1], [0.3, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(second.v[0], [0.3, 0, 0], atol=1e-15)
 
 
 # --- a four-bar linkage: a parallelogram, whose angles are known
