@@ -128,7 +128,7 @@ def evaluated(
 # Numbers of a state in the measurement of a processor's limit, and operations in a row, each of which waits for
 # the one before. They are so few that a processor, which looks a few hundred operations ahead, finds enough
 # that wait for nothing.
-_NUMBERS, _PASSES = 16, 16
+_NUMBERS, _PASSES = 16, 4
 
 
 @native
