@@ -1477,18 +1477,18 @@ def _test_terms(
         total = np.sum(T, axis=1, keepdims=True)
         return -T * filter_columns([1 - keep], [1.0, -keep], total / np.mean(total) - 1)
 
-    def test(name: str) -> tuple[float, float, float]:
-        """Share of a term by the moments, its variance and p-value: what is wrong is wrong about all axes alike."""
+    def test(name: str) -> tuple[float, float]:
+        """Share of a term by the moments, and its variance: what is wrong is wrong about all axes alike."""
         terms = apply_filter(b, a, change(name, rotation.lags) @ (sides[:, axes] * effectiveness))
-        share, V, p = rotation.test_columns(terms[round(_SETTLING / dt) :, :, None], _BLOCK)
-        return float(share[0]), float(V[0, 0]), p
+        share, V, _ = rotation.test_columns(terms[round(_SETTLING / dt) :, :, None], _BLOCK)
+        return float(share[0]), float(V[0, 0])
 
     results = {}
     for name, sentence in (
         ("trend", "Effectiveness changes by {:.0f} % through the flight."),
         ("curve", "Thrust has a linear part of {:.0f} % of the slope beside the assumed curve."),
     ):
-        share, variance, _ = test(name)
+        share, variance = test(name)
         excess = max(abs(share) - _NEGLIGIBLE, 0.0)
         p = min(1.0, 2 * float(stats.norm.sf(excess / np.sqrt(variance))))
         results[name] = (p, sentence.format(100 * share))
@@ -1504,7 +1504,7 @@ def _test_terms(
         column = np.zeros((len(translation.noise), 3, 1))
         column[:, 2] = _thrust_columns(record, n, thrust[:, None])
         by_force, V, _ = translation.test_columns(column, _BLOCK)
-        by_moments, variance, _ = test(name)
+        by_moments, variance = test(name)
         # Forces and moments estimate the same quantity independently: weighted together they
         # detect a smaller one than either does.
         weights = np.array([1 / V[0, 0], 1 / variance])
