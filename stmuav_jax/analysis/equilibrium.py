@@ -37,8 +37,6 @@ from ..dynamics.actuation import (
     force_units,
     input_labels,
     input_scales,
-    mechanism_size,
-    mechanism_weight,
     names_of_largest,
 )
 from ..dynamics.formulations.independence import DEPENDENT
@@ -53,6 +51,7 @@ from ..math.rotation import product, rotation_matrix, turn_about
 from ..math.space import Point
 from ..mechanics.inputs import Inputs, inputs_of
 from ..mechanics.internal import with_internal
+from ..mechanics.size import mechanism_size, mechanism_weight
 from ..mechanics.state import State
 from ..mechanics.system import System
 

@@ -12,6 +12,7 @@ from ..checks.errors import ModelError, SettingError, StateError
 from ..checks.numbers import check_inertia, check_mass
 from ..mechanics.forces import Gravity
 from ..mechanics.inputs import Inputs, inputs_of, present_values
+from ..mechanics.size import mechanism_size
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .actuation import (
@@ -21,7 +22,6 @@ from .actuation import (
     force_units,
     input_labels,
     joints_in_motion,
-    mechanism_size,
     names_of_largest,
 )
 from .assembly.rank import Rank, rank_of

@@ -20,9 +20,9 @@ from ..checks.numbers import array_module, as_floats, as_jax, as_numpy
 from ..checks.shapes import Numbers
 from ..math.compiler import in_blocks, kept_jit
 from ..math.derivative import safe_norm
+from ..mechanics.size import mechanism_size
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .actuation import mechanism_size
 from .evaluation import Saved, evaluate_reactions
 from .formulations.base import AbstractFormulation, Reactions, in_joint_axes
 from .formulations.stabilisation import Unstabilised

@@ -25,12 +25,12 @@ from ..analysis.sensors import gravity_of
 from ..checks.errors import AbstractReason, ModelError, StateError, first_reason, has_values
 from ..checks.numbers import as_floats
 from ..checks.shapes import Numbers
-from ..dynamics.actuation import mechanism_weight
 from ..dynamics.statespace.tree import TreePoint, TreeSpace
 from ..math.compiler import kept_jit, quick_jit
 from ..math.derivative import sharp_sqrt
 from ..math.rotation import rotation_matrix, to_rotation_vector, turn_about
 from ..mechanics.inputs import Inputs, inputs_of
+from ..mechanics.size import mechanism_weight
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .allocation import RotorLimits, check_lift, minimum_norm, wrench_map

@@ -6,7 +6,8 @@ import pytest
 from parallel_robots import BASE, HEAVY, LIGHT, TOP, G, slider_crank, three_rps
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.actuation import force_units, input_scales, mechanism_size
+from stmuav_jax.dynamics.actuation import force_units, input_scales
+from stmuav_jax.mechanics.size import mechanism_size
 
 LEGS = {"effort_P0", "effort_P1", "effort_P2"}
 
