@@ -16,6 +16,7 @@ are fixed by A = G L^T). Conventions: docs/conventions.md.
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -37,9 +38,16 @@ def skew(a: Vec3s) -> Float[Array, "3 3 ..."]:
 
 def cross(a: Vec3s, b: Vec3s) -> Float[Array, "3 ..."]:
     """Cross product a x b, shape (3,)."""
-    x, y, z = a[0], a[1], a[2]
-    u, v, w = b[0], b[1], b[2]
-    return jnp.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+    a, b = jnp.asarray(a), jnp.asarray(b)
+    axes = max(a.ndim, b.ndim)
+    a, b = (x.reshape(x.shape + (1,) * (axes - x.ndim)) if x.ndim < axes else x for x in (a, b))
+    # Half as many operations to trace as by components, whose derivatives double them again.
+    return _roll(a * _roll(b) - _roll(a) * b)
+
+
+def _roll(a: Array) -> Array:
+    """Components (y, z, x)."""
+    return jax.lax.concatenate([a[1:], a[:1]], 0)
 
 
 def relative_acceleration(omega: Vec3s, omega_rate: Vec3s, arm: Vec3s) -> Float[Array, "3 ..."]:

@@ -195,7 +195,7 @@ def closure_rows(
         support_mask = find_supported(tree)[np.ix_(motion_columns(tree).frame, frame)].T.astype(
             float
         )
-        product = sum(W[i][:, None] * moving.S[i][None] for i in range(6))
+        product = jnp.sum(W[:, :, None] * moving.S[:, None], axis=0)
         J = J + align_axes(support_mask, 2 + len(batch)) * product
         wrenches.append(W)
     return Rows(flatten_rows("value"), flatten_rows("target"), gamma, J, tuple(wrenches))

@@ -220,8 +220,7 @@ def mass_matrix(
     # Entries of two axes on different branches are zero (branch-induced sparsity). The mask is a constant
     # of the tree, and the symmetric half is the transpose of the computed one.
     above = find_supported(tree)[np.ix_(frame, frame)]
-    product = sum(S[i][:, None] * F[i][None] for i in range(6))
-    product = jnp.asarray(product)
+    product = jnp.sum(S[:, :, None] * F[:, None], axis=0)
     batch = product.ndim
     flipped = jnp.swapaxes(product, 0, 1)
     M = jnp.where(
@@ -238,7 +237,7 @@ def bias_force(tree: SpanningTree, S: Float[Array, "6 m *s"], at: Inertia) -> Fl
     if tree.floating and not tree.steps:
         return at.wrench[:, 0]
     wrench = pick_entries(at.wrench, motion_columns(tree).frame, 1)
-    joint_bias = jnp.asarray(sum(S[i] * wrench[i] for i in range(6)))
+    joint_bias = jnp.sum(S * wrench, axis=0)
     return jnp.concatenate([at.wrench[:, 0], joint_bias]) if tree.floating else joint_bias
 
 
