@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from shared.pages import Lines, Row, legend, number, panels, plain, power, save, table
 
 from stmuav_jax.figures import look
@@ -102,6 +103,9 @@ def work(record: Row, cost: str, label: str, solvers: tuple[str, ...] = tuple(SO
             mine = [row for row in rows if row["family"] == family]
             x, y = [row["largest"] for row in mine], [row[cost] for row in mine]
             ax.loglog(x, y, **style(mine[0]))
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 3)))
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_formatter(NullFormatter())
         ax.set(title=problem["title"], xlabel=f"largest {ERROR}", ylabel=label)
 
     note = "Where a method has fewer points than elsewhere, its other runs did not reach the end."

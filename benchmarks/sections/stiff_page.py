@@ -30,11 +30,8 @@ def fastest(record: Row) -> Lines:
     rows = []
     for scene in record["scenes"]:
         found, eigenvalue = scene["cheapest"]["1e-06"], scene["eigenvalue"]
-        name = "no force on the sliders" if scene["name"] == "free" else scene["name"]
-        if scene["stiffness"]:
-            name = f"servo {scene['stiffness']:.0e} N/m, {scene['damping']:,g} N s/m"
         rows.append([
-            name, *(plain(eigenvalue[key]) for key in ("start", "median", "largest")),
+            named(scene), *(plain(eigenvalue[key]) for key in ("start", "median", "largest")),
             best(found["explicit"]), best(found["implicit"]), plain(found["explicit_over_implicit"]),
         ])  # fmt: skip
     head = ["scene", "largest eigenvalue at the start [1/s]", "median", "largest", "explicit", "implicit",
@@ -53,8 +50,10 @@ def completed(scene: Row, solver: str) -> list[Row]:
 
 
 def named(scene: Row) -> str:
-    """A scene's name, with the unit of the servo's stiffness."""
-    return scene["name"] + (" N/m" if "e+" in scene["name"] else "")
+    """A scene in words, with the stiffness and the damping of its servos."""
+    if scene["stiffness"]:
+        return f"servo {scene['stiffness']:.0e} N/m, {scene['damping']:,g} N s/m"
+    return "no force on the sliders" if scene["name"] == "free" else scene["name"]
 
 
 def work(record: Row) -> Figure:
@@ -95,7 +94,8 @@ def crossover(record: Row) -> Figure:
     for scene in servos:
         at, place = start(scene), ax.get_xaxis_transform()
         beside = {"rotation": 90, "ha": "right", "fontsize": 7, "color": "0.4"}
-        ax.text(at, 0.03, named(scene) + " ", transform=place, **beside)
+        label = named(scene).replace(", ", "\n")
+        ax.text(at, 0.03, label, transform=place, **beside)
         ax.axvline(at, color="0.9", zorder=0)
     seconds = f"fastest run for {record['t1']:g} s of motion,\nerror up to 1e-6 m [s]"
     ax.set(xlabel="largest |eigenvalue| at the start [1/s]", ylabel=seconds)
