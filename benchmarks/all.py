@@ -1,4 +1,4 @@
-"""Run every benchmark of the documentation's pages, in order, then write the benchmark page.
+"""Run every benchmark of the documentation's pages, in order, then write the pages' tables.
 
     python benchmarks/all.py            what has no result of this code yet
     python benchmarks/all.py --list     what would be run, and why

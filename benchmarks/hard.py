@@ -196,7 +196,7 @@ def page(content: dict[str, Any]) -> str:
     )
     rows = [*content["cases"], *content["tolerances"]]
     missed = [row["name"] for row in rows if not holds(row)]
-    verdict = f"Missed: {', '.join(missed)}." if missed else "All meet the required error."
+    verdict = f"Missed: {', '.join(missed)}." if missed else "All cases meet the required error."
     where = "Run times are for one core."
     cases = titled(
         "### Cases", content["cases"], ("case", "name"), ("difficulty", "why"),

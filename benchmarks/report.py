@@ -1,9 +1,10 @@
-"""The benchmark page: a verdict with one figure, one table a question, and the provenance at the end.
+"""The benchmark page, and the tables of measurements on all other pages, from the stored results alone.
 
     python benchmarks/report.py
 
-The page is made of the stored results alone. Its text is `page.md.jinja`; a table holds the few rows
-that answer its question, and the result that it links holds every run.
+The text of the benchmark page is `page.md.jinja`: a verdict with one figure, one table a question, and
+the provenance at the end. A table holds the few rows that answer its question, and the result that it
+links holds every run. Other pages name a table in a comment (`sections/page_tables.py`).
 """
 
 import argparse
@@ -14,6 +15,7 @@ from typing import Any
 
 import jinja2
 from matplotlib.figure import Figure
+from sections.page_tables import TABLES, fill
 from sections.throughput_page import comparable
 from shared.pages import Row, number, panels, power, save, table
 from shared.record import RESULTS, ROOT
@@ -21,6 +23,7 @@ from shared.record import RESULTS, ROOT
 from stmuav_jax.io.netcdf import write_atomically
 
 PAGE = ROOT / "docs" / "benchmarks.md"
+OTHER_PAGES = (ROOT / "README.md", *sorted(PAGE.parent.glob("*.md")))
 TEMPLATE = Path(__file__).with_name("page.md.jinja")
 # The results with a section on the page, in its order.
 SHOWN = (
@@ -113,6 +116,16 @@ def least_times(curve: Row, errors: list[str]) -> str:
         for name in programs_of([curve])
     ]
     return text_table(["error of any body", *(f"<= {error} m" for error in errors)], rows)
+
+
+def readme_times(content: Row) -> list[str]:
+    """Least run times of the flight by the programs of the curves."""
+    curve, errors = content["curves"][0], ("1e-03", "1e-06", "1e-09")
+    rows = [
+        [name.split(",")[0], *(duration(least_time(curve, name, error)) for error in errors)]
+        for name in CURVES
+    ]
+    return table(["largest error of any body", *(f"{error} m" for error in errors)], rows)
 
 
 def mechanism_times(curves: list[Row]) -> str:
@@ -373,13 +386,21 @@ def build(folder: Path, page: Path) -> Path:
     return write_atomically(page, f"{text.rstrip()}\n".encode())
 
 
+ALL_TABLES = TABLES | {"run times": ("suite_work_precision", readme_times)}
+
+
 def main() -> None:
-    """Make the page from the stored results."""
+    """Make the page, and the tables of the others, from the stored results."""
     parser = argparse.ArgumentParser(description="Write the benchmark page.")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--page", type=Path, default=PAGE)
     options = parser.parse_args()
     print(build(options.results, options.page))
+    if options.results == RESULTS:
+        for page in OTHER_PAGES:
+            text = page.read_text(encoding="utf-8")
+            if (filled := fill(text, ALL_TABLES)) != text:
+                print(write_atomically(page, filled.encode()))
 
 
 if __name__ == "__main__":

@@ -237,10 +237,10 @@ def centres() -> None:
         save({f"centre_of_mass_{first}": figure})
 
 
-# Hatching and words of what ends the workspace.
+# Hatching and names of the limits of the workspace.
 _LIMITS = {
     Reason.TILT: ("tilt limit", "", "0.93"),
-    Reason.SINGULAR: ("sliders lose the panel", "////", "white"),
+    Reason.SINGULAR: ("direct singularity", "////", "white"),
     Reason.STROKE_2: ("stroke of slider 2", "||||", "white"),
     Reason.STROKE_3: ("stroke of slider 3", "----", "white"),
 }
@@ -258,7 +258,7 @@ def workspace() -> None:
     x = np.degrees(tilt[None] * np.cos(turn[:, None]))
     y = np.degrees(tilt[None] * np.sin(turn[:, None]))
     levels = [1, 1.5, 2, 3, 5, 10, 50]
-    figure, axes = grid(1, 2, 3.8)
+    figure, axes = grid(1, 2, 3.4)
     maps = ((by_angles, *np.degrees(by_angles)), (by_direction, x, y))
     shades = ScalarMappable(BoundaryNorm(levels, 256), "viridis_r")
     for ax, (angles, first, second) in zip(axes[0], maps, strict=True):
@@ -281,7 +281,7 @@ def workspace() -> None:
     keys = [Patch(facecolor=color, edgecolor="0.3", hatch=hatch, label=words)
             for words, hatch, color in _LIMITS.values()]  # fmt: skip
     figure.legend(handles=keys, ncols=4, fontsize=8, loc="outside lower center")
-    figure.suptitle("Workspace of the tracker, and what ends it", fontsize=10)
+    figure.suptitle("Workspace of the tracker and its limits", fontsize=10)
     save_figures({"workspace": figure}, FOLDER / "figures", "png", dpi=110)
 
 

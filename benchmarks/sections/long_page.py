@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from shared.pages import Row, legend, number, panels, power, save, shown, titled
+from matplotlib.ticker import LogLocator, NullFormatter
+from shared.pages import Lines, Row, legend, number, panels, plain, power, save, table
 
 from stmuav_jax.figures import look
 
@@ -15,6 +16,7 @@ SOLVERS = {
     "dopri8": "Dopri8", "tsit5": "Tsit5", "gauss": "Gauss order 4", "midpoint": "midpoint order 2",
 }  # fmt: skip
 HOLDS = {"projection": "projected", "none": "unstabilised", "baumgarte": "Baumgarte"}
+EXPLICIT = ("dopri8", "tsit5")
 ERROR = "|energy error| / scale [1]"
 # Colour and marker tell the solver; dash and filling tell what holds the joints.
 LINES = {"projection": ("-", "full"), "none": ("--", "none"), "baumgarte": (":", "bottom")}
@@ -29,75 +31,81 @@ def name_of(family: str) -> str:
 
 
 def show(path: Path, folder: Path) -> str:
-    """The tables for docs/simulation.md, and where the figures are that are drawn into a folder."""
+    """The places of the figures that are drawn into a folder."""
     record = json.loads(path.read_text())
-    problems = record["problems"]
-    parts = [cheapest(problems, level) for level in problems[0]["cheapest"]]
-    parts += [at_tolerance(problems), finest(problems)]
     figures = {
-        "long_horizon_work": work(record, "seconds", "run time [s]"),
+        "long_horizon_work": work(record, "seconds", "run time [s]", EXPLICIT),
         "long_horizon_evaluations": work(record, "evaluations", "evaluations of x' = f(t, x) [1]"),
         "long_horizon_energy": over_time(record),
     }
-    return shown(parts, save(figures, folder))
+    return "\n".join(map(str, save(figures, folder)))
 
 
-def by_family(title: str, problems: list[Row], cell: Callable[[Row, str], str]) -> str:
-    """A table with a line for each family and a column for each problem."""
-    families = [{"family": family} for family in problems[0]["cheapest"]["0.001"]]
-    of = lambda problem: (problem["title"], "family", lambda family: cell(problem, family))
-    return titled(title, families, ("method", "family", name_of), *map(of, problems))
+def comparisons(record: Row) -> Lines:
+    """Symmetric runs against the best projected explicit run of at most as many evaluations."""
+    rows = []
+    for problem in record["problems"]:
+        answer = problem["answers"]["evaluations"]
+        count = lambda key, of=answer: f"{of[key]} of {of['compared']}"
+        ratios = [pair["ratio"] for pair in answer["pairs"] if pair["family"].startswith("gauss")]
+        symmetric = [row for row in problem["runs"] if row["solver"] not in EXPLICIT]
+        failed = sum(not row["completed"] for row in symmetric)
+        span = " to ".join(f"{ratio:.1g}" for ratio in sorted({min(ratios), max(ratios)}))
+        rows.append([
+            problem["title"], count("explicit_better"), span, count("explicit_drifts_less"),
+            f"{failed} of {len(symmetric)}",
+        ])  # fmt: skip
+    head = ["problem", "explicit run has the smaller error", "error of the order-4 run / error of the explicit run",
+            "explicit run drifts less", "symmetric runs that fail"]  # fmt: skip
+    return table(head, rows)
 
 
-def cheapest(problems: list[Row], level: str) -> str:
-    """Seconds of the cheapest run of each family that keeps the error below the level."""
-    title = f"Seconds for an energy error up to {float(level):.0e} over the whole horizon"
+def at_tolerance(record: Row) -> Lines:
+    """Energy error and run time of Dopri8 at 1e-6 by stabilisation."""
+
+    def of(problem: Row, hold: str) -> Row:
+        mine = lambda row: (row["solver"], row["hold"], row["tolerance"]) == ("dopri8", hold, 1e-6)
+        return next(row for row in problem["runs"] if mine(row))
+
+    def cell(row: Row) -> str:
+        if row["largest"] is None:
+            return f"stops at {row['reached']:.2g} s"
+        return f"{power(row['largest'])} ({plain(1e3 * row['seconds'])} ms)"
+
+    rows = []
+    for problem in record["problems"]:
+        residual = number(of(problem, "none")["residual"], digits=2)
+        rows.append([problem["title"], *(cell(of(problem, hold)) for hold in HOLDS), residual])
+    return table(
+        ["Dopri8 at 1e-6", *HOLDS.values(), "joint error of the unstabilised run [m]"], rows
+    )
+
+
+def cheapest(record: Row) -> Lines:
+    """Milliseconds of the cheapest explicit run of each family with an energy error of at most 1e-9."""
+    problems = record["problems"]
+    families = [f for f in problems[0]["cheapest"]["1e-09"] if f.split(", ")[0] in EXPLICIT]
 
     def cell(problem: Row, family: str) -> str:
-        best = problem["cheapest"][level][family]
-        return number(best and best["seconds"], digits=2)
+        best = problem["cheapest"]["1e-09"][family]
+        return plain(best and 1e3 * best["seconds"])
 
-    return by_family(title, problems, cell)
-
-
-def finest(problems: list[Row]) -> str:
-    """The smallest error that each family reached, and runs that failed."""
-
-    def cell(problem: Row, family: str) -> str:
-        mine = [row for row in problem["runs"] if row["family"] == family]
-        whole = [row for row in mine if row["largest"] is not None]
-        best = min(whole, key=lambda row: row["largest"], default=None)
-        text = "-" if best is None else f"{best['largest']:.0e} ({best['seconds']:.2g} s)"
-        failed = len(mine) - len(whole)
-        return text + (f", {failed} of {len(mine)} failed" if failed else "")
-
-    return by_family("Smallest error", problems, cell)
+    rows = [[name_of(f), *(cell(problem, f) for problem in problems)] for f in families]
+    return table(["run time [ms]", *(problem["title"] for problem in problems)], rows)
 
 
-def at_tolerance(problems: list[Row]) -> str:
-    """Error and drift at one tolerance with and without projection."""
-    rows = [
-        {"problem": problem["title"], **row}
-        for problem in problems
-        for row in problem["runs"]
-        if row["tolerance"] == 1e-6
-    ]
-    return titled(
-        "At tolerance 1e-6", rows, "problem", ("method", "family", name_of),
-        ("error", "largest", power), ("drift [1/s]", "drift", power),
-        ("run [s]", "seconds", power), ("joints off by [m]", "residual", power),
-    )  # fmt: skip
-
-
-def work(record: Row, cost: str, label: str) -> Figure:
-    """Cost against largest energy error, one panel per problem."""
+def work(record: Row, cost: str, label: str, solvers: tuple[str, ...] = tuple(SOLVERS)) -> Figure:
+    """Cost against largest energy error of some solvers, one panel per problem."""
 
     def draw(ax: Any, problem: Row) -> None:
-        rows = [row for row in problem["runs"] if row["largest"]]
+        rows = [row for row in problem["runs"] if row["largest"] and row["solver"] in solvers]
         for family in dict.fromkeys(row["family"] for row in rows):
             mine = [row for row in rows if row["family"] == family]
             x, y = [row["largest"] for row in mine], [row[cost] for row in mine]
             ax.loglog(x, y, **style(mine[0]))
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 3)))
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_formatter(NullFormatter())
         ax.set(title=problem["title"], xlabel=f"largest {ERROR}", ylabel=label)
 
     note = "Where a method has fewer points than elsewhere, its other runs did not reach the end."

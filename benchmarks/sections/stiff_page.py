@@ -1,75 +1,42 @@
-"""Markdown tables and figures of the stiff benchmark, from its JSON record alone."""
+"""Markdown table and figures of the stiff benchmark, from its JSON record alone."""
 
 import json
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
-from shared.pages import Row, legend, number, panels, power, save, shown, titled
+from shared.pages import Lines, Row, legend, panels, plain, save, table
 
 from stmuav_jax.figures import look
 
-NAMES = {"dopri8": "Dopri8", "tsit5": "Tsit5", "rodas5p": "Rodas5P", "kvaerno5": "Kvaerno5"}
+NAMES = {"dopri8": "Dopri8", "tsit5": "Tsit5", "kvaerno5": "Kvaerno5"}
 STYLES = {solver: look(k) | {"label": name} for k, (solver, name) in enumerate(NAMES.items())}
 
 
 def show(path: Path, folder: Path) -> str:
-    """The tables for docs/simulation.md, and where the figures are that are drawn into a folder."""
+    """The places of the figures that are drawn into a folder."""
     record = json.loads(path.read_text())
-    scenes = record["scenes"]
-    parts = [fastest(scenes, level) for level in scenes[0]["cheapest"]]
-    parts += [eigenvalues(scenes), at_tolerance(scenes, 1e-6)]
-    parts += [json.dumps(record["crossover"], indent=1), f"compile: {record['compile_seconds']}"]
-    drawn = save({"stiff_work": work(record), "stiff_crossover": crossover(record)}, folder)
-    return shown(parts, drawn)
+    figures = {"stiff_work": work(record), "stiff_crossover": crossover(record)}
+    return "\n".join(map(str, save(figures, folder)))
 
 
-def fastest(scenes: list[Row], level: str) -> str:
-    """The fastest runs with an error up to a level."""
+def fastest(record: Row) -> Lines:
+    """The fastest explicit and implicit run with an error of at most 1e-6 m, by scene."""
 
-    def best(kind: str) -> Any:
-        def cell(scene: Row) -> str:
-            row = scene["cheapest"][level][kind]
-            said = row and f"{row['seconds']:.2g} s, {NAMES[row['solver']]} {row['tolerance']:.0e}"
-            return said or "-"
+    def best(row: Row | None) -> str:
+        if row is None:
+            return "not reached"
+        return f"{plain(1e3 * row['seconds'])} ms, {NAMES[row['solver']]} {row['tolerance']:.0e}"
 
-        return (kind, None, cell)
-
-    return titled(
-        f"Fastest run with an error up to {float(level):.0e} m", scenes, ("scene", "name"),
-        ("eigenvalue at the start [1/s]", "eigenvalue", lambda e: number(e["start"], digits=2)),
-        best("explicit"), best("implicit"),
-        ("ratio", "cheapest", lambda c: number(c[level]["explicit_over_implicit"], digits=2)),
-    )  # fmt: skip
-
-
-def eigenvalues(scenes: list[Row]) -> str:
-    """The largest eigenvalue at the start and on the way, and what the references differ by."""
-    at_start = lambda e: "{:.2g} {:+.2g} i".format(*e["start_value"])
-    on_the_way = lambda e: f"{e['largest']:.2g} at {e['largest_at']:g} s"
-    apart = lambda r: ", ".join(power(a, 0) for key in r if key.endswith("_apart") for a in r[key])
-    return titled(
-        "Largest eigenvalue in size [1/s]", scenes, ("scene", "name"),
-        ("at the start", "eigenvalue", at_start),
-        ("median", "eigenvalue", lambda e: f"{e['median']:.2g}"),
-        ("largest on the way", "eigenvalue", on_the_way),
-        ("references apart [m]", "reference", apart),
-    )  # fmt: skip
-
-
-def at_tolerance(scenes: list[Row], tol: float) -> str:
-    """Every solver's steps, run time and error at one tolerance."""
-
-    def of(solver: str) -> Any:
-        def cell(runs: list[Row]) -> str:
-            row = next(r for r in runs if (r["solver"], r["tolerance"]) == (solver, tol))
-            error = "failed" if row["error"] is None else f"{row['error']:.0e} m"
-            return f"{row['accepted']}+{row['rejected']}, {row['seconds']:.2g} s, {error}"
-
-        return (NAMES[solver], "runs", cell)
-
-    title = f"At tolerance {tol:.0e}: steps+rejected, run, error"
-    return titled(title, scenes, ("scene", "name"), *map(of, solvers(scenes)))
+    rows = []
+    for scene in record["scenes"]:
+        found, eigenvalue = scene["cheapest"]["1e-06"], scene["eigenvalue"]
+        rows.append([
+            named(scene), *(plain(eigenvalue[key]) for key in ("start", "median", "largest")),
+            best(found["explicit"]), best(found["implicit"]), plain(found["explicit_over_implicit"]),
+        ])  # fmt: skip
+    head = ["scene", "largest eigenvalue at the start [1/s]", "median", "largest", "explicit", "implicit",
+            "explicit / implicit"]  # fmt: skip
+    return table(head, rows)
 
 
 def solvers(scenes: list[Row]) -> list[str]:
@@ -83,8 +50,10 @@ def completed(scene: Row, solver: str) -> list[Row]:
 
 
 def named(scene: Row) -> str:
-    """A scene's name, with the unit of the servo's stiffness."""
-    return scene["name"] + (" N/m" if "e+" in scene["name"] else "")
+    """A scene in words, with the stiffness and the damping of its servos."""
+    if scene["stiffness"]:
+        return f"servo {scene['stiffness']:.0e} N/m, {scene['damping']:,g} N s/m"
+    return "no force on the sliders" if scene["name"] == "free" else scene["name"]
 
 
 def work(record: Row) -> Figure:
@@ -125,7 +94,8 @@ def crossover(record: Row) -> Figure:
     for scene in servos:
         at, place = start(scene), ax.get_xaxis_transform()
         beside = {"rotation": 90, "ha": "right", "fontsize": 7, "color": "0.4"}
-        ax.text(at, 0.03, named(scene) + " ", transform=place, **beside)
+        label = named(scene).replace(", ", "\n")
+        ax.text(at, 0.03, label, transform=place, **beside)
         ax.axvline(at, color="0.9", zorder=0)
     seconds = f"fastest run for {record['t1']:g} s of motion,\nerror up to 1e-6 m [s]"
     ax.set(xlabel="largest |eigenvalue| at the start [1/s]", ylabel=seconds)

@@ -42,14 +42,14 @@ def titled(title: str, rows: Sequence[Row], *columns: Column) -> str:
     return "\n".join([title, "", *listed(rows, *columns)])
 
 
-def shown(parts: Sequence[str], figures: Sequence[Path]) -> str:
-    """Texts with a blank line between them, and the figures' places."""
-    return "\n".join(["\n\n".join(parts), *map(str, figures)])
-
-
 def number(value: float | None, unit: float = 1.0, digits: int = 3) -> str:
     """Some digits, or a dash."""
     return "-" if value is None else f"{unit * value:.{digits}g}"
+
+
+def plain(value: float | None) -> str:
+    """Two digits without a power of ten, or a dash."""
+    return "-" if value is None else f"{float(f'{value:.2g}'):,g}"
 
 
 def power(value: float | None, behind: int = 1) -> str:

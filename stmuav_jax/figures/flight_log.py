@@ -223,18 +223,22 @@ def draw_windows(subject: IdentifiedFlight) -> Figure | None:
         ax.set_visible(False)
     for ax, name in zip(axes.flat, names, strict=False):
         e = result.estimates[name]
+        scale, unit = (1e3, "mm") if e.unit == "m" else (1.0, e.unit)
+        value, deviation = scale * e.value, scale * e.deviation
         edges = np.linspace(record.ts[0], record.ts[-1], len(e.window_values) + 1)
-        ax.axhspan(e.value - e.deviation, e.value + e.deviation, color=_BAND)
-        ax.axhline(e.value, color=STYLES[1][0], linestyle=STYLES[1][1], linewidth=1.2)
+        ax.axhspan(value - deviation, value + deviation, color=_BAND)
+        ax.axhline(value, color=STYLES[1][0], linestyle=STYLES[1][1], linewidth=1.2)
         ax.errorbar(
-            (edges[1:] + edges[:-1]) / 2, e.window_values, e.window_deviations,
+            (edges[1:] + edges[:-1]) / 2, scale * np.asarray(e.window_values), scale * np.asarray(e.window_deviations),
             fmt="o", color=STYLES[0][0], markersize=4, capsize=3, linewidth=1.2,
         )  # fmt: skip
-        ax.set_title(f"{e.name} [{e.unit}]", fontsize=7, parse_math=False)
+        ax.set_title(f"{e.name} [{unit}]", fontsize=8, parse_math=False)
         ax.ticklabel_format(axis="y", scilimits=(-3, 4))
         ax.yaxis.get_offset_text().set_fontsize(7)
-    for ax in axes[-1]:
+    # below the last panel of each column, also where the last row is not full
+    for ax in axes.flat[max(len(names) - columns, 0) : len(names)]:
         ax.set_xlabel("time [s]", fontsize=9)
+        ax.tick_params(labelbottom=True)
     figure.suptitle("Windows with bars of one deviation; the whole flight as a band", fontsize=10)
     return figure
 

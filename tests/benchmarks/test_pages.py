@@ -2,11 +2,14 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
+import hard
 import pytest
 import report
-from sections.throughput_page import of_peer
+from sections.page_tables import BLOCK, fill
+from sections.throughput_page import of_peer, write_page
 from shared.record import RESULTS
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -31,6 +34,26 @@ def table_rows(text):
 
 def test_stored_page_is_that_of_the_stored_results(page):
     assert report.PAGE.read_text() == page.read_text()
+
+
+def test_tables_of_other_pages_are_those_of_the_stored_results():
+    names = []
+    for page in report.OTHER_PAGES:
+        text = page.read_text()
+        assert fill(text, report.ALL_TABLES) == text, f"run `python benchmarks/report.py`: {page}"
+        names += [name for _, name, _ in BLOCK.findall(text)]
+        assert text.count("<!-- table: ") == text.count("<!-- end of table -->")
+    assert sorted(names) == sorted(report.ALL_TABLES)
+
+
+def test_sections_of_other_pages_are_those_of_the_stored_results(tmp_path):
+    content = json.loads((RESULTS / "hard.json").read_text())
+    assert hard.page(content).strip() in (DOCS / "validation.md").read_text()
+    page = Path(shutil.copy(DOCS / "studies.md", tmp_path))
+    assert (
+        write_page(RESULTS / "montecarlo.json", page).read_text()
+        == (DOCS / "studies.md").read_text()
+    )
 
 
 def test_page_answers_in_its_first_lines_and_is_short():

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 import stmuav_jax as stm
 from stmuav_jax.math.compiler import quick_jit
@@ -41,6 +42,19 @@ def test_speeds_without_a_rotor_keep_thrust_and_tilt(plant):
         across = got[1] * wrench[2] - got[2] * wrench[1]
         assert abs(across) < 1e-9 * (1 + np.hypot(*wrench[1:3]) ** 2)
     assert 12 <= kept < 24
+
+
+@pytest.mark.parametrize("rotor", range(6))
+def test_no_hover_without_a_rotor_holds_the_yaw(plant, rotor):
+    """Docs/control_and_missions.md, by linear programmes: within the limits only without the yaw moment's equation."""
+    wrenches = stm.uav.wrench_map(plant.system.forces[1], plant.system.bodies.com[0])
+    B = np.delete(np.asarray(wrenches), rotor, axis=1)
+    hover = np.array([9.81 * float(plant.system.bodies.mass[0]), 0.0, 0.0, 0.0])
+    for rows, is_possible in ((4, False), (3, True)):
+        found = scipy.optimize.linprog(
+            np.zeros(5), A_eq=B[:rows], b_eq=hover[:rows], bounds=(200.0**2, 1900.0**2)
+        )
+        assert found.success == is_possible
 
 
 def test_a_hexacopter_follows_a_path_without_a_rotor(plant):

@@ -1434,7 +1434,7 @@ def _judge_estimates(
         )
     else:
         status = "consistent"
-        sentences.insert(0, f"Consistent: none of {len(p_values)} tests speaks against the model.")
+        sentences.insert(0, f"Consistent: none of {len(p_values)} tests rejects the model.")
     return FlightVerdict(status, p_values, " ".join(sentences))
 
 
