@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from html_pages import read
 
 import stmuav_jax as stm
 from stmuav_jax.cli import main as cli
 from stmuav_jax.cli.main import main
 from stmuav_jax.io.netcdf import load
-from stmuav_jax.uav.scenes.registry import SCENES, make_scene
 
 
 @pytest.fixture(autouse=True)
@@ -33,11 +33,6 @@ def test_list_names_every_scene_and_case(capsys):
     out = capsys.readouterr().out
     for words in ("spin", "uav_tracker", "1, 2, 3", "Part II, 5.1", "end [s]"):
         assert words in out
-
-
-def test_what_list_says_is_what_the_scenes_are():
-    for name, entry in SCENES.items():
-        assert make_scene(name).t1 == entry.t1
 
 
 def test_importing_and_starting_set_nothing_but_threads_of_factorisations():
@@ -61,10 +56,6 @@ def test_version_and_help(capsys):
     assert main(["--help"]) == 0
     words = " ".join(capsys.readouterr().out.split())
     assert "Simulate, trim, tune and estimate a UAV that carries" in words
-    assert main(["trim", "--help"]) == 0
-    words = " ".join(capsys.readouterr().out.split())
-    assert "Example: stmuav trim --phi 10" in words
-    assert "default: None" not in words
 
 
 @pytest.mark.slow
@@ -110,7 +101,6 @@ def test_parameters_and_solver_reach_the_run(tmp_path, capsys):
     ("arguments", "words"),
     [
         (("tracker", "--case", "7"), "no case 7"),
-        (("tracker", "--t1", "-1"), "end of the time span must be above 0"),
         (("tracker", "--rtol", "0"), "relative tolerance must be above 0"),
         (("tracker", "--params", "/none.toml"), "There is no file '/none.toml'"),
         (("hexacopter", "--loads"), "hexacopter has none"),
@@ -170,20 +160,13 @@ def test_sun_prints_draws_and_saves_a_day(tmp_path, capsys):
     ("arguments", "words"),
     [
         (("--lat", "91"), "latitude must lie within"),
-        (("--lat", "nan"), "latitude must be finite"),
         (("--date", "yesterday"), "The date must be like 2024-03-21, not 'yesterday'"),
-        (("--date", "2024-02-30"), "There is no day 2024-02-30 in the calendar"),
-        (("--date", "0001-01-01"), "years 1950 to 2110, not for 0001-01-01"),
-        (("--date", "9999-12-31"), "years 1950 to 2110"),
         (("--altitude", "60000"), "altitude must lie within -500 and 11000 m, but it is 60000"),
         (("--roll", "nan"), "angle must be finite, but it is nan degrees (--roll)"),
-        (("--turbidity", "inf"), "turbidity must be finite"),
         (("--date", "2024-12-21", "--lat", "80"), "The sun does not rise at 80 degrees north"),
         (("--timezone", "Asia/Pnom_Penh"), "Did you mean 'Asia/Phnom_Penh'"),
-        (("--step", "0"), "step must lie within"),
         (("--attitude", "/none.csv"), "There is no file '/none.csv'"),
         (("--attitude", "/none.csv", "--yaw", "3"), "excludes"),
-        (("--turbidity", "0"), "turbidity must lie within 1 and 20"),
     ],
 )
 def test_sun_bad_input_is_one_paragraph_and_exit_code_two(arguments, words, capsys, tmp_path):
@@ -368,6 +351,12 @@ def test_estimate_prints_draws_and_saves_a_case(tmp_path, capsys):
     rows = json.loads(data.attrs["summaries"])
     assert rows["report"]["case"] == 4
     assert rows["report"]["verdict"]["status"] == "inconsistent"
+    assert main(["view", str(tmp_path), "--report", str(tmp_path / "page" / "report.html")]) == 0
+    page, text = read(tmp_path / "page" / "report.html")
+    assert len(page.sources) == 1
+    assert "Report tuning: inconsistent. 3 of 3 runs are inconsistent" in text
+    off = np.sqrt(np.mean(error.sel(component="offset_x").isel(time=-1) ** 2, axis=-1))
+    assert f"offset_x [m], report {float(off[0]):.4g} " in text
     given = "--case", "4", "--seeds", "3", "--t1", "0.05", "--tuning", "consistent"
     assert run("estimate", *given, "--figures", "none", "--out", str(tmp_path)) == 0
     # a mismatch: the filter alone believes in a better gyroscope
@@ -381,8 +370,6 @@ def test_estimate_prints_draws_and_saves_a_case(tmp_path, capsys):
     ("arguments", "words"),
     [
         (("--case", "9"), "number of the case must lie within 1 and 8"),
-        (("--case", "1", "--seeds", "0"), "number of runs must lie within 1 and 100000"),
-        (("--case", "1", "--t1", "0"), "must be above 0 and at most 100000 s"),
         (("--case", "1", "--t1", "1e-4"), "between one step of 0.001 s"),
         (("--params", "/none.toml"), "There is no file '/none.toml'"),
     ],

@@ -2,12 +2,10 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 import stmuav_jax as stm
-from stmuav_jax.uav.tracker.bodies import SLIDER_JOINTS
 
 G = 9.81
 
@@ -113,11 +111,3 @@ def stewart(mass: Any = 20.0, com: Any = (0.0, 0.0, 0.0)):
         np.array(feet),
         np.array(heads),
     )
-
-
-def ground_tracker():
-    """The report's tracker on the ground, each of its sliders pushed by an effort of its joint."""
-    scene = stm.make_scene("tracker")
-    efforts = [stm.JointEffort(name, 0.0) for name in SLIDER_JOINTS]
-    forces = (stm.Gravity([0.0, 0.0, -G]), *efforts)
-    return eqx.tree_at(lambda s: s.forces, scene.system, forces)

@@ -16,7 +16,6 @@ from mechanisms import (
     G,
     cart_pole,
     four_bar,
-    ground_tracker,
     stewart,
 )
 
@@ -27,17 +26,6 @@ import stmuav_jax as stm
 def cart():
     space = stm.TreeSpace(cart_pole())
     return space, space.from_state(space.system.reference)
-
-
-def test_names_of_a_cart_pole(cart):
-    space, x = cart
-    assert space.names == (
-        ("rail.displacement", "m"), ("hinge.angle", "rad"),
-        ("rail.displacement_rate", "m/s"), ("hinge.angle_rate", "rad/s"),
-    )  # fmt: skip
-    assert (space.dof, space.size) == (2, 4)
-    assert stm.inputs_of(space.system).names == (("effort", "N"),)
-    assert float(space.conditioning(x)) == 1.0
 
 
 def test_stacked_points_differ_as_single_ones_do(cart):
@@ -257,39 +245,7 @@ def test_matrices_of_a_hexacopter_in_closed_form():
     np.testing.assert_allclose(found.B, B, atol=1e-12 * np.max(np.abs(B)))
 
 
-# --- the tracker on the ground, against its energies
-
-
-@pytest.mark.slow
-def test_matrices_of_the_tracker_on_the_ground():
-    """At rest, M q'' = -K q + S^T f, with M, K and S from the energies and the strokes."""
-    space = stm.TreeSpace(ground_tracker())
-    x, bodies = space.from_state(space.system.reference), space.system.bodies
-    held = stm.trim(space, at=x).values
-    found = stm.linearize(space, x, values=held)
-    sliders = np.array([space.system.index(name) for name in ("slider_2", "slider_3")])
-
-    def potential(q):
-        r = space.to_state(space.retract(x, jnp.concatenate([q, jnp.zeros(2)]))).r
-        return G * (bodies.mass @ r[:, 2]) - held @ r[sliders, 2]
-
-    def speeds(u):
-        state = space.to_state(space.retract(x, jnp.concatenate([jnp.zeros(2), u])))
-        return state.v, state.omega
-
-    zero = jnp.zeros(2)
-    slope, K = jax.jit(lambda q: (jax.jacfwd(potential)(q), jax.jacfwd(jax.jacfwd(potential))(q)))(
-        zero
-    )
-    K = np.asarray(K)
-    # the held forces are those of virtual work
-    np.testing.assert_allclose(slope, 0.0, atol=1e-8 * np.max(np.abs(held)))
-    v, omega = (np.asarray(part) for part in jax.jit(jax.jacfwd(speeds))(zero))
-    M = np.einsum("b,bik,bil->kl", bodies.mass, v, v)
-    M += np.einsum("bik,bij,bjl->kl", omega, bodies.inertia, omega)
-    np.testing.assert_allclose(found.A[2:, :2], -np.linalg.solve(M, K), rtol=1e-8)
-    np.testing.assert_allclose(found.B[2:], np.linalg.solve(M, v[sliders, 2].T), rtol=1e-8)
-    np.testing.assert_allclose(found.A[2:, 2:], 0.0, atol=1e-9)
+# --- the tracker on the ground, against its _energies
 
 
 # --- a Stewart platform: six legs, six degrees of freedom

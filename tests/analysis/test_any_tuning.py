@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
-from mechanisms import G, cart_pole, four_bar, pendulum, stewart
-from scipy.interpolate import CubicSpline
-from scipy.optimize import root
-from scipy.spatial.transform import Rotation
-from test_any_mechanism import static_forces
+from mechanisms import cart_pole, pendulum
 
 import stmuav_jax as stm
 from stmuav_jax.analysis.identification import Misfit, predict_columns, residuals_and_jacobian
+from stmuav_jax.analysis.multiple_shooting import integrate_points
+from stmuav_jax.math.compiler import quick_jit
 from stmuav_jax.math.least_squares import evaluate_columns
 from stmuav_jax.math.sampled import Sampled
 from stmuav_jax.uav.rotor import hover_speed_squared
@@ -82,6 +80,33 @@ def test_a_motion_in_parts_is_that_in_one_piece(pushed):
     assert tuning.motion(start, 23) is motion
     two = tuning.motion(start, 2)
     np.testing.assert_allclose(two.points.u[-1], motion.points.u[-1], atol=1e-8)
+    # reaction forces along the motion, by another formulation
+    loads = quick_jit(stm.dynamics.joint_loads)(system, motion.ts, run.states, stm.Augmented())
+    forces = np.linalg.norm(loads.force, axis=2)
+    np.testing.assert_allclose(quick_jit(stm.analysis.joint_forces)(motion), forces, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_motion_in_parts_keeps_the_speeds_of_its_motors():
+    """With motors that lag, the rotors' speeds go on from one call of the program to the next, to 1e-8."""
+    motor = stm.uav.Motor(time_constant=0.05)
+    space = stm.TreeSpace(stm.make_scene("hexacopter", motor=motor).system)
+    start = space.from_state(space.system.reference)
+    tuning = stm.analysis.tune_inputs(
+        space, [stm.analysis.departures(space, start)], start=start, duration=0.1,
+        values=np.full(6, 1.4e6), sizes=[1.4e6] * 6, segments=2,
+    )  # fmt: skip
+    values = jax.tree.map(lambda x: 1.2 * x, tuning.start)
+    motion = tuning.motion(values, 12)
+    problem, ts = tuning.residuals, jnp.linspace(0.0, 0.1, 12)
+    system = problem.system(values["values"])
+    whole = jax.jit(lambda at: integrate_points(space, system, at, ts, problem.method))(
+        problem.start
+    )
+    off = np.asarray(jax.vmap(space.difference)(motion.points, whole))
+    scale = np.where(np.arange(off.shape[1]) < 12, 1.0, 1e3)
+    assert np.max(np.abs(off) / scale) < 1e-8
+    assert np.ptp(np.asarray(whole.internal)[:, 0]) > 10.0
 
 
 @pytest.mark.slow
@@ -175,30 +200,25 @@ def test_what_tuning_refuses(cart):
         )
     with pytest.raises(stm.SettingError, match="name 'hinge', which is no state"):
         stm.analysis.departures(space, x, {"hinge": 1.0})
+    slew = lambda *arguments, **options: stm.analysis.tune_slew(
+        space, x, x, *arguments, values=np.ones(1), **options
+    )
+    with pytest.raises(stm.SettingError, match="must be positive, not -1 s"):
+        slew(-1.0)
+    with pytest.raises(stm.SettingError, match="four knots or more"):
+        slew(1.0, knots=3)
+    with pytest.raises(stm.SettingError, match="two or more increasing times"):
+        stm.analysis.make_shooting(
+            space, lambda v: v, lambda *a: a, lambda t: x, np.array([0.0, 0.0])
+        )
 
 
 # --- identification
 
 
-def fitted(predict, truth, sizes, sigma, labels):
-    """From a start that is off by half of the sizes: without noise, and with it."""
-    # predictions by the program that identification compiles anyway
-    shape = eqx.filter_eval_shape(predict_columns, predict, jnp.asarray(truth)).shape
-    zero, one = jnp.zeros(len(truth)), jnp.ones(len(truth))
-    none = Misfit(predict, jnp.zeros(shape), jnp.ones(shape[1]), jnp.asarray(truth), one)
-    clean = np.asarray(residuals_and_jacobian(none, zero)[0]).reshape(shape)
-    start = truth + 0.5 * sizes * (-1.0) ** np.arange(len(truth))
-    rng = np.random.default_rng(7)
-    noisy = clean + sigma * rng.normal(size=clean.shape)
-    return [
-        stm.analysis.identify(predict, record, sigma, start, sizes, labels=labels)
-        for record in (clean, noisy)
-    ]
-
-
 @pytest.mark.slow
 def test_a_cart_pole_is_identified(cart):
-    """Bob, length and damping from the cart's place, the pole's angle and its gyroscope."""
+    """Bob, length and damping from the cart's place, the pole's angle and its gyroscope: without noise, and with it."""
     space = stm.TreeSpace(cart_pole(damping=0.05))
     x = space.from_state(space.system.reference)
     knots = np.linspace(0.0, 0.8, 7)
@@ -213,27 +233,22 @@ def test_a_cart_pole_is_identified(cart):
     )
     truth, sizes = np.array([0.5, 0.8, 0.05]), np.array([0.1, 0.1, 0.05])
     sigma = np.array([1e-3, 2e-3, 5e-3, 5e-3, 5e-3])
-    exact, found = fitted(predict, truth, sizes, sigma, ["bob", "length", "damping"])
+    # predictions by the program that identification compiles anyway
+    shape = eqx.filter_eval_shape(predict_columns, predict, jnp.asarray(truth)).shape
+    none = Misfit(
+        predict, jnp.zeros(shape), jnp.ones(shape[1]), jnp.asarray(truth), jnp.ones(len(truth))
+    )
+    clean = np.asarray(residuals_and_jacobian(none, jnp.zeros(len(truth)))[0]).reshape(shape)
+    start = truth + 0.5 * sizes * np.array([1.0, -1.0, 1.0])
+    noisy = clean + sigma * np.random.default_rng(7).normal(size=clean.shape)
+    labels = ["bob", "length", "damping"]
+    exact, found = (
+        stm.analysis.identify(predict, record, sigma, start, sizes, labels=labels)
+        for record in (clean, noisy)
+    )
     np.testing.assert_allclose(exact.values, truth, rtol=1e-8)
     assert found.within(truth, 4.0)
     assert 0.6 < found.reduced_chi_square < 1.4
-
-
-@pytest.mark.slow
-def test_a_four_bar_is_identified():
-    """A mass and a damper in a closed loop, from one encoder and one rate."""
-    space = stm.TreeSpace(four_bar(damping=0.3), independent=["A.angle"])
-    x = space.from_state(space.system.reference)
-    predict = stm.analysis.motion_model(
-        lambda q: four_bar(masses=(1.0, 2.0, q[0]), damping=q[1]),
-        x, np.linspace(0.0, 0.8, 33), ["A.angle", "A.angle_rate"],
-        inputs={"effort": 8.0}, space=space,
-    )  # fmt: skip
-    truth, sizes = np.array([1.5, 0.3]), np.array([0.3, 0.1])
-    sigma = np.array([1e-4, 1e-3])
-    exact, found = fitted(predict, truth, sizes, sigma, ["rocker", "damping"])
-    np.testing.assert_allclose(exact.values, truth, rtol=1e-8)
-    assert found.within(truth, 4.0)
 
 
 @pytest.mark.slow
@@ -259,6 +274,46 @@ def test_what_a_motion_model_refuses():
         model(["hinge.angle"], space=space, start_deviations={"hinge.angle": -0.1})
     with pytest.raises(stm.SettingError, match="name 'force', which is no input"):
         model(["hinge.angle"], space=space, inputs={"force": 1.0})
+
+
+def test_what_cannot_be_told_is_named():
+    J = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 5.0]])
+    with pytest.raises(
+        stm.analysis.IdentifiabilityError, match=r"[+-]0\.71 (a|b), [+-]0\.71 (a|b) \(singular"
+    ):
+        stm.analysis.check_identifiable(J, ["a", "b", "c"])
+    assert stm.analysis.check_identifiable(J[:, 1:], ["b", "c"])[0] == pytest.approx(5.0)
+    line = lambda q: (q[0] + q[1]) * jnp.linspace(0, 1, 5)[:, None]
+    with pytest.raises(stm.analysis.IdentifiabilityError, match="leave one of the parameters out"):
+        stm.analysis.identify(line, np.ones((5, 1)), [0.1], [0.0, 0.0], [1.0, 1.0])
+
+
+def test_records_refused():
+    line = lambda q: q[0] * jnp.ones((5, 1))
+    with pytest.raises(stm.ModelError, match=r"record has shape \(4, 1\), but predictions"):
+        stm.analysis.identify(line, np.ones((4, 1)), [0.1], [0.0], [1.0])
+    with pytest.raises(stm.ModelError, match="record"):
+        stm.analysis.identify(line, np.full((5, 1), np.nan), [0.1], [0.0], [1.0])
+    with pytest.raises(stm.SettingError, match="1 positive deviations"):
+        stm.analysis.identify(line, np.ones((5, 1)), [0.0], [0.0], [1.0])
+    with pytest.raises(stm.SettingError, match="1 positive sizes"):
+        stm.analysis.identify(line, np.ones((5, 1)), [0.1], [0.0], [-1.0])
+    # not as parameters that the record leaves open
+    heavy = lambda q: jnp.sqrt(q[0]) * jnp.ones((5, 1)) + q[1] * jnp.linspace(0, 1, 5)[:, None]
+    with pytest.raises(stm.SettingError, match=r"predictions at the start .* mass = -1, slope = 0"):
+        stm.analysis.identify(
+            heavy, np.ones((5, 1)), [0.1], {"mass": -1.0, "slope": 0.0}, [1.0, 1.0]
+        )
+    with pytest.raises(stm.SettingError, match="derivatives of the predictions at the start"):
+        stm.analysis.identify(
+            heavy, np.ones((5, 1)), [0.1], {"mass": 0.0, "slope": 0.0}, [1.0, 1.0]
+        )
+    with pytest.raises(stm.ModelError, match="has no entry"):
+        stm.analysis.from_table(
+            lambda table: stm.uav.make_uav(table).space,
+            stm.PART_II,
+            [stm.analysis.Unknown("mass.panel_7", 0.1, ((0,),))],
+        )
 
 
 # --- flight conditions
@@ -321,39 +376,3 @@ def test_what_a_flight_condition_refuses(hexacopter, cart):
         trim(space, stm.analysis.hover(sun=[0, 0, 1.0]), at=x)
     with pytest.raises(stm.ModelError, match="no body 'panel'"):
         trim(space, stm.analysis.hover(sun=[0, 0, 1.0]), at=x, pointing="panel")
-
-
-# --- a Stewart platform moved to a pose
-
-
-def potential(feet, heads, longer):
-    """Potential energy of all bodies with the legs longer by so much, by the platform's geometry."""
-    centre, length = np.array([0.0, 0.0, 1.25]), np.linalg.norm(heads - feet, axis=1)
-    ends = lambda pose: centre + pose[:3] + Rotation.from_rotvec(pose[3:]).apply(heads - centre)
-    miss = lambda pose: np.linalg.norm(ends(pose) - feet, axis=1) - length - longer
-    pose = root(miss, np.zeros(6), tol=1e-13).x
-    legs = ends(pose) - feet
-    # barrels a quarter of the first length above their feet, rods as far below their heads
-    quarter = 0.25 * (legs[:, 2] / np.linalg.norm(legs, axis=1)) * length
-    rods = ends(pose)[:, 2] - quarter
-    return G * (20.0 * (1.25 + pose[2]) + 0.8 * np.sum(quarter) + 0.5 * np.sum(rods))
-
-
-@pytest.mark.slow
-def test_a_platform_is_moved_to_a_pose():
-    """Six forces after which it rests in another pose; their work has lifted all bodies."""
-    system, feet, heads = stewart()
-    space = stm.TreeSpace(system, independent=[f"T{k}.displacement" for k in range(6)])
-    x, longer = space.from_state(system.reference), np.array([0.03, 0.01, -0.02, 0.0, 0.02, 0.04])
-    target = space.retract(x, jnp.concatenate([jnp.asarray(longer), jnp.zeros(6)]))
-    tuning = stm.analysis.tune_inputs(
-        space, [stm.analysis.end_at(space, target)], start=x, duration=0.3,
-        values=static_forces(feet, heads), knots=4, outputs_per_segment=1,
-    )  # fmt: skip
-    motion = tuning.motion(tuning.search().values)
-    end = jax.tree.map(lambda leaf: leaf[-1], motion.points)
-    np.testing.assert_allclose(space.difference(end, target), 0.0, atol=1e-8)
-    power = np.sum(np.asarray(motion.inputs * motion.points.u), axis=1)
-    work = CubicSpline(motion.ts, power).integrate(0.0, 0.3)
-    lifted = potential(feet, heads, longer) - potential(feet, heads, np.zeros(6))
-    assert work == pytest.approx(lifted, rel=1e-6)

@@ -234,20 +234,15 @@ def test_the_uav_from_its_own_sensors_over_a_hundred_seeds(uav):
     assert np.all(UAV_STEPS * UAV_DT * UAV_START[11:14] > 1.5 * UAV_START[3:6])
 
 
-# --- a cart-pole and the hexacopter
+# --- the hexacopter
 
 
-def cart_pole_case():
-    """Rail and gyroscope; the pole stands upright, and falls."""
-    space = stm.TreeSpace(cart_pole())
-    sensors = [sensing.Encoder("rail"), sensing.Gyroscope("pole")]
-    start, wander = np.array([0.02, 0.05, 0.05, 0.1]), np.array([0.0, 0.0, 0.02, 0.02])
-    push = 3.0 * np.sin(np.arange(10.0))[:, None]
-    return space, sensors, start, wander, np.array([1e-3, *[0.01] * 3]), push
+@pytest.mark.slow
+def test_a_hexacopter_over_many_seeds():
+    """Gyroscope, and fixes of position and attitude: readings of ten numbers with errors of nine.
 
-
-def hexacopter_case():
-    """Gyroscope, and fixes of position and attitude: readings of ten numbers with errors of nine."""
+    NEES within its 95 % interval; NIS within 99.9 %, as it is looked at for each mechanism.
+    """
     space = stm.TreeSpace(stm.make_scene("hexacopter").system)
     name = space.system.names[0]
     sensors = [sensing.Gyroscope(name), sensing.PositionFix(name), sensing.AttitudeFix(name)]
@@ -255,17 +250,7 @@ def hexacopter_case():
     x = space.from_state(space.system.reference)
     held = stm.analysis.trim_condition(space, stm.analysis.hover(), at=x).values
     shake = 0.05 * np.sin(np.arange(10.0)[:, None] * np.linspace(0.5, 2.0, 6))
-    return space, sensors, start, wander, np.repeat([0.01, 0.05, 0.02], 3), held * (1 + shake)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "seeds"),
-    [(cart_pole_case, 100), (hexacopter_case, 40)],
-)
-def test_other_mechanisms_over_many_seeds(case, seeds):
-    """NEES within its 95 % interval; NIS within 99.9 %, as it is looked at for each of them too."""
-    space, sensors, start, wander, noise, u = case()
+    noise, u, seeds = np.repeat([0.01, 0.05, 0.02], 3), held * (1 + shake), 40
     inputs = stm.inputs_of(space.system)
     model, fine = (
         sensing.system_model(
@@ -273,7 +258,7 @@ def test_other_mechanisms_over_many_seeds(case, seeds):
         )
         for substeps in (1, 4)
     )
-    prior = estimation.gaussian(space.from_state(space.system.reference), np.diag(start**2))
+    prior = estimation.gaussian(x, np.diag(start**2))
     parts = {"all": slice(0, space.size)}
     out = consistent(model, fine, prior, start, wander, jnp.asarray(u), 0.02, parts, 0.999, seeds)
     # what is known at the end is more than what was known at the start

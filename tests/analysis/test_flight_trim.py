@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from uav_numbers import STORED, same
 
 import stmuav_jax as stm
 from stmuav_jax.analysis import climb, cruise, hover, linearize, steady_turn
 from stmuav_jax.math.compiler import quick_jit
-from stmuav_jax.uav import TrimLimits, TrimReason, Uav, trim_flight
-from stmuav_jax.uav.allocation import RotorLimits, minimum_norm, wrench_map
+from stmuav_jax.uav import TrimLimits, TrimReason, Uav, trim_flight, trim_slopes
+from stmuav_jax.uav.allocation import RotorLimits, wrench_map
 from stmuav_jax.uav.scenes.uav_tracker import make_uav
 from stmuav_jax.uav.tracker.kinematics import Reason
 
@@ -96,14 +95,6 @@ def test_rotors_with_curves_give_the_wrench_of_rotors_without(uav, start):
     np.testing.assert_allclose(thrusts, plain.k_f * start.speed_squared, rtol=1e-4)
 
 
-def test_trims_of_an_earlier_commit(many):
-    """Before the package was rebuilt, at the first six of the panel's angles."""
-    found = many[1]
-    for k, stored in enumerate(STORED["trims"]):
-        same(found.speeds[k], stored["speeds"])
-        same(found.forces[k], stored["forces"])
-
-
 def test_nothing_accelerates_in_maximal_coordinates(uav, start):
     state = uav.space.to_state(start.point)
     found = jax.jit(lambda s, i: stm.dynamics.evaluate(uav.inputs.applied(uav.system, i), s))(
@@ -165,16 +156,10 @@ def test_other_things_in_place_of_a_flight(uav):
     bare = inspect.unwrap(trim_flight)
     with pytest.raises(stm.ModelError, match=r"a steady flight, such as hover.* not 'hover'"):
         bare(uav, "hover")
-    with pytest.raises(stm.ModelError, match=r"must be a Uav, .* not a System"):
-        bare(uav.system, hover(START))
-    with pytest.raises(stm.ModelError, match="must be a TrimLimits, not a RotorLimits"):
-        bare(uav, hover(START), RotorLimits(0.0, 1e3))
     with pytest.raises(stm.ModelError, match="positive number of newtons, not nan"):
         trim_flight(uav, hover(START), TrimLimits(actuator=np.nan))
     with pytest.raises(stm.ModelError, match=r"climb must be a number \[m/s\], but it is 'a'"):
         climb("a", START)
-    with pytest.raises(stm.ModelError, match=r"level speed must be a number .* shape is \(2,\)"):
-        cruise([1, 2], angles=START)
     with pytest.raises(stm.ModelError, match="rate of turn must be finite, but it is nan"):
         steady_turn(1.0, np.nan, START)
 
@@ -197,30 +182,9 @@ def test_within_rotor_limits(uav, start):
         np.testing.assert_allclose(refused.speeds, start.speeds, rtol=1e-12)
 
 
-def test_least_norm_allocation(uav):
-    rotors = uav.rotors
-    B = np.asarray(wrench_map(rotors, jnp.array([0.01, -0.02, 0.05])))
-    wrench = np.array([70.0, 0.3, -0.2, 0.05])
-    u = np.asarray(minimum_norm(jnp.asarray(B), jnp.asarray(wrench)))
-    np.testing.assert_allclose(u, np.linalg.pinv(B) @ wrench, rtol=1e-10)
-    full = np.asarray(rotors.wrench(jnp.asarray(u), jnp.array([0.01, -0.02, 0.05])))
-    np.testing.assert_allclose(full, [0, 0, *wrench], atol=1e-12)
-
-
 @pytest.fixture(scope="module")
 def linear(uav, start):
     return linearize(uav.space, start.point, uav.inputs, start.values)
-
-
-@pytest.mark.slow
-def test_linear_model_of_an_earlier_commit(uav, start, linear):
-    """It was in the panel's angles (phi, theta) instead of those of the joint at its post."""
-    of = lambda v: uav.panel_angles(uav.space.retract(start.point, v))
-    S = np.eye(16)
-    S[6:8, 6:8] = S[14:, 14:] = jax.jit(jax.jacfwd(of))(jnp.zeros(16))[:, 6:8]
-    same(S @ linear.A @ np.linalg.inv(S), STORED["linear"]["A"])
-    # inputs are squared speeds and newtons
-    same(S @ linear.B, STORED["linear"]["B"], axis=0)
 
 
 @quick_jit
@@ -249,6 +213,26 @@ def test_linear_against_the_simulated_flight(uav, start, linear):
                    ((ends[0].r, ends[1].r), (ends[0].omega, ends[1].omega)))  # fmt: skip
     np.testing.assert_allclose(moved, later[:3], rtol=1e-6, atol=1e-6 * np.max(np.abs(later[:3])))
     np.testing.assert_allclose(spun, later[11:14], rtol=1e-5, atol=1e-5 * np.max(np.abs(spun)))
+
+
+def test_coordinates_are_those_that_the_loops_determine(uav):
+    """The selection that is made without numbers is the one at the reference posture."""
+    assert stm.TreeSpace(uav.system).selection == uav.space.selection
+
+
+@pytest.mark.slow
+def test_slopes_of_a_trim_keep_the_balance():
+    """The thrust carries the weight at any mass and coefficient: k sum(w^2) = m g."""
+    values = {name: jnp.asarray(stm.PART_II.value(name)) for name in ("mass.panel_7", "rotor.k_f")}
+    found, slopes = trim_slopes(
+        lambda values: make_uav(stm.PART_II.replaced(values)), values, hover(START)
+    )
+    places = [k for k, (name, _) in enumerate(found.names) if name.startswith("speed")]
+    by_mass, by_k = (np.asarray(slopes[name])[places] for name in values)
+    speeds, k = np.asarray(found.speeds), float(values["rotor.k_f"])
+    assert len(places) == 6
+    assert 2 * k * speeds @ by_mass == pytest.approx(9.81, rel=1e-9)
+    assert 2 * k * speeds @ by_k == pytest.approx(-speeds @ speeds, rel=1e-9)
 
 
 def test_modes_and_measures(linear):

@@ -244,6 +244,8 @@ def test_white_residuals_keep_their_deviations():
         found = stm.analysis.identify(
             line, line(jnp.array([1.0, 2.0])) + size * noise, [0.1], [0.5, 1.0], [1.0, 1.0]
         )
+        record = REGRESSORS @ [1.0, 2.0] + size * noise[:, 0]
+        np.testing.assert_allclose(found.values, np.linalg.lstsq(REGRESSORS, record)[0], atol=1e-8)
         np.testing.assert_allclose(found.deviations.white, 0.1 * exact, rtol=1e-8)
         scale = 1.0 if size == 0.1 else np.sqrt(found.reduced_chi_square)
         np.testing.assert_allclose(found.standard_deviations, scale * 0.1 * exact, rtol=1e-8)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from helpers import np_rotation
 from mechanisms import pendulum
-from scipy.integrate import solve_ivp
 
 import stmuav_jax as stm
 from stmuav_jax.analysis.sensors import (
@@ -15,7 +14,6 @@ from stmuav_jax.analysis.sensors import (
     Encoder,
     Gyroscope,
     PositionFix,
-    moved_over,
     readings,
     sensed_motion_at,
 )
@@ -30,40 +28,6 @@ def copter():
     x = space.from_state(system.reference)
     v = np.array([0.1, -0.2, 0.3, 0.3, -0.2, 0.5, 1.0, -0.5, 0.2, 0.8, -1.1, 0.6])
     return space, space.retract(x, jnp.asarray(v))
-
-
-def rigid_body(system, squared, start, dt):
-    """Newton's and Euler's equations of the bare hexacopter, by SciPy to round-off."""
-    rotors = next(f for f in system.forces if isinstance(f, stm.uav.Rotors))
-    arms, spin = np.asarray(rotors.arms), np.asarray(rotors.spin)
-    mass, J = float(system.bodies.mass[0]), np.asarray(system.bodies.inertia[0])
-    com = np.asarray(system.bodies.com[0])
-    lift = float(rotors.k_f) * squared
-    force = np.array([0.0, 0.0, lift.sum()])
-    moment = np.cross(arms - com, lift[:, None] * [0.0, 0.0, 1.0]).sum(axis=0)
-    moment[2] -= float(rotors.k_tau) * spin @ squared
-
-    def rate(_, y):
-        p, v, w = y[3:7], y[7:10], y[10:]
-        e0, e = p[0], p[1:]
-        p_rate = 0.5 * np.concatenate([[-e @ w], e0 * w + np.cross(e, w)])
-        a = np_rotation(p) @ force / mass + [0.0, 0.0, -G]
-        return np.concatenate([v, p_rate, a, np.linalg.solve(J, moment - np.cross(w, J @ w))])
-
-    return solve_ivp(rate, (0, dt), start, method="DOP853", rtol=3e-14, atol=1e-16).y[:, -1]
-
-
-def test_a_step_of_the_hexacopter_is_that_of_a_rigid_body(copter):
-    """The process model against a hand-derived rigid body over 10 ms: to 1e-12."""
-    space, x = copter
-    squared = np.array([2.0e5, 2.1e5, 1.9e5, 2.05e5, 2.2e5, 1.8e5])
-    inputs = stm.inputs_of(space.system)
-    system = inputs.applied(space.system, jnp.asarray(squared))
-    end = jax.jit(lambda x: moved_over(space, x, 0.01, system, 4))(x)
-    start = np.concatenate([x.r, x.p, x.v, x.omega])
-    exact = rigid_body(space.system, squared, start, 0.01)
-    found = np.concatenate([end.r, end.p, end.v, end.omega])
-    np.testing.assert_allclose(found, exact, atol=1e-12)
 
 
 def test_sensors_of_a_turning_body(copter):

@@ -59,12 +59,6 @@ def test_misprints_change_the_accelerations(moving, variant):
     assert np.max(np.abs(wrong - right)) > 1e-4 * np.max(np.abs(right))
 
 
-def test_residuals_of_the_start(moving):
-    model = Dense(moving)
-    assert model.violation(model.start(moving)) < 1e-10
-    assert model.norm_error(model.start(moving)) < 1e-15
-
-
 @pytest.mark.parametrize(
     ("scheme", "error"),
     [

@@ -27,14 +27,6 @@ def test_energy_error_of_a_straight_line():
     assert set(failed.values()) == {None}
 
 
-def test_cheapest():
-    row = {"family": "a", "tolerance": 1e-6, "step": None, "evaluations": 1, "drift": 0.0}
-    runs = [{**row, "seconds": s, "largest": e} for s, e in ((2.0, 1e-9), (1.0, 1e-6), (0.5, None))]
-    assert long_horizon.cheapest(runs, 1e-6)["a"]["seconds"] == 1.0
-    assert long_horizon.cheapest(runs, 1e-8)["a"]["seconds"] == 2.0
-    assert long_horizon.cheapest(runs, 1e-10) == {"a": None}
-
-
 @pytest.mark.slow
 def test_symmetric_methods_are_kept():
     """The former record's runs and comparison stand beside new runs, which they do not touch."""

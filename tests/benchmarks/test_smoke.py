@@ -1,9 +1,12 @@
 """Benchmark scripts at their smallest size: each leaves a complete record, and figures or a page."""
 
+import itertools
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from problems.multirotor_flights import VALUES
 from shared.record import RESULTS
 
 pytestmark = pytest.mark.slow
@@ -117,12 +120,25 @@ def test_suite(run_script, tmp_path):
     assert "smallest size" in text
 
 
-def test_flight_logs(run_script):
+def test_flight_logs(run_script, monkeypatch):
+    """Of made-up answers, alternately two deviations above the truth and at it; tests/uav identifies flights."""
+    answers = itertools.cycle([2.0, 0.0])
+
+    def identify(record, layout):
+        off = next(answers)
+        estimates = {
+            name: SimpleNamespace(value=value + off * 0.1, deviation=0.1, white=0.05)
+            for name, value in VALUES.items()
+        }
+        p_values = {"lag": 1e-3 if off else 0.5, "sag": 0.5}
+        verdict = SimpleNamespace(p_values=p_values, status="consistent")
+        return SimpleNamespace(estimates=estimates, verdict=verdict)
+
+    monkeypatch.setattr("stmuav_jax.uav.identify_flight", identify)
     record = run_script("flight_logs")
-    assert {row["quantity"] for row in record["estimates"]} >= {
-        "roll",
-        "thrust",
-        "imu_z",
-        "free_centre_x",
-    }
-    assert [row["flights"] for row in record["said"]] == [2, 2, 1, 1]
+    assert {row["quantity"] for row in record["estimates"]} == set(VALUES)
+    row = record["estimates"][0]
+    assert (row["flights"], row["cover_95"], row["over_white"]) == (2, 0.5, 2.0)
+    assert row["mean_in_deviations"] == pytest.approx(1.0)
+    found = [(row["flights"], row["share"]) for row in record["said"]]
+    assert found == [(2, 0.5), (2, 0.0), (1, 1.0), (1, 0.0)]

@@ -9,7 +9,6 @@ import pytest
 
 from stmuav_jax.checks.errors import SettingError
 from stmuav_jax.cli import identify, main as cli, simulate, trim, tune
-from stmuav_jax.cli.options import Number
 from stmuav_jax.cli.output import INTERRUPTED
 
 NUMBERS = (
@@ -153,20 +152,16 @@ def test_one_boundary(error, code, words, monkeypatch, capsys, tmp_path):
     ("words", "what"),
     [
         ("trim --speed 1e10", "speed must lie within"),
-        ("trim --climb -1e300", "speed must lie within"),
         ("trim --force nan", "limit of the force must be finite"),
         ("trim --by", "--by needs at least one value"),
         ("estimate --seed -1", "seed must lie within 0"),
-        (f"estimate --seed {'9' * 26}", "seed must lie within 0"),
         ("estimate --seeds 10000000000", "number of runs must lie within 1"),
         ("tune hold spin --segments 0", "number of segments must lie within 1"),
-        ("tune hold spin --segments 1000000000", "number of segments must lie within 1"),
         ("tune hold spin --t1 nan", "end of the time span must be finite"),
         ("tune slew spin --reaction -5", "limit of the force must be above 0"),
         (f"simulate spin --max-steps {'9' * 23}", "max"),
         ("simulate spin --save-every 5e-324", "save"),
         ("simulate spin --max-step 0", "largest step must be above 1e-12"),
-        ("simulate spin --max-step nan", "largest step must be finite"),
         ("simulate spin --first-step -1", "first step must be above 1e-12"),
         ("simulate spin --jump-times 0.1 inf", "time of a jump must be finite"),
         ("simulate spin --jump-times", "--jump-times needs at least one value"),
@@ -187,24 +182,11 @@ def test_what_was_once_taken_in_silence_or_broke(words, what, stubbed, capsys, m
     assert not stubbed
 
 
-def test_words_of_a_range():
-    number = Number("speed", "m/s", -1.0, 2.0)
-    with pytest.raises(SettingError, match=r"speed must lie within -1 and 2 m/s, but it is 3 m/s"):
-        number.check(3, "--speed")
-    number.check((0.0, None, 2), "--speed")
-    with pytest.raises(SettingError, match="must be above 0 s, but it is 0 s"):
-        Number("time", "s", above=0.0).check(0.0, "--t1")
-    with pytest.raises(
-        SettingError, match="must be at least 1, but it is a whole number of about 4001 digits"
-    ):
-        Number("count", "", low=1).check(-(10**4000), "--n")
-
-
 @pytest.mark.slow
 def test_an_interrupted_command_ends_with_its_code(tmp_path):
     """Ctrl-C while XLA compiles or runs: 130 or the code of a saved part, and never a signal's."""
     command = [sys.executable, "-P", "-m", "stmuav_jax", "simulate", "hexacopter"]
-    for seconds in (1.0, 1.5, 4.0, 6.5):
+    for seconds in (1.0, 4.0):
         process = subprocess.Popen(
             command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )

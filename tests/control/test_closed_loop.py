@@ -106,27 +106,6 @@ def test_fixed_steps_of_the_default_method_are_too_long_for_a_stiff_loop():
 
 
 @pytest.mark.slow
-def test_a_hexacopter_flies_the_same_way_implicitly():
-    """Along a circle with a climb, by diffrax's Kvaerno5 and by the default fixed steps."""
-    path = control.follow_path(lambda t: jnp.stack([jnp.cos(2 * t) - 1.0, jnp.sin(2 * t), 0.2 * t]))
-    scene = stm.make_scene("hexacopter")
-    pilot = stm.uav.FlightController(scene.system, 100.0)
-    ends = {}
-    for name, method, steps in (
-        ("implicit", stm.Method(solver=diffrax.Kvaerno5(), **TIGHT), None),
-        ("fixed", None, 2),
-    ):
-        plant = control.Plant(scene, rate=100.0, method=method, steps=steps)
-        ends[name] = control.close_loop(
-            plant, pilot, 1.0, reference=path, memory=pilot.start(), balances=False
-        )
-    for field in ("r", "p", "v", "omega"):
-        one, other = (getattr(end.states, field) for end in ends.values())
-        # two fixed steps of order 4 in 10 ms leave 3e-7 rad/s
-        np.testing.assert_allclose(one, other, atol=1e-6)
-
-
-@pytest.mark.slow
 def test_adaptive_steps_are_safe_for_derivatives_unless_told_otherwise():
     """At rest, where the state has no error: by the held input, as the matrix exponential has it."""
     system, _ = spring_mass()

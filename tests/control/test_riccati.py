@@ -83,24 +83,6 @@ def assert_same(one, other):
     np.testing.assert_allclose(np.sort_complex(one), np.sort_complex(other), rtol=1e-7)
 
 
-def test_gains_meet_the_riccati_equation(systems):
-    """The residual of the continuous equation, and of the held one by its two forms."""
-    for linear in systems:
-        n, m = linear.B.shape
-        Q, R = np.eye(n), 0.2 * np.eye(m)
-        found = control.regulator(linear, Q, R)
-        S, K, A, B = found.S, found.K, linear.A, linear.B
-        left = A.T @ S + S @ A - K.T @ R @ K + Q
-        np.testing.assert_allclose(left, 0.0, atol=1e-9 * np.max(np.abs(S)))
-        found = control.regulator(linear, Q, R, rate=RATE)
-        A, B = control.held_matrices(A, B, 1 / RATE)
-        S, K, closed = found.S, found.K, A - B @ found.K
-        cost = (Q + K.T @ R @ K) / RATE
-        np.testing.assert_allclose(
-            closed.T @ S @ closed + cost, S, rtol=1e-8, atol=1e-9 * np.max(S)
-        )
-
-
 @pytest.mark.filterwarnings("ignore:invalid value encountered in cast")  # SciPy's, of its scaling
 @pytest.mark.parametrize(
     ("Q", "R", "rate", "words"),

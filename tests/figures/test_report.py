@@ -1,5 +1,6 @@
 """Reports of runs and filters: they show what the files hold, and nothing else is read."""
 
+import csv
 import json
 
 import numpy as np
@@ -10,11 +11,12 @@ from matplotlib.figure import Figure
 
 import stmuav_jax as stm
 from stmuav_jax.cli.main import main
-from stmuav_jax.dynamics.loads import run_loads
+from stmuav_jax.dynamics import envelope
+from stmuav_jax.dynamics.loads import COMPONENTS, run_loads
 from stmuav_jax.figures import report
-from stmuav_jax.figures.filter_record import FORMAT, FORMAT_VERSION, record_content
-from stmuav_jax.figures.run import FIGURES, saved_loads
-from stmuav_jax.io.netcdf import _SEAL_LENGTH, label_table, save_labelled
+from stmuav_jax.figures.filter_record import record_content
+from stmuav_jax.figures.run import FIGURES, HEADER, save_loads, saved_loads
+from stmuav_jax.io.netcdf import _SEAL_LENGTH
 
 # --- runs
 
@@ -42,6 +44,23 @@ def test_figures_of_a_saved_run_are_those_of_the_run(short_run, saved):
     size = np.max(np.abs(exact.force))
     np.testing.assert_allclose(loads.force, exact.force, atol=1e-13 * size)
     np.testing.assert_allclose(loads.moment, exact.moment, atol=1e-13 * size)
+
+
+def test_csv_holds_every_component_of_every_joint(short_run, tmp_path):
+    loads = run_loads(short_run)
+    path = save_loads(short_run.scene, loads, tmp_path / "loads.csv")
+    with open(path, newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    assert tuple(header) == HEADER
+    assert len(rows) == 8 * len(COMPONENTS)
+    found = envelope(loads)
+    k, c = loads.joints.index("R14"), COMPONENTS.index("M_y")
+    row = next(r for r in rows if r[0] == "R14" and r[4] == "M_y")
+    assert row[1:4] == ["revolute", "hexacopter_1", "post_4"]
+    assert row[5] == "N m"
+    assert float(row[6]) == pytest.approx(float(found.minimum[k, c]), rel=1e-5)
+    assert float(row[8]) == pytest.approx(float(found.maximum[k, c]), rel=1e-5)
+    assert float(row[9]) == pytest.approx(float(found.t_maximum[k, c]), rel=1e-5)
 
 
 @pytest.mark.slow
@@ -118,49 +137,6 @@ def test_report_of_a_filter_on_a_model(tmp_path, biased, monkeypatch):
     assert ("Inconsistent" in text) == biased
     error = np.sqrt(np.mean(arrays["error"][-1, 0] ** 2))
     assert f"hinge.angle [rad], filter {error:.4g} 0.1" in text
-
-
-def case(hover=False):
-    """Dataset with the layout of estimate.nc or hover.nc, of two tunings."""
-    rng = np.random.default_rng(4)
-    truth = rng.standard_normal((40, 5, 6))
-    error = np.stack([np.full((40, 5, 6), 0.1), 0.01 * rng.standard_normal((40, 5, 6))])
-    path = ("time", "component", "seed")
-    each, scalar = ("tuning", *path), ("tuning", "time", "seed")
-    chi = lambda n: np.sum(rng.standard_normal((2, 40, n, 6)) ** 2, axis=2)
-    table = {
-        "truth": (path, truth, "rad/s, m", "truth"),
-        "estimate": (each, truth + error, "rad/s, m", "means"),
-        "standard_deviation": (each, np.full(error.shape, 0.01), "rad/s, m", "own"),
-        "nees": (scalar, chi(14 if hover else 5), "1", "NEES"),
-        "nis": (scalar, chi(6 if hover else 3), "1", "NIS"),
-        "ok": (scalar, np.ones((2, 40, 6), bool), "1", "ok"),
-    }
-    if hover:
-        table["position"] = (("tuning", "time", "axis", "seed"), np.zeros((2, 40, 3, 6)), "m", "")
-        table["truth"] = (each, np.stack([truth, truth]), "rad/s, m", "truth")
-    names = ["Omega_x", "Omega_y", "Omega_z", "offset_x", "offset_y"]
-    verdict = {"status": "inconsistent", "explanation": "6 of 6 runs are inconsistent."}
-    summaries = {
-        "report": {"verdict": verdict, "rmse": [0.001, 0.002], "nees": 80.0, "to_2cm": np.nan}
-    }
-    return label_table(
-        table, {"time": 0.02 * np.arange(1, 41), "tuning": ["report", "consistent"], "component": names},
-        format=FORMAT, format_version=FORMAT_VERSION, title="Report Part III, case 4", summaries=summaries,
-    )  # fmt: skip
-
-
-def test_report_of_the_filters_of_a_case(tmp_path):
-    """Of a case and of a hover; each tuning has a verdict and its errors."""
-    for name in ("estimate.nc", "hover.nc"):
-        folder = tmp_path / name
-        folder.mkdir()
-        save_labelled(case("hover" in name), folder / name)
-        assert main(["view", str(folder), "--report", str(folder / "report.html")]) == 0
-        page, text = read(folder / "report.html")
-        assert len(page.sources) == 1
-        assert "Report tuning: inconsistent. 6 of 6 runs are inconsistent." in text
-        assert "Omega_x [rad/s], report 0.1 0.01" in text
 
 
 # --- what is no result

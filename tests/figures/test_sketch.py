@@ -61,15 +61,6 @@ def test_names_in_a_sketch_do_not_overlap(model, counts):
         assert max(areas) < 1
 
 
-def test_a_sketch_is_beside_the_results_of_simulate(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["view", "uav_tracker", "--no-cache"]) == 0
-    assert Path("runs/uav_tracker_2/mechanism.png").is_file()
-    monkeypatch.setenv("COLUMNS", "200")
-    assert cli.main(["view", "uav_tracker", "--help"]) == 0
-    assert "runs/SCENE_CASE or runs/MODEL" in capsys.readouterr().out
-
-
 def test_links_of_a_floating_platform_are_apart(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     words = ["view", str(MODELS / "stewart_platform.toml"), "--out", str(tmp_path), "--no-cache"]

@@ -54,10 +54,10 @@ def test_a_servo_too_fast_for_its_delay_is_refused_with_the_fastest_that_is_stab
     # stiffness and damping of the strokes, which know no masses
     with pytest.raises(stm.SettingError, match=r'servo = \{ kind = "strokes", stiffness = '):
         missions.make_mission(plain | {"controller": {"servo": {"kind": "strokes"}}})
-    # position and attitude, with motors that follow late too
-    motors = {"machine": {"scene": "uav_tracker", "options": {"motor": {}}}}
+    # position and attitude, of a machine without a panel
+    bare = {"machine": {"scene": "hexacopter"}, "rates": {"delay": 0.1}, "panel": []}
     with pytest.raises(stm.SettingError, match=r"position and attitude.*gains = \{ position = "):
-        missions.make_mission(plain | motors | {"rates": {"delay": 0.02}})
+        missions.make_mission(plain | bare)
 
 
 @pytest.mark.slow

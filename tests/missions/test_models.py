@@ -2,15 +2,12 @@
 
 import json
 import pickle
-import tomllib
 from typing import Any
 
 import numpy as np
 import pytest
 
 import stmuav_jax as stm
-from stmuav_jax.cli.fly import NOT_KEPT
-from stmuav_jax.cli.main import main
 
 missions = stm.missions
 
@@ -128,7 +125,7 @@ def test_an_own_machine_flies_in_gusts_and_moves_its_gimbal(flight, data):
 @pytest.mark.slow
 def test_hinges_and_slides_have_their_units_and_any_number_of_joints_is_drawn(tmp_path):
     parts = [(MODEL.split("[joints]")[0], "", "")]
-    for k in range(3):
+    for k in range(2):
         body = f"bodies = ['frame', 'ballast_{k}']"
         parts.append((
             f"ballast_{k} = {{mass = 0.1, inertia = [2e-4, 2e-4, 2e-4], position = [0, 0, {0.1 * k}]}}",
@@ -142,7 +139,7 @@ def test_hinges_and_slides_have_their_units_and_any_number_of_joints_is_drawn(tm
     moves = [{"joint": "rail_1", "to": 0.05, "at": 0.0}]
     flight = missions.fly(missions.make_mission(changed(t1=0.1, joints=moves), tmp_path))
     data = missions.to_data(flight)
-    order = ["m", "m", "m", "rad", "rad"]
+    order = ["m", "m", "rad", "rad"]
     assert list(data.driven_joint_unit.values) == order
     efforts = [{"m": "N", "rad": "N m"}[unit] for unit in order]
     assert list(data.driven_joint_effort_unit.values) == efforts
@@ -150,13 +147,7 @@ def test_hinges_and_slides_have_their_units_and_any_number_of_joints_is_drawn(tm
     assert (
         data.commanded_effort.units == data.highest_effort.units == "see driven_joint_effort_unit"
     )
-    axes = missions.flight_figures(data)["joints"].axes
-    assert [ax.get_ylabel() for ax in axes] == [
-        "joints [degrees]", "error [degrees]", "joints [m]", "error [m]",
-    ]  # fmt: skip
-    assert [len(ax.lines) for ax in axes] == [4, 2, 6, 3]
-    curve = axes[2].lines[1]
-    assert curve.get_label() == "rail_1"
+    curve = missions.flight_figures(data)["joints"].axes[2].lines[1]
     np.testing.assert_array_equal(curve.get_ydata(), data.joint_position.values[:, 1])
 
 
@@ -236,15 +227,6 @@ def test_wind_without_drag_says_what_the_model_needs(tmp_path):
         missions.make_mission(MISSION, tmp_path)
 
 
-STUDY = """
-kind = "missions"
-mission = "own_mission.toml"
-samples = 16
-factors.camera = {distribution = "empirical", values = [1.0, 1.2, -1.0, 1.1], relative = true}
-factors.k_f = {distribution = "uniform", low = 0.95, high = 1.05, relative = true}
-"""
-
-
 @pytest.fixture(scope="module")
 def study(folder):
     # the table of the samples: the machine itself first
@@ -288,17 +270,3 @@ def test_a_study_of_a_model_names_its_parameters(study, folder):
         missions.make_mission_study(study.evaluate.mission, {"label": 1.0})
     with pytest.raises(stm.SettingError, match=r"'camra' is no parameter of own.*'camera'"):
         missions.make_mission_study(study.evaluate.mission, {"camra": 1.0})
-
-
-@pytest.mark.slow
-def test_the_commands_fly_and_study_an_own_machine(folder, monkeypatch, capsys):
-    monkeypatch.chdir(folder)
-    content = tomllib.loads(STUDY)
-    assert content["mission"] == "own_mission.toml"
-    lines = ["format = 1", "t1 = 0.5", 'machine = {model = "own.toml"}', "rates = {control = 200.0}",
-             "wind = {steady = [2, 0, 0], gusts = {}}", "tolerances = {position = 1e-9}"]  # fmt: skip
-    (folder / "own_mission.toml").write_text("\n".join(lines))
-    (folder / "study.toml").write_text(STUDY)
-    assert main(["fly", "own_mission.toml", "--figures", "none"]) == NOT_KEPT
-    assert main(["montecarlo", "study.toml", "--figures", "none"]) == 0
-    assert "largest error of joint pitch" in capsys.readouterr().out

@@ -16,9 +16,7 @@ from studies.toy import Precise, Toy, contents
 
 import stmuav_jax
 from stmuav_jax.checks.errors import SettingError, SimulationError
-from stmuav_jax.io.netcdf import FileError
 from stmuav_jax.studies import StudyProgress, open_store
-from stmuav_jax.studies.store import computing_versions, create_store
 
 distributed = pytest.importorskip("distributed")
 
@@ -182,16 +180,6 @@ def test_a_work_that_fails(tmp_path, outside):
     with pytest.raises(RuntimeError, match="a bug"):
         work.run(tmp_path / "s.zarr", 20, scheduler=outside.address, chunk=5)
     assert open_store(tmp_path / "s.zarr").finished == 0
-
-
-@pytest.mark.slow
-def test_other_versions_are_refused(tmp_path, outside):
-    path = tmp_path / "study.zarr"
-    create_store(path, WORK, 20, 5, computing_versions() | {"jax": "0.0.1"}).close()
-    with pytest.raises(FileError, match=r"computed by other code.*versions\.jax is \"0\.0\.1\""):
-        WORK.run(path, 20, scheduler=outside.address, resume=True)
-    with pytest.raises(FileError, match="exists: resume it"):
-        WORK.run(path, 20, scheduler=outside.address)
 
 
 def test_no_scheduler(tmp_path):

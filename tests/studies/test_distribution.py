@@ -80,11 +80,8 @@ REFUSED = {
         {"distribution": "normal", "mean": 0.0, "standard_deviation": -0.1},
         "'standard_deviation' must be greater than 0, but it is -0.1",
     ),
-    "zero": ({"distribution": "weibull", "scale": 0.0, "shape": 1.0}, "greater than 0"),
-    "not a number": ({"distribution": "normal", "mean": "0", "standard_deviation": 1.0}, "must be a number"),
     "true": ({"distribution": "constant", "value": True}, "must be a number"),
     "nan": ({"distribution": "constant", "value": float("nan")}, "must be a finite number"),
-    "infinite": ({"distribution": "uniform", "low": 0.0, "high": float("inf")}, "must be a finite number"),
     "order": (
         {"distribution": "uniform", "low": 2.0, "high": 1.0},
         "low must be below high, but it has low = 2, high = 1",
@@ -100,7 +97,6 @@ REFUSED = {
     "weights": ({"distribution": "choice", "values": [1, 2], "weights": [1]}, "one weight"),
     "weight": ({"distribution": "choice", "values": [1], "weights": [0]}, "'weights.0' must be greater than 0"),
     "empty": ({"distribution": "empirical", "values": []}, "at least 1 item"),
-    "no list": ({"distribution": "empirical", "values": 3}, "must be a list"),
     "in a list": ({"distribution": "empirical", "values": [1.0, float("inf")]}, "'values.1' must be a finite number"),
 }  # fmt: skip
 
@@ -131,8 +127,6 @@ def test_scipys_frozen_distributions():
         (st.norm(0.0, -1.0), "draws that are not finite"),
         (st.norm(0.0, np.ones(2)), "'scale' must be a number"),
         (st.rv_histogram(np.histogram([1.0, 2.0, 2.0]))(), "not one of scipy.stats"),
-        ({"distribution": "scipy.gama", "a": 1.0}, "no distribution 'scipy.gama'"),
-        ({"distribution": "scipy.gamma"}, "needs 'a'"),
         ({"distribution": "scipy.gamma", "a": 1.0, "sale": 1.0}, "Did you mean 'scale'"),
         ({"distribution": "scipy.bootstrap"}, "no distribution"),
     ],

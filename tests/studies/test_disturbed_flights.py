@@ -66,12 +66,6 @@ def test_where_factors_go():
     assert of.entry("rotor.k_f").unit == PART_II["rotor.k_f"].unit
 
 
-def test_a_sampled_product_of_inertia_keeps_the_tensor_symmetric():
-    table = make_flights("hexacopter")._draw_table({"bare.inertia[0, 1]": jnp.asarray(0.002)})
-    inertia = np.asarray(table.value("bare.inertia"))
-    assert inertia[0, 1] == inertia[1, 0] == 0.002
-
-
 def test_inputs():
     of = make_flights("uav_tracker", 2)
     plain = of.build({})[0].forces

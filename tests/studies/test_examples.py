@@ -6,6 +6,7 @@ import pytest
 from stmuav_jax import SettingError
 from stmuav_jax.studies import READY, load_builtin_study, make_study
 from stmuav_jax.studies.estimates import LANES
+from stmuav_jax.studies.study_file import check_study
 from stmuav_jax.uav import consistent_tuning, study_case
 
 
@@ -20,7 +21,12 @@ def test_every_kind_of_ready_study_is_a_study(name):
     roles = [column.role for column in study.columns.values()]
     assert roles.count("status") == 1
     assert all(axis in study.axes for c in study.columns.values() for axis in c.dims)
-    assert all(each["samples"] >= 1000 for each in READY.values())
+
+
+def test_ready_studies_fit_the_schema():
+    for name, entries in READY.items():
+        check_study(load_builtin_study(name))
+        assert entries["samples"] >= 1000
 
 
 @pytest.mark.slow

@@ -194,10 +194,7 @@ class Doubled(AbstractStabilisation):
     ("method", "words"),
     [
         (Method(solver=diffrax.Kvaerno5()), r"Dopri8\(\) or Tsit5\(\), not Kvaerno5"),
-        (Method(solver="auto"), r"Dopri8\(\) or Tsit5\(\), not auto"),
         (Method(event=lambda t, state: t - 1.0), "cannot have 'event'"),
-        (Method(jump_ts=[0.1]), "cannot have 'jump_ts'"),
-        (Method(balances=True), "cannot have 'balances'"),
         (Method(rtol=2.0), "'rtol' must be at most 1"),
         (Method(max_steps=2**40), "'max_steps' must be at most"),
         (Method(stabilisation=Doubled()), "numbers and texts, but Doubled has 'inner'"),
@@ -332,14 +329,11 @@ def test_a_mechanism_with_closed_loops_as_flights_one_by_one():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"scen": "x"}, "Did you mean 'scene'"),
         ({"quantities": {}}, "has no quantities"),
-        ({"quantities": {"a": {"signal": "tlt", "take": "final"}}}, "Did you mean 'tilt'"),
         ({"quantities": {"a": {"signal": "tilt", "take": "final", "level": 1.0}}}, "no level"),
         ({"quantities": {"a": {"signal": "tilt", "take": "when_above"}}}, "needs a level"),
         ({"quantities": {"steps": {"signal": "tilt", "take": "final"}}}, "names of other columns"),
         ({"direction": [0.0, 0.0, 2.0]}, "unit vector"),
-        ({"rtol": 1e-16}, "at least 1e-15"),
     ],
 )
 def test_bad_studies(change, words):

@@ -63,13 +63,6 @@ def test_peaks_and_crossings_of_sines():
     assert np.max(np.abs(np.asarray(monitor.crossings.times()) - exact)) < 1.5 * bound / slope
 
 
-def test_never_and_first():
-    f = lambda t: jnp.stack([jnp.sin(t) - 1.5, jnp.sin(3 * t) - 0.5])
-    times = watched(f, np.linspace(0.0, 8.0, 200)).crossings.times()
-    assert np.isinf(times[0])
-    assert times[1] == pytest.approx(np.arcsin(0.5) / 3, abs=1e-6)
-
-
 def test_a_crossing_within_a_step_is_seen():
     """Up and down again between two steps that both lie below."""
     f = lambda t: jnp.stack([0.2 - (t - 0.5) ** 2])

@@ -13,7 +13,7 @@ from studies.toy import Toy, contents
 
 from stmuav_jax.checks.errors import SettingError, SimulationError
 from stmuav_jax.io.netcdf import FileError
-from stmuav_jax.studies import StudyProgress, make_study, open_store
+from stmuav_jax.studies import StudyProgress, open_store
 
 HERE = Path(__file__).parent
 WORK = Toy(seed=7)
@@ -242,23 +242,3 @@ def test_memory_is_that_of_a_chunk(tmp_path):
     small, large = map(float, done[1:])
     assert done[0] == "1000000"
     assert large < small + 40
-
-
-@pytest.mark.slow
-def test_changes_of_devices_give_the_same_files(tmp_path):
-    """A study of flights that is resumed on other numbers of cores."""
-    plain = {
-        "scene": "hexacopter", "t1": 0.02, "seed": 4,
-        "factors": {"start.p": {"distribution": "normal", "mean": 0.0, "standard_deviation": 3.0}},
-        "quantities": {"tilt": {"signal": "tilt", "take": "largest"}},
-    }  # fmt: skip
-    first = make_study(plain, block=16, lanes=8, devices=1)
-    first.run(tmp_path / "unbroken.zarr", 200, chunk=20)
-    path = tmp_path / "study.zarr"
-    for devices, end in ((1, 40), (2, 80), (5, 140), (3, 200)):
-        work = make_study(plain, block=16, lanes=8, devices=devices)
-        vars(work)["_compiled"] = first._compiled  # pyright: ignore[reportIndexIssue]
-        work.run(path, end, chunk=20, resume=True)
-    assert contents(path) == contents(tmp_path / "unbroken.zarr")
-    with pytest.raises(FileError, match="lanes is 8 there and 16 here"):
-        make_study(plain, lanes=16).run(path, 200, resume=True)

@@ -1,7 +1,6 @@
 """Study files with odd entries: one clear error in the user's words, never a traceback or a wait."""
 
 import copy
-import random
 import re
 import shutil
 import time
@@ -10,11 +9,10 @@ from pathlib import Path
 import pytest
 
 from stmuav_jax.checks.errors import ModelError, SettingError
-from stmuav_jax.checks.schema import format_value, name_fault
+from stmuav_jax.checks.schema import name_fault
 from stmuav_jax.io.netcdf import FileError
 from stmuav_jax.studies import disturbed_flights
-from stmuav_jax.studies.examples import READY, load_builtin_study
-from stmuav_jax.studies.study_file import check_study, load_study, make_study
+from stmuav_jax.studies.study_file import load_study, make_study
 from stmuav_jax.uav import make_scene
 
 NORMAL = {"distribution": "normal", "mean": 0.0, "standard_deviation": 0.3}
@@ -127,46 +125,23 @@ def test_a_thousand_odd_studies(scenes_made_once):
     assert taken < 0.2 * len(cases)
 
 
-def test_many_changes_at_once(scenes_made_once):
-    rng = random.Random(3)
-    everywhere = places(BASE)
-    for _ in range(200):
-        plain = copy.deepcopy(BASE)
-        for path in rng.sample(everywhere, 3):
-            table = plain
-            try:
-                for key in path[:-1]:
-                    table = table[key]
-                table[path[-1]] = rng.choice(VALUES)
-            except (TypeError, KeyError, IndexError):
-                continue
-        judged(plain)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"inputs": "nope"}, "'inputs' must be 'case' or 'trim', but it is 'nope'"),
-        ({"inputs": 3}, "'inputs' must be 'case' or 'trim', but it is 3"),
         ({"inputs": "Case"}, "Did you mean 'case'"),
-        ({"drag": "no"}, "'drag' must be true or false, but it is 'no'"),
         ({"gusts": 1}, "'gusts' must be true or false"),
         ({"samples": True}, "'samples' must be a whole number, but it is True"),
         ({"samples": 10**31}, "'samples' must be at most 1000000000000"),
-        ({"samples": 0}, "'samples' must be at least 1, but it is 0"),
         ({"max_steps": float("nan")}, "'max_steps' must be a whole number"),
-        ({"rtol": 1e308}, "'rtol' must be at most 1"),
-        ({"t1": 1e308}, "'t1' must be at most 1000000"),
         ({"every": 1e-300}, "more than 100,000"),
         ({"direction": [0, 1]}, "'direction' must have more entries"),
         ({"name": "../../up"}, "'name' must begin with neither a dot"),
-        ({"name": "a/b"}, "'name' must have no separators"),
         ({"lanes": 12}, "'lanes' must be a multiple of 8"),
         ({"failure": {"quantity": "ovr"}}, "Did you mean 'over'"),
         ({"failure": {"quantity": "tilt"}}, "needs a limit"),
         ({"failure": {"quantity": "path", "above": 1.0}}, "no quantity with one number"),
         ({"quantities": {"a b": {"signal": "tilt", "take": "final"}}}, "letters, digits and _"),
-        ({"quantities": {"a": {"signal": "tilt", "take": "fial"}}}, "Did you mean 'final'"),
         ({"quantities": {"a": {"signal": "tilt"}}}, "'quantities.a' needs 'take'"),
         ({"quantities": {"a": {"signal": "tilt", "take": "final", "levl": 1}}},
          "'quantities.a' has no entry 'levl'. Did you mean 'level'"),
@@ -175,8 +150,6 @@ def test_many_changes_at_once(scenes_made_once):
         ({"factors": {"start.p": {"distribution": "uniform", "low": -1e308, "high": 1e308}}},
          "draws that are not finite"),
         ({"factors": {"bare.inertia[0,]": 1.0}, "correlation": []}, "must name one entry"),
-        ({"factors": {"bare.inertia[0, 1]": 0.0, "bare.inertia[1, 0]": 0.0}, "correlation": []},
-         "are the same number"),
         ({"factors": {"bare.inertia[0, 1]": 0.0, "bare.inertia[0,1]": 0.0}, "correlation": []},
          "are the same number"),
     ],
@@ -185,12 +158,6 @@ def test_words(change, words):
     with pytest.raises(SettingError) as caught:
         make_study(BASE | change)
     assert words in str(caught.value)
-
-
-def test_ready_studies_fit_the_schema():
-    for name in READY:
-        check_study(load_builtin_study(name))
-    assert load_builtin_study("collapse")["failure"] == {"quantity": "collapse"}
 
 
 @pytest.mark.parametrize(
@@ -245,14 +212,10 @@ mission = "hover"
     ("content", "old", "new", "words"),
     [
         (FLIGHTS, "log_standard_deviation", "standard_deviation", "no entry .standard_deviation."),
-        (FLIGHTS, "median = 1.0", 'median = "1"', "'median' must be a number"),
         (FLIGHTS, "median = 1.0", "median = -1.0", "'median' must be"),
-        (FLIGHTS, "lognormal", "lognorm", "no distribution 'lognorm'.*lognormal"),
         (FLIGHTS, ", level = 0.5", "", "'when_above' of signal 'tilt' needs a level"),
-        (FLIGHTS, "[factors]", 'inputs = "constant"\n[factors]', "'inputs' must be"),
         (FLIGHTS, "[factors]", 'design = "latin"\nstratum = 0\n[factors]', "'stratum' must be"),
         (FLIGHTS, "[factors]", 'kind = "flight"\n[factors]', "kind is flights, estimation, or"),
-        (MISSIONS, "standard_deviation", "deviation", "no entry .deviation."),
         (MISSIONS, "mission =", "missions =", "no entry .missions."),
     ],
 )
@@ -265,10 +228,3 @@ def test_a_study_is_checked_whole_when_it_is_loaded(tmp_path, content, old, new,
     path.write_text(content.replace(old, new))
     with pytest.raises(SettingError, match=rf"study\.toml: .*{words}"):
         load_study(path)
-
-
-def test_values_are_shortened():
-    assert format_value("x" * 10_000).startswith("'xxx")
-    assert all(len(format_value(value)) <= 80 for value in VALUES)
-    assert format_value(10**400) == "a whole number of about 401 digits"
-    assert format_value(list(range(100))) == "[0, 1, 2, 3, 4, 5, ...]"

@@ -137,7 +137,6 @@ def test_every_type_and_axes(tmp_path):
         ({}, {}, "needs a column 'status'"),
         ({"status": Column("int32", "1", "", "status")}, {}, "needs a column 'status'"),
         (STATUS | {"../x": Column("float64", "m", "")}, {}, "'../x' cannot name"),
-        (STATUS | {"sample": Column("float64", "m", "")}, {}, "'sample' cannot name"),
         (STATUS | {"leg": Column("float64", "m", "")}, AXES, "'leg' cannot name"),
         (STATUS | {"x": Column("object", "m", "")}, {}, "'x' has type object"),
         (STATUS | {"x": Column("float64", "m", "", dims=("arm",))}, AXES, r"not given: \['arm'\]"),

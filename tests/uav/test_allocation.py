@@ -42,13 +42,6 @@ def test_idealised_mixing_is_the_wrench_map_of_a_hexagon():
     np.testing.assert_allclose(B, units @ MIXING, rtol=0, atol=1e-20)
 
 
-def test_printed_moments_are_no_machines():
-    """Rows of B_M as printed: equal speeds would roll and pitch."""
-    printed = np.array([[HALF, -1, HALF, HALF, 1, HALF], [ROOT, 0, ROOT, ROOT, 0, -ROOT]])
-    np.testing.assert_allclose(printed.sum(axis=1), [2, 2 * ROOT])
-    np.testing.assert_allclose(MIXING[1:].sum(axis=1), 0, atol=1e-15)
-
-
 def inverse_as_printed(length, k):
     """Eq. 4.10, with k = k_f l / k_tau."""
     r = np.sqrt(3)

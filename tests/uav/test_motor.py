@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import derivative_size, np_rotation, relative_error, scene_of, state_of
+from helpers import np_rotation, relative_error, scene_of, state_of
 from scipy.integrate import solve_ivp
 
 import stmuav_jax as stm
-from stmuav_jax.mechanics.internal import internal_states, with_internal
+from stmuav_jax.mechanics.internal import internal_states
 
 MASS, INERTIA = 1.4, np.array([0.02, 0.03, 0.05])
 ARMS = 0.3 * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
@@ -228,28 +228,6 @@ def test_a_run_with_joints_motors_and_certificate():
         jnp.asarray(one.internal),
     )  # fmt: skip
     assert relative_error(loads.force, stm.dynamics.run_loads(runs[0]).force) < 1e-9
-
-
-def test_states_can_be_set_and_read():
-    motors = stm.uav.MotorRotors(rotors(FULL**2), time_constant=TAU)
-    made = system(motors)
-    np.testing.assert_allclose(internal_states(made), FULL, rtol=1e-14)
-    other = with_internal(made, jnp.asarray(START))
-    np.testing.assert_array_equal(internal_states(other), START)
-    assert motors.internal_names()[1] == "hull: speed of rotor 2 [rad/s]"
-
-
-def test_each_part_costs_only_where_it_is_used():
-    plain = rotors(FULL**2)
-    bare, size = derivative_size(system(plain))
-    wrapped, same = derivative_size(system(stm.uav.MotorRotors(plain)))
-    inertia, still = derivative_size(system(stm.uav.MotorRotors(plain, inertia=J)))
-    lagging, larger = derivative_size(system(stm.uav.MotorRotors(plain, time_constant=TAU)))
-    assert same == still == size
-    assert larger == size + 4
-    assert bare < wrapped < bare + 16  # a square root that may be zero, and its square
-    assert wrapped < inertia
-    assert bare < lagging
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_motion_estimator import instruments
 
 import stmuav_jax as stm
 
@@ -29,16 +30,6 @@ def test_a_mode_that_the_outputs_do_not_see_is_named():
         control.check_observable(measured([0.0, 1.0, 1.0]))
     with pytest.raises(stm.ModelError, match=r"x \(100%\)"):
         control.check_observable(measured([0.0, 0.0, 1.0]))
-
-
-def instruments(name):
-    make = control.Instrument
-    return [
-        make(sensing.Gyroscope(name), noise=2e-3),
-        make(sensing.Accelerometer(name), noise=0.02),
-        make(sensing.PositionFix(name), rate=50.0, noise=0.01, delay=LATE),
-        make(sensing.AttitudeFix(name), rate=100.0, noise=0.01, delay=0.01),
-    ]
 
 
 def unseen(fixes):

@@ -17,12 +17,6 @@ def test_every_line_has_value_unit_and_source(table):
         assert len(line.source) > 3, key
 
 
-def test_masses_are_the_printed_ones():
-    """Report Part II, Table 5.1: 7.3653 kg in all."""
-    total = sum(PART_II.value(key) for key in PART_II if key.startswith("mass."))
-    assert total == pytest.approx(7.3653, abs=5e-5)
-
-
 def test_replaced_keeps_units_and_says_who_gave_the_value():
     table = PART_II.replaced({"mass.panel_7": 0.95})
     assert table.value("mass.panel_7") == 0.95
@@ -37,8 +31,6 @@ def test_replaced_keeps_units_and_says_who_gave_the_value():
         ({"mass.panel_8": 1.0}, "Did you mean 'mass.panel_7'"),
         ({"mass.panel_7": (1.0, 2.0)}, r"shape \(\)"),
         ({"mass.panel_7": float("nan")}, "finite"),
-        ({"mass.panel_7": "heavy"}, "numbers"),
-        ({"mass.panel_7": 0.0}, "is a mass and must be positive, but it is 0.0 kg"),
         ({"mass.panel_7": -1.0}, "is a mass and must be positive"),
         ({"mass.panel_7": 10**400}, "not a whole number of about 401 digits"),
         ({"inertia.panel_7": -np.eye(3)}, "'inertia.panel_7' must be positive definite"),

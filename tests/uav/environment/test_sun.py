@@ -195,6 +195,10 @@ def test_directions_between_frames():
     expected = np.stack([R[..., k].T @ s_w[:, k] for k in range(6)], axis=-1)
     np.testing.assert_allclose(s_b, expected, atol=1e-15)
     np.testing.assert_allclose(in_world(s_b, R), s_w, atol=1e-15)
+    # a sensor sees what place, time and attitude say
+    seen = sun_in_body(NOON, PHNOM_PENH, R[..., 0], air=Air())
+    noon = np.asarray(sun_at(NOON, PHNOM_PENH, air=Air()).s_w)
+    np.testing.assert_allclose(sensed_sun(3.7 * R[..., 0].T @ noon), seen, atol=1e-15)
     both = in_body(s_w[:, 0], R)  # one direction, many attitudes
     np.testing.assert_allclose(both[:, 3], R[..., 3].T @ s_w[:, 0], atol=1e-15)
 
@@ -211,20 +215,7 @@ def test_attitude_by_angles():
     np.testing.assert_allclose(general, expected, atol=1e-15)
 
 
-def test_both_scenarios_agree():
-    """A sensor that sees what place, time and attitude say."""
-    R = np_rotation(random_quaternion(np.random.default_rng(7)))
-    s_b = sun_in_body(NOON, PHNOM_PENH, R, air=Air())
-    s_w = sun_at(NOON, PHNOM_PENH, air=Air()).s_w
-    np.testing.assert_allclose(sensed_sun(3.7 * R.T @ np.asarray(s_w)), s_b, atol=1e-15)
-
-
 # --- bad input
-
-
-def test_a_time_without_zone_is_refused():
-    with pytest.raises(stm.SettingError, match="2024-04-25 12:00:00 has no time zone"):
-        sun_at(datetime(2024, 4, 25, 12), PHNOM_PENH)
 
 
 BERLIN = ZoneInfo("Europe/Berlin")
@@ -236,14 +227,11 @@ BERLIN = ZoneInfo("Europe/Berlin")
         ("2024-03-21T05:00", "2024-03-21 05:00:00 has no time zone"),
         ("21 March", "must be like 2024-03-21T05:00.07:00, not '21 March'"),
         (1.7e9, r"not 1700000000.0 \(float\). Unix times \[s\] are what sun_position"),
-        (np.float64(1.7e9), "Unix times"),
-        (None, "must be a datetime"),
         (date(2024, 3, 21), r"not datetime.date\(2024, 3, 21\) \(date\)"),
         (np.datetime64("2024-03-21T05:00"), "numpy.datetime64 has none"),
         ([NOON, NOON], r"single one, but its shape is \(2,\)"),
         (datetime(2024, 3, 31, 2, 30, tzinfo=BERLIN), "no time 2024-03-31 02:30:00 in Europe/Berlin"),
         (datetime(1940, 7, 1, 12, tzinfo=UTC), "years 1950 to 2110, not for 1940-07-01"),
-        (datetime(2200, 7, 1, 12, tzinfo=UTC), "years 1950 to 2110, not for 2200-07-01"),
     ],
 )  # fmt: skip
 def test_a_time_that_says_too_little_is_refused_in_words(when, words):
@@ -259,50 +247,29 @@ def test_times_as_text_and_the_two_that_a_clock_shows_twice():
     assert unix_time(twice.replace(fold=1)) - unix_time(twice) == 3600.0
 
 
-def test_arrays_of_places_and_times_of_single_functions_are_refused_in_words():
-    places = Place.degrees([11.0, 12.0], [104.0, 105.0])
-    for call in (lambda: sun_at(NOON, places), lambda: sun_position_spa(1.7e9, places)):
-        with pytest.raises(stm.SettingError, match=r"must be a single one.*\(2,\)\. sun_position"):
-            call()
-    with pytest.raises(stm.SettingError, match="must be a single state"):
-        sun_position_spa(1.7e9, PHNOM_PENH, air=Air([1e5, 9e4]))
-    with pytest.raises(stm.SettingError, match=r"years 1678 to 2261.*Are they seconds"):
-        sun_position_spa(1.7e12, PHNOM_PENH)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ((91.0, 0.0), "latitude must lie within -90 and 90 degrees, but it is 91"),
-        ((np.nan, 0.0), "latitude must be finite"),
-        ((0.0, 400.0), "longitude must lie within"),
-        ((0.0, 0.0, np.inf), "altitude must be finite"),
-        ((0.0, 0.0, 1e6), "altitude must lie within -500 and 100000 m, but it is 1e"),
-    ],
-)
-def test_a_place_off_the_earth_is_refused(arguments, words):
-    with pytest.raises(stm.SettingError, match=words):
-        Place.degrees(*arguments)
+PLACES = Place.degrees([11.0, 12.0], [104.0, 105.0])
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (lambda: sun_at(NOON, PLACES), r"must be a single one.*\(2,\)\. sun_position"),
+        (lambda: sun_position_spa(1.7e9, PLACES), r"must be a single one.*\(2,\)\. sun_position"),
+        (lambda: sun_position_spa(1.7e9, PHNOM_PENH, air=Air([1e5, 9e4])), "must be a single state"),
+        (lambda: sun_position_spa(1.7e12, PHNOM_PENH), r"years 1678 to 2261.*Are they seconds"),
+        (lambda: Place.degrees(91.0, 0.0), "latitude must lie within -90 and 90 degrees, but it is 91"),
+        (lambda: Place.degrees(np.nan, 0.0), "latitude must be finite"),
+        (lambda: Place.degrees(0.0, 0.0, 1e6), "altitude must lie within -500 and 100000 m, but it is 1e"),
+        (lambda: Place(48.1, 11.6), r"Place\.degrees"),
         (lambda: Air(np.nan), "air's pressure must be finite"),
         (lambda: Air(-1.0), "pressure must not be negative"),
         (lambda: Air(1e5, 0.0), "temperature must be positive"),
         (lambda: Air.standard(1e5), "from -500 to 11000 m, not at 100000"),
-        (lambda: Air.standard(np.nan), "altitude must be finite"),
     ],
-)
-def test_air_that_cannot_be_is_refused(make, words):
+)  # fmt: skip
+def test_places_and_air_that_cannot_be_are_refused(make, words):
     with pytest.raises(stm.SettingError, match=words):
         make()
-
-
-def test_degrees_given_as_radians_are_refused_with_a_hint():
-    with pytest.raises(stm.SettingError, match=r"Place\.degrees"):
-        Place(48.1, 11.6)
 
 
 def test_a_sun_below_the_horizon_is_refused_by_name():
@@ -315,21 +282,19 @@ def test_a_sun_below_the_horizon_is_refused_by_name():
 
 
 @pytest.mark.parametrize(
-    ("direction", "words"),
-    [((0, 0, 0), "zero length"), ((np.nan, 0, 1), "finite"), ((1, 0), "three numbers")],
+    ("look", "words"),
+    [
+        (lambda: sensed_sun((0, 0, 0)), "zero length"),
+        (lambda: sensed_sun((np.nan, 0, 1)), "finite"),
+        (lambda: sensed_sun((1, 0)), "three numbers"),
+        (lambda: check_attitude(1.1 * np.eye(3)), r"by 0\.21"),
+        (lambda: check_attitude(np.diag([1.0, 1.0, -1.0])), "is a reflection"),
+        (lambda: sun_in_body(NOON, PHNOM_PENH, np.eye(4)), r"shape \(3, 3"),
+    ],
 )
-def test_a_sensor_without_direction_is_refused(direction, words):
+def test_sensors_without_direction_and_attitudes_that_are_none_are_refused(look, words):
     with pytest.raises(stm.StateError, match=words):
-        sensed_sun(direction)
-
-
-def test_an_attitude_that_is_no_rotation_is_refused():
-    with pytest.raises(stm.StateError, match=r"by 0\.21"):
-        check_attitude(1.1 * np.eye(3))
-    with pytest.raises(stm.StateError, match="is a reflection"):
-        check_attitude(np.diag([1.0, 1.0, -1.0]))
-    with pytest.raises(stm.StateError, match=r"shape \(3, 3"):
-        sun_in_body(NOON, PHNOM_PENH, np.eye(4))
+        look()
 
 
 def test_reasons_in_arrays():

@@ -144,15 +144,6 @@ def test_start_of_the_report_is_far_outside(studies):
 
 
 @pytest.mark.slow
-def test_five_states_do_as_well(studies):
-    """The report's tuning without the angles: the same centre of mass."""
-    record = studies[2].record
-    five = estimate_case(record, report_tuning("observable"))
-    # rounding of points 0.9 deviations apart, grown by the angles' covariance
-    np.testing.assert_allclose(five.mean, studies[2].estimates["report"].mean, rtol=0, atol=1e-8)
-
-
-@pytest.mark.slow
 def test_smoother(studies):
     """RMSE at most 60 % of the filter's, after 0.1 s; and its covariance is right."""
     study, tuning = studies[8], consistent_tuning(8)

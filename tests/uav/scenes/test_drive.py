@@ -117,23 +117,10 @@ def test_a_servo_follows_given_targets():
     assert [float(x) for x in second.reference(jnp.asarray(2.0))] == [0.002, 0.0]
 
 
-def test_a_scene_is_differentiable_in_its_options():
-    def total(k, limit):
-        scene = make_scene("tracker", 1, servo=Servo(stiffness=k), stops=Stops(upper=(limit, 0.2)))
-        a, b = (f for f in scene.system.forces if isinstance(f, JointServo))
-        (c, _) = (f for f in scene.system.forces if isinstance(f, EndStop))
-        assert c.upper is not None
-        return a.stiffness + b.stiffness + c.upper
-
-    assert [float(g) for g in jax.grad(total, argnums=(0, 1))(1e6, 0.1)] == [2.0, 1.0]
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"servo": Servo(stiffness=-1.0)}, "stiffness of the servo in joint 'T12'.* negative"),
-        ({"servo": Servo(stiffness=np.nan)}, r"'servo\.stiffness' must be finite"),
-        ({"stops": Stops(lower=0.1)}, "end stop in joint 'T12' must be lower < upper"),
         ({"stops": Stops(lower=(0.0, 0.1, 0.2))}, r"'stop\.lower' must have shape \(2,\)"),
         ({"friction": Friction(speed=0.0)}, "speed of the friction in joint 'T12'.* positive"),
     ],

@@ -110,23 +110,12 @@ def test_a_flight_in_gusts_keeps_its_balances(name, tmp_path):
     ("options", "words"),
     [
         ({"wind": stm.uav.Wind()}, "give drag=Drag"),
-        ({"drag": stm.uav.Drag(linear=[-1.0, 0, 0])}, "must not be negative"),
         ({"drag": stm.uav.Drag(linear=0.1)}, r"'drag.linear' must have shape \(3,\)"),
         (
             {"drag": stm.uav.Drag(), "wind": stm.uav.Wind(mean=[0.0] * 3, gusts=True)},
             "that is not zero",
         ),
-        (
-            {"drag": stm.uav.Drag(), "wind": stm.uav.Wind(height=1.0, gusts=True)},
-            "3.048 to 304.8 m",
-        ),
-        (
-            {"gear": stm.uav.Gear(stiffness=0.0)},
-            "stiffness of the ground contact .* must be positive",
-        ),
-        ({"motor": stm.uav.Motor(time_constant=0.0)}, "must be positive"),
         ({"motor": stm.uav.Motor(highest=1000.0)}, r"72.25 N are required.* 39.28 N"),
-        ({"motor": stm.uav.Motor(lowest=2000.0)}, "lowest < highest"),
     ],
 )
 def test_senseless_options_are_refused(options, words):

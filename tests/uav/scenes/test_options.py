@@ -65,11 +65,9 @@ def test_plain_data_make_the_options():
 @pytest.mark.parametrize(
     ("plain", "words"),
     [
-        ({"drag": {}}, "Scene tracker has no drag; its options: servo, stops, friction, strokes"),
         ({"frictoin": {}}, "its options: servo, .*Did you mean 'friction'"),
         ({"servo": {"kp": 1.0}}, "no field 'kp'.* Known names: stiffness, damping, targets"),
         ({"servo": {"stiffness": "stiff"}}, r"'servo.stiffness' must be a number \[N/m\]"),
-        ({"servo": {"stiffness": True}}, r"'servo.stiffness' must be a number \[N/m\]"),
         ({"servo": {"targets": [0.1]}}, r"'servo.targets' must be 2 numbers \[m\]"),
         ({"stops": {"lower": [0.1, 0.2, 0.3]}}, "must be 1 or 2 numbers"),
         ({"servo": 3.0}, "must be a table of its fields"),

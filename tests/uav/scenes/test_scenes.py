@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from stmuav_jax import (
-    PART_I,
-    PART_II,
     SCENES,
     Augmented,
     Method,
@@ -24,14 +22,7 @@ from stmuav_jax import (
 )
 from stmuav_jax.dynamics import rank
 from stmuav_jax.math.rotation import normalise
-from stmuav_jax.uav import PRINTED_ORIENTATIONS, Rotors
-
-# each case is a program of its own: one of them is in the default run
-CASES = [
-    pytest.param(name, case, marks=[pytest.mark.slow] * ((name, case) != ("uav_tracker", 2)))
-    for name in ("tracker", "uav_tracker")
-    for case in (1, 2, 3)
-]
+from stmuav_jax.uav import PRINTED_ORIENTATIONS
 
 
 @pytest.mark.slow
@@ -46,23 +37,7 @@ def test_spin_against_closed_form():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "case"), CASES)
-def test_two_seconds_with_default_settings(name, case):
-    """Past the 0.45 to 0.5 s at which the report's simulation stopped."""
-    run = simulate(make_scene(name, case))
-    c = run.certificate
-    assert c.result == "successful"
-    assert c.t_end == 2.0
-    assert c.position_violation <= 1e-10
-    assert c.velocity_violation <= 1e-9
-    assert c.norm_violation <= 1e-12
-    assert c.rank == c.rows == 34
-    assert c.smallest_singular_value is not None
-    assert c.smallest_singular_value > 1e-3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "case"), CASES)
+@pytest.mark.parametrize(("name", "case"), [("tracker", 3), ("uav_tracker", 2)])
 def test_energy_balance(name, case):
     """At rtol 1e-10: at most 1e-8 of the largest energy, work of rotors and actuators counted."""
     c = simulate(make_scene(name, case), method=Method(rtol=1e-10, atol=1e-10)).certificate
@@ -76,10 +51,8 @@ def test_energy_balance(name, case):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize(("case", "t1"), [(1, 60.0), (2, 10.0), (3, 10.0)])
-def test_a_minute_with_default_settings(case, t1):
-    """The first case for a minute, the others, which differ by their inputs, for a part of it."""
-    c = simulate(make_scene("uav_tracker", case), t1=t1, save_every=0.1).certificate
+def test_a_minute_with_default_settings():
+    c = simulate(make_scene("uav_tracker", 1), t1=60.0, save_every=0.1).certificate
     assert c.result == "successful"
     assert c.position_violation <= 1e-10
     assert c.velocity_violation <= 1e-9
@@ -116,20 +89,6 @@ def test_hexacopter_has_no_constraint_code():
     assert "potrf" in jax.jit(rate).lower(y).as_text()
 
 
-def test_hexacopter_rises_by_its_excess_thrust():
-    """1.1 times the weight: z = 0.1 g t^2 / 2 while it is level (0.2 s: the arms turn it)."""
-    run = simulate(make_scene("hexacopter"), method=Method(rtol=1e-10, atol=1e-10), t1=0.2)
-    assert float(run.states.r[-1, 0, 2]) == pytest.approx(0.5 * 0.1 * 9.81 * 0.04, rel=1e-3)
-
-
-def test_case_three_lifts_by_its_factor():
-    heavier = make_scene("uav_tracker", 3, PART_II.replaced({"lift_factor": 1.5}))
-    default = make_scene("uav_tracker", 3)
-    rotors = [scene.system.forces[1] for scene in (heavier, default)]
-    speeds = [each.speed_squared for each in rotors if isinstance(each, Rotors)]
-    assert np.asarray(speeds[0]) == pytest.approx(np.asarray(speeds[1]) * 1.5 / 1.2)
-
-
 def printed_state(scene):
     """The scene's state with the Euler parameters of Table 6.1 as they are printed."""
     p = [PRINTED_ORIENTATIONS.get(name, (1.0, 0.0, 0.0, 0.0)) for name in scene.system.names]
@@ -158,16 +117,6 @@ def test_the_cure_works():
     found = assemble(scene.system, printed_state(scene))
     assert bool(found.converged)
     assert float(found.largest_displacement) < 5e-3
-
-
-def test_a_scene_starts_from_another_posture():
-    """The panel level instead of tilted by 23 degrees; the loops close there as well."""
-    table = PART_I.replaced({"posture.phi": 0.0, "posture.theta": 0.0})
-    scene = make_scene("tracker", 1, table)
-    assert np.asarray(scene.state0.p[5]) == pytest.approx([1, 0, 0, 0], abs=1e-15)
-    found = assemble(scene.system, scene.state0)
-    assert float(jnp.max(found.residuals)) < 1e-15
-    assert float(found.largest_displacement) < 1e-15
 
 
 @pytest.mark.parametrize("name", ["tracker", "uav_tracker"])

@@ -20,9 +20,7 @@ from vectors import np_panel, np_strokes
 
 import stmuav_jax as stm
 from stmuav_jax.figures.day import (
-    DAY_FIGURES,
     day_rows,
-    day_tables,
     labelled_day,
     load_attitude,
 )
@@ -32,9 +30,9 @@ from stmuav_jax.uav.environment.ephemeris import Air, Place, sun_direction
 from stmuav_jax.uav.environment.irradiance import clear_sky, single_axis_normals
 from stmuav_jax.uav.environment.sun import attitude, sun_position
 from stmuav_jax.uav.tracker import day as day_module
-from stmuav_jax.uav.tracker.day import PANELS, Imperfections, attitude_history, day_times, track_day
+from stmuav_jax.uav.tracker.day import Imperfections, attitude_history, day_times, track_day
 from stmuav_jax.uav.tracker.kinematics import Reason, panel_normal, stroke_jacobian
-from stmuav_jax.uav.tracker.workspace import nearest_reachable, survey
+from stmuav_jax.uav.tracker.workspace import survey
 
 PHNOM_PENH = Place.degrees(11.55, 104.92, 12.0)
 ZONE = timezone(timedelta(hours=7))
@@ -93,12 +91,6 @@ def test_out_of_reach_the_panel_is_as_near_as_it_can_be(day):
     assert np.all(day.pointing_error[out] <= best + np.radians(0.001))
     assert np.all(day.pointing_error[out] >= best - np.radians(0.5))  # the sampling's spacing
     assert np.all(np.asarray(reason(day.angles))[out] == Reason.VALID)
-
-
-def test_nearest_reachable_of_a_reachable_direction_is_itself(day):
-    angles = jnp.array([[0.1, -0.2, 0.3], [0.2, 0.1, -0.15]])
-    found = nearest_reachable(day.geometry, np.asarray(panel_normal(angles)), day.limits)
-    assert np.degrees(np.abs(found - angles)).max() < 0.001
 
 
 @pytest.mark.slow
@@ -202,34 +194,6 @@ def test_the_best_multiple_of_fifteen_degrees(best, found, monkeypatch):
 # --- light
 
 
-def test_clear_sky_is_that_of_pvlib(day):
-    """By pvlib's own chain from times to irradiance."""
-    index = pd.DatetimeIndex(pd.to_datetime(day.unix, unit="s", utc=True))
-    spot = pvlib.location.Location(11.55, 104.92, altitude=12.0)
-    linke = day.sky.turbidity[day.is_up]  # by UTC day: it changes at 7 h
-    position = spot.get_solarposition(index[day.is_up])
-    high = np.asarray(position["apparent_elevation"]) > 3
-    expected = spot.get_clearsky(
-        index[day.is_up], solar_position=position, linke_turbidity=linke,
-        dni_extra=day.sky.extraterrestrial[day.is_up],
-    )  # fmt: skip
-    for name, mine in (
-        ("dni", day.sky.beam),
-        ("dhi", day.sky.diffuse),
-        ("ghi", day.sky.global_horizontal),
-    ):
-        np.testing.assert_allclose(mine[day.is_up][high], expected[name][high], rtol=1e-3)
-    assert np.all((linke > 3.5) & (linke < 5.5))
-
-
-def test_level_panel_gets_the_level_irradiance(day):
-    """Transposition to a level panel changes nothing; sums are integrals."""
-    np.testing.assert_allclose(day.irradiance["flat"], day.sky.global_horizontal, atol=1e-6)
-    # the table's rectangles, whose night's ends are nearly zero: 900 s of 12 h
-    hours = np.sum(day.sky.global_horizontal) * 900.0
-    assert day.energy["flat"] == pytest.approx(hours, rel=1e-3)
-
-
 def test_single_axis_is_the_projection_on_its_plane(day):
     """An axis to the north leaves (east, 0, up), at most 60 degrees from level."""
     s_w = np.asarray(day.sun.s_w)[:, day.is_up]
@@ -237,29 +201,6 @@ def test_single_axis_is_the_projection_on_its_plane(day):
     expected = np.stack([np.sin(lean), np.zeros_like(lean), np.cos(lean)])
     mine = single_axis_normals(day.sun)[:, day.is_up]
     np.testing.assert_allclose(mine, expected, atol=1e-7)
-
-
-def test_energies_are_ordered_and_gains_are_those_of_the_literature(day):
-    """Two axes beat the tracker beats one axis beats level; 20 to 40 % as the report cites."""
-    energies = day.energy
-    assert energies["two_axis"] > energies["tracker"] > energies["single_axis"] > energies["flat"]
-    assert energies["airframe"] == pytest.approx(energies["flat"], rel=1e-12)
-    assert set(energies) == set(day.irradiance) == set(PANELS)
-    assert 0.2 < day.gain("tracker") < 0.4
-    assert day.gain("tracker", "two_axis") == pytest.approx(
-        energies["tracker"] / energies["two_axis"] - 1
-    )
-
-
-def test_daylight_against_pvlib(day):
-    """Ours counts the sun's centre, pvlib its edge: 0.27 degrees, about a minute."""
-    (rise, down), *more = day.daylight
-    assert not more
-    index = pd.DatetimeIndex([pd.Timestamp("2024-03-21 12:00", tz="Asia/Phnom_Penh")])
-    spa = pvlib.solarposition.sun_rise_set_transit_spa(index, 11.55, 104.92)
-    for mine, name in ((rise, "sunrise"), (down, "sunset")):
-        at = (spa[name].iloc[0] - pd.Timestamp(day.start)).total_seconds() / 3600
-        assert mine == pytest.approx(at, abs=2.5 / 60)
 
 
 def test_days_of_other_lengths():
@@ -281,11 +222,8 @@ def test_days_of_other_lengths():
     ("change", "error", "words"),
     [
         ({"step": 0.0}, stm.SettingError, "step must lie within"),
-        ({"turbidity": 0.5}, stm.SettingError, "turbidity must be at least 1"),
         ({"turbidity": np.inf}, stm.SettingError, "finite, but it is inf"),
         ({"albedo": 1.5}, stm.SettingError, "albedo must lie within 0 and 1, but it is 1.5"),
-        ({"samples": 0}, stm.SettingError, "samples of a day must be at least 1"),
-        ({"flaws": Imperfections(stroke_step=-1.0)}, stm.SettingError, "actuators' step"),
         ({"flaws": Imperfections(attitude_error=(np.nan, 0, 0))}, stm.SettingError, "attitude error"),
         ({"R_wb": 2 * np.eye(3)}, stm.StateError, "must be a rotation"),
         ({"R_wb": np.zeros((3, 3, 5))}, stm.StateError, r"for each of the 97 times"),
@@ -401,12 +339,9 @@ def test_clock_times_are_those_that_a_clock_shows():
 @pytest.mark.parametrize(
     ("day", "zone", "words"),
     [
-        (
-            "2011-12-30",
-            "Pacific/Apia",
-            "There was no 2011-12-30 in Pacific/Apia: its calendar skipped",
-        ),
-        ("1993-08-21", "Pacific/Kwajalein", "There was no 1993-08-21"),
+        ("2011-12-30", "Pacific/Apia", "There was no 2011-12-30 in Pacific/Apia: its calendar"),
+        ("2024-02-30", UTC, "2024-02-30"),
+        (EQUINOX, "Asia/Pnom_Penh", "Did you mean 'Asia/Phnom_Penh'"),
         (datetime(2024, 3, 21, 9), UTC, "must be a day without a time"),
         (1.7e9, UTC, r"a datetime.date or text like 2024-03-21, not 1700000000.0 \(float\)"),
         (EQUINOX, 7.0, r"The time zone must be a name.*not 7.0 \(float\)"),
@@ -428,7 +363,10 @@ def test_days_and_zones_in_other_forms_are_the_same_day(day):
         assert parse_date(form) == EQUINOX
     for form in (ZONE, "+07:00", "Asia/Phnom_Penh", None):
         assert day_times(EQUINOX, day_zone(form, 104.92), 3600.0)[0].timestamp() == day.unix[0]
-    assert track_day(PHNOM_PENH, "2024-03-21", "+07:00", NORTHWARD).energy == day.energy
+    noon = datetime(2024, 7, 1, 12)
+    assert day_zone("-03:30", 0.0).utcoffset(noon) == timedelta(hours=-3.5)
+    assert day_zone("Europe/Berlin", 0.0).utcoffset(noon) == timedelta(hours=2)
+    assert day_zone(None, 350.0).utcoffset(noon) == timedelta(hours=-1)
 
 
 def test_hours_that_clocks_skip_or_show_twice_are_named():
@@ -447,19 +385,6 @@ def test_hours_that_clocks_skip_or_show_twice_are_named():
 def test_polar_night_is_named():
     with pytest.raises(stm.StateError, match=r"does not rise at 78.2 degrees north on 2024-12-21"):
         track_day(Place.degrees(78.2, 15.6), date(2024, 12, 21), UTC, step=3600.0)
-
-
-def test_dates_and_zones():
-    assert parse_date("2024-03-21") == EQUINOX
-    noon = datetime(2024, 7, 1, 12)
-    assert day_zone("-03:30", 0.0).utcoffset(noon) == timedelta(hours=-3.5)
-    assert day_zone("Europe/Berlin", 0.0).utcoffset(noon) == timedelta(hours=2)
-    assert day_zone(None, 104.92).utcoffset(noon) == timedelta(hours=7)
-    assert day_zone(None, 350.0).utcoffset(noon) == timedelta(hours=-1)
-    with pytest.raises(stm.SettingError, match="2024-02-30"):
-        parse_date("2024-02-30")
-    with pytest.raises(stm.SettingError, match=r"Did you mean 'Asia/Phnom_Penh'"):
-        day_zone("Asia/Pnom_Penh", 0.0)
 
 
 # --- files and figures
@@ -484,26 +409,12 @@ def test_day_as_a_file(day, tmp_path):
     assert labelled_day(day).dataset().attrs["start"] == "2024-03-21T00:00:00+07:00"
 
 
-def test_table_and_figures(day):
-    words = dict(day_rows(day))
-    assert words["Sun above the horizon"].startswith("06:0")
-    assert words["Within the tracker's reach"] == f"{day.lit.hours_of(day.lit.facing):.1f} h"
-    assert day.lit.hours_of(day.lit.facing) == pytest.approx(day.hours_of(day.facing), abs=0.5)
-    assert "tilt" in words["Out of reach because of"]
-    assert all(table.row_count >= 5 for table in day_tables(day))
-    for draw in DAY_FIGURES.values():
-        axes = draw(day).axes
-        assert all(len(ax.lines) + len(ax.patches) > 0 for ax in axes)
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         (None, "There is no file"),
-        ("time,roll\n0,1\n", "must begin with"),
         ("t,roll,pitch,yaw\n0,1,2\n", "3 cells"),
         ("t,roll,pitch,yaw\n0,1,2,3\n0,1,2,3\n", "times that increase"),
-        ("t,roll,pitch,yaw\n", "no rows"),
     ],
 )
 def test_attitude_files_that_cannot_be_used(text, words, tmp_path):

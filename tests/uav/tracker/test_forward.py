@@ -123,14 +123,6 @@ def path(start, end, count=60):
 along = jax.jit(follow)
 
 
-@pytest.mark.slow
-def test_a_path_is_followed():
-    x = path([-10.0, -17.0], [25.0, 30.0])
-    found = along(G, strokes(G, x), x[:, 0])
-    assert np.all(np.asarray(found.reason) == Reason.VALID)
-    assert np.max(np.abs(found.angles - x)) < ROUND_TRIP
-
-
 def test_a_path_never_goes_to_the_other_side():
     """Strokes of angles that pass the singularity, at -56.7 degrees, do not lead past it."""
     x = path([-40.0, 0.0], [-70.0, 0.0])

@@ -8,7 +8,6 @@ from helpers import central, np_rotation
 from vectors import UNEVEN
 
 from stmuav_jax import PART_I, PART_II, Augmented, ModelError, System, make_scene
-from stmuav_jax.io.netcdf import load_parameters
 from stmuav_jax.mechanics import Parameter, Parameters
 from stmuav_jax.uav import TrackerGeometry, tracker_geometry
 from stmuav_jax.uav.tracker.bodies import TRACKER_BODIES, place, tracker_bodies, tracker_joints
@@ -56,10 +55,9 @@ def test_the_tables_lengths_give_the_assembled_mechanism():
         assert np.asarray(joints[name].point_i) == pytest.approx(point, abs=1e-12)
 
 
-@pytest.mark.parametrize("changes", [{}, UNEVEN], ids=["even", "uneven"])
-def test_points_keep_the_lengths(changes):
+def test_points_keep_the_lengths():
     """Straight from the joints' places: rods, post, arms, and where the panel carries them."""
-    g = tracker_geometry(PART_I.replaced(changes))
+    g = tracker_geometry(PART_I.replaced(UNEVEN))
     at = place(g, jnp.array([0.3, -0.2]))
     points = {name: np.asarray(point) for name, point in at.points.items()}
     span = lambda a, b: np.linalg.norm(points[b] - points[a])
@@ -110,18 +108,6 @@ def test_a_changed_length_moves_the_joints():
     # a longer rod 6 lowers slider 2 and its own middle, and nothing else
     assert moved[1, 2] < -5e-3
     assert np.abs(np.delete(moved, [1, 5], axis=0)).max() < ROUND_OFF
-
-
-def test_lengths_come_from_toml(tmp_path):
-    file = tmp_path / "mine.toml"
-    file.write_text(
-        '[geometry]\nrods = [0.096, 0.097]\npost = {value = 0.085, unit = "m"}\n[posture]\nphi = 0.1\n'
-    )
-    table = load_parameters(file, PART_I)
-    g = tracker_geometry(table)
-    assert np.asarray(g.rods).tolist() == [0.096, 0.097]
-    assert float(g.post) == 0.085
-    assert np.asarray(initial_angles(table)).tolist() == [0.1, -0.3088]
 
 
 @pytest.mark.slow

@@ -57,10 +57,7 @@ def test_shifts_are_what_the_scenes_joints_measure():
     [
         ((0, 0, 0), LIMITS, "zero length"),
         ((np.nan, 0, 1), LIMITS, "must be finite"),
-        ((0, np.inf, 1), LIMITS, "must be finite"),
         ((1, 0, 0.1), LIMITS, r"84\.29 degrees from the base's z axis, 24\.3 more than .* 60"),
-        ((1, 0, 0), LIMITS, r"90 degrees from .* 30 more"),
-        ((0, 0, -1), LIMITS, r"180 degrees from .* 120 more"),
         ((-1, 0, 1.2), LIMITS, r"slider 2 .* at -14\.06 mm .* 2\.06 mm beyond its lower stop at -12"),
         ((0.7, 0, 0.7), LIMITS, r"slider 2 .* 75\.43 mm .* 0\.431 mm beyond its upper stop at 75"),
         ((0.5, 0.7, 0.9), LIMITS, r"beyond the singularity .*margin -0\.0127, at least 0\.05"),

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import np_rotation
 
 from stmuav_jax import PART_I, SettingError
 from stmuav_jax.uav import initial_angles, tracker_geometry
@@ -20,22 +19,13 @@ from reconstruction import (
     ALTERNATIVES,
     UNKNOWNS,
     Reading,
-    comparison,
     fit,
     mechanism,
     predicted,
     rms,
-    table,
 )
 
 PRINTED = np.array(list(PRINTED_CENTRES.values()))
-# docs/report_machine.md and the tables [m], [rad]
-ADOPTED = {
-    "arm": 0.092, "panel_arm": 0.0709, "panel_depth": 0.0145, "post": 0.084, "hinge": 0.0632,
-    "rod": 0.095, "post_up": 0.0361, "panel_out": 0.0202, "panel_up": 0.0012, "slider_up": 0.0028,
-    "phi": -0.2674, "theta": -0.3088, "axis_x": -0.015, "axis_y": 0.015, "slider_reach": 0.10899,
-    "post_aside": 0.0035,
-}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -65,12 +55,6 @@ def test_the_fit_reaches_its_figure(best):
     assert 1e3 * best.worst() == pytest.approx(0.742, abs=2e-3)
     # as good as its weights say
     assert 0.4 < best.chi_square / best.freedom < 1.6
-
-
-def test_the_adopted_lengths_are_within_the_fits_deviations(best):
-    for name, value in ADOPTED.items():
-        assert abs(best.values[name] - value) < 1.0 * best.standard_deviations[name], name
-    assert set(best.values) - set(ADOPTED) == {"middle_5", "middle_6", "rod_more"}
 
 
 def test_the_fitted_mechanism_closes(best):
@@ -120,28 +104,6 @@ def test_other_starts_find_the_same(best):
         assert other.chi_square == pytest.approx(best.chi_square, rel=1e-9)
 
 
-def test_the_printed_sign_of_p4_is_wrong(fits, best):
-    """With it nothing fits: chi-square 491 against 11, centres of mass off by millimetres."""
-    printed = fits["e1 of p4 as printed"]
-    assert printed.chi_square > best.chi_square + 400
-    assert printed.worst() > 4e-3
-    # the turn alone says so: it leans the post to -y, and its printed centre is at y > 15 mm
-    lean = np_rotation(PRINTED_ORIENTATIONS["post_4"])[1, 2]
-    assert lean < 0 < PRINTED[2, 1] - 0.015
-
-
-def test_p7_must_have_had_norm_one(fits):
-    """e0 follows from the others: 0.9793 whether the printed 0.9768 is used or not."""
-    printed = fits["p7 as printed"]
-    e0 = PRINTED_ORIENTATIONS["panel_7"][0] + printed.euler_errors[3, 0]
-    assert np.linalg.norm(PRINTED_ORIENTATIONS["panel_7"]) == pytest.approx(0.9974, abs=5e-5)
-    assert printed.euler_deviations[3, 0] < 1e-3
-    assert abs(e0 - 0.9794) < 0.5 * printed.euler_deviations[3, 0]
-    assert abs(e0 - 0.9768) > 3 * printed.euler_deviations[3, 0]
-    for name in ("p7 as printed", "p7 divided by its norm"):
-        assert abs(fits[name].chi_square - fits["adopted reading"].chi_square) < 1
-
-
 def test_what_the_tables_do_not_decide(fits, best):
     """Joint 3-5's order weakly, equal rods not at all; legs apart fit a little better."""
     assert 1 < fits["joint 3-5 with x in the slider"].chi_square - best.chi_square < 4
@@ -151,16 +113,6 @@ def test_what_the_tables_do_not_decide(fits, best):
     gain = best.chi_square - fits["panel arms apart"].chi_square
     assert 6 < gain < 10
     assert fits["all of these apart"].freedom == best.freedom - 3
-
-
-def test_the_texts_show_every_number(fits, best):
-    shown = table(best)
-    for name in best.values:
-        assert name in shown
-    assert "rms 0.428 mm over the seven" in shown
-    lines = comparison(fits).splitlines()
-    assert len(lines) == 1 + len(ALTERNATIVES)
-    assert not any("not converged" in line for line in lines)
 
 
 def test_bad_input():
