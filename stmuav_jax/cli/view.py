@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # Files of results, by the commands that write them.
 NAMES = {
-    "run.nc": "simulate", "flight.nc": "fly", "estimate.nc": "estimate", "hover.nc": "estimate --hover",
+    "run.nc": "simulate", "flight.nc": "fly", "estimate.nc": "estimate",
     "estimate.npz": "estimate MODEL", "study.zarr": "montecarlo",
 }  # fmt: skip
 # Size of the report's picture of the mechanism [pixels], and the eye's elevation and azimuth [degrees].

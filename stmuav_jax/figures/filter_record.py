@@ -17,7 +17,7 @@ from .plot import STYLES, grid
 if TYPE_CHECKING:
     import xarray as xr
 
-# Format of the datasets of estimate.nc and hover.nc.
+# Format of the dataset of estimate.nc.
 FORMAT = "stmuav_jax estimate"
 FORMAT_VERSION = 1
 
@@ -149,9 +149,9 @@ def load_record(path: str | os.PathLike[str]) -> FilterRecord:
 
 
 def record_of_dataset(data: "xr.Dataset") -> FilterRecord:
-    """Record of a dataset of estimate.nc or hover.nc, as `stmuav estimate` writes them."""
+    """Record of a dataset of estimate.nc, as `stmuav estimate` writes it."""
     mean = data["estimate"].values
-    # a hover is flown by the estimate, and has a truth of its own with each tuning
+    # one truth for all tunings
     truth = np.broadcast_to(data["truth"].values, mean.shape)
     names = [str(name) for name in data["component"].values]
     states = tuple(f"{name} [{_UNITS[name.rpartition('_')[0]]}]" for name in names)
