@@ -89,26 +89,6 @@ def test_the_load_by_hand(state):
     np.testing.assert_allclose(normal, N, rtol=1e-12)
 
 
-def test_work_is_minus_the_rate_of_the_potential_plus_the_power(state):
-    def moved(h):
-        omega = np.asarray(state.omega[0])
-        by = turn(omega, np.linalg.norm(omega) * h)
-        p = stm.rotation.product(state.p[0], jnp.asarray(by))
-        there = stm.State(state.r + h * state.v, p[None], state.v, state.omega)
-        return float(_load(system_with(), there)[0].potential)
-
-    load, _, _ = _load(system_with(), state)
-    work = float(jnp.sum(load.force[0] * state.v[0]) + jnp.sum(load.moment[0] * state.omega[0]))
-    assert work == pytest.approx(float(load.power) - central(moved, 1e-4), rel=1e-7)
-
-
-def test_nothing_acts_above_the_ground(state):
-    high = stm.State(state.r + jnp.array([0.0, 0.0, 2.0]), state.p, state.v, state.omega)
-    load, _, normal = _load(system_with(), high)
-    for leaf in jax.tree.leaves((load, normal)):
-        assert not np.any(leaf)
-
-
 def test_derivatives_forward_reverse_and_by_differences(state):
     """Of the load, with respect to its numbers and the state."""
     system = system_with()

@@ -58,13 +58,6 @@ class World:
         k, s = "ab".index(name), self.arm(name, point)
         return self.r[k] + s, self.v[k] + np.cross(self.w[k], s)
 
-    def power(self, load):
-        """Power of a load on the moving bodies."""
-        w_body = [R.T @ w for R, w in zip(self.R, self.w, strict=True)]
-        return np.sum(np.asarray(load.force)[:2] * self.v) + np.sum(
-            np.asarray(load.moment)[:2] * w_body
-        )
-
 
 def check(load, force, moment, potential, power):
     """Compare with world forces and world moments on a and b, given as (2, 3)."""
@@ -176,47 +169,6 @@ def test_joint_damping(state):
     ]
     loss = -4 * slip**2 - 0.7 * np.sum((world.w[1] - world.w[0]) ** 2)
     check(load, [drag, -drag], moments, 0, loss)
-
-
-CONSERVATIVE = {
-    "gravity": stm.Gravity([0.5, -1.0, -9.0]),
-    "spring": stm.LinearSpringDamper(
-        "a", "b", point_i=POINT_A, point_j=POINT_B, stiffness=50.0, damping=7.0, length=0.4
-    ),
-    "to ground": stm.LinearSpringDamper("ground", "b", stiffness=9.0, damping=2.0, length=0.3),
-}
-
-
-@pytest.mark.parametrize("name", CONSERVATIVE)
-def test_power_is_minus_the_rate_of_the_potential(state, name):
-    force, world = CONSERVATIVE[name], World(state)
-    load = load_of(force, state)
-    p_rate = jax.vmap(stm.rotation.euler_parameter_rate)(state.p, state.omega)
-
-    def potential(h):
-        p = state.p + h * p_rate
-        p = p / jnp.sqrt(jnp.sum(p**2, axis=1, keepdims=True))
-        moved = stm.State(state.r + h * state.v, p, state.v, state.omega)
-        return float(load_of(force, moved).potential)
-
-    rate = (potential(1e-5) - potential(-1e-5)) / 2e-5
-    assert world.power(load) == pytest.approx(-rate + float(load.power), rel=1e-7)
-    assert abs(rate) > 0.1
-
-
-def test_power_of_a_torsional_spring():
-    """On a closed revolute joint that turns."""
-    rate, force = 1.7, stm.TorsionalSpringDamper("J", stiffness=5.0, damping=0.3, angle=0.5)
-    at = lambda phi: state_of(
-        [COM["a"], COM["b"]],
-        [[1, 0, 0, 0], np.concatenate([[np.cos(phi / 2)], np.sin(phi / 2) * AXIS])],
-        None,
-        [np.zeros(3), rate * AXIS],
-    )
-    load, h = load_of(force, at(0.9)), 1e-5
-    ahead, behind = (load_of(force, at(0.9 + k * rate * h)).potential for k in (1, -1))
-    expected = -float(ahead - behind) / (2 * h) + float(load.power)
-    assert World(at(0.9)).power(load) == pytest.approx(expected, rel=1e-8)
 
 
 SAME = [[1.0, 0, 0, 0]] * 2
