@@ -82,8 +82,9 @@ TIMES = jnp.asarray([0.0, 0.15, 0.3])
 @pytest.fixture(scope="module")
 def two_steps():
     """Two coarse steps, and the second again from a fresh start at the first one's end."""
-    problem = prepare_problem(SYSTEM, dataclasses.replace(method("Tsit5"), balances=True))
-    x = stm.Augmented().to_vector(problem.model, START)
+    how = dataclasses.replace(method("Tsit5"), balances=True)
+    problem = prepare_problem(SYSTEM, how)
+    x = how.formulation.to_vector(problem.model, START)
     y0 = jnp.concatenate([x, jnp.zeros(1)])
     solver, terms = problem.solver(), diffrax.ODETerm(problem.field)
 
