@@ -7,6 +7,7 @@ the comparisons.
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -122,6 +123,33 @@ def derivative_size(system: stm.System) -> tuple[int, int]:
     y = begin_integration(problem, jnp.zeros(()), system.reference).y
     found = jax.make_jaxpr(lambda t, y: problem.field(t, y, problem.model))(0.0, y)
     return count(found.jaxpr), y.shape[0]
+
+
+def make_equal_steps(
+    system: stm.System, start: stm.State, solver: Any, formulation: Any
+) -> Callable[[float, int], np.ndarray]:
+    """(t1 [s], count) -> positions (n, 3) [m] at t1 by that many equal steps, from one program.
+
+    Stages of implicit solvers are solved to 1e-13.
+    """
+    method = stm.Method(
+        formulation=formulation, solver=solver, rtol=1e-13, atol=1e-13,
+        adjoint=diffrax.ForwardMode(), steps="state",
+    )  # fmt: skip
+    problem = prepare_problem(system, method)
+    y0 = begin_integration(problem, jnp.zeros(()), start).y
+
+    @jax.jit
+    def end(t1: Any, step: Any) -> Any:
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(problem.field), problem.solver(), 0.0, t1, step, y0, problem.model,
+            stepsize_controller=diffrax.ConstantStepSize(), adjoint=method.adjoint, max_steps=1024,
+        )  # fmt: skip
+        assert solution.ys is not None
+        return formulation.to_state(problem.model, solution.ys[0][: problem.n_state]).r
+
+    # a last step of round-off's length would be one more
+    return lambda t1, count: np.asarray(end(t1, t1 / count * (1 + 1e-14)))
 
 
 def central(f: Callable[[float], Any], step: float) -> np.ndarray:

@@ -10,31 +10,6 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-# What the notebook shows is tested otherwise by default; its own run takes minutes.
-LONG = (
-    "00_the_machine_in_pictures",
-    "01_first_flight",
-    "02_your_own_mechanism",
-    "03_the_equations_two_formulations",
-    "04_what_fails_at_half_a_second",
-    "05_the_geometry_from_the_printed_tables",
-    "06_speed_against_error",
-    "07_a_day_of_pointing_at_the_sun",
-    "08_inverse_dynamics_and_reaction_loads",
-    "09_trim_and_linearisation",
-    "10_gradients_through_a_motion",
-    "11_inputs_by_gradients",
-    "12_design_by_gradients",
-    "13_parameters_from_a_record",
-    "14_centre_of_mass",
-    "15_a_filter_for_your_own_model",
-    "16_it_flies",
-    "17_does_the_panel_pay",
-    "18_two_thousand_collapses",
-    "19_your_own_study_on_a_cluster",
-    "20_learning_and_gain_tuning",
-    "21_from_a_flight_log_to_a_model",
-)
 # Real flights, which are not part of the package: cells with this tag show them where they lie beside the checkout.
 FLIGHTS, REAL = Path(__file__).parents[2] / "shared" / "flights", "real-flights"
 PICTURES = Path(__file__).parents[1] / "docs" / "make_pictures.py"
@@ -141,7 +116,7 @@ def code_of(path: Path) -> str:
 
 @pytest.mark.parametrize("path", [*NOTEBOOKS, PICTURES], ids=lambda p: p.stem)
 def test_what_is_imported_exists(path, monkeypatch):
-    """Most notebooks run among the slow tests only, the pictures' script in none."""
+    """Notebooks run among the slow tests only, the pictures' script in none."""
     monkeypatch.syspath_prepend(str(path.parent))
     for node in ast.walk(ast.parse(code_of(path))):
         if isinstance(node, ast.Import):
@@ -154,10 +129,8 @@ def test_what_is_imported_exists(path, monkeypatch):
                     importlib.import_module(f"{node.module}.{alias.name}")
 
 
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(p, id=p.stem, marks=[pytest.mark.slow] * (p.stem in LONG)) for p in NOTEBOOKS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebook(path):
     notebook = nbformat.read(path, as_version=4)
     stored = nbformat.read(path, as_version=4)

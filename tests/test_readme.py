@@ -1,4 +1,4 @@
-"""The Python of the README, docs/multirotors.md and docs/models.md runs; links lead somewhere."""
+"""The Python of the README, docs/multirotors.md and docs/models.md runs."""
 
 import re
 from pathlib import Path
@@ -10,12 +10,6 @@ import stmuav_jax as stm
 
 ROOT = Path(__file__).parents[1]
 README, DOCS = ROOT / "README.md", ROOT / "docs"
-pages = pytest.mark.parametrize(
-    ("page", "count"),
-    # the first and the last block of multirotors.md run in tests/test_docs.py and uav/test_battery.py
-    [(README, 3), (DOCS / "multirotors.md", 2), (DOCS / "models.md", 11)],
-    ids=lambda x: str(x)[-9:],
-)
 
 
 @pytest.fixture
@@ -30,7 +24,12 @@ def tables():
 
 
 @pytest.mark.slow
-@pages
+@pytest.mark.parametrize(
+    ("page", "count"),
+    # the first and the last block of multirotors.md run in tests/test_docs.py and uav/test_battery.py
+    [(README, 3), (DOCS / "multirotors.md", 2), (DOCS / "models.md", 11)],
+    ids=lambda x: str(x)[-9:],
+)
 def test_python_blocks_run(page, count, tables, tmp_path, monkeypatch):
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     if page.stem == "multirotors":
@@ -45,13 +44,6 @@ def test_python_blocks_run(page, count, tables, tmp_path, monkeypatch):
     if page.stem == "models":
         heights: Any = names["heights"]
         assert heights.tolist() == run.states.r[:, 0, 2:].tolist()
-
-
-@pages
-def test_links_lead_somewhere(page, count):
-    text = page.read_text(encoding="utf-8")
-    for target in re.findall(r"\]\(([^)#]+)\)", text):
-        assert target.startswith("https:") or (page.parent / target).exists(), target
 
 
 def test_the_table_of_mechanisms_names_tests():

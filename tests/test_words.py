@@ -3,12 +3,10 @@
 import ast
 from pathlib import Path
 
-import pytest
-
 import stmuav_jax
 
 ROOT = Path(stmuav_jax.__file__).parent
-MODULES = sorted(ROOT.rglob("*.py"))
+TREES = {path: ast.parse(path.read_text()) for path in sorted(ROOT.rglob("*.py"))}
 
 # With these a sentence has no subject: its reader does not know what is spoken of.
 NO_SUBJECT = {
@@ -29,14 +27,14 @@ def documented(tree: ast.Module) -> list[tuple[str, str]]:
     return found
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_docstrings_name_their_subject(path):
-    for name, words in documented(ast.parse(path.read_text())):
-        first = words.split()
-        opening = first[0].strip(",.:")
-        assert opening not in NO_SUBJECT, f"{name}: {words.splitlines()[0]}"
-        assert " ".join(first[:2]) not in NO_SUBJECT_PAIRS, f"{name}: {words.splitlines()[0]}"
-        assert len(words.split()) > 1, f"{name}: {words}"
+def test_docstrings_name_their_subject():
+    for path, tree in TREES.items():
+        for name, docstring in documented(tree):
+            words = docstring.split()
+            place = f"{path}, {name}: {docstring.splitlines()[0]}"
+            assert words[0].strip(",.:") not in NO_SUBJECT, place
+            assert " ".join(words[:2]) not in NO_SUBJECT_PAIRS, place
+            assert len(words) > 1, place
 
 
 # Participles, pronouns, adverbs and prepositions, which name no thing, and how many bindings still have them
@@ -63,6 +61,6 @@ def bound_names(tree):
 
 
 def test_names_are_nouns():
-    trees = [ast.parse(path.read_text()) for path in MODULES]
-    count = sum(name.strip("_") in NAMELESS for tree in trees for name in bound_names(tree))
+    names = (name.strip("_") for tree in TREES.values() for name in bound_names(tree))
+    count = sum(name in NAMELESS for name in names)
     assert 0 < count <= NAMELESS_BINDINGS

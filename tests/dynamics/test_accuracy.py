@@ -7,8 +7,7 @@ from helpers import pendulum, scene_of, swung
 
 import stmuav_jax as stm
 from stmuav_jax.dynamics import simulation as module
-from stmuav_jax.dynamics.diagnostics import LOST, ErrorEstimate, _estimate_growth
-from stmuav_jax.dynamics.integration.advance import March
+from stmuav_jax.dynamics.diagnostics import LOST, _estimate_growth
 from stmuav_jax.figures.terminal import certificate_rows
 
 SYSTEM = pendulum()
@@ -62,23 +61,6 @@ def test_the_estimate_is_within_a_factor_of_three_of_the_error(reference, tolera
     assert c.error_words == ""
 
 
-def test_the_second_run_compiles_nothing_and_can_be_left_out(reference):
-    count = []
-    original = module.SecondRun
-
-    class Counting(original):
-        def __init__(self, *args, **kwargs):
-            super().__init__(*args, **kwargs)
-            count.append(self.march.program)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "SecondRun", Counting)
-        first = March(module.prepare_problem(SYSTEM, reference.method), 0.0, SCENE.state0)
-        run()
-        run(error_estimate=False)
-    assert count == [first.program]
-
-
 def test_without_an_estimate_the_certificate_says_so(reference):
     c = reference.certificate
     assert np.isnan([c.position_error, c.position_error_end, c.angle_error]).all()
@@ -97,16 +79,6 @@ def test_steps_that_nothing_steers_are_in_the_certificate(reference):
     assert words.startswith(f"{c.accepted_steps}: ")
     assert reference.certificate.steps_at_growth_limit < 0.5 * reference.certificate.accepted_steps
     assert "Steps that grew at their limit" not in dict(certificate_rows(reference.certificate))
-
-
-def test_an_interrupted_run_has_an_estimate_of_what_was_done():
-    def stop(fraction):
-        raise KeyboardInterrupt
-
-    found = run(save_every=0.1, progress=stop)
-    assert found.certificate.result == "interrupted"
-    assert 1 < found.errors.estimated_count == len(found.ts) < 41
-    assert found.certificate.position_error > 0
 
 
 def test_a_second_run_that_stops_is_replaced_or_ends_the_estimate(monkeypatch):
@@ -172,18 +144,6 @@ def test_exponential_growth_is_told_from_powers_of_time():
     folding, lost = grown(lambda t: np.minimum(np.exp(t / 0.05), 1e10))
     assert folding == pytest.approx(0.05, rel=0.05)
     assert lost == pytest.approx(0.05 * np.log(LOST / 1e-10), abs=0.02)
-
-
-def test_words_of_a_chaotic_run():
-    none = np.zeros((3, 1))
-    error = np.array([[0.0], [0.002], [0.013]])
-    found = ErrorEstimate(
-        error, none, none, none, e_folding_time=0.0912, predictability_horizon=1.7
-    )
-    assert found.describe(np.array([0.0, 1.0, 1.7])) == (
-        "Errors grow e-fold every 0.091 s. From t = 1.7 s on the positions are known to no better than "
-        "0.01 m and the orientations to no better than 0 rad."
-    )
 
 
 CASES = [

@@ -24,9 +24,6 @@ from stmuav_jax.dynamics.simulation import check_method
 SYSTEM = pendulum()
 START = swung(SYSTEM, 1.0, 0.5)
 SCENE = scene_of(SYSTEM, START, t1=0.4, save_every=0.02)
-NOTHING = (0.0, 0.0, 0.0)
-
-
 # --- settings: refused before anything is compiled
 
 
@@ -35,16 +32,11 @@ NOTHING = (0.0, 0.0, 0.0)
     [
         ({"t1": -0.1}, r"t1 = -0.1 s must be finite and not before t0 = 0.0 s"),
         ({"t1": np.nan}, "must be finite"),
-        ({"t1": np.inf}, "must be finite"),
         ({"save_every": 0.0}, "save_every must be finite and positive"),
-        ({"save_every": -0.1}, "save_every must be finite and positive"),
-        ({"save_every": np.nan}, "save_every must be finite and positive"),
         ({"ts": [0.0, 0.2, 0.1]}, r"must increase, but ts\[2\] = 0.1 s follows ts\[1\] = 0.2 s"),
-        ({"ts": [0.0, 0.1, 0.1]}, "must increase"),
         ({"ts": [0.1, 0.2]}, "first output time must be the scene's t0 = 0.0 s, not 0.1 s"),
         ({"ts": []}, "list of finite numbers"),
         ({"ts": [0.0, np.nan]}, "list of finite numbers"),
-        ({"ts": np.array([[0.0, 1.0]])}, "list of finite numbers"),
         ({"state": START}, "A scene has its own initial state"),
     ],
 )
@@ -57,16 +49,11 @@ def test_bad_settings_are_refused(settings, words):
     ("settings", "words"),
     [
         ({"rtol": -1e-6}, "rtol must be finite and at least 1e-15.*-1e-06"),
-        ({"rtol": 1e-17}, "rtol must be finite and at least 1e-15"),
         ({"rtol": np.nan}, "rtol must be finite"),
         ({"atol": 0.0}, "atol must be finite and at least 1e-15"),
-        ({"atol": np.inf}, "atol must be finite"),
         ({"solver": diffrax.Euler()}, "Euler has no error estimate.*Dopri8"),
         ({"max_steps": 0}, "max_steps"),
-        ({"max_steps": -5}, "max_steps"),
         ({"first_step": 0.0}, "first_step"),
-        ({"first_step": -1e-3}, "first_step"),
-        ({"first_step": np.nan}, "first_step"),
         (
             {"solver": "Kvaerno5"},
             r"solver must be an object.*the text 'Kvaerno5': write kvaerno5\(\)",
@@ -76,7 +63,6 @@ def test_bad_settings_are_refused(settings, words):
             {"formulation": "tree"},
             r"formulation must be an object such as Tree\(\).*text 'tree': write Tree",
         ),
-        ({"formulation": stm.Tree}, r"the class Tree: write Tree\(\)"),
         ({"stabilisation": "none"}, r"stabilisation must be an object such as Projection\(\)"),
     ],
 )
@@ -87,7 +73,7 @@ def test_bad_methods_are_refused(settings, words):
 
 @pytest.mark.parametrize(
     ("given", "words"),
-    [(diffrax.Dopri8(), "Dopri8"), (stm.Method, "the class Method"), ("dopri8", "'dopri8'")],
+    [(diffrax.Dopri8(), "Dopri8"), (stm.Method, "the class Method")],
 )
 def test_nothing_but_a_method_says_how_to_integrate(given, words):
     with pytest.raises(stm.SettingError, match=rf"must be a Method\(\.\.\.\), but it is {words}"):
@@ -100,14 +86,6 @@ def test_a_solver_to_be_chosen_needs_simulate():
         stm.integrate(SYSTEM, START, jnp.array([0.0, 0.1]), stm.Method(solver="auto"))
 
 
-def test_simulate_sets_what_only_it_may_decide():
-    """A run is not differentiated, and its balances belong to its analysis."""
-    asked = stm.Method(rtol=1e-6, steps="sensitivities", balances=True)
-    got = stm.simulate(SCENE, method=asked, t1=0.1, error_estimate=False, analysis=False).method
-    assert isinstance(got.adjoint, diffrax.ForwardMode)
-    assert (got.steps, got.balances, got.rtol, got.max_steps) == ("state", False, 1e-6, 100_000)
-
-
 def simulated(system=SYSTEM, state=START, **settings):
     return stm.simulate(system, state, **settings)
 
@@ -116,10 +94,7 @@ def simulated(system=SYSTEM, state=START, **settings):
     ("settings", "words"),
     [
         ({}, r"give the end t1 \[s\], or the saved times"),
-        ({"t1": np.nan}, "t1 = nan s must be finite"),
-        ({"t1": -1.0}, "not before t0"),
         ({"t1": 1.0, "state": None}, r"give its initial State.*given: none"),
-        ({"ts": []}, "list of finite numbers"),
     ],
 )
 def test_a_system_needs_a_state_and_an_end(settings, words):
@@ -156,11 +131,8 @@ def with_start(**changes):
     ("changes", "words"),
     [
         ({"r": START.r * jnp.nan}, "initial position of body 'bob' must be finite"),
-        ({"v": START.v.at[0, 1].set(jnp.inf)}, "initial velocity of body 'bob' must be finite"),
-        ({"omega": START.omega * jnp.nan}, "angular velocity of body 'bob' must be finite"),
         ({"p": START.p * 0.9}, "body 'bob' in the initial state must have norm 1.*has norm 0.9"),
         ({"p": START.p * 0.0}, "body 'bob' in the initial state are all zero"),
-        ({"p": START.p * jnp.nan}, "body 'bob' in the initial state must be finite"),
         (
             {"r": START.r + 1e-5},
             "initial positions do not fit the joints: joint 'hinge' is off by 1e-05.*assemble",
@@ -191,19 +163,10 @@ def test_a_wrong_angle_and_a_wrong_distance_have_their_own_units():
         simulated(tied, state_of([[0, 0, 0.0]], [[1.0, 0, 0, 0]]), t1=0.1, analysis=False)
 
 
-def test_states_of_another_size_are_refused():
-    two = state_of(np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
-    with pytest.raises(stm.SettingError, match=r"State.r must have shape \(1, 3\)"):
-        stm.simulate(scene_of(SYSTEM, two))
-
-
-@pytest.mark.parametrize("kind", [stm.AppliedForce, stm.AppliedMoment])
-def test_a_load_that_is_not_finite_at_the_start(kind):
-    bad = kind("bob", lambda t, kin: jnp.asarray([jnp.nan, 0.0, 0.0]) * (1 + t))
+def test_a_load_that_is_not_finite_at_the_start():
+    bad = stm.AppliedMoment("bob", lambda t, kin: jnp.asarray([jnp.nan, 0.0, 0.0]) * (1 + t))
     system = pendulum(forces=(stm.JointDamping("hinge", turning=0.1), bad))
-    with pytest.raises(
-        stm.ModelError, match=rf"load of {kind.__name__} on bob is not finite at t = 0"
-    ):
+    with pytest.raises(stm.ModelError, match="load of AppliedMoment on bob is not finite at t = 0"):
         stm.simulate(scene_of(system, START))
 
 
@@ -307,34 +270,21 @@ def test_ctrl_c_keeps_what_was_reached(run):
     count = len(found.ts)
     assert 1 < count < 21
     assert found.certificate.t_end == found.ts[-1] < 0.4
+    assert found.errors.estimated_count == count
+    assert found.certificate.position_error > 0
     full = run[0].states.r[:count]
     np.testing.assert_allclose(found.states.r, full, rtol=0, atol=1e-12)
 
 
-def bursting():
-    """A pendulum whose load turns bad at 0.3 s."""
-    burst = lambda t, kin: jnp.where(t < 0.3, 1.0, jnp.nan) * jnp.asarray([0.0, 0.0, 1.0])
-    return scene_of(
-        pendulum(forces=(stm.AppliedForce("bob", burst),)), START, t1=0.5, save_every=0.1
-    )
-
-
-@pytest.fixture(scope="module")
-def failed():
-    """The error of such a run."""
-    with pytest.raises(stm.SimulationError) as error:
-        stm.simulate(bursting())
-    return error.value
-
-
 @pytest.mark.slow
-def test_a_load_that_turns_bad_is_named(failed):
-    assert "load of AppliedForce on bob is not finite" in str(failed)
-    assert "stopped at t = 0.3" in str(failed)
-
-
-def check_part(run):
-    """The part before 0.3 s, finite throughout."""
+def test_a_load_that_turns_bad_is_named_and_the_run_before_it_is_kept():
+    burst = lambda t, kin: jnp.where(t < 0.3, 1.0, jnp.nan) * jnp.asarray([0.0, 0.0, 1.0])
+    system = pendulum(forces=(stm.AppliedForce("bob", burst),))
+    with pytest.raises(stm.SimulationError) as error:
+        stm.simulate(scene_of(system, START, t1=0.5, save_every=0.1))
+    assert "load of AppliedForce on bob is not finite" in str(error.value)
+    assert "stopped at t = 0.3" in str(error.value)
+    run = error.value.run
     assert isinstance(run, stm.Run)
     assert not run.successful
     assert run.certificate.t_end == pytest.approx(0.3, abs=1e-6)
@@ -342,10 +292,6 @@ def check_part(run):
     assert len(run.ts) == len(run.states.r) == 4
     assert np.all(np.isfinite(run.states.r))
     assert np.isfinite(run.certificate.energy_error)
-
-
-def test_the_failed_run_is_kept(failed):
-    check_part(failed.run)
 
 
 def test_without_analysis_there_is_no_snapshot(run):

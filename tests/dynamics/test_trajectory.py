@@ -94,16 +94,6 @@ def test_gradients_equal_finite_differences(batched, forward):
         assert float(batched[1][0, k]) == pytest.approx(float(expected), rel=1e-6)
 
 
-def test_a_failed_flight_is_not_a_number(of_batch, batched):
-    """Nor is its gradient, so that a sum shows it; the others are as without it."""
-    values, gradients = of_batch(BATCH.at[1, 1].set(jnp.nan))
-    assert np.isnan(values[1])
-    assert np.all(np.isnan(gradients[1]))
-    for k in (0, 2):
-        assert float(values[k]) == pytest.approx(float(batched[0][k]), rel=1e-12)
-        assert relative_error(gradients[k], batched[1][k]) < 1e-10
-
-
 def test_a_flight_that_stops_on_the_way_is_not_a_number(of_batch, batched, forward):
     """In both modes; what it has reached is kept, and the other flights are as without it."""
     fast = BATCH.at[1, 0].set(250.0)

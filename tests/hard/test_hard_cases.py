@@ -3,21 +3,18 @@
 The cases and what they are compared with are those of `benchmarks/problems/hard.py` and `hard_loops.py`.
 """
 
-import json
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from hard import EVERY, PEERS, beside, holds, page, result_of, row_of, singular_start, sweep
+from hard import EVERY, beside, holds, row_of, singular_start, sweep
 from peers.adapter import Outcome, Prepared, Setting
 from problems.hard import TOLERANCES, Hard, apart, on_rail
 from problems.hard_loops import STARTS
 
 import stmuav_jax as stm
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
 # Motions that are known to fewer digits than the run has, or whose error is not that of a length,
 # an angle or a rate, tell nothing about the estimate.
 NOT_KNOWN_WELL = ("stiffness 1e9", "mass ratio 1e9", "ten minutes")
@@ -115,31 +112,9 @@ def test_other_programs_run_at_their_finest_setting_that_fits():
     row = beside(case(1), peer)
     assert row["error"] == pytest.approx(0.25)
     assert (row["seconds"], row["setting"]["solver"], row["reason"]) == (2.0, "fine", "")
-    assert result_of(row) == "0.25, 2 s (step 0.25 s)"
     assert beside(case(2), peer)["reason"] == "Two bodies are not supported by our adapters."
-    assert result_of(beside(case(2), peer)) == "not in our adapter"
-    lost = row | {
-        "reason": "It diverged.",
-        "setting": {"solver": "", "tolerance": 1e-12, "step": None},
-    }
-    assert result_of(lost) == "It diverged (tolerance 1e-12)."
     peer.reason = "It is not installed."
     assert beside(case(1), peer) == {
         "peer": "falling", "error": None, "seconds": None, "setting": None,
         "reason": "It is not installed.",
     }  # fmt: skip
-    assert len(PEERS) == 3
-    assert [one.name for one in EVERY if not one.of_positions] == [
-        "fast rotation", "intermediate axis", "ten minutes of the tracker"
-    ]  # fmt: skip
-
-
-def test_the_page_of_an_older_record_has_no_empty_sections():
-    content = json.loads((FOLDER / "results" / "hard.json").read_text())
-    for row in content["cases"]:
-        row.pop("peers", None)
-    content.pop("starts", None)
-    text = page(content)
-    assert "constraint violation [m]" in text
-    assert "Other programs" not in text
-    assert "singular posture" not in text.split("## All tolerances")[1]

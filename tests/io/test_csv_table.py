@@ -8,8 +8,10 @@ from stmuav_jax.io import FileError
 from stmuav_jax.io.csv_table import read_csv_table
 
 
-@pytest.mark.parametrize("code", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
-@pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", ","), ("\t", ",")])
+@pytest.mark.parametrize(
+    ("code", "separator", "decimal"),
+    [("utf-8", ",", "."), ("utf-8-sig", ";", ","), ("utf-16", "\t", ","), ("cp1252", ";", ",")],
+)
 def test_separators_decimals_and_codes(code, separator, decimal, tmp_path):
     lines = [["t", "Höhe [m]"], ["0", "1.5"], ["0.1", ""], [], ["0.2", "-2e3"]]
     text = "\r\n".join(separator.join(line).replace(".", decimal) for line in lines)

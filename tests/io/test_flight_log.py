@@ -242,12 +242,9 @@ def test_settings_of_the_other_formats_have_their_sources(tmp_path):
     assert pilot["gyroscope_cutoff"] == (40.0, "Hz", "INS_GYRO_FILTER")
 
 
-def test_commands_are_those_of_the_thrust_curve_of_their_factor(tmp_path):
-    """PX4 logs what the outputs solve f u^2 + (1 - f) u for; ArduPilot's curve begins at MOT_SPIN_MIN."""
+def test_commands_of_ardupilot_are_those_of_its_thrust_curve(tmp_path):
+    """ArduPilot's curve begins at MOT_SPIN_MIN; PX4's is above."""
     T = flight()["motor_commands"]
-    log = read_flight_log(written("ulog", tmp_path, flight(), parameters=[("THR_MDL_FAC", 0.3)]))
-    u = log["motor_commands"].values
-    np.testing.assert_allclose(0.3 * u**2 + 0.7 * u, T, atol=1e-6)
     spins = [("MOT_SPIN_MIN", 0.15), ("MOT_SPIN_MAX", 0.95), ("MOT_PWM_MIN", 1000.0)]
     log = read_flight_log(written("bin", tmp_path, flight(), parameters=spins))
     expected = np.maximum((T - 0.15) / 0.8, 0.0)
@@ -431,13 +428,6 @@ def test_windows_keep_the_log_s_times(tmp_path):
             call()
 
 
-def test_the_description_names_channels_flights_and_sources(tmp_path):
-    text = read_flight_log(written("card", tmp_path, flight())).describe()
-    assert "in flight: 2.0 to 6.0 s" in text
-    assert "fixedFrequency: acc.x, acc.y, acc.z" in text
-    assert "gyroscope_cutoff" in text
-
-
 @pytest.mark.parametrize("kind", FORMATS)
 def test_what_is_before_a_cut_is_kept(kind, tmp_path):
     path = written(kind, tmp_path, flight())
@@ -590,9 +580,6 @@ FAULTS = {
         lambda parts: parts | {"gyroscope": parts["gyroscope"][:, [1, 0, 2]]},
         "about x, y, z as the gyroscope measures y, x, z", True,
     ),
-    "attitude of other signs": (
-        scaled("attitude", [1, 1, -1, -1]), "about x, y, z as the gyroscope measures x, -y, -z", True,
-    ),
     "attitude from degrees": (
         lambda parts: {k: v for k, v in parts.items() if k != "attitude"}
         | {"euler_angles": parts["euler_angles"] / degree},
@@ -605,7 +592,6 @@ FAULTS = {
         scaled("position", 100), "position moves along x, y, z 100 times as much as the velocity measures, as if one "
         "were in cm", False,
     ),
-    "velocity of other signs": (scaled("velocity", [1, -1, -1]), "measures x, -y, -z", False),
     "accelerometer in g": (
         lambda parts: scaled("accelerometer", 0.6)({k: v for k, v in parts.items() if k != "position"}),
         "velocity changes along x, y, z 1.6", False,
@@ -662,13 +648,10 @@ def test_a_single_wrong_stamp_costs_one_sample(tmp_path):
     ("kind", "options", "words"),
     [
         ("ulog", {"parameters": [("MAV_TYPE", 22)]}, "of a VTOL aircraft"),
-        ("ulog", {"parameters": [("MAV_TYPE", 1)]}, "of a fixed-wing aircraft"),
         ("bin", {"texts": ["ArduPlane V4.5"]}, "the firmware ArduPlane"),
-        ("bin", {"parameters": [("Q_ENABLE", 1.0)]}, "of a VTOL aircraft"),
         ("ulog", {"parameters": [("MAV_TYPE", 0), ("CA_AIRFRAME", 11)]}, "of a helicopter"),
         ("bin", {"parameters": [("FRAME_CLASS", 6.0)]}, "of a helicopter"),
         ("bin", {"texts": (), "parameters": [("SERVO1_FUNCTION", 4.0)]}, "of an aircraft with control surfaces"),
-        ("bin", {"parameters": [("FRAME_CLASS", 9.0)]}, "of a coaxial rotor above vanes"),
         ("ulog", {"parameters": [("CA_AIRFRAME", 8)]}, "of a multirotor with tilting rotors"),
         ("ulog", {"parameters": [("CA_ROTOR_COUNT", 1), ("CA_ROTOR0_PX", 0.1), ("CA_ROTOR0_AY", -0.5)]},
          "Rotor 1 is tilted by 26.6 degrees"),
@@ -722,8 +705,6 @@ def test_a_missing_library_is_named(kind, tmp_path, monkeypatch):
         (b"H Product:Blackbox flight data recorder", "a blackbox log of Betaflight"),
         (b"Dear reader,\nthis is a letter.\n", "is no flight log: its first line"),
         (b"t [s],gyroscope.x [rad/s],gyroscope.y [rad/s],gyroscope.z [rad/s]\n", "has no rows"),
-        (b"t [s],battery_voltage [V]\n0,1\n1,2,3\n2,3\n", "3 cells, but the header has 2"),
-        (b"t [s],battery_voltage [V]\n0,1\n1,x\n", "'x' in column 'battery_voltage [V]' is not a number"),
         (b"t,battery_voltage [V]\n0,1\n1,1\n", "'t' has no unit; valid are s, sec, ms"),
         (b"t [s],battery_voltage [bar]\n0,1\n1,1\n", "has the unit 'bar'; valid are V, mV"),
         (b"t [s],motor_commands.1\n0,1000\n1,1500\n", "give their range"),
@@ -746,7 +727,6 @@ def test_other_files_are_refused_in_words(content, words, tmp_path):
         ({"batery_voltage": {"columns": ["volt"]}}, "battery_voltage"),
         ({"motor_commands": {"columns": ["m"], "range": [5, 5]}}, "two different ends"),
         ({"settings": {"gyroscope_cutof": 80}}, "gyroscope_cutoff"),
-        ({"settings": {"gyroscope_cutoff": "80 Hz"}}, "must be a number"),
         ({"settings": {"gyroscope_cutoff": 0}}, "must be positive, but it is 0 Hz"),
     ],
 )

@@ -27,7 +27,6 @@ from stmuav_jax.io.model_schema import (
     INSTRUMENTS,
     JOINTS,
     START_BODY,
-    _joint_kinds,
     model_json_schema,
 )
 from stmuav_jax.mechanics import (
@@ -36,7 +35,6 @@ from stmuav_jax.mechanics import (
     JointFriction,
     JointServo,
     SineMotion,
-    joint as joint_functions,
     joint_motion,
 )
 from stmuav_jax.mechanics.joint import CATALOGUE
@@ -317,13 +315,6 @@ def test_every_kind_comes_back_to_the_last_bit(tmp_path):
     assert model_to_text(again) == path.read_text(encoding="utf-8")
 
 
-def test_a_joint_with_an_argument_that_files_do_not_know_is_left_out(monkeypatch):
-    slope = lambda name, body_i, body_j, *, slope: None
-    monkeypatch.setitem(CATALOGUE, "slope", CATALOGUE["revolute"])
-    monkeypatch.setattr(joint_functions, "slope", slope, raising=False)
-    assert _joint_kinds() == [kind for kind in CATALOGUE if kind in JOINTS and "drive" not in kind]
-
-
 def test_what_a_file_cannot_hold_is_refused(gallery):
     system = gallery["pendulum"].system
     pin = system.joints[0]
@@ -394,34 +385,21 @@ def test_a_multirotor_of_a_file_hovers_in_its_wind(tmp_path):
     assert run.v_rate[0] == pytest.approx([0.2 * 3.0 / 2.0, 0.0, 0.0], abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("number = 4\n", "", "Rotors need 'arms' and 'spin', or a layout by 'number' and 'radius'"),
-        ("radius = 0.25\n", "", "A layout of rotors needs 'radius'"),
-        ("number = 4", "number = 5", "must be even, and at least 4, so that drag torques balance, but it is 5"),
-        ("[forces.weight]", "[forces.more]\nkind = 'rotors'\nbody = 'frame'\nnumber = 4\nradius = 1\nk_f = 1\n"
-         "k_tau = 0\n[forces.weight]", "[forces.more]: One of several sets of rotors needs 'speed_squared'"),
-        ("kind = \"drag\"", "kind = \"moment\"\nmoment = [0, 0, 0]", "no entry 'linear'"),
-        ("[wind]", "[wind]\ngusts = {}\nsteaddy = 0", "'wind' has no entry 'steaddy'. Did you mean 'steady'?"),
-        ("steady = [3.0, 0.0, 0.0]", "gusts = {}", "[wind]: Gusts pass at the speed of the steady wind"),
-        ("format = 2", "format = 1", "'wind' needs format = 2"),
-        ("highest = 1200.0", "lowest = 1300.0\nhighest = 1200.0", "must be 0 <= lowest < highest"),
-        ("k_tau = 2e-7\n", "", "Rotors need 'k_f' and 'k_tau', or 'points' of a test stand"),
-        ("k_tau = 2e-7\n", "points = [[1, 2, 3]]\n", "either 'points' of a test stand or coefficients"),
-        ("k_tau = 2e-7", "k_tau = 2e-7\nthrust_linear = -1e-3", "falls with their speed below 50 rad/s, but "
-         "their lowest speed is 0 rad/s"),
-        ("k_f = 1e-5\nk_tau = 2e-7\n", "points = [[1, 0, 0], [2, 1, 1], [3, 0, 0], [4, 1, 1]]\n",
-         "No quadratic curve of the speed fits the thrusts"),
-        ("k_f = 1e-5\nk_tau = 2e-7\n", "points = [[1, 0, 0], [2, 1, 1]]\n", "at three speeds or more"),
-    ],
-)  # fmt: skip
-def test_errors_of_a_flying_model_name_the_place(old, new, words, tmp_path):
-    path = tmp_path / "bad.toml"
-    assert FLYING.count(old) == 1
-    path.write_text(FLYING.replace(old, new))
-    with pytest.raises(FileError, match=re.escape(words)):
-        load_model(path)
+BAD_FLYING = [
+    ("number = 4\n", "", "Rotors need 'arms' and 'spin', or a layout by 'number' and 'radius'"),
+    ("number = 4", "number = 5", "must be even, and at least 4, so that drag torques balance, but it is 5"),
+    ("[forces.weight]", "[forces.more]\nkind = 'rotors'\nbody = 'frame'\nnumber = 4\nradius = 1\nk_f = 1\n"
+     "k_tau = 0\n[forces.weight]", "[forces.more]: One of several sets of rotors needs 'speed_squared'"),
+    ("[wind]", "[wind]\ngusts = {}\nsteaddy = 0", "'wind' has no entry 'steaddy'. Did you mean 'steady'?"),
+    ("steady = [3.0, 0.0, 0.0]", "gusts = {}", "[wind]: Gusts pass at the speed of the steady wind"),
+    ("format = 2", "format = 1", "'wind' needs format = 2"),
+    ("highest = 1200.0", "lowest = 1300.0\nhighest = 1200.0", "must be 0 <= lowest < highest"),
+    ("k_tau = 2e-7\n", "", "Rotors need 'k_f' and 'k_tau', or 'points' of a test stand"),
+    ("k_tau = 2e-7", "k_tau = 2e-7\nthrust_linear = -1e-3", "falls with their speed below 50 rad/s, but "
+     "their lowest speed is 0 rad/s"),
+    ("k_f = 1e-5\nk_tau = 2e-7\n", "points = [[1, 0, 0], [2, 1, 1], [3, 0, 0], [4, 1, 1]]\n",
+     "No quadratic curve of the speed fits the thrusts"),
+]  # fmt: skip
 
 
 CURVES = """k_f = 1e-5
@@ -485,7 +463,6 @@ pin = 0.1
 BAD = [
     ("format = 1", "format = 3", "'format' is 3, but this version reads the formats 1 and 2"),
     ("format = 1", "format = 1\ntitel = 'x'", "no entry 'titel'. Did you mean 'title'?"),
-    ("format = 1", "format = 1\nwatch = ['rd']", "There is no body 'rd'. Did you mean 'rod'?"),
     ("value = 1.0", "value = 'x'", "'parameters.mass.value' must be finite numbers, but it is 'x'"),
     (', source = "chosen"', "", "'parameters.mass' needs 'source'"),
     ('unit = "kg"', 'unit = "g"', "[bodies.rod]: 'mass' is a quantity in kg, but the parameter "
@@ -493,51 +470,30 @@ BAD = [
     ('mass = "mass"', 'mass = "mas"', "[bodies.rod]: 'mass' must be numbers or the names of "
      "parameters, but there is no parameter 'mas'. Did you mean 'mass'?"),
     ('mass = "mass"', "mass = -1", "[bodies.rod]: The mass of body 'rod' must be finite and positive"),
-    ("[1, 1, 1]", "[1, 1, 9]", "[bodies.rod]: The inertia tensor of"),
-    ("[1, 1, 1]", "[1, 1, 1]\norientation = [2, 0, 0, 0]", "[bodies.rod]: "),
     ("[1, 1, 1]", "[1, 1, 1]\nposition = [0, 0, 0]\ncom_position = [0, 0, 0]", "not both"),
     ("bodies.rod", "bodies.ground", "[bodies.ground]: A body cannot be named 'ground'"),
     ("revolute", "revolut", "[joints.pin]: A joint has the kind 'revolut'. Did you mean 'revolute'?"),
     ('"rod"]', '"rood"]', "Joint 'pin' names the unknown body 'rood'. Did you mean 'rod'?"),
-    ('["ground", "rod"]', '"rod"', "'bodies' must be a list, but it is 'rod'"),
     ("axis = [0, 1, 0]", "axis = [0, 0, 0]", "[joints.pin]: The axis of joint 'pin' has zero length"),
     ("axis = [0, 1, 0]", "axes = [0, 1, 0]", "A joint of kind revolute has no entry 'axes'. Did you "
      "mean 'axis'?"),
     ('kind = "gravity"', 'kind = "spring"\nbodies = ["rod", "ground"]\nstiffness = -1',
      "[forces.weight]: The stiffness of the spring between 'rod' and 'ground' must not be negative"),
-    ('kind = "gravity"', 'kind = "servo"\njoint = "pn"\nstiffness = 1\ndamping = 1\ntarget = 0',
-     "A JointServo names the unknown joint 'pn'. Did you mean 'pin'?"),
     ('kind = "gravity"', 'kind = "effort"\njoint = "pin"\neffort = 1\ncoordinate = "angel"',
      "'coordinate' must be 'angle' or 'displacement', but it is 'angel'. Did you mean 'angle'?"),
-    ('kind = "gravity"', 'kind = "moment"\nbody = "rod"\nmoment = ["mass", 0, 0]',
-     "'moment' is a quantity in N m, but the parameter 'mass' is in 'kg'"),
     # units of a coordinate are those of its joint
     ("pin = 0.1", 'pin = "mass"', "'coordinates.pin' is a quantity in rad, but the parameter 'mass'"),
-    ("pin = 0.1", 'pin = ["mass"]', "'coordinates.pin' is a quantity in rad, but"),
     ("[start.coordinates]\npin = 0.1", '[start.rates]\npin = "mass"',
      "'rates.pin' is a quantity in rad/s, but"),
     ('kind = "gravity"', 'kind = "effort"\njoint = "pin"\neffort = "mass"',
      "'effort' is a quantity in N m, but the parameter 'mass' is in 'kg'"),
-    ("[forces.weight]", '[joints.turn]\nkind = "drive_angle"\njoint = "pin"\nrate = "mass"\n[forces.weight]',
-     "[joints.turn]: 'rate' is a quantity in rad/s, but"),
     ("pin = 0.1", "pn = 0.1", "[start]: There is no joint 'pn'. Did you mean 'pin'?"),
-    ("pin = 0.1", "pin = 0.1\n[start.bodies.rod]\nspeed = 1", "'bodies.rod' has no entry 'speed'"),
     ("[joints.pin]", "[joints.pin]\nin_bodies = 3", "no entry 'point'"),
     ("[forces.weight]", "[joints.motor]\nkind = 'drive_angle'\njoint = 'pn'\n[forces.weight]",
      "[joints.motor]: 'joint' must be a joint of a table before this one, but it is 'pn'. Did you"),
     ("[forces.weight]", "[joints.motor]\nkind = 'drive_displacement'\njoint = 'pin'\n[forces.weight]",
      "[joints.motor]: Driver 'motor' prescribes the displacement of joint 'pin', but a revolute"),
 ]  # fmt: skip
-
-
-@pytest.mark.parametrize(("old", "new", "words"), BAD)
-def test_errors_name_file_table_entry_and_what_is_valid(old, new, words, tmp_path):
-    path = tmp_path / "bad.toml"
-    assert SMALL.count(old) == 1
-    path.write_text(SMALL.replace(old, new))
-    with pytest.raises(FileError, match=re.escape(words)) as caught:
-        load_model(path)
-    assert str(caught.value).startswith(str(path))
 
 
 def test_a_driver_moves_as_its_numbers_say(tmp_path):
@@ -705,22 +661,28 @@ def test_sensors_of_a_file_come_back(tmp_path):
     ]
 
 
+BAD_SENSED = [
+    ('joint = "pin"', 'joint = "pi"', "[sensors.angle]: There is no joint 'pi'"),
+    ("[0.01, 0, -0.01]", "[0.01, 0]", "'bias' must have one number, or 3, but it has 2"),
+    ("noise = 1e-3", "noise = -1e-3",
+     "'angle' must not be negative, since it is a standard deviation, but it is -0.001"),
+    ("rate = 10}", "rate = 0}", "'facing' must be positive and finite, but it is 0.0 Hz"),
+    ('unit = "rad/s"', 'unit = "m/s"', "'noise' is a quantity in rad/s"),
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("text", "old", "new", "words"),
     [
-        ("format = 2", "format = 1", "'sensors' needs format = 2, but the file has 1"),
-        ('kind = "attitude"', 'kind = "attitud"', "[sensors.facing]: A sensor has the kind 'attitud'. Did you mean"),
-        ('joint = "pin"', 'joint = "pi"', "[sensors.angle]: There is no joint 'pi'"),
-        ("[0.01, 0, -0.01]", "[0.01, 0]", "'bias' must have one number, or 3, but it has 2"),
-        ("noise = 1e-3", "noise = -1e-3",
-         "'angle' must not be negative, since it is a standard deviation, but it is -0.001"),
-        ("rate = 10}", "rate = 0}", "'facing' must be positive and finite, but it is 0.0 Hz"),
-        ('unit = "rad/s"', 'unit = "m/s"', "'noise' is a quantity in rad/s"),
+        *((SMALL, *each) for each in BAD),
+        *((FLYING, *each) for each in BAD_FLYING),
+        *((SENSED, *each) for each in BAD_SENSED),
     ],
-)  # fmt: skip
-def test_errors_of_sensors_name_the_place(old, new, words, tmp_path):
-    assert SENSED.count(old) == 1
+)
+def test_errors_name_file_table_entry_and_what_is_valid(text, old, new, words, tmp_path):
     path = tmp_path / "bad.toml"
-    path.write_text(SENSED.replace(old, new))
-    with pytest.raises(FileError, match=re.escape(words)):
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new))
+    with pytest.raises(FileError, match=re.escape(words)) as caught:
         load_model(path)
+    assert str(caught.value).startswith(str(path))

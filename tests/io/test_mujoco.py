@@ -445,6 +445,22 @@ def test_a_spring_is_a_tendon_and_a_hinge_in_a_loop_two_points(mujoco, tmp_path)
     assert abs(wanted) > 1
 
 
+def check_fall(mujoco, scene, path, *, least):
+    """Compare places after a fall of 0.3 s, by the file alone, with those of a run here."""
+    system = scene.system
+    end = np.asarray(stm.simulate(scene).states.r)[-1]
+    assert save_mjcf(scene, path) == ()
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    assert model.opt.timestep == 1e-4
+    mujoco.mj_step(model, data, 3000)
+    mujoco.mj_forward(model, data)
+    assert np.abs(end - np.asarray(system.reference.r)).max() > least
+    places = np.array([data.xipos[model.body(name).id] for name in system.names])
+    # MuJoCo's own step leaves 2e-9 m
+    np.testing.assert_allclose(places, end, atol=1e-7)
+
+
 def test_joints_without_a_counterpart_are_refused(tmp_path):
     scene = load_model(MODELS / "stewart_platform.toml")
     with pytest.raises(
@@ -506,19 +522,7 @@ def test_a_parallel_robot_moves_in_mujoco_as_here_without_options(mujoco, tmp_pa
     """3-RPS that falls for 0.3 s, by the file alone; soft loops of MuJoCo's defaults are 3e-4 m off."""
     system = three_rps(0.45)
     scene = Scene("rps", "3-RPS", system, system.reference, t1=0.3, save_every=0.3)
-    run = stm.simulate(scene)
-    assert save_mjcf(scene, tmp_path / "rps.xml") == ()
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "rps.xml"))
-    data = mujoco.MjData(model)
-    assert model.opt.timestep == 1e-4
-    for _ in range(3000):
-        mujoco.mj_step(model, data)
-    mujoco.mj_forward(model, data)
-    # the fall itself, and the distance from ours; MuJoCo's own step leaves 2e-9 m
-    fall = np.asarray(run.states.r)[-1] - np.asarray(system.reference.r)
-    assert np.abs(fall).max() > 0.1
-    places = np.array([data.xipos[model.body(name).id] for name in system.names])
-    np.testing.assert_allclose(places, np.asarray(run.states.r)[-1], atol=1e-7)
+    check_fall(mujoco, scene, tmp_path / "rps.xml", least=0.1)
 
 
 @pytest.mark.slow
@@ -537,18 +541,7 @@ def test_coupled_joints_move_in_mujoco_as_here(mujoco, tmp_path):
     rack = stm.mimic("track", slide, first, ratio=0.05)
     system = stm.System(bodies, [first, second, slide, gear, rack], [stm.Gravity()])
     scene = Scene("geared", "geared", system, system.reference, t1=0.3, save_every=0.3)
-    run = stm.simulate(scene)
-    path = tmp_path / "geared.xml"
-    assert save_mjcf(scene, path) == ()
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    for _ in range(3000):
-        mujoco.mj_step(model, data)
-    mujoco.mj_forward(model, data)
-    fall = np.asarray(run.states.r)[-1] - np.asarray(system.reference.r)
-    assert np.abs(fall).max() > 0.05
-    places = np.array([data.xipos[model.body(name).id] for name in system.names])
-    np.testing.assert_allclose(places, np.asarray(run.states.r)[-1], atol=1e-7)
-    again = load_robot(path).system
+    check_fall(mujoco, scene, tmp_path / "geared.xml", least=0.05)
+    again = load_robot(tmp_path / "geared.xml").system
     numbers = {joint.name: float(joint.mate.ratio) for joint in again.joints if joint.mate}
     assert numbers == {"gear": -1.5, "track": 0.05}

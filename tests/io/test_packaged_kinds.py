@@ -89,19 +89,14 @@ CROSS = [0.0, 0.0, 0.5, 1.0, 1.0, 1.0]
 UPS = ("RXPRXZ", CROSS)
 # legs, feet and heads, joint of the closures, degrees of freedom by the count of Chebychev, Gruebler and Kutzbach
 KINDS = {
-    "four-bar": (["RR", "RR"], *LINE, "weld", 1),
     "four-bar by a hinge": (["RR", "RR"], *LINE, "revolute", 1),
     "five-bar": (["RRR", "RR"], *LINE, "weld", 2),
-    "3-joint leg pair": (["RRR", "RRR"], *LINE, "weld", 3),
     "slider-crank": (["RRR", "P"], *LINE, "weld", 1),
-    "five-bar with slides": (["PRR", "PR"], *LINE, "weld", 2),
     "ankle with two rods": (["RX", UPS, UPS], [(0.0, 0.0), *ring(0.3, 2)], [(0.0, 0.0), *ring(0.2, 2)], "weld", 2),
     "3-RPS": ([("RPXRZ", BALL)] * 3, ring(0.4), ring(0.3), "weld", 3),
-    "3-RRS": ([("RRXRZ", BALL)] * 3, ring(0.4), ring(0.3), "weld", 3),
     "3-RRS by balls": (
         [("RRXRZ", BALL), ("RR", [0.0, 0.5]), ("RR", [0.0, 0.5])], ring(0.4), ring(0.3), "spherical", 3
     ),
-    "3-PRS": ([("PRXRZ", BALL)] * 3, ring(0.4), ring(0.3), "weld", 3),
     "3-UPS and a sliding post": (
         [("P", [0.0]), UPS, UPS, UPS], [(0.0, 0.0), *ring(0.4)], [(0.0, 0.0), *ring(0.3)], "weld", 1
     ),
@@ -109,25 +104,18 @@ KINDS = {
 }  # fmt: skip
 
 
-def check(kind, path):
+@pytest.mark.parametrize(
+    "kind",
+    ["five-bar", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != "five-bar")],
+)
+def test_parallel_robots_closed_by_frames_have_their_degrees_of_freedom(kind, tmp_path):
     legs, feet, heads, closure, dof = KINDS[kind]
-    text = legged(legs, feet, heads)
-    path.write_text(text)
+    path = tmp_path / "robot.urdf"
+    path.write_text(legged(legs, feet, heads))
     loops = {(f"seat_{k}", f"tip_{k}"): closure for k in range(1, len(legs))}
     scene = load_robot(path, loops=loops)
     assert scene.warnings == ()
-    assert stm.dynamics.rank(scene.system, scene.state0).dof == dof, kind
-
-
-@pytest.mark.parametrize("kind", ["five-bar"])
-def test_frames_that_coincide_close_loops(kind, tmp_path):
-    check(kind, tmp_path / "robot.urdf")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "five-bar"])
-def test_parallel_robots_of_frames_have_their_degrees_of_freedom(kind, tmp_path):
-    check(kind, tmp_path / "robot.urdf")
+    assert stm.dynamics.rank(scene.system, scene.state0).dof == dof
 
 
 def test_loops_of_unknown_links_and_kinds_are_refused(tmp_path):

@@ -8,16 +8,13 @@ the next order no longer shows, and so coarse that round-off does not yet.
 from functools import cache
 from typing import Any
 
-import diffrax
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import make_equal_steps
 from problems.conservative import SLOW, top
 
 import stmuav_jax as stm
 from stmuav_jax.dynamics.choices import solver_named
-from stmuav_jax.dynamics.integration.problem import begin_integration, prepare_problem
 
 SPAN = 1.0
 # Order, and numbers of steps.
@@ -30,31 +27,8 @@ SYSTEM, START = top(SLOW)
 
 @cache
 def by_equal_steps(solver: Any, formulation: Any) -> Any:
-    """Function count -> positions at the end (1, 3), one compiled program for all counts."""
-    method = stm.Method(
-        formulation=formulation,
-        solver=solver_named(solver),
-        # to which the stages of implicit methods are solved
-        rtol=1e-13,
-        atol=1e-13,
-        adjoint=diffrax.ForwardMode(),
-        steps="state",
-    )
-    problem = prepare_problem(SYSTEM, method)
-    y0 = begin_integration(problem, jnp.zeros(()), START).y
-
-    @jax.jit
-    def end(step: Any) -> Any:
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(problem.field), problem.solver(), 0.0, SPAN, step, y0, problem.model,
-            stepsize_controller=diffrax.ConstantStepSize(), adjoint=method.adjoint,
-            max_steps=1024,
-        )  # fmt: skip
-        assert solution.ys is not None
-        return formulation.to_state(problem.model, solution.ys[0][: problem.n_state]).r
-
-    # a last step of round-off's length would be one more
-    return lambda count: np.asarray(end(SPAN / count * (1 + 1e-14)))
+    steps = make_equal_steps(SYSTEM, START, solver_named(solver), formulation)
+    return lambda count: steps(SPAN, count)
 
 
 def orders(solver: Any, formulation: Any, counts: tuple[int, ...]) -> np.ndarray:

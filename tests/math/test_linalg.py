@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 from helpers import central
-from jax.test_util import check_grads
 
-from stmuav_jax.math import lapack, linalg
+from stmuav_jax.math import linalg
 from stmuav_jax.math.linalg import (
     Factor,
     factor_cholesky,
@@ -65,20 +64,15 @@ def test_svd_gives_the_minimum_norm(rng, rank):
 
 
 @pytest.mark.parametrize("redundant", [False, True])
-@pytest.mark.parametrize("which", ["symmetric", "general"])
-def test_gradients(rng, redundant, which):
+def test_gradients(rng, redundant):
     """Along matrices of one rank: there, the minimum-norm solution is differentiable."""
     rank = 4 if redundant else 2 * N
     B, B1 = rng.normal(size=(2, N, rank))
-    C = B if which == "symmetric" else rng.normal(size=(N, rank))
-    C1 = B1 if which == "symmetric" else rng.normal(size=(N, rank))
     b, b1, w = rng.normal(size=(3, N))
 
     def solution(t):
-        S, vector = (B + t * B1) @ (C + t * C1).T, b + t * b1
-        if which == "symmetric":
-            return (factor_minimum_norm if redundant else factor_definite)(S).solve(vector)
-        return lapack.pseudoinverse(S, 1e-11) @ vector if redundant else lapack.solve(S, vector)
+        S, vector = (B + t * B1) @ (B + t * B1).T, b + t * b1
+        return (factor_minimum_norm if redundant else factor_definite)(S).solve(vector)
 
     solution = jax.jit(solution)
     rate = jax.jvp(solution, (0.0,), (1.0,))[1]
@@ -169,14 +163,3 @@ def test_factorisations_against_scipy():
             x = linalg.solve_lower(jnp.asarray(L), jnp.asarray(A), transpose=transpose)
             expected = scipy.linalg.solve_triangular(L, A, lower=True, trans=int(transpose))
             np.testing.assert_allclose(x, expected, atol=1e-12)
-
-
-def test_derivatives_of_the_factorisations():
-    rng = np.random.default_rng(2)
-    A, b = rng.normal(size=(4, 4)), rng.normal(size=4)
-
-    def solutions(A, b):
-        S = A @ A.T + jnp.eye(4)
-        return factor_definite(S).solve(b), linalg.factor_cholesky(S)
-
-    check_grads(jax.jit(solutions), (A, b), order=1, rtol=1e-5, atol=1e-5)

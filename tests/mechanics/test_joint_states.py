@@ -90,13 +90,6 @@ def test_coordinates_and_rates_by_kind(kind):
     np.testing.assert_allclose(found.rates, w if q_rate is None else q_rate, atol=1e-9)
 
 
-def test_zero_at_the_reference_posture():
-    for joint in JOINTS.values():
-        system = system_of(joint)
-        found = stm.mechanics.joint_motion(system, system.reference, "J")
-        np.testing.assert_allclose(found.coordinates, 0, atol=1e-15)
-
-
 def wheel(turns, rate, count):
     """States of a wheel that turns evenly."""
     system = stm.System(

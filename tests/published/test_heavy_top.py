@@ -8,19 +8,15 @@ kg m^2, centre of mass 1 m from the fixed point along the body's y axis, g = 9.8
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import diffrax
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_forms import scene
-from jax import Array
+from helpers import make_equal_steps
 from problems.conservative import FAST, MASS, SLOW, top
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration.problem import begin_integration, prepare_problem
 
 TIMES = np.array([0.0, 0.1, 0.2])  # s
 ENERGY = 5435.696790865547  # J, fast, at the start
@@ -85,37 +81,10 @@ def test_tip_force_is_the_motions(run: stm.Run) -> None:
 Steps = Callable[[float, int], np.ndarray]
 
 
-def by_fixed_steps(omega: tuple[float, float, float], solver: Any) -> Steps:
-    """(t1 [s], count) -> centre of mass at t1 by that many equal steps, one compilation."""
-    system, state = top(omega)
-    method = stm.Method(solver=solver, adjoint=diffrax.ForwardMode(), steps="state")
-    problem = prepare_problem(system, method)
-    y0 = begin_integration(problem, jnp.zeros(()), state).y
-
-    @eqx.filter_jit
-    def end(t1: Array, step: Array) -> Array:
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(problem.field),
-            problem.solver(),
-            jnp.zeros(()),
-            t1,
-            step,
-            y0,
-            problem.model,
-            saveat=diffrax.SaveAt(t1=True),
-            stepsize_controller=diffrax.ConstantStepSize(),
-            adjoint=method.adjoint,
-        )
-        assert solution.ys is not None
-        return method.formulation.to_state(problem.model, solution.ys[0, : problem.n_state]).r[0]
-
-    return lambda t1, count: np.asarray(end(jnp.asarray(t1), jnp.asarray(t1 / count)))
-
-
 @pytest.fixture(scope="module")
 def fine() -> Steps:
     """The slow top by fixed steps of Dopri8."""
-    return by_fixed_steps(SLOW, diffrax.Dopri8())
+    return make_equal_steps(*top(SLOW), diffrax.Dopri8(), stm.Tree())
 
 
 def observed_order(steps: Steps, t1: float, exact: np.ndarray, counts: tuple[int, ...]) -> float:
@@ -135,7 +104,7 @@ def test_order_of_dopri8(fine: Steps) -> None:
 
 def test_order_of_tsit5(fine: Steps) -> None:
     """Statistical class: 5 within 0.3 on x(0.2) of the slow top, against fine Dopri8."""
-    steps = by_fixed_steps(SLOW, diffrax.Tsit5())
+    steps = make_equal_steps(*top(SLOW), diffrax.Tsit5(), stm.Tree())
     order = observed_order(steps, 0.2, fine(0.2, 100), (8, 16, 32))
     assert abs(order - 5) <= 0.3
 
@@ -144,7 +113,7 @@ def test_slow_top_by_adaptive_steps(run: stm.Run, fine: Steps) -> None:
     """Solver class: no figure is published for the slow top; 100 steps of Dopri8 serve."""
     if is_fast(run):
         pytest.skip("compared with published figures")
-    np.testing.assert_allclose(run.states.r[-1, 0], fine(0.2, 100), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(run.states.r[-1, 0], fine(0.2, 100)[0], rtol=0, atol=1e-7)
 
 
 @pytest.mark.slow
@@ -152,5 +121,5 @@ def test_slow_top_by_an_implicit_method(fine: Steps) -> None:
     """Solver class: Kvaerno5 at rtol 1e-8 meets the same acceptance, 1e-5 m at 0.2 s."""
     system, state = top(SLOW)
     run = stm.simulate(scene(system, state), method=stm.Method(solver=diffrax.Kvaerno5()), ts=TIMES)
-    np.testing.assert_allclose(run.states.r[-1, 0], fine(0.2, 100), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(run.states.r[-1, 0], fine(0.2, 100)[0], rtol=0, atol=1e-5)
     assert run.certificate.position_violation <= 1e-8

@@ -132,19 +132,14 @@ def test_forward_gradient_is_the_closed_forms() -> None:
     np.testing.assert_allclose(got, [GRADIENT[t] for t in times], rtol=1e-6)
 
 
-def test_massless_inertia_is_a_named_error() -> None:
-    """A point mass has no inertia tensor: the model says so instead of dividing by zero."""
-    with pytest.raises(stm.ModelError, match=r"'bob'.*positive definite"):
-        stm.Body("bob", MASS, (0.0, 0.0, 0.0))
-
-
 @pytest.mark.slow
 def test_residual_stays_bounded_for_a_thousand_seconds() -> None:
     """No drift of the joint: 1e-8 m over 1000 s, which are 422 periods.
 
     Energy: 1e-4 J, as its drift grows in proportion to time from the 3e-7 J that 10 s show.
     """
-    long = stm.simulate(scene(pendulum(GRAVITY, LENGTH), t1=1000.0, save_every=1.0))
+    scene_of_422_periods = scene(pendulum(GRAVITY, LENGTH), t1=1000.0, save_every=1.0)
+    long = stm.simulate(scene_of_422_periods, error_estimate=False)
     assert long.certificate.t_end == 1000.0
     assert long.certificate.position_violation <= 1e-8
     assert long.certificate.velocity_violation <= 1e-7

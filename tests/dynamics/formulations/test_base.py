@@ -112,12 +112,3 @@ def test_one_that_cannot_allow_for_dependent_rows_is_refused_where_there_are():
         stm.ModelError, match=r"have dependent constraint rows, which NewtonEuler does not support"
     ):
         stm.simulate(scene, method=method, ts=[0.0, 0.1], analysis=False)
-
-
-def test_those_of_the_package_allow_for_dependent_rows():
-    for plain in (stm.Tree(cut=("C",)), stm.Augmented()):
-        allowing = plain.allowing_dependent_rows()
-        assert (plain.redundant, allowing.redundant) == (False, True)
-        assert allowing.allowing_dependent_rows() is allowing
-    assert str(stm.Tree(cut=("A", "C"))) == "Tree(cut=A, C, redundant=False)"
-    assert str(allowing) == "Augmented(redundant=True)"

@@ -1,7 +1,5 @@
 """Implicit steps with one Jacobian for many, lean explicit ones, factorisations in loops, and what is stiff."""
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
@@ -9,15 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-from helpers import pendulum, relative_error, swung
+from helpers import relative_error
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration import solvers
-from stmuav_jax.dynamics.integration.solvers import (
-    NonDenseESDIRK,
-    NonDenseRungeKutta,
-    butcher_coefficients,
-)
+from stmuav_jax.dynamics.integration.solvers import NonDenseESDIRK, NonDenseRungeKutta
 from stmuav_jax.dynamics.integration.stepping import own_iterations
 
 FORWARD = diffrax.ForwardMode()
@@ -60,35 +53,6 @@ def final(solution: diffrax.Solution) -> np.ndarray:
     return np.asarray(solution.ys[-1])
 
 
-def test_differences_give_the_jacobian():
-    """Columns side by side; integrals beside the state have none."""
-    wider = lambda t, y: jnp.append(field(t, y, 2.0), y[0] ** 2)
-    y = jnp.array([0.7, -0.4, 3.0])
-    found = solvers._difference_jacobian(wider, 0.2, y, 2)
-    exact = jax.jacfwd(lambda y: wider(0.2, y))(y)
-    # the step of a difference is the root of the round-off
-    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-7)
-
-
-def test_observed_order_is_five():
-    start = jnp.array([1.0, 0.5])
-    exact = final(adaptive(diffrax.Dopri8(), field, start, 2.0, 1e-13, 1.0))
-    errors = [np.max(np.abs(np.asarray(END(1.0, h)) - exact)) for h in (0.1, 0.05, 0.025)]
-    np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 5, atol=0.1)
-
-
-@pytest.mark.slow
-def test_it_differentiates():
-    """Forward = reverse = differences, from the stages' equations."""
-    forward = jax.jvp(lambda x: END(x, 0.1)[0], (1.0,), (1.0,))[1]
-    back: Any = diffrax.RecursiveCheckpointAdjoint()
-    reverse = jax.jit(jax.grad(lambda x: fixed(x, 0.1, back)[0]))(1.0)
-    move = 1e-5
-    difference = (END(1.0 + move, 0.1)[0] - END(1.0 - move, 0.1)[0]) / (2 * move)
-    assert float(forward) == pytest.approx(float(reverse), rel=1e-12)
-    assert float(forward) == pytest.approx(float(difference), rel=1e-8)
-
-
 @pytest.mark.slow
 def test_a_jacobian_that_no_longer_fits_is_computed_again():
     """Van der Pol with 1e4 1/s: its fast jumps change df/dy by orders of magnitude in a step."""
@@ -103,12 +67,11 @@ def test_a_jacobian_that_no_longer_fits_is_computed_again():
     np.testing.assert_allclose(final(found)[0], exact.y[0, -1], atol=2e-5)
 
 
-@pytest.mark.parametrize("rate", [1e3, 1e8])
-def test_stiffness_costs_no_steps_and_no_accuracy(rate):
+def test_stiffness_costs_no_steps_and_no_accuracy():
     """Prothero and Robinson: y' = -lambda (y - cos t) - sin t; explicit steps would be at most 5 / lambda."""
     stiff = lambda t, y, args: -args * (y - jnp.cos(t)) - jnp.sin(t)
     own = NonDenseESDIRK(diffrax.Kvaerno5(), 1e-6, 1e-6, 1)
-    run = adaptive(own, stiff, jnp.array([1.0]), 10.0, 1e-6, jnp.asarray(rate))
+    run = adaptive(own, stiff, jnp.array([1.0]), 10.0, 1e-6, jnp.asarray(1e8))
     assert run.stats["num_steps"] < 100
     assert abs(final(run)[0] - np.cos(10.0)) < 1e-5
 
@@ -130,12 +93,7 @@ def test_another_root_finder_is_left_to_diffrax():
 # --- explicit
 
 
-def test_stages_that_only_serve_interpolation_are_left_out():
-    assert len(butcher_coefficients(diffrax.Dopri8())[3]) == 13
-    assert len(butcher_coefficients(diffrax.Tsit5())[3]) == 7
-
-
-@pytest.mark.parametrize("method", [diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Dopri5()])
+@pytest.mark.parametrize("method", [diffrax.Dopri8(), diffrax.Tsit5()])
 def test_lean_steps_are_those_of_the_method(method):
     term, start = diffrax.ODETerm(field), jnp.array([1.0, 0.5])
     state = method.init(term, 0.0, 0.3, start, 1.0)
@@ -157,22 +115,6 @@ def rail():
         "rail", stiffness=1e6, damping=2e5, target=lambda t: 0.1 * jnp.sin(3 * t)
     )
     return stm.System([body], [joint], [stm.Gravity(), servo])
-
-
-@pytest.mark.slow
-def test_the_spectrum_of_a_servo(rail):
-    """m x'' + c x' + k x = 0: the roots of m s^2 + c s + k."""
-    values = stm.dynamics.spectrum(rail, rail.reference)
-    expected = np.roots([1.0, 2e5, 1e6])
-    np.testing.assert_allclose(values[:2], expected, rtol=1e-8)
-
-
-@pytest.mark.slow
-def test_the_spectrum_of_a_pendulum_hanging():
-    system = pendulum()
-    values = stm.dynamics.spectrum(system, swung(system, 0.0))
-    assert np.max(np.abs(np.real(values))) < 1e-6
-    assert np.min(np.abs(values)) < 1e-6 or len(values) == 2
 
 
 @pytest.mark.slow

@@ -12,12 +12,6 @@ from helpers import pendulum
 from scipy.linalg import expm
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration.stepping import (
-    Guard,
-    accuracy_radius,
-    spectral_radius,
-    stability_function,
-)
 
 TIMES = (0.5, 1.0, 2.0, 5.0, 10.0)
 ONE = stm.revolute("h", "ground", "bob", point=(0, 0, 0), axis=(0, 1, 0))
@@ -130,34 +124,3 @@ def test_steps_for_the_state_alone():
     assert int(free.counts.accepted[-1]) < 10
     assert int(bounded.counts.accepted[-1]) >= 100
     assert int(free.counts.at_growth_limit[-1]) == int(free.counts.accepted[-1])
-
-
-@pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5(), stm.dynamics.kvaerno5()])
-def test_radius_keeps_the_error_of_a_step_below_its_share(solver):
-    R = stability_function(solver)
-    assert R is not None
-    order = solver.order(diffrax.ODETerm(lambda t, y, args: y))
-    for rtol in (1e-4, 1e-7):
-        r = float(accuracy_radius(solver, order, rtol))
-        for way in (1j, complex(-1.0), np.exp(2.3j)):
-            assert abs(R(r * way) - np.exp(r * way)) <= 1.01 * r * rtol / 500
-
-
-def test_modes_of_a_matrix():
-    """All directions of a linear system give its modes exactly; whatever is left of them."""
-    rng = np.random.default_rng(3)
-    A = rng.normal(size=(9, 9))
-    expected = np.max(np.abs(np.linalg.eigvals(A)))
-    assert float(spectral_radius(jnp.asarray(A))) == pytest.approx(expected, rel=0.05)
-    stiff = np.diag(np.r_[[-2e4, -300.0], np.linspace(-1, 1, 7)]) + np.triu(A, 1)
-    for matrix, implicit, waited, fastest in (
-        (A, False, 0.0, expected), (stiff, False, 1.0, 2e4), (stiff, True, 0.0, 2e4),
-        (stiff, True, 1.0, 1.0),
-    ):  # fmt: skip
-        guard = Guard(jnp.asarray(0.4), 5, implicit, 9)
-        y = jnp.zeros(9)
-        modes = guard.begin(0.0, y)
-        field = lambda t, y, A=matrix: jnp.asarray(A) @ y
-        found = guard.update_modes(field, waited, y, 1e-3, modes)
-        assert float(0.4 / found.longest) == pytest.approx(fastest, rel=0.06)
-        assert int(found.age) == 0

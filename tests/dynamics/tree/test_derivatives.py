@@ -8,7 +8,6 @@ import pytest
 from helpers import central, forked
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.tree.topology import pick_entries
 
 
 @pytest.fixture(scope="module")
@@ -62,12 +61,3 @@ def test_second_derivative(case):
     expected = central(run, 1e-3)
     size = np.max(np.abs(expected))
     np.testing.assert_allclose(second, expected, rtol=1e-7, atol=1e-7 * size)
-
-
-def test_picking_is_linear():
-    """The rule of picking against its definition."""
-    rows = jnp.asarray(np.random.default_rng(2).normal(size=(6, 4, 2)))
-    pick = lambda a: pick_entries(a, np.array([3, 0, 3]), 1)
-    np.testing.assert_array_equal(jax.jvp(pick, (rows,), (rows,))[1], pick(rows))
-    (back,) = jax.vjp(pick, rows)[1](pick(rows))
-    assert float(jnp.vdot(back, rows)) == pytest.approx(float(jnp.sum(pick(rows) ** 2)), rel=1e-12)

@@ -13,14 +13,7 @@ import stmuav_jax as stm
 from stmuav_jax.dynamics.formulations.stabilisation import Unstabilised
 from stmuav_jax.math.stacked import apply_matrix, apply_transposed, multiply_matrices
 from stmuav_jax.mechanics.joint import CATALOGUE, Freedom, JointKind, Term, X, Y, Z
-from stmuav_jax.mechanics.motions import (
-    PRISMATIC,
-    REVOLUTE,
-    SCREW,
-    AbstractRelativeMotion,
-    MotionColumn,
-    RelativePose,
-)
+from stmuav_jax.mechanics.motions import AbstractRelativeMotion, MotionColumn, RelativePose
 
 SAME = 1e-11
 
@@ -144,9 +137,3 @@ def test_a_motion_of_ones_own(monkeypatch):
         assert relative_error(ours[0], one.v_rate) < SAME
         assert relative_error(ours[1], one.omega_rate) < SAME
     assert left.position < 1e-13
-
-
-def test_names_and_units():
-    assert REVOLUTE.coordinates == SCREW.coordinates == (("angle", "rad"),)
-    assert PRISMATIC.coordinates == (("displacement", "m"),)
-    assert [c.linear for m in (REVOLUTE, PRISMATIC, SCREW) for c in m.columns] == [0.0, 1.0, None]

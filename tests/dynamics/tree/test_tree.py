@@ -135,30 +135,6 @@ def test_rates_of_coordinates_move_the_bodies(both):
     assert relative_error(slope.omega, rates.omega_rate) < SAME
 
 
-def test_projection_leaves_nothing():
-    """Of a disturbance of a floating mechanism with closed loops."""
-    system = stm.make_scene("uav_tracker", 2).system
-    tree = stm.Tree()
-    model, t = tree.prepare(system), jnp.zeros(())
-    x = jax.jit(lambda: tree.to_vector(model, system.reference))()
-    off = x + 1e-5 * np.random.default_rng(1).normal(size=x.shape)
-
-    @jax.jit
-    def look(off):
-        end, left = tree.project(model, t, off, 3)
-        return tree.residuals(model, t, off), end, left, tree.residuals(model, t, end)
-
-    before, end, left, again = look(off)
-    assert before.position > 1e-7
-    assert left.position < 1e-14
-    assert left.velocity < 1e-12
-    assert left.norm < 1e-14
-    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(left), strict=True):
-        assert abs(a - b) < 1e-13
-    # it is near: not further than the disturbance
-    assert float(jnp.max(jnp.abs(end - x))) < 1e-3
-
-
 def test_the_uavs_tree():
     system = stm.make_scene("uav_tracker", 2).system
     tree = stm.dynamics.spanning_tree(system)
@@ -189,17 +165,6 @@ def test_the_base_of_a_floating_machine_is_the_body_declared_free(free):
     text = stm.io.model_to_text(stm.Scene("gimbal", "Gimbal", system, state))
     assert text.count("free = true") == 1
     assert text.split("free = true")[0].rpartition("[bodies.")[2].startswith(free)
-
-
-@pytest.mark.parametrize(
-    ("name", "case", "velocities", "rows"),
-    [("tracker", 1, 8, 6), ("hexacopter", None, 6, 0), ("spin", None, 3, 0)],
-)
-def test_sizes(name, case, velocities, rows):
-    system = stm.make_scene(name, case).system
-    tree = stm.dynamics.spanning_tree(system)
-    assert tree.n_velocities == velocities
-    assert sum(system.joints[k].n_rows for k in tree.cut) == rows
 
 
 @pytest.mark.slow
