@@ -80,7 +80,7 @@ def differences(structure: Structure, seed: int) -> tuple[float, float, float]:
 
 
 @settings(
-    max_examples=5, derandomize=True, deadline=None, database=None,
+    max_examples=8, derandomize=True, deadline=None, database=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large], phases=[Phase.generate],
 )  # fmt: skip
 @given(structures(), st.integers(0, 99))

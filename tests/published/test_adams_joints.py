@@ -151,6 +151,17 @@ def test_reactions_are_those_of_adams(run: stm.Run, name: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_reactions_balance_the_motion(run: stm.Run, name: str) -> None:
+    """Exact class: the joint's force on the body is m (a - g), to 1e-9 N of some 30 N."""
+    k = CASES.index(name)
+    needed = run.snapshot.accelerations.v_rate[:, k] + GRAVITY * Z
+    on_body = 1 if name in ON_A_LINK else -1
+    force = on_body * run.snapshot.reactions.force[:, k]
+    np.testing.assert_allclose(force, needed, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
 def test_joints_and_energy_are_kept(run: stm.Run) -> None:
     """1e-8 m and 1e-7 m/s over all steps; energy to 1e-8 of the largest."""
     assert run.certificate.rank == run.certificate.rows

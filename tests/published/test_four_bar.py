@@ -165,7 +165,7 @@ def test_a_linkage_that_misses_the_singular_posture_goes_on() -> None:
 
 @pytest.mark.slow
 def test_a_posture_that_cannot_be_passed_is_named() -> None:
-    """A crank driven beyond its reach: 1 m of crank and coupler, a massless rocker, 1.5 m of ground.
+    """A crank driven beyond its reach: with 1 m of crank, coupler and rocker, 1.5 m of ground.
 
     Coupler and rocker are stretched where (cos a, sin a), a = pi / 2 + t, is 2 m from (1.5, 0):
     sin t = 1/4. There the driver demands infinite velocities.
@@ -174,18 +174,20 @@ def test_a_posture_that_cannot_be_passed_is_named() -> None:
     across = np.array([d, -1.0])
     middle, out = np.array([d, 1.0]) / 2, np.array([1.0, d]) / np.hypot(1.0, d)
     knee = middle + np.sqrt(1 - across @ across / 4) * out
-    rods = {"crank": ((0, 0), (0, 1)), "coupler": ((0, 1), knee)}
+    rods = {"crank": ((0, 0), (0, 1)), "rocker": ((d, 0), knee), "coupler": ((0, 1), knee)}
     bodies = []
     for name, (a, b) in rods.items():
         (x, y), (i, j) = np.mean([a, b], axis=0), np.subtract(b, a)
         half = np.arctan2(j, i) / 2
         turned = (np.cos(half), 0.0, 0.0, np.sin(half))
         bodies.append(stm.Body(name, 1.0, (THIN, ROD, ROD), position=(x, y, 0), orientation=turned))
-    joints = [
-        stm.revolute("A", "ground", "crank", point=(0.0, 0.0, 0.0), axis=Z),
-        stm.revolute("B", "crank", "coupler", point=(0.0, 1.0, 0.0), axis=Z),
-        stm.distance("rocker", "ground", "coupler", point_i=(d, 0.0, 0.0), point_j=(*knee, 0.0)),
-    ]
+    ends = {
+        "A": ("ground", "crank", (0.0, 0.0, 0.0)),
+        "B": ("crank", "coupler", (0.0, 1.0, 0.0)),
+        "C": ("rocker", "coupler", (*knee, 0.0)),
+        "D": ("ground", "rocker", (d, 0.0, 0.0)),
+    }
+    joints = [stm.revolute(name, i, j, point=p, axis=Z) for name, (i, j, p) in ends.items()]
     system = stm.dynamics.add_drivers(stm.System(bodies, joints), {"A": lambda t: t})
     rest = system.reference
     guess = stm.State(rest.r, rest.p, rest.v, rest.omega.at[0, 2].set(1.0))
