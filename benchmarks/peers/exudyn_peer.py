@@ -156,7 +156,7 @@ class ExudynPeer(Peer):
     caveats = (
         "Actuator forces are Python functions, called at every step.",
         "Joint residuals are not reported.",
-        "Accelerations alone are not timed: they come with an implicit step.",
+        "Accelerations are not timed separately: an implicit step computes them.",
     )
     how = (
         "Redundant coordinates, index 3 (its default), spectral radius 0.9; modified Newton with its "

@@ -96,7 +96,9 @@ def tracker_turning() -> Problem:
     omega = np.zeros((system.n_bodies, 3))
     omega[system.names.index("panel_7")] = PANEL_RATE
     state = stm.assemble(system, moving(system, np.zeros_like(omega), omega)).state
-    return Problem("tracker_turning", "tracker without gravity, set turning", system, state)
+    return Problem(
+        "tracker_turning", "tracker without gravity, with an initial rotation", system, state
+    )
 
 
 PROBLEMS: tuple[Callable[[], Problem], ...] = (

@@ -92,7 +92,7 @@ def error_factors(content: Row) -> Lines:
     head = [
         "factor on the tolerances of the second run",
         "estimates correct within a factor of three",
-        "step attempts, second / first run: least, median, most",
+        "step attempts, second / first run: smallest, median, largest",
     ]
     return table(head, rows)
 
