@@ -23,7 +23,7 @@ from ..uav.flight_identification.record import (
 from ..uav.flight_identification.stages import AXES, FlightIdentification, ParameterEstimate
 from .plot import STYLES, draw_legend_beside, grid, look, plot_histories
 
-# Length of a segment for the frequency response, and of the stretch that is drawn of accelerations [s].
+# Length of a segment for the frequency response, and of the interval that is drawn of accelerations [s].
 _SEGMENT, _SHOWN = 2.0, 3.0
 # Highest frequency of the response that is drawn [Hz], and coherence from which it is.
 _HIGHEST, _COHERENT = 25.0, 0.6
@@ -34,7 +34,7 @@ _BAND = "0.88"
 
 
 class IdentifiedFlight(NamedTuple):
-    """Log, the stretch of it that was identified, and the result."""
+    """Log, the segment of it that was identified, and the result."""
 
     log: FlightLog
     record: FlightRecord
@@ -47,7 +47,7 @@ def _axes_of(result: FlightIdentification) -> list[int]:
 
 
 def draw_log(subject: IdentifiedFlight) -> Figure:
-    """Commands, rates, forces and voltage of the whole log, with stretches in flight and windows."""
+    """Commands, rates, forces and voltage of the whole log, with flight segments and windows."""
     log, record, result = subject
     names = [
         name

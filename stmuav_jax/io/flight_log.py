@@ -45,7 +45,7 @@ from .netcdf import FileError, read_toml, regular_file
 _SHORTEST, _STOP = 1.0, 1.0
 # Share of the usual command above which a multirotor counts as in flight, and commands that are none.
 _IN_FLIGHT, _OFF = 0.3, 0.02
-# Specific force of an impact [m/s^2], stretch before the end in which it counts, and cut before it [s].
+# Specific force of an impact [m/s^2], time before the end in which it counts, and cut before it [s].
 _IMPACT, _LAST, _BEFORE_IMPACT = 5 * STANDARD_GRAVITY, 3.0, 0.5
 # Specific force at rest that counts as gravity, and in flight where there is no rest [m/s^2].
 _GRAVITY, _IN_AIR = (9.5, 10.1), (7.0, 14.0)
@@ -116,8 +116,8 @@ class FlightLog:
             compensation of the battery), `rotor_speeds`, `accelerometer` (specific force), `gyroscope`,
             `attitude` (unit quaternion w, x, y, z from body to world), `euler_angles` where they are no
             whole attitude, `position`, `velocity`, `acceleration`, `battery_voltage`, `battery_current`.
-        flights: start and end (n, 2) [s] of each stretch in flight. A crash is cut off.
-        gaps: stretches without samples.
+        flights: start and end (n, 2) [s] of each flight segment. A crash is cut off.
+        gaps: intervals without samples.
         settings: `gyroscope_cutoff` and `accelerometer_cutoff` [Hz] of low-pass filters that the
             channels went through, `filter_rate` [Hz] of the filters' clock, `rotor_positions` (n, 3) [m],
             `rotor_spin` (n,) as in `Rotors`, and `thrust_model_factor` f of thrust f u^2 + (1 - f) u; those
@@ -151,7 +151,7 @@ class FlightLog:
         return self.channels[channel]
 
     def flight(self, index: int | None = None) -> "FlightLog":
-        """Log of one stretch in flight, by default the longest.
+        """Log of one flight segment, by default the longest.
 
         Raises:
             SettingError: the log has refusals, or no flight of that index.
@@ -162,7 +162,7 @@ class FlightLog:
             index = int(np.argmax(self.flights[:, 1] - self.flights[:, 0]))
         if index is None or not 0 <= index < len(self.flights):
             raise SettingError(
-                f"{self.name} has {len(self.flights)} stretches in flight, which are numbered from 0, but "
+                f"{self.name} has {len(self.flights)} flight segments, which are numbered from 0, but "
                 f"not number {index or 0}."
             )
         return self.window(*map(float, self.flights[index]))
@@ -235,7 +235,7 @@ class FlightLog:
         return dataclasses.replace(self, channels=channels)
 
     def to_record(self, index: int | None = None) -> FlightRecord:
-        """Record of one stretch in flight, by default the longest, for `stm.uav.identify_flight`.
+        """Record of one flight segment, by default the longest, for `stm.uav.identify_flight`.
 
         It leaves out a second after take-off and half a second before landing, has the rate of the IMU
         but at most 500 Hz, and bridges gaps of up to 50 ms; a longer gap splits it, and the longer part is
@@ -274,7 +274,7 @@ class FlightLog:
             if g.channel in names and g.end - g.start > _BRIDGED
         ]
         t0, t1 = flight.flights[0] + [_TAKE_OFF, -_LANDING]
-        # Ends of gaps, in order, are the edges of the stretches between them.
+        # Ends of gaps, in order, are the edges of the segments between them.
         edges = np.array([t0, *np.ravel(sorted(gaps)), t1]).reshape(-1, 2)
         whole_length = t1 - t0
         t0, t1 = edges[np.argmax(edges[:, 1] - edges[:, 0])].tolist()
@@ -750,15 +750,15 @@ def _check_channels(draft: LogDraft, channels: Mapping[str, Channel], gaps: Sequ
     # A logger that stops loses all channels at once: they share one sentence.
     alike: dict[tuple[tuple[float, float], ...], list[str]] = {}
     for name in channels:
-        stretches = tuple((gap.start, gap.end) for gap in gaps if gap.channel == name)
-        alike.setdefault(stretches, []).append(name)
+        intervals = tuple((gap.start, gap.end) for gap in gaps if gap.channel == name)
+        alike.setdefault(intervals, []).append(name)
     alike.pop((), None)
-    for stretches, names in alike.items():
-        k = int(np.argmax([end - begin for begin, end in stretches]))
-        count = "once, at" if len(stretches) == 1 else f"{len(stretches)} times, the longest at"
+    for intervals, names in alike.items():
+        k = int(np.argmax([end - begin for begin, end in intervals]))
+        count = "once, at" if len(intervals) == 1 else f"{len(intervals)} times, the longest at"
         draft.notes.append(
-            f"Samples are missing {count} {stretches[k][0]:.2f} s for "
-            f"{stretches[k][1] - stretches[k][0]:.3g} s: {', '.join(names)}."
+            f"Samples are missing {count} {intervals[k][0]:.2f} s for "
+            f"{intervals[k][1] - intervals[k][0]:.3g} s: {', '.join(names)}."
         )
     if "attitude" in channels:
         norm = np.linalg.norm(channels["attitude"].values, axis=1)

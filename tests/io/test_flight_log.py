@@ -421,7 +421,7 @@ def test_windows_keep_the_log_s_times(tmp_path):
         (lambda: log.window(3.0, 1.0), "must end after its start"),
         (lambda: log.window(100.0, 101.0), "has no samples"),
         (lambda: log.resample(0.0), "must be between"),
-        (lambda: log.flight(1), "has 1 stretches in flight"),
+        (lambda: log.flight(1), "has 1 flight segments"),
         (lambda: log["gyroscop"], "Did you mean 'gyroscope'?"),
     ):
         with pytest.raises(SettingError, match=words.replace("?", r"\?")):
