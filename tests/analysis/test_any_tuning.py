@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
-from mechanisms import cart_pole, pendulum
+from mechanisms import cart_pole, four_bar, pendulum
 
 import stmuav_jax as stm
 from stmuav_jax.analysis.identification import Misfit, predict_columns, residuals_and_jacobian
@@ -216,6 +216,22 @@ def test_what_tuning_refuses(cart):
 # --- identification
 
 
+def fitted(predict, truth, sizes, sigma, labels):
+    """From a start that is off by half of the sizes: without noise, and with it."""
+    # predictions by the program that identification compiles anyway
+    shape = eqx.filter_eval_shape(predict_columns, predict, jnp.asarray(truth)).shape
+    zero, one = jnp.zeros(len(truth)), jnp.ones(len(truth))
+    none = Misfit(predict, jnp.zeros(shape), jnp.ones(shape[1]), jnp.asarray(truth), one)
+    clean = np.asarray(residuals_and_jacobian(none, zero)[0]).reshape(shape)
+    start = truth + 0.5 * sizes * (-1.0) ** np.arange(len(truth))
+    rng = np.random.default_rng(7)
+    noisy = clean + sigma * rng.normal(size=clean.shape)
+    return [
+        stm.analysis.identify(predict, record, sigma, start, sizes, labels=labels)
+        for record in (clean, noisy)
+    ]
+
+
 @pytest.mark.slow
 def test_a_cart_pole_is_identified(cart):
     """Bob, length and damping from the cart's place, the pole's angle and its gyroscope: without noise, and with it."""
@@ -233,22 +249,27 @@ def test_a_cart_pole_is_identified(cart):
     )
     truth, sizes = np.array([0.5, 0.8, 0.05]), np.array([0.1, 0.1, 0.05])
     sigma = np.array([1e-3, 2e-3, 5e-3, 5e-3, 5e-3])
-    # predictions by the program that identification compiles anyway
-    shape = eqx.filter_eval_shape(predict_columns, predict, jnp.asarray(truth)).shape
-    none = Misfit(
-        predict, jnp.zeros(shape), jnp.ones(shape[1]), jnp.asarray(truth), jnp.ones(len(truth))
-    )
-    clean = np.asarray(residuals_and_jacobian(none, jnp.zeros(len(truth)))[0]).reshape(shape)
-    start = truth + 0.5 * sizes * np.array([1.0, -1.0, 1.0])
-    noisy = clean + sigma * np.random.default_rng(7).normal(size=clean.shape)
-    labels = ["bob", "length", "damping"]
-    exact, found = (
-        stm.analysis.identify(predict, record, sigma, start, sizes, labels=labels)
-        for record in (clean, noisy)
-    )
+    exact, found = fitted(predict, truth, sizes, sigma, ["bob", "length", "damping"])
     np.testing.assert_allclose(exact.values, truth, rtol=1e-8)
     assert found.within(truth, 4.0)
     assert 0.6 < found.reduced_chi_square < 1.4
+
+
+@pytest.mark.slow
+def test_a_four_bar_is_identified():
+    """A mass and a damper in a closed loop, from one encoder and one rate."""
+    space = stm.TreeSpace(four_bar(damping=0.3), independent=["A.angle"])
+    x = space.from_state(space.system.reference)
+    predict = stm.analysis.motion_model(
+        lambda q: four_bar(masses=(1.0, 2.0, q[0]), damping=q[1]),
+        x, np.linspace(0.0, 0.8, 33), ["A.angle", "A.angle_rate"],
+        inputs={"effort": 8.0}, space=space,
+    )  # fmt: skip
+    truth, sizes = np.array([1.5, 0.3]), np.array([0.3, 0.1])
+    sigma = np.array([1e-4, 1e-3])
+    exact, found = fitted(predict, truth, sizes, sigma, ["rocker", "damping"])
+    np.testing.assert_allclose(exact.values, truth, rtol=1e-8)
+    assert found.within(truth, 4.0)
 
 
 @pytest.mark.slow
