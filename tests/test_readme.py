@@ -50,7 +50,7 @@ def test_the_table_of_mechanisms_names_tests():
     text = (ROOT / "docs" / "validation.md").read_text(encoding="utf-8")
     places = dict(re.findall(r"^\[(test_\w+)\]: (\S+)$", text, re.MULTILINE))
     rows = [line for line in text.splitlines() if line.startswith("|") and "[test_" in line]
-    assert len(rows) == 6
+    assert len(rows) == 5
     for row in rows:
         names = re.findall(r"\[(test_\w+)\]", row)
         assert 2 <= len(names) <= 5
