@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+Scalar = Float[Array, ""]
 Vec3 = Float[Array, "3"]
 Quat = Float[Array, "4"]
 Vector = Float[Array, " _"]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..checks.errors import ModelError, check_finite, check_shape, has_values
+from ..checks.errors import ModelError, check_shape, has_values
 from ..checks.numbers import (
     array_module,
     as_floats,
@@ -26,7 +26,7 @@ from ..checks.numbers import (
     check_vector,
     stack_arrays,
 )
-from ..checks.shapes import Numbers
+from ..checks.shapes import Numbers, Quat, Scalar, Vec3
 from ..math.native.structure import has_structure
 from ..math.rotation import rotation_matrix, rotation_matrix_in
 
@@ -59,11 +59,11 @@ class Body(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    mass: Float[Array, ""]
+    mass: Scalar
     inertia: Float[Array, "3 3"]
-    com: Float[Array, "3"]
-    position: Float[Array, "3"]
-    orientation: Float[Array, "4"]
+    com: Vec3
+    position: Vec3
+    orientation: Quat
     free: bool = eqx.field(static=True)
     triangle_tolerance: float = eqx.field(static=True)
 
@@ -79,11 +79,10 @@ class Body(eqx.Module):
         free: bool = False,
         triangle_tolerance: float = 0.0,
     ) -> None:
-        self.name = name
-        self.free = free
-        self.triangle_tolerance = triangle_tolerance
-        self.mass = as_floats(mass)
-        tensor = as_floats(inertia)
+        if not name or name == GROUND:
+            raise ModelError(f"A body cannot be named '{name}': '{GROUND}' is the fixed world.")
+        self.name, self.free, self.triangle_tolerance = name, free, triangle_tolerance
+        self.mass, tensor = as_floats(mass), as_floats(inertia)
         if tensor.shape == (3,):
             # Three numbers are principal moments.
             tensor = as_floats(array_module(tensor).diag(tensor))
@@ -91,20 +90,14 @@ class Body(eqx.Module):
         if tensor.shape == (3, 3) and not has_values(tensor):
             # A derivative by one entry is then one of a symmetric tensor.
             self.inertia = 0.5 * (tensor + tensor.T)
-        self.com = as_floats(com)
-        self.position = as_floats(position)
         self.orientation = as_floats(orientation)
-        if not name or name == GROUND:
-            raise ModelError(f"A body cannot be named '{name}': '{GROUND}' is the fixed world.")
         check_shape(self.mass, (), f"The mass of body '{name}'")
         check_shape(self.inertia, (3, 3), f"The inertia tensor of body '{name}'")
-        check_shape(self.com, (3,), f"The centre of mass of body '{name}'")
-        check_shape(self.position, (3,), f"The position of body '{name}'")
         check_shape(self.orientation, (4,), f"The Euler parameters of body '{name}'")
+        self.com = check_vector(com, f"The centre of mass of body '{name}'", "m")
+        self.position = check_vector(position, f"The position of body '{name}'", "m")
         check_mass(self.mass, f"body '{name}'")
         check_inertia(self.inertia, f"body '{name}'", triangle_tolerance)
-        check_finite(self.com, f"The centre of mass of body '{name}'", "m")
-        check_finite(self.position, f"The position of body '{name}'", "m")
         check_unit(self.orientation, f"body '{name}'", ModelError)
 
     @property
@@ -144,9 +137,8 @@ def check_bodies(bodies: Bodies) -> None:
     """
     if not has_values(bodies.mass, bodies.inertia):
         return
-    for name, mass, inertia in zip(
-        bodies.names, *as_numpy((bodies.mass, bodies.inertia)), strict=True
-    ):
+    numbers = as_numpy((bodies.mass, bodies.inertia))
+    for name, mass, inertia in zip(bodies.names, *numbers, strict=True):
         check_mass(mass, f"body '{name}'")
         check_inertia(inertia, f"body '{name}'", np.inf)
 
@@ -179,8 +171,8 @@ class Part(eqx.Module):
         inertia: inertia tensor about it, in the frame's axes (3, 3) [kg m^2].
     """
 
-    mass: Float[Array, ""]
-    com: Float[Array, "3"]
+    mass: Scalar
+    com: Vec3
     inertia: Float[Array, "3 3"]
 
 
@@ -331,8 +323,8 @@ def sphere(
 
 
 def _solid_mass(
-    mass: Numbers | None, density: Numbers | None, volume: Float[Array, ""], shape_name: str
-) -> Float[Array, ""]:
+    mass: Numbers | None, density: Numbers | None, volume: Scalar, shape_name: str
+) -> Scalar:
     if mass is not None and density is None:
         return check_positive(mass, f"The mass of {shape_name}", "kg")
     if density is not None and mass is None:
@@ -340,9 +332,7 @@ def _solid_mass(
     raise ModelError(f"{shape_name.capitalize()} needs either a mass or a density, and not both.")
 
 
-def _span_points(
-    start: Numbers, end: Numbers, shape_name: str
-) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
+def _span_points(start: Numbers, end: Numbers, shape_name: str) -> tuple[Vec3, Vec3, Scalar]:
     """Middle of two points, the vector from start to end, and its square."""
     a = check_vector(start, f"The start of a {shape_name}", "m")
     b = check_vector(end, f"The end of a {shape_name}", "m")
@@ -355,7 +345,7 @@ def _span_points(
     return 0.5 * (a + b), axis_vector, square
 
 
-def _point_inertia(arm: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def _point_inertia(arm: Vec3) -> Float[Array, "3 3"]:
     """Inertia factor |a|^2 I - a a^T of a point mass at the arm a."""
     return (arm @ arm) * jnp.eye(3) - arm[:, None] * arm
 

@@ -19,7 +19,7 @@ from ..checks.numbers import (
     check_scalar,
     check_vector,
 )
-from ..checks.shapes import Numbers
+from ..checks.shapes import Numbers, Scalar, Vec3
 from ..math.derivative import length_and_direction, without_derivative
 from ..math.rotation import cross
 from ..math.stacked import apply_matrix, dot_product
@@ -33,7 +33,7 @@ from .state import Kinematics
 class Gravity(AbstractForce):
     """Uniform gravity with acceleration a (3,) [m/s^2] in the world; potential -m a . r."""
 
-    acceleration: Float[Array, "3"]
+    acceleration: Vec3
 
     def __init__(self, acceleration: Numbers = (0.0, 0.0, -9.81)) -> None:
         self.acceleration = check_vector(acceleration, "The acceleration of gravity", "m/s^2")
@@ -41,7 +41,7 @@ class Gravity(AbstractForce):
     def acts_on(self) -> ActsOn:
         return ActsOn()
 
-    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+    def load(self, t: Scalar, kin: Kinematics) -> Load:
         force = kin.mass[:, None] * self.acceleration[None]
         return Load(force, jnp.zeros_like(force), -jnp.sum(force * kin.r), jnp.zeros_like(t))
 
@@ -65,7 +65,7 @@ class AppliedForce(AbstractForce):
     body: str = eqx.field(static=True)
     force: Signal
     frame: Literal["world", "body"] = eqx.field(static=True)
-    point: Float[Array, "3"] | None
+    point: Vec3 | None
 
     def __init__(
         self,
@@ -75,26 +75,17 @@ class AppliedForce(AbstractForce):
         frame: Literal["world", "body"] = "world",
         point: Numbers | None = None,
     ) -> None:
-        self.body = body
-        self.force = check_signal(force, self._describe_body(body), (3,), "N")
-        self.frame = _check_frame(frame)
+        self.body, self.frame = body, _check_frame(frame)
+        self.force = check_signal(force, f"AppliedForce: the force on body '{body}'", (3,), "N")
         subject = f"The point of the force on body '{body}'"
         self.point = None if point is None else check_vector(point, subject, "m")
-
-    @staticmethod
-    def _describe_body(body: str) -> str:
-        return f"AppliedForce: the force on body '{body}'"
 
     def acts_on(self) -> ActsOn:
         return ActsOn(bodies=(self.body,))
 
-    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        # A function is called with time and kinematics even if it uses the time alone, so that a force has
-        # one signature.
-        value = evaluate(self.force, t, kin, self._describe_body(self.body), (3,))
-        force_w = (
-            apply_matrix(kin.R_wb[kin.index(self.body)], value) if self.frame == "body" else value
-        )
+    def load(self, t: Scalar, kin: Kinematics) -> Load:
+        subject = f"AppliedForce: the force on body '{self.body}'"
+        force_w = _evaluate_in_world(self.force, t, kin, subject, self.body, self.frame)
         arm = None if self.point is None else kin.arm(self.body, self.point)
         return push(kin, self.body, force_w, arm)
 
@@ -114,22 +105,16 @@ class AppliedMoment(AbstractForce):
         *,
         frame: Literal["world", "body"] = "world",
     ) -> None:
-        self.body = body
-        self.moment = check_signal(moment, self._describe_body(body), (3,), "N m")
-        self.frame = _check_frame(frame)
-
-    @staticmethod
-    def _describe_body(body: str) -> str:
-        return f"AppliedMoment: the moment on body '{body}'"
+        subject = f"AppliedMoment: the moment on body '{body}'"
+        self.body, self.frame = body, _check_frame(frame)
+        self.moment = check_signal(moment, subject, (3,), "N m")
 
     def acts_on(self) -> ActsOn:
         return ActsOn(bodies=(self.body,))
 
-    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        value = evaluate(self.moment, t, kin, self._describe_body(self.body), (3,))
-        moment_w = (
-            apply_matrix(kin.R_wb[kin.index(self.body)], value) if self.frame == "body" else value
-        )
+    def load(self, t: Scalar, kin: Kinematics) -> Load:
+        subject = f"AppliedMoment: the moment on body '{self.body}'"
+        moment_w = _evaluate_in_world(self.moment, t, kin, subject, self.body, self.frame)
         return push(kin, self.body, jnp.zeros_like(moment_w), moment_w=moment_w)
 
 
@@ -155,11 +140,11 @@ class LinearSpringDamper(AbstractForce):
 
     body_i: str = eqx.field(static=True)
     body_j: str = eqx.field(static=True)
-    point_i: Float[Array, "3"]
-    point_j: Float[Array, "3"]
-    stiffness: Float[Array, ""]
-    damping: Float[Array, ""]
-    length: Float[Array, ""]
+    point_i: Vec3
+    point_j: Vec3
+    stiffness: Scalar
+    damping: Scalar
+    length: Scalar
 
     def __init__(
         self,
@@ -172,7 +157,14 @@ class LinearSpringDamper(AbstractForce):
         damping: Numbers = 0.0,
         length: Numbers = 0.0,
     ) -> None:
-        _two_bodies("A spring-damper", body_i, body_j)
+        if body_i == body_j:
+            raise ModelError(
+                f"A spring-damper joins body '{body_i}' to itself: name two different bodies."
+            )
+        if not body_i or not body_j:
+            raise ModelError(
+                f"A spring-damper needs two bodies; the fixed one is called '{GROUND}'."
+            )
         self.body_i, self.body_j = body_i, body_j
         of = f"of the spring between '{body_i}' and '{body_j}'"
         self.point_i = check_vector(point_i, f"The point on '{body_i}' {of}", "m")
@@ -184,7 +176,7 @@ class LinearSpringDamper(AbstractForce):
     def acts_on(self) -> ActsOn:
         return ActsOn(bodies=(self.body_i, self.body_j))
 
-    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+    def load(self, t: Scalar, kin: Kinematics) -> Load:
         a, a_rate = kin.point(self.body_i, self.point_i)
         b, b_rate = kin.point(self.body_j, self.point_j)
         d, d_rate = b - a, b_rate - a_rate
@@ -201,12 +193,8 @@ class LinearSpringDamper(AbstractForce):
         load = push(kin, self.body_i, pull, kin.arm(self.body_i, self.point_i)) + push(
             kin, self.body_j, -pull, kin.arm(self.body_j, self.point_j)
         )
-        return Load(
-            load.force,
-            load.moment,
-            0.5 * self.stiffness * square,
-            -self.damping * rate_square,
-        )
+        energy = 0.5 * self.stiffness * square
+        return Load(load.force, load.moment, energy, -self.damping * rate_square)
 
 
 class TorsionalSpringDamper(AbstractJointForce):
@@ -221,9 +209,9 @@ class TorsionalSpringDamper(AbstractJointForce):
         ModelError: a number is not finite, or stiffness or damping is negative.
     """
 
-    stiffness: Float[Array, ""]
-    damping: Float[Array, ""]
-    angle: Float[Array, ""]
+    stiffness: Scalar
+    damping: Scalar
+    angle: Scalar
 
     def __init__(
         self, joint: str, *, stiffness: Numbers, damping: Numbers = 0.0, angle: Numbers = 0.0
@@ -234,12 +222,10 @@ class TorsionalSpringDamper(AbstractJointForce):
         self.damping = check_nonnegative(damping, f"The damping {of}", "N m s/rad")
         self.angle = check_scalar(angle, f"The angle {of}", "rad")
 
-    def law(
-        self, x: Float[Array, ""], x_rate: Float[Array, ""], t: Float[Array, ""]
-    ) -> Float[Array, ""]:
+    def law(self, x: Scalar, x_rate: Scalar, t: Scalar) -> Scalar:
         return -self.stiffness * (x - self.angle) - self.damping * x_rate
 
-    def potential_energy(self, x: Float[Array, ""], t: Float[Array, ""]) -> Float[Array, ""]:
+    def potential_energy(self, x: Scalar, t: Scalar) -> Scalar:
         return 0.5 * self.stiffness * (x - self.angle) ** 2
 
 
@@ -256,22 +242,19 @@ class JointDamping(AbstractForce):
     """
 
     joint: str = eqx.field(static=True)
-    turning: Float[Array, ""]
-    sliding: Float[Array, ""]
+    turning: Scalar
+    sliding: Scalar
 
     def __init__(self, joint: str, *, turning: Numbers = 0.0, sliding: Numbers = 0.0) -> None:
         self.joint = joint
-        self.turning = check_nonnegative(
-            turning, f"The turning damping of joint '{joint}'", "N m s/rad"
-        )
-        self.sliding = check_nonnegative(
-            sliding, f"The sliding damping of joint '{joint}'", "N s/m"
-        )
+        of = f"damping of joint '{joint}'"
+        self.turning = check_nonnegative(turning, f"The turning {of}", "N m s/rad")
+        self.sliding = check_nonnegative(sliding, f"The sliding {of}", "N s/m")
 
     def acts_on(self) -> ActsOn:
         return ActsOn(joints=(self.joint,))
 
-    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+    def load(self, t: Scalar, kin: Kinematics) -> Load:
         joint = kin.joint(self.joint)
         i, j = kin.index(joint.body_i), kin.index(joint.body_j)
         # Damping acts on the relative motion in the joint as a pair of forces, so that it neither pushes nor
@@ -282,19 +265,22 @@ class JointDamping(AbstractForce):
         return drag + couple_load(kin, joint.body_i, joint.body_j, spin)
 
 
+def _evaluate_in_world(
+    signal: Signal, t: Scalar, kin: Kinematics, subject: str, body: str, frame: str
+) -> Vec3:
+    """World vector of a signal in the axes of the world or of a body.
+
+    A function is called with time and kinematics even if it uses the time alone, so that a force has one
+    signature.
+    """
+    value = evaluate(signal, t, kin, subject, (3,))
+    return apply_matrix(kin.R_wb[kin.index(body)], value) if frame == "body" else value
+
+
 def _check_frame(frame: str) -> Literal["world", "body"]:
     if frame not in ("world", "body"):
         raise ModelError(f"The frame of a load must be 'world' or 'body', not '{frame}'.")
     return frame  # pyright: ignore[reportReturnType]
-
-
-def _two_bodies(element_name: str, body_i: str, body_j: str) -> None:
-    if body_i == body_j:
-        raise ModelError(
-            f"{element_name} joins body '{body_i}' to itself: name two different bodies."
-        )
-    if not body_i or not body_j:
-        raise ModelError(f"{element_name} needs two bodies; the fixed one is called '{GROUND}'.")
 
 
 class GroundContact(AbstractForce):
@@ -328,12 +314,12 @@ class GroundContact(AbstractForce):
 
     body: str = eqx.field(static=True)
     feet: Float[Array, "k 3"]
-    height: Float[Array, ""]
-    stiffness: Float[Array, ""]
-    damping: Float[Array, ""]
-    width: Float[Array, ""]
-    friction: Float[Array, ""]
-    slip_speed: Float[Array, ""]
+    height: Scalar
+    stiffness: Scalar
+    damping: Scalar
+    width: Scalar
+    friction: Scalar
+    slip_speed: Scalar
 
     def __init__(
         self,
@@ -381,19 +367,15 @@ class GroundContact(AbstractForce):
         law = self.stiffness, self.damping, self.width
         return jax.vmap(lambda d, d_rate: one_sided_push(d, d_rate, *law))(depth, rate)
 
-    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
-        del t
+    def load(self, t: Scalar, kin: Kinematics) -> Load:
         place, velocity = self._foot_motion(kin)
         depth, rate = self.height - place[:, 2], -velocity[:, 2]
         normal = self._normal_forces(depth, rate)
         # Coulomb's law jumps at rest, where an integrator would chatter. Smoothed over a speed it
         # is a damper there, with continuous derivatives.
         slip_velocity = velocity[:, :2]
-        drag = (
-            self.friction
-            * normal
-            / jnp.sqrt(jnp.sum(slip_velocity * slip_velocity, axis=1) + self.slip_speed**2)
-        )
+        slip_square = jnp.sum(slip_velocity * slip_velocity, axis=1)
+        drag = self.friction * normal / jnp.sqrt(slip_square + self.slip_speed**2)
         force = jnp.concatenate([-drag[:, None] * slip_velocity, normal[:, None]], axis=1)
         total = jnp.sum(force, axis=0)
         # The opposite load on ground is kept: the balance of a system's momentum counts it, and a
@@ -406,7 +388,7 @@ class GroundContact(AbstractForce):
         of_springs = self.stiffness * jax.vmap(lambda d: smooth_ramp(d, self.width))(depth)
         # Potential energy is that of the springs alone, which the damper's part of the force is
         # not: that part, and friction, is power without a potential.
-        lost = (of_springs - normal) * rate - drag * jnp.sum(slip_velocity * slip_velocity, axis=1)
+        lost = (of_springs - normal) * rate - drag * slip_square
         energy = self.stiffness * jax.vmap(lambda d: ramp_area(d, self.width))(depth)
         return Load(load.force, load.moment, jnp.sum(energy), jnp.sum(lost))
 

@@ -6,8 +6,8 @@ and makes the system in which they have other values or histories.
 """
 
 import inspect
-from collections.abc import Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -41,24 +41,15 @@ class NamedInput(NamedTuple):
 
 
 class Components(eqx.Module):
-    """Field value that selects some components from a history of all inputs."""
+    """Field value that selects some components from a history of all inputs, which may be a plain number."""
 
     whole: Any
     places: tuple[int, ...] = eqx.field(static=True)
     shape: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, t: Any, kin: Any = None) -> Array:
-        values = jnp.asarray(self.whole(t, kin))
+        values = jnp.asarray(self.whole(t, kin)).reshape(-1)
         return values[np.array(self.places, dtype=int)].reshape(self.shape)
-
-
-class _Vector(eqx.Module):
-    """A function of time whose value is one vector, also where it returns a plain number."""
-
-    whole: Any
-
-    def __call__(self, t: Any, kin: Any = None) -> Array:
-        return jnp.asarray(self.whole(t, kin)).reshape(-1)
 
 
 class Inputs(eqx.Module):
@@ -119,7 +110,7 @@ class Inputs(eqx.Module):
         fields: dict[tuple[int, str], list[int]] = {}
         for k, entry in enumerate(self.entries):
             fields.setdefault((entry.force, entry.field), []).append(k)
-        kinematics = _KinematicsShape(system)
+        kinematics = _find_kinematics_shape(system)
         for (force, field), places in fields.items():
             old = _read_field(system, self.entries[places[0]])
             shape = _value_shape(old, kinematics)
@@ -193,7 +184,7 @@ def with_inputs(system: System, values: Mapping[str, Any]) -> System:
     for name, value in values.items():
         chosen_inputs = every.chosen([name])
         if callable(value):
-            system = chosen_inputs.applied(system, _Vector(value))
+            system = chosen_inputs.applied(system, value)
         else:
             shape = (len(chosen_inputs),) if np.ndim(value) or len(chosen_inputs) > 1 else ()
             input_values = check_numbers(
@@ -219,7 +210,7 @@ def inputs_of(system: System, names: Sequence[str] | None = None) -> Inputs:
         for field, unit in force.inputs
     ]
     entries: list[NamedInput] = []
-    kinematics = _KinematicsShape(system)
+    kinematics = _find_kinematics_shape(system)
     for k, force, field, unit in raw:
         last = field.split(".")[-1]
         # Short names where they are unambiguous: a second force with the same field makes both longer.
@@ -262,32 +253,23 @@ def _number_suffix(place: tuple[int, ...]) -> str:
 
 
 def _walk_fields(force: AbstractForce, field: str) -> Any:
-    value: Any = force
-    for part in field.split("."):
-        value = getattr(value, part)
-    return value
+    return reduce(getattr, field.split("."), force)
 
 
 def _read_field(system: System, entry: NamedInput) -> Any:
     return _walk_fields(system.forces[entry.force], entry.field)
 
 
-class _KinematicsShape:
-    """Shapes of a system's kinematics, found when they are first asked for: a trace takes 0.05 s."""
-
-    def __init__(self, system: System) -> None:
-        self._system = system
-
-    @cached_property
-    def value(self) -> Any:
-        return eqx.filter_eval_shape(self._system.kinematics, self._system.reference)
+def _find_kinematics_shape(system: System) -> Callable[[], Any]:
+    """Function that returns shapes of a system's kinematics, found once asked for: a trace takes 0.05 s."""
+    return cache(lambda: eqx.filter_eval_shape(system.kinematics, system.reference))
 
 
-def _value_shape(value: Any, kinematics: _KinematicsShape) -> tuple[int, ...]:
+def _value_shape(value: Any, kinematics: Callable[[], Any]) -> tuple[int, ...]:
     """Shape of a field's value, or of the result of its function."""
     if not callable(value):
         return jnp.shape(value)
     # loads take (t, kinematics), motions along a joint's coordinate t alone
     count = len(inspect.signature(value).parameters)
-    arguments = (jnp.zeros(()),) if count < 2 else (jnp.zeros(()), kinematics.value)
+    arguments = (jnp.zeros(()),) if count < 2 else (jnp.zeros(()), kinematics())
     return eqx.filter_eval_shape(lambda *a: jnp.asarray(value(*a)), *arguments).shape

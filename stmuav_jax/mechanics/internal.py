@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..checks.errors import ModelError
 from ..checks.numbers import as_floats, check_scalar
-from ..checks.shapes import Numbers
+from ..checks.shapes import Numbers, Scalar
 from .load import AbstractForce
 from .state import Kinematics
 from .system import System
@@ -37,7 +37,7 @@ class AbstractInternalForce(AbstractForce):
     internal: eqx.AbstractVar[Float[Array, " m"]]
 
     @abstractmethod
-    def internal_rate(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " m"]:
+    def internal_rate(self, t: Scalar, kin: Kinematics) -> Float[Array, " m"]:
         """Rate dz/dt of the actuator states at time t [s]."""
 
     @abstractmethod
@@ -95,7 +95,7 @@ def with_internal(system: System, z: Float[Array, " m"]) -> System:
     return eqx.tree_at(lambda s: s.forces, system, tuple(forces)) if start else system
 
 
-def internal_rates(system: System, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " m"]:
+def internal_rates(system: System, t: Scalar, kin: Kinematics) -> Float[Array, " m"]:
     """Rates dz/dt of the actuator states of a system (m,), in their order."""
     return _join_states([force.internal_rate(t, kin) for _, force in _internal_owners(system)])
 
@@ -111,11 +111,9 @@ def internal_starts(system: System, kin: Kinematics) -> Float[Array, " m"]:
 
 def counted_hinges(system: System) -> tuple[str | None, ...]:
     """Joint whose angle each internal state of a system counts, None for an actuator state (m,)."""
-    hinges: list[str | None] = []
-    for _, force in _internal_owners(system):
-        hinge = force.counted_hinge() if isinstance(force, AbstractTurnCounter) else None
-        hinges += [hinge] * force.internal.shape[-1]
-    return tuple(hinges)
+    owners = (force for _, force in _internal_owners(system))
+    hinge = lambda force: force.counted_hinge() if isinstance(force, AbstractTurnCounter) else None
+    return tuple(hinge(force) for force in owners for _ in range(force.internal.shape[-1]))
 
 
 def actuator_mask(system: System) -> Bool[np.ndarray, " m"]:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, has_values
 from ..checks.numbers import array_module, as_floats, as_numpy, check_scalar, check_vector
-from ..checks.shapes import Numbers
+from ..checks.shapes import Numbers, Scalar, Vec3
 from ..math.native.structure import has_structure
 from ..math.rotation import rotation_matrix_in
 from .body import Body
@@ -88,7 +88,7 @@ class JointKind(NamedTuple):
         return any(column.linear is None for column in self.columns)
 
 
-Motion = Callable[[Float[Array, ""]], Float[Array, ""]]
+Motion = Callable[[Scalar], Scalar]
 
 # Kinds of joints are data, and primitives are the only code: a new kind is one more entry, and
 # both formulations, the assembly and the sensors read it from there.
@@ -110,15 +110,9 @@ CATALOGUE: dict[str, JointKind] = {
         (Freedom(REVOLUTE, X, " about axis_i"), Freedom(REVOLUTE, Y, " about axis_j")),
     ),
     "revolute": JointKind((_POINT, *_PARALLEL), (_REVOLUTE,)),
-    "translational": JointKind(
-        (*_PARALLEL, *_ON_AXIS, Term("n1", X, Y)),
-        (_PRISMATIC,),
-    ),
+    "translational": JointKind((*_PARALLEL, *_ON_AXIS, Term("n1", X, Y)), (_PRISMATIC,)),
     "cylindrical": JointKind((*_PARALLEL, *_ON_AXIS), (_PRISMATIC, _REVOLUTE)),
-    "screw": JointKind(
-        (*_PARALLEL, *_ON_AXIS, Term("screw", Z, X, X)),
-        (Freedom(SCREW),),
-    ),
+    "screw": JointKind((*_PARALLEL, *_ON_AXIS, Term("screw", Z, X, X)), (Freedom(SCREW),)),
     # Massless links have constraints but no coordinates that a tree could use: they always close a
     # loop.
     "distance": JointKind((Term("distance"),)),
@@ -148,9 +142,9 @@ class Mate(eqx.Module):
     dependent: str = eqx.field(static=True)
     coordinates: tuple[Which, Which] = eqx.field(static=True)
     joint: "Joint"
-    ratio: Float[Array, ""]
-    offset: Float[Array, ""]
-    period: Float[Array, ""]
+    ratio: Scalar
+    offset: Scalar
+    period: Scalar
 
 
 @has_structure(zero=("point_i", "point_j"), unit=("frame_i", "frame_j"))
@@ -168,11 +162,11 @@ class Joint(eqx.Module):
     body_i: str = eqx.field(static=True)
     body_j: str = eqx.field(static=True)
     in_world: bool = eqx.field(static=True)
-    point_i: Float[Array, "3"]
-    point_j: Float[Array, "3"]
+    point_i: Vec3
+    point_j: Vec3
     frame_i: Float[Array, "3 3"]
     frame_j: Float[Array, "3 3"]
-    length: Float[Array, ""]
+    length: Scalar
     motion: Motion | None = None
     mate: Mate | None = None
 
@@ -194,13 +188,9 @@ class Joint(eqx.Module):
     ) -> Data:
         """Body-fixed parameters of one primitive, with points relative to the centres of mass."""
         return Data(
-            point_i=self.point_i - com_i,
-            point_j=self.point_j - com_j,
-            axis_i=self.frame_i[:, term.axis_i],
-            axis_j=self.frame_j[:, term.axis_j],
-            side_i=self.frame_i[:, term.side_i],
-            length=self.length,
-        )
+            self.point_i - com_i, self.point_j - com_j, self.frame_i[:, term.axis_i],
+            self.frame_j[:, term.axis_j], self.frame_i[:, term.side_i], self.length,
+        )  # fmt: skip
 
 
 def free_coordinates(joint: Joint) -> list[Which]:
@@ -263,7 +253,7 @@ def resolve_joint(joint: Joint, bodies: Mapping[str, Body]) -> Joint:
     )
 
 
-def _unit_axis(axis: Numbers, subject: str) -> Float[Array, "3"]:
+def _unit_axis(axis: Numbers, subject: str) -> Vec3:
     axis_vector = as_numpy(check_vector(axis, subject, ""))
     length = array_module(axis_vector).sqrt(axis_vector @ axis_vector)
     if has_values(axis_vector) and float(length) == 0:
@@ -271,7 +261,7 @@ def _unit_axis(axis: Numbers, subject: str) -> Float[Array, "3"]:
     return as_floats(axis_vector / length)
 
 
-def _frame_about(z: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def _frame_about(z: Vec3) -> Float[Array, "3 3"]:
     """Right-handed frame with the given third column, its x axis near the least aligned axis."""
     z, module = as_numpy(z), array_module(z)
     # Any x axis would do for a hinge. The least aligned one keeps the division away from zero for
@@ -300,18 +290,7 @@ def _make_joint(
         raise ModelError(
             f"Joint '{name}' joins body '{body_i}' to itself: name two different bodies."
         )
-    return Joint(
-        name=name,
-        kind=kind,
-        body_i=body_i,
-        body_j=body_j,
-        in_world=True,
-        point_i=points[0],
-        point_j=points[1],
-        frame_i=frame,
-        frame_j=frame,
-        length=as_floats(length),
-    )
+    return Joint(name, kind, body_i, body_j, True, *points, frame, frame, as_floats(length))
 
 
 _ORIGIN = (0.0, 0.0, 0.0)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, has_values
 from ..checks.numbers import as_floats, check_nonnegative, check_positive, check_scalar
-from ..checks.shapes import Numbers
+from ..checks.shapes import Numbers, Scalar
 from .internal import AbstractTurnCounter
 from .joint import Joint, Motion, Which, choose_coordinate
 from .joint_states import JointCoordinate, evaluate_coordinate
@@ -26,20 +26,20 @@ from .load import ActsOn, Load
 from .state import Kinematics
 
 
-def smooth_ramp(d: Float[Array, ""], w: Float[Array, ""]) -> Float[Array, ""]:
+def smooth_ramp(d: Scalar, w: Scalar) -> Scalar:
     """Smooth ramp: 0 up to d = 0, d - w/2 from d = w, three times continuously differentiable."""
     u = jnp.clip(d / w, 0.0, 1.0)
     inner = w * u**4 * (2.5 - 3 * u + u * u)
     return jnp.where(d < w, inner, d - 0.5 * w)
 
 
-def ramp_slope(d: Float[Array, ""], w: Float[Array, ""]) -> Float[Array, ""]:
+def ramp_slope(d: Scalar, w: Scalar) -> Scalar:
     """Derivative of `smooth_ramp` with respect to d, from 0 to 1."""
     u = jnp.clip(d / w, 0.0, 1.0)
     return u**3 * (10 - 15 * u + 6 * u * u)
 
 
-def ramp_area(d: Float[Array, ""], w: Float[Array, ""]) -> Float[Array, ""]:
+def ramp_area(d: Scalar, w: Scalar) -> Scalar:
     """Integral of `smooth_ramp` from 0 to d."""
     u = jnp.clip(d / w, 0.0, 1.0)
     # The potential is the exact integral of the ramp: the energy balance of a run would show any
@@ -49,12 +49,12 @@ def ramp_area(d: Float[Array, ""], w: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def one_sided_push(
-    depth: Float[Array, ""],
-    rate: Float[Array, ""],
-    stiffness: Float[Array, ""],
-    damping: Float[Array, ""],
-    width: Float[Array, ""],
-) -> Float[Array, ""]:
+    depth: Scalar,
+    rate: Scalar,
+    stiffness: Scalar,
+    damping: Scalar,
+    width: Scalar,
+) -> Scalar:
     """Push of a spring and damper at a depth, E/2 + ramp(E + D, E), which is never negative.
 
         E = stiffness ramp(depth, width)     D = damping ramp'(depth, width) rate
@@ -102,13 +102,11 @@ class AbstractJointForce(AbstractTurnCounter):
     internal: Float[Array, " m"] | None = eqx.field(default=None, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @abstractmethod
-    def law(
-        self, x: Float[Array, ""], x_rate: Float[Array, ""], t: Float[Array, ""]
-    ) -> Float[Array, ""]:
+    def law(self, x: Scalar, x_rate: Scalar, t: Scalar) -> Scalar:
         """Generalised force Q on body j, [N] for a displacement [m], [N m] for an angle [rad]."""
 
     @abstractmethod
-    def potential_energy(self, x: Float[Array, ""], t: Float[Array, ""]) -> Float[Array, ""]:
+    def potential_energy(self, x: Scalar, t: Scalar) -> Scalar:
         """Potential energy V [J]; -dV/dx is the conservative part of Q."""
 
     def acts_on(self) -> ActsOn:
@@ -160,7 +158,7 @@ class AbstractJointForce(AbstractTurnCounter):
             lambda c: c.value, joint_coordinate, joint_coordinate.value + 2 * jnp.pi * turns
         )
 
-    def internal_rate(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, " m"]:
+    def internal_rate(self, t: Scalar, kin: Kinematics) -> Float[Array, " m"]:
         return self.coordinate_at(kin).rate[None]
 
     def internal_names(self) -> tuple[str, ...]:
@@ -172,7 +170,7 @@ class AbstractJointForce(AbstractTurnCounter):
     def counted_hinge(self) -> str:
         return self.joint
 
-    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+    def load(self, t: Scalar, kin: Kinematics) -> Load:
         now = self.coordinate_at(kin)
         effort = self.law(now.value, now.rate, t)
         # The power without potential follows from the law and the potential, so that a subclass cannot state
@@ -203,10 +201,10 @@ class JointServo(AbstractJointForce):
     """
 
     inputs: ClassVar[tuple[tuple[str, str], ...]] = (("target", "m or rad"),)
-    stiffness: Float[Array, ""]
-    damping: Float[Array, ""]
-    target: Float[Array, ""] | Motion
-    limit: Float[Array, ""] | None
+    stiffness: Scalar
+    damping: Scalar
+    target: Scalar | Motion
+    limit: Scalar | None
 
     def __init__(
         self,
@@ -223,11 +221,9 @@ class JointServo(AbstractJointForce):
         self.stiffness = check_nonnegative(stiffness, f"The stiffness {of}", _STIFFNESS[coordinate])
         self.damping = check_nonnegative(damping, f"The damping {of}", _DAMPING[coordinate])
         self.target = time_signal(target, f"The target {of}", _LENGTH[coordinate])
-        self.limit = (
-            None if limit is None else check_positive(limit, f"The limit {of}", _EFFORT[coordinate])
-        )
+        self.limit = _check_limit(limit, f"The limit {of}", _EFFORT[coordinate])
 
-    def reference(self, t: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def reference(self, t: Scalar) -> tuple[Scalar, Scalar]:
         """Target x_ref and its rate at time t [s]."""
         target = self.target
         if not callable(target):
@@ -236,14 +232,12 @@ class JointServo(AbstractJointForce):
         # pull in steady motion.
         return jax.jvp(lambda s: jnp.asarray(target(s), s.dtype), (t,), (jnp.ones_like(t),))
 
-    def law(
-        self, x: Float[Array, ""], x_rate: Float[Array, ""], t: Float[Array, ""]
-    ) -> Float[Array, ""]:
+    def law(self, x: Scalar, x_rate: Scalar, t: Scalar) -> Scalar:
         target, target_rate = self.reference(t)
         effort = -self.stiffness * (x - target) - self.damping * (x_rate - target_rate)
         return effort if self.limit is None else jnp.clip(effort, -self.limit, self.limit)
 
-    def potential_energy(self, x: Float[Array, ""], t: Float[Array, ""]) -> Float[Array, ""]:
+    def potential_energy(self, x: Scalar, t: Scalar) -> Scalar:
         return 0.5 * self.stiffness * (x - self.reference(t)[0]) ** 2
 
 
@@ -273,11 +267,11 @@ class EndStop(AbstractJointForce):
             are in the wrong order.
     """
 
-    lower: Float[Array, ""] | None
-    upper: Float[Array, ""] | None
-    stiffness: Float[Array, ""]
-    damping: Float[Array, ""]
-    width: Float[Array, ""]
+    lower: Scalar | None
+    upper: Scalar | None
+    stiffness: Scalar
+    damping: Scalar
+    width: Scalar
 
     def __init__(
         self,
@@ -307,12 +301,10 @@ class EndStop(AbstractJointForce):
                     f"The limits {of} must be lower < upper, but they are {low} and {high} {unit}."
                 )
 
-    def _stop_force(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
+    def _stop_force(self, depth: Scalar, rate: Scalar) -> Scalar:
         return one_sided_push(depth, rate, self.stiffness, self.damping, self.width)
 
-    def law(
-        self, x: Float[Array, ""], x_rate: Float[Array, ""], t: Float[Array, ""]
-    ) -> Float[Array, ""]:
+    def law(self, x: Scalar, x_rate: Scalar, t: Scalar) -> Scalar:
         effort = jnp.zeros_like(x)
         if self.lower is not None:
             effort = effort + self._stop_force(self.lower - x, -x_rate)
@@ -320,7 +312,7 @@ class EndStop(AbstractJointForce):
             effort = effort - self._stop_force(x - self.upper, x_rate)
         return effort
 
-    def potential_energy(self, x: Float[Array, ""], t: Float[Array, ""]) -> Float[Array, ""]:
+    def potential_energy(self, x: Scalar, t: Scalar) -> Scalar:
         area = jnp.zeros_like(x)
         if self.lower is not None:
             area = area + ramp_area(self.lower - x, self.width)
@@ -345,9 +337,9 @@ class JointFriction(AbstractJointForce):
     """
 
     depends_on_position: ClassVar[bool] = False
-    coulomb: Float[Array, ""]
-    viscous: Float[Array, ""]
-    speed: Float[Array, ""]
+    coulomb: Scalar
+    viscous: Scalar
+    speed: Scalar
 
     def __init__(
         self,
@@ -366,12 +358,10 @@ class JointFriction(AbstractJointForce):
         )
         self.speed = check_positive(speed, f"The smoothing speed {of}", f"{unit}/s")
 
-    def law(
-        self, x: Float[Array, ""], x_rate: Float[Array, ""], t: Float[Array, ""]
-    ) -> Float[Array, ""]:
+    def law(self, x: Scalar, x_rate: Scalar, t: Scalar) -> Scalar:
         return -self.coulomb * jnp.tanh(x_rate / self.speed) - self.viscous * x_rate
 
-    def potential_energy(self, x: Float[Array, ""], t: Float[Array, ""]) -> Float[Array, ""]:
+    def potential_energy(self, x: Scalar, t: Scalar) -> Scalar:
         return jnp.zeros_like(x)
 
 
@@ -390,9 +380,12 @@ def which_coordinate(value: Which | None) -> Which | None:
     return value
 
 
-def time_signal(
-    value: Numbers | Callable[..., object], subject: str, unit: str
-) -> Float[Array, ""] | Motion:
+def _check_limit(limit: Numbers | None, subject: str, unit: str) -> Scalar | None:
+    """Checked largest effort as an array, or none."""
+    return None if limit is None else check_positive(limit, subject, unit)
+
+
+def time_signal(value: Numbers | Callable[..., object], subject: str, unit: str) -> Scalar | Motion:
     """Checked number as an array, or a function of t, tried without evaluating it."""
     if not callable(value):
         return check_scalar(value, subject, unit)
@@ -425,8 +418,8 @@ class JointEffort(AbstractJointForce):
 
     inputs: ClassVar[tuple[tuple[str, str], ...]] = (("effort", "N or N m"),)
     depends_on_position: ClassVar[bool] = False
-    effort: Float[Array, ""] | Motion
-    limit: Float[Array, ""] | None
+    effort: Scalar | Motion
+    limit: Scalar | None
 
     def __init__(
         self,
@@ -439,17 +432,11 @@ class JointEffort(AbstractJointForce):
         self.joint, self.coordinate = joint, which_coordinate(coordinate)
         quantity = f"effort in joint '{joint}'"
         self.effort = time_signal(effort, f"The {quantity}", "N or N m")
-        self.limit = (
-            None
-            if limit is None
-            else check_positive(limit, f"The limit of the {quantity}", "N or N m")
-        )
+        self.limit = _check_limit(limit, f"The limit of the {quantity}", "N or N m")
 
-    def law(
-        self, x: Float[Array, ""], x_rate: Float[Array, ""], t: Float[Array, ""]
-    ) -> Float[Array, ""]:
+    def law(self, x: Scalar, x_rate: Scalar, t: Scalar) -> Scalar:
         effort = jnp.asarray(self.effort(t) if callable(self.effort) else self.effort, x.dtype)
         return effort if self.limit is None else jnp.clip(effort, -self.limit, self.limit)
 
-    def potential_energy(self, x: Float[Array, ""], t: Float[Array, ""]) -> Float[Array, ""]:
+    def potential_energy(self, x: Scalar, t: Scalar) -> Scalar:
         return jnp.zeros_like(x)

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, SettingError
-from ..checks.shapes import Numbers
+from ..checks.shapes import Numbers, Scalar, Vec3
 from ..math import lapack
 from ..math.rotation import cross, from_matrix, from_rotation_vector, product, rotation_matrix
 from ..math.stacked import apply_matrix, apply_transposed, dot_product, multiply_matrices
@@ -56,12 +56,12 @@ class JointCoordinate(eqx.Module):
     kind: Which = eqx.field(static=True)
     body_i: str = eqx.field(static=True)
     body_j: str = eqx.field(static=True)
-    value: Float[Array, ""]
-    rate: Float[Array, ""]
-    axis: Float[Array, "3"]
-    point: Float[Array, "3"]
+    value: Scalar
+    rate: Scalar
+    axis: Vec3
+    point: Vec3
 
-    def load(self, kin: Kinematics, effort: Float[Array, ""]) -> Load:
+    def load(self, kin: Kinematics, effort: Scalar) -> Load:
         """Load of an effort ([N m] or [N] on the coordinate) on body j, and its opposite on body i.
 
         Its power is effort times rate. Both forces act at j's point, so that they have no
@@ -222,14 +222,10 @@ def _of_motions(
 ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
     """Coordinates and rates of any sequence of motions, read one after the other."""
     i, j = kin.index(joint.body_i), kin.index(joint.body_j)
-    F_i, F_j = (
-        multiply_matrices(kin.R_wb[i], joint.frame_i),
-        multiply_matrices(kin.R_wb[j], joint.frame_j),
-    )
-    (a, a_rate), (b, b_rate) = (
-        kin.point(joint.body_i, joint.point_i),
-        kin.point(joint.body_j, joint.point_j),
-    )
+    F_i = multiply_matrices(kin.R_wb[i], joint.frame_i)
+    F_j = multiply_matrices(kin.R_wb[j], joint.frame_j)
+    a, a_rate = kin.point(joint.body_i, joint.point_i)
+    b, b_rate = kin.point(joint.body_j, joint.point_j)
     R, d = multiply_matrices(F_i.T, F_j), apply_transposed(F_i, b - a)
     behind, zero = reference_directions([f[:2] for f in motions], f"Joint '{joint.name}'")
     last = frame_columns(motions[-1].axis)
@@ -274,28 +270,20 @@ def relative_pose(joint: Joint, q: Float[Array, " c"], u: Float[Array, " c"]) ->
     zero = jnp.zeros(3, q.dtype)
     total_pose = RelativePose(from_rotation_vector(zero), zero, zero, zero)
     start = 0
-    for number, freedom in enumerate(CATALOGUE[joint.kind].motion or ()):
-        coordinate_slice = slice(start, start + len(freedom.motion.coordinates))
-        step = freedom.motion.pose(
-            q[coordinate_slice], u[coordinate_slice], freedom.axis, joint.length
-        )
-        total_pose, start = (
-            step if number == 0 else _compose_poses(total_pose, step),
-            coordinate_slice.stop,
-        )
+    for number, (motion, axis, _) in enumerate(CATALOGUE[joint.kind].motion or ()):
+        columns = slice(start, start + len(motion.coordinates))
+        step = motion.pose(q[columns], u[columns], axis, joint.length)
+        total_pose = _compose_poses(total_pose, step) if number else step
+        start = columns.stop
     return total_pose
 
 
 def _compose_poses(first: RelativePose, second: RelativePose) -> RelativePose:
     """Pose of the child frame of two successive motions in the parent frame of the first."""
     R = rotation_matrix(first.p)
-    d = R @ second.d
-    return RelativePose(
-        product(first.p, second.p),
-        first.d + d,
-        first.w + R @ second.w,
-        first.v + R @ second.v + cross(first.w, d),
-    )
+    d, w, v = R @ second.d, R @ second.w, R @ second.v
+    p = product(first.p, second.p)
+    return RelativePose(p, first.d + d, first.w + w, first.v + v + cross(first.w, d))
 
 
 @eqx.filter_jit

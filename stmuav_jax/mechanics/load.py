@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, check_finite, check_shape
 from ..checks.numbers import as_floats, check_scalar
-from ..checks.shapes import Numbers
+from ..checks.shapes import Numbers, Scalar, Vec3
 from ..math.rotation import cross
 from ..math.stacked import apply_transposed, dot_product
 from .joint import Which
@@ -27,7 +27,7 @@ from .state import Kinematics
 if TYPE_CHECKING:
     from .joint import Joint
 
-Signal = Float[Array, "..."] | Callable[[Float[Array, ""], Kinematics], Float[Array, "..."]]
+Signal = Float[Array, "..."] | Callable[[Scalar, Kinematics], Float[Array, "..."]]
 
 
 def check_signal(
@@ -64,7 +64,7 @@ def check_arguments(function: Callable[..., object], subject: str) -> None:
 
 
 def evaluate(
-    value: Signal, t: Float[Array, ""], kin: Kinematics, subject: str, shape: tuple[int, ...]
+    value: Signal, t: Scalar, kin: Kinematics, subject: str, shape: tuple[int, ...]
 ) -> Float[Array, "..."]:
     """Value of a signal at time t [s].
 
@@ -103,15 +103,14 @@ class Sine(eqx.Module):
     """
 
     amplitude: Float[Array, "*shape"]
-    angular_frequency: Float[Array, ""]
+    angular_frequency: Scalar
 
     def __init__(self, amplitude: Numbers, angular_frequency: Numbers) -> None:
         check_finite((amplitude, angular_frequency), "A sine signal", "")
         self.amplitude = as_floats(amplitude)
         self.angular_frequency = as_floats(angular_frequency)
 
-    def __call__(self, t: Float[Array, ""], kin: Kinematics) -> Float[Array, "*shape"]:
-        del kin
+    def __call__(self, t: Scalar, kin: Kinematics) -> Float[Array, "*shape"]:
         return self.amplitude * jnp.sin(self.angular_frequency * t)
 
 
@@ -126,11 +125,11 @@ class SineMotion(eqx.Module):
         ModelError: a number is not finite.
     """
 
-    start: Float[Array, ""]
-    rate: Float[Array, ""]
-    amplitude: Float[Array, ""]
-    angular_frequency: Float[Array, ""]
-    phase: Float[Array, ""]
+    start: Scalar
+    rate: Scalar
+    amplitude: Scalar
+    angular_frequency: Scalar
+    phase: Scalar
 
     def __init__(
         self,
@@ -146,7 +145,7 @@ class SineMotion(eqx.Module):
         self.angular_frequency = check_scalar(angular_frequency, "The angular frequency", "rad/s")
         self.phase = check_scalar(phase, "The phase of a driver's motion", "rad")
 
-    def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
+    def __call__(self, t: Scalar) -> Scalar:
         swing = self.amplitude * jnp.sin(self.angular_frequency * t + self.phase)
         return self.start + self.rate * t + swing
 
@@ -163,8 +162,8 @@ class Load(eqx.Module):
 
     force: Float[Array, "N 3"]
     moment: Float[Array, "N 3"]
-    potential: Float[Array, ""]
-    power: Float[Array, ""]
+    potential: Scalar
+    power: Scalar
 
     def __add__(self, other: "Load") -> "Load":
         return Load(
@@ -184,9 +183,9 @@ def no_load(kin: Kinematics) -> Load:
 def push(
     kin: Kinematics,
     body: str,
-    force_w: Float[Array, "3"],
-    arm_w: Float[Array, "3"] | None = None,
-    moment_w: Float[Array, "3"] | None = None,
+    force_w: Vec3,
+    arm_w: Vec3 | None = None,
+    moment_w: Vec3 | None = None,
 ) -> Load:
     """Load of a world force [N] at `arm_w` [m] from a body's centre of mass, and a moment [N m].
 
@@ -211,7 +210,7 @@ def push(
     )
 
 
-def total_load(forces: "Sequence[AbstractForce]", t: Float[Array, ""], kin: Kinematics) -> Load:
+def total_load(forces: "Sequence[AbstractForce]", t: Scalar, kin: Kinematics) -> Load:
     """Sum of the loads of all force elements at time t [s].
 
     Raises:
@@ -233,12 +232,10 @@ def _check_load(force: "AbstractForce", element_load: object, expected: Load) ->
         shape = jnp.shape(getattr(element_load, name)) if isinstance(element_load, Load) else None
         if shape != must:
             mismatch = f"has {name} of shape {shape}" if shape is not None else "is none"
+            rows = f"of shape {must}, a row for every body and one for ground"
             raise ModelError(
-                f"The load of {type(force).__name__} on {force.acts_on()} must be a Load with {name} of "
-                f"shape {must}, a row for every body and one for ground, but it {mismatch}."
-                if must
-                else f"The load of {type(force).__name__} on {force.acts_on()} must be a Load with {name} a "
-                f"single number, but it {mismatch}."
+                f"The load of {type(force).__name__} on {force.acts_on()} must be a Load with {name} "
+                f"{rows if must else 'a single number'}, but it {mismatch}."
             )
 
 
@@ -271,7 +268,7 @@ class AbstractForce(eqx.Module):
     inputs: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     @abstractmethod
-    def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
+    def load(self, t: Scalar, kin: Kinematics) -> Load:
         """Load on all bodies at time t [s]."""
 
     @abstractmethod
@@ -280,11 +277,10 @@ class AbstractForce(eqx.Module):
 
     def resolve(self, joints: "Sequence[Joint]") -> "AbstractForce":
         """Force element for a system with these joints; by default it is unchanged."""
-        del joints
         return self
 
 
-def couple_load(kin: Kinematics, body_i: str, body_j: str, moment_w: Float[Array, "3"]) -> Load:
+def couple_load(kin: Kinematics, body_i: str, body_j: str, moment_w: Vec3) -> Load:
     """Load of the moment `moment_w` [N m] on body i and its opposite on body j."""
     none = jnp.zeros_like(moment_w)
     return push(kin, body_i, none, moment_w=moment_w) + push(kin, body_j, none, moment_w=-moment_w)

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError
+from ..checks.shapes import Quat, Scalar, Vec3
 from ..math.rotation import (
     conjugate,
     euler_parameter_rate,
@@ -31,6 +32,12 @@ from ..math.rotation import (
     to_rotation_vector,
 )
 from ..math.stacked import apply_matrix, multiply_matrices, unit_matrix
+
+# Rotations, Euler parameters and vectors of k frames, and a joint's c coordinates or rates.
+Rotations = Float[Array, "3 3 k ..."]
+Quaternions = Float[Array, "4 k ..."]
+Offsets = Float[Array, "3 k ..."]
+Coordinates = Float[Array, " c"]
 
 # Columns of a joint's frame in the cyclic order that makes the given axis the third.
 CYCLIC = {0: (1, 2, 0), 1: (2, 0, 1), 2: (0, 1, 2)}
@@ -85,10 +92,10 @@ class RelativeFrames(NamedTuple):
 class RelativePose(NamedTuple):
     """Pose of a child frame: Euler parameters, displacement [m], rates in the parent's axes."""
 
-    p: Float[Array, "4"]
-    d: Float[Array, "3"]
-    w: Float[Array, "3"]
-    v: Float[Array, "3"]
+    p: Quat
+    d: Vec3
+    w: Vec3
+    v: Vec3
 
 
 class AbstractRelativeMotion(ABC):
@@ -123,12 +130,8 @@ class AbstractRelativeMotion(ABC):
 
     @abstractmethod
     def relative(
-        self,
-        q: Float[Array, "..."],
-        K: Float[Array, "3 3 k *s"],
-        k: Float[Array, "3 k *s"],
-        shares: ColumnParts,
-    ) -> tuple[Float[Array, "3 3 k ..."], Float[Array, "3 k ..."]]:
+        self, q: Array, K: Rotations, k: Offsets, shares: ColumnParts
+    ) -> tuple[Rotations, Offsets]:
         """Rotation and position [m] of the child frames in their parents.
 
         Args:
@@ -136,15 +139,11 @@ class AbstractRelativeMotion(ABC):
         """
 
     @abstractmethod
-    def euler_parameters(
-        self, q: Float[Array, "..."], shares: ColumnParts
-    ) -> Float[Array, "4 k ..."]:
+    def euler_parameters(self, q: Array, shares: ColumnParts) -> Quaternions:
         """Euler parameters of the motion's rotation, continuous in q."""
 
     @abstractmethod
-    def read(
-        self, frames: RelativeFrames, shares: ColumnParts
-    ) -> tuple[Array, Float[Array, "3 3 k"], Float[Array, "3 k"]]:
+    def read(self, frames: RelativeFrames, shares: ColumnParts) -> tuple[Array, Rotations, Offsets]:
         """Positions q (*positions, k), and rotation and displacement [m] of this motion alone."""
 
     @abstractmethod
@@ -160,9 +159,7 @@ class AbstractRelativeMotion(ABC):
         """Step along the velocities that leads from x to y, so that retract(x, step) is y."""
 
     @abstractmethod
-    def pose(
-        self, x: Float[Array, " c"], x_rate: Float[Array, " c"], axis: int, pitch: Float[Array, ""]
-    ) -> RelativePose:
+    def pose(self, x: Coordinates, x_rate: Coordinates, axis: int, pitch: Scalar) -> RelativePose:
         """Pose of the child frame from the joint's coordinates and their rates.
 
         Args:
@@ -179,7 +176,6 @@ class AbstractFlatMotion(AbstractRelativeMotion):
     flat: ClassVar[bool] = True
 
     def rates(self, q: Float[Array, "..."], u: Float[Array, "..."]) -> Float[Array, "..."]:
-        del q
         return u
 
     def retract(self, q: Float[Array, "..."], step: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -219,12 +215,8 @@ class Axial(AbstractFlatMotion):
         return (MotionColumn(2, self.angular, self.linear),)
 
     def relative(
-        self,
-        q: Float[Array, "k *s"],
-        K: Float[Array, "3 3 k *s"],
-        k: Float[Array, "3 k *s"],
-        shares: ColumnParts,
-    ) -> tuple[Float[Array, "3 3 k *s"], Float[Array, "3 k *s"]]:
+        self, q: Array, K: Rotations, k: Offsets, shares: ColumnParts
+    ) -> tuple[Rotations, Offsets]:
         # A revolute, a prismatic and a helical joint are one formula with other constants: frames of all
         # three are evaluated as one array without a branch.
         c, s = jnp.cos(shares.angular * q), jnp.sin(shares.angular * q)
@@ -233,15 +225,11 @@ class Axial(AbstractFlatMotion):
         X = jnp.stack([c * K[:, 0] + s * K[:, 1], c * K[:, 1] - s * K[:, 0], z], axis=1)
         return X, k + (shares.linear * q)[None] * K[:, 2]
 
-    def euler_parameters(
-        self, q: Float[Array, "k *s"], shares: ColumnParts
-    ) -> Float[Array, "4 k *s"]:
+    def euler_parameters(self, q: Array, shares: ColumnParts) -> Quaternions:
         half, zero = 0.5 * shares.angular * q, jnp.zeros_like(q)
         return jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])
 
-    def read(
-        self, frames: RelativeFrames, shares: ColumnParts
-    ) -> tuple[Float[Array, " k"], Float[Array, "3 3 k"], Float[Array, "3 k"]]:
+    def read(self, frames: RelativeFrames, shares: ColumnParts) -> tuple[Array, Rotations, Offsets]:
         x, y = frames.zero[0], frames.zero[1]
         # The angle is read from a direction that later motions of the joint do not move, so that a sequence
         # of motions is solved one after the other.
@@ -266,9 +254,7 @@ class Axial(AbstractFlatMotion):
         X = rotation_matrix(jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)]))
         return q, X, jnp.stack([zero, zero, shares.linear * q])
 
-    def pose(
-        self, x: Float[Array, " c"], x_rate: Float[Array, " c"], axis: int, pitch: Float[Array, ""]
-    ) -> RelativePose:
+    def pose(self, x: Coordinates, x_rate: Coordinates, axis: int, pitch: Scalar) -> RelativePose:
         axis_vector = _EYE[axis]
         # The pitch is a number of the joint and may be differentiated; all other columns are constants.
         advance = pitch if self.linear is None else self.linear
@@ -315,50 +301,32 @@ class Spherical(AbstractRelativeMotion):
         return tuple(MotionColumn(axis, 1.0, 0.0) for axis in range(3))
 
     def relative(
-        self,
-        q: Float[Array, "4 k *s"],
-        K: Float[Array, "3 3 k *s"],
-        k: Float[Array, "3 k *s"],
-        shares: ColumnParts,
-    ) -> tuple[Float[Array, "3 3 k ..."], Float[Array, "3 k ..."]]:
-        del shares
+        self, q: Array, K: Rotations, k: Offsets, shares: ColumnParts
+    ) -> tuple[Rotations, Offsets]:
         return multiply_matrices(K, rotation_matrix(q)), k
 
-    def euler_parameters(
-        self, q: Float[Array, "4 k *s"], shares: ColumnParts
-    ) -> Float[Array, "4 k *s"]:
-        del shares
+    def euler_parameters(self, q: Array, shares: ColumnParts) -> Quaternions:
         return q
 
-    def read(
-        self, frames: RelativeFrames, shares: ColumnParts
-    ) -> tuple[Float[Array, "4 k"], Float[Array, "3 3 k"], Float[Array, "3 k"]]:
-        del shares
+    def read(self, frames: RelativeFrames, shares: ColumnParts) -> tuple[Array, Rotations, Offsets]:
         # Euler parameters of a ball joint are chosen with a sign: both describe one rotation, and
         # the motion from there is the same.
         q = frames.parameters()
         # frames behind may have other axes than this motion's
         return q, rotation_matrix(q), jnp.zeros_like(frames.offset)
 
-    def rates(self, q: Float[Array, "4 k *s"], u: Float[Array, "3 k *s"]) -> Float[Array, "4 k *s"]:
+    def rates(self, q: Quaternions, u: Offsets) -> Quaternions:
         return euler_parameter_rate(q, u)
 
-    def retract(
-        self, q: Float[Array, "4 k *s"], step: Float[Array, "3 k *s"]
-    ) -> Float[Array, "4 k *s"]:
+    def retract(self, q: Quaternions, step: Offsets) -> Quaternions:
         # Steps are multiplied on, not added: the norm stays one to round-off, and no direction of
         # the four numbers is wasted on it.
         return product(q, from_rotation_vector(step))
 
-    def difference(
-        self, y: Float[Array, "4 k *s"], x: Float[Array, "4 k *s"]
-    ) -> Float[Array, "3 k *s"]:
+    def difference(self, y: Quaternions, x: Quaternions) -> Offsets:
         return to_rotation_vector(product(conjugate(x), y))
 
-    def pose(
-        self, x: Float[Array, " c"], x_rate: Float[Array, " c"], axis: int, pitch: Float[Array, ""]
-    ) -> RelativePose:
-        del pitch
+    def pose(self, x: Coordinates, x_rate: Coordinates, axis: int, pitch: Scalar) -> RelativePose:
         axis_frame = jnp.eye(3, dtype=x.dtype)[:, CYCLIC[axis]]
         zero = jnp.zeros_like(x)
         return RelativePose(from_rotation_vector(axis_frame @ x), zero, axis_frame @ x_rate, zero)
@@ -385,32 +353,18 @@ class Translation(AbstractFlatMotion):
         return tuple(MotionColumn(axis, 0.0, 1.0) for axis in range(3))
 
     def relative(
-        self,
-        q: Float[Array, "3 k *s"],
-        K: Float[Array, "3 3 k *s"],
-        k: Float[Array, "3 k *s"],
-        shares: ColumnParts,
-    ) -> tuple[Float[Array, "3 3 k ..."], Float[Array, "3 k ..."]]:
-        del shares
+        self, q: Array, K: Rotations, k: Offsets, shares: ColumnParts
+    ) -> tuple[Rotations, Offsets]:
         return K, k + apply_matrix(K, q)
 
-    def euler_parameters(
-        self, q: Float[Array, "3 k *s"], shares: ColumnParts
-    ) -> Float[Array, "4 k *s"]:
-        del shares
+    def euler_parameters(self, q: Array, shares: ColumnParts) -> Quaternions:
         return jnp.zeros((4, *q.shape[1:]), q.dtype).at[0].set(1.0)
 
-    def read(
-        self, frames: RelativeFrames, shares: ColumnParts
-    ) -> tuple[Float[Array, "3 k"], Float[Array, "3 3 k"], Float[Array, "3 k"]]:
-        del shares
+    def read(self, frames: RelativeFrames, shares: ColumnParts) -> tuple[Array, Rotations, Offsets]:
         X = jnp.broadcast_to(unit_matrix(frames.offset), frames.rotation.shape)
         return frames.offset, X, frames.offset
 
-    def pose(
-        self, x: Float[Array, " c"], x_rate: Float[Array, " c"], axis: int, pitch: Float[Array, ""]
-    ) -> RelativePose:
-        del pitch
+    def pose(self, x: Coordinates, x_rate: Coordinates, axis: int, pitch: Scalar) -> RelativePose:
         axis_frame = jnp.eye(3, dtype=x.dtype)[:, CYCLIC[axis]]
         zero = jnp.zeros_like(x)
         return RelativePose(jnp.eye(4, dtype=x.dtype)[0], axis_frame @ x, zero, axis_frame @ x_rate)

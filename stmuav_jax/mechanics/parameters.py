@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks.errors import ModelError, has_values, nearest_names
+from ..checks.errors import ModelError, check_finite, check_shape, has_values, nearest_names
 from ..checks.numbers import check_inertia
 from ..checks.schema import SHOWN, Entries, format_value, quote_name
 
@@ -103,7 +103,8 @@ class Parameters(Mapping[str, Parameter]):
 
 
 def _check_value(key: str, value: Any, old: Parameter) -> None:
-    wrong = f"Parameter '{key}' must be numbers [{old.unit}], not {format_value(value)}."
+    subject = f"Parameter '{key}'"
+    wrong = f"{subject} must be numbers [{old.unit}], not {format_value(value)}."
     if _is_other(value):
         raise ModelError(wrong)
     if not has_values(value):
@@ -112,20 +113,13 @@ def _check_value(key: str, value: Any, old: Parameter) -> None:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
         raise ModelError(wrong) from None
-    shape = np.shape(old.value)
-    if array.shape != shape:
-        raise ModelError(
-            f"Parameter '{key}' must have shape {shape}, but {format_value(value)} has {array.shape}."
-        )
-    if not np.all(np.isfinite(array)):
-        raise ModelError(
-            f"Parameter '{key}' must be finite, but it is {format_value(array.tolist())} {old.unit}."
-        )
+    check_shape(array, np.shape(old.value), subject)
+    check_finite(array, subject, old.unit)
     if old.unit == "kg" and not np.all(array > 0):
         raise ModelError(
-            f"Parameter '{key}' is a mass and must be positive, but it is {format_value(array.tolist())} kg."
+            f"{subject} is a mass and must be positive, but it is {format_value(array.tolist())} kg."
         )
-    if old.unit == "kg m^2" and shape == (3, 3):
+    if old.unit == "kg m^2" and array.shape == (3, 3):
         check_inertia(array, f"parameter '{key}'", old.tolerance)
 
 

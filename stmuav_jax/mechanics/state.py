@@ -1,5 +1,6 @@
 """State of a system of rigid bodies, and the kinematics of every body that follows from it."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -8,12 +9,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, nearest_names
+from ..checks.shapes import Vec3
 from ..math.rotation import cross, rotation_matrix
 from ..math.stacked import apply_matrix
 from .body import GROUND
 
 if TYPE_CHECKING:
     from .joint import Joint
+
+
+def find_place(name: str, names: Sequence[str], kind: str, subject: str = "There is no") -> int:
+    """Place of the name of a body or joint among others.
+
+    Raises:
+        ModelError: an unknown name; the sentence is "SUBJECT KIND 'NAME'." and the nearest names.
+    """
+    if name not in names:
+        raise ModelError(f"{subject} {kind} '{name}'.{nearest_names(name, names)}")
+    return list(names).index(name)
 
 
 class State(eqx.Module):
@@ -63,27 +76,18 @@ class Kinematics(eqx.Module):
 
     def index(self, name: str) -> int:
         """Row of the named body; raises `ModelError` for an unknown name."""
-        if name not in self.names:
-            raise ModelError(f"There is no body '{name}'.{nearest_names(name, self.names)}")
-        return self.names.index(name)
+        return find_place(name, self.names, "body")
 
     def joint(self, name: str) -> "Joint":
         """Joint of this name; raises `ModelError` for an unknown name."""
-        for joint in self.joints:
-            if joint.name == name:
-                return joint
-        raise ModelError(
-            f"There is no joint '{name}'.{nearest_names(name, [j.name for j in self.joints])}"
-        )
+        return self.joints[find_place(name, [joint.name for joint in self.joints], "joint")]
 
-    def arm(self, name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    def arm(self, name: str, point: Vec3) -> Vec3:
         """World vector from the centre of mass to a point of the body's reference frame [m]."""
         k = self.index(name)
         return apply_matrix(self.R_wb[k], point - self.com[k])
 
-    def point(
-        self, name: str, point: Float[Array, "3"]
-    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    def point(self, name: str, point: Vec3) -> tuple[Vec3, Vec3]:
         """World position [m] and velocity [m/s] of a point of the body's reference frame."""
         k = self.index(name)
         s = self.arm(name, point)

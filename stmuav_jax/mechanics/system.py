@@ -15,11 +15,12 @@ from jaxtyping import Array, Float
 
 from ..checks.errors import ModelError, SettingError, nearest_names
 from ..checks.numbers import stack_arrays
+from ..checks.shapes import Vec3
 from ..math.rotation import rotation_matrix
 from .body import GROUND, Bodies, Body, stack_bodies
 from .joint import Joint, choose_coordinate, resolve_joint
 from .load import AbstractForce
-from .state import Kinematics, State, compute_kinematics
+from .state import Kinematics, State, compute_kinematics, find_place
 
 
 class System(eqx.Module):
@@ -83,12 +84,8 @@ class System(eqx.Module):
             self.bodies = stack_bodies(tuple(bodies))
             self.joints = tuple(resolve_joint(j, by_name) for j in joints)
             zero = stack_arrays([np.zeros(3, self.bodies.com.dtype)] * len(bodies))
-            self.reference = State(
-                r=stack_arrays([b.com_position for b in bodies]),
-                p=stack_arrays([b.orientation for b in bodies]),
-                v=zero,
-                omega=zero,
-            )
+            r = stack_arrays([b.com_position for b in bodies])
+            self.reference = State(r, stack_arrays([b.orientation for b in bodies]), zero, zero)
             names = list(by_name)
         _check_forces(names, self.joints, forces)
         # A force in a joint may need the joint's kind and frames, which are known from here on.
@@ -146,28 +143,18 @@ class System(eqx.Module):
 
     def index(self, name: str) -> int:
         """Row of the named moving body in a state; raises `ModelError` if unknown."""
-        if name not in self.names:
-            raise ModelError(f"There is no body '{name}'.{nearest_names(name, self.names)}")
-        return self.names.index(name)
+        return find_place(name, self.names, "body")
 
     def joint_index(self, name: str) -> int:
         """Index of the named joint; raises `ModelError` if unknown."""
-        names = [j.name for j in self.joints]
-        if name not in names:
-            raise ModelError(f"There is no joint '{name}'.{nearest_names(name, names)}")
-        return names.index(name)
+        return find_place(name, [joint.name for joint in self.joints], "joint")
 
     def kinematics(self, state: State) -> Kinematics:
         """Positions, rotations and velocities of all bodies and ground, for one state."""
-        return compute_kinematics(
-            state,
-            mass=self.bodies.mass,
-            com=self.bodies.com,
-            names=self.names,
-            joints=self.joints,
-        )
+        mass, com = self.bodies.mass, self.bodies.com
+        return compute_kinematics(state, mass=mass, com=com, names=self.names, joints=self.joints)
 
-    def com(self, state: State) -> Float[Array, "3"]:
+    def com(self, state: State) -> Vec3:
         """Centre of mass of the whole system in the world (3,) [m]."""
         mass = self.bodies.mass
         return mass @ state.r / jnp.sum(mass)
@@ -207,19 +194,12 @@ def _with_parameter(system: System, name: str, value: Any) -> System:
     # Two springs in one joint have the same name: guessing which is meant would change the wrong
     # one without a word.
     if len(places) != 1:
-        parts = {f"{n}.{key}" for n in system.names for key in _OF_BODY}
-        parts |= {
-            f"{n}.{key}"
-            for f in system.forces
-            for n in _force_owners(f)
-            for key in _constructor_fields(f)
-        }
-        wrong = (
-            "several forces have it: exchange them by dataclasses.replace(system, forces=(...))."
-        )
-        wrong = (
-            wrong if places else f"there is none of this name.{nearest_names(name, sorted(parts))}"
-        )
+        fields = [(_force_owners(force), _constructor_fields(force)) for force in system.forces]
+        fields.append((set(system.names), list(_OF_BODY)))
+        names = {f"{n}.{key}" for owners, keys in fields for n in owners for key in keys}
+        wrong = f"there is none of this name.{nearest_names(name, sorted(names))}"
+        if places:
+            wrong = "several forces have it: exchange them by dataclasses.replace(system, forces=(...))."
         raise ModelError(f"The parameter '{name}' cannot be set: {wrong}")
     k, path = places[0]
     walk = lambda part: functools.reduce(getattr, path, part)
@@ -238,24 +218,17 @@ def _force_owners(force: AbstractForce) -> set[str]:
 
 def _constructor_fields(part: Any) -> list[str]:
     """Numbers that the constructor of a force, or of a part of it, takes."""
-    names = list(inspect.signature(type(part)).parameters)
-    return [
-        n
-        for n in names
-        if n != "internal" and not isinstance(getattr(part, n, ""), str | eqx.Module)
-    ]
+    names = (n for n in inspect.signature(type(part)).parameters if n != "internal")
+    return [n for n in names if not isinstance(getattr(part, n, ""), str | eqx.Module)]
 
 
 def _field_path(force: AbstractForce, field: str) -> tuple[str, ...]:
     """Path to a field of a force, or of a part of it; () if there is none."""
     if field in _constructor_fields(force):
         return (field,)
-    parts = {n: getattr(force, n, None) for n in inspect.signature(type(force)).parameters}
-    inner = [
-        n
-        for n, part in parts.items()
-        if isinstance(part, eqx.Module) and field in _constructor_fields(part)
-    ]
+    parts = ((n, getattr(force, n, None)) for n in inspect.signature(type(force)).parameters)
+    has_field = lambda part: isinstance(part, eqx.Module) and field in _constructor_fields(part)
+    inner = [n for n, part in parts if has_field(part)]
     return (inner[0], field) if len(inner) == 1 else ()
 
 
@@ -308,9 +281,8 @@ def _check_names(bodies: Sequence[Body], joints: Sequence[Joint]) -> None:
     for kind, names in (("Body", [b.name for b in bodies]), ("Joint", [j.name for j in joints])):
         twice = [name for name, count in Counter(names).items() if count > 1]
         if twice:
-            raise ModelError(
-                f"{kind} names must be unique, but these occur twice: {', '.join(twice)}."
-            )
+            said = f"{kind} names must be unique, but these occur twice: {', '.join(twice)}."
+            raise ModelError(said)
 
 
 def _check_stacked(bodies: Bodies, joints: Sequence[Joint], reference: State | None) -> State:
@@ -337,16 +309,10 @@ def _check_joints(names: Sequence[str], joints: Sequence[Joint]) -> None:
         # Couplings name other joints and not bodies, and are checked against those.
         coupled = () if joint.mate is None else (joint.mate.dependent, joint.mate.joint.name)
         for name in coupled:
-            if name not in joint_names:
-                raise ModelError(
-                    f"The coupling '{joint.name}' names the unknown joint '{name}'."
-                    f"{nearest_names(name, joint_names)}"
-                )
+            subject = f"The coupling '{joint.name}' names the unknown"
+            find_place(name, joint_names, "joint", subject)
         for name in (joint.body_i, joint.body_j):
-            if name not in body_names:
-                raise ModelError(
-                    f"Joint '{joint.name}' names the unknown body '{name}'.{nearest_names(name, body_names)}"
-                )
+            find_place(name, body_names, "body", f"Joint '{joint.name}' names the unknown")
 
 
 def _check_forces(names: Sequence[str], joints: Sequence[Joint], forces: Sequence[Any]) -> None:
@@ -358,20 +324,14 @@ def _check_forces(names: Sequence[str], joints: Sequence[Joint], forces: Sequenc
                 f"{type(force).__name__}."
             )
         kind, named = type(force).__name__, force.acts_on()
+        subject = f"A {kind} names the unknown"
         for name in named.bodies:
-            if name not in body_names:
-                raise ModelError(
-                    f"A {kind} names the unknown body '{name}'.{nearest_names(name, body_names)}"
-                )
-        for name in (*named.joints, *(name for name, _ in named.coordinates)):
-            if name not in joint_names:
-                raise ModelError(
-                    f"A {kind} names the unknown joint '{name}'.{nearest_names(name, joint_names)}"
-                )
+            find_place(name, body_names, "body", subject)
+        for name in named.joints:
+            find_place(name, joint_names, "joint", subject)
         for name, coordinate in named.coordinates:
-            choose_coordinate(
-                joints[joint_names.index(name)], coordinate, f"{kind} in joint '{name}'"
-            )
+            joint = joints[find_place(name, joint_names, "joint", subject)]
+            choose_coordinate(joint, coordinate, f"{kind} in joint '{name}'")
 
 
 def _check_connected(bodies: Sequence[Body], joints: Sequence[Joint]) -> None:
