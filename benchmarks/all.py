@@ -17,8 +17,7 @@ import sys
 import time
 from pathlib import Path
 
-from shared.command import parser
-from shared.record import ROOT, has_code_of
+from shared.record import ROOT, has_code_of, make_parser
 
 FOLDER = Path(__file__).parent
 SCRIPTS = (
@@ -28,14 +27,15 @@ SCRIPTS = (
 )  # fmt: skip
 # Sections of suite.py, in the order of running.
 SUITE = (
-    "work_precision", "acceleration", "batch", "scaling", "gradient", "vector_steps", "hexacopter", "scenes",
-    "published", "stiff",
+    "work_precision", "batch", "scaling", "gradient", "vector_steps", "hexacopter", "published", "stiff",
 )  # fmt: skip
 # Result -> the script that measures it, with its arguments, in the order of running.
 BENCHMARKS: dict[str, tuple[str, ...]] = {
-    **{f"suite_{name}": ("suite.py", "--only", name, "--no-report") for name in SUITE},
+    **{f"suite_{name}": ("suite.py", "--only", name) for name in SUITE},
     **{name: (f"{name}.py",) for name in SCRIPTS},
 }
+# Results that no script measures any more: no page has their numbers, and their commits have the scripts.
+KEPT = {"suite_acceleration", "suite_scenes"}
 # Parts of a result that no script measures any more: their question is settled, and they stay as
 # they were measured (docs/validation.md names the commits of their scripts).
 FINISHED = {
@@ -74,7 +74,7 @@ def run_benchmark(name: str, results: Path) -> bool:
 
 def main() -> None:
     """Run the benchmarks that have no current result, then write the page."""
-    options = parser(__doc__, again="run also what is current", list="say what would be run")
+    options = make_parser(__doc__, again="run also what is current", list="say what would be run")
     options.add_argument("--only", nargs="+", choices=list(BENCHMARKS), default=list(BENCHMARKS))
     chosen = options.parse_args()
     results = chosen.results.resolve()
@@ -84,7 +84,7 @@ def main() -> None:
     if chosen.list:
         return
     failures = []
-    due = [name for name, age in ages.items() if age or chosen.has_restarted]
+    due = [name for name, age in ages.items() if age or chosen.again]
     for k, name in enumerate(due, start=1):
         print(f"\n[{k}/{len(due)}] {name}, load {os.getloadavg()[0]:.1f}", flush=True)
         clock = time.perf_counter()

@@ -15,7 +15,7 @@ import montecarlo
 import numpy as np
 from estimation import programs, record_of_case
 from shared.clock import measure
-from shared.command import benchmark
+from shared.record import benchmark
 
 from stmuav_jax.estimation.filter import DEFAULT
 
@@ -51,7 +51,7 @@ def filters(sweep: Sweep, size: int) -> dict[str, Any]:
     u, y = record_of_case(2, sweep.steps)
     spread = 0.01 * np.random.default_rng(1).normal(size=(sweep.steps, 3, size))
     given = jnp.asarray(y[:, :, None] + spread), jnp.asarray(u)
-    _, bank = programs(DEFAULT, 8)
+    _, bank = programs(DEFAULT)
     timing, found = measure(lambda: bank(*given), repeats=sweep.repeats)
     lost = int(np.sum(~np.asarray(found[2])))
     return {"filter_step_us": 1e6 * timing.median / (sweep.steps * size), "filters_failed": lost}

@@ -22,8 +22,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from sections.gradient import PARAMETERS, functional
-from shared.command import benchmark
 from shared.methods import trajectory
+from shared.record import benchmark
 
 import stmuav_jax as stm
 from stmuav_jax.math.native.structure import find_structure, rely_on
@@ -33,10 +33,10 @@ Made = tuple[Callable[..., Any], tuple[Any, ...]]
 END, STEPS = 0.3, 100_000
 
 
-def flight(solver: Any, formulation: Any, *scene: Any) -> Made:
+def flight(solver: Any, *scene: Any) -> Made:
     """Simulation of a scene, not differentiated."""
     made = stm.make_scene(*scene)
-    run = trajectory(formulation, solver, None, STEPS)
+    run = trajectory(stm.Tree(), solver, None, STEPS)
     return run, (made.system, made.state0, jnp.array([0.0, END]), 1e-8)
 
 
@@ -49,8 +49,8 @@ def derivative(reverse: bool) -> Made:
     return jax.grad(height) if reverse else jax.jacfwd(of), (jnp.zeros(20), 1e-8)
 
 
-def trim(differentiated: bool) -> Made:
-    """Hover trim, and its derivative by a mass and the rods' lengths (`stmuav trim --by`)."""
+def trim() -> Made:
+    """Hover trim of a UAV whose panel's mass and rods' lengths are given."""
     given = stm.PART_II
     values = {k: jnp.asarray(given.value(k), float) for k in ("mass.panel_7", "geometry.rods")}
     wanted = stm.analysis.hover(jnp.radians(jnp.array([10.0, -5.0])))
@@ -59,52 +59,17 @@ def trim(differentiated: bool) -> Made:
         uav = stm.uav.make_uav(given.replaced(values))
         return stm.uav.trim_flight(uav, wanted, throw=False).vector
 
-    return jax.jacfwd(of) if differentiated else of, (values,)
+    return of, (values,)
 
 
-def tune() -> Made:
-    """Residuals of a search for inputs that hold the UAV, with their Jacobian, eight segments."""
-    from stmuav_jax.math.least_squares import value_and_columns
-
-    uav, angles = stm.uav.make_uav(), jnp.zeros(2)
-    values = stm.uav.trim_flight(uav, stm.analysis.hover(angles)).values
-    start = uav.point(angles)
-    tuning = stm.analysis.tune_inputs(
-        uav.space, [stm.analysis.departures(uav.space, start)], start=start, duration=0.4,
-        inputs=uav.inputs, values=values, segments=8, weight=10.0,
-    )  # fmt: skip
-    return value_and_columns, (tuning.residuals, tuning.start)
-
-
-def identify() -> Made:
-    """Residuals of parameters from a record of the UAV's flight, with their Jacobian."""
-    from shared.uav_record import simulate_record
-
-    from stmuav_jax.analysis.identification import Misfit
-    from stmuav_jax.math.least_squares import value_and_columns
-
-    case = simulate_record()
-    record, sigma, start, sizes = (
-        jnp.asarray(x, float) for x in (case.record, case.sigma, case.start, case.sizes)
-    )
-    misfit = Misfit(case.predict, record, sigma, start, sizes)
-    return value_and_columns, (misfit, jnp.zeros(len(case.truth)))
-
-
-UAV = ("uav_tracker", 2)
 # Name -> what makes the program, in the order of the table; the first is the smallest.
 ROWS: dict[str, Callable[[], Made]] = {
-    "spin, Dopri8": lambda: flight(diffrax.Dopri8(), stm.Tree(), "spin"),
-    "uav_tracker 2, Dopri8": lambda: flight(diffrax.Dopri8(), stm.Tree(), *UAV),
-    "uav_tracker 2, Tsit5": lambda: flight(diffrax.Tsit5(), stm.Tree(), *UAV),
-    "uav_tracker 2, Kvaerno5": lambda: flight(stm.dynamics.kvaerno5(), stm.Tree(), *UAV),
-    "uav_tracker 2, Dopri8, Augmented": lambda: flight(diffrax.Dopri8(), stm.Augmented(), *UAV),
+    "spin, Dopri8": lambda: flight(diffrax.Dopri8(), "spin"),
+    "uav_tracker 2, Dopri8": lambda: flight(diffrax.Dopri8(), "uav_tracker", 2),
+    "uav_tracker 2, Kvaerno5": lambda: flight(stm.dynamics.kvaerno5(), "uav_tracker", 2),
     "forward (jacfwd), 20 parameters": lambda: derivative(reverse=False),
     "reverse (grad), 20 parameters": lambda: derivative(reverse=True),
-    "trim": lambda: trim(differentiated=False),
-    "trim by parameters": lambda: trim(differentiated=True),
-    "tune hold": tune,
-    "identify": identify,
+    "trim": trim,
 }
 
 
@@ -155,11 +120,8 @@ def record(names: list[str]) -> Iterator[dict[str, Any]]:
     for name in names:
         rows.append(apart(name))
         print(rows[-1], flush=True)
-        yield {
-            "what": "processor time to trace, lower and compile",
-            "parameters": PARAMETERS,
-            "rows": rows,
-        }
+        what = "processor time to trace, lower and compile"
+        yield {"what": what, "parameters": PARAMETERS, "rows": rows}
 
 
 if __name__ == "__main__":

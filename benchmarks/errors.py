@@ -7,13 +7,12 @@ would cost less. One core:
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 taskset -c 1 python benchmarks/errors.py
 """
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from shared.command import benchmark
+from shared.record import benchmark
 
 import stmuav_jax as stm
 from stmuav_jax.dynamics.diagnostics import SecondRun, estimate_error
@@ -32,15 +31,14 @@ CASES = (
 
 @dataclass(frozen=True)
 class Size:
-    """Which cases, factors on the tolerances of the second run, repeats, end [s]."""
+    """Which cases, factors on the tolerances of the second run, end [s]."""
 
     cases: tuple[tuple[str, int, float], ...] = CASES
     factors: tuple[float, ...] = (0.01, 0.1, 1 / 3, 5.0, 10.0)
-    repeats: int = 3
     t1: float = 2.0
 
 
-QUICK = Size(cases=(("tracker", 1, 1e-2),), factors=(0.1,), repeats=1, t1=0.5)
+QUICK = Size(cases=(("tracker", 1, 1e-2),), factors=(0.1,), t1=0.5)
 
 
 def simulated(scene: stm.Scene, tolerance: float, t1: float) -> stm.Run:
@@ -55,25 +53,13 @@ def attempts(march: March) -> int:
     return int(counts.accepted[-1] + counts.rejected[-1])
 
 
-def least(repeats: int, make: Callable[[], Any], go: Callable[[Any], Any]) -> tuple[Any, float]:
-    """What was made last, and the least processor seconds that `go` took with it."""
-    made, best = None, float("inf")
-    for _ in range(repeats):
-        made = make()
-        clock = time.process_time()
-        go(made)
-        best = min(best, time.process_time() - clock)
-    return made, best
-
-
-def second_run(scene: stm.Scene, march: March, factor: float, repeats: int) -> dict[str, Any]:
-    """Largest estimated position error, step attempts and least processor seconds."""
+def second_run(scene: stm.Scene, march: March, factor: float) -> dict[str, Any]:
+    """Largest estimated position error, and step attempts."""
     first = march.trajectory()
-    make = lambda: SecondRun(march.problem, scene.t0, scene.state0, factor=factor)
-    second, seconds = least(repeats, make, lambda second: second.follow(first))
+    second = SecondRun(march.problem, scene.t0, scene.state0, factor=factor)
+    second.follow(first)
     estimate = float(np.nanmax(estimate_error(first, second, None).position))
-    counted = attempts(second.march)
-    return {"factor": factor, "estimate": estimate, "attempts": counted, "seconds": seconds}
+    return {"factor": factor, "estimate": estimate, "attempts": attempts(second.march)}
 
 
 def record(size: Size) -> Iterator[dict[str, Any]]:
@@ -86,35 +72,27 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
             references[name, case] = simulated(scene, REFERENCE, size.t1)
         run = simulated(scene, tolerance, size.t1)
         apart = np.linalg.norm(run.states.r - references[name, case].states.r, axis=-1)
-        make = lambda of=scene, run=run: March(
-            prepare_problem(of.system, run.method), of.t0, of.state0
-        )
-        march, seconds = least(size.repeats, make, lambda march, ts=run.ts: march.to(ts))
+        march = March(prepare_problem(scene.system, run.method), scene.t0, scene.state0)
+        march.to(run.ts)
         row: dict[str, Any] = {"scene": name, "case": case, "tolerance": tolerance}
-        row |= {"true": float(np.max(apart)), "attempts": attempts(march), "seconds": seconds}
-        row["second"] = [second_run(scene, march, f, size.repeats) for f in size.factors]
+        row |= {"true": float(np.max(apart)), "attempts": attempts(march)}
+        row["second"] = [second_run(scene, march, factor) for factor in size.factors]
         rows.append(row)
         each = (f"x {s['factor']:.2g}: {s['estimate']:.2e} m" for s in row["second"])
         print(f"{name} {case} {tolerance:g}: true {row['true']:.2e} m;", *each, flush=True)
     factors = {str(f): summary(rows, k) for k, f in enumerate(size.factors)}
     print(*factors.items(), sep="\n")
-    yield {
-        "what": "estimates of the largest position error [m] against the true one, and their cost",
-        "seconds": "processor time of the process, the least of the repeats",
-        "t1": size.t1,
-        "rows": rows,
-        "factors": factors,
-    }
+    what = "estimates of the largest position error [m] against the true one, and their cost"
+    yield {"what": what, "t1": size.t1, "rows": rows, "factors": factors}
 
 
 def summary(rows: list[dict[str, Any]], k: int) -> dict[str, Any]:
-    """How many of the k-th second runs are within a factor of three; cost in first runs."""
+    """How many of the k-th second runs are within a factor of three; attempts in those of first runs."""
     over = lambda key, of: np.array([row["second"][k][key] / row[of] for row in rows])
-    spread = lambda x: [float(np.min(x)), float(np.median(x)), float(np.max(x))]
-    ratios, cost = over("estimate", "true"), spread(over("seconds", "seconds"))
+    ratios, cost = over("estimate", "true"), over("attempts", "attempts")
     within = int(np.sum((ratios <= 3) & (ratios >= 1 / 3)))
-    steps = spread(over("attempts", "attempts"))
-    return {"within": within, "of": len(rows), "cost": cost, "attempts": steps}
+    attempts = [float(f(cost)) for f in (np.min, np.median, np.max)]
+    return {"within": within, "of": len(rows), "attempts": attempts}
 
 
 if __name__ == "__main__":

@@ -17,8 +17,7 @@ import numpy as np
 from dense.steps import Scheme
 from dense.system import attempt
 from dense.tables import Variant
-from shared.command import benchmark
-from shared.record import RESULTS, make_environment
+from shared.record import RESULTS, benchmark, make_environment
 
 from stmuav_jax import make_scene
 from stmuav_jax.uav import PRINTED_ORIENTATIONS

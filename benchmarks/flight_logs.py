@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from problems.multirotor_flights import LAYOUT, TRUTH, VALUES, Truth, simulate_flights
-from shared.command import benchmark
+from shared.record import benchmark
 
 from stmuav_jax.uav import identify_flight
 

@@ -22,11 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from problems.conservative import PROBLEMS, Problem, simple_pendulum
-from sections import long_page
-from shared.clock import compiled, ready, rounded, timed
-from shared.command import benchmark
+from shared.clock import compiled, measure_processor, rounded
 from shared.methods import evaluations, trajectory
-from shared.record import RESULTS, make_environment
+from shared.record import RESULTS, benchmark, make_environment
 
 import stmuav_jax as stm
 
@@ -72,7 +70,6 @@ class Path(NamedTuple):
     kinetic: Array
     accepted: Array
     rejected: Array
-    evaluations: Array
     worst: Array
 
 
@@ -89,10 +86,8 @@ def integration(solver: diffrax.AbstractSolver, hold: str, redundant: bool) -> C
         # a run that stopped keeps its last time
         good = found.ts >= ts * (1 - 1e-12)
         of = jax.vmap(lambda state: stm.dynamics.energy(system, state, jnp.zeros(())))(found.states)
-        took, not_taken = found.counts.accepted[-1], found.counts.rejected[-1]
-        worst = found.worst.position[-1]
-        calls: Any = evaluations(solver, took + not_taken)
-        return Path(good, of.kinetic + of.potential, of.kinetic, took, not_taken, calls, worst)
+        steps = found.counts.accepted[-1], found.counts.rejected[-1]
+        return Path(good, of.kinetic + of.potential, of.kinetic, *steps, found.worst.position[-1])
 
     return run
 
@@ -117,14 +112,14 @@ class Runner:
             run = integration(SOLVERS[solver], hold, problem.redundant)
             self.compiled[key] = compiled(run, *given, clock=time.process_time)
         call, seconds = self.compiled[key]
-        cost, path = timed(call, *given, repeats=self.repeats)
-        path = ready(path)
-        counts = ("accepted", "rejected", "evaluations")
+        timing, path = measure_processor(lambda: call(*given), repeats=self.repeats)
+        path = jax.device_get(path)
+        accepted, rejected = int(path.accepted), int(path.rejected)
         row = {
             "family": f"{solver}, {hold}", "solver": solver, "hold": hold, "tolerance": tolerance,
-            "step": None, "seconds": rounded(cost.processor.median), "cost": cost.to_dict(),
-            "compile_seconds": rounded(seconds),
-            **{name: int(getattr(path, name)) for name in counts},
+            "step": None, "seconds": rounded(timing.median), "compile_seconds": rounded(seconds),
+            "accepted": accepted, "rejected": rejected,
+            "evaluations": evaluations(SOLVERS[solver], accepted + rejected),
             "residual": rounded(path.worst),
             "reached": float(self.ts[int(np.flatnonzero(path.good)[-1])]),
             "completed": bool(np.all(path.good)),
@@ -216,4 +211,4 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    benchmark("long_horizon", __doc__, record, (Size(), QUICK), long_page.show)
+    benchmark("long_horizon", __doc__, record, (Size(), QUICK))

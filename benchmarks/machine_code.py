@@ -8,12 +8,10 @@ of a motion near the start, flights agree to their tolerance. The processor's li
 fused multiplications and additions that need no table or order. The figure stands in docs/theory.md.
 """
 
-import json
 import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -22,10 +20,8 @@ import jax.numpy as jnp
 import montecarlo
 import numpy as np
 from jax.extend import core
-from matplotlib.figure import Figure
-from shared.clock import compiled, timed
-from shared.command import benchmark
-from shared.pages import save
+from shared.clock import compiled, measure_processor
+from shared.record import benchmark
 
 import stmuav_jax as stm
 from stmuav_jax.dynamics.integration.problem import (
@@ -120,8 +116,8 @@ def evaluated(
 
     argument = starts[0] if one else starts
     program, seconds = compiled(chain, argument, clock=time.process_time)
-    cost, last = timed(program, argument, repeats=size.repeats)
-    best = 1e6 * cost.processor.best / (passes * len(starts))
+    timing, last = measure_processor(lambda: program(argument), repeats=size.repeats)
+    best = 1e6 * timing.best / (passes * len(starts))
     return {"us_per_state": best, "compile_seconds": seconds, "last": np.asarray(last)}
 
 
@@ -167,10 +163,10 @@ def fly(size: Size, lanes: int) -> dict[str, Any]:
     begun = time.process_time()
     bare = montecarlo.Bare(replace(size.flights, flights=count), size.tolerance, lanes)
     seconds = time.process_time() - begun
-    cost, _ = timed(bare.fly, count, repeats=size.repeats)
+    timing, _ = measure_processor(lambda: bare.fly(count), repeats=size.repeats)
     ends = bare.ends(min(count, size.flights.checked))
     return {
-        "flights_per_second": count / cost.processor.best, "compile_seconds": seconds, "ends": ends,
+        "flights_per_second": count / timing.best, "compile_seconds": seconds, "ends": ends,
     }  # fmt: skip
 
 
@@ -203,33 +199,5 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
         yield content
 
 
-def show(path: Path, folder: Path) -> Path:
-    """Draw operations before and after, and time per state against lanes."""
-    content = json.loads(path.read_text())
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1, 2))
-    operations = content["operations"]
-    places = np.arange(len(operations))
-    for k, (key, label) in enumerate((("traced", "as traced"), ("left", "machine code"))):
-        left.bar(places + 0.4 * k, [o[key] for o in operations.values()], 0.4, label=label)
-    left.set_xticks(places + 0.2, list(operations))
-    left.set_ylabel("operations of one evaluation")
-    rows = [row for row in content["rows"] if row["function"] == "right-hand side"]
-    for key, label in (("xla", "XLA"), ("machine_code", "machine code")):
-        times = [row[key]["us_per_state"] for row in rows]
-        right.loglog([row["lanes"] for row in rows], times, "o-", label=label)
-    limits = [row["us_per_state"] for row in content["limit"]]
-    right.loglog([row["lanes"] for row in rows], limits, "k--", label="processor's limit")
-    right.set_xticks([row["lanes"] for row in rows], [str(row["lanes"]) for row in rows])
-    right.set_xticks([], minor=True)
-    right.set_xlabel("states at once")
-    right.set_ylabel("time per right-hand side [us]")
-    left.margins(y=0.35)
-    left.legend(frameon=False, loc="upper right")
-    right.legend(frameon=False, loc="center right")
-    (picture,) = save({"machine_code": figure}, folder)
-    return picture
-
-
 if __name__ == "__main__":
-    benchmark("machine_code", __doc__, record, (Size(), QUICK), show)
+    benchmark("machine_code", __doc__, record, (Size(), QUICK))

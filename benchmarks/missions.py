@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from shared.command import benchmark
+from shared.record import benchmark
 
 import stmuav_jax as stm
 from stmuav_jax.studies.statistics import probability

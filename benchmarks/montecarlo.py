@@ -1,20 +1,19 @@
 """Many flights: throughput by lanes, on one core and all, against peers; what store and study cost.
 
-    OPENBLAS_NUM_THREADS=1 python benchmarks/montecarlo.py             writes results/montecarlo.json
-    python benchmarks/montecarlo.py --size one                         the smallest run, for tests
+    OPENBLAS_NUM_THREADS=1 python benchmarks/montecarlo.py
 
 Flights of uav_tracker case 2, 1 s, from starts that differ in the base's velocities (normal, 0.1 m/s
 and 0.1 rad/s). Errors are those of any body's position at the end, over the first flights, against
 runs at a tighter tolerance.
 """
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,10 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from sections.ours import peers
 from sections.speed import errors, throughput
-from sections.throughput_page import write_page
 from shared.clock import compiled, measure
-from shared.command import parser
-from shared.record import ROOT, write_record
+from shared.record import benchmark
 
 import stmuav_jax as stm
 from stmuav_jax.dynamics.integration.lanes import integrate_batch
@@ -143,8 +140,8 @@ def rate_one_by_one(size: Size, tolerance: float) -> float:
 
 def on_devices(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
     """A study's flights per second on so many cores, bare and with the store, in a new process."""
-    given = [sys.executable, __file__, "--devices", str(devices), "--tolerance", str(tolerance)]
-    given += ["--size", "full" if size == FULL else "one"]
+    words = json.dumps([devices, tolerance, size == FULL])
+    given = [sys.executable, __file__, "--devices", words]
     done = subprocess.run(given, capture_output=True, text=True, check=True)
     row = json.loads(done.stdout.splitlines()[-1])
     print(f"  {devices} cores: {row}", flush=True)
@@ -172,43 +169,27 @@ def child(size: Size, tolerance: float, devices: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def run(size: Size) -> dict[str, Any]:
+def record(size: Size) -> Iterator[dict[str, Any]]:
     """Everything."""
     tight = Bare(size, size.tight, 16)
     exact = tight.ends(size.checked)
     tolerance, tried = tolerance_for(size, exact)
     rows = by_lanes(size, tolerance)
-    best = max(rows, key=lambda row: row["per_second"])
     cores = sorted({1, os.cpu_count() or 1}) if size == FULL else [1]
     label = size.scene if size.case is None else f"{size.scene} case {size.case}"
     given = (stm.make_scene(size.scene, size.case), tight.starts(size.checked), size.t1)
-    found = [row for peer in peers()[0] for row in throughput(peer, given, exact, WANTED, 30.0)]
-    return {
+    yield {
         "what": f"flights per second, {label}", "t1": size.t1, "flights": size.flights,
         "wanted_error": WANTED, "tolerance": tolerance, "tried": tried, "rows": rows,
-        "best_lanes": best["lanes"], "one_lane_per_second": rate_one_by_one(size, tolerance),
-        "peers": found,
+        "one_lane_per_second": rate_one_by_one(size, tolerance),
+        "peers": [row for peer in peers()[0] for row in throughput(peer, given, exact, WANTED, 30.0)],
         "cores": [on_devices(size, tolerance, count) for count in cores],
     }  # fmt: skip
 
 
-def main() -> None:
-    """Run what was asked for."""
-    made = parser((__doc__ or "").splitlines()[0])
-    made.add_argument("--size", choices=("full", "one"), default="full")
-    made.add_argument("--page", type=Path)
-    made.add_argument("--devices", type=int, help=argparse.SUPPRESS)
-    made.add_argument("--tolerance", type=float, help=argparse.SUPPRESS)
-    options = made.parse_args()
-    size = FULL if options.size == "full" else ONE
-    if options.devices:
-        print(json.dumps(child(size, options.tolerance, options.devices)))
-        return
-    path = write_record("montecarlo", run(size), options.results)
-    print(path)
-    if size == FULL or options.page:
-        print(write_page(path, options.page or ROOT / "docs" / "studies.md"))
-
-
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["--devices"]:
+        devices, tolerance, is_full = json.loads(sys.argv[2])
+        print(json.dumps(child(FULL if is_full else ONE, tolerance, devices)))
+    else:
+        benchmark("montecarlo", __doc__, record, (FULL, ONE))

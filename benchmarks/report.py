@@ -1,30 +1,41 @@
-"""The benchmark page, and the tables of measurements on all other pages, from the stored results alone.
+"""All pages, tables and figures of measurements, from the stored results alone.
 
     python benchmarks/report.py
 
 The text of the benchmark page is `page.md.jinja`: a verdict with one figure, one table a question, and
 the provenance at the end. A table holds the few rows that answer its question, and the result that it
-links holds every run. Other pages name a table in a comment (`sections/page_tables.py`).
+links holds every run. Other pages name a table, or a section, in a comment.
 """
 
 import argparse
 import json
+import math
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jinja2
-from matplotlib.figure import Figure
-from sections.page_tables import TABLES, fill
-from sections.throughput_page import comparable
-from shared.pages import Row, number, panels, power, save, table
+from sections.figures import EXPLICIT, HOLDS, draw_figures, name_family
+from shared.pages import (
+    Row,
+    comparable,
+    describe_scene,
+    duration,
+    holds,
+    number,
+    plain,
+    power,
+    table,
+)
 from shared.record import RESULTS, ROOT
 
 from stmuav_jax.io.netcdf import write_atomically
 
-PAGE = ROOT / "docs" / "benchmarks.md"
-OTHER_PAGES = (ROOT / "README.md", *sorted(PAGE.parent.glob("*.md")))
-TEMPLATE = Path(__file__).with_name("page.md.jinja")
+DOCS = ROOT / "docs"
+PAGE = DOCS / "benchmarks.md"
+OTHER_PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
 # The results with a section on the page, in its order.
 SHOWN = (
     "suite_work_precision", "suite_published", "suite_stiff", "suite_scaling", "suite_hexacopter", "montecarlo",
@@ -33,10 +44,6 @@ SHOWN = (
 
 DEFAULT = "stmuav_jax, Dopri8"
 PINOCCHIO = "Pinocchio in C++, Boost rkf78"
-MUJOCO = "MuJoCo, RK4"
-EXUDYN = "Exudyn, generalised-alpha"
-HEYOKA = "heyoka, Taylor series"
-DENSE = "the report's dense system in NumPy, DOP853"
 # Row of a table -> method and solver in the results.
 PROGRAMS = {
     DEFAULT: ("stmuav-jax, tree", "Dopri8"),
@@ -45,52 +52,47 @@ PROGRAMS = {
     "stmuav_jax, Tsit5": ("stmuav-jax, tree", "Tsit5"),
     PINOCCHIO: ("Pinocchio (C++), Boost rkf78", "rkf78"),
     "Pinocchio from Python, SciPy DOP853": ("Pinocchio (Python), SciPy DOP853", "DOP853"),
-    MUJOCO: ("MuJoCo (C), RK4", "RK4"),
+    "MuJoCo, RK4": ("MuJoCo (C), RK4", "RK4"),
     "MuJoCo, implicitfast": ("MuJoCo (C), RK4", "implicitfast"),
     "MJX on a CPU, RK4": ("MuJoCo MJX (CPU), RK4", "RK4"),
-    EXUDYN: ("Exudyn, generalised-alpha", "generalised-alpha"),
-    HEYOKA: ("heyoka, Taylor series", "taylor"),
-    DENSE: ("NumPy, the report's dense system", "DOP853"),
+    "Exudyn, generalised-alpha": ("Exudyn, generalised-alpha", "generalised-alpha"),
+    "heyoka, Taylor series": ("heyoka, Taylor series", "taylor"),
+    "the report's dense system in NumPy, DOP853": ("NumPy, the report's dense system", "DOP853"),
     "the report's dense system in NumPy, RK45": ("NumPy, the report's dense system", "RK45"),
 }
+# Programs of the README's table.
+COMPARED = (
+    DEFAULT, PINOCCHIO, "MuJoCo, RK4", "Exudyn, generalised-alpha", "heyoka, Taylor series",
+    "the report's dense system in NumPy, DOP853",
+)  # fmt: skip
 # Method in the results -> row of a table without a choice of solver.
 LABELS = {method: name for name, (method, _) in reversed(PROGRAMS.items())}
-# The curves: colour, dash and marker.
-CURVES = {
-    DEFAULT: ("#0072B2", "-", "o"),
-    PINOCCHIO: ("#D55E00", "-", "s"),
-    MUJOCO: ("#009E73", "-", "^"),
-    EXUDYN: ("#CC79A7", "-", "D"),
-    HEYOKA: ("#56B4E9", "-", "P"),
-    DENSE: ("#666666", "-", "v"),
-}
 # Loops, stiffness, mass ratios, impacts and long times among the hard cases.
 HARD = (
     "massless link", "stiffness 1e9 beside 10 N/m", "impacts on end stops", "singular posture, mass ratio 1e6",
     "redundant loops, Bricard", "redundant loops, four-bars", "ten minutes of the tracker", "2,000 s of a pendulum",
 )  # fmt: skip
-COMMANDS = ("simulate", "fly", "trim", "sun", "estimate", "montecarlo")
-COMPILED = {
-    "uav_tracker 2, Dopri8": "flight of the UAV, Dopri8",
-    "uav_tracker 2, Kvaerno5": "flight of the UAV, Kvaerno5",
-    "forward (jacfwd), 20 parameters": "its derivatives with respect to 20 parameters, forward",
-    "reverse (grad), 20 parameters": "its gradient with respect to 20 parameters, reverse",
-    "trim": "trim",
+# A row of the table of flight logs -> its estimates.
+FLIGHT_LOG_ROWS = (
+    ("roll", "pitch", "yaw"), ("roll_over_lag", "pitch_over_lag", "yaw_over_lag"), ("lag", "delay"),
+    ("roll_speed", "pitch_speed", "spin_up"), ("centre_x", "centre_y"), ("free_centre_x", "free_centre_y"),
+    ("thrust", "thrust_slope", "thrust_linear", "thrust_quadratic", "thrust_lag"),
+    ("imu_x", "imu_y", "imu_z"), ("drag_x", "drag_y", "drag_z"),
+    ("force", "inertia_x", "inertia_y", "inertia_ratio"),
+)  # fmt: skip
+# Names of equations in the record -> those of docs/failure.md.
+VARIANTS = {
+    "h_j with the rate of body i": "h_k with the rate of body i",
+    "the same, normalised": "printed p, sign of p4 restored, normalised",
+    "rows frozen at the start": "rows chosen once at the start",
 }
+FIXED_STEPS = {
+    "rk4 h=1 ms": "Runge-Kutta 1 ms", "rk4 h=2 ms": "2 ms",
+    "euler h=1 ms": "Euler 1 ms", "euler h=2 ms": "2 ms",
+}  # fmt: skip
 
 
-def text_table(head: Any, rows: Any) -> str:
-    """A Markdown table as text."""
-    return "\n".join(table(list(head), list(rows)))
-
-
-def duration(seconds: float | None) -> str:
-    """Three digits, in ms below a second."""
-    if seconds is None:
-        return "not reached"
-    return f"{1e3 * seconds:.3g} ms" if seconds < 1 else f"{seconds:.3g} s"
-
-
+# --- the benchmark page
 def least_time(curve: Row, program: str, error: str) -> float | None:
     """Least run time [s] of a program to the last horizon with at most an error."""
     for row in curve["cheapest"]:
@@ -103,98 +105,29 @@ def least_time(curve: Row, program: str, error: str) -> float | None:
 def programs_of(curves: list[Row]) -> list[str]:
     """The programs that ran; explicit Tsit5 beside Dopri8 has no row of its own."""
     measured = {(row["method"], row["solver"]) for curve in curves for row in curve["cheapest"]}
-    left_out: set[str] = set()
-    if PROGRAMS[DEFAULT] in measured:
-        left_out = {"stmuav_jax, Kvaerno5", "stmuav_jax, Tsit5"}
+    has_default = PROGRAMS[DEFAULT] in measured
+    left_out = {"stmuav_jax, Kvaerno5", "stmuav_jax, Tsit5"} if has_default else set()
     return [name for name, key in PROGRAMS.items() if key in measured and name not in left_out]
 
 
 def least_times(curve: Row, errors: list[str]) -> str:
     """Least run times of one problem, a column for each error."""
-    rows = [
-        [name, *(duration(least_time(curve, name, error)) for error in errors)]
-        for name in programs_of([curve])
-    ]
-    return text_table(["error of any body", *(f"<= {error} m" for error in errors)], rows)
-
-
-def readme_times(content: Row) -> list[str]:
-    """Least run times of the flight by the programs of the curves."""
-    curve, errors = content["curves"][0], ("1e-03", "1e-06", "1e-09")
-    rows = [
-        [name.split(",")[0], *(duration(least_time(curve, name, error)) for error in errors)]
-        for name in CURVES
-    ]
-    return table(["largest error of any body", *(f"{error} m" for error in errors)], rows)
+    times = lambda name: (duration(least_time(curve, name, error)) for error in errors)
+    rows = ([name, *times(name)] for name in programs_of([curve]))
+    return table(["error of any body", *(f"<= {error} m" for error in errors)], rows)
 
 
 def mechanism_times(curves: list[Row]) -> str:
     """Least run times for a micrometre, a column for each problem."""
-    rows = [
-        [name, *(duration(least_time(curve, name, "1e-06")) for curve in curves)]
-        for name in programs_of(curves)
-    ]
-    return text_table(["program", *(curve["title"] for curve in curves)], rows)
+    times = lambda name: (duration(least_time(curve, name, "1e-06")) for curve in curves)
+    rows = ([name, *times(name)] for name in programs_of(curves))
+    return table(["program", *(curve["title"] for curve in curves)], rows)
 
 
 def time_ratios(curves: list[Row], other: str) -> list[float]:
     """Run time of this package over that of another program at a micrometre, from the least."""
     pairs = ([least_time(curve, name, "1e-06") for name in (DEFAULT, other)] for curve in curves)
     return sorted(ours / theirs for ours, theirs in pairs if ours and theirs)
-
-
-def draw_curves(curve: Row) -> Figure:
-    """Run time against error to the last horizon, one colour a program."""
-    figure, (ax,) = panels(1, 1, 4.2)
-    figure.set_size_inches(5.4, 4.2)  # so that its words are legible on a window of 420 pixels
-    for name, (color, dash, mark) in CURVES.items():
-        points = [
-            (row["error"], 1e3 * row["seconds"]["median"])
-            for row in curve["rows"]
-            if (row["method"], row["solver"]) == PROGRAMS[name]
-            and row["horizon"] == curve["horizons"][-1]
-            and (row["error"] and row["seconds"] and not row["failure"])
-        ]
-        style = {"color": color, "linestyle": dash, "marker": mark, "markersize": 5}
-        ax.loglog(*to_columns(points), **style, linewidth=1.6, label=name.split(",")[0])
-    ax.set(xlabel="error of any body [m]", ylabel="run time [ms]")
-    ax.set_title(f"{curve['horizons'][-1]:g} s of the seven-body UAV on one core")
-    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
-    return figure
-
-
-def to_columns(points: list[tuple[float, float]]) -> tuple[list[float], list[float]]:
-    """Abscissae and ordinates of points, from left to right."""
-    ordered = sorted(points)
-    return [x for x, _ in ordered], [y for _, y in ordered]
-
-
-def loop_times(content: Row) -> str:
-    """Times against the number of closed loops."""
-    head = [
-        "N",
-        "bodies",
-        "one acceleration [us]",
-        "run",
-        "compile [s]",
-        "constraint violation [m]",
-    ]
-    rows = [
-        [row["loops"], row["bodies"], number(row["acceleration_seconds"], 1e6), duration(row["run_seconds"]["median"]),
-         number(row["run_compile_seconds"]), power(row["residual"])]
-        for row in content["rows"] if row.get("run_seconds")
-    ]  # fmt: skip
-    return text_table(head, rows)
-
-
-def body_times(content: Row) -> str:
-    """One free body by the package and by hand."""
-    times: dict[float, list[float]] = {}
-    for row in content["rows"]:
-        times.setdefault(row["tolerance"], []).append(1e6 * row["seconds"]["median"])
-    head = ["tolerance", "stmuav_jax [us]", "13 hand-written equations in diffrax [us]", "ratio"]
-    rows = [[f"{x:.0e}", f"{a:.0f}", f"{b:.0f}", f"{a / b:.2f}"] for x, (a, b) in times.items()]
-    return text_table(head, rows)
 
 
 def flight_rates(content: Row) -> list[list[str]]:
@@ -209,8 +142,8 @@ def flight_rates(content: Row) -> list[list[str]]:
         ("stmuav_jax, one by one", content["one_lane_per_second"], "same tolerance"),
         (f"stmuav_jax on {cores['devices']} cores, with its store", cores["per_second_stored"], "same tolerance"),
     ]  # fmt: skip
+    equal: dict[str, Row] = {row["method"]: row for row in comparable(content)}
     ended: list[Row] = [row for row in content["peers"] if row["largest_error"] is not None]
-    equal: dict[str, Row] = {row["method"]: row for row in comparable({**content, "peers": ended})}
     for method in dict.fromkeys(row["method"] for row in ended):
         settings: list[Row] = [row for row in ended if row["method"] == method]
         for row in (equal.get(method, settings[-1]), settings[0]):
@@ -222,68 +155,20 @@ def flight_rates(content: Row) -> list[list[str]]:
 
 def block_rates(content: Row) -> dict[str, Row]:
     """Fastest row of each program whose largest error is small enough."""
-    rows = [
-        row for row in content["rows"]
-        if row["per_second"] and row["largest_error"] <= content["error_wanted"]
-    ]  # fmt: skip
+    most = content["error_wanted"]
+    rows = (row for row in content["rows"] if row["per_second"] and row["largest_error"] <= most)
     return {LABELS[row["method"]]: row for row in sorted(rows, key=lambda row: row["per_second"])}
 
 
-def step_rates(content: Row) -> str:
-    """Most steps per second of each program, machine and method, in double precision."""
-    rows = [
-        row for row in content["rows"]
-        if row["precision"] != "single" and row.get("position_error_many") is not None
-    ]  # fmt: skip
+def step_rates(content: Row) -> list[Row]:
+    """Rows with most steps per second of each program, machine and method, in double precision."""
     key = lambda row: (row["program"], row["machine"], row["method"])
-    best = {key(row): row for row in sorted(rows, key=lambda row: row["per_second"])}
-    head = [
-        "program",
-        "machine",
-        "method",
-        "steps per second",
-        f"error after {content['horizon']:g} s [m]",
-    ]
-    rates = [
-        [program.replace("-", "_"), machine, method, power(row["per_second"]), power(row["position_error_many"])]
-        for (program, machine, method), row in sorted(best.items())
-    ]  # fmt: skip
-    return text_table(head, rates)
-
-
-def gradient_costs(content: Row) -> str:
-    """Time and error of derivatives at a tolerance of 1e-8."""
-    head = ["mode", "run", "run / simulation", "relative error", "compile [s]"]
-    rows = [
-        [row["mode"], duration(row["seconds"]["median"]), f"{row['cost_in_simulations']:.1f}", power(row["error"]),
-         number(row["compile_seconds"])]
-        for row in content["rows"] if row.get("tolerance") == 1e-8
-    ]  # fmt: skip
-    return text_table(head, rows)
-
-
-def filter_times(content: Row) -> str:
-    """Microseconds per step of one filter and of one among many."""
-    forms = {
-        "unscented, covariance": "unscented_covariance",
-        "cubature, square root (default)": "cubature_square_root",
+    best = {
+        key(row): row
+        for row in sorted(content["rows"], key=lambda row: row["per_second"])
+        if row["precision"] != "single" and row.get("position_error_many") is not None
     }
-    measured = {f"stmuav_jax, {how}": content["ours"][form] for how, form in forms.items()}
-    if "dynamax" in content:
-        measured["dynamax, unscented, covariance"] = content["dynamax"]
-    if "filterpy" in content:
-        measured["FilterPy, unscented, covariance"] = {"single": content["filterpy"], "bank": None}
-    cells = lambda x: [number(x[k] and x[k]["median_us"]) for k in ("single", "bank")]
-    return text_table(
-        ["filter", "one filter", "one of a bank of 256"],
-        [[name, *cells(x)] for name, x in measured.items()],
-    )
-
-
-def hard_missed(content: Row) -> int:
-    """How many hard cases and tolerances miss the error that is demanded."""
-    rows = [*content["cases"], *content["tolerances"]]
-    return sum(row["result"] != "successful" or row["reached"] > row["demanded"] for row in rows)
+    return [row for _, row in sorted(best.items())]
 
 
 def hard_errors(content: Row) -> str:
@@ -292,11 +177,8 @@ def hard_errors(content: Row) -> str:
     def of_peer(peer: Row) -> str:
         if peer["error"] is not None:
             return power(peer["error"])
-        return (
-            "not in our adapter"
-            if "not supported" in peer["reason"]
-            else peer["reason"].rstrip(".")
-        )
+        is_ours = "not supported" in peer["reason"]
+        return "not in our adapter" if is_ours else peer["reason"].rstrip(".")
 
     cases = [row for row in content["cases"] if row["name"] in HARD]
     names = list(dict.fromkeys(peer["peer"] for row in cases for peer in row.get("peers", ())))
@@ -307,27 +189,7 @@ def hard_errors(content: Row) -> str:
         peers = [of_peer(peer) for peer in row.get("peers", ())] or ["-"] * len(names)
         rows.append([row["name"], *errors, *peers])
     head = ["case", "required", "error", "estimated by the run", *(LABELS[name] for name in names)]
-    return text_table(head, rows)
-
-
-def command_times(content: Row) -> str:
-    """Wall time of commands, first and later."""
-    rows = []
-    for name in (name for name in COMMANDS if name in content["commands"]):
-        command = content["commands"][name]
-        words = command["words"].replace(" --out {out}", "")
-        walls = [number(command[kind]["wall"]) for kind in ("cold", "warm")]
-        rows.append([f"`stmuav {words}`", *walls, f"{command['warm']['memory']:.0f}"])
-    return text_table(["command", "first", "later", "peak memory, later [MB]"], rows)
-
-
-def program_times(content: Row) -> str:
-    """Seconds to make programs."""
-    total = lambda row: sum(row[f"{k}_seconds"] for k in ("trace", "lower", "compile"))
-    rows = {row["program"]: number(total(row)) for row in content["rows"]}
-    return text_table(
-        ["program", "time [s]"], [[COMPILED[k], x] for k, x in rows.items() if k in COMPILED]
-    )
+    return table(head, rows)
 
 
 def peers(results: dict[str, Row]) -> str:
@@ -339,68 +201,253 @@ def peers(results: dict[str, Row]) -> str:
         [name, x["version"], x.get("how", ""), " ".join(x["caveats"])] for name, x in ran.items()
     ]
     rows += [[name, "skipped", reason, ""] for name, reason in absent.items()]
-    return text_table(
-        ["program", "version", "how it is run", "what is left out or done differently"], rows
-    )
+    head = ["program", "version", "how it is run", "what is left out or done differently"]
+    return table(head, rows)
+
+
+# --- sections of other pages
+def peer_result(one: Row) -> str:
+    """Error, seconds and setting of another program; or the reason why there is none, and at which setting."""
+    setting, at = one["setting"], ""
+    if setting is not None:
+        tolerance, step = setting["tolerance"], setting["step"]
+        at = f"step {step:.2g} s" if tolerance is None else f"tolerance {tolerance:.0e}"
+    if reason := one["reason"]:
+        if "not supported" in reason:
+            return "not in our adapter"
+        return f"{reason.rstrip('.')} ({at})." if at else reason
+    return f"{number(one['error'], digits=2)}, {number(one['seconds'], digits=2)} s ({at})"
+
+
+def batch_result(row: Row) -> tuple[str, str, str, str]:
+    """Rate, median and largest error of a batch by another program, and why there are none.
+
+    A rate of flights that stopped early says nothing, so it is left out, and the reason told.
+    """
+    numbers = [row.get(key) for key in ("per_second", "median_error", "largest_error")]
+    if all(x is not None and math.isfinite(x) for x in numbers):
+        rate, median, largest = numbers
+        return f"{rate:.1f}", f"{median:.1e}", f"{largest:.1e}", row["failure"] or "-"
+    lost = row.get("not_finite")
+    who = "Some flights (how many was not recorded)" if lost is None else f"{lost} flights"
+    return "-", "-", "-", row["failure"] or f"{who} ended with a state that is not finite."
+
+
+# --- tables of other pages
+def tabulate_readme(content: Row) -> str:
+    """Least run times of the flight by the programs of the curves."""
+    curve, errors = content["curves"][0], ("1e-03", "1e-06", "1e-09")
+    times = lambda name: (duration(least_time(curve, name, error)) for error in errors)
+    rows = ([name.split(",")[0], *times(name)] for name in COMPARED)
+    return table(["largest error of any body", *(f"{error} m" for error in errors)], rows)
+
+
+def tabulate_stabilisations(record: Row) -> str:
+    """Energy error and run time of Dopri8 at 1e-6 by stabilisation."""
+
+    def cell(row: Row) -> str:
+        if row["largest"] is None:
+            return f"stops at {row['reached']:.2g} s"
+        return f"{power(row['largest'])} ({plain(1e3 * row['seconds'])} ms)"
+
+    rows = []
+    for problem in record["problems"]:
+        runs = {(row["solver"], row["hold"], row["tolerance"]): row for row in problem["runs"]}
+        of = {hold: runs["dopri8", hold, 1e-6] for hold in HOLDS}
+        residual = number(of["none"]["residual"], digits=2)
+        rows.append([problem["title"], *map(cell, of.values()), residual])
+    head = ["Dopri8 at 1e-6", *HOLDS.values(), "joint error of the unstabilised run [m]"]
+    return table(head, rows)
+
+
+def tabulate_long_times(record: Row) -> str:
+    """Milliseconds of the cheapest explicit run of each family with an energy error of at most 1e-9."""
+    problems = record["problems"]
+    families = [f for f in problems[0]["cheapest"]["1e-09"] if f.split(", ")[0] in EXPLICIT]
+    best = lambda problem, family: problem["cheapest"]["1e-09"][family]
+    cell = lambda row: plain(row and 1e3 * row["seconds"])
+    rows = [[name_family(f), *(cell(best(p, f)) for p in problems)] for f in families]
+    return table(["run time [ms]", *(problem["title"] for problem in problems)], rows)
+
+
+def tabulate_chains(content: Row) -> str:
+    """Errors and steps of chains of four-bars by tolerance."""
+    heavy = [row for row in content["couplers"] if row["coupler"] == 1e6]
+    columns = {f"N = {row['loops']}": row["loops"] for row in content["chains"]}
+    rows: dict[float, list[str]] = {}
+    for row in [*sorted(content["chains"], key=lambda row: row["loops"]), *heavy]:
+        cell = f"{power(row['error'])} ({row['accepted']} + {row['rejected']})"
+        rows.setdefault(row["tolerance"], [f"{row['tolerance']:.0e}"]).append(cell)
+    return table(["rtol = atol", *columns, "N = 1, coupler of 1e6 kg"], rows.values())
+
+
+def tabulate_flight_logs(content: Row) -> str:
+    """Coverage and mean error of the estimates from simulated flight logs."""
+    found = {row["quantity"]: row for row in content["estimates"]}
+    rows = []
+    for names in FLIGHT_LOG_ROWS:
+        covers = ", ".join(f"{100 * found[name]['cover_95']:.0f}" for name in names)
+        means = ", ".join(f"{found[name]['mean_in_deviations']:.2f}" for name in names)
+        rows.append([", ".join(f"`{name}`" for name in names), f"{covers} %", means])
+    head = ["estimate", "coverage of 95 % intervals", "mean error / standard deviation"]
+    return table(head, rows)
+
+
+def name_variant(run: Row) -> str:
+    """The equations and the method of a run of the report's system."""
+    return f"{VARIANTS.get(run['name'], run['name'])}, {run['scheme']}"
+
+
+def tabulate_case_2(content: Row) -> str:
+    """All runs of the report's system in the second case."""
+    rows = []
+    for run in sorted((r for r in content["trials"] if r["case"] == 2), key=lambda r: r["part"]):
+        at = lambda key, time, run=run: power(run[key].get(time))
+        stop = " **stop**" if run["failure"] else ""
+        rows.append([
+            run["part"], name_variant(run), f"{run['reached']:.3f} s{stop}", run["steps"],
+            *(at("violation", time) for time in ("0.1", "0.5", "2")), at("norm_error", "0.5"),
+            at("energy_drift", "0.5"), power(run["condition"][1]), f"{run['fastest_rate']:.0f}",
+        ])  # fmt: skip
+    head = ["", "variant", "reached", "steps", "violation 0.1 s", "0.5 s", "2 s", "norms 0.5 s", "energy 0.5 s",
+            "condition", "eigenvalue [1/s]"]  # fmt: skip
+    return table(head, rows)
+
+
+def tabulate_printed_equations(content: Row) -> str:
+    """Times at which the printed equations stop."""
+    rows: dict[str, list[str]] = {}
+    for run in content["trials"]:
+        if run["part"] == "b" and run["scheme"].startswith("ode45"):
+            name = name_variant(run)
+            rows.setdefault(name, [name, *"---"])[run["case"]] = f"{run['reached']:.3f} s"
+    return table(["printed", "case 1", "case 2", "case 3"], rows.values())
+
+
+def tabulate_fixed_steps(content: Row) -> str:
+    """Ends of runs of the corrected equations with fixed steps."""
+    rows: dict[str, dict[str, str]] = {}
+    for run in content["alignment_methods"]:
+        near = run["name"] == "nearest sample"
+        name = "the geometry with 2.2 degrees at 0.490 s" if near else run["name"]
+        stops, reaches = f"stops at {run['reached']:.2f} s", f"reaches {run['reached']:g} s"
+        cells = rows.setdefault(f"{name}, case {run['case']}", {})
+        cells[run["scheme"]] = stops if run["failure"] else reaches
+    cells = [[name, *(row[scheme] for scheme in FIXED_STEPS)] for name, row in rows.items()]
+    return table(["", *FIXED_STEPS.values()], cells)
+
+
+def tabulate_eight_cases(content: Row) -> str:
+    """The report's eight cases of estimation with both tunings."""
+    runs = {(run["case"], run["tuning"]): run for run in content["cases"]}
+    rows = []
+    for case in sorted({case for case, _ in runs}):
+        pair = [runs[case, tuning] for tuning in ("report", "consistent")]
+        both = lambda cell, pair=pair: ", ".join(cell(run) for run in pair)
+        rmse = lambda run: ", ".join(f"{1e3 * x:.2f}" for x in run["rmse"])
+        rows.append([
+            case, both(lambda run: f"{run['to_2cm']:.3f}"), *map(rmse, pair),
+            both(lambda run: f"{run['nees_offset']:.3g}"), both(lambda run: f"{run['nis']:.2f}"),
+            both(lambda run: f"{run['verdict']['flagged']}"),
+        ])  # fmt: skip
+    head = ["case", "time to 2 cm: report, consistent [s]", "RMSE x, y after 1.2 s: report [mm]",
+            "RMSE x, y: consistent [mm]", "NEES (2): report, consistent", "NIS (3): report, consistent",
+            "inconsistent runs of 50: report, consistent"]  # fmt: skip
+    return table(head, rows)
+
+
+ENVIRONMENT = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(Path(__file__).parent), trim_blocks=True, lstrip_blocks=True
+)
+for _filter in (duration, power, number, plain, peer_result, batch_result):
+    ENVIRONMENT.filters[_filter.__name__] = _filter
+for _function in (
+    min, max, holds, least_time, least_times, mechanism_times, time_ratios, flight_rates, block_rates, step_rates,
+    hard_errors, peers, table, comparable, describe_scene,
+):  # fmt: skip
+    ENVIRONMENT.globals[_function.__name__] = _function
+ENVIRONMENT.tests["held"] = holds
+ENVIRONMENT.globals.update(DEFAULT=DEFAULT, PINOCCHIO=PINOCCHIO)
+MACROS: Any = ENVIRONMENT.get_template("tables.md.jinja").module
+
+# Name in the comments of the pages -> the result, or its path, and the function that makes the table.
+TABLES: dict[str, tuple[str, Callable[[Row], str]]] = {
+    "run times": ("suite_work_precision", tabulate_readme),
+    "stiff scenes": ("stiff", MACROS.stiff_scenes),
+    "symmetric methods": ("long_horizon", MACROS.symmetric_methods),
+    "stabilisations": ("long_horizon", tabulate_stabilisations),
+    "long times": ("long_horizon", tabulate_long_times),
+    "chains": ("singular", tabulate_chains),
+    "machine code": ("machine_code", MACROS.machine_code),
+    "error estimates": ("errors", MACROS.error_estimates),
+    "second runs": ("errors", MACROS.second_runs),
+    "batch sizes": ("batch_sizes", MACROS.batch_sizes),
+    "flight logs": ("flight_logs", tabulate_flight_logs),
+    "runs of case 2": ("failure", tabulate_case_2),
+    "printed equations": ("failure", tabulate_printed_equations),
+    "eigenvalues": ("failure", MACROS.eigenvalues),
+    "fixed steps": ("failure", tabulate_fixed_steps),
+    "eight cases": ("../../docs/figures/estimation/numbers", tabulate_eight_cases),
+}
+BLOCK = re.compile(r"(<!-- table: ([\w ]+) -->\n+).*?(\n+<!-- end of table -->)", re.DOTALL)
+# A section of another page stands between two comments that name the script of its measurements.
+SECTION_TEMPLATES = {"hard": "hard.md.jinja", "montecarlo": "throughput.md.jinja"}
+
+
+def read_result(name: str) -> Row:
+    """A stored result."""
+    return json.loads((RESULTS / f"{name}.json").read_text())
+
+
+def fill(text: str) -> str:
+    """Text of a page with the tables and the section that its comments name."""
+
+    def make_table(match: re.Match[str]) -> str:
+        result, tabulate = TABLES[match[2]]
+        return match[1] + tabulate(read_result(result)).strip() + match[3]
+
+    text = BLOCK.sub(make_table, text)
+    for result, template in SECTION_TEMPLATES.items():
+        script = f"benchmarks/{result}.py"
+        begin, end = f"<!-- made by {script} -->\n", f"<!-- end of what {script} makes -->\n"
+        before, is_named, rest = text.partition(begin)
+        if is_named:
+            content = read_result(result)
+            section = ENVIRONMENT.get_template(template).render(content, content=content).strip()
+            text = f"{before}{begin}\n{section}\n\n{end}{rest.partition(end)[2]}"
+    return text
 
 
 def build(folder: Path, page: Path) -> Path:
-    """Write the page, and its figure in `figures` beside it; returns its path."""
+    """Write the benchmark page from the results of a folder; returns its path."""
     stored = {path.stem: path for path in sorted(folder.glob("*.json"))}
     results = {name: json.loads(stored[name].read_text()) for name in SHOWN if name in stored}
     if not results:
         raise SystemExit(f"There are no results in {folder}.")
-    link = lambda name: f"[{name}.json]({os.path.relpath(stored[name], page.parent)})"
-
-    def commits(results: dict[str, Row]) -> str:
-        groups: dict[tuple[str, ...], list[str]] = {}
-        for name, content in results.items():
-            about = content["environment"]
-            commit = about["commit"][:10] + (" with changes" if about["dirty"] else "")
-            key = commit, about["date"][:10], about["versions"]["stmuav-jax"]
-            groups.setdefault(key, []).append(link(name))
-        return text_table(
-            ["commit", "date", "version", "results"],
-            [[*key, ", ".join(x)] for key, x in groups.items()],
-        )
-
-    if "suite_work_precision" in results:
-        curve = results["suite_work_precision"]["curves"][0]
-        save({"work_precision": draw_curves(curve)}, page.parent / "figures" / "benchmarks")
-    environment = jinja2.Environment(trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(duration=duration, power=power, number=number)
-    functions = (
-        least_time, least_times, mechanism_times, time_ratios, loop_times, body_times, flight_rates, block_rates,
-        step_rates, gradient_costs, filter_times, hard_missed, hard_errors, command_times, program_times,
-        peers, commits,
-    )  # fmt: skip
-    environment.globals.update({function.__name__: function for function in functions})
-    environment.globals.update(
-        link=link, table=text_table, DEFAULT=DEFAULT, PINOCCHIO=PINOCCHIO, MUJOCO=MUJOCO,
-        EXUDYN=EXUDYN, DENSE=DENSE,
-    )  # fmt: skip
-    text = environment.from_string(TEMPLATE.read_text()).render(
-        results=results, others=[name for name in stored if name not in results],
-        smallest=any(content.get("size", "full") != "full" for content in results.values()), **results,
+    commits: dict[tuple[str, ...], list[str]] = {}
+    for name, content in results.items():
+        about = content["environment"]
+        commit = about["commit"][:10] + (" with changes" if about["dirty"] else "")
+        key = commit, about["date"][:10], about["versions"]["stmuav-jax"]
+        commits.setdefault(key, []).append(name)
+    text = ENVIRONMENT.get_template("page.md.jinja").render(
+        results, results=results, commits=commits,
+        link=lambda name: f"[{name}.json]({os.path.relpath(stored[name], page.parent)})",
+        others=[name for name in stored if name not in results],
+        smallest=any(content.get("size", "full") != "full" for content in results.values()),
     )  # fmt: skip
     return write_atomically(page, f"{text.rstrip()}\n".encode())
 
 
-ALL_TABLES = TABLES | {"run times": ("suite_work_precision", readme_times)}
-
-
 def main() -> None:
-    """Make the page, and the tables of the others, from the stored results."""
-    parser = argparse.ArgumentParser(description="Write the benchmark page.")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--page", type=Path, default=PAGE)
-    options = parser.parse_args()
-    print(build(options.results, options.page))
-    if options.results == RESULTS:
-        for page in OTHER_PAGES:
-            text = page.read_text(encoding="utf-8")
-            if (filled := fill(text, ALL_TABLES)) != text:
-                print(write_atomically(page, filled.encode()))
+    """Make the benchmark page and its figures, and the tables and sections of all other pages."""
+    argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "").parse_args()
+    print(build(RESULTS, PAGE))
+    for page in OTHER_PAGES:
+        text = page.read_text(encoding="utf-8")
+        if (filled := fill(text)) != text:
+            print(write_atomically(page, filled.encode()))
+    print(*draw_figures(RESULTS, DOCS / "figures" / "benchmarks"), sep="\n")
 
 
 if __name__ == "__main__":

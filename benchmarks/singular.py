@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from problems import four_bar
 from problems.four_bar import LONG, TOLERANCES
-from shared.command import benchmark
+from shared.record import benchmark
 
 import stmuav_jax as stm
 

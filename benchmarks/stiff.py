@@ -21,10 +21,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from sections import stiff_page
-from shared.clock import compiled, ready, rounded, timed
-from shared.command import benchmark
+from shared.clock import compiled, measure_processor, rounded
 from shared.methods import trajectory
+from shared.record import benchmark
 
 import stmuav_jax as stm
 
@@ -91,14 +90,8 @@ class Size:
 
 
 QUICK = Size(
-    StiffScene.slider,
-    SERVOS[::3],
-    ("dopri8", "kvaerno5"),
-    (1e-6, 1e-8),
-    t1=0.1,
-    pieces=2,
-    repeats=1,
-)
+    StiffScene.slider, SERVOS[::3], ("dopri8", "kvaerno5"), (1e-6, 1e-8), t1=0.1, pieces=2, repeats=1
+)  # fmt: skip
 
 
 def as_given(scene: stm.Scene) -> tuple[stm.System, stm.State]:
@@ -108,95 +101,70 @@ def as_given(scene: stm.Scene) -> tuple[stm.System, stm.State]:
 
 
 class Runner:
-    """Runs with output at the start, the middle and the end, compiled on first use."""
+    """Runs of (system, state, ts, tolerance), compiled once for each solver and number of times."""
 
-    def __init__(self, t1: float, repeats: int) -> None:
-        self.ends, self.repeats = jnp.array([0.0, 0.5 * t1, t1]), repeats
-        self.calls: dict[str, Any] = {}
+    def __init__(self) -> None:
+        self.calls: dict[tuple[str, int], Any] = {}
         self.compile_seconds: dict[str, float] = {}
 
-    def prepared(self, solver: str, *given: Any) -> Any:
-        """The integration by a solver, compiled for (system, state, ts, tolerance)."""
-        if solver not in self.calls:
+    def __call__(self, solver: str, scene: stm.Scene, ts: np.ndarray, tol: float) -> Any:
+        """Call without arguments that returns a trajectory."""
+        given = (*as_given(scene), jnp.asarray(ts), jnp.asarray(tol))
+        if (solver, len(ts)) not in self.calls:
             run = trajectory(stm.Tree(), SOLVERS[solver]())
-            done, seconds = compiled(run, *given, clock=time.process_time)
-            self.calls[solver], self.compile_seconds[solver] = done, seconds
-        return self.calls[solver]
-
-    def positions(self, found: Any) -> np.ndarray:
-        """Positions (2, n, 3) [m] behind the start; not numbers if the run did not reach the end."""
-        there = bool(np.all(np.asarray(found.ts) >= np.asarray(self.ends) * (1 - 1e-12)))
-        positions = np.asarray(found.states.r[1:])
-        return positions if there else np.full_like(positions, np.nan)
-
-    def tight(self, solver: str, scene: stm.Scene) -> np.ndarray:
-        """Positions (2, n, 3) [m] at the middle and the end, at the tightest tolerance."""
-        given = (*as_given(scene), self.ends, jnp.asarray(TIGHT))
-        return self.positions(self.prepared(solver, *given)(*given))
-
-    def run(self, solver: str, tol: float, scene: stm.Scene, exact: np.ndarray) -> dict[str, Any]:
-        """One timed run: counts, seconds, largest position error over all bodies [m]."""
-        given = (*as_given(scene), self.ends, jnp.asarray(tol))
-        cost, found = timed(self.prepared(solver, *given), *given, repeats=self.repeats)
-        found = ready(found)
-        off = np.max(np.linalg.norm(self.positions(found) - exact, axis=-1), axis=-1)
-        return {
-            "solver": solver, "tolerance": tol,
-            "accepted": int(found.counts.accepted[-1]),
-            "rejected": int(found.counts.rejected[-1]),
-            "seconds": rounded(cost.processor.median), "cost": cost.to_dict(),
-            "error_middle": rounded(off[0]), "error_end": rounded(off[1]),
-            "error": rounded(np.max(off)), "completed": bool(np.all(np.isfinite(off))),
-        }  # fmt: skip
-
-    def along(self, scene: stm.Scene, pieces: int, tol: float) -> Iterator[tuple[float, stm.State]]:
-        """Times and states along a run by Kvaerno5: pieces of two, in the same compilation."""
-        system, state = as_given(scene)
-        times = np.linspace(0.0, float(self.ends[-1]), 2 * pieces + 1)
-        yield 0.0, state
-        for k in range(pieces):
-            given = (system, state, jnp.asarray(times[2 * k : 2 * k + 3]), jnp.asarray(tol))
-            found = self.prepared("kvaerno5", *given)(*given)
-            for i in (1, 2):
-                state = jax.tree.map(lambda x, i=i: x[i], found.states)
-                yield float(times[2 * k + i]), state
-
-    def eigenvalues(self, scene: stm.Scene, pieces: int) -> dict[str, Any]:
-        """The eigenvalue of df/dx that is largest in size, at the start and along the run."""
-        system, _ = as_given(scene)
-        values, times = [], []
-        for t, state in self.along(scene, pieces, 1e-8):
-            if not np.all(np.isfinite(state.r)):
-                break
-            values.append(stm.dynamics.spectrum(system, state, t)[0])
-            times.append(t)
-        sizes = np.abs(values)
-        peak = int(np.argmax(sizes))
-        parts = lambda value: [rounded(value.real), rounded(value.imag)]
-        return {
-            "start": rounded(sizes[0]), "start_value": parts(values[0]),
-            "median": rounded(np.median(sizes)),
-            "largest": rounded(sizes[peak]), "largest_value": parts(values[peak]),
-            "largest_at": times[peak], "states": len(times),
-        }  # fmt: skip
+            call, seconds = compiled(run, *given, clock=time.process_time)
+            self.calls[solver, len(ts)] = call
+            self.compile_seconds.setdefault(solver, seconds)
+        return lambda: self.calls[solver, len(ts)](*given)
 
 
-def run_scene(held: StiffScene, size: Size, runner: Runner) -> dict[str, Any]:
-    """All solvers on one scene."""
-    scene = size.build(held)
-    exact, other = runner.tight("dopri8", scene), runner.tight("kvaerno5", scene)
+def positions(found: Any, ts: np.ndarray) -> np.ndarray:
+    """Positions (k, n, 3) [m] behind the start; not numbers if the run did not reach the end."""
+    there = bool(np.all(np.asarray(found.ts) >= ts * (1 - 1e-12)))
+    r = np.asarray(found.states.r[1:])
+    return r if there else np.full_like(r, np.nan)
+
+
+def eigenvalues(run: Runner, scene: stm.Scene, size: Size) -> dict[str, Any]:
+    """Size of the largest eigenvalue of df/dx, at the start and along a run by Kvaerno5."""
+    ts = np.linspace(0.0, size.t1, 2 * size.pieces + 1)
+    states, sizes = run("kvaerno5", scene, ts, 1e-8)().states, []
+    system, _ = as_given(scene)
+    for k, t in enumerate(ts):
+        state = jax.tree.map(lambda x, k=k: x[k], states)
+        if not np.all(np.isfinite(state.r)):
+            break
+        sizes.append(np.abs(stm.dynamics.spectrum(system, state, float(t))[0]))
+    return {
+        "start": rounded(sizes[0]), "median": rounded(np.median(sizes)), "largest": rounded(max(sizes)),
+        "states": len(sizes),
+    }  # fmt: skip
+
+
+def run_scene(held: StiffScene, size: Size, run: Runner) -> dict[str, Any]:
+    """All solvers on one scene, with output at the start, the middle and the end."""
+    scene, ts = size.build(held), np.array([0.0, 0.5 * size.t1, size.t1])
+    exact, other = (
+        positions(run(solver, scene, ts, TIGHT)(), ts) for solver in ("dopri8", "kvaerno5")
+    )
     apart = np.max(np.linalg.norm(exact - other, axis=-1), axis=-1)
     runs = []
     for solver in size.solvers:
         for tol in size.tolerances:
-            row = runner.run(solver, tol, scene, exact)
-            runs.append(row)
-            said = f"{row['seconds']:.3g} s, {row['error']} m"
-            print(f"{held.name}: {solver} {tol:g}: {said}", flush=True)
+            timing, found = measure_processor(run(solver, scene, ts, tol), repeats=size.repeats)
+            off = np.max(np.linalg.norm(positions(found, ts) - exact, axis=-1))
+            runs.append({
+                "solver": solver, "tolerance": tol,
+                "accepted": int(found.counts.accepted[-1]),
+                "rejected": int(found.counts.rejected[-1]),
+                "seconds": rounded(timing.median), "error": rounded(off),
+                "completed": bool(np.isfinite(off)),
+            })  # fmt: skip
+            print(held.name, runs[-1], flush=True)
     return {
         **asdict(held),
         "reference": {"tolerance": TIGHT, "kvaerno5_apart": rounded(apart)},
-        "eigenvalue": runner.eigenvalues(scene, size.pieces),
+        "eigenvalue": eigenvalues(run, scene, size),
         "runs": runs,
         "cheapest": {str(level): cheapest(runs, level) for level in LEVELS},
     }
@@ -215,33 +183,9 @@ def cheapest(runs: list[dict[str, Any]], level: float) -> dict[str, Any]:
     return {"explicit": explicit, "implicit": implicit, "explicit_over_implicit": ratio}
 
 
-def crossover(scenes: list[dict[str, Any]], level: float) -> dict[str, Any]:
-    """Between which servos, and which largest eigenvalues at the start, implicit begins to pay.
-
-    Of the scenes with a servo only, in order of the eigenvalue: the last below which explicit is
-    always faster, the first from which implicit always is.
-    """
-    servos = [s for s in scenes if s["stiffness"] > 0]
-    rows = sorted(servos, key=lambda s: s["eigenvalue"]["start"])
-    ratios = [s["cheapest"][str(level)]["explicit_over_implicit"] for s in rows]
-    pays = [ratio is not None and ratio > 1 for ratio in ratios]
-    first = next((i for i in range(len(rows)) if all(pays[i:])), None)
-    last = next((i - 1 for i in range(len(rows)) if pays[i]), len(rows) - 1)
-
-    def of(index: int | None) -> dict[str, Any] | None:
-        if index is None or index < 0:
-            return None
-        row = rows[index]
-        about = {key: row[key] for key in ("name", "stiffness", "damping")}
-        about["eigenvalue_at_start"] = row["eigenvalue"]["start"]
-        return {**about, "explicit_over_implicit": ratios[index]}
-
-    return {"explicit_up_to": of(last), "implicit_from": of(first)}
-
-
 def record(size: Size) -> Iterator[dict[str, Any]]:
     """All scenes."""
-    runner = Runner(size.t1, size.repeats)
+    runner = Runner()
     scenes = [run_scene(held, size, runner) for held in size.scenes]
     yield {
         "what": "explicit and implicit solvers on scenes of growing stiffness",
@@ -249,9 +193,8 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
         "t1": size.t1,
         "compile_seconds": {k: rounded(v) for k, v in runner.compile_seconds.items()},
         "scenes": scenes,
-        "crossover": {str(level): crossover(scenes, level) for level in LEVELS},
     }
 
 
 if __name__ == "__main__":
-    benchmark("stiff", __doc__, record, (Size(), QUICK), stiff_page.show)
+    benchmark("stiff", __doc__, record, (Size(), QUICK))

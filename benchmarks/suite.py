@@ -1,6 +1,6 @@
 """The benchmark suite: problems x methods x tolerances x peers.
 
-    python benchmarks/suite.py                      everything, and the report page
+    python benchmarks/suite.py                      everything
     python benchmarks/suite.py --only scaling batch only these sections
     python benchmarks/suite.py --size one           the smallest run of each, for tests
     python benchmarks/suite.py --no-peers           ours only
@@ -20,22 +20,20 @@ import jax
 # compile times are measured
 jax.config.update("jax_enable_compilation_cache", False)
 
-import report
 from peers.adapter import Peer
 from sections.gradient import gradient
+from sections.hexacopter import hexacopter
 from sections.ours import peers
 from sections.precision import describe, published_problems, stiff_variants, work_precision
-from sections.scenes import hexacopter, scenes
 from sections.size import FULL, ONE, Size
-from sections.speed import acceleration, batch, scaling
+from sections.speed import batch, scaling
 from sections.vector_steps import vector_steps
-from shared.command import parser
-from shared.record import write_record
+from shared.record import make_parser, write_record
 
 SECTIONS: dict[str, Callable[[Size, list[Peer]], dict[str, Any]]] = {
-    "work_precision": work_precision, "acceleration": acceleration, "batch": batch,
-    "scaling": scaling, "gradient": gradient, "hexacopter": hexacopter, "scenes": scenes,
-    "published": published_problems, "stiff": stiff_variants, "vector_steps": vector_steps,
+    "work_precision": work_precision, "batch": batch, "scaling": scaling, "gradient": gradient,
+    "hexacopter": hexacopter, "published": published_problems, "stiff": stiff_variants,
+    "vector_steps": vector_steps,
 }  # fmt: skip
 
 
@@ -49,11 +47,10 @@ def machine() -> str:
 
 def main() -> None:
     """Run what was asked for."""
-    made = parser(__doc__, **{"no-peers": "ours only", "no-report": "records only, no page"})
-    made.add_argument("--only", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
-    made.add_argument("--size", choices=("full", "one"), default="full")
-    made.add_argument("--page", type=Path, default=report.PAGE)
-    options = made.parse_args()
+    parser = make_parser(__doc__, **{"no-peers": "ours only"})
+    parser.add_argument("--only", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
+    parser.add_argument("--size", choices=("full", "one"), default="full")
+    options = parser.parse_args()
     size = FULL if options.size == "full" else ONE
     there, absent = ([], []) if options.no_peers else peers()
     for row in absent:
@@ -68,8 +65,6 @@ def main() -> None:
         compared = {"peers": describe(there), "skipped": absent}
         path = write_record(f"suite_{name}", {**head, **compared, **content}, options.results)
         print(f"{path}, {took:.0f} s", flush=True)
-    if not options.no_report:
-        print(report.build(options.results, options.page))
 
 
 if __name__ == "__main__":

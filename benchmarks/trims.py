@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import root
 from shared.clock import measure
-from shared.command import benchmark
+from shared.record import benchmark
 
 import stmuav_jax as stm
 from stmuav_jax.uav.allocation import minimum_norm, wrench_map

@@ -11,11 +11,11 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from shared.command import parser
-from shared.record import write_record
+from shared.record import benchmark
 
 # Words of each command, with the folder for its results in the place of {out}.
 COMMANDS = {
@@ -41,7 +41,6 @@ COMMANDS = {
 }
 # Commands that read what another has written, which is run before them and not measured.
 BEFORE = {"view": "simulate", "view, report": "montecarlo"}
-ABOUT = "stmuav, whole process: CPU and wall time [s], peak memory [MB]"
 
 
 def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
@@ -69,10 +68,8 @@ def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
 def split(out: Path) -> dict[str, float]:
     """Seconds of a simulation's parts by its certificate; empty for other commands."""
     path = out / "certificate.json"
-    if not path.exists():
-        return {}
-    told = json.loads(path.read_text())["certificate"]
-    return {part: told[f"{part}_seconds"] for part in ("compile", "run", "analysis")}
+    told = json.loads(path.read_text())["certificate"] if path.exists() else {}
+    return {part: told[f"{part}_seconds"] for part in ("compile", "run", "analysis") if told}
 
 
 def least(runs: list[dict[str, Any]]) -> dict[str, float]:
@@ -96,22 +93,20 @@ def measured(name: str, repeats: int) -> dict[str, Any]:
     return {"words": words, **{kind: {**least(own), "runs": own} for kind, own in runs.items()}}
 
 
-def main() -> None:
-    """Run and write `waiting.json`, after each command what there is so far."""
-    made = parser(__doc__, quick="the command `list` once, for a smoke test")
-    made.add_argument("--repeats", type=int, default=3)
-    made.add_argument("--only", nargs="+", choices=tuple(COMMANDS), default=tuple(COMMANDS))
-    options = made.parse_args()
-    names = ("list",) if options.quick else options.only
+def record(size: tuple[list[str], int]) -> Iterator[dict[str, Any]]:
+    """What there is so far after each command, of so many repeats."""
+    names, repeats = size
     found: dict[str, Any] = {}
     for name in names:
-        found[name] = measured(name, 1 if options.quick else options.repeats)
+        found[name] = measured(name, repeats)
         for kind in ("cold", "warm"):
-            own = found[name][kind]
-            told = ", ".join(f"{k} {own[k]:.1f}" for k in ("cpu", "wall", "memory"))
-            print(f"{name}, {kind}: {told}")
-        print(write_record("waiting", {"what": ABOUT, "commands": found}, options.results))
+            told = (f"{k} {found[name][kind][k]:.1f}" for k in ("cpu", "wall", "memory"))
+            print(f"{name}, {kind}:", *told)
+        yield {
+            "what": "stmuav, whole process: CPU and wall time [s], peak memory [MB]",
+            "commands": found,
+        }
 
 
 if __name__ == "__main__":
-    main()
+    benchmark("waiting", __doc__, record, ((list(COMMANDS), 3), (["list"], 1)))

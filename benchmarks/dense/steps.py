@@ -4,13 +4,13 @@ MATLAB's rule for the step size of ode45 (Shampine and Reichelt, The MATLAB ODE 
 Comput. 18, 1997: error in the maximum norm), and the classical Runge-Kutta method with fixed steps.
 """
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.integrate import RK45
+from scipy.interpolate import CubicHermiteSpline
 
 Array = np.ndarray
 Field = Callable[[float, Array], Array]
@@ -18,20 +18,9 @@ Field = Callable[[float, Array], Array]
 Steps = Iterator[tuple[float, Array, Callable[[float], Array]]]
 
 
-@dataclass(frozen=True)
-class Limits:
-    """When a run is given up.
-
-    Attributes:
-        evaluations: of the accelerations. seconds: of wall time.
-        step: an adaptive step shorter than this [s] counts as collapsed.
-        size: largest entry of the state.
-    """
-
-    evaluations: int = 60_000
-    seconds: float = 3600.0
-    step: float = 1e-9
-    size: float = 1e7
+# When a run is given up: accelerations evaluated, an adaptive step that counts as collapsed [s], the largest
+# entry of the state.
+MOST_EVALUATIONS, LEAST_STEP, LARGEST = 60_000, 1e-9, 1e7
 
 
 @dataclass(frozen=True)
@@ -53,20 +42,16 @@ class Scheme:
 
 @dataclass
 class History:
-    """States (k, m) at the wanted times that were reached, steps taken, and how it ended.
+    """States (k, m) at the wanted times that were reached, and how the run ended.
 
-    `ends` and `sizes` are of accepted steps [s]; `failure` is empty if the end was reached. They
-    are lists while the run goes on, and arrays when it has ended.
+    `sizes` are those of accepted steps [s]; `failure` is empty if the end was reached.
     """
 
-    times: Any
-    states: Any
-    ends: Any
-    sizes: Any
-    evaluations: int = 0
-    seconds: float = 0.0
-    failure: str = ""
-    stopped_at: float = 0.0
+    times: Array
+    states: Array
+    sizes: Array
+    failure: str
+    stopped_at: float
 
     def summary(self) -> dict[str, Any]:
         """How far it came, why no farther, and in how many steps."""
@@ -105,23 +90,9 @@ def ode45(f: Field, y: Array, t1: float, rtol: float, atol: float) -> Steps:
             failed = True
         end, last, error = tried
         wanted = h if failed else h / max(1.25 * (error / rtol) ** 0.2, 0.2)
-        between = hermite(t, y, slope, t + h, end, last)
+        nodes = [t, t + h], [y, end], [slope, last]
         t, y, slope = t + h, end, last
-        yield t, y, between
-
-
-def hermite(
-    t0: float, y0: Array, f0: Array, t1: float, y1: Array, f1: Array
-) -> Callable[[float], Array]:
-    """The cubic with given values and rates at t0 and t1."""
-    h = t1 - t0
-
-    def at(t: float) -> Array:
-        x = (t - t0) / h
-        bend = (1 - 2 * x) * (y1 - y0) + h * ((x - 1) * f0 + x * f1)
-        return (1 - x) * y0 + x * y1 + x * (x - 1) * bend
-
-    return at
+        yield t, y, lambda s, nodes=nodes: CubicHermiteSpline(*nodes)(s)
 
 
 def runge_kutta(f: Field, y: Array, t1: float, h: float) -> Steps:
@@ -137,15 +108,16 @@ def runge_kutta(f: Field, y: Array, t1: float, h: float) -> Steps:
 
 
 def integrate(
-    f: Field, y0: Array, times: Array, scheme: Scheme, limits: Limits | None = None
+    f: Field, y0: Array, times: Array, scheme: Scheme, most_evaluations: int = MOST_EVALUATIONS
 ) -> History:
     """Integrate y' = f(t, y) from times[0] = 0 and keep the states at `times`."""
-    log, limits = History([0.0], [y0], [], []), limits or Limits()
-    started, end = time.perf_counter(), float(times[-1])
+    states, sizes, failure, stopped_at, end = [y0], [], "", 0.0, float(times[-1])
+    evaluations = 0
 
     def counted(t: float, y: Array) -> Array:
         """y'. A state that is not finite gives one that is not, and no error."""
-        log.evaluations += 1
+        nonlocal evaluations
+        evaluations += 1
         try:
             return f(t, y) if np.all(np.isfinite(y)) else np.full_like(y, np.nan)
         except np.linalg.LinAlgError:
@@ -156,36 +128,19 @@ def integrate(
     with np.errstate(all="ignore"):
         try:
             for t, y, between in steps:
-                h, log.stopped_at = t - log.stopped_at, t
-                check_size(y, limits)
-                log.ends.append(t)
-                log.sizes.append(h)
-                left = times[len(log.times) :]
-                for wanted in left[left <= t + 1e-12]:
-                    log.times.append(float(wanted))
-                    log.states.append(np.array(between(wanted)))
-                seconds = time.perf_counter() - started
-                if len(log.times) < len(times) and h < limits.step:
-                    raise FloatingPointError(f"step size below {limits.step:.0e} s")
-                if log.evaluations >= limits.evaluations:
-                    raise FloatingPointError(f"{limits.evaluations} evaluations")
-                if seconds > limits.seconds:
-                    raise FloatingPointError(f"{limits.seconds:g} s of wall time")
+                h, stopped_at = t - stopped_at, t
+                if not np.all(np.isfinite(y)):
+                    raise FloatingPointError("state not finite")
+                if np.max(np.abs(y)) > LARGEST:
+                    raise FloatingPointError(f"state above {LARGEST:.0e}")
+                sizes.append(h)
+                left = times[len(states) :]
+                states += [np.array(between(wanted)) for wanted in left[left <= t + 1e-12]]
+                if len(states) < len(times) and h < LEAST_STEP:
+                    raise FloatingPointError(f"step size below {LEAST_STEP:.0e} s")
+                if evaluations >= most_evaluations:
+                    raise FloatingPointError(f"{most_evaluations} evaluations")
         except FloatingPointError as stop:
-            log.failure = str(stop)
-    log.seconds = time.perf_counter() - started
-    for name in ("times", "states", "ends", "sizes"):
-        setattr(log, name, np.array(getattr(log, name)))
-    return log
-
-
-def check_size(y: Array, limits: Limits) -> None:
-    """Raise where a state is not finite or too large.
-
-    Raises:
-        FloatingPointError: in words.
-    """
-    if not np.all(np.isfinite(y)):
-        raise FloatingPointError("state not finite")
-    if np.max(np.abs(y)) > limits.size:
-        raise FloatingPointError(f"state above {limits.size:.0e}")
+            failure = str(stop)
+    reached = np.array(times[: len(states)], dtype=float)
+    return History(reached, np.array(states), np.array(sizes), failure, stopped_at)

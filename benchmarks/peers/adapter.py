@@ -4,11 +4,11 @@ A peer is one module in `benchmarks/peers/` with one class derived from `Peer`. 
 same `Scene` as we do and builds its own model from it, so that all solve the same problem.
 """
 
-import importlib.util
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from importlib import metadata
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -113,13 +113,16 @@ class Peer(ABC):
     def missing(self) -> str:
         """Why it cannot run here (not installed, no compiler); empty if it can."""
         for module, package in self.packages:
-            if importlib.util.find_spec(module) is None:
+            # a module of a package that is not there is an error
+            if not (find_spec(module.partition(".")[0]) and find_spec(module)):
                 return f"The package {package} is not installed."
         return ""
 
     def version(self) -> str:
-        """Version of the measured program."""
-        return metadata.version(self.packages[0][1])
+        """Version of the measured program, and those of the packages beside it."""
+        (_, first), *beside = self.packages
+        others = (f", {name} {metadata.version(name)}" for _, name in beside)
+        return metadata.version(first) + "".join(others)
 
     def unsupported(self, scene: Scene) -> str:
         """What our adapter lacks for this scene; empty if it can be run."""
@@ -144,8 +147,4 @@ class Peer(ABC):
         Returns:
             The median rate [1/s]; centres of mass at t1 (k, n, 3) [m].
         """
-        return None
-
-    def acceleration_seconds(self, scene: Scene) -> float | None:
-        """Cost of one evaluation of all accelerations at the start [s], in a tight loop."""
         return None

@@ -7,14 +7,13 @@ factors. It shares coordinates, but no equation with the package.
 """
 
 import math
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from problems.plain import start, starts
+from problems.plain import loop_seconds, start, starts
 from problems.tree import coordinates
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at, tolerances
@@ -24,8 +23,6 @@ from stmuav_jax import Scene, State
 # Coordinates of a link; their rates are as wide as `WIDTH`, of free links and balls (velocity,)
 # angular velocity in body axes.
 COUNT = {"free": 7, "ball": 4, "turn": 1, "slide": 1, "universal": 2}
-# Timed calls of all flights of a batch.
-REPEATS = 3
 
 
 def rotation(axis: int, angle: Any) -> np.ndarray:
@@ -151,14 +148,8 @@ class Equations:
         for link, q, v, first in rows:
             ahead = motions[link.parent] if link.parent >= 0 else GROUND
             R, x = ahead.R @ link.placement.R, ahead.point(link.placement.x)
-            now = Motion(
-                R,
-                x,
-                ahead.omega,
-                ahead.turn_bias,
-                ahead.point_bias(link.placement.x),
-                [*ahead.axes],
-            )
+            bias = ahead.point_bias(link.placement.x)
+            now = Motion(R, x, ahead.omega, ahead.turn_bias, bias, [*ahead.axes])
             columns = range(first, first + WIDTH[link.kind])
             if link.kind == "slide":
                 slide = R[:, 2]
@@ -377,14 +368,9 @@ class HeyokaTaylor(Peer):
                 ends.append(program.state.T.copy())
             return np.concatenate(ends)[: len(x0)]
 
-        seconds = []
-        ends = fly()
-        for _ in range(REPEATS):
-            began = time.perf_counter()
-            ends = fly()
-            seconds.append(time.perf_counter() - began)
-        look = self._looker(equations)
-        return len(x0) / statistics.median(seconds), np.stack([look(x)[0] for x in ends])
+        ends, look = fly(), self._looker(equations)
+        seconds = loop_seconds(fly, loops=1, repeats=3)
+        return len(x0) / seconds, np.stack([look(x)[0] for x in ends])
 
     @staticmethod
     def _looker(equations: Equations) -> Callable[[np.ndarray], tuple[np.ndarray, float]]:

@@ -84,8 +84,7 @@ def _torques(links: LinkModel) -> list[tuple[int, float]]:
         link = links.links[k]
         along, whole = float(link.placement.R[:, 2] @ moment), np.linalg.norm(moment)
         if (link.kind, link.parent) != ("turn", -1) or abs(along) < 0.999999 * whole:
-            said = "A world moment that is not along a hinge on ground is not supported by our adapters."
-            raise UnsupportedError(said)
+            raise UnsupportedError("A world moment that is not along a hinge on ground")
         found.append((k, along))
     return found
 
@@ -221,11 +220,6 @@ class MujocoC(Peer):
             return looked_at(path, world.positions, len(world.order), taken)
 
         return Prepared(run)
-
-    def acceleration_seconds(self, scene: Scene) -> float | None:
-        world = World(scene, 1e-4)
-        world.begin(start(scene))
-        return loop_seconds(lambda: world.mujoco.mj_forward(world.model, world.data))
 
     def throughput(
         self, scene: Scene, states: State, t1: float, setting: Setting

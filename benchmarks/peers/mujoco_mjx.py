@@ -1,12 +1,11 @@
 """MJX: MuJoCo's model compiled by JAX, fourth-order Runge-Kutta at a fixed step, on this CPU."""
 
 import importlib
-import importlib.util
 import time
 from typing import Any
 
 import numpy as np
-from problems.plain import loop_seconds, start
+from problems.plain import start
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at, steps
 from peers.mujoco_c import World, whole_steps, why_no_mujoco
@@ -27,11 +26,6 @@ class MujocoMjx(Peer):
 
     def __init__(self) -> None:
         self._programs: dict[str, tuple[Any, float]] = {}
-
-    def missing(self) -> str:
-        if importlib.util.find_spec("mujoco") is None:
-            return "The package mujoco is not installed."
-        return super().missing()
 
     def unsupported(self, scene: Scene) -> str:
         return why_no_mujoco(scene)
@@ -96,21 +90,3 @@ class MujocoMjx(Peer):
         compiled = jax.jit(advance).lower(model, first, 1, rate, phase).compile()
         self._programs[scene.name] = compiled, time.perf_counter() - clock
         return self._programs[scene.name]
-
-    def acceleration_seconds(self, scene: Scene) -> float | None:
-        import jax
-
-        mjx, _, model, first = self._model(scene, 1e-4)
-        loops = 500
-
-        def repeat(model: Any, data: Any) -> Any:
-            # a trace of each result in the next state, or XLA would move the work out of the loop
-            def once(_: Any, now: Any) -> Any:
-                return mjx.forward(model, now.replace(qvel=now.qvel + 1e-15 * now.qacc))
-
-            return jax.lax.fori_loop(0, loops, once, data).qacc
-
-        compiled = jax.jit(repeat).lower(model, first).compile()
-        call = lambda: jax.block_until_ready(compiled(model, first))
-        call()
-        return loop_seconds(call, loops=1) / loops

@@ -168,11 +168,6 @@ class PinocchioCpp(Peer):
 
         return Prepared(run, seconds)
 
-    def acceleration_seconds(self, scene: Scene) -> float | None:
-        program, _ = compile_program()
-        words = Texts(scene).call(program, "cost", 20_000)
-        return float(np.median(words["seconds"]))
-
     def throughput(
         self, scene: Scene, states: State, t1: float, setting: Setting
     ) -> tuple[float, np.ndarray]:

@@ -104,9 +104,7 @@ def _servos(model: Plain, tree: Tree) -> Iterator[tuple[int, float, float, float
         joint = model.joints[servo.joint]
         number = next((k for k, one in enumerate(tree.links) if one.joint is joint), None)
         if number is None:
-            raise UnsupportedError(
-                "A servo in a joint at which a loop is cut is not supported by our adapters."
-            )
+            raise UnsupportedError("A servo in a joint at which a loop is cut")
         sign = 1.0 if tree.links[number].parent == joint.i else -1.0
         yield number, servo.stiffness, servo.damping, sign * servo.target
 
@@ -135,21 +133,17 @@ def generalised(links: LinkModel) -> tuple[np.ndarray, list[tuple[np.ndarray, Si
 
     for k, force, moment in links.wrenches:
         if links.links[k].kind != "free":
-            raise UnsupportedError(
-                "A body-fixed wrench on a body that is not free is not supported by our adapters."
-            )
+            raise UnsupportedError("A body-fixed wrench on a body that is not free")
         constant[ends[k] : ends[k + 1]] += np.concatenate([force, moment])
     for base, slider, _, axis, force in links.actuators:
         link = links.links[slider]
         along = abs(link.placement.R[:, 2] @ axis)
         if (link.kind, link.parent) != ("slide", base) or along < 1 - 1e-12:
-            raise UnsupportedError("An actuator across its slide is not supported by our adapters.")
+            raise UnsupportedError("An actuator across its slide")
         wave(slider, axis * force.amplitude, force)
     for k, _, force in links.forces:
         if (links.links[k].kind, links.links[k].parent) != ("slide", -1):
-            raise UnsupportedError(
-                "A force on a body that does not slide on ground is not supported by our adapters."
-            )
+            raise UnsupportedError("A force on a body that does not slide on ground")
         wave(k, force.amplitude, force)
     return constant, waves
 

@@ -1,11 +1,10 @@
 """Pinocchio from Python: a tree with cut joints, `constraintDynamics`, SciPy's DOP853."""
 
 import math
-from importlib import metadata
 from typing import Any
 
 import numpy as np
-from problems.plain import loop_seconds, start
+from problems.plain import start
 
 from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at, tolerances
 from peers.pinocchio_model import generalised, linked, start_vectors, why_no_joint_forces
@@ -133,11 +132,6 @@ class PinocchioPython(Peer):
         "Python; SciPy's DOP853, rtol = atol = tolerance."
     )
 
-    def version(self) -> str:
-        import pinocchio as pin  # pyright: ignore[reportMissingImports]
-
-        return f"{pin.__version__}, SciPy {metadata.version('scipy')}"
-
     def unsupported(self, scene: Scene) -> str:
         return why_no_joint_forces(scene)
 
@@ -149,13 +143,10 @@ class PinocchioPython(Peer):
         x0, tolerance = np.concatenate([dynamics.q0, dynamics.v0]), setting.tolerance or 1e-6
 
         def run() -> Outcome:
-            path = follow(dynamics.rate, x0, scene.t0, times, setting.solver, tolerance)
+            states, counts, failure = follow(
+                dynamics.rate, x0, scene.t0, times, setting.solver, tolerance
+            )
             n = len(dynamics.links.bodies)
-            return looked_at(path.states, dynamics.positions, n, path.counts(), path.failure)
+            return looked_at(states, dynamics.positions, n, counts, failure)
 
         return Prepared(run)
-
-    def acceleration_seconds(self, scene: Scene) -> float | None:
-        dynamics = Dynamics(scene)
-        q, v, t = dynamics.q0, dynamics.v0, scene.t0
-        return loop_seconds(lambda: dynamics.acceleration(t, q, v))

@@ -2,13 +2,12 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from dense.system import Dense
-from problems.plain import loop_seconds, why_not
+from problems.plain import why_not
 
-from peers.adapter import Outcome, Peer, Prepared, Setting, tolerances
+from peers.adapter import Outcome, Peer, Prepared, Setting, looked_at, tolerances
 from stmuav_jax import Scene
 
 # Seconds of the clock after which a run is given up. Rows that depend on each other leave a method
@@ -19,21 +18,6 @@ MOST_SECONDS = 20.0
 _PER_STEP = {"RK45": 6, "DOP853": 12}
 
 
-@dataclass(frozen=True)
-class Path:
-    """States at the wanted times (k, m), not a number from where it failed; and counts."""
-
-    states: np.ndarray
-    evaluations: int
-    accepted: int
-    rejected: int
-    failure: str
-
-    def counts(self) -> tuple[int, int, int]:
-        """Evaluations, accepted and rejected steps."""
-        return self.evaluations, self.accepted, self.rejected
-
-
 def follow(
     rate: Callable[[float, np.ndarray], np.ndarray],
     x: np.ndarray,
@@ -41,8 +25,13 @@ def follow(
     times: np.ndarray,
     method: str,
     tolerance: float,
-) -> Path:
-    """Integrate from t0 [s] with rtol = atol = tolerance; steps end at the wanted times."""
+) -> tuple[np.ndarray, tuple[int, int, int], str]:
+    """Integrate from t0 [s] with rtol = atol = tolerance; steps end at the wanted times.
+
+    Returns:
+        States at the wanted times (k, m), not a number from where it failed; evaluations, accepted and
+        rejected steps; why it failed, or nothing.
+    """
     from scipy.integrate import solve_ivp
 
     states, counts, failure = np.full((len(times), len(x)), np.nan), np.zeros(3, int), ""
@@ -69,14 +58,14 @@ def follow(
             break
         states[k] = x
     evaluations, accepted, rejected = map(int, counts)
-    return Path(states, evaluations, accepted, rejected, failure)
+    return states, (evaluations, accepted, rejected), failure
 
 
 class ScipyDense(Peer):
     """The report's method in NumPy and SciPy."""
 
     name = "NumPy, the report's dense system"
-    packages = (("scipy", "scipy"),)
+    packages = (("numpy", "numpy"), ("scipy", "scipy"))
     how = (
         "One dense system per evaluation by numpy.linalg.solve; SciPy's solvers, "
         "rtol = atol = tolerance."
@@ -85,11 +74,6 @@ class ScipyDense(Peer):
         "Planar loops of spatial joints, whose rows are dependent: least squares by numpy.linalg.lstsq.",
         "Not stabilised: constraint violations persist and grow.",
     )
-
-    def version(self) -> str:
-        import scipy
-
-        return f"NumPy {np.__version__}, SciPy {scipy.__version__}"
 
     def unsupported(self, scene: Scene) -> str:
         return why_not(scene)
@@ -102,14 +86,10 @@ class ScipyDense(Peer):
         x0 = dense.start(scene)
 
         def run() -> Outcome:
-            path = follow(dense.rate, x0, scene.t0, times, setting.solver, tolerance)
-            finite = [x for x in path.states if np.all(np.isfinite(x))]
-            gap = max((dense.gap(x) for x in finite), default=None)
-            return Outcome(dense.positions(path.states), *path.counts(), gap, failure=path.failure)
+            states, counts, failure = follow(
+                dense.rate, x0, scene.t0, times, setting.solver, tolerance
+            )
+            look = lambda x: (dense.positions(x), dense.gap(x))
+            return looked_at(states, look, dense.model.n, counts, failure)
 
         return Prepared(run)
-
-    def acceleration_seconds(self, scene: Scene) -> float | None:
-        dense = Dense(scene)
-        x0 = dense.start(scene)
-        return loop_seconds(lambda: dense.accelerations(scene.t0, x0), loops=200)

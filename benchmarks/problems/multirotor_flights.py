@@ -88,19 +88,10 @@ def simulate_flights(seeds, length=40.0, truth=None, settings=(80.0, 30.0)):
     pick = lambda x: np.asarray(x[:, ::EVERY], float)
     ts = np.arange(steps)[::EVERY] * DT
     has_voltage = truth.discharge > 0 or truth.dip > 0
+    voltage = lambda volts: 4.0 * volts if has_voltage else None
     return [
-        FlightRecord(
-            ts,
-            commands,
-            gyroscope,
-            accelerometer,
-            4.0 * volts if has_voltage else None,
-            settings,
-            filter_rate=1 / DT,
-        )
-        for commands, gyroscope, accelerometer, volts in zip(
-            *map(pick, (u, w, f, ratio)), strict=True
-        )
+        FlightRecord(ts, commands, gyro, accel, voltage(volts), settings, filter_rate=1 / DT)
+        for commands, gyro, accel, volts in zip(*map(pick, (u, w, f, ratio)), strict=True)
     ]
 
 
@@ -139,9 +130,8 @@ def _fly(key, pilot, truth, filters):
         decay = jnp.exp(-DT / truth.tau)
         ratio = 1 - truth.discharge * (k / steps - 0.5) - truth.dip * (slow / (4 * hover**2) - 1)
         s_next = decay * s + (1 - decay) * pipe[1] * ratio**truth.voltage_exponent
-        second = jnp.where(
-            truth.second_lag > 0, jnp.exp(-DT / jnp.maximum(truth.second_lag, 1e-9)), 0.0
-        )
+        keep = jnp.exp(-DT / jnp.maximum(truth.second_lag, 1e-9))
+        second = jnp.where(truth.second_lag > 0, keep, 0.0)
         s2_next = second * s2 + (1 - second) * s_next
         spun = jnp.array([0.0, 0.0, -truth.spin_up * jnp.sum(SPIN * (s2_next - s2))])
         # sensors at the beginning of the step
@@ -155,24 +145,20 @@ def _fly(key, pilot, truth, filters):
         moments += jnp.array([truth.speed[0] * vb[1], truth.speed[1] * vb[0], 0.0])
         G, E, spin = truth.gyroscopic, truth.rate_force, jnp.sum(SPIN * s2)
         moments += spin * jnp.array([-G[0] * w[1], G[1] * w[0], 0.0])
-        acceleration = (
-            moments + gust[:3] + ratios * jnp.array([w[1] * w[2], w[0] * w[2], w[0] * w[1]])
-        )
+        products = jnp.array([w[1] * w[2], w[0] * w[2], w[0] * w[1]])
+        acceleration = moments + gust[:3] + ratios * products
         force = jnp.array([0.0, 0.0, truth.thrust * jnp.sum(T)]) - drag * vb + gust[3:]
         force += jnp.array([E[0] * w[1], -E[1] * w[0], 0.0])
         felt = force + jnp.cross(acceleration + spun / DT, imu) + jnp.cross(w, jnp.cross(w, imu))
-        gf, gyro = filtered(
-            gf, w + jnp.asarray(truth.gyro_bias) + truth.gyro_noise * e[:3], filters[0]
-        )
-        ff, accel = filtered(
-            ff, felt + jnp.asarray(truth.force_bias) + truth.force_noise * e[3:6], filters[1]
-        )
+        seen = w + jnp.asarray(truth.gyro_bias) + truth.gyro_noise * e[:3]
+        gf, gyro = filtered(gf, seen, filters[0])
+        felt = felt + jnp.asarray(truth.force_bias) + truth.force_noise * e[3:6]
+        ff, accel = filtered(ff, felt, filters[1])
         # controller: tilt from an ideal attitude, rates from the gyroscope
         roll, pitch = jnp.arctan2(R[2, 1], R[2, 2]), -jnp.arcsin(jnp.clip(R[2, 0], -1, 1))
         M = jnp.asarray(truth.manoeuvres)
-        target = jnp.array(
-            [8 * (M[0] * wish[0] - roll), 8 * (M[1] * wish[1] - pitch), M[2] * wish[2]]
-        )
+        tilts = 8 * (M[0] * wish[0] - roll), 8 * (M[1] * wish[1] - pitch)
+        target = jnp.array([*tilts, M[2] * wish[2]])
         # a slow loop brings the vehicle back
         target += jnp.array([0.6 * vb[1], -0.6 * vb[0], 0.0])
         error = target - gyro
@@ -190,28 +176,15 @@ def _fly(key, pilot, truth, filters):
         pipe = jnp.concatenate([pipe[1:], u[None]])
         slow = slow + DT / 2.0 * (jnp.sum(s2**2) - slow)
         w_next = w + DT * (1.5 * acceleration - 0.5 * dw) + spun
-        R_next = R @ jax.scipy.linalg.expm(
-            DT * _cross(w + 0.5 * DT * acceleration), max_squarings=1
-        )
+        turn = DT * _cross(w + 0.5 * DT * acceleration)
+        R_next = R @ jax.scipy.linalg.expm(turn, max_squarings=1)
         v_next = v + DT * (R @ force - jnp.array([0, 0, GRAVITY]))
         scale = jnp.append(jnp.asarray(truth.gust_moment), jnp.full(3, truth.gust_force))
         gust = wind_keep * gust + jnp.sqrt(1 - wind_keep**2) * scale * e[6:]
         carry = (
-            s_next,
-            s2_next,
-            w_next,
-            R_next,
-            v_next,
-            gust,
-            pipe,
-            gf,
-            ff,
-            integral,
-            u,
-            slow,
-            k + 1,
+            s_next, s2_next, w_next, R_next, v_next, gust, pipe, gf, ff, integral, u, slow, k + 1,
             acceleration,
-        )
+        )  # fmt: skip
         return carry, (u, gyro, accel, ratio)
 
     start = jnp.full(n, hover)

@@ -24,6 +24,9 @@ ROWS = {"translational": 5, "revolute": 5, "universal": 4, "spherical": 3}
 class UnsupportedError(Exception):
     """A scene holds something that our adapters for the peers do not hand over."""
 
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what} is not supported by our adapters.")
+
 
 @dataclass(frozen=True)
 class Sinus:
@@ -142,9 +145,7 @@ def plain(scene: Scene, *, any_couple: bool = False) -> Plain:
     joints = []
     for joint in system.joints:
         if joint.kind not in ROWS:
-            raise UnsupportedError(
-                f"A joint of kind {joint.kind} is not supported by our adapters."
-            )
+            raise UnsupportedError(f"A joint of kind {joint.kind}")
         i, j = index[joint.body_i], index[joint.body_j]
         points = np.asarray(joint.point_i) - com[i], np.asarray(joint.point_j) - com[j]
         frames = np.asarray(joint.frame_i), np.asarray(joint.frame_j)
@@ -193,28 +194,20 @@ def _load(
             joints = scene.system.joints
             number = next(k for k, joint in enumerate(joints) if joint.name == force.joint)
             if joints[number].kind != "translational":
-                raise UnsupportedError(
-                    "A servo in a joint that turns is not supported by our adapters."
-                )
+                raise UnsupportedError("A servo in a joint that turns")
             if callable(force.target):
-                raise UnsupportedError(
-                    "A servo with a moving target is not supported by our adapters."
-                )
+                raise UnsupportedError("A servo with a moving target")
             numbers = float(force.stiffness), float(force.damping), float(force.target)
             return "servos", Servo(number, *numbers)
     kind = type(force).__name__
-    raise UnsupportedError(
-        f"A force of kind {kind}, as used here, is not supported by our adapters."
-    )
+    raise UnsupportedError(f"A force of kind {kind}, as used here,")
 
 
 def _sinus(value: object) -> Sinus:
     if isinstance(value, Sine):
         return Sinus(np.asarray(value.amplitude), float(value.angular_frequency), 0.0)
     if callable(value):
-        raise UnsupportedError(
-            "A force that is a function of the state is not supported by our adapters."
-        )
+        raise UnsupportedError("A force that is a function of the state")
     return Sinus(np.asarray(value, dtype=float), 0.0, 0.5 * np.pi)
 
 

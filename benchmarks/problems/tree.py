@@ -87,9 +87,7 @@ def span(scene: Scene, model: Plain | None = None) -> Tree:
             if parent != body:
                 continue
             if number is None:
-                raise UnsupportedError(
-                    "More than one floating part is not supported by our adapters."
-                )
+                raise UnsupportedError("More than one floating part")
             links.append(_link(model.joints[number], parent, child, carrier[body], forward))
             carrier[child] = len(links) - 1
             grow(child)
@@ -102,8 +100,7 @@ def span(scene: Scene, model: Plain | None = None) -> Tree:
     spatial = all(joint.kind == "spherical" for joint in cuts)
     plane = None if spatial else in_plane(model)
     if plane is None and not spatial:
-        said = "Cutting a spatial loop at a joint that is not spherical is not supported by our adapters."
-        raise UnsupportedError(said)
+        raise UnsupportedError("Cutting a spatial loop at a joint that is not spherical")
     bodies = tuple(carrier[k] for k in range(model.n))
     return Tree(tuple(links), cuts, bodies, plane, tree_parameters(scene.system, spanned))
 
@@ -129,8 +126,7 @@ def in_plane(model: Plain) -> np.ndarray | None:
 def _link(joint: PlainJoint, parent: int, child: int, ahead: int, forward: bool) -> Link:
     ends = Frame(joint.frame_i, joint.point_i), Frame(joint.frame_j, joint.point_j)
     if joint.kind not in KINDS or (joint.kind == "universal" and not forward):
-        said = f"A {joint.kind} joint from its second body to its first is not supported by our adapters."
-        raise UnsupportedError(said)
+        raise UnsupportedError(f"A {joint.kind} joint from its second body to its first")
     first, second = ends if forward else ends[::-1]
     return Link(KINDS[joint.kind], parent, child, ahead, first, second, joint)
 

@@ -97,42 +97,30 @@ def reference(problem: Problem, ours: Ours, size: Size) -> dict[float, np.ndarra
 
 
 def check(rows: list[dict[str, Any]], end: float) -> dict[str, Any]:
-    """How closely independent codes, and our other formulation, meet the reference."""
-    near = [row for row in rows if row["horizon"] == end and row["error"] is not None]
-
-    def best(wanted: Callable[[str], bool]) -> dict[str, Any] | None:
-        found = [row for row in near if wanted(row["method"]) and not row["failure"]]
-        if not found:
-            return None
-        row = min(found, key=lambda row: row["error"])
-        return {k: row[k] for k in ("method", "solver", "tolerance", "error")}
-
-    return {
-        "horizon": end,
-        "second_code": best(lambda name: name.startswith(SECOND_CODES)),
-        "other_formulation": best(lambda name: name.startswith("stmuav-jax, augmented")),
-    }
+    """How closely an independent code meets the reference."""
+    near = [
+        row for row in rows
+        if row["horizon"] == end and row["error"] is not None and not row["failure"]
+        and row["method"].startswith(SECOND_CODES)
+    ]  # fmt: skip
+    best = min(near, key=lambda row: row["error"], default=None)
+    keys = ("method", "solver", "tolerance", "error")
+    return {"horizon": end, "second_code": best and {key: best[key] for key in keys}}
 
 
 def cheapest(rows: list[dict[str, Any]], end: float) -> list[dict[str, Any]]:
-    """For every method the least time that reaches each target, and the ratio to our best."""
-    whole = [row for row in rows if row["error"] is not None and not row["failure"]]
-    good = [row for row in whole if row["horizon"] == end]
-    methods = dict.fromkeys((row["method"], row["solver"]) for row in rows)
-
-    def least(target: float, wanted: Callable[[dict[str, Any]], bool]) -> float | None:
-        fits = (row for row in good if wanted(row) and row["error"] <= target)
-        return min((row["seconds"]["median"] for row in fits), default=None)
-
+    """For every method the least time that reaches each target."""
     table = []
-    for name, solver in methods:
+    for name, solver in dict.fromkeys((row["method"], row["solver"]) for row in rows):
+        good = [
+            row for row in rows
+            if (row["method"], row["solver"], row["horizon"]) == (name, solver, end)
+            and row["error"] is not None and not row["failure"]
+        ]  # fmt: skip
         entry: dict[str, Any] = {"method": name, "solver": solver, "horizon": end}
         for target in TARGETS:
-            key = (name, solver)
-            mine = least(target, lambda row, key=key: (row["method"], row["solver"]) == key)
-            ours = least(target, lambda row: row["method"].startswith("stmuav-jax"))
-            ratio = mine / ours if mine is not None and ours is not None else None
-            entry[f"{target:.0e}"] = {"seconds": mine, "ratio_to_ours": ratio}
+            times = (row["seconds"]["median"] for row in good if row["error"] <= target)
+            entry[f"{target:.0e}"] = {"seconds": min(times, default=None)}
         table.append(entry)
     return table
 
@@ -186,6 +174,6 @@ def published_problems(size: Size, others: list[Peer]) -> dict[str, Any]:
 
 def stiff_variants(size: Size, others: list[Peer]) -> dict[str, Any]:
     """Sliders held by stiff servos, explicit and implicit methods."""
-    problems = stiff(size.horizons[-1])[-size.stiff_problems :]
-    curves = [curve(p, for_stiff(size.stiff_tolerances), others, size) for p in problems]
+    methods = for_stiff(size.stiff_tolerances)
+    curves = [curve(stiff(size.horizons[-1]), methods, others, size)]
     return {"what": "time against error, stiff variants", "curves": curves}

@@ -9,16 +9,16 @@ class Size:
 
     Attributes:
         horizons: [s]. tolerances, stiff_tolerances: from coarse to fine. reference: tolerance of
-            the reference run. methods, problems, scenes: how many; stiff_problems: from the end.
+            the reference run. methods, problems: how many.
         repeats: timed calls, as far as `budget` [s] allows.
-        evaluations: in a loop, to time one. batches: states evaluated together.
+        evaluations: in a loop, to time one.
         trajectories: in one batch, the middle one for all block sizes in `blocks`;
             peer_trajectories: those of peers.
         batch_tolerances: tried for `batch_error` [m] against runs at `tight`.
         loops: of the four-bar chains; run_loops: those that are integrated, too.
         flights: that take a step together, `group` of them side by side; compared: those of which
-            errors are found; inner: steps in a call; machines: how many; closed_loop: length [s].
-        gradient_horizon: [s]. parameters: of the gradient. span: of scenes and hexacopter [s].
+            errors are found; inner: steps in a call; machines: how many.
+        gradient_horizon: [s]. parameters: of the gradient. span: of the hexacopter [s].
     """
 
     horizons: tuple[float, ...] = (0.5, 1.0)
@@ -27,11 +27,9 @@ class Size:
     reference: float = 1e-13
     methods: int = 9
     problems: int = 9
-    stiff_problems: int = 1
     repeats: int = 5
     budget: float = 1.5
     evaluations: int = 5000
-    batches: tuple[int, ...] = (64, 256, 1024)
     trajectories: tuple[int, ...] = (64, 256, 1024)
     blocks: tuple[int, ...] = (16, 64, 256)
     peer_trajectories: int = 64
@@ -49,16 +47,14 @@ class Size:
     group: int = 64
     step_repeats: int = 40
     machines: int = 3
-    closed_loop: float = 30.0
-    scenes: int = 99
     span: float = 2.0
 
 
 FULL = Size()
 ONE = Size(
     horizons=(0.02,), tolerances=(1e-4, 1e-6), stiff_tolerances=(1e-4,), reference=1e-9, methods=1,
-    problems=1, repeats=1, budget=0.1, evaluations=10, batches=(2,), trajectories=(2,), blocks=(2,),
+    problems=1, repeats=1, budget=0.1, evaluations=10, trajectories=(2,), blocks=(2,),
     peer_trajectories=2, batch_tolerances=(1e-6,), tight=1e-9, loops=(1, 2), run_loops=(1,),
-    flights=8, compared=4, inner=2, group=4, step_repeats=1, machines=1, closed_loop=0.0,
-    gradient_horizon=0.02, gradient_tolerances=(1e-6,), parameters=2, scenes=1, span=0.02,
+    flights=8, compared=4, inner=2, group=4, step_repeats=1, machines=1,
+    gradient_horizon=0.02, gradient_tolerances=(1e-6,), parameters=2, span=0.02,
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What one acceleration costs, what a batch of trajectories costs, and how both grow."""
+"""What a batch of trajectories costs, and how time grows with closed loops."""
 
 from functools import partial
 from typing import Any
@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from peers.adapter import Peer
 from problems.compared import chain, disturbed, tracker
-from sections.ours import label
-from sections.precision import distance, reason
+from sections.precision import reason
 from sections.size import Size
 from shared.clock import compile_and_measure, compiled, measure
 from shared.methods import trajectory, words
@@ -22,7 +21,6 @@ from stmuav_jax.dynamics.integration.problem import _get_derivative
 NUDGE = 1e-15
 # A peer's setting that takes longer than this for all its trajectories ends its list [s].
 PATIENCE = 2.0
-NOT_ALONE = "Accelerations alone are not timed in our adapter."
 # Growing chains end where one size took longer than this [s].
 LONGEST = 90.0
 
@@ -34,46 +32,6 @@ def one_after_the_other(derivative: Any, count: int) -> Any:
         return jax.lax.fori_loop(0, count, lambda _, x: x + NUDGE * derivative(x), x)
 
     return run
-
-
-def formulation_cost(formulation: Any, scene: stm.Scene, size: Size) -> list[dict[str, Any]]:
-    """Seconds for one acceleration of one state, and of states in batches."""
-    model = formulation.prepare(scene.system)
-    t = jnp.asarray(scene.t0, float)
-    field = lambda x: _get_derivative(formulation, model, t, x, stm.Unstabilised())[0]
-    to_vector = jax.jit(lambda state: formulation.to_vector(model, state))
-    single = to_vector(scene.state0)
-    rows = []
-    for batch in (1, *size.batches):
-        count = max(1, size.evaluations // batch)
-        x = single if batch == 1 else jax.vmap(to_vector)(disturbed(scene, batch))
-        run = one_after_the_other(field if batch == 1 else jax.vmap(field), count)
-        timing, _, seconds = compile_and_measure(run, x, repeats=size.repeats, budget=5.0)
-        each, spread = (x / (count * batch) for x in (timing.median, timing.spread))
-        rows.append({
-            "method": f"stmuav-jax, {label(formulation)}", "batch": batch, "seconds": each,
-            "spread": spread, "compile_seconds": seconds, "failure": "",
-        })  # fmt: skip
-        print(f"  {rows[-1]['method']} x {batch}: {1e6 * each:.2f} us", flush=True)
-    return rows
-
-
-def acceleration(size: Size, others: list[Peer]) -> dict[str, Any]:
-    """One evaluation of all accelerations, a lower bound of any explicit step."""
-    scene = tracker(size.horizons).scene
-    kinds = (stm.Tree(), stm.Augmented())[: size.methods]
-    rows = [row for formulation in kinds for row in formulation_cost(formulation, scene, size)]
-    for peer in others:
-        row: dict[str, Any] = {"method": peer.name, "batch": 1, "seconds": None, "failure": ""}
-        try:
-            why = peer.unsupported(scene)
-            row["seconds"] = None if why else peer.acceleration_seconds(scene)
-            row["failure"] = why or ("" if row["seconds"] is not None else NOT_ALONE)
-        except Exception as error:
-            row["failure"] = reason(error)
-        rows.append(row)
-        print(f"  {peer.name}: {row['seconds']} {row['failure']}", flush=True)
-    return {"what": "seconds for one acceleration, uav_tracker case 2", "rows": rows}
 
 
 def errors(ends: Any, exact: Any) -> dict[str, float | None]:
@@ -239,21 +197,17 @@ def chain_cost(loops: int, size: Size) -> dict[str, Any]:
     run = partial(trajectory(tree, diffrax.Dopri8()), system)
     timing, path, seconds = compile_and_measure(run, *given, **how)
     fine = bool(path.result == diffrax.RESULTS.successful)
-    # parallel cranks: by symmetry all of them turn alike
-    heights = np.asarray(path.states.r[-1])[: loops + 1, 1:2]
     return row | {
         "run_seconds": timing.to_dict(), "run_compile_seconds": seconds,
         "steps": int(path.counts.accepted[-1] + path.counts.rejected[-1]),
         "residual": float(path.worst.position[-1]), "failure": "" if fine else words(path.result),
-        "cranks_differ": distance(heights, heights[:1] + 0 * heights),
     }  # fmt: skip
 
 
-def exponent(rows: list[dict[str, Any]], key: str, least: int) -> float | None:
-    """k of seconds ~ N^k by least squares over rows with N >= least."""
-    read = lambda row: row[key]["median"] if isinstance(row[key], dict) else row[key]
-    fits = (row for row in rows if row["loops"] >= least and not row["failure"] and row[key])
-    good = np.log([(row["loops"], read(row)) for row in fits])
+def exponent(rows: list[dict[str, Any]], least: int) -> float | None:
+    """k of seconds of a run ~ N^k by least squares over rows with N >= least."""
+    runs = {row["loops"]: row.get("run_seconds") for row in rows if not row["failure"]}
+    good = np.log([(n, x["median"]) for n, x in runs.items() if n >= least and x])
     return float(np.polyfit(good[:, 0], good[:, 1], 1)[0]) if len(good) > 1 else None
 
 
@@ -276,8 +230,7 @@ def scaling(size: Size, others: list[Peer]) -> dict[str, Any]:
         print(f"  N = {loops}: {1e6 * row['acceleration_seconds']:.1f} us, {run}", flush=True)
         if timing.median > LONGEST:
             left = f"left out: N = {loops} took {timing.median:.0f} s"
-    fits = lambda key: {str(least): exponent(rows, key, least) for least in (1, 8)}
     return {
         "what": "N-four-bar chain, tree without dependent rows; run: 1 s, Dopri8 at 1e-6", "rows": rows,
-        "exponents": {"acceleration": fits("acceleration_seconds"), "run": fits("run_seconds")},
+        "exponents": {"run": {"8": exponent(rows, 8)}},
     }  # fmt: skip

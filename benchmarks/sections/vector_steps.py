@@ -1,11 +1,10 @@
-"""Steps of many flights at once, beside crazyflow and rotorpy, and closed loops against real time.
+"""Steps of many flights at once, beside crazyflow and rotorpy.
 
 A step is one control period of 1/400 s with held inputs, from given starts, of all flights in one
-compiled program: of hexacopters and of UAVs with tracker by `Plant.step`, of an environment that
-begins anew after its end by `step_or_reset`, and of each peer's own quadrotor. With the rates stand the errors of one
+compiled program: of hexacopters and of UAVs with tracker by `Plant.step`, and of each peer's own
+quadrotor. With the rates stand the errors of one
 step and of 0.1 s against eight times as many steps of RK4 of the same program in double precision.
-Apart from these, 30 s of the report's case 1 with noisy sensors and the estimator in the loop. Times
-are those of the processor.
+Times are those of the processor.
 
 The peers are in an environment of their own, since crazyflow excludes JAX 0.10.2:
 
@@ -109,14 +108,10 @@ def rated(function: Any, given: tuple[Any, ...], size: Size, inner: int) -> dict
     program, seconds = compiled(function, *given, clock=time.process_time)
     call = lambda: jax.block_until_ready(program(*given))
     row = flying.rate_row(call, size.flights, inner, size.step_repeats)
-    finite = all(bool(jnp.all(jnp.isfinite(x))) for x in numbers_of(call()))
+    numbers = eqx.filter(call(), eqx.is_inexact_array)
+    finite = all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(numbers))
     failure = "" if finite else "Some numbers are not finite."
     return {**row, "compile_seconds": seconds, "failure": failure}
-
-
-def numbers_of(tree: Any) -> list[Any]:
-    """Arrays of floating-point numbers."""
-    return [x for x in jax.tree.leaves(tree) if eqx.is_inexact_array(x)]
 
 
 def poses(machine: dict[str, Any], flights: int, finer: int) -> dict[int, flying.Poses]:
@@ -142,40 +137,6 @@ def ours(size: Size) -> Iterator[dict[str, Any]]:
         for inner, group in ((1, size.flights), (size.inner, size.flights), (1, size.group)):
             row = rated(steps(plant, inner, group), (now, inputs), size, inner)
             yield {**RK4, "machine": name, "side_by_side": group, **row, **wrong}
-    yield {**RK4, **trained(size)}
-
-
-def observe(now: Any) -> Any:
-    """Position, Euler parameters, velocity and angular velocity of the first body (13,)."""
-    state = now.state
-    return jnp.concatenate([x[0] for x in (state.r, state.p, state.v, state.omega)])
-
-
-def step_or_reset(plant: Any, episode: Any, inputs: Any) -> Any:
-    """State, observation, reward and end one period later, or of a new start where the episode is over."""
-    now, _, _, is_over = episode
-    begun, after = plant.reset(now.key), plant.step(now, inputs)
-    now = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), begun, after)
-    seen = observe(now)
-    reward = jnp.where(is_over, 0.0, -jnp.sum(seen[:3] ** 2))
-    return now, seen, reward, (jnp.sum(seen[:3] ** 2) > 100.0) | (now.k >= 400)
-
-
-def trained(size: Size) -> dict[str, Any]:
-    """Row of a training environment: a hexacopter's step, observation, reward and new start."""
-    plant, _, inputs = ready(MACHINES["hexacopter"], size.flights)
-
-    def begin(key: Any) -> Any:
-        now = plant.reset(key)
-        return now, observe(now), jnp.zeros(()), jnp.zeros((), bool)
-
-    keys = jax.random.split(jax.random.key(0), size.flights)
-    begun = stm.math.outer_jit(lambda keys: jax.vmap(begin)(keys))(keys)
-    step = lambda episodes, inputs: jax.vmap(lambda e, u: step_or_reset(plant, e, u))(
-        episodes, inputs
-    )
-    row = rated(step, (begun, inputs), size, 1)
-    return {"machine": "environment of a hexacopter", "side_by_side": size.flights, **row}
 
 
 def of_peer(name: str, size: Size) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -203,32 +164,11 @@ def of_peer(name: str, size: Size) -> tuple[dict[str, Any], list[dict[str, Any]]
     return about, rows
 
 
-def closed(t1: float) -> dict[str, Any]:
-    """Seconds of processor time of a flight of case 1, of its program and of flying it again."""
-    mission = stm.missions.load_mission("case-1", t1=t1)
-    clock = time.process_time()
-    flight = stm.missions.fly(mission)
-    first = time.process_time() - clock
-    spent = []
-    for _ in range(3):
-        clock = time.process_time()
-        flight = stm.missions.fly(mission)
-        spent.append(time.process_time() - clock)
-    data = stm.missions.to_data(flight)
-    seconds = float(np.median(spent))
-    return {
-        "mission": "case-1", "t1": t1, "first_flight_seconds": first, "seconds": seconds,
-        "spent": spent, "times_real_time": t1 / seconds,
-        "largest_position_error": float(np.max(np.linalg.norm(data.position_error.values, axis=1))),
-    }  # fmt: skip
-
-
 def vector_steps(size: Size, there: list[Peer]) -> dict[str, Any]:
     """The section; other programs are run if the suite compares at all."""
     content: dict[str, Any] = {
         "what": f"{size.flights} flights in one call, one control period of 1/{flying.RATE:g} s each, on one core",
         "horizon": flying.HORIZON / flying.RATE, "peers": [], "skipped": [], "rows": [],
-        "closed_loops": [],
     }  # fmt: skip
     for name in PEERS if there else ():
         about, rows = of_peer(name, size)
@@ -237,6 +177,4 @@ def vector_steps(size: Size, there: list[Peer]) -> dict[str, Any]:
     for row in ours(size):
         print(row, flush=True)
         content["rows"].append(row)
-    if size.closed_loop:
-        content["closed_loops"] = [closed(size.closed_loop)]
     return content

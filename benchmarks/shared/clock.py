@@ -8,16 +8,13 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 
 import stmuav_jax as stm
-
-# A call that `timed` measures is not repeated once this much is spent on it [s of the clock].
-BUDGET = 1.0
 
 
 @dataclass(frozen=True)
@@ -37,15 +34,6 @@ class Timing:
     to_dict = asdict
 
 
-@dataclass(frozen=True)
-class Cost:
-    """Seconds of the processor and of the clock."""
-
-    processor: Timing
-    clock: Timing
-    to_dict = asdict
-
-
 def summary(seconds: list[float]) -> Timing:
     """Median, best and spread of measured seconds."""
     ordered = sorted(seconds)
@@ -56,7 +44,12 @@ def summary(seconds: list[float]) -> Timing:
 
 
 def measure(
-    call: Callable[[], Any], *, repeats: int = 5, warm_up: int = 1, budget: float = 20.0
+    call: Callable[[], Any],
+    *,
+    repeats: int = 5,
+    warm_up: int = 1,
+    budget: float = 20.0,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> tuple[Timing, Any]:
     """Time `call`, and return its last output.
 
@@ -68,24 +61,14 @@ def measure(
         output = jax.block_until_ready(call())
     seconds: list[float] = []
     while len(seconds) < repeats and (not seconds or sum(seconds) < budget):
-        start = time.perf_counter()
+        start = clock()
         output = jax.block_until_ready(call())
-        seconds.append(time.perf_counter() - start)
+        seconds.append(clock() - start)
     return summary(seconds), output
 
 
-def timed(call: Callable[..., Any], *arguments: Any, repeats: int = 3) -> tuple[Cost, Any]:
-    """Cost and output of a compiled call; slow calls are made once."""
-    seconds: list[float] = []
-
-    def once() -> Any:
-        start = time.process_time()
-        output = jax.block_until_ready(call(*arguments))
-        seconds.append(time.process_time() - start)
-        return output
-
-    clock, output = measure(once, repeats=repeats, warm_up=0, budget=BUDGET)
-    return Cost(summary(seconds), clock), output
+# Of a compiled call, on the processor; slow calls are made once.
+measure_processor = partial(measure, repeats=3, warm_up=0, budget=1.0, clock=time.process_time)
 
 
 def compiled(
@@ -115,8 +98,3 @@ def rounded(value: Any, digits: int = 4) -> Any:
     """Significant digits of an array as a list, for JSON; what is not finite as None."""
     flat = [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in np.ravel(value)]
     return flat if np.ndim(value) else flat[0]
-
-
-def ready(tree: Any) -> Any:
-    """All arrays as NumPy arrays."""
-    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)

@@ -1,45 +1,21 @@
-"""Markdown tables and figures of the benchmarks' pages, which hold only what JSON records say."""
+"""Numbers, tables and figures of the benchmarks' pages, which hold only what JSON records say."""
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from stmuav_jax.figures import grid, save_figures
+from stmuav_jax.figures import grid
 
-Lines = list[str]
 Row = dict[str, Any]
-# A column: the key that is also its head; or head and key; or head, key and format. A format with
-# no key is given the whole row.
-Column = str | tuple[Any, ...]
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> Lines:
+def table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
     """A Markdown table."""
     cell = lambda x: str(x).replace("|", "/").replace("\n", " ")
     line = lambda cells: "| " + " | ".join(cell(x) for x in cells) + " |"
-    return [line(head), line(["---"] * len(head)), *(line(row) for row in rows)]
-
-
-def listed(rows: Sequence[Row], *columns: Column) -> Lines:
-    """A Markdown table of records, column by column."""
-
-    def cell(row: Row, column: Column) -> Any:
-        if isinstance(column, str):
-            return row[column]
-        _, key, *form = column
-        if not form:
-            return row[key]
-        return form[0](row if key is None else row.get(key))
-
-    head = [column if isinstance(column, str) else column[0] for column in columns]
-    return table(head, [[cell(row, column) for column in columns] for row in rows])
-
-
-def titled(title: str, rows: Sequence[Row], *columns: Column) -> str:
-    """A table of records under its title, as text."""
-    return "\n".join([title, "", *listed(rows, *columns)])
+    head = list(head)
+    return "\n".join([line(head), line(["---"] * len(head)), *map(line, rows)])
 
 
 def number(value: float | None, unit: float = 1.0, digits: int = 3) -> str:
@@ -57,6 +33,37 @@ def power(value: float | None, behind: int = 1) -> str:
     return "-" if value is None else f"{value:.{behind}e}"
 
 
+def duration(seconds: float | None) -> str:
+    """Three digits, in ms below a second."""
+    if seconds is None:
+        return "not reached"
+    return f"{1e3 * seconds:.3g} ms" if seconds < 1 else f"{seconds:.3g} s"
+
+
+def holds(row: Row) -> bool:
+    """True if a hard case reached its end with the error that is demanded."""
+    return row["result"] == "successful" and bool(row["reached"] <= row["demanded"])
+
+
+def describe_scene(scene: Row) -> str:
+    """A stiff scene in words, with the stiffness and the damping of its servos."""
+    if scene["stiffness"]:
+        return f"servo {scene['stiffness']:.0e} N/m, {scene['damping']:,g} N s/m"
+    return "no force on the sliders" if scene["name"] == "free" else scene["name"]
+
+
+def comparable(content: Row) -> list[Row]:
+    """Each program's fastest setting whose largest error is at most twice ours."""
+    most, best = 2 * content["tried"][-1]["largest_error"], {}
+    for row in content["peers"]:
+        error, name = row.get("largest_error"), row["method"]
+        if error is None or not error <= most:
+            continue
+        if name not in best or row["per_second"] > best[name]["per_second"]:
+            best[name] = row
+    return list(best.values())
+
+
 def panels(rows: int, columns: int, height: float, **shared: Any) -> tuple[Figure, list[Any]]:
     """A figure of the library's style with so many panels, row by row; its height in inches."""
     figure, axes = grid(rows, columns, height, **shared)
@@ -71,11 +78,3 @@ def legend(figure: Figure, axes: Sequence[Any], columns: int, size: float = 8, *
             lines.setdefault(label, line)
     how = {"loc": "outside lower center", "handlelength": 3, "title_fontsize": size} | how
     figure.legend(lines.values(), lines.keys(), ncols=columns, fontsize=size, **how)
-
-
-def save(figures: dict[str, Figure], folder: Path) -> list[Path]:
-    """Write figures as PNG under their names, for print; returns their paths."""
-    for ax in (ax for figure in figures.values() for ax in figure.axes):
-        for text in (ax.title, ax.xaxis.label, ax.yaxis.label):
-            text.set_fontsize(9)
-    return save_figures(figures, folder, dpi=160)

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dense.steps import Limits, Scheme, integrate
+from dense.steps import Scheme, integrate
 from dense.system import Dense
 from dense.tables import Variant, g_and_l
 from helpers import evaluated
@@ -85,5 +85,5 @@ def test_every_run_ends():
         history = integrate(blow_up, np.array([1.0, 0.0]), times, scheme)
         assert history.failure
         assert 0.8 < history.stopped_at < 1.2
-    few = integrate(lambda t, y: -y, np.ones(2), times, Scheme("ode45"), Limits(evaluations=8))
+    few = integrate(lambda t, y: -y, np.ones(2), times, Scheme("ode45"), 8)
     assert few.failure == "8 evaluations"

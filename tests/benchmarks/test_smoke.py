@@ -1,4 +1,4 @@
-"""Benchmark scripts at their smallest size: each leaves a complete record, and figures or a page."""
+"""Benchmark scripts at their smallest size: each leaves a complete record, of which figures and pages are made."""
 
 import itertools
 import json
@@ -6,7 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import report
 from problems.multirotor_flights import VALUES
+from sections.figures import draw_figures
 from shared.record import RESULTS
 
 pytestmark = pytest.mark.slow
@@ -37,13 +39,14 @@ def test_batch_sizes(run_script):
 
 
 def test_machine_code(run_script, tmp_path):
-    record = run_script("machine_code", "--quick", "--figures", str(tmp_path))
+    record = run_script("machine_code")
     for operations in record["operations"].values():
         assert 0 < operations["left"] < 0.7 * operations["traced"]
     for row in (*record["rows"], *record["flights"]):
         assert row["difference"] <= 1e-9
     assert len(record["rows"]) == 4
-    assert (tmp_path / "machine_code.png").stat().st_size > 5000
+    (figure,) = draw_figures(tmp_path, tmp_path)
+    assert figure.stat().st_size > 5000
 
 
 def test_errors(run_script):
@@ -64,7 +67,7 @@ def test_failure(run_script):
 
 
 def test_long_horizon(run_script, tmp_path):
-    (problem,) = run_script("long_horizon", "--quick", "--figures", str(tmp_path))["problems"]
+    (problem,) = run_script("long_horizon")["problems"]
     assert len(problem["runs"]) == 2
     for row in problem["runs"]:
         assert row["completed"]
@@ -73,11 +76,11 @@ def test_long_horizon(run_script, tmp_path):
     coarse, fine = problem["runs"]
     assert fine["largest"] < coarse["largest"]
     assert fine["evaluations"] > coarse["evaluations"]
-    assert len(list(tmp_path.glob("*.png"))) == 3
+    assert len(draw_figures(tmp_path, tmp_path)) == 3
 
 
 def test_stiff(run_script, tmp_path):
-    record = run_script("stiff", "--quick", "--figures", str(tmp_path))
+    record = run_script("stiff")
     soft, hard = record["scenes"]
     # one sliding body of m = 1 kg: |eigenvalue| = sqrt(k / m) where the damping is light
     assert soft["eigenvalue"]["start"] == pytest.approx(np.sqrt(soft["stiffness"]), rel=1e-3)
@@ -85,25 +88,22 @@ def test_stiff(run_script, tmp_path):
     for scene in (soft, hard):
         assert max(scene["reference"]["kvaerno5_apart"]) <= 1e-10
         assert all(row["completed"] and row["error"] <= 1e-6 for row in scene["runs"])
-    assert record["crossover"]["1e-06"]
-    assert len(list(tmp_path.glob("*.png"))) == 2
+        assert scene["cheapest"]["1e-06"]["explicit_over_implicit"] > 0
+    assert len(draw_figures(tmp_path, tmp_path)) == 2
 
 
 # Section of the suite -> keys of its record, and keys of its first row. The others time programs that
-# other tests compile: accelerations those of `scaling`, curves those of `published`, gradients those of
-# tests/laws/test_gradients.py.
+# other tests compile: curves those of `published`, gradients those of tests/laws/test_gradients.py.
 SECTIONS = {
     "scaling": ({"rows", "exponents"}, {"loops", "acceleration_seconds", "run_seconds"}),
-    "vector_steps": ({"rows", "closed_loops"}, {"machine", "per_second", "position_error_many"}),
-    "scenes": ({"rows"}, {"scene", "seconds", "accepted", "residual"}),
+    "vector_steps": ({"rows", "horizon"}, {"machine", "per_second", "position_error_many"}),
     "published": ({"curves"}, {"problem", "rows", "references", "cheapest", "failure"}),
 }
 
 
 def test_suite(run_script, tmp_path):
     """Every record is complete, nothing failed, and the page shows what there is."""
-    page = tmp_path / "docs" / "benchmarks.md"
-    arguments = ("--size", "one", "--no-peers", "--page", str(page), "--only", *SECTIONS)
+    arguments = ("--size", "one", "--no-peers", "--only", *SECTIONS)
     run_script("suite", *arguments, record="suite_scaling")
     for name, (keys, first) in SECTIONS.items():
         record = json.loads((tmp_path / f"suite_{name}.json").read_text())
@@ -113,9 +113,9 @@ def test_suite(run_script, tmp_path):
         assert first <= set(rows[0])
         for row in [*rows, *(point for curve in rows for point in curve.get("rows", []))]:
             assert row["failure"] == ""
-    text = page.read_text()
-    # the scenes have no table, and the provenance stands at the end
-    assert text.count("\n## ") == len(SECTIONS)
+    text = report.build(tmp_path, tmp_path / "benchmarks.md").read_text()
+    # the provenance stands at the end
+    assert text.count("\n## ") == len(SECTIONS) + 1
     assert all(f"suite_{name}.json" in text for name in SECTIONS)
     assert "smallest size" in text
 

@@ -1,10 +1,8 @@
-"""The stiff benchmark: its scenes, its reading of the crossover, its smoke test."""
+"""The scenes of the stiff benchmark."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-import stiff
 from stiff import FREE, SCENES, as_given
 
 import stmuav_jax as stm
@@ -34,26 +32,3 @@ def test_elements_that_are_not_there_do_nothing():
         load = force.load(jnp.asarray(0.1), kin)
         assert not np.any(load.force)
         assert not np.any(load.moment)
-
-
-def scene(stiffness, eigenvalue, ratio):
-    best = {"explicit_over_implicit": ratio}
-    return {"name": f"{stiffness:g}", "stiffness": stiffness, "damping": 0.0,
-            "eigenvalue": {"start": eigenvalue}, "cheapest": {"1e-06": best}}  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("ratios", "up_to", "since"),
-    [
-        ((0.1, 0.5, 2.0), "20", "30"),
-        ((0.1, 0.5, 0.9), "30", None),
-        ((1.5, 2.0, 3.0), None, "10"),
-        ((0.1, 2.0, 0.5), "10", None),
-    ],
-)
-def test_crossover(ratios, up_to, since):
-    """Explicit up to the last before implicit first pays; implicit from where it always does."""
-    rows = [scene(10.0 * (i + 1), 100.0 * i, ratio) for i, ratio in enumerate(ratios)]
-    found = stiff.crossover([scene(0.0, 0.0, 5.0), *reversed(rows)], 1e-6)
-    assert (found["explicit_up_to"] or {}).get("name") == up_to
-    assert (found["implicit_from"] or {}).get("name") == since

@@ -1,6 +1,6 @@
 """Hard cases: each reaches its end, with the error demanded, and knows how large its error is.
 
-The cases and what they are compared with are those of `benchmarks/problems/hard.py` and `hard_loops.py`.
+The cases and what they are compared with are those of `benchmarks/problems/hard.py`.
 """
 
 from types import SimpleNamespace
@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hard import EVERY, beside, holds, row_of, singular_start, sweep
+from hard import beside, row_of, singular_start, sweep
 from peers.adapter import Outcome, Prepared, Setting
-from problems.hard import TOLERANCES, Hard, apart, on_rail
-from problems.hard_loops import STARTS
+from problems.hard import CASES, STARTS, TOLERANCES, Hard, apart, on_rail
+from shared.pages import holds
 
 import stmuav_jax as stm
 
@@ -23,7 +23,7 @@ ROUND_OFF = 1e-12
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize("case", EVERY, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_a_hard_case(case: Hard):
     """The tracker for the first two of its ten minutes; `benchmarks/hard.py` goes to their end."""
     if case.name.startswith("ten minutes"):
@@ -37,7 +37,7 @@ def test_a_hard_case(case: Hard):
 
 def test_the_tracker_may_neither_open_nor_lose_energy():
     """In ten minutes at 1e-11: joints within 1e-10 m, energy within 1e-8 of itself."""
-    case = next(one for one in EVERY if one.name == "ten minutes of the tracker")
+    case = next(one for one in CASES if one.name == "ten minutes of the tracker")
     assert (case.demanded, case.unit, case.method["rtol"]) == (1e-8, "relative", 1e-11)
 
     def run(open_by: float) -> Any:
