@@ -42,13 +42,8 @@ _OF_JOINTS = ("joint_point_i", "joint_point_j", "joint_frame_i", "joint_frame_j"
 
 # Variables that have plots of their own, and the largest number of curves of any other.
 _SHOWN = (
-    "kinetic_energy",
-    "potential_energy",
-    "work",
-    "rotor_thrust",
-    "reaction_force",
-    "reaction_moment",
-)
+    "kinetic_energy", "potential_energy", "work", "rotor_thrust", "reaction_force", "reaction_moment",
+)  # fmt: skip
 _MOST_CURVES = 12
 
 Curves = list[dict[str, Any]]
@@ -70,39 +65,55 @@ def content_of(
     """
     check_viewable(run)
     # A browser holds a few thousand poses of many bodies with ease, but not a million.
-    time_indices, note = _shown_times(run)
+    time_indices, count, note = finite_times(run), run.sizes["time"], ""
+    if len(time_indices) < count:
+        note = f"{count - len(time_indices)} of {count} saved times are not finite and left out. "
+    if len(time_indices) > MOST_TIMES:
+        some = np.unique(np.round(np.linspace(0, len(time_indices) - 1, MOST_TIMES)).astype(int))
+        note += f"{MOST_TIMES} of {len(time_indices)} saved times are shown."
+        time_indices = time_indices[some]
     run = run.isel(time=time_indices)
     names = [str(name) for name in run["body"].values]
-    custom_shapes = dict(shapes or {})
+    custom_shapes: dict[str, Sequence[Shape]] = dict(shapes or {})
     for name in custom_shapes:
         if name not in names:
             raise SettingError(f"There is no body '{name}' to draw.{nearest_names(name, names)}")
-    towards = None if sun is None else _sun_direction(sun)
+    solids_by_body = {name: body_shapes(run, name) for name in names} | custom_shapes
+    rotors = None
+    if "rotor_thrust" in run:
+        carriers = [str(name) for name in run["rotor_body"].values]
+        points = [point for body in dict.fromkeys(carriers) for point in rotor_points(run, body)]
+        rotors = {
+            "bodies": carriers, "positions": np.array(points).tolist(), "spin": run["rotor_spin"].values.tolist(),
+            "speed": encode_array(run["rotor_speed"].values),
+            "thrust": encode_array(run["rotor_thrust"].values),
+        }  # fmt: skip
+    optional = lambda name: encode_array(run[name].values) if name in run else None
+    towards = None
+    if sun is not None:
+        sun_vector = np.asarray(check_vector(sun, "The direction of the sun", ""))
+        length = float(np.linalg.norm(sun_vector))
+        if length == 0:
+            raise SettingError(
+                "The direction of the sun has zero length; give any vector towards it."
+            )
+        towards = sun_vector / length
     return {
         "title": str(run.attrs.get("title", "")) or str(run.attrs.get("scene", "")) or "Motion",
-        "note": note,
+        "note": note.strip(),
         # Times in double precision: a late one in single precision loses the digits that tell frames apart.
         # Poses in single precision halve the page.
         "times": encode_array(run["time"].values, "<f8"),
         "positions": encode_array(run["position"].values),
         "orientations": encode_array(run["euler_parameters"].values),
         "bodies": [
-            {
-                "name": name,
-                "shapes": [
-                    shape.to_dict() for shape in custom_shapes.get(name, body_shapes(run, name))
-                ],
-            }
-            for name in names
+            {"name": name, "shapes": [shape.to_dict() for shape in solids]}
+            for name, solids in solids_by_body.items()
         ],
         "joints": [joint_of(run, k) for k in range(run.sizes.get("joint", 0))],
-        "reactions": encode_array(run["reaction_force"].values)
-        if "reaction_force" in run
-        else None,
-        "reference": encode_array(run["reference_position"].values)
-        if "reference_position" in run
-        else None,
-        "rotors": _rotor_data(run),
+        "reactions": optional("reaction_force"),
+        "reference": optional("reference_position"),
+        "rotors": rotors,
         "sun": None if towards is None else towards.tolist(),
         "watch": watched_bodies(run),
         "size": machine_size(run),
@@ -129,9 +140,8 @@ def encode_array(values: Any, kind: str = "<f4") -> str:
 
 def finite_times(run: xr.Dataset) -> Int[np.ndarray, " k"]:
     """Indices of the saved times at which all poses are finite; `FileError` if there is none."""
-    finite = np.all(np.isfinite(run["position"].values), axis=(1, 2))
-    finite &= np.all(np.isfinite(run["euler_parameters"].values), axis=(1, 2))
-    finite_indices = np.flatnonzero(finite)
+    poses = np.concatenate([run["position"].values, run["euler_parameters"].values], axis=2)
+    finite_indices = np.flatnonzero(np.all(np.isfinite(poses), axis=(1, 2)))
     if not len(finite_indices):
         raise FileError(
             f"The run of scene '{run.attrs.get('scene', '')}' has no saved time at which all poses are "
@@ -158,33 +168,12 @@ def interpolate_poses(
         )
     ts, p = run["time"].values[finite], run["euler_parameters"].values[finite]
     # Between saved times bodies turn along the shortest arc; a mean of Euler parameters is no rotation.
-    turns = (Slerp(ts, Rotation.from_quat(p[:, n, [1, 2, 3, 0]])) for n in range(p.shape[1]))
+    turns = (Slerp(ts, Rotation.from_quat(q, scalar_first=True)) for q in np.moveaxis(p, 1, 0))
     k = np.clip(np.searchsorted(ts, times, side="right") - 1, 0, len(ts) - 2)
     share = ((times - ts[k]) / (ts[k + 1] - ts[k]))[:, None, None]
     r = run["position"].values[finite]
     R_wb = np.stack([turn(times).as_matrix() for turn in turns], axis=1)
     return (1 - share) * r[k] + share * r[k + 1], R_wb
-
-
-def _shown_times(run: xr.Dataset) -> tuple[np.ndarray, str]:
-    """Indices of the saved times that are shown, and a sentence about the others."""
-    time_indices, count = finite_times(run), run.sizes["time"]
-    note = ""
-    if len(time_indices) < count:
-        note = f"{count - len(time_indices)} of {count} saved times are not finite and left out. "
-    if len(time_indices) > MOST_TIMES:
-        some = np.unique(np.round(np.linspace(0, len(time_indices) - 1, MOST_TIMES)).astype(int))
-        note += f"{MOST_TIMES} of {len(time_indices)} saved times are shown."
-        time_indices = time_indices[some]
-    return time_indices, note.strip()
-
-
-def _sun_direction(sun: Numbers) -> Float[np.ndarray, "3"]:
-    sun_vector = np.asarray(check_vector(sun, "The direction of the sun", ""))
-    length = float(np.linalg.norm(sun_vector))
-    if length == 0:
-        raise SettingError("The direction of the sun has zero length; give any vector towards it.")
-    return sun_vector / length
 
 
 def watched_bodies(run: xr.Dataset) -> list[str]:
@@ -210,9 +199,8 @@ def _body_poses(run: xr.Dataset, body: str) -> tuple[Any, Any]:
     if body == GROUND:
         return np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3))
     k = list(run["body"].values).index(body)
-    e = run["euler_parameters"].values[:, k]
-    rotation_matrices = Rotation.from_quat(e[:, [1, 2, 3, 0]]).as_matrix()
-    return run["position"].values[:, k], rotation_matrices
+    R = Rotation.from_quat(run["euler_parameters"].values[:, k], scalar_first=True).as_matrix()
+    return run["position"].values[:, k], R
 
 
 def joint_of(run: xr.Dataset, k: int) -> dict[str, Any]:
@@ -236,19 +224,6 @@ def joint_displacement(run: xr.Dataset, k: int) -> Float[np.ndarray, " t"]:
     """Displacement of a joint's point on body j along the axis on body i (t,) [m]."""
     motion = motion_of(run)
     return displacement_of(motion, motion.joints[k])
-
-
-def _rotor_data(run: xr.Dataset) -> dict[str, Any] | None:
-    if "rotor_thrust" not in run:
-        return None
-    at, bodies = [], [str(name) for name in run["rotor_body"].values]
-    for body in dict.fromkeys(bodies):
-        at += rotor_points(run, body).tolist()
-    return {
-        "bodies": bodies, "positions": at, "spin": run["rotor_spin"].values.tolist(),
-        "speed": encode_array(run["rotor_speed"].values),
-        "thrust": encode_array(run["rotor_thrust"].values),
-    }  # fmt: skip
 
 
 def machine_size(run: xr.Dataset) -> float:
@@ -423,8 +398,10 @@ def dataset_of(run: Run | LoopRun | xr.Dataset | str | os.PathLike[str]) -> xr.D
         return loop_to_dataset(run)
     path = Path(run)
     if path.is_dir():
-        path = next(
-            (path / n for n in ("run.nc", "flight.nc") if (path / n).exists()), path / "run.nc"
+        path /= (
+            "run.nc"
+            if (path / "run.nc").exists() or not (path / "flight.nc").exists()
+            else "flight.nc"
         )
     return load(path)
 

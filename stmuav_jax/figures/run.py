@@ -273,17 +273,8 @@ def _plot_logarithmic(
 # --- reaction loads
 
 
-class SavedLoads(NamedTuple):
-    """Reaction loads in NumPy arrays, as in `JointLoads`: times (k,), force and moment (k, joints, 3)."""
-
-    ts: np.ndarray
-    force: np.ndarray
-    moment: np.ndarray
-    joints: tuple[str, ...]
-
-
-def saved_loads(data: "xr.Dataset") -> SavedLoads | None:
-    """Reaction loads at the saved times of a saved run; None where its file has none."""
+def saved_loads(data: "xr.Dataset") -> JointLoads | None:
+    """Reaction loads at the saved times of a saved run, in NumPy arrays; None where its file has none."""
     if "reaction_force" not in data or not data.sizes["joint"]:
         return None
     motion = motion_of(data)
@@ -291,20 +282,17 @@ def saved_loads(data: "xr.Dataset") -> SavedLoads | None:
     # components along the columns of each frame
     # Bearings are sized in their own axes, and files hold loads in those of the world.
     in_joint_axes = lambda name: np.einsum("kjab,kja->kjb", frames, data[name].values)
-    names = tuple(joint.name for joint in motion.joints)
-    return SavedLoads(
-        motion.ts, in_joint_axes("reaction_force"), in_joint_axes("reaction_moment"), names
-    )
+    names, ts = tuple(joint.name for joint in motion.joints), motion.ts
+    parts: Any = (ts, in_joint_axes("reaction_force"), in_joint_axes("reaction_moment"))
+    return JointLoads(*parts, names)
 
 
 def loads_figure(scene: Scene, loads: JointLoads) -> Figure:
     """Figure of the magnitudes of force and moment at every joint over time."""
-    names = tuple(joint.name for joint in scene.system.joints)
-    ts, force, moment = (np.asarray(x) for x in (loads.ts, loads.force, loads.moment))
-    return draw_loads(scene.title, SavedLoads(ts, force, moment, names))
+    return draw_loads(scene.title, loads)
 
 
-def draw_loads(title: str, loads: SavedLoads) -> Figure:
+def draw_loads(title: str, loads: JointLoads) -> Figure:
     """Figure of `loads_figure` of loads in memory or of `saved_loads`.
 
     The joints with the largest peaks are drawn, with a curve each. Impacts exceed the usual loads by orders
@@ -313,7 +301,7 @@ def draw_loads(title: str, loads: SavedLoads) -> Figure:
     figure, axes = grid(2, 1, 5.6, sharex=True)
     labels = ("force [N]", "moment [N m]")
     for ax, parts, label in zip(axes[:, 0], (loads.force, loads.moment), labels, strict=True):
-        _plot_magnitudes(ax, loads, np.linalg.norm(parts, axis=-1))
+        _plot_magnitudes(ax, loads, np.linalg.norm(np.asarray(parts), axis=-1))
         ax.set_ylabel(label, fontsize=9)
     axes[1, 0].set_xlabel("time [s]", fontsize=9)
     figure.align_ylabels(axes[:, 0])
@@ -321,7 +309,7 @@ def draw_loads(title: str, loads: SavedLoads) -> Figure:
     return figure
 
 
-def _plot_magnitudes(ax: Axes, loads: SavedLoads, magnitude: np.ndarray) -> None:
+def _plot_magnitudes(ax: Axes, loads: JointLoads, magnitude: np.ndarray) -> None:
     """Curves of magnitudes (k, joints) of the joints with the largest peaks, in the order of the joints."""
     peaks = np.nanmax(np.where(np.isfinite(magnitude), magnitude, 0.0), axis=0, initial=0.0)
     loaded = np.flatnonzero(peaks > NOTHING)
@@ -333,7 +321,7 @@ def _plot_magnitudes(ax: Axes, loads: SavedLoads, magnitude: np.ndarray) -> None
     for k in drawn_joints:
         # a joint keeps its style in both panels; marks would hide the peaks
         style: Any = look(int(k)) | {"marker": ""}
-        ax.plot(loads.ts, magnitude[:, k], label=loads.joints[k], **style)
+        ax.plot(np.asarray(loads.ts), magnitude[:, k], label=loads.joints[k], **style)
     ax.set_yscale("log")
     top = 10 ** np.ceil(np.log10(peaks[drawn_joints].max()))
     ax.set_ylim(max(1e-4 * top, 0.5 * float(np.nanmin(magnitude[:, drawn_joints]))), top)

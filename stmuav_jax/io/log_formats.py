@@ -170,10 +170,9 @@ class LogDraft:
         ]
         # Firmwares log the same quantity in several messages at different rates; a slow copy is taken only
         # without a fast one.
-        counts = [len(self.topics[source.topic].stamps) for source in available]
-        return next(
-            (s for s, n in zip(available, counts, strict=True) if 2 * n >= max(counts)), None
-        )
+        count = lambda source: len(self.topics[source.topic].stamps)
+        most = max(map(count, available), default=0)
+        return next((source for source in available if 2 * count(source) >= most), None)
 
 
 def _decode_ulog(source: Path, data: bytes) -> LogDraft:
@@ -186,14 +185,12 @@ def _decode_ulog(source: Path, data: bytes) -> LogDraft:
         ) from None
     # A log that ends with the battery is truncated: what was written before is whole, and is read.
     draft, reader = LogDraft("PX4 ULog", is_down=True), _CutReader(data)
-    names = sorted(
-        {row.topic for row in _ULOG} | {"actuator_motors", "actuator_outputs", "esc_status"}
-    )
+    names = {row.topic for row in _ULOG} | {"actuator_motors", "actuator_outputs", "esc_status"}
     states = ["actuator_armed", "vehicle_land_detected", "vehicle_status"]
     with contextlib.redirect_stdout(io.StringIO()):
         try:
             # Only the topics that are used are decoded; a log has many others.
-            log = pyulog.ULog(reader, [*names, *states])
+            log = pyulog.ULog(reader, [*sorted(names), *states])
         # a damaged head can fail in any of its parts
         except Exception as error:
             raise FileError(
@@ -364,11 +361,8 @@ def _px4_motors(draft: LogDraft, parameters: Mapping[str, Any]) -> list[LogSourc
     topic = draft.topics.get("actuator_outputs")
     if draft.refusals or not topic:
         return []
-    functions = {
-        int(parameters.get(f"PWM_MAIN_FUNC{k + 1}", 0)) - 101: k
-        for k in range(16)
-        if 101 <= int(parameters.get(f"PWM_MAIN_FUNC{k + 1}", 0)) <= 112
-    }
+    function_of = lambda k: int(parameters.get(f"PWM_MAIN_FUNC{k + 1}", 0))
+    functions = {function_of(k) - 101: k for k in range(16) if 101 <= function_of(k) <= 112}
     count = _ROTORS.get(int(parameters.get("MAV_TYPE", 0)), 0)
     # Outputs are in the order of the pins, motors in that of their functions: the second is the
     # order of the rotors' positions.
@@ -502,23 +496,14 @@ def _decode_bin(source: Path, data: bytes) -> LogDraft:
             if _is_numbers(part.get(clock)) and len(part[clock]):
                 stamps = part[clock].astype(np.int64) * (1 if clock == "TimeUS" else 1000)
                 draft.topics[f"{kind}.{number}" if number else kind] = LogTopic(stamps, part)
-    parameter_table, texts = (
-        tables.get("PARM", {}),
-        tables.get("MSG", {}).get("Message", np.array([], "S1")),
-    )
-    texts = [str(text, "ascii", "replace") for text in texts]
-    named_values = zip(
-        parameter_table.get("Name", ()), parameter_table.get("Value", ()), strict=False
-    )
-    parameters = {str(name, "ascii", "replace"): float(value) for name, value in named_values}
-    parameters = _finite_parameters(parameters)
+    decode = lambda text: str(text, "ascii", "replace")
+    texts = [decode(text) for text in tables.get("MSG", {}).get("Message", ())]
+    pairs = zip(*(tables.get("PARM", {}).get(c, ()) for c in ("Name", "Value")), strict=False)
+    parameters = _finite_parameters({decode(name): float(value) for name, value in pairs})
     _read_ardupilot_vehicle(draft, parameters, texts)
     draft.sources = [*_BIN, *_ardupilot_motors(draft, parameters, texts), *_ardupilot_speeds(draft)]
-    filters = {
-        "gyroscope": ("IMU", "INS_GYRO_FILTER"),
-        "accelerometer": ("IMU", "INS_ACCEL_FILTER"),
-    }
-    draft.set_cutoffs(parameters, filters)
+    filters = {"gyroscope": "INS_GYRO_FILTER", "accelerometer": "INS_ACCEL_FILTER"}
+    draft.set_cutoffs(parameters, {channel: ("IMU", name) for channel, name in filters.items()})
     draft.set_factor(parameters, "MOT_THST_EXPO")
     if "EV" in draft.topics and "Id" in draft.topics["EV"].fields:
         stamps, events = draft.topics["EV"].stamps, draft.topics["EV"].fields["Id"]
@@ -595,9 +580,8 @@ def _ardupilot_motors(
     outputs = [motors[k] for k in sorted(motors)]
     if not outputs:
         frame = re.search(r"\b(TRI|QUAD|HEXA|Y6|OCTA)", " ".join(texts).upper())
-        count = _CLASSES.get(
-            int(parameters.get("FRAME_CLASS", 0)), _FRAMES[frame[1]] if frame else 0
-        )
+        by_text = _FRAMES[frame[1]] if frame else 0
+        count = _CLASSES.get(int(parameters.get("FRAME_CLASS", 0)), by_text)
         outputs = list(range(1, count + 1))
         if outputs:
             draft.assume(
@@ -615,13 +599,10 @@ def _ardupilot_motors(
     # The command of the thrust curve f u^2 + (1 - f) u, f = MOT_THST_EXPO, is 0 at MOT_SPIN_MIN and 1 at MOT_SPIN_MAX.
     # Source: ardupilot, libraries/AP_Motors/AP_Motors_Thrust_Linearization.cpp (thrust_to_actuator).
     span = high - low
-    low, high = (
-        low + span * parameters.get(name, usual)
-        for name, usual in (("MOT_SPIN_MIN", 0.0), ("MOT_SPIN_MAX", 1.0))
-    )
-    return _pulse_source(
-        draft, "RCOU", [f"{prefix}{k}" for k in outputs], [(low, high)] * len(outputs)
-    )
+    high = low + span * parameters.get("MOT_SPIN_MAX", 1.0)
+    low = low + span * parameters.get("MOT_SPIN_MIN", 0.0)
+    names = [f"{prefix}{k}" for k in outputs]
+    return _pulse_source(draft, "RCOU", names, [(low, high)] * len(outputs))
 
 
 def _ardupilot_speeds(draft: LogDraft) -> list[LogSource]:
@@ -766,26 +747,17 @@ class _ChannelColumns(Entries):
     range: Annotated[tuple[Finite, Finite] | None, Tuples] = None
 
 
-class _ColumnMap(Entries):
+class _MapHead(Entries):
     axes: Literal["forward-left-up", "forward-right-down"] = "forward-left-up"
     separator: Literal[",", ";", "\t"] | None = None
     decimal: Literal[".", ","] | None = None
     vehicle: str = "multirotor"
     time: _TimeColumn
-    motor_commands: _ChannelColumns | None = None
-    thrust_commands: _ChannelColumns | None = None
-    rotor_speeds: _ChannelColumns | None = None
-    accelerometer: _ChannelColumns | None = None
-    gyroscope: _ChannelColumns | None = None
-    attitude: _ChannelColumns | None = None
-    euler_angles: _ChannelColumns | None = None
-    position: _ChannelColumns | None = None
-    velocity: _ChannelColumns | None = None
-    acceleration: _ChannelColumns | None = None
-    battery_voltage: _ChannelColumns | None = None
-    battery_current: _ChannelColumns | None = None
     settings: dict[str, Any] = pydantic.Field(default_factory=dict)
 
+
+_CHANNELS: Any = dict.fromkeys(QUANTITIES, (_ChannelColumns | None, None))
+_ColumnMap = pydantic.create_model("_ColumnMap", __base__=_MapHead, **_CHANNELS)
 
 _SETTING_UNITS = {
     "gyroscope_cutoff": "Hz", "accelerometer_cutoff": "Hz", "filter_rate": "Hz", "thrust_model_factor": "1",
@@ -897,10 +869,8 @@ def _map_setting(name: str, value: Any) -> Any:
         numbers = np.array(value, float)
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
-    good = (
-        np.all(np.isfinite(numbers)) and numbers.ndim == shape and numbers.shape[1:] in ((), (3,))
-    )
-    if not good:
+    fits = numbers.ndim == shape and numbers.shape[1:] in ((), (3,))
+    if not (fits and np.all(np.isfinite(numbers))):
         kind = ("a number", "a list of numbers", "a list of points [x, y, z]")[shape]
         raise SettingError(f"The setting {name} must be {kind}, but it is {format_value(value)}.")
     if _SETTING_UNITS[name] == "Hz" and not numbers > 0:
