@@ -214,7 +214,7 @@ def draw_mechanism(
     axes.set_box_aspect(half.tolist())
     axes.apply_aspect()
     box = np.array(list(itertools.product(axes.get_xlim3d(), axes.get_ylim3d(), axes.get_zlim3d())))
-    x, y, _ = proj_transform(*box.T, axes.get_proj())
+    x, y, _ = proj_transform(box[:, 0], box[:, 1], box[:, 2], axes.get_proj())
     extent = np.ptp(axes.transData.transform(np.column_stack([x, y])), axis=0)
     space = np.maximum(np.asarray(size) - _LABELS, 0.5 * np.asarray(size))
     axes.set_box_aspect(half.tolist(), zoom=float(np.min(space / extent)))

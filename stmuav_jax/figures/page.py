@@ -398,11 +398,7 @@ def dataset_of(run: Run | LoopRun | xr.Dataset | str | os.PathLike[str]) -> xr.D
         return loop_to_dataset(run)
     path = Path(run)
     if path.is_dir():
-        path /= (
-            "run.nc"
-            if (path / "run.nc").exists() or not (path / "flight.nc").exists()
-            else "flight.nc"
-        )
+        path /= next((n for n in ("run.nc", "flight.nc") if (path / n).exists()), "run.nc")
     return load(path)
 
 

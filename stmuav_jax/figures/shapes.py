@@ -73,18 +73,11 @@ def body_shapes(run: xr.Dataset, body: str) -> tuple[Shape, ...]:
         least, most = (length * part for part in _SLENDER)
         return (rod(distinct_points[0], distinct_points[1], min(max(thin, least), most)),)
     solid = inertia_solid(mass, inertia, kind="panel" if "panel" in body.lower() else None)
-    round_part = solid.kind in ("sphere", "cylinder")
-    halves = (
-        (*solid.size[:1], *(0.5 * x for x in solid.size[1:]))
-        if round_part
-        else [0.5 * x for x in solid.size]
-    )
-    outer_points = [
-        point for point in distinct_points if np.linalg.norm(point) > 1.05 * max(halves)
-    ]
-    struts = (
-        rod(np.zeros(3), point, 0.02 * float(np.linalg.norm(point))) for point in outer_points
-    )
+    halves = [0.5 * x for x in solid.size]
+    if solid.kind in ("sphere", "cylinder"):
+        halves[0] = solid.size[0]
+    ends = [(point, float(np.linalg.norm(point))) for point in distinct_points]
+    struts = [rod(np.zeros(3), end, 0.02 * d) for end, d in ends if d > 1.05 * max(halves)]
     return (solid, *struts)
 
 
@@ -136,10 +129,8 @@ def inertia_solid(mass: float, inertia: Float[np.ndarray, "3 3"], kind: str | No
         moments, R = np.linalg.eigh(inertia)
         # Eigenvectors may be a reflection, which no orientation is.
         R = R * np.sign(np.linalg.det(R))
-    equal = [
-        abs(moments[(k + 1) % 3] - moments[(k + 2) % 3]) <= _EQUAL * np.max(moments)
-        for k in range(3)
-    ]
+    gaps = np.abs(np.roll(moments, -1) - np.roll(moments, -2))
+    equal = (gaps <= _EQUAL * np.max(moments)).tolist()
     if kind is None and all(equal):
         return Shape("sphere", (float(np.sqrt(2.5 * np.mean(moments) / mass)),))
     # From m (b^2 + c^2) / 12 about each axis: the edges of a uniform box follow from three moments.
@@ -191,9 +182,8 @@ def _rotorcraft_shapes(rotors: Points) -> tuple[Shape, ...]:
     shapes = [Shape("cylinder", (0.3 * reach, 2.6 * thick), tuple(hub))] if reach else []
     for rotor in rotors:
         under = rotor - np.array([0.0, 0.0, 2 * thick])
-        shapes.append(
-            Shape("cylinder", (1.6 * thick, 3 * thick), tuple(rotor - [0, 0, 1.7 * thick]))
-        )
+        motor = tuple(rotor - [0, 0, 1.7 * thick])
+        shapes.append(Shape("cylinder", (1.6 * thick, 3 * thick), motor))
         if reach:
             shapes.append(rod(hub, under, thick))
     return tuple(shapes)
@@ -203,9 +193,8 @@ def rod(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: floa
     """Cylinder from one point to another, with a radius [m]; points (3,) in body axes [m]."""
     axis_vector = end - start
     middle = tuple(float(x) for x in 0.5 * (start + end))
-    return Shape(
-        "cylinder", (radius, float(np.linalg.norm(axis_vector))), middle, turn_towards(axis_vector)
-    )
+    size = (radius, float(np.linalg.norm(axis_vector)))
+    return Shape("cylinder", size, middle, turn_towards(axis_vector))
 
 
 def turn_towards(axis: Float[np.ndarray, "3"]) -> tuple[float, ...]:

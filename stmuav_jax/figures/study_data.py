@@ -197,7 +197,7 @@ def study_data(dataset: xr.Dataset) -> StudyData:
         for part in _column_parts(dataset, name, notes):
             (curves if part.axis else inputs if role == "input" else quantities).append(part)
     codes = np.asarray(dataset[status[0]].values)
-    parts = (tuple(each) for each in (inputs, quantities, curves, notes))
+    parts: Any = (tuple(each) for each in (inputs, quantities, curves, notes))
     data = StudyData(dataset, codes, identity, reasons, *parts)
     # inputs in the order of the factors, since a folder may have sorted its columns
     place = {name: k for k, name in enumerate(data.factors)}

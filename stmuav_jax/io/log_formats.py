@@ -161,13 +161,9 @@ class LogDraft:
 
     def chosen(self, channel: str) -> LogSource | None:
         """First source of a channel that the file has, at half the rate of the fastest one or more."""
-        available = [
-            source
-            for source in self.sources
-            if source.channel == channel
-            and source.topic in self.topics
-            and all(_is_numbers(self.topics[source.topic].fields.get(n)) for n in source.fields)
-        ]
+        are_numbers = lambda fields, names: all(_is_numbers(fields.get(name)) for name in names)
+        sources = [s for s in self.sources if s.channel == channel and s.topic in self.topics]
+        available = [s for s in sources if are_numbers(self.topics[s.topic].fields, s.fields)]
         # Firmwares log the same quantity in several messages at different rates; a slow copy is taken only
         # without a fast one.
         count = lambda source: len(self.topics[source.topic].stamps)
@@ -323,10 +319,8 @@ def _read_px4_vehicle(draft: LogDraft, parameters: Mapping[str, Any]) -> None:
     if rotors and all(f"{name}PX" in parameters for name in rotors):
         places = [[parameters.get(f"{name}P{axis}", 0.0) for axis in "XYZ"] for name in rotors]
         # Rotors push along (AX, AY, AZ), by default up; those of the model push along z.
-        axes = [
-            [parameters.get(f"{name}A{axis}", usual) for axis, usual in zip("XYZ", (0.0, 0.0, -1.0), strict=True)]
-            for name in rotors
-        ]  # fmt: skip
+        usual = {"X": 0.0, "Y": 0.0, "Z": -1.0}
+        axes = [[parameters.get(f"{name}A{k}", x) for k, x in usual.items()] for name in rotors]
         tilts = [np.degrees(np.arctan2(np.hypot(x, y), -z)) for x, y, z in axes]
         if max(tilts) > _TILTED:
             draft.refuse(
@@ -789,9 +783,8 @@ def decode_csv(source: Path, columns: Any) -> LogDraft:
     if _OTHER_WORDS.search(plan.vehicle):
         draft.refuse_vehicle(f"a {plan.vehicle} (the map's vehicle)")
     if cells.is_cut:
-        draft.notes.append(
-            "The file is truncated: its last row is not whole or has no end of line, and was left out."
-        )
+        cut = "its last row is not whole or has no end of line, and was left out"
+        draft.notes.append(f"The file is truncated: {cut}.")
     if "axes" not in plan.model_fields_set and columns is not None:
         draft.assume(
             "x is forward, y left and z up",
@@ -837,12 +830,10 @@ def decode_csv(source: Path, columns: Any) -> LogDraft:
             raise FileError(
                 f"{source} has no row in which time and all columns of {name} are numbers."
             )
-        if quantity.is_held and (
-            np.min(values[complete]) < -0.01 or np.max(values[complete]) > 1.01
-        ):
-            ends = f"{np.min(values[complete]):g} to {np.max(values[complete]):g}"
+        low, high = np.min(values[complete]), np.max(values[complete])
+        if quantity.is_held and not -0.01 <= low <= high <= 1.01:
             raise SettingError(
-                f"The {name} must be 0 to 1, but they are {ends}: give their range in the map, such as "
+                f"The {name} must be 0 to 1, but they are {low:g} to {high:g}: give their range in the map, such as "
                 "range = [1000, 2000]."
             )
         # channels with the same rows have one clock

@@ -365,7 +365,7 @@ START_BODY: dict[str, Entry] = {
 class ModelParameter(Entries):
     """Entry of a parameter, to which the entries of bodies, joints and forces may refer."""
 
-    value: Value
+    value: Value  # pyright: ignore[reportInvalidTypeForm]
     unit: str
     source: str
 

@@ -393,14 +393,11 @@ def _make_scene(
             between += [entry.name for entry in chain_bodies[:-1]]
             joints_by_number |= links
     equalities = range(0 if disabled_flags & {"EQUALITY", "CONSTRAINT"} else model.neq)
-    loops = [
-        loop
-        for k in equalities
-        if (loop := _make_loop(reader, k, left_out, joints_by_number, mimics))
-    ]
-    loops += [loop for m in mimics.values() if (loop := _mimic(m, joints_by_number, left_out))]
+    built = [_make_loop(reader, k, left_out, joints_by_number, mimics) for k in equalities]
+    built += [_mimic(m, joints_by_number, left_out) for m in mimics.values()]
     closures = (*(() if urdf is None else urdf.loops), *closures)
-    loops += [loop for closure in closures if (loop := _loop_of_urdf(reader, closure, left_out))]
+    built += [_loop_of_urdf(reader, closure, left_out) for closure in closures]
+    loops = [loop for loop in built if loop is not None]
     # Gravity is an option of MuJoCo's model and a force here, so that a system without it has
     # none.
     forces: list[AbstractForce] = (

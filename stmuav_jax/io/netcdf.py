@@ -37,12 +37,11 @@ LOOP_FORMAT, LOOP_VERSION = "stmuav_jax closed loop", 1
 _READ = {FORMAT: FORMAT_VERSION, LOOP_FORMAT: LOOP_VERSION}
 # Signals of missions by their names in files of version 0.3.0 and before, which have the same content.
 _FORMER_NAMES = {
-    "wanted_force": "commanded_force",
-    "wanted_effort": "commanded_effort",
-    "wanted_position": "reference_position",
-    "wanted_heading": "reference_heading",
-    "wanted_panel_angles": "reference_panel_angles",
-    "wanted_joint_position": "reference_joint_position",
+    **{f"wanted_{name}": f"commanded_{name}" for name in ("force", "effort")},
+    **{
+        f"wanted_{name}": f"reference_{name}"
+        for name in ("position", "heading", "panel_angles", "joint_position")
+    },
     "believed_centre_of_mass": "estimated_centre_of_mass",
 }
 
@@ -109,8 +108,7 @@ def _write_array(file: Any, name: str, parts: Parts, checksums: bool) -> None:
         # NetCDF has no truth values; xarray's mark for them
         values, about["dtype"] = values.astype(np.int8), "bool"
     # HDF5 has no checksums of scalars
-    checked = checksums and values.dtype.kind == "f" and values.ndim and values.size
-    if checked:
+    if checksums and values.dtype.kind == "f" and values.ndim and values.size:
         more["fletcher32"] = True
     kind = h5py.string_dtype() if values.dtype.kind in "UO" else values.dtype
     values = values.astype(object) if values.dtype.kind == "U" else values
