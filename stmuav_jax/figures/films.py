@@ -20,7 +20,6 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 from matplotlib.animation import FFMpegWriter, PillowWriter
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
@@ -37,16 +36,12 @@ from .page import (
     dataset_of,
     finite_times,
     interpolate_poses,
-    joint_of,
-    machine_size,
     watched_bodies,
 )
-from .shapes import Shape, body_shapes, make_quads, rotor_points
-from .sketch import COLOURS
+from .shapes import COLOURS, JOINT_COLOUR, joint_of, machine_size, make_faces
 
 # Browsers show a frame of a GIF for at least 0.02 s.
 _FASTEST = {".gif": 50.0, ".mp4": 240.0}
-_BASE, _PANEL, _JOINT, _ROTOR = "#8b929c", "#1d3f72", "#69717d", "#c3c8d0"
 # Size of the box of a film by that of the motion, and its smallest edge by the largest.
 _MARGIN, _FLATTEST = 1.05, 0.4
 # Width and height of a picture for the title and the labels of the axes [pixels].
@@ -187,7 +182,7 @@ def draw_mechanism(
     axes.tick_params(labelsize=7)
     axes.locator_params(nbins=4)
     faces = axes.add_collection3d(Poly3DCollection(list(corners), linewidths=0.3), autolim=False)
-    lines = Line3DCollection([], colors=_JOINT, linewidths=1.5)
+    lines = Line3DCollection([], colors=JOINT_COLOUR, linewidths=1.5)
     axes.add_collection3d(lines, autolim=False)
     base = names.index(watched_bodies(run)[0])
     (trail,) = axes.plot([], [], [], color=COLOURS[0], linewidth=1.2)
@@ -237,37 +232,6 @@ def draw_mechanism(
         clock.set_text(f"t = {times[k]:.{digits}f} s   {caption}")
 
     return figure, draw_frame
-
-
-def make_faces(run: xr.Dataset, names: Sequence[str]) -> tuple[np.ndarray, ...]:
-    """Quadrilaterals of all bodies, joints and rotors of a saved run.
-
-    Returns:
-        Index of the body in `names` (f,); corners from its centre of mass, body axes (f, 4, 3) [m]; normals out of
-        the solid (f, 3); and red, green and blue from 0 to 1 (f, 3).
-    """
-    solids: list[tuple[str, Shape, str]] = []
-    for n, name in enumerate(str(name) for name in run["body"].values):
-        rotors = rotor_points(run, name)
-        colour = _PANEL if "panel" in name.lower() else COLOURS[n % len(COLOURS)]
-        solids += [(name, s, _BASE if len(rotors) else colour) for s in body_shapes(run, name)]
-        gaps = np.linalg.norm(rotors[:, None] - rotors[None], axis=2)
-        radius = 0.45 * float(np.min(gaps[gaps > 0], initial=0.5 * machine_size(run)))
-        disc = (radius, 0.02 * radius)
-        solids += [(name, Shape("cylinder", disc, tuple(point)), _ROTOR) for point in rotors]
-    for joint in (joint_of(run, k) for k in range(run.sizes.get("joint", 0))):
-        ball = Shape("sphere", (0.01 * machine_size(run),), tuple(joint["point_j"]))
-        solids.append((joint["body_j"], ball, _JOINT))
-    parts: list[tuple[np.ndarray, ...]] = []
-    for name, shape, colour in solids:
-        quads = make_quads(shape)
-        normals = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
-        # all shapes are convex: a normal points away from the middle
-        outward = np.sum(normals * (quads.mean(axis=1) - np.asarray(shape.position)), axis=1)
-        normals *= (np.sign(outward) / np.linalg.norm(normals, axis=1))[:, None]
-        indices = np.full(len(quads), names.index(name))
-        parts.append((indices, quads, normals, np.tile(to_rgb(colour), (len(quads), 1))))
-    return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
 
 def _find_ffmpeg() -> str:

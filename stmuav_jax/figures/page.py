@@ -14,7 +14,6 @@ import tempfile
 import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,16 @@ from ..control.closed_loop import LoopRun
 from ..dynamics.simulation import Run
 from ..io.netcdf import FileError, load, write_atomically
 from ..io.run_file import loop_to_dataset, to_dataset
-from ..mechanics.body import GROUND
-from .run import SLIDING, displacement_of, motion_of
-from .shapes import Shape, body_centre, body_shapes, joint_points, rotor_points
+from .run import SLIDING
+from .shapes import (
+    Shape,
+    body_poses,
+    body_shapes,
+    joint_displacement,
+    joint_of,
+    machine_size,
+    rotor_points,
+)
 
 # Largest number of saved times in a page: more are thinned out evenly.
 MOST_TIMES = 2000
@@ -193,55 +199,6 @@ def _upright_bodies(run: xr.Dataset) -> list[str]:
     return [n for n in _body_names(run) if len(rotor_points(run, n)) or "panel" in n.lower()]
 
 
-def _body_poses(run: xr.Dataset, body: str) -> tuple[Any, Any]:
-    """Positions (k, 3) [m] and rotation matrices (k, 3, 3) of a body or ground at all times."""
-    count = run.sizes["time"]
-    if body == GROUND:
-        return np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3))
-    k = list(run["body"].values).index(body)
-    R = Rotation.from_quat(run["euler_parameters"].values[:, k], scalar_first=True).as_matrix()
-    return run["position"].values[:, k], R
-
-
-def joint_of(run: xr.Dataset, k: int) -> dict[str, Any]:
-    """Plain data of a joint, with points from the bodies' centres of mass."""
-    i, j = (str(run[f"joint_body_{side}"].values[k]) for side in ("i", "j"))
-    point_i = run["joint_point_i"].values[k] - body_centre(run, i)
-    point_j = run["joint_point_j"].values[k] - body_centre(run, j)
-    frame_i, kind = run["joint_frame_i"].values[k], str(run["joint_kind"].values[k])
-    joint_data = {
-        "name": str(run["joint"].values[k]), "kind": kind, "body_i": i, "body_j": j,
-        "point_i": point_i.tolist(), "point_j": point_j.tolist(),
-        "frame_i": frame_i.tolist(), "frame_j": run["joint_frame_j"].values[k].tolist(),
-    }  # fmt: skip
-    if kind in SLIDING:
-        displacements = joint_displacement(run, k)
-        joint_data["slide"] = [float(np.min(displacements)), float(np.max(displacements))]
-    return joint_data
-
-
-def joint_displacement(run: xr.Dataset, k: int) -> Float[np.ndarray, " t"]:
-    """Displacement of a joint's point on body j along the axis on body i (t,) [m]."""
-    motion = motion_of(run)
-    return displacement_of(motion, motion.joints[k])
-
-
-def machine_size(run: xr.Dataset) -> float:
-    """Diagonal [m] of the box around all joints, rotors and centres of mass at the start."""
-    point_sets = [run["position"].values[0]]
-    for body in (str(name) for name in run["body"].values):
-        r, R = _body_poses(run, body)
-        for points in (joint_points(run, body)[0], rotor_points(run, body)):
-            point_sets.append(r[0] + points @ R[0].T)
-    every = np.concatenate(point_sets)
-    diagonal = float(np.linalg.norm(np.max(every, axis=0) - np.min(every, axis=0)))
-    # A single body has no extent of points; its radius of gyration stands for its size.
-    gyration = np.sqrt(
-        np.max(np.linalg.eigvalsh(run["inertia"].values)[:, -1] / run["mass"].values)
-    )
-    return max(diagonal, 3 * float(gyration))
-
-
 # --- curves
 
 
@@ -252,7 +209,7 @@ def plot_curves(run: xr.Dataset, sun: Float[np.ndarray, "3"] | None) -> Curves:
         r = run["position"].values[:, names.index(body)]
         curves_by_title[f"position of {_spell_name(body)} [m]"] = dict(zip("xyz", r.T, strict=True))
     normals = {
-        _spell_name(name): _body_poses(run, name)[1][:, :, 2] for name in _upright_bodies(run)
+        _spell_name(name): body_poses(run, name)[1][:, :, 2] for name in _upright_bodies(run)
     }
     curves_by_title["tilt of z from the vertical [degrees]"] = {
         name: _angle_degrees(z[:, 2]) for name, z in normals.items()
@@ -379,11 +336,12 @@ def view(
     # "<" within the numbers and names would end the script element
     # Everything is in one file, which opens without a network and can be sent.
     data = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
-    parts = {name: _read_asset(name) for name in _PARTS}
+    assets = Path(__file__).with_name("assets")
+    parts = {name: (assets / name).read_text(encoding="utf-8") for name in (*_PARTS, "page.html")}
     parts |= {"title": html.escape(" | ".join(titles)), "data": data}
     # One pass: text that a part brings along is not searched for placeholders.
     page = re.sub(
-        r"\{\{([\w.]+)\}\}", lambda placeholder: parts[placeholder[1]], _read_asset("page.html")
+        r"\{\{([\w.]+)\}\}", lambda placeholder: parts[placeholder[1]], parts["page.html"]
     )
     return RunPage(page)
 
@@ -400,8 +358,3 @@ def dataset_of(run: Run | LoopRun | xr.Dataset | str | os.PathLike[str]) -> xr.D
     if path.is_dir():
         path /= next((n for n in ("run.nc", "flight.nc") if (path / n).exists()), "run.nc")
     return load(path)
-
-
-@cache
-def _read_asset(name: str) -> str:
-    return (Path(__file__).with_name("assets") / name).read_text(encoding="utf-8")

@@ -20,9 +20,8 @@ from ..io.run_file import posture
 from ..mechanics.body import GROUND
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .shapes import body_centre, body_shapes, make_quads, rotor_points
+from .shapes import COLOURS, body_centre, body_shapes, make_quads, rotor_points
 
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#F0E442")
 _AXES = ("#D55E00", "#009E73", "#0072B2")
 # Names are in front of all solids, whose order matplotlib computes.
 _ON_TOP: dict[str, Any] = {

@@ -548,29 +548,6 @@ def _add_left_out(model: Any, left_out: LeftOut, disabled_flags: set[str]) -> No
     touching = int(np.sum((model.geom_contype != 0) | (model.geom_conaffinity != 0)))
     if touching and "CONTACT" not in disabled_flags:
         left_out.add(f"contacts between its {touching} shapes", "")
-    _add_left_out_of_joints(model, left_out)
-    for k in range(model.ntendon):
-        left_out.add("tendons", model.tendon(k).name or f"tendon_{k}")
-    for k in range(model.nbody):
-        if model.body_gravcomp[k]:
-            left_out.add("compensation of gravity", model.body(k).name)
-        if model.body_mocapid[k] >= 0:
-            left_out.add("motion capture, whose bodies stand still", model.body(k).name)
-    for k in range(model.nu):
-        is_damper = model.actuator_biasprm[k, 1] == 0 and model.actuator_biasprm[k, 2] != 0
-        is_lost = model.actuator_forcelimited[k] and (is_damper or _effort_limit(model, k) is None)
-        # those of a site are left to the rotors, which keep limits of their speeds
-        if is_lost or (model.actuator_ctrllimited[k] and model.actuator_trntype[k] != _AT_SITE):
-            left_out.add("limits of actuators", model.actuator(k).name)
-    if model.opt.density or model.opt.viscosity:
-        left_out.add("forces of the surrounding medium", "")
-    for feature, count in (("flexible bodies", model.nflex), ("plugins", model.nplugin)):
-        if count:
-            left_out.add(feature, "")
-
-
-def _add_left_out_of_joints(model: Any, left_out: LeftOut) -> None:
-    """Add limits, dry friction, rotor inertia and nonlinear springs and dampers of joints."""
     # newer versions of MuJoCo have polynomial springs and dampers
     none = np.zeros((max(model.njnt, model.nv), 1))
     spring = getattr(model, "jnt_stiffnesspoly", none)
@@ -591,6 +568,24 @@ def _add_left_out_of_joints(model: Any, left_out: LeftOut) -> None:
         for feature, is_present in checks:
             if is_present:
                 left_out.add(feature, name)
+    for k in range(model.ntendon):
+        left_out.add("tendons", model.tendon(k).name or f"tendon_{k}")
+    for k in range(model.nbody):
+        if model.body_gravcomp[k]:
+            left_out.add("compensation of gravity", model.body(k).name)
+        if model.body_mocapid[k] >= 0:
+            left_out.add("motion capture, whose bodies stand still", model.body(k).name)
+    for k in range(model.nu):
+        is_damper = model.actuator_biasprm[k, 1] == 0 and model.actuator_biasprm[k, 2] != 0
+        is_lost = model.actuator_forcelimited[k] and (is_damper or _effort_limit(model, k) is None)
+        # those of a site are left to the rotors, which keep limits of their speeds
+        if is_lost or (model.actuator_ctrllimited[k] and model.actuator_trntype[k] != _AT_SITE):
+            left_out.add("limits of actuators", model.actuator(k).name)
+    if model.opt.density or model.opt.viscosity:
+        left_out.add("forces of the surrounding medium", "")
+    for feature, count in (("flexible bodies", model.nflex), ("plugins", model.nplugin)):
+        if count:
+            left_out.add(feature, "")
 
 
 # --- loops

@@ -235,33 +235,28 @@ def _labelled_run(run: Run) -> Labelled:
     }  # fmt: skip
     table |= machine_table(system) | rotor_table(system, saved_states(run.trajectory))
     if run.model is not None:
-        table |= _analysis_variables(run)
+        view, worst = run.snapshot, run.trajectory.worst
+        vector, wrench = ("time", "body", "axis"), ("time", "joint", "axis")
+        table |= {
+            "acceleration": (vector, view.accelerations.v_rate, "m/s^2", "of the centre of mass"),
+            "angular_acceleration": (vector, view.accelerations.omega_rate, "rad/s^2", "body axes"),
+            "reaction_force": (wrench, view.reactions.force, "N", "of body i on body j, world axes"),
+            "reaction_moment": (
+                wrench, view.reactions.moment, "N m",
+                "of body i on body j about the joint's point on body j, world axes",
+            ),
+            "kinetic_energy": (("time",), view.kinetic, "J", "of all bodies"),
+            "potential_energy": (("time",), view.potential, "J", "of gravity and springs"),
+            "work": (("time",), run.trajectory.work, "J", "done by forces without potential"),
+            "position_violation": (("time",), worst.position, "m", "of lengths, the largest so far"),
+            "velocity_violation": (("time",), worst.velocity, "m/s", "of their rates, the largest so far"),
+        }  # fmt: skip
     coordinates = _motion_coordinates(system, run.ts, "saved times")
     return label_table(
         table, coordinates, format=FORMAT, format_version=FORMAT_VERSION, scene=run.scene.name,
         title=run.scene.title, notes=(*run.scene.warnings, *run.scene.notes), parameters=run.scene.parameters,
         settings=run.settings, certificate=run.certificate.to_dict(), watch=list(run.scene.watch),
     )  # fmt: skip
-
-
-def _analysis_variables(run: Run) -> dict[str, tuple[tuple[str, ...], Any, str, str]]:
-    """Dimensions, values, unit and description of the analysis's results."""
-    view, worst = run.snapshot, run.trajectory.worst
-    vector, wrench = ("time", "body", "axis"), ("time", "joint", "axis")
-    return {
-        "acceleration": (vector, view.accelerations.v_rate, "m/s^2", "of the centre of mass"),
-        "angular_acceleration": (vector, view.accelerations.omega_rate, "rad/s^2", "body axes"),
-        "reaction_force": (wrench, view.reactions.force, "N", "of body i on body j, world axes"),
-        "reaction_moment": (
-            wrench, view.reactions.moment, "N m",
-            "of body i on body j about the joint's point on body j, world axes",
-        ),
-        "kinetic_energy": (("time",), view.kinetic, "J", "of all bodies"),
-        "potential_energy": (("time",), view.potential, "J", "of gravity and springs"),
-        "work": (("time",), run.trajectory.work, "J", "done by forces without potential"),
-        "position_violation": (("time",), worst.position, "m", "of lengths, the largest so far"),
-        "velocity_violation": (("time",), worst.velocity, "m/s", "of their rates, the largest so far"),
-    }  # fmt: skip
 
 
 def save(run: Run, path: str | os.PathLike[str]) -> Path:
