@@ -115,8 +115,8 @@ def _of_motion(data: xr.Dataset) -> _Content:
             f"and {certificate['angle_error']:.2g} rad."
         )
     is_good = certificate["result"] in ("successful", "event occurred") and not failure
-    known = {k.replace("_", " "): v for k, v in certificate.items() if v is not None}
-    accuracy = [(name, _shorten_data(value)) for name, value in known.items()]
+    entries = {k.replace("_", " "): v for k, v in certificate.items() if v is not None}
+    accuracy = [(name, _shorten_data(value)) for name, value in entries.items()]
     title = str(data.attrs.get("title") or data.attrs.get("scene") or "Run")
     captioned_figures = [(name.capitalize(), draw(data)) for name, draw in FIGURES.items()]
     figures = [(caption, figure) for caption, figure in captioned_figures if figure is not None]

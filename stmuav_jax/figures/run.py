@@ -300,22 +300,24 @@ def draw_loads(title: str, loads: JointLoads) -> Figure:
         magnitude = np.linalg.norm(np.asarray(parts), axis=-1)
         peaks = np.nanmax(np.where(np.isfinite(magnitude), magnitude, 0.0), axis=0, initial=0.0)
         loaded = np.flatnonzero(peaks > NOTHING)
-        drawn = np.sort(loaded[np.argsort(-peaks[loaded], kind="stable")][:_LOADED])
-        if not len(drawn):
+        drawn_joints = np.sort(loaded[np.argsort(-peaks[loaded], kind="stable")][:_LOADED])
+        if not len(drawn_joints):
             ax.set_yticks([])
             middle: Any = {"transform": ax.transAxes, "ha": "center", "fontsize": 9}
             ax.text(0.5, 0.5, "zero at every joint", **middle)
             continue
-        for k in drawn:
+        for k in drawn_joints:
             # a joint keeps its style in both panels; marks would hide the peaks
             style: Any = look(int(k)) | {"marker": ""}
             ax.plot(np.asarray(loads.ts), magnitude[:, k], label=loads.joints[k], **style)
         ax.set_yscale("log")
-        top = 10 ** np.ceil(np.log10(peaks[drawn].max()))
-        ax.set_ylim(max(1e-4 * top, 0.5 * float(np.nanmin(magnitude[:, drawn]))), top)
+        top = 10 ** np.ceil(np.log10(peaks[drawn_joints].max()))
+        ax.set_ylim(max(1e-4 * top, 0.5 * float(np.nanmin(magnitude[:, drawn_joints]))), top)
         draw_legend_beside(ax)
-        if len(loaded) > len(drawn):
-            ax.set_title(f"{len(drawn)} of {len(loaded)} joints: the largest peaks", fontsize=9)
+        if len(loaded) > len(drawn_joints):
+            ax.set_title(
+                f"{len(drawn_joints)} of {len(loaded)} joints: the largest peaks", fontsize=9
+            )
     axes[1, 0].set_xlabel("time [s]", fontsize=9)
     figure.align_ylabels(axes[:, 0])
     figure.suptitle(f"{title}\nmagnitudes of the joint reactions", fontsize=10, parse_math=False)

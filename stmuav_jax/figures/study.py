@@ -434,8 +434,8 @@ def draw_sensitivities(data: StudyData, analysis: Analysis) -> Figure | None:
     figure.legend(handles, labels, ncols=3, fontsize=8, loc="outside lower center")
     inputs = len(findings[0].influence.names)
     few = f"{len(names)} of {inputs} inputs." if len(names) < inputs else ""
-    shown, total = len(panel_findings), len(findings)
-    more = f"{shown} of {total} quantities." if shown < total else ""
+    count, total = len(panel_findings), len(findings)
+    more = f"{count} of {total} quantities." if count < total else ""
     level = f"{100 * analysis.level:g} %"
     bars = f"Bars: estimates with {level} intervals; those below 0 are drawn at 0."
     add_caption(figure, f"{data.title}: influence of the inputs", [bars, few, more])

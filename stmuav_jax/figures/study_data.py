@@ -197,8 +197,8 @@ def study_data(dataset: xr.Dataset) -> StudyData:
         for part in _column_parts(dataset, name, notes):
             (curves if part.axis else inputs if role == "input" else quantities).append(part)
     codes = np.asarray(dataset[status[0]].values)
-    parts: Any = (tuple(each) for each in (inputs, quantities, curves, notes))
-    data = StudyData(dataset, codes, identity, reasons, *parts)
+    fields: Any = (tuple(parts) for parts in (inputs, quantities, curves, notes))
+    data = StudyData(dataset, codes, identity, reasons, *fields)
     # inputs in the order of the factors, since a folder may have sorted its columns
     place = {name: k for k, name in enumerate(data.factors)}
     inputs.sort(key=lambda part: place.get(part.key, len(place)))

@@ -254,8 +254,8 @@ def _make_motors(
 def _read_motors(motors: MotorRotors, name: str) -> Any:
     if name in ("lowest", "highest"):
         return getattr(motors.limits, name, None)
-    own = name in ("time_constant", "inertia", "start")
-    return getattr(motors if own else motors.rotors, name, None)
+    is_of_motors = name in ("time_constant", "inertia", "start")
+    return getattr(motors if is_of_motors else motors.rotors, name, None)
 
 
 _ROTORS = {

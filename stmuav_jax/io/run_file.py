@@ -163,8 +163,8 @@ def _squared_speeds(
         speed_names, names = force.internal_names(), internal_names(system)
         return np.asarray(saved.internal)[:, [names.index(name) for name in speed_names]] ** 2
     if callable(plain.speed_squared) or input_history is not None:
-        held = Held(Inputs(()), np.zeros((len(saved.ts), 0)))
-        inputs, values = held if input_history is None else input_history
+        no_inputs = Held(Inputs(()), np.zeros((len(saved.ts), 0)))
+        inputs, values = no_inputs if input_history is None else input_history
         # Blocks of one size bound the memory and share one program.
         function = lambda *at: _commanded_speeds(
             set_index, system, inputs, *jax.tree.map(as_jax, at)
