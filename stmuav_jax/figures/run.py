@@ -90,8 +90,9 @@ def motion_of(run: "Run | xr.Dataset") -> Motion:
         # of motors with their rotors, these have the body
         sets = [f.rotors for f in system.forces if isinstance(f, Rotors | MotorRotors)]
         base = sets[0].body if sets else (scene.watch or system.names)[-1]
-        arrays = (np.asarray(x) for x in (states.r, states.p, states.omega, system.bodies.com))
-        return Motion(scene.title, data.ts, tuple(system.names), base, *arrays, system.joints)
+        r, p, omega = (np.asarray(x) for x in (states.r, states.p, states.omega))
+        com, names = np.asarray(system.bodies.com), tuple(system.names)
+        return Motion(scene.title, data.ts, names, base, r, p, omega, com, system.joints)
     names = tuple(map(str, data["body"].values))
     watched = json.loads(data.attrs.get("watch", "[]")) or names
     base = str(data["rotor_body"].values[0]) if "rotor_body" in data.coords else watched[-1]
