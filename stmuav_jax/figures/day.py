@@ -56,16 +56,8 @@ def day_title(day: Day) -> str:
     return f"Pointing at the sun, {where}, {day.start:%Y-%m-%d} (UTC{day.start.isoformat()[19:]})"
 
 
-def _reason_words(day: Day) -> str:
-    codes = np.unique(day.lit.reason[day.lit.is_up & ~day.lit.facing])
-    hour = np.array([day.lit.hours_of(day.lit.reason == code) for code in codes])
-    order = np.argsort(-hour)
-    reason_durations = [f"{Reason(int(codes[k])).label} {hour[k]:.1f} h" for k in order]
-    return ", ".join(reason_durations) or "-"
-
-
-def _format_span(values: np.ndarray, unit: str, digits: int = 1) -> str:
-    return f"{np.nanmin(values):.{digits}f} to {np.nanmax(values):.{digits}f} {unit}"
+def _format_span(values: np.ndarray, unit: str) -> str:
+    return f"{np.nanmin(values):.1f} to {np.nanmax(values):.1f} {unit}"
 
 
 def day_rows(day: Day) -> list[tuple[str, str]]:
@@ -75,16 +67,17 @@ def day_rows(day: Day) -> list[tuple[str, str]]:
     up = ", ".join(f"{clock_time(day, a)} to {clock_time(day, b)}" for a, b in day.daylight)
     height = math.degrees(np.max(np.asarray(lit.sun.elevation)))
     angles, q = np.degrees(lit.angles), 1e3 * lit.strokes
+    codes = np.unique(lit.reason[lit.is_up & ~lit.facing])
+    hours = [(lit.hours_of(lit.reason == code), int(code)) for code in codes]
+    hours = sorted(hours, key=lambda entry: -entry[0])
+    reasons = [f"{Reason(code).label} {hour:.1f} h" for hour, code in hours]
     rows = [
         ("Sun above the horizon", f"{up} ({sum(b - a for a, b in day.daylight):.1f} h)"),
         ("Highest", f"{height:.1f}° at {clock_time(day, day.culmination)}"),
         ("Within the tracker's reach", f"{lit.hours_of(lit.facing):.1f} h"),
-        ("Out of reach because of", _reason_words(day)),
-        (
-            "Panel angles phi, theta",
-            f"{_format_span(angles[0], '°')}, {_format_span(angles[1], '°')}",
-        ),
-        ("Strokes q2, q3", f"{_format_span(q[0], 'mm')}, {_format_span(q[1], 'mm')}"),
+        ("Out of reach because of", ", ".join(reasons) or "-"),
+        ("Panel angles phi, theta", ", ".join(_format_span(angle, "°") for angle in angles)),
+        ("Strokes q2, q3", ", ".join(_format_span(stroke, "mm") for stroke in q)),
     ]
     # On a day on which the sun is never within reach there is no largest error.
     if np.any(lit.facing):
@@ -107,13 +100,10 @@ def day_tables(day: Day) -> tuple[Table, Table]:
     heads = ("panel", "kWh/m² a day", "more than level", "more than single axis")
     energies = make_table(*heads, title="Under a clear sky", right=1)
     for panel in PANELS:
-        add_row(
-            energies,
-            PANEL_NAMES[panel],
-            f"{day.energy[panel] / 3.6e6:.3f}",
-            f"{100 * day.gain(panel):+.1f} %",
-            f"{100 * day.gain(panel, 'single_axis'):+.1f} %",
+        gains = (
+            f"{100 * gain:+.1f} %" for gain in (day.gain(panel), day.gain(panel, "single_axis"))
         )
+        add_row(energies, PANEL_NAMES[panel], f"{day.energy[panel] / 3.6e6:.3f}", *gains)
     return figures, energies
 
 
@@ -149,13 +139,9 @@ def labelled_day(day: Day) -> Labelled:
     }  # fmt: skip
     time_attributes = {"units": "s", "description": "since local midnight"}
     coordinates = {
-        "time": ((s,), day.unix - day.unix[0], time_attributes),
-        "axis": ["x", "y", "z"],
-        "axis_b": ["x", "y", "z"],
-        "angle": ["phi", "theta"],
-        "leg": [2, 3],
-        "panel": list(PANELS),
-    }
+        "time": ((s,), day.unix - day.unix[0], time_attributes), "axis": ["x", "y", "z"],
+        "axis_b": ["x", "y", "z"], "angle": ["phi", "theta"], "leg": [2, 3], "panel": list(PANELS),
+    }  # fmt: skip
     place = {k: float(getattr(day.place, k)) for k in ("latitude", "longitude", "altitude")}
     return label_table(
         table, coordinates, format=FORMAT, format_version=FORMAT_VERSION, title=day_title(day),
@@ -212,15 +198,6 @@ def _set_hours(ax: Axes, day: Day) -> None:
     ax.set_xlabel("time since local midnight [h]", fontsize=9)
 
 
-def _shade_unreachable(ax: Axes, day: Day) -> None:
-    """Shade the times in which the sun is up but out of reach."""
-    out = day.is_up & ~day.facing
-    ax.fill_between(
-        day.hours, 0, 1, where=out.tolist(), transform=ax.get_xaxis_transform(), color="0.9", lw=0,
-        label="out of reach",
-    )  # fmt: skip
-
-
 def tracking(day: Day) -> Figure:
     """Figure of sun, panel angles, strokes and pointing error over the day."""
     figure, axes = grid(2, 2, 5.2)
@@ -235,11 +212,14 @@ def tracking(day: Day) -> Figure:
     }  # fmt: skip
     for place, (name, label, lines) in curves.items():
         ax = axes[place]
-        _shade_unreachable(ax, day)
+        # the times in which the sun is up but out of reach
+        ax.fill_between(
+            day.hours, 0, 1, where=(day.is_up & ~day.facing).tolist(),
+            transform=ax.get_xaxis_transform(), color="0.9", lw=0, label="out of reach",
+        )  # fmt: skip
         for (legend_text, values), (color, dash) in zip(lines, STYLES, strict=False):
-            ax.plot(
-                day.hours, values, label=legend_text, color=color, linestyle=dash, linewidth=1.4
-            )
+            style = {"color": color, "linestyle": dash, "linewidth": 1.4}
+            ax.plot(day.hours, values, label=legend_text, **style)
         ax.set_title(name, fontsize=10)
         ax.set_ylabel(label, fontsize=9)
         _set_hours(ax, day)
@@ -272,10 +252,24 @@ def sky(day: Day) -> Figure:
         around[up] = np.unwrap(np.arctan2(way[1, up], way[0, up]))
         down = np.degrees(np.arccos(np.clip(way[2], -1, 1)))
         ax.plot(around, down, color=color, linestyle=dash, label=label)
-    _mark_hours(ax, day)
+    azimuth, tilts = (
+        np.arctan2(day.s_b[1], day.s_b[0]),
+        np.degrees(np.arccos(np.clip(day.s_b[2], -1, 1))),
+    )
+    for hour in range(math.ceil(day.hours[-1])):
+        k = int(np.argmin(np.abs(day.hours - hour)))
+        if day.is_up[k] and day.s_b[2, k] > 0:
+            at = float(azimuth[k]), float(tilts[k])
+            ax.plot(*at, "o", color=STYLES[0][0], markersize=3)
+            if hour % 2 == 0:
+                ax.annotate(f"{hour} h", at, (4, 4), textcoords="offset points", fontsize=8)
     ax.fill([], [], color="#DDEEDD", ec="#009E73", label="reach of the tracker")
     ax.set_ylim(0, 90)
-    ax.set_rlabel_position(_free_azimuth(day))
+    # Labels are off the axes, at the azimuth farthest from the sun's path.
+    path, choices = azimuth[day.is_up & (day.s_b[2] > 0)], np.radians(np.arange(22.5, 360.0, 45.0))
+    distances = np.abs((path[:, None] - choices + np.pi) % (2 * np.pi) - np.pi)
+    farthest = np.argmax(np.min(distances, axis=0, initial=np.pi))
+    ax.set_rlabel_position(float(np.degrees(choices[farthest])))
     ax.set_xticks(np.radians([0, 90, 180, 270]), ["x", "y", "-x", "-y"])
     ax.set_yticks([15, 30, 45, 60, 75], ["15°", "30°", "45°", "60°", "75°"], fontsize=8)
     ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.05, 1.0))
@@ -296,33 +290,15 @@ def _smallest_margin(
     return jnp.min(jnp.where(jnp.isfinite(parts), parts, -1.0), axis=0)
 
 
-def _free_azimuth(day: Day) -> float:
-    """Azimuth [degrees] at which labels are farthest from the sun's path, off the axes."""
-    path = np.arctan2(day.s_b[1], day.s_b[0])[day.is_up & (day.s_b[2] > 0)]
-    choices = np.radians([22.5, 67.5, 112.5, 157.5, 202.5, 247.5, 292.5, 337.5])
-    angular_distances = np.abs((path[:, None] - choices + np.pi) % (2 * np.pi) - np.pi)
-    return float(np.degrees(choices[np.argmax(np.min(angular_distances, axis=0, initial=np.pi))]))
-
-
-def _mark_hours(ax: Axes, day: Day) -> None:
-    for hour in range(math.ceil(day.hours[-1])):
-        k = int(np.argmin(np.abs(day.hours - hour)))
-        if day.is_up[k] and day.s_b[2, k] > 0:
-            at = math.atan2(day.s_b[1, k], day.s_b[0, k]), math.degrees(math.acos(day.s_b[2, k]))
-            ax.plot(*at, "o", color=STYLES[0][0], markersize=3)
-            if hour % 2 == 0:
-                ax.annotate(f"{hour} h", at, (4, 4), textcoords="offset points", fontsize=8)
-
-
 def light(day: Day) -> Figure:
     """Figure of the panels' irradiances over the day, and of their energies."""
     figure, axes = grid(1, 2, 3.4, width_ratios=(3, 2))
     irradiance_axes, energy_axes = axes[0]
     # On a level UAV the fixed panel is the level one, and its curve would cover that one's.
     plotted_panels = [p for p in PANELS if p != "airframe" or abs(day.gain("airframe")) > 1e-6]
-    dash_dot_style: tuple[str, Any] = ("#CC79A7", (0, (5, 1, 1, 1)))
-    looks = (STYLES[0], STYLES[3], STYLES[1], dash_dot_style, STYLES[2])
-    styles: dict[str, tuple[str, Any]] = dict(zip(PANELS, looks, strict=True))
+    dash_dot_style = ("#CC79A7", (0, (5, 1, 1, 1)))
+    looks: Any = (STYLES[0], STYLES[3], STYLES[1], dash_dot_style, STYLES[2])
+    styles: dict[str, Any] = dict(zip(PANELS, looks, strict=True))
     for panel in plotted_panels:
         color, dash = styles[panel]
         irradiance_axes.plot(
@@ -334,15 +310,10 @@ def light(day: Day) -> Figure:
     _set_hours(irradiance_axes, day)
     irradiance_axes.legend(fontsize=8, loc="lower center")
     energies = [day.energy[panel] / 3.6e6 for panel in plotted_panels]
-    bars = energy_axes.barh(
-        [PANEL_NAMES[p] for p in plotted_panels],
-        energies,
-        color=[styles[p][0] for p in plotted_panels],
-        height=0.6,
-    )
-    energy_axes.bar_label(
-        bars, [f" {100 * day.gain(p):+.1f} %" for p in plotted_panels], fontsize=8
-    )
+    names, colours = zip(*((PANEL_NAMES[p], styles[p][0]) for p in plotted_panels), strict=True)
+    bars = energy_axes.barh(names, energies, color=colours, height=0.6)
+    gains = [f" {100 * day.gain(p):+.1f} %" for p in plotted_panels]
+    energy_axes.bar_label(bars, gains, fontsize=8)
     energy_axes.set_xlim(0, 1.4 * max(energies))
     # Matplotlib stacks bars upwards, while the legend beside them reads downwards.
     energy_axes.invert_yaxis()

@@ -114,8 +114,7 @@ def rates(study: CaseStudy) -> Figure:
     """Figure of the body rates over the first half second, estimate and truth."""
     figure, axes = grid(3, 1, 5.4)
     t = np.asarray(study.record.t)
-    count = int(np.searchsorted(t, 0.5))
-    count = min(count, len(t) - 1)
+    count = min(int(np.searchsorted(t, 0.5)), len(t) - 1)
     truth = np.asarray(study.record.omega)[..., 0]
     for row, axis in enumerate("xyz"):
         ax = axes[row, 0]
@@ -171,9 +170,7 @@ def consistency(study: CaseStudy) -> Figure:
         for ax, part in ((axes[row, 0], settled_mask), (axes[row, 1], ~settled_mask)):
             ax.axhspan(*mean_interval(degrees, seeds), color="0.8", label="consistent: 99.9 %")
             for name, estimates in study.estimates.items():
-                values = np.mean(
-                    np.asarray(estimates.nees if degrees == 5 else estimates.nis), axis=1
-                )
+                values = np.mean(estimates.nees if degrees == 5 else estimates.nis, axis=1)
                 _plot_line(ax, t[part], values[part], name, linewidth=0.9)
         axes[row, 0].set_ylim(bottom=0.0)
         axes[row, 1].set_yscale("log")
@@ -205,6 +202,11 @@ def labelled_case(study: CaseStudy) -> Labelled:
     component_dims = ("tuning", *path)
     scalar = ("tuning", "time", "seed")
     first = next(iter(estimates_by_tuning.values()))
+    # Filters of one case may read different sensors: innovations that only another has are NaN.
+    innovations = [normalised_innovations(e) for e in estimates_by_tuning.values()]
+    most = max(x.shape[1] for x in innovations)
+    widen = lambda x: np.pad(x, ((0, 0), (0, most - x.shape[1]), (0, 0)), constant_values=np.nan)
+    innovations = [widen(x) for x in innovations]
     table = {
         "thrust": (("time", "rotor"), record.u, "N", "of each rotor, held over the step"),
         "truth": (path, first.truth, "rad/s, m", "body rates and centre of mass"),
@@ -212,41 +214,24 @@ def labelled_case(study: CaseStudy) -> Labelled:
         "measured": (("time", "axis", "seed"), record.y[:, :3], "rad/s", "by the gyroscope"),
         "estimate": (component_dims, together(lambda e: e.mean), "rad/s, m", "means"),
         "standard_deviation": (
-            component_dims,
-            together(lambda e: e.standard_deviation),
-            "rad/s, m",
-            "the filter's own",
+            component_dims, together(lambda e: e.standard_deviation), "rad/s, m", "the filter's own",
         ),
-        "innovation": _joined_innovations(estimates_by_tuning.values()),
+        "innovation": (
+            ("tuning", "time", "reading", "seed"), np.stack(innovations), "1",
+            "normalised, of unit covariance if the filter is consistent",
+        ),
         "nees": (scalar, together(lambda e: e.nees), "1", "of rates and offset, 5 degrees"),
         "nees_offset": (scalar, together(lambda e: e.nees_offset), "1", "2 degrees of freedom"),
         "nis": (scalar, together(lambda e: e.nis), "1", "of the innovations, 3 degrees"),
         "ok": (scalar, together(lambda e: e.ok), "1", "whether the filter still runs"),
-    }
-    named = {
-        "component": list(COMPONENTS),
-        "axis": ["x", "y", "z"],
-        "tuning": list(estimates_by_tuning),
-    }
-    times = (
-        ("time",),
-        np.asarray(record.t)[1:],
-        {"units": "s", "description": "ends of the steps"},
-    )
+    }  # fmt: skip
+    about = {"units": "s", "description": "ends of the steps"}
+    coordinates = {
+        "time": (("time",), np.asarray(record.t)[1:], about), "component": list(COMPONENTS),
+        "axis": ["x", "y", "z"], "tuning": list(estimates_by_tuning),
+    }  # fmt: skip
     return label_table(
-        table, {"time": times} | named, format=FORMAT, format_version=FORMAT_VERSION,
+        table, coordinates, format=FORMAT, format_version=FORMAT_VERSION,
         title=_study_title(study),
         summaries={name: summary.plain() for name, summary in study.summaries.items()},
     )  # fmt: skip
-
-
-def _joined_innovations(estimates: Iterable[Estimates]) -> tuple[tuple[str, ...], Any, str, str]:
-    """Normalised innovations of all tunings; those that are missing, or that only another has, are NaN."""
-    every = [normalised_innovations(e) for e in estimates]
-    most = max(innovations.shape[1] for innovations in every)
-    # Filters of one case may read different sensors.
-    wide = [
-        np.pad(e, ((0, 0), (0, most - e.shape[1]), (0, 0)), constant_values=np.nan) for e in every
-    ]
-    dims = ("tuning", "time", "reading", "seed")
-    return dims, np.stack(wide), "1", "normalised, of unit covariance if the filter is consistent"

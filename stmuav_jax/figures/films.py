@@ -18,9 +18,8 @@ from typing import Any
 import matplotlib
 import numpy as np
 import xarray as xr
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from matplotlib.animation import FFMpegWriter, PillowWriter
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
@@ -37,16 +36,12 @@ from .page import (
     dataset_of,
     finite_times,
     interpolate_poses,
-    joint_of,
-    machine_size,
     watched_bodies,
 )
-from .shapes import Shape, body_shapes, make_quads, rotor_points
-from .sketch import COLOURS
+from .shapes import COLOURS, JOINT_COLOUR, joint_of, machine_size, make_faces
 
 # Browsers show a frame of a GIF for at least 0.02 s.
 _FASTEST = {".gif": 50.0, ".mp4": 240.0}
-_BASE, _PANEL, _JOINT, _ROTOR = "#8b929c", "#1d3f72", "#69717d", "#c3c8d0"
 # Size of the box of a film by that of the motion, and its smallest edge by the largest.
 _MARGIN, _FLATTEST = 1.05, 0.4
 # Width and height of a picture for the title and the labels of the axes [pixels].
@@ -55,8 +50,6 @@ _LABELS = np.array([110.0, 85.0])
 _FAR = 1.5
 
 Times = Float[np.ndarray, " k"]
-Triples = Float[np.ndarray, "f 3"]
-Faces = tuple[Int[np.ndarray, " f"], Float[np.ndarray, "f 4 3"], Triples, Triples]
 
 
 def film(
@@ -93,16 +86,17 @@ def film(
         raise SettingError(
             f"A film is a file that ends with .gif or .mp4, but this one is '{target.name}'."
         )
-    whole = all(isinstance(n, int | np.integer) and 64 <= n <= 4096 for n in size)
-    if len(size) != 2 or not whole or (suffix == ".mp4" and any(n % 2 for n in size)):
-        kind = "even whole numbers" if suffix == ".mp4" else "whole numbers"
+    step, kind = (2, "even whole numbers") if suffix == ".mp4" else (1, "whole numbers")
+    fits = lambda n: isinstance(n, int | np.integer) and 64 <= n <= 4096 and n % step == 0
+    if len(size) != 2 or not all(map(fits, size)):
         raise SettingError(
             f"The size of the film must be two {kind} of pixels within 64 and 4096, but it is {tuple(size)}."
         )
-    for value, quantity_name, most in (
+    limits = (
         (fps, "rate of a film [frames/s]", _FASTEST[suffix]),
         (speed, "speed of a film", math.inf),
-    ):
+    )
+    for value, quantity_name, most in limits:
         if not (math.isfinite(value) and 0 < value <= most):
             bound = "" if math.isinf(most) else f" and at most {most:g} in {target.name}"
             raise SettingError(f"The {quantity_name} must be positive{bound}, but it is {value:g}.")
@@ -115,16 +109,17 @@ def film(
     check_viewable(data)
     times = frame_times(data["time"].values[finite_times(data)], span, fps, speed)
     figure, draw = draw_mechanism(data, times, size, eye, "" if speed == 1 else f"speed {speed:g}")
-    extra = ["-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     rate: Any = fps
-    is_gif = suffix == ".gif"
-    settings: Any = {} if is_gif else {"animation.ffmpeg_path": _find_ffmpeg()}
+    settings: Any = {}
+    writer: Any = PillowWriter(fps=rate)
+    if suffix == ".mp4":
+        settings["animation.ffmpeg_path"] = _find_ffmpeg()
+        # H.264 with 4:2:0 colours plays in every browser.
+        extra = ["-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+        writer = FFMpegWriter(fps=rate, codec="libx264", extra_args=extra)
     # Drawn aside and moved at the end: an interrupted film leaves no half of a file.
     with matplotlib.rc_context(settings), tempfile.TemporaryDirectory() as folder:
         film_path = Path(folder) / f"film{suffix}"
-        # H.264 with 4:2:0 colours plays in every browser.
-        mp4 = FFMpegWriter(fps=rate, codec="libx264", extra_args=extra)
-        writer = PillowWriter(fps=rate) if is_gif else mp4
         try:
             with writer.saving(figure, film_path, dpi=100):
                 for k in range(len(times)):
@@ -144,9 +139,7 @@ def frame_times(
     """Times that the frames of a film show (k,) [s], within the saved times `ts` [s]; see `film`."""
     first, last = start, end = float(ts[0]), float(ts[-1])
     if span is not None:
-        first, last = (
-            float(t) for t in check_numbers(span, (2,), "The span of a film", "s", SettingError)
-        )
+        first, last = map(float, check_numbers(span, (2,), "The span of a film", "s", SettingError))
     # saved times are decimal fractions only up to round-off
     slack = 1e-9 * max(abs(start), abs(end))
     if span is not None and not start - slack <= first < last <= end + slack:
@@ -173,10 +166,9 @@ def draw_mechanism(
     R_wb = np.concatenate([R_wb, np.broadcast_to(np.eye(3), (len(times), 1, 3, 3))], axis=1)
     names = [*(str(name) for name in run["body"].values), GROUND]
     body, corners, normals, colours = make_faces(run, names)
-    joints = [joint_of(run, k) for k in range(run.sizes.get("joint", 0))]
     rods = [
         [(names.index(joint[f"body_{side}"]), np.array(joint[f"point_{side}"])) for side in "ij"]
-        for joint in joints
+        for joint in (joint_of(run, k) for k in range(run.sizes.get("joint", 0)))
         if joint["kind"] in ("distance", "revolute_spherical")
     ]
     # a little more, as Agg cuts 114.99999 pixels to 114
@@ -190,9 +182,8 @@ def draw_mechanism(
     axes.tick_params(labelsize=7)
     axes.locator_params(nbins=4)
     faces = axes.add_collection3d(Poly3DCollection(list(corners), linewidths=0.3), autolim=False)
-    lines = axes.add_collection3d(
-        Line3DCollection([], colors=_JOINT, linewidths=1.5), autolim=False
-    )
+    lines = Line3DCollection([], colors=JOINT_COLOUR, linewidths=1.5)
+    axes.add_collection3d(lines, autolim=False)
     base = names.index(watched_bodies(run)[0])
     (trail,) = axes.plot([], [], [], color=COLOURS[0], linewidth=1.2)
     title = str(run.attrs.get("title", "")) or str(run.attrs.get("scene", ""))
@@ -214,7 +205,14 @@ def draw_mechanism(
     high = np.max([(corners_at(k) - moved_by[k]).max(axis=(0, 1)) for k in frames], axis=0)
     half = 0.5 * (high - low)
     half = _MARGIN * np.maximum(half, _FLATTEST * np.max(half))
-    _fill_picture(axes, half.tolist(), size)
+    # The box is as large as a picture with labels allows. Matplotlib would scale an array in place.
+    axes.set_box_aspect(half.tolist())
+    axes.apply_aspect()
+    box = np.array(list(itertools.product(axes.get_xlim3d(), axes.get_ylim3d(), axes.get_zlim3d())))
+    x, y, _ = proj_transform(box[:, 0], box[:, 1], box[:, 2], axes.get_proj())
+    extent = np.ptp(axes.transData.transform(np.column_stack([x, y])), axis=0)
+    space = np.maximum(np.asarray(size) - _LABELS, 0.5 * np.asarray(size))
+    axes.set_box_aspect(half.tolist(), zoom=float(np.min(space / extent)))
     azimuth = math.radians(float(view[1])) + 0.5
     # Light from beside the eye: faces of one body differ in shade from any direction.
     light = np.array([math.cos(azimuth), math.sin(azimuth), 1.0]) / math.sqrt(2.0)
@@ -234,51 +232,6 @@ def draw_mechanism(
         clock.set_text(f"t = {times[k]:.{digits}f} s   {caption}")
 
     return figure, draw_frame
-
-
-def _fill_picture(axes: Any, half: list[float], size: Sequence[int]) -> None:
-    """Set the box of the axes to half of its edges (3,), as large as a picture with labels allows."""
-    # Matplotlib would scale an array in place.
-    axes.set_box_aspect(half)
-    axes.apply_aspect()
-    ends = np.array([axes.get_xlim3d(), axes.get_ylim3d(), axes.get_zlim3d()])
-    box = np.array(list(itertools.product(*ends)))
-    x, y, _ = proj_transform(box[:, 0], box[:, 1], box[:, 2], axes.get_proj())
-    extent = np.ptp(axes.transData.transform(np.column_stack([x, y])), axis=0)
-    room = np.maximum(np.asarray(size) - _LABELS, 0.5 * np.asarray(size))
-    axes.set_box_aspect(half, zoom=float(np.min(room / extent)))
-
-
-def make_faces(run: xr.Dataset, names: Sequence[str]) -> Faces:
-    """Quadrilaterals of all bodies, joints and rotors of a saved run.
-
-    Returns:
-        Index of the body in `names`; corners from its centre of mass, body axes [m]; normals out of the solid;
-        and red, green and blue from 0 to 1.
-    """
-    solids: list[tuple[str, Shape, str]] = []
-    for n, name in enumerate(str(name) for name in run["body"].values):
-        rotors = rotor_points(run, name)
-        colour = _PANEL if "panel" in name.lower() else COLOURS[n % len(COLOURS)]
-        solids += [(name, s, _BASE if len(rotors) else colour) for s in body_shapes(run, name)]
-        gaps = np.linalg.norm(rotors[:, None] - rotors[None], axis=2)
-        radius = 0.45 * float(np.min(gaps[gaps > 0], initial=0.5 * machine_size(run)))
-        disc = (radius, 0.02 * radius)
-        solids += [(name, Shape("cylinder", disc, tuple(point)), _ROTOR) for point in rotors]
-    for joint in (joint_of(run, k) for k in range(run.sizes.get("joint", 0))):
-        ball = Shape("sphere", (0.01 * machine_size(run),), tuple(joint["point_j"]))
-        solids.append((joint["body_j"], ball, _JOINT))
-    parts = []
-    for name, shape, colour in solids:
-        quads = make_quads(shape)
-        normals = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
-        # all shapes are convex: a normal points away from the middle
-        outward = np.sum(normals * (quads.mean(axis=1) - np.asarray(shape.position)), axis=1)
-        normals *= (np.sign(outward) / np.linalg.norm(normals, axis=1))[:, None]
-        indices = np.full(len(quads), names.index(name))
-        parts.append((indices, quads, normals, np.tile(to_rgb(colour), (len(quads), 1))))
-    body, corners, normals, colours = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return body, corners, normals, colours
 
 
 def _find_ffmpeg() -> str:

@@ -131,14 +131,12 @@ def load_record(path: str | os.PathLike[str]) -> FilterRecord:
             f"{', '.join(missing)}."
         )
     lost = int(np.sum(~arrays["ok"]))
-    tests = end_consistency(
-        arrays["nees"], arrays["error"].shape[1], arrays["nis"], arrays["degrees"]
-    )
+    nees, nis, size = arrays["nees"], arrays["nis"], arrays["error"].shape[1]
+    tests = end_consistency(nees, size, nis, arrays["degrees"])
     is_good = all(test.holds for test in tests) and not lost
     verdict_text = f"{lost} filters lost their covariance. " if lost else ""
-    verdict_text += (
-        "Consistent. " if is_good else "Inconsistent: the covariance is not that of the errors. "
-    )
+    inconsistent = "Inconsistent: the covariance is not that of the errors. "
+    verdict_text += "Consistent. " if is_good else inconsistent
     verdict_text += " ".join(test.explanation for test in tests)
     about = {**head.get("about", {}), **{k: head[k] for k in ("versions", "date") if k in head}}
     return FilterRecord(
@@ -183,18 +181,11 @@ def error_figure(record: FilterRecord, part: range) -> Figure:
     late = record.t >= record.t[0] + 0.5 * (record.t[-1] - record.t[0])
     for tuning_index, name in enumerate(record.tunings):
         for ax, k in zip(axes[:, tuning_index], part, strict=True):
-            error, band = (
-                record.error[tuning_index, :, k, :_SEEDS],
-                3 * record.deviation[tuning_index, :, k, 0],
-            )
+            error = record.error[tuning_index, :, k, :_SEEDS]
+            band = 3 * record.deviation[tuning_index, :, k, 0]
+            color, _ = STYLES[tuning_index % len(STYLES)]
             ax.plot(record.t, error, color="0.65", linewidth=0.5)
-            for sign in (1, -1):
-                ax.plot(
-                    record.t,
-                    sign * band,
-                    color=STYLES[tuning_index % len(STYLES)][0],
-                    linewidth=1.3,
-                )
+            ax.plot(record.t, np.outer(band, (1, -1)), color=color, linewidth=1.3)
             sizes = np.concatenate([np.abs(error[late]).ravel(), band[late]])
             most = float(np.max(sizes[np.isfinite(sizes)], initial=0.0))
             if most > 0:

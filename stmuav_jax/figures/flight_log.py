@@ -49,11 +49,8 @@ def _axes_of(result: FlightIdentification) -> list[int]:
 def draw_log(subject: IdentifiedFlight) -> Figure:
     """Commands, rates, forces and voltage of the whole log, with flight segments and windows."""
     log, record, result = subject
-    names = [
-        name
-        for name in ("motor_commands", "gyroscope", "accelerometer", "battery_voltage")
-        if name in log
-    ]
+    names = ("motor_commands", "gyroscope", "accelerometer", "battery_voltage")
+    names = [name for name in names if name in log]
     figure, axes = grid(len(names), 1, 0.9 + 1.5 * len(names), sharex=True)
     count = len(next(iter(result.estimates.values())).window_values) if result.estimates else 1
     for ax, name in zip(axes[:, 0], names, strict=True):
@@ -61,14 +58,8 @@ def draw_log(subject: IdentifiedFlight) -> Figure:
         # Points beyond the width of the figure show nothing and make vector files large.
         every = max(len(channel.ts) // _MOST, 1)
         for k, column in enumerate(channel.columns):
-            style = {"color": look(k)["color"], "linestyle": look(k)["linestyle"]}
-            ax.plot(
-                channel.ts[::every],
-                channel.values[::every, k],
-                label=column,
-                linewidth=0.8,
-                **style,
-            )
+            style = look(k) | {"marker": "", "linewidth": 0.8}
+            ax.plot(channel.ts[::every], channel.values[::every, k], label=column, **style)
         for start, end in log.flights:
             ax.axvspan(start, end, color=_BAND, zorder=0)
         for t in np.linspace(record.ts[0], record.ts[-1], count + 1):
@@ -77,9 +68,8 @@ def draw_log(subject: IdentifiedFlight) -> Figure:
         draw_legend_beside(ax)
     axes[-1, 0].set_xlabel("time [s]", fontsize=9)
     figure.align_ylabels(axes[:, 0])
-    figure.suptitle(
-        f"{log.name}: flight (grey) and windows (dotted)", fontsize=10, parse_math=False
-    )
+    title = f"{log.name}: flight (grey) and windows (dotted)"
+    figure.suptitle(title, fontsize=10, parse_math=False)
     return figure
 
 
@@ -90,9 +80,8 @@ def draw_accelerations(subject: IdentifiedFlight) -> Figure:
     figure, axes = grid(len(axes_of) + 1, 1, 1.2 + 1.5 * (len(axes_of) + 1), sharex=True)
     ts, rows = record.ts, round(_SHOWN / record.dt)
     # A wrong model shows most where the commands change most.
-    spread = np.convolve(
-        np.sum(np.diff(record.commands, axis=0) ** 2, axis=1), np.ones(rows), "same"
-    )
+    changes = np.sum(np.diff(record.commands, axis=0) ** 2, axis=1)
+    spread = np.convolve(changes, np.ones(rows), "same")
     middle = float(ts[np.argmax(spread)])
     b, a = low_pass(20.0, record.dt)
     for c, axis in enumerate(axes_of):
@@ -112,17 +101,14 @@ def draw_accelerations(subject: IdentifiedFlight) -> Figure:
         ax.set_xlabel("")
         # Matplotlib scales an axis by the whole curve, also by what lies outside of the drawn
         # seconds.
-        inside = np.concatenate([
-            np.asarray(line.get_ydata(), float)[np.abs(np.asarray(line.get_xdata(), float) - middle) < _SHOWN / 2]
-            for line in ax.lines
-        ])  # fmt: skip
+        x, y = np.concatenate([np.asarray(line.get_xydata()) for line in ax.lines]).T
+        inside = y[np.abs(x - middle) < _SHOWN / 2]
         if len(inside):
             low, high = float(np.min(inside)), float(np.max(inside))
             ax.set_ylim(low - 0.08 * (high - low), high + 0.08 * (high - low))
     axes[-1, 0].set_xlabel("time [s]", fontsize=9)
-    axes[0, 0].legend(
-        fontsize=8, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False
-    )
+    above = (1.0, 1.0)
+    axes[0, 0].legend(fontsize=8, ncols=2, loc="lower right", bbox_to_anchor=above, frameon=False)
     figure.align_ylabels(axes[:, 0])
     figure.suptitle("Accelerations by commands, both below 20 Hz", fontsize=10)
     return figure
@@ -183,13 +169,8 @@ def draw_response(subject: IdentifiedFlight) -> Figure | None:
         fit = result.estimates[AXES[axis]].value * np.exp(-s * delay) / (1 + s * tau) * filtered
         # A rotor that changes its speed turns the vehicle by its inertia, which yaw alone shows.
         if axis == 2:
-            fit += (
-                result.estimates["spin_up"].value
-                * s
-                / (1 + s * tau)
-                * np.exp(-s * delay)
-                * filtered
-            )
+            spin_up = result.estimates["spin_up"].value
+            fit += spin_up * s / (1 + s * tau) * np.exp(-s * delay) * filtered
         for row, of in enumerate((np.abs, lambda x: np.degrees(np.unwrap(np.angle(x))))):
             ax: Axes = axes[row, column]
             ax.plot(f[good], of(H)[good], "o", color=STYLES[0][0], markersize=3, label="measured")
@@ -203,9 +184,8 @@ def draw_response(subject: IdentifiedFlight) -> Figure | None:
     for row, label in enumerate(("gain [rad/s$^2$]", "phase [degrees]", "coherence [1]")):
         axes[row, 0].set_ylabel(label, fontsize=9)
     axes[0, 0].legend(fontsize=8, frameon=False)
-    figure.suptitle(
-        f"Response to commands; points with a coherence above {_COHERENT:g}", fontsize=10
-    )
+    title = f"Response to commands; points with a coherence above {_COHERENT:g}"
+    figure.suptitle(title, fontsize=10)
     return figure
 
 
@@ -216,9 +196,8 @@ def draw_windows(subject: IdentifiedFlight) -> Figure | None:
     if not names:
         return None
     columns = min(3, len(names))
-    figure, axes = grid(
-        -(-len(names) // columns), columns, 0.8 + 1.6 * -(-len(names) // columns), sharex=True
-    )
+    rows = -(-len(names) // columns)
+    figure, axes = grid(rows, columns, 0.8 + 1.6 * rows, sharex=True)
     for ax in axes.flat[len(names) :]:
         ax.set_visible(False)
     for ax, name in zip(axes.flat, names, strict=False):
@@ -252,21 +231,17 @@ def draw_centre(subject: IdentifiedFlight) -> Figure | None:
     radius = float(np.sqrt(stats.chi2.ppf(_ELLIPSE, 2)))
     for ax in axes[0]:
         ax.plot(0.0, 0.0, "+", color="0.3", markersize=10, label="origin")
-        for k, (prefix, label) in enumerate(
-            (("centre", "motors equal"), ("free_centre", "motors free"))
-        ):
+        kinds = (("centre", "motors equal"), ("free_centre", "motors free"))
+        for k, (prefix, label) in enumerate(kinds):
             if f"{prefix}_x" not in e:
                 continue
             x, y = e[f"{prefix}_x"], e[f"{prefix}_y"]
             color, dash = STYLES[k]
             # forward is up, and left is to the left
-            place, size = (
-                (-1e3 * y.value, 1e3 * x.value),
-                2e3 * radius * np.array([y.deviation, x.deviation]),
-            )
-            ax.add_patch(
-                Ellipse(place, *size, fill=False, color=color, linestyle=dash, linewidth=1.4)
-            )
+            place = (-1e3 * y.value, 1e3 * x.value)
+            size = 2e3 * radius * np.array([y.deviation, x.deviation])
+            style = {"fill": False, "color": color, "linestyle": dash, "linewidth": 1.4}
+            ax.add_patch(Ellipse(place, *size, **style))
             ax.plot(*place, "o^"[k], color=color, markersize=5, label=label)
         ax.set_aspect("equal")
         ax.set_xlabel("to the right [mm]", fontsize=9)
@@ -281,9 +256,8 @@ def draw_centre(subject: IdentifiedFlight) -> Figure | None:
     axes[0, 0].set_ylabel("forward [mm]", fontsize=9)
     axes[0, 1].legend(fontsize=8, frameon=False, loc="upper right")
     # Deviations are much smaller than the arms: the second panel enlarges the centre of the first.
-    reach = (
-        1e3 * radius * max(e[name].deviation + abs(e[name].value) for name in e if "centre" in name)
-    )
+    sizes = [x.deviation + abs(x.value) for name, x in e.items() if "centre" in name]
+    reach = 1e3 * radius * max(sizes)
     axes[0, 1].set_xlim(-1.1 * reach, 1.1 * reach)
     axes[0, 1].set_ylim(-1.1 * reach, 1.1 * reach)
     figure.suptitle("Centre of mass, 95 %, on the plan of the rotors", fontsize=10)
@@ -318,12 +292,10 @@ def draw_thrust(subject: IdentifiedFlight) -> Figure | None:
         label = "assumed shape through the weight"
     color, dash = STYLES[0]
     ax.plot(u, scale * thrust, color=color, linestyle=dash, linewidth=1.4, label=label)
-    ax.fill_between(
-        u, scale * (thrust - spread), scale * (thrust + spread), color=color, alpha=0.25
-    )
-    ax.plot(
-        result.hover, scale * weight, "^", color=STYLES[1][0], label="weight at the mean command"
-    )
+    low, high = scale * (thrust - spread), scale * (thrust + spread)
+    ax.fill_between(u, low, high, color=color, alpha=0.25)
+    label = "weight at the mean command"
+    ax.plot(result.hover, scale * weight, "^", color=STYLES[1][0], label=label)
     ax.set_xlim(0.0, 1.0)
     ax.set_ylim(min(0.0, float(np.min(scale * thrust))), None)
     ax.set_xlabel("command [1]", fontsize=9)
@@ -336,17 +308,13 @@ def draw_thrust(subject: IdentifiedFlight) -> Figure | None:
 def draw_table(subject: IdentifiedFlight) -> Figure:
     """Table of what is determined with its deviation, and the sentences on what is not."""
     result = subject.result
-    rows = [
-        [e.name, f"{e.value:.4g}", f"{e.deviation:.2g}", e.unit] for e in result.estimates.values()
-    ]
-    sentences = [
-        fill(text, 110) for text in (*result.refusals.values(), result.verdict.explanation)
-    ]
+    estimates = result.estimates.values()
+    rows = [[e.name, f"{e.value:.4g}", f"{e.deviation:.2g}", e.unit] for e in estimates]
+    texts = (*result.refusals.values(), result.verdict.explanation)
+    sentences = [fill(text, 110) for text in texts]
     lines = sum(text.count("\n") + 1 for text in sentences)
-    height = 0.9 + 0.19 * (len(rows) + 1) + 0.16 * lines
-    figure, axes = grid(
-        2, 1, height, height_ratios=[0.19 * (len(rows) + 1) + 0.1, 0.16 * lines + 0.1]
-    )
+    heights = [0.19 * (len(rows) + 1) + 0.1, 0.16 * lines + 0.1]
+    figure, axes = grid(2, 1, 0.7 + sum(heights), height_ratios=heights)
     for ax in axes[:, 0]:
         ax.axis("off")
     if rows:
@@ -359,10 +327,8 @@ def draw_table(subject: IdentifiedFlight) -> Figure:
         for cell in table.get_celld().values():
             cell.set_linewidth(0.4)
             cell.get_text().set_parse_math(False)
-    text = axes[1, 0].text(
-        0.0, 1.0, "\n".join(sentences), fontsize=7.5, va="top", transform=axes[1, 0].transAxes
-    )
-    text.set_parse_math(False)
+    style = {"fontsize": 7.5, "va": "top", "transform": axes[1, 0].transAxes}
+    axes[1, 0].text(0.0, 1.0, "\n".join(sentences), parse_math=False, **style)
     figure.suptitle("What the flight determines, and what it does not", fontsize=10)
     return figure
 
@@ -383,14 +349,10 @@ def draw_filtered_centre(
         if estimates is not None and f"centre_{name}" in estimates:
             e = estimates[f"centre_{name}"]
             color, dash = STYLES[1]
-            ax.axhline(1e3 * e.value, color=color, linestyle=dash, label="whole record")
-            ax.axhspan(
-                1e3 * (e.value - 2 * e.deviation),
-                1e3 * (e.value + 2 * e.deviation),
-                color=_BAND,
-                zorder=0,
-            )
-            low, high = min(low, 1e3 * e.value), max(high, 1e3 * e.value)
+            whole, band = 1e3 * e.value, 2e3 * e.deviation
+            ax.axhline(whole, color=color, linestyle=dash, label="whole record")
+            ax.axhspan(whole - band, whole + band, color=_BAND, zorder=0)
+            low, high = min(low, whole), max(high, whole)
         margin = 0.5 * (high - low) + 2e3 * filtered.deviation[-1, axis]
         ax.set_ylim(low - margin, high + margin)
         ax.set_ylabel(f"centre of mass {name} [mm]", fontsize=9)

@@ -14,7 +14,6 @@ import tempfile
 import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,16 @@ from ..control.closed_loop import LoopRun
 from ..dynamics.simulation import Run
 from ..io.netcdf import FileError, load, write_atomically
 from ..io.run_file import loop_to_dataset, to_dataset
-from ..mechanics.body import GROUND
-from .run import SLIDING, displacement_of, motion_of
-from .shapes import Shape, body_centre, body_shapes, joint_points, rotor_points
+from .run import SLIDING
+from .shapes import (
+    Shape,
+    body_poses,
+    body_shapes,
+    joint_displacement,
+    joint_of,
+    machine_size,
+    rotor_points,
+)
 
 # Largest number of saved times in a page: more are thinned out evenly.
 MOST_TIMES = 2000
@@ -42,13 +48,8 @@ _OF_JOINTS = ("joint_point_i", "joint_point_j", "joint_frame_i", "joint_frame_j"
 
 # Variables that have plots of their own, and the largest number of curves of any other.
 _SHOWN = (
-    "kinetic_energy",
-    "potential_energy",
-    "work",
-    "rotor_thrust",
-    "reaction_force",
-    "reaction_moment",
-)
+    "kinetic_energy", "potential_energy", "work", "rotor_thrust", "reaction_force", "reaction_moment",
+)  # fmt: skip
 _MOST_CURVES = 12
 
 Curves = list[dict[str, Any]]
@@ -70,39 +71,55 @@ def content_of(
     """
     check_viewable(run)
     # A browser holds a few thousand poses of many bodies with ease, but not a million.
-    time_indices, note = _shown_times(run)
+    time_indices, count, note = finite_times(run), run.sizes["time"], ""
+    if len(time_indices) < count:
+        note = f"{count - len(time_indices)} of {count} saved times are not finite and left out. "
+    if len(time_indices) > MOST_TIMES:
+        some = np.unique(np.round(np.linspace(0, len(time_indices) - 1, MOST_TIMES)).astype(int))
+        note += f"{MOST_TIMES} of {len(time_indices)} saved times are shown."
+        time_indices = time_indices[some]
     run = run.isel(time=time_indices)
     names = [str(name) for name in run["body"].values]
-    custom_shapes = dict(shapes or {})
+    custom_shapes: dict[str, Sequence[Shape]] = dict(shapes or {})
     for name in custom_shapes:
         if name not in names:
             raise SettingError(f"There is no body '{name}' to draw.{nearest_names(name, names)}")
-    towards = None if sun is None else _sun_direction(sun)
+    solids_by_body = {name: body_shapes(run, name) for name in names} | custom_shapes
+    rotors = None
+    if "rotor_thrust" in run:
+        carriers = [str(name) for name in run["rotor_body"].values]
+        points = [point for body in dict.fromkeys(carriers) for point in rotor_points(run, body)]
+        rotors = {
+            "bodies": carriers, "positions": np.array(points).tolist(), "spin": run["rotor_spin"].values.tolist(),
+            "speed": encode_array(run["rotor_speed"].values),
+            "thrust": encode_array(run["rotor_thrust"].values),
+        }  # fmt: skip
+    optional = lambda name: encode_array(run[name].values) if name in run else None
+    towards = None
+    if sun is not None:
+        sun_vector = np.asarray(check_vector(sun, "The direction of the sun", ""))
+        length = float(np.linalg.norm(sun_vector))
+        if length == 0:
+            raise SettingError(
+                "The direction of the sun has zero length; give any vector towards it."
+            )
+        towards = sun_vector / length
     return {
         "title": str(run.attrs.get("title", "")) or str(run.attrs.get("scene", "")) or "Motion",
-        "note": note,
+        "note": note.strip(),
         # Times in double precision: a late one in single precision loses the digits that tell frames apart.
         # Poses in single precision halve the page.
         "times": encode_array(run["time"].values, "<f8"),
         "positions": encode_array(run["position"].values),
         "orientations": encode_array(run["euler_parameters"].values),
         "bodies": [
-            {
-                "name": name,
-                "shapes": [
-                    shape.to_dict() for shape in custom_shapes.get(name, body_shapes(run, name))
-                ],
-            }
-            for name in names
+            {"name": name, "shapes": [shape.to_dict() for shape in solids]}
+            for name, solids in solids_by_body.items()
         ],
         "joints": [joint_of(run, k) for k in range(run.sizes.get("joint", 0))],
-        "reactions": encode_array(run["reaction_force"].values)
-        if "reaction_force" in run
-        else None,
-        "reference": encode_array(run["reference_position"].values)
-        if "reference_position" in run
-        else None,
-        "rotors": _rotor_data(run),
+        "reactions": optional("reaction_force"),
+        "reference": optional("reference_position"),
+        "rotors": rotors,
         "sun": None if towards is None else towards.tolist(),
         "watch": watched_bodies(run),
         "size": machine_size(run),
@@ -129,9 +146,8 @@ def encode_array(values: Any, kind: str = "<f4") -> str:
 
 def finite_times(run: xr.Dataset) -> Int[np.ndarray, " k"]:
     """Indices of the saved times at which all poses are finite; `FileError` if there is none."""
-    finite = np.all(np.isfinite(run["position"].values), axis=(1, 2))
-    finite &= np.all(np.isfinite(run["euler_parameters"].values), axis=(1, 2))
-    finite_indices = np.flatnonzero(finite)
+    poses = np.concatenate([run["position"].values, run["euler_parameters"].values], axis=2)
+    finite_indices = np.flatnonzero(np.all(np.isfinite(poses), axis=(1, 2)))
     if not len(finite_indices):
         raise FileError(
             f"The run of scene '{run.attrs.get('scene', '')}' has no saved time at which all poses are "
@@ -158,33 +174,12 @@ def interpolate_poses(
         )
     ts, p = run["time"].values[finite], run["euler_parameters"].values[finite]
     # Between saved times bodies turn along the shortest arc; a mean of Euler parameters is no rotation.
-    turns = (Slerp(ts, Rotation.from_quat(p[:, n, [1, 2, 3, 0]])) for n in range(p.shape[1]))
+    turns = (Slerp(ts, Rotation.from_quat(q, scalar_first=True)) for q in np.moveaxis(p, 1, 0))
     k = np.clip(np.searchsorted(ts, times, side="right") - 1, 0, len(ts) - 2)
     share = ((times - ts[k]) / (ts[k + 1] - ts[k]))[:, None, None]
     r = run["position"].values[finite]
     R_wb = np.stack([turn(times).as_matrix() for turn in turns], axis=1)
     return (1 - share) * r[k] + share * r[k + 1], R_wb
-
-
-def _shown_times(run: xr.Dataset) -> tuple[np.ndarray, str]:
-    """Indices of the saved times that are shown, and a sentence about the others."""
-    time_indices, count = finite_times(run), run.sizes["time"]
-    note = ""
-    if len(time_indices) < count:
-        note = f"{count - len(time_indices)} of {count} saved times are not finite and left out. "
-    if len(time_indices) > MOST_TIMES:
-        some = np.unique(np.round(np.linspace(0, len(time_indices) - 1, MOST_TIMES)).astype(int))
-        note += f"{MOST_TIMES} of {len(time_indices)} saved times are shown."
-        time_indices = time_indices[some]
-    return time_indices, note.strip()
-
-
-def _sun_direction(sun: Numbers) -> Float[np.ndarray, "3"]:
-    sun_vector = np.asarray(check_vector(sun, "The direction of the sun", ""))
-    length = float(np.linalg.norm(sun_vector))
-    if length == 0:
-        raise SettingError("The direction of the sun has zero length; give any vector towards it.")
-    return sun_vector / length
 
 
 def watched_bodies(run: xr.Dataset) -> list[str]:
@@ -204,69 +199,6 @@ def _upright_bodies(run: xr.Dataset) -> list[str]:
     return [n for n in _body_names(run) if len(rotor_points(run, n)) or "panel" in n.lower()]
 
 
-def _body_poses(run: xr.Dataset, body: str) -> tuple[Any, Any]:
-    """Positions (k, 3) [m] and rotation matrices (k, 3, 3) of a body or ground at all times."""
-    count = run.sizes["time"]
-    if body == GROUND:
-        return np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3))
-    k = list(run["body"].values).index(body)
-    e = run["euler_parameters"].values[:, k]
-    rotation_matrices = Rotation.from_quat(e[:, [1, 2, 3, 0]]).as_matrix()
-    return run["position"].values[:, k], rotation_matrices
-
-
-def joint_of(run: xr.Dataset, k: int) -> dict[str, Any]:
-    """Plain data of a joint, with points from the bodies' centres of mass."""
-    i, j = (str(run[f"joint_body_{side}"].values[k]) for side in ("i", "j"))
-    point_i = run["joint_point_i"].values[k] - body_centre(run, i)
-    point_j = run["joint_point_j"].values[k] - body_centre(run, j)
-    frame_i, kind = run["joint_frame_i"].values[k], str(run["joint_kind"].values[k])
-    joint_data = {
-        "name": str(run["joint"].values[k]), "kind": kind, "body_i": i, "body_j": j,
-        "point_i": point_i.tolist(), "point_j": point_j.tolist(),
-        "frame_i": frame_i.tolist(), "frame_j": run["joint_frame_j"].values[k].tolist(),
-    }  # fmt: skip
-    if kind in SLIDING:
-        displacements = joint_displacement(run, k)
-        joint_data["slide"] = [float(np.min(displacements)), float(np.max(displacements))]
-    return joint_data
-
-
-def joint_displacement(run: xr.Dataset, k: int) -> Float[np.ndarray, " t"]:
-    """Displacement of a joint's point on body j along the axis on body i (t,) [m]."""
-    motion = motion_of(run)
-    return displacement_of(motion, motion.joints[k])
-
-
-def _rotor_data(run: xr.Dataset) -> dict[str, Any] | None:
-    if "rotor_thrust" not in run:
-        return None
-    at, bodies = [], [str(name) for name in run["rotor_body"].values]
-    for body in dict.fromkeys(bodies):
-        at += rotor_points(run, body).tolist()
-    return {
-        "bodies": bodies, "positions": at, "spin": run["rotor_spin"].values.tolist(),
-        "speed": encode_array(run["rotor_speed"].values),
-        "thrust": encode_array(run["rotor_thrust"].values),
-    }  # fmt: skip
-
-
-def machine_size(run: xr.Dataset) -> float:
-    """Diagonal [m] of the box around all joints, rotors and centres of mass at the start."""
-    point_sets = [run["position"].values[0]]
-    for body in (str(name) for name in run["body"].values):
-        r, R = _body_poses(run, body)
-        for points in (joint_points(run, body)[0], rotor_points(run, body)):
-            point_sets.append(r[0] + points @ R[0].T)
-    every = np.concatenate(point_sets)
-    diagonal = float(np.linalg.norm(np.max(every, axis=0) - np.min(every, axis=0)))
-    # A single body has no extent of points; its radius of gyration stands for its size.
-    gyration = np.sqrt(
-        np.max(np.linalg.eigvalsh(run["inertia"].values)[:, -1] / run["mass"].values)
-    )
-    return max(diagonal, 3 * float(gyration))
-
-
 # --- curves
 
 
@@ -277,7 +209,7 @@ def plot_curves(run: xr.Dataset, sun: Float[np.ndarray, "3"] | None) -> Curves:
         r = run["position"].values[:, names.index(body)]
         curves_by_title[f"position of {_spell_name(body)} [m]"] = dict(zip("xyz", r.T, strict=True))
     normals = {
-        _spell_name(name): _body_poses(run, name)[1][:, :, 2] for name in _upright_bodies(run)
+        _spell_name(name): body_poses(run, name)[1][:, :, 2] for name in _upright_bodies(run)
     }
     curves_by_title["tilt of z from the vertical [degrees]"] = {
         name: _angle_degrees(z[:, 2]) for name, z in normals.items()
@@ -404,11 +336,12 @@ def view(
     # "<" within the numbers and names would end the script element
     # Everything is in one file, which opens without a network and can be sent.
     data = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
-    parts = {name: _read_asset(name) for name in _PARTS}
+    assets = Path(__file__).with_name("assets")
+    parts = {name: (assets / name).read_text(encoding="utf-8") for name in (*_PARTS, "page.html")}
     parts |= {"title": html.escape(" | ".join(titles)), "data": data}
     # One pass: text that a part brings along is not searched for placeholders.
     page = re.sub(
-        r"\{\{([\w.]+)\}\}", lambda placeholder: parts[placeholder[1]], _read_asset("page.html")
+        r"\{\{([\w.]+)\}\}", lambda placeholder: parts[placeholder[1]], parts["page.html"]
     )
     return RunPage(page)
 
@@ -423,12 +356,5 @@ def dataset_of(run: Run | LoopRun | xr.Dataset | str | os.PathLike[str]) -> xr.D
         return loop_to_dataset(run)
     path = Path(run)
     if path.is_dir():
-        path = next(
-            (path / n for n in ("run.nc", "flight.nc") if (path / n).exists()), path / "run.nc"
-        )
+        path /= next((n for n in ("run.nc", "flight.nc") if (path / n).exists()), "run.nc")
     return load(path)
-
-
-@cache
-def _read_asset(name: str) -> str:
-    return (Path(__file__).with_name("assets") / name).read_text(encoding="utf-8")

@@ -13,22 +13,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, each with its own dash, so that either alone tells curves apart.
-STYLES = (
-    ("#0072B2", "-"),
-    ("#D55E00", "--"),
-    ("#009E73", "-."),
-    ("#000000", ":"),
-)
+STYLES = (("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#000000", ":"))
 # More of them for figures of many curves. With the markers, whose number is no multiple of that of the
 # colours, 104 curves stay apart.
 _COLORS = (*(color for color, _ in STYLES), "#CC79A7", "#E69F00", "#56B4E9", "#666666")
-_DASHES = (
-    *(dash for _, dash in STYLES),
-    (0, (5, 1)),
-    (0, (3, 1, 1, 1, 1, 1)),
-    (0, (1, 1)),
-    (0, (9, 2)),
-)
+_LONGER_DASHES = ((0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (9, 2)))
+_DASHES = (*(dash for _, dash in STYLES), *_LONGER_DASHES)
 _MARKS = "os^DvP*X<>hp8"
 WIDTH = 7.0  # text width of a page [inch]
 

@@ -28,14 +28,10 @@ def survey_map(survey: Survey, title: str = "") -> Figure:
     largest = np.max(np.abs(survey.values), axis=2, initial=0.0)
     units = ", ".join(dict.fromkeys(unit for _, unit in survey.inputs.names))
     limit = np.nanpercentile(largest, _MOST) if np.any(survey.reachable) else 1.0
+    ticks = MaxNLocator(8).tick_values(0.0, limit or 1.0)
     panels = (
         (axes[0, 0], survey.hold, "smallest singular value of the inputs' hold", list(_LEVELS)),
-        (
-            axes[0, 1],
-            largest,
-            f"largest input at rest [{units}]",
-            MaxNLocator(8).tick_values(0.0, limit or 1.0),
-        ),
+        (axes[0, 1], largest, f"largest input at rest [{units}]", ticks),
     )
     for ax, values, label, levels in panels:
         filled = ax.contourf(

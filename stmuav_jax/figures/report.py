@@ -107,18 +107,16 @@ def write_report(
 def _of_motion(data: xr.Dataset) -> _Content:
     """Content of a run or of a closed loop."""
     certificate, failure = json.loads(data.attrs["certificate"]), data.attrs.get("failure", "")
-    verdict_text = (
-        failure or f"It ended at t = {certificate['t_end']:g} s: {certificate['result']}."
-    )
+    ending = f"It ended at t = {certificate['t_end']:g} s: {certificate['result']}."
+    verdict_text = failure or ending
     if certificate.get("position_error") is not None:
         verdict_text += (
             f" Its distance from the exact motion is estimated as at most {certificate['position_error']:.2g} m "
             f"and {certificate['angle_error']:.2g} rad."
         )
     is_good = certificate["result"] in ("successful", "event occurred") and not failure
-    accuracy = [
-        (k.replace("_", " "), _shorten_data(v)) for k, v in certificate.items() if v is not None
-    ]
+    entries = {k.replace("_", " "): v for k, v in certificate.items() if v is not None}
+    accuracy = [(name, _shorten_data(value)) for name, value in entries.items()]
     title = str(data.attrs.get("title") or data.attrs.get("scene") or "Run")
     captioned_figures = [(name.capitalize(), draw(data)) for name, draw in FIGURES.items()]
     figures = [(caption, figure) for caption, figure in captioned_figures if figure is not None]
@@ -170,25 +168,19 @@ def _settings_tables(data: xr.Dataset) -> list[ReportTable]:
 def _of_filters(record: FilterRecord) -> _Content:
     rows = []
     for tuning_index, tuning in enumerate(record.tunings):
-        rms = [
-            np.sqrt(np.mean(part[tuning_index, -1] ** 2, axis=-1))
-            for part in (record.error, record.deviation)
-        ]
+        ends = (record.error[tuning_index, -1], record.deviation[tuning_index, -1])
+        rms = [np.sqrt(np.mean(end**2, axis=-1)) for end in ends]
         rows += [
             (f"{state}, {tuning}", *(f"{x:.4g}" for x in numbers))
             for state, *numbers in zip(record.states, *rms, strict=True)
         ]
     head = ("state", "RMS error at the end", "standard deviation by the filter")
-    about = [
-        (name, _shorten_data(value)) for name, value in flatten_tables(record.about) if value != ""
-    ]
+    about = [(name, _shorten_data(x)) for name, x in flatten_tables(record.about) if x != ""]
     tables = [ReportTable("Errors", head, rows), ReportTable("Settings", (), about)]
     caption = "Errors of up to 20 runs, and the filters' 3-sigma bands"
     count = len(record.states)
-    figures = (
-        (caption, error_figure(record, range(k, min(k + _STATES, count))))
-        for k in range(0, count, _STATES)
-    )
+    parts = (range(k, min(k + _STATES, count)) for k in range(0, count, _STATES))
+    figures = ((caption, error_figure(record, part)) for part in parts)
     return _Content(record.title, list(record.verdicts), tables, figures)
 
 
@@ -209,9 +201,8 @@ def _of_study(dataset: xr.Dataset, analysis: Analysis | None) -> _Content:
         ReportTable("Settings", (), about),
     ]
     level = f"Intervals hold with {100 * analysis.level:g} %, each by itself."
-    verdicts: list[Verdict] = [
-        (text, None) for text in (*summary_lines(analysis), *analysis.notes, level)
-    ]
+    sentences = (*summary_lines(analysis), *analysis.notes, level)
+    verdicts: list[Verdict] = [(text, None) for text in sentences]
     figures = ((text, figure) for _, text, figure in study_figures(data, analysis))
     return _Content(data.title, verdicts, tables, figures)
 

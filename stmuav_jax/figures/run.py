@@ -17,11 +17,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..checks.errors import StateError
-from ..dynamics.loads import COMPONENTS, UNITS, Envelope, JointLoads, envelope
+from ..checks.numbers import as_jax
+from ..dynamics.loads import COMPONENTS, UNITS, JointLoads, envelope
 from ..dynamics.simulation import Scene
 from ..io.netcdf import write_atomically
 from ..math.rotation import rotation_matrix_in
-from ..mechanics.system import System
 from ..uav.motor import MotorRotors
 from ..uav.rotor import Rotors
 from .plot import draw_histories, draw_legend_beside, grid, look, plot_histories
@@ -84,29 +84,25 @@ class Motion(NamedTuple):
 
 def motion_of(run: "Run | xr.Dataset") -> Motion:
     """Motion of a run in memory, or of the dataset of a saved run or closed loop."""
-    source: Any = run
-    if hasattr(source, "data_vars"):
-        return _saved_motion(source)
-    system, states = source.scene.system, source.states
-    com = np.asarray(system.bodies.com)
-    return Motion(
-        source.scene.title, source.ts, tuple(system.names), _base_name(source), np.asarray(states.r),
-        np.asarray(states.p), np.asarray(states.omega), com, system.joints,
-    )  # fmt: skip
-
-
-def _saved_motion(data: "xr.Dataset") -> Motion:
-    """Motion of a saved run, of a scene or of a closed loop."""
+    data: Any = run
+    if not hasattr(data, "data_vars"):
+        scene, system, states = data.scene, data.scene.system, data.states
+        # of motors with their rotors, these have the body
+        sets = [f.rotors for f in system.forces if isinstance(f, Rotors | MotorRotors)]
+        base = sets[0].body if sets else (scene.watch or system.names)[-1]
+        r, p, omega = (np.asarray(x) for x in (states.r, states.p, states.omega))
+        com, names = np.asarray(system.bodies.com), tuple(system.names)
+        return Motion(scene.title, data.ts, names, base, r, p, omega, com, system.joints)
     names = tuple(map(str, data["body"].values))
     watched = json.loads(data.attrs.get("watch", "[]")) or names
     base = str(data["rotor_body"].values[0]) if "rotor_body" in data.coords else watched[-1]
     texts = ("joint", "joint_kind", "joint_body_i", "joint_body_j")
     arrays = ("joint_point_i", "joint_point_j", "joint_frame_i", "joint_frame_j")
     joints: list[Any] = []
-    for k in range(data.sizes.get("joint", 0)):
-        name, kind, body_i, body_j = (str(data[text].values[k]) for text in texts)
-        numbers = (data[array].values[k] for array in arrays)
-        joints.append(PlacedJoint(name, kind, body_i, body_j, *numbers))
+    if data.sizes.get("joint", 0):
+        columns = [data[name].values.astype(str).tolist() for name in texts]
+        columns += [data[name].values for name in arrays]
+        joints = [PlacedJoint(*row) for row in zip(*columns, strict=True)]
     return Motion(
         data.attrs.get("title", ""), data["time"].values, names, base, data["position"].values,
         data["euler_parameters"].values, data["angular_velocity"].values,
@@ -273,16 +269,7 @@ def _plot_logarithmic(
 # --- reaction loads
 
 
-class SavedLoads(NamedTuple):
-    """Reaction loads in NumPy arrays, as in `JointLoads`: times (k,), force and moment (k, joints, 3)."""
-
-    ts: np.ndarray
-    force: np.ndarray
-    moment: np.ndarray
-    joints: tuple[str, ...]
-
-
-def saved_loads(data: "xr.Dataset") -> SavedLoads | None:
+def saved_loads(data: "xr.Dataset") -> JointLoads | None:
     """Reaction loads at the saved times of a saved run; None where its file has none."""
     if "reaction_force" not in data or not data.sizes["joint"]:
         return None
@@ -291,20 +278,17 @@ def saved_loads(data: "xr.Dataset") -> SavedLoads | None:
     # components along the columns of each frame
     # Bearings are sized in their own axes, and files hold loads in those of the world.
     in_joint_axes = lambda name: np.einsum("kjab,kja->kjb", frames, data[name].values)
+    force, moment = (as_jax(in_joint_axes(f"reaction_{part}")) for part in ("force", "moment"))
     names = tuple(joint.name for joint in motion.joints)
-    return SavedLoads(
-        motion.ts, in_joint_axes("reaction_force"), in_joint_axes("reaction_moment"), names
-    )
+    return JointLoads(as_jax(motion.ts), force, moment, names)
 
 
 def loads_figure(scene: Scene, loads: JointLoads) -> Figure:
     """Figure of the magnitudes of force and moment at every joint over time."""
-    names = tuple(joint.name for joint in scene.system.joints)
-    ts, force, moment = (np.asarray(x) for x in (loads.ts, loads.force, loads.moment))
-    return draw_loads(scene.title, SavedLoads(ts, force, moment, names))
+    return draw_loads(scene.title, loads)
 
 
-def draw_loads(title: str, loads: SavedLoads) -> Figure:
+def draw_loads(title: str, loads: JointLoads) -> Figure:
     """Figure of `loads_figure` of loads in memory or of `saved_loads`.
 
     The joints with the largest peaks are drawn, with a curve each. Impacts exceed the usual loads by orders
@@ -313,45 +297,32 @@ def draw_loads(title: str, loads: SavedLoads) -> Figure:
     figure, axes = grid(2, 1, 5.6, sharex=True)
     labels = ("force [N]", "moment [N m]")
     for ax, parts, label in zip(axes[:, 0], (loads.force, loads.moment), labels, strict=True):
-        _plot_magnitudes(ax, loads, np.linalg.norm(parts, axis=-1))
         ax.set_ylabel(label, fontsize=9)
+        magnitude = np.linalg.norm(np.asarray(parts), axis=-1)
+        peaks = np.nanmax(np.where(np.isfinite(magnitude), magnitude, 0.0), axis=0, initial=0.0)
+        loaded = np.flatnonzero(peaks > NOTHING)
+        drawn_joints = np.sort(loaded[np.argsort(-peaks[loaded], kind="stable")][:_LOADED])
+        if not len(drawn_joints):
+            ax.set_yticks([])
+            middle: Any = {"transform": ax.transAxes, "ha": "center", "fontsize": 9}
+            ax.text(0.5, 0.5, "zero at every joint", **middle)
+            continue
+        for k in drawn_joints:
+            # a joint keeps its style in both panels; marks would hide the peaks
+            style: Any = look(int(k)) | {"marker": ""}
+            ax.plot(np.asarray(loads.ts), magnitude[:, k], label=loads.joints[k], **style)
+        ax.set_yscale("log")
+        top = 10 ** np.ceil(np.log10(peaks[drawn_joints].max()))
+        ax.set_ylim(max(1e-4 * top, 0.5 * float(np.nanmin(magnitude[:, drawn_joints]))), top)
+        draw_legend_beside(ax)
+        if len(loaded) > len(drawn_joints):
+            ax.set_title(
+                f"{len(drawn_joints)} of {len(loaded)} joints: the largest peaks", fontsize=9
+            )
     axes[1, 0].set_xlabel("time [s]", fontsize=9)
     figure.align_ylabels(axes[:, 0])
     figure.suptitle(f"{title}\nmagnitudes of the joint reactions", fontsize=10, parse_math=False)
     return figure
-
-
-def _plot_magnitudes(ax: Axes, loads: SavedLoads, magnitude: np.ndarray) -> None:
-    """Curves of magnitudes (k, joints) of the joints with the largest peaks, in the order of the joints."""
-    peaks = np.nanmax(np.where(np.isfinite(magnitude), magnitude, 0.0), axis=0, initial=0.0)
-    loaded = np.flatnonzero(peaks > NOTHING)
-    drawn_joints = np.sort(loaded[np.argsort(-peaks[loaded], kind="stable")][:_LOADED])
-    if not len(drawn_joints):
-        ax.set_yticks([])
-        ax.text(0.5, 0.5, "zero at every joint", transform=ax.transAxes, ha="center", fontsize=9)
-        return
-    for k in drawn_joints:
-        # a joint keeps its style in both panels; marks would hide the peaks
-        style: Any = look(int(k)) | {"marker": ""}
-        ax.plot(loads.ts, magnitude[:, k], label=loads.joints[k], **style)
-    ax.set_yscale("log")
-    top = 10 ** np.ceil(np.log10(peaks[drawn_joints].max()))
-    ax.set_ylim(max(1e-4 * top, 0.5 * float(np.nanmin(magnitude[:, drawn_joints]))), top)
-    draw_legend_beside(ax)
-    if len(loaded) > len(drawn_joints):
-        ax.set_title(f"{len(drawn_joints)} of {len(loaded)} joints: the largest peaks", fontsize=9)
-
-
-def load_rows(system: System, loads_envelope: Envelope) -> list[tuple[str | float, ...]]:
-    """Rows of the table, one per joint and component, with columns as in `HEADER`."""
-    columns = ("minimum", "t_minimum", "maximum", "t_maximum")
-    values = [np.asarray(getattr(loads_envelope, column)) for column in columns]
-    table: list[tuple[str | float, ...]] = []
-    for k, joint in enumerate(system.joints):
-        for c, (name, unit) in enumerate(zip(COMPONENTS, UNITS, strict=True)):
-            numbers = (float(x[k, c]) for x in values)
-            table.append((joint.name, joint.kind, joint.body_i, joint.body_j, name, unit, *numbers))
-    return table
 
 
 def save_loads(scene: Scene, loads: JointLoads, path: str | os.PathLike[str]) -> Path:
@@ -360,24 +331,21 @@ def save_loads(scene: Scene, loads: JointLoads, path: str | os.PathLike[str]) ->
     Loads act from body i on body j, about the joint's point on body j, in the axes of the
     joint's frame on body i.
     """
-    text = io.StringIO(newline="")
+    text, extremes = io.StringIO(newline=""), envelope(loads)
+    columns = ("minimum", "t_minimum", "maximum", "t_maximum")
+    values = [np.asarray(getattr(extremes, column)) for column in columns]
     writer = csv.writer(text)
     writer.writerow(HEADER)
-    for row in load_rows(scene.system, envelope(loads)):
-        writer.writerow([f"{x:.6g}" if isinstance(x, float) else x for x in row])
+    for k, joint in enumerate(scene.system.joints):
+        for c, component in enumerate(zip(COMPONENTS, UNITS, strict=True)):
+            numbers = (f"{x[k, c]:.6g}" for x in values)
+            writer.writerow(
+                [joint.name, joint.kind, joint.body_i, joint.body_j, *component, *numbers]
+            )
     return write_atomically(path, text.getvalue().encode())
 
 
 # --- coordinates
-
-
-def _base_name(run: "Run") -> str:
-    for force in run.scene.system.forces:
-        if isinstance(force, MotorRotors):
-            return force.rotors.body
-        if isinstance(force, Rotors):
-            return force.body
-    return (run.scene.watch or run.scene.system.names)[-1]
 
 
 def _rotation_matrices(p: Any) -> np.ndarray:

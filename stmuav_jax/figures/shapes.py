@@ -16,11 +16,15 @@ from typing import Any, Literal
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
+from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
 from ..mechanics.body import GROUND
-from .run import SLIDING
+from .run import SLIDING, displacement_of, motion_of
 
+# Colours of bodies; those of a base with rotors, panels, joints and rotors.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#F0E442")
+_BASE, _PANEL, JOINT_COLOUR, _ROTOR = "#8b929c", "#1d3f72", "#69717d", "#c3c8d0"
 # Relative difference below which two principal moments count as equal; products of inertia below
 # this part of the largest moment leave the solid along the body's own axes.
 _EQUAL = 0.05
@@ -73,18 +77,11 @@ def body_shapes(run: xr.Dataset, body: str) -> tuple[Shape, ...]:
         least, most = (length * part for part in _SLENDER)
         return (rod(distinct_points[0], distinct_points[1], min(max(thin, least), most)),)
     solid = inertia_solid(mass, inertia, kind="panel" if "panel" in body.lower() else None)
-    round_part = solid.kind in ("sphere", "cylinder")
-    halves = (
-        (*solid.size[:1], *(0.5 * x for x in solid.size[1:]))
-        if round_part
-        else [0.5 * x for x in solid.size]
-    )
-    outer_points = [
-        point for point in distinct_points if np.linalg.norm(point) > 1.05 * max(halves)
-    ]
-    struts = (
-        rod(np.zeros(3), point, 0.02 * float(np.linalg.norm(point))) for point in outer_points
-    )
+    halves = [0.5 * x for x in solid.size]
+    if solid.kind in ("sphere", "cylinder"):
+        halves[0] = solid.size[0]
+    ends = [(point, float(np.linalg.norm(point))) for point in distinct_points]
+    struts = [rod(np.zeros(3), end, 0.02 * d) for end, d in ends if d > 1.05 * max(halves)]
     return (solid, *struts)
 
 
@@ -136,10 +133,8 @@ def inertia_solid(mass: float, inertia: Float[np.ndarray, "3 3"], kind: str | No
         moments, R = np.linalg.eigh(inertia)
         # Eigenvectors may be a reflection, which no orientation is.
         R = R * np.sign(np.linalg.det(R))
-    equal = [
-        abs(moments[(k + 1) % 3] - moments[(k + 2) % 3]) <= _EQUAL * np.max(moments)
-        for k in range(3)
-    ]
+    gaps = np.abs(np.roll(moments, -1) - np.roll(moments, -2))
+    equal = (gaps <= _EQUAL * np.max(moments)).tolist()
     if kind is None and all(equal):
         return Shape("sphere", (float(np.sqrt(2.5 * np.mean(moments) / mass)),))
     # From m (b^2 + c^2) / 12 about each axis: the edges of a uniform box follow from three moments.
@@ -191,9 +186,8 @@ def _rotorcraft_shapes(rotors: Points) -> tuple[Shape, ...]:
     shapes = [Shape("cylinder", (0.3 * reach, 2.6 * thick), tuple(hub))] if reach else []
     for rotor in rotors:
         under = rotor - np.array([0.0, 0.0, 2 * thick])
-        shapes.append(
-            Shape("cylinder", (1.6 * thick, 3 * thick), tuple(rotor - [0, 0, 1.7 * thick]))
-        )
+        motor = tuple(rotor - [0, 0, 1.7 * thick])
+        shapes.append(Shape("cylinder", (1.6 * thick, 3 * thick), motor))
         if reach:
             shapes.append(rod(hub, under, thick))
     return tuple(shapes)
@@ -203,9 +197,8 @@ def rod(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: floa
     """Cylinder from one point to another, with a radius [m]; points (3,) in body axes [m]."""
     axis_vector = end - start
     middle = tuple(float(x) for x in 0.5 * (start + end))
-    return Shape(
-        "cylinder", (radius, float(np.linalg.norm(axis_vector))), middle, turn_towards(axis_vector)
-    )
+    size = (radius, float(np.linalg.norm(axis_vector)))
+    return Shape("cylinder", size, middle, turn_towards(axis_vector))
 
 
 def turn_towards(axis: Float[np.ndarray, "3"]) -> tuple[float, ...]:
@@ -228,3 +221,86 @@ def _distinct_points(
         if all(np.linalg.norm(point - other) > 1e-6 * size for other in unique_points):
             unique_points.append(point)
     return unique_points
+
+
+# --- poses, joints and faces of a run
+
+
+def body_poses(run: xr.Dataset, body: str) -> tuple[Any, Any]:
+    """Positions (k, 3) [m] and rotation matrices (k, 3, 3) of a body or ground at all times."""
+    count = run.sizes["time"]
+    if body == GROUND:
+        return np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3))
+    k = list(run["body"].values).index(body)
+    R = Rotation.from_quat(run["euler_parameters"].values[:, k], scalar_first=True).as_matrix()
+    return run["position"].values[:, k], R
+
+
+def joint_of(run: xr.Dataset, k: int) -> dict[str, Any]:
+    """Plain data of a joint, with points from the bodies' centres of mass."""
+    i, j = (str(run[f"joint_body_{side}"].values[k]) for side in ("i", "j"))
+    point_i = run["joint_point_i"].values[k] - body_centre(run, i)
+    point_j = run["joint_point_j"].values[k] - body_centre(run, j)
+    frame_i, kind = run["joint_frame_i"].values[k], str(run["joint_kind"].values[k])
+    joint_data = {
+        "name": str(run["joint"].values[k]), "kind": kind, "body_i": i, "body_j": j,
+        "point_i": point_i.tolist(), "point_j": point_j.tolist(),
+        "frame_i": frame_i.tolist(), "frame_j": run["joint_frame_j"].values[k].tolist(),
+    }  # fmt: skip
+    if kind in SLIDING:
+        displacements = joint_displacement(run, k)
+        joint_data["slide"] = [float(np.min(displacements)), float(np.max(displacements))]
+    return joint_data
+
+
+def joint_displacement(run: xr.Dataset, k: int) -> Float[np.ndarray, " t"]:
+    """Displacement of a joint's point on body j along the axis on body i (t,) [m]."""
+    motion = motion_of(run)
+    return displacement_of(motion, motion.joints[k])
+
+
+def machine_size(run: xr.Dataset) -> float:
+    """Diagonal [m] of the box around all joints, rotors and centres of mass at the start."""
+    point_sets = [run["position"].values[0]]
+    for body in (str(name) for name in run["body"].values):
+        r, R = body_poses(run, body)
+        for points in (joint_points(run, body)[0], rotor_points(run, body)):
+            point_sets.append(r[0] + points @ R[0].T)
+    every = np.concatenate(point_sets)
+    diagonal = float(np.linalg.norm(np.max(every, axis=0) - np.min(every, axis=0)))
+    # A single body has no extent of points; its radius of gyration stands for its size.
+    gyration = np.sqrt(
+        np.max(np.linalg.eigvalsh(run["inertia"].values)[:, -1] / run["mass"].values)
+    )
+    return max(diagonal, 3 * float(gyration))
+
+
+def make_faces(run: xr.Dataset, names: Sequence[str]) -> tuple[np.ndarray, ...]:
+    """Quadrilaterals of all bodies, joints and rotors of a saved run.
+
+    Returns:
+        Index of the body in `names` (f,); corners from its centre of mass, body axes (f, 4, 3) [m]; normals out of
+        the solid (f, 3); and red, green and blue from 0 to 1 (f, 3).
+    """
+    solids: list[tuple[str, Shape, str]] = []
+    for n, name in enumerate(str(name) for name in run["body"].values):
+        rotors = rotor_points(run, name)
+        colour = _PANEL if "panel" in name.lower() else COLOURS[n % len(COLOURS)]
+        solids += [(name, s, _BASE if len(rotors) else colour) for s in body_shapes(run, name)]
+        gaps = np.linalg.norm(rotors[:, None] - rotors[None], axis=2)
+        radius = 0.45 * float(np.min(gaps[gaps > 0], initial=0.5 * machine_size(run)))
+        disc = (radius, 0.02 * radius)
+        solids += [(name, Shape("cylinder", disc, tuple(point)), _ROTOR) for point in rotors]
+    for joint in (joint_of(run, k) for k in range(run.sizes.get("joint", 0))):
+        ball = Shape("sphere", (0.01 * machine_size(run),), tuple(joint["point_j"]))
+        solids.append((joint["body_j"], ball, JOINT_COLOUR))
+    parts: list[tuple[np.ndarray, ...]] = []
+    for name, shape, colour in solids:
+        quads = make_quads(shape)
+        normals = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+        # all shapes are convex: a normal points away from the middle
+        outward = np.sum(normals * (quads.mean(axis=1) - np.asarray(shape.position)), axis=1)
+        normals *= (np.sign(outward) / np.linalg.norm(normals, axis=1))[:, None]
+        indices = np.full(len(quads), names.index(name))
+        parts.append((indices, quads, normals, np.tile(to_rgb(colour), (len(quads), 1))))
+    return tuple(np.concatenate(part) for part in zip(*parts, strict=True))

@@ -20,9 +20,8 @@ from ..io.run_file import posture
 from ..mechanics.body import GROUND
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .shapes import body_centre, body_shapes, make_quads, rotor_points
+from .shapes import COLOURS, body_centre, body_shapes, make_quads, rotor_points
 
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#F0E442")
 _AXES = ("#D55E00", "#009E73", "#0072B2")
 # Names are in front of all solids, whose order matplotlib computes.
 _ON_TOP: dict[str, Any] = {
@@ -81,7 +80,9 @@ class _SketchFigure(Figure):
 def _draw_sketch(ax: Any, run: xr.Dataset, view: tuple[float, float]) -> None:
     places, point_sets = {GROUND: (np.zeros(3), np.eye(3))}, [run["position"].values[0]]
     labels: list[tuple[str, np.ndarray, str]] = []
-    size = _mechanism_size(run)
+    # Largest distance between centres of mass, or the radius of gyration of a single body.
+    gyration = np.sqrt(np.max(run["inertia"].values / run["mass"].values[:, None, None]))
+    size = max(np.max(np.ptp(point_sets[0], axis=0)), 3 * gyration)
     for k, name in enumerate(str(name) for name in run["body"].values):
         r, e = run["position"].values[0, k], run["euler_parameters"].values[0, k]
         R = Rotation.from_quat(e[[1, 2, 3, 0]]).as_matrix()
@@ -93,10 +94,8 @@ def _draw_sketch(ax: Any, run: xr.Dataset, view: tuple[float, float]) -> None:
             shapes = shapes[:1]
         for shape in shapes:
             faces = list(r + make_quads(shape) @ R.T)
-            solid = Poly3DCollection(
-                faces, facecolor=colour, edgecolor=colour, linewidth=0.3, alpha=0.3
-            )
-            ax.add_collection3d(solid, autolim=False)
+            style = {"facecolor": colour, "edgecolor": colour, "linewidth": 0.3, "alpha": 0.3}
+            ax.add_collection3d(Poly3DCollection(faces, **style), autolim=False)
             point_sets += faces
         for axis, tint in zip(R.T, _AXES, strict=True):
             ax.plot(*np.stack([r, r + 0.07 * size * axis], axis=1), color=tint, linewidth=1.2)
@@ -112,17 +111,15 @@ def _draw_sketch(ax: Any, run: xr.Dataset, view: tuple[float, float]) -> None:
         # of a distance, whose points are apart, the middle; of the other joints their point
         labels.append((str(run["joint"].values[k]), np.mean(ends, axis=0), "black"))
     every = np.concatenate(point_sets)
-    middle, half = (
-        0.5 * (every.max(axis=0) + every.min(axis=0)),
-        0.5 * float(np.max(np.ptp(every, axis=0))),
-    )
+    middle = 0.5 * (every.max(axis=0) + every.min(axis=0))
+    half = 0.5 * float(np.max(np.ptp(every, axis=0)))
     ax.set(**{f"{name}lim": (m - half, m + half) for name, m in zip("xyz", middle, strict=True)})
     ax.set_box_aspect((1, 1, 1))
     ax.view_init(*view)
     ax.tick_params(labelsize=7)
     ax.locator_params(nbins=5)
-    for set_label, name in ((ax.set_xlabel, "x"), (ax.set_ylabel, "y"), (ax.set_zlabel, "z")):
-        set_label(f"{name} [m]", fontsize=8)
+    for name in "xyz":
+        getattr(ax, f"set_{name}label")(f"{name} [m]", fontsize=8)
     ax.set_title("frames of the bodies: x red, y green, z blue", fontsize=9)
     # Points in the picture are known only with view and limits.
     projection = ax.get_proj()
@@ -185,13 +182,6 @@ def _overlap_area(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.prod(np.maximum(size, 0.0)))
 
 
-def _mechanism_size(run: xr.Dataset) -> float:
-    """Largest distance [m] between centres of mass, or the radius of gyration of a single body."""
-    r = run["position"].values[0]
-    gyration = float(np.sqrt(np.max(run["inertia"].values / run["mass"].values[:, None, None])))
-    return max(float(np.max(np.ptp(r, axis=0))), 3 * gyration)
-
-
 # --- graph
 
 
@@ -235,17 +225,9 @@ def _joint_label(system: System, k: int) -> str:
 
 
 def _draw_edge(
-    ax: Axes,
-    start: tuple[float, float],
-    end: tuple[float, float],
-    label: str,
-    colour: str,
-    boxes: list[np.ndarray],
-    text_size: np.ndarray,
-    *,
-    bend: float = 0.0,
-    dashed: bool = False,
-) -> None:
+    ax: Axes, start: tuple[float, float], end: tuple[float, float], label: str, colour: str,
+    boxes: list[np.ndarray], text_size: np.ndarray, *, bend: float = 0.0, dashed: bool = False,
+) -> None:  # fmt: skip
     """Line, or arc bent to the side, with words on it where they overlap the fewest of the boxes."""
     a, b = np.array(start), np.array(end)
     control = 0.5 * (a + b) + 2 * bend * np.array([b[1] - a[1], a[0] - b[0]])

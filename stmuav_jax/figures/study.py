@@ -8,7 +8,7 @@ import math
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -98,12 +98,9 @@ def draw_fans(data: StudyData, analysis: Analysis) -> Figure | None:
     used = [_draw_fan(data, curve, ax) for curve, ax in zip(curves, axes, strict=True)]
     handles, names = axes[0].get_legend_handles_labels()
     figure.legend(handles, names, ncols=4, fontsize=8, loc="outside lower center")
-    thinning_note = (
-        f"{min(used):,} of {len(data.completed):,} completed samples."
-        if min(used) < len(data.completed)
-        else ""
-    )
-    notes = [thinning_note, _left_out(len(curves), len(data.curves), "curves")]
+    notes = [_left_out(len(curves), len(data.curves), "curves")]
+    if min(used) < len(data.completed):
+        notes.insert(0, f"{min(used):,} of {len(data.completed):,} completed samples.")
     add_caption(figure, f"{data.title}: quantiles and single samples", notes)
     return figure
 
@@ -208,10 +205,8 @@ def draw_scatter(data: StudyData, analysis: Analysis) -> Figure | None:
     findings = [f for f in analysis.findings if f.event is None and f.summary.values > 1]
     if not keys or not findings:
         return None
-    strongest = sorted(findings, key=lambda f: -np.max(influence_strength(f), initial=0.0))[
-        :PANEL_ROWS
-    ]
-    rows = [f for f in findings if f in strongest]
+    strongest = sorted(findings, key=lambda f: -np.max(influence_strength(f), initial=0.0))
+    rows = [f for f in findings if f in strongest[:PANEL_ROWS]]
     names = [name for name in sort_inputs(rows) if name in keys][:COLUMNS] or list(keys)[:COLUMNS]
     figure, axes = grid(len(rows), len(names), 1.0 + 1.75 * len(rows))
     picked = thin_indices(len(data.completed), POINTS)
@@ -223,13 +218,24 @@ def draw_scatter(data: StudyData, analysis: Analysis) -> Figure | None:
             axes[i, j].set_title(_strength_words(finding, name), fontsize=7.5, pad=6)
             limit_ticks(axes[i, j], 3)
             axes[i, j].tick_params(labelsize=7, labelleft=j == 0, labelbottom=i == len(rows) - 1)
-        axes[i, 0].set_ylabel(
-            wrap_label(finding.quantity.label, finding.quantity.unit, 22), fontsize=8
-        )
+        label = wrap_label(finding.quantity.label, finding.quantity.unit, 22)
+        axes[i, 0].set_ylabel(label, fontsize=8)
     for j, name in enumerate(names):
         axes[-1, j].set_xlabel(wrap_label(keys[name].label, keys[name].unit, 18), fontsize=8)
     figure.align_ylabels(axes[:, 0])
-    notes = _scatter_notes(data, analysis, len(picked), rows, names)
+    notes = []
+    if len(picked) < len(data.completed):
+        notes.append(f"{len(picked):,} of {len(data.completed):,} completed samples.")
+    if len(rows) < len(findings) or len(names) < len(analysis.varying):
+        notes.append(
+            f"{len(rows)} of {len(findings)} quantities and {len(names)} of {len(analysis.varying)} inputs: "
+            "those with the largest shares."
+        )
+    is_saltelli = data.design == "saltelli"
+    letters = ", T: with its interactions." if is_saltelli else ", $\\rho$: rank correlation."
+    notes.append(f"S: first-order share of the variance{letters}")
+    if any(f.summary.infinite_probability for f in rows):
+        notes.append("Triangles: infinite.")
     add_caption(figure, f"{data.title}: quantities against inputs", notes)
     return figure
 
@@ -268,19 +274,9 @@ def _strength_words(finding: QuantityAnalysis, name: str) -> str:
     if name not in influence.names:
         return ""
     k = influence.names.index(name)
-    if influence.indices:
-        first, total = (
-            format_two(part.value[k]) for part in (influence.indices.first, influence.indices.total)
-        )
-        return f"S {first}, T {total}"
-    strength_text = (
-        f"S {format_two(influence.first.value[k])}" if influence.first is not None else ""
-    )
-    return (
-        f"{strength_text}, $\\rho$ {format_two(influence.ranks.value[k])}"
-        if influence.ranks
-        else strength_text
-    )
+    total = influence.indices.total if influence.indices else None
+    parts = (("S", influence.first), ("T", total), ("$\\rho$", influence.ranks))
+    return ", ".join(f"{sign} {format_two(x.value[k])}" for sign, x in parts if x is not None)
 
 
 def _draw_points(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
@@ -297,29 +293,6 @@ def _draw_points(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
                        clip_on=False, rasterized=True)  # fmt: skip
 
 
-def _scatter_notes(
-    data: StudyData, analysis: Analysis, points: int, rows: list[QuantityAnalysis], names: list[str]
-) -> list[str]:
-    count = len([f for f in analysis.findings if f.event is None and f.summary.values > 1])
-    notes = []
-    if points < len(data.completed):
-        notes.append(f"{points:,} of {len(data.completed):,} completed samples.")
-    if len(rows) < count or len(names) < len(analysis.varying):
-        notes.append(
-            f"{len(rows)} of {count} quantities and {len(names)} of {len(analysis.varying)} inputs: "
-            "those with the largest shares."
-        )
-    letters = "S: first-order share of the variance"
-    letters += (
-        ", T: with its interactions."
-        if data.design == "saltelli"
-        else ", $\\rho$: rank correlation."
-    )
-    if any(f.summary.infinite_probability for f in rows):
-        letters += " Triangles: infinite."
-    return [*notes, letters]
-
-
 BARS = 12  # largest number of inputs in one panel of sensitivities
 CELLS = 8  # largest number of cells along each side of a map of probabilities
 _SHADES = LinearSegmentedColormap.from_list("shades", ["#FFFFFF", "#F3B383", ORANGE, "#5F2A00"])
@@ -331,9 +304,8 @@ _SHADES = LinearSegmentedColormap.from_list("shades", ["#FFFFFF", "#F3B383", ORA
 def draw_failures(data: StudyData, analysis: Analysis) -> Figure | None:
     """Figure of failed samples over the two inputs in which they differ most from the others."""
     failed = ~np.isin(data.computed[:ROWS], data.completed)
-    return _draw_region(
-        data, analysis, failed, ("did not complete", "runs that did not complete"), "computed"
-    )
+    labels = ("did not complete", "runs that did not complete")
+    return _draw_region(data, analysis, failed, labels, "computed")
 
 
 def draw_event(data: StudyData, analysis: Analysis, quantity: StudyQuantity) -> Figure | None:
@@ -430,9 +402,8 @@ def _plot_share(ax: Axes, x: np.ndarray, hits: np.ndarray, level: float) -> None
         inside = place == k
         estimate = probability(int(np.sum(hits[inside])), int(np.sum(inside)), level)
         ends = [[estimate.value - (estimate.low or 0.0)], [(estimate.high or 0.0) - estimate.value]]
-        ax.errorbar(
-            np.median(x[inside]), estimate.value, ends, fmt="o", color=BLUE, capsize=2.5, ms=4
-        )
+        middle = np.median(x[inside])
+        ax.errorbar(middle, estimate.value, ends, fmt="o", color=BLUE, capsize=2.5, ms=4)
     ax.set_ylim(bottom=0.0)
     ax.set_ylabel("estimated probability", fontsize=9)
 
@@ -449,11 +420,10 @@ def draw_sensitivities(data: StudyData, analysis: Analysis) -> Figure | None:
     names = sort_inputs(panel_findings)[:BARS]
     figure, axes = make_panels(len(panel_findings), 0.75 + 0.29 * len(names), 2)
     input_labels = {entry.key: wrap_label(entry.label, "1", 24) for entry in data.inputs}
+    labels = [input_labels.get(name, name) for name in names]
     for entry, ax in zip(panel_findings, axes, strict=True):
         (_sobol_bars if entry.influence.indices else _share_bars)(ax, entry, names)
-        ax.set_yticks(
-            range(len(names)), [input_labels.get(name, name) for name in names], fontsize=7.5
-        )
+        ax.set_yticks(range(len(names)), labels, fontsize=7.5)
         ax.invert_yaxis()
         ax.set_title(wrap_label(entry.quantity.label, "1", 34), fontsize=8.5, loc="left")
         ax.grid(False, axis="y")
@@ -464,15 +434,11 @@ def draw_sensitivities(data: StudyData, analysis: Analysis) -> Figure | None:
     figure.legend(handles, labels, ncols=3, fontsize=8, loc="outside lower center")
     inputs = len(findings[0].influence.names)
     few = f"{len(names)} of {inputs} inputs." if len(names) < inputs else ""
-    more = (
-        f"{len(panel_findings)} of {len(findings)} quantities."
-        if len(panel_findings) < len(findings)
-        else ""
-    )
-    level = (
-        f"Bars: estimates with {100 * analysis.level:g} % intervals; those below 0 are drawn at 0."
-    )
-    add_caption(figure, f"{data.title}: influence of the inputs", [level, few, more])
+    count, total = len(panel_findings), len(findings)
+    more = f"{count} of {total} quantities." if count < total else ""
+    level = f"{100 * analysis.level:g} %"
+    bars = f"Bars: estimates with {level} intervals; those below 0 are drawn at 0."
+    add_caption(figure, f"{data.title}: influence of the inputs", [bars, few, more])
     return figure
 
 
@@ -504,22 +470,13 @@ def _share_bars(ax: Axes, finding: QuantityAnalysis, names: list[str]) -> None:
     influence = finding.influence
     assert influence.first is not None
     picked = [influence.names.index(name) for name in names]
-    legend_label = "first-order share"
-    widest = max(
-        _draw_bars(ax, np.arange(len(names)), influence.first, picked, 0.6, BLUE, legend_label),
-        0.05,
-    )
+    places, legend_label = np.arange(len(names)), "first-order share"
+    widest = _draw_bars(ax, places, influence.first, picked, 0.6, BLUE, legend_label)
+    widest = max(widest, 0.05)
     if influence.ranks:
+        style: Any = {"fontsize": 7, "ha": "right", "va": "center", "color": "0.25"}
         for row, k in enumerate(picked):
-            ax.text(
-                1.2 * widest,
-                row,
-                format_two(influence.ranks.value[k]),
-                fontsize=7,
-                ha="right",
-                va="center",
-                color="0.25",
-            )
+            ax.text(1.2 * widest, row, format_two(influence.ranks.value[k]), **style)
         ax.set_title("rank correlation", loc="right", fontsize=6.5, color="0.25")
     ax.set_xlim(0.0, 1.23 * widest)
     ax.set_xlabel("share of the variance", fontsize=8)

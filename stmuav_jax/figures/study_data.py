@@ -188,12 +188,8 @@ def study_data(dataset: xr.Dataset) -> StudyData:
     if len(status) != 1:
         raise FileError(f"A study has one column of the role 'status', but here are {status}.")
     identity = _read_json(dataset, "identity")
-    reasons = {
-        int(code): str(description) for code, description in _read_json(dataset, "reasons").items()
-    }
-    inputs: list[StudyQuantity] = []
-    quantities: list[StudyQuantity] = []
-    curves: list[StudyQuantity] = []
+    reasons = {int(k): str(text) for k, text in _read_json(dataset, "reasons").items()}
+    inputs, quantities, curves = ([] for _ in range(3))
     notes: list[str] = []
     for name, role in roles.items():
         if role not in ("input", "quantity") or "sample" not in dataset[name].dims:
@@ -201,8 +197,8 @@ def study_data(dataset: xr.Dataset) -> StudyData:
         for part in _column_parts(dataset, name, notes):
             (curves if part.axis else inputs if role == "input" else quantities).append(part)
     codes = np.asarray(dataset[status[0]].values)
-    remaining_fields = (tuple(quantities), tuple(curves), tuple(notes))
-    data = StudyData(dataset, codes, identity, reasons, tuple(inputs), *remaining_fields)
+    fields: Any = (tuple(parts) for parts in (inputs, quantities, curves, notes))
+    data = StudyData(dataset, codes, identity, reasons, *fields)
     # inputs in the order of the factors, since a folder may have sorted its columns
     place = {name: k for k, name in enumerate(data.factors)}
     inputs.sort(key=lambda part: place.get(part.key, len(place)))
@@ -230,11 +226,10 @@ def _column_parts(dataset: xr.Dataset, name: str, notes: list[str]) -> Iterator[
     for place in places[:COMPONENTS]:
         where = dict(zip(others, place, strict=True))
         of = lambda dim, k: dataset[dim].values[k] if dim in dataset.coords else k
-        marks = [f"{dim}={of(dim, k)}" for dim, k in where.items()]
-        key = f"{name}[{', '.join(marks)}]" if marks else name
-        full_name = (
-            f"{long_name}, {', '.join(m.split('=')[1] for m in marks)}" if marks else long_name
-        )
+        marks = {dim: str(of(dim, k)) for dim, k in where.items()}
+        key, full_name = name, ", ".join([long_name, *marks.values()])
+        if marks:
+            key = f"{name}[{', '.join(f'{dim}={mark}' for dim, mark in marks.items())}]"
         if axis:
             attributes = dataset[axis].attrs
             axis_words = str(attributes.get("long_name") or axis.replace("_", " "))
@@ -358,21 +353,12 @@ def analyse(data: StudyData, level: float = LEVEL) -> Analysis:
         SettingError: a level outside (0, 1).
     """
     sample_outcomes = outcomes(data.status[data.chosen], data.reasons, level)
-    inputs = {
-        quantity.key: summarise(data.values(quantity, "computed"), level=level)
-        for quantity in data.inputs
-    }
+    inputs = {q.key: summarise(data.values(q, "computed"), level=level) for q in data.inputs}
     # An input that does not vary has no influence, and a regression on it has no slope.
-    varying = tuple(
-        quantity
-        for quantity, summary in zip(data.inputs, inputs.values(), strict=True)
-        if summary.minimum != summary.maximum
-    )
+    varying = tuple(q for q in data.inputs if inputs[q.key].minimum != inputs[q.key].maximum)
     picked = [data.inputs.index(quantity) for quantity in varying]
     table = data.table(limit=ROWS)[:, picked]
-    names = (
-        data.factors if data.design == "saltelli" else tuple(quantity.key for quantity in varying)
-    )
+    names = data.factors if data.design == "saltelli" else tuple(q.key for q in varying)
     findings = tuple(
         _analyse_quantity(data, quantity, names, table, level) for quantity in data.quantities
     )
@@ -390,26 +376,18 @@ def _find_failure(data: StudyData, level: float) -> Failing | None:
     if not isinstance(declared, Mapping) or declared.get("quantity") not in quantities:
         return None
     quantity = quantities[declared["quantity"]]
-    values, limits = (
-        data.values(quantity),
-        {k: declared[k] for k in ("above", "below") if k in declared},
-    )
-    # the time of a crossing that never happens is infinite
-    happened = np.zeros(len(values), bool) if limits else np.isfinite(values)
-    unit = "" if quantity.unit in ("", "1") else f" {quantity.unit}"
-    limit_texts = []
-    if "above" in limits:
-        happened |= values > limits["above"]
-        limit_texts.append(f"above {limits['above']:g}{unit}")
-    if "below" in limits:
-        happened |= values < limits["below"]
-        limit_texts.append(f"below {limits['below']:g}{unit}")
-    if limit_texts:
-        description = f"{quantity.label} {' or '.join(limit_texts)}"
-    else:
-        description = quantity.label.removeprefix("time at which ")
+    values = data.values(quantity)
     if not len(values):
         return None
+    # the time of a crossing that never happens is infinite
+    happened, description = np.isfinite(values), quantity.label.removeprefix("time at which ")
+    limits = {k: declared[k] for k in ("above", "below") if k in declared}
+    if limits:
+        above, below = limits.get("above", math.inf), limits.get("below", -math.inf)
+        happened = (values > above) | (values < below)
+        unit = "" if quantity.unit in ("", "1") else f" {quantity.unit}"
+        description = " or ".join(f"{side} {limit:g}{unit}" for side, limit in limits.items())
+        description = f"{quantity.label} {description}"
     return Failing(description, probability(int(np.sum(happened)), len(values), level), len(values))
 
 
@@ -425,10 +403,9 @@ def _analyse_quantity(
     table: np.ndarray,
     level: float,
 ) -> QuantityAnalysis:
-    values = data.values(quantity)
-    event = (
-        probability(int(np.sum(values)), len(values), level) if is_event(quantity, values) else None
-    )
+    values, event = data.values(quantity), None
+    if is_event(quantity, values):
+        event = probability(int(np.sum(values)), len(values), level)
     if data.design == "saltelli":
         influence = _sobol_influence(data, quantity, names, level)
     else:
@@ -449,9 +426,8 @@ def _sobol_influence(
         indices = sobol(values, data.status, len(names), level=level, resamples=resamples)
     except SettingError as error:
         return Influence(names, None, None, None, 0, str(error))
-    note = f"{indices.used} base points" + (
-        f", {indices.lost} lost to failures" * (indices.lost > 0)
-    )
+    note = f"{indices.used} base points"
+    note += f", {indices.lost} lost to failures" if indices.lost else ""
     samples = indices.used * (len(names) + 2)
     return Influence(names, indices, indices.first, None, samples, note)
 
@@ -527,9 +503,8 @@ def plain_analysis(analysis: Analysis) -> dict[str, Any]:
         for finding in analysis.findings
     }  # fmt: skip
     names = [quantity.key for quantity in analysis.varying]
-    differences = analysis.failing if analysis.failing is None else dict(
-        zip(names, analysis.failing, strict=True)
-    )  # fmt: skip
+    failing = analysis.failing
+    differences = None if failing is None else dict(zip(names, failing, strict=True))
     return to_json({
         "level": analysis.level, "samples": samples, "failure": analysis.failure,
         "inputs": analysis.inputs, "quantities": quantities, "failures_differ_in": differences,

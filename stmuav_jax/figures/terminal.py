@@ -71,10 +71,8 @@ def summary_rows(c: Any) -> list[tuple[str, str]]:
 
     Remarks on the error estimates and dependent constraint rows are added where a run has them.
     """
-    lengths, angles = (
-        _format_number(c.position_violation, "m"),
-        _format_number(c.angle_violation, "rad"),
-    )
+    lengths = _format_number(c.position_violation, "m")
+    angles = _format_number(c.angle_violation, "rad")
     seconds = c.compile_seconds + c.run_seconds + c.estimate_seconds + c.analysis_seconds
     rows = [
         *_error_rows(c),
@@ -108,20 +106,17 @@ def certificate_rows(c: Any) -> list[tuple[str, str]]:
         ("Constraint violation, rates of angles", c.angular_velocity_violation, "rad/s"),
         ("Largest | |p|^2 - 1 | of the Euler parameters", c.norm_violation, ""),
         ("Relative energy error", c.relative_energy_error, ""),
-    ]
-    # None where they do not exist, or were not asked for
-    optional_numbers = [
+        # None where they do not exist, or were not asked for
         ("Relative error of momentum", c.momentum_error, ""),
         ("Relative error of angular momentum", c.angular_momentum_error, ""),
         ("Smallest singular value of the constraint Jacobian", c.smallest_singular_value, ""),
         ("Relative difference of accelerations, two formulations", c.formulation_difference, ""),
     ]
-    numbers += [row for row in optional_numbers if row[1] is not None]
     limited = 2 * c.steps_at_growth_limit > c.accepted_steps
     at_limit = f"{c.steps_at_growth_limit}: the saved times limit most step lengths, not the error"
     rows = [
         *_error_rows(c),
-        *((quantity, _format_number(value, unit)) for quantity, value, unit in numbers),
+        *((quantity, _format_number(x, unit)) for quantity, x, unit in numbers if x is not None),
         ("Rank of the constraint Jacobian", rank),
         ("Steps accepted, rejected", f"{c.accepted_steps}, {c.rejected_steps}"),
         ("Steps that grew at their limit", at_limit if limited else ""),

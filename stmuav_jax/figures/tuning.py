@@ -27,13 +27,11 @@ _Loss = Annotated[float, Field(strict=True, allow_inf_nan=True)]
 
 def save_linear(linear: Linear, path: str | os.PathLike[str]) -> Path:
     """Write A, B, C, D and the names with units of states, inputs and outputs to an npz file."""
-    names = {
-        kind: np.array([f"{name} [{unit}]" for name, unit in getattr(linear, kind)])
-        for kind in ("states", "inputs", "outputs")
-    }
+    arrays: dict[str, Any] = {name: getattr(linear, name) for name in "ABCD"}
+    for kind in ("states", "inputs", "outputs"):
+        arrays[kind] = np.array([f"{name} [{unit}]" for name, unit in getattr(linear, kind)])
     content = io.BytesIO()
-    matrices = {name: getattr(linear, name) for name in "ABCD"}
-    np.savez(content, **matrices, **names)  # pyright: ignore[reportArgumentType]
+    np.savez(content, **arrays)
     return write_atomically(path, content.getvalue())
 
 
@@ -57,13 +55,9 @@ def save_search(search: Search, problem: str, path: str | os.PathLike[str]) -> P
         path: path of the npz file.
     """
     head = _Head(
-        format=_FORMAT,
-        problem=problem,
-        loss=float(search.loss),
-        history=tuple(map(float, search.history)),
-        best=int(search.best),
-        reason=int(search.reason),
-    )
+        format=_FORMAT, problem=problem, loss=float(search.loss), best=int(search.best),
+        history=tuple(map(float, search.history)), reason=int(search.reason),
+    )  # fmt: skip
     return save_checkpoint(path, dict(head), jax.tree.leaves(search.values))
 
 

@@ -61,24 +61,16 @@ def make_wind(
     steady = jnp.asarray(entry.steady, dtype=float)
     before: Any = steady
     if entry.gusts is not None:
-        height, speed_20ft = (
-            table.value(f"gust.{name}")
-            if (number := getattr(entry.gusts, name)) is None
-            else number
-            for name in ("height", "speed_20ft")
-        )
-        speed = float(np.linalg.norm(entry.steady))
+        gusts, speed = entry.gusts, float(np.linalg.norm(entry.steady))
+        choose = lambda name, number: table.value(f"gust.{name}") if number is None else number
+        height = choose("height", gusts.height)
+        speed_20ft = choose("speed_20ft", gusts.speed_20ft)
         if speed == 0.0:
             raise SettingError(
                 "Gusts pass at the speed of the steady wind, which must not be zero."
             )
-        before = dryden(
-            entry.gusts.seed if seed is None else seed,
-            low_altitude(height, speed_20ft),
-            airspeed=speed,
-            duration=duration,
-            mean=steady,
-        )
+        spectrum, seed = low_altitude(height, speed_20ft), gusts.seed if seed is None else seed
+        before = dryden(seed, spectrum, airspeed=speed, duration=duration, mean=steady)
     change = entry.change
     if change is None:
         return before

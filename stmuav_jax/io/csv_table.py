@@ -78,15 +78,11 @@ class CsvTable(NamedTuple):
                     "equal numbers would be valid."
                 )
             cell = row[place].strip()
-            try:
-                numbers[k] = float(
-                    (cell.replace(",", ".") if self.decimal == "," else cell) or "nan"
-                )
-                is_valid = (admits_infinite or not np.isinf(numbers[k])) and (
-                    admits_blanks or not np.isnan(numbers[k])
-                )
-            except ValueError:
-                is_valid = False
+            is_valid = False
+            with contextlib.suppress(ValueError):
+                x = numbers[k] = float(cell.replace(self.decimal, ".") or "nan")
+                is_valid = not (np.isinf(x) and not admits_infinite)
+                is_valid &= not (np.isnan(x) and not admits_blanks)
             if not is_valid:
                 kind = "a number" if admits_infinite else "a finite number"
                 raise FileError(
@@ -130,8 +126,7 @@ def read_csv_table(
     except OSError as error:
         raise FileError(f"{source} cannot be read: {error.strerror}.") from None
     # Binary files decode in Windows' code too; control characters tell that they are no text.
-    odd = _NO_TEXT.search(text)
-    if odd:
+    if odd := _NO_TEXT.search(text):
         raise FileError(
             f"character {odd.start() + 1} of {source} is {odd[0]!a}, which no text has."
         )
@@ -146,11 +141,8 @@ def read_csv_table(
         raise FileError(f"{source} is not a readable CSV file: {error}.") from None
     heads = [cell.strip() for cell in entries[0][1]] if entries else []
     # without an end of its line the last number may have lost digits
-    is_cut = (
-        admits_cut
-        and len(entries) > 1
-        and (len(entries[-1][1]) < len(heads) or not text.endswith(("\n", "\r")))
-    )
+    is_cut = admits_cut and len(entries) > 1
+    is_cut &= bool(entries) and (len(entries[-1][1]) < len(heads) or text[-1] not in "\n\r")
     entries = entries[1 : len(entries) - is_cut]
     lines, rows = [line for line, _ in entries], [row for _, row in entries]
     # with another separator the comma is taken for the decimal sign

@@ -26,7 +26,7 @@ from ..uav.flight_identification.record import (
     make_layout,
 )
 from .csv_table import write_csv_table
-from .log_consistency import find_contradictions
+from .log_consistency import find_contradictions, interpolate
 from .log_formats import (
     DECODERS,
     FOREIGN_FORMATS,
@@ -259,20 +259,14 @@ class FlightLog:
         steps = np.diff(flight[motors].values, axis=0)
         changes = rate * np.count_nonzero(np.any(steps, axis=1)) / max(len(steps), 1)
         if rate < _SLOWEST_COMMANDS or 0 < changes < _SLOWEST_COMMANDS:
-            fact = (
-                f"come at {rate:.3g} Hz"
-                if rate < _SLOWEST_COMMANDS
-                else f"change at {changes:.3g} Hz"
-            )
+            is_slow = rate < _SLOWEST_COMMANDS
+            fact = f"come at {rate:.3g} Hz" if is_slow else f"change at {changes:.3g} Hz"
             raise SettingError(
                 f"{motors} of {self.name} {fact}, which is slower than the lag of motors; {_SLOWEST_COMMANDS:g} Hz or "
                 "more would be valid (a high-rate logging profile)."
             )
-        gaps = [
-            (g.start, g.end)
-            for g in flight.gaps
-            if g.channel in names and g.end - g.start > _BRIDGED
-        ]
+        relevant = [gap for gap in flight.gaps if gap.channel in names]
+        gaps = [(gap.start, gap.end) for gap in relevant if gap.end - gap.start > _BRIDGED]
         t0, t1 = flight.flights[0] + [_TAKE_OFF, -_LANDING]
         # Ends of gaps, in order, are the edges of the segments between them.
         edges = np.array([t0, *np.ravel(sorted(gaps)), t1]).reshape(-1, 2)
@@ -283,9 +277,8 @@ class FlightLog:
                 f"Gaps of more than {_BRIDGED:g} s leave at most {t1 - t0:.3g} s of the flight of {self.name} without "
                 f"one; {SHORTEST_RECORD:g} s or more would be valid."
             )
-        rate = float(
-            round(min(_RECORD_RATE, flight["gyroscope"].rate, flight["accelerometer"].rate))
-        )
+        rates = (flight["gyroscope"].rate, flight["accelerometer"].rate)
+        rate = float(round(min(_RECORD_RATE, *rates)))
         part = flight.window(t0, t1)
         grid = part.resample(rate)
         ts = grid["gyroscope"].ts
@@ -297,16 +290,13 @@ class FlightLog:
         for name, values in columns.items():
             present = np.all(np.isfinite(values), axis=1)
             if np.any(present):
-                columns[name] = np.stack(
-                    [np.interp(ts, ts[present], x[present]) for x in values.T], axis=1
-                )
+                columns[name] = interpolate(ts, ts[present], values[present])
         inside = slice(int(np.argmax(whole)), len(whole) - int(np.argmax(whole[::-1])))
-        cutoffs = tuple(
-            float(self.settings[key].value) if key in self.settings else np.inf
-            for key in ("gyroscope_cutoff", "accelerometer_cutoff")
+        number = lambda key, usual: (
+            float(self.settings[key].value) if key in self.settings else usual
         )
-        setting = self.settings.get("filter_rate")
-        filter_rate = None if setting is None else float(setting.value)
+        cutoffs = number("gyroscope_cutoff", np.inf), number("accelerometer_cutoff", np.inf)
+        filter_rate = number("filter_rate", None)
         voltage = columns["battery_voltage"][inside, 0] if "battery_voltage" in columns else None
         commands, gyroscope, accelerometer = (columns[name][inside] for name in names)
         if motors == "rotor_speeds":
@@ -315,9 +305,7 @@ class FlightLog:
             commands = (commands + after) / (2 * np.max(self[motors].values))
             voltage = None
         channels = (commands, gyroscope, accelerometer, voltage)
-        return FlightRecord(
-            ts[inside], *channels, (cutoffs[0], cutoffs[1]), resolution, filter_rate
-        )
+        return FlightRecord(ts[inside], *channels, cutoffs, resolution, filter_rate)
 
     def to_layout(self, mass: float | int | None = None) -> RotorLayout:
         """Layout of the rotors that the vehicle's parameters give.
@@ -374,13 +362,9 @@ def _align_signs(q: np.ndarray) -> np.ndarray:
 
 
 def _on_grid(
-    grid: np.ndarray,
-    width: float,
-    ts: np.ndarray,
-    values: np.ndarray,
-    is_held: bool,
+    grid: np.ndarray, width: float, ts: np.ndarray, values: np.ndarray, is_held: bool,
     gaps: Sequence[tuple[float, float]],
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Values (k, m) at the times of a grid, or their means over `width` [s] around each."""
     if len(ts) < 2:
         return np.full((len(grid), values.shape[1]), np.nan)
@@ -472,11 +456,9 @@ def read_flight_log(
         raise FileError(f"{source} is empty; a flight log would be valid.")
     # Formats that are known but not read are named: as a CSV, their bytes would only raise errors
     # of columns.
-    foreign = next(
-        (kind for magic, kind in FOREIGN_FORMATS.items() if data.startswith(magic)), None
-    )
-    if foreign:
-        raise FileError(f"{source} is {foreign}, which is not read; export it as CSV.")
+    for magic, kind in FOREIGN_FORMATS.items():
+        if data.startswith(magic):
+            raise FileError(f"{source} is {kind}, which is not read; export it as CSV.")
     decode = next((read for magic, read in DECODERS.items() if data.startswith(magic)), None)
     if decode and columns is not None:
         raise SettingError(f"{source} is no CSV file: leave out the map of columns.")
@@ -579,9 +561,8 @@ def _convert_channel(draft: LogDraft, name: str, row: LogSource, ts: np.ndarray)
     place = row.topic if not row.topic.startswith("rows ") else "CSV"
     plain = ", ".join(c.partition(":")[2] or c for c in row.fields)
     source = f"{place}: {plain}"
-    return Channel(
-        ts[keep], values[keep], quantity.unit, columns, row.topic, source, quantity.is_held
-    )
+    about = (quantity.unit, columns, row.topic, source, quantity.is_held)
+    return Channel(ts[keep], values[keep], *about)
 
 
 def _find_gaps(name: str, channel: Channel) -> Iterable[Gap]:
@@ -597,11 +578,9 @@ def _find_gaps(name: str, channel: Channel) -> Iterable[Gap]:
 
 def _motor_level(channels: Mapping[str, Channel]) -> tuple[np.ndarray, np.ndarray] | None:
     """Times and mean command of the motors, or mean squared speed as a share of the largest."""
-    if "motor_commands" in channels:
-        channel = channels["motor_commands"]
+    if channel := channels.get("motor_commands"):
         return channel.ts, np.mean(channel.values, axis=1)
-    if "rotor_speeds" in channels:
-        channel = channels["rotor_speeds"]
+    if channel := channels.get("rotor_speeds"):
         power = np.mean(channel.values**2, axis=1)
         return channel.ts, power / max(float(np.max(power)), 1e-300)
     return None
@@ -659,9 +638,8 @@ def _find_flights(
     if not flights:
         armed = switches.get("armed")
         disarmed = not np.any(armed[1]) if armed else level is not None and not turning
-        state = (
-            "is disarmed throughout" if disarmed else f"has no flight of {_SHORTEST:g} s or more"
-        )
+        few = f"has no flight of {_SHORTEST:g} s or more"
+        state = "is disarmed throughout" if disarmed else few
         draft.refuse(f"The log {state}; a log with a flight would be valid.")
     return np.array(flights, float).reshape(-1, 2)
 
@@ -708,11 +686,8 @@ def _note_assumptions(
     """Note what an identification assumes in place of settings and channels that the log lacks."""
     if draft.refusals or not len(flights) or not {"accelerometer", "gyroscope"} <= set(channels):
         return
-    unknown = [
-        name
-        for name in ("gyroscope", "accelerometer")
-        if f"{name}_cutoff" not in draft.settings and name not in draft.unfiltered
-    ]
+    is_known = lambda name: f"{name}_cutoff" in draft.settings or name in draft.unfiltered
+    unknown = [name for name in ("gyroscope", "accelerometer") if not is_known(name)]
     if unknown:
         names = " and ".join(f"{name}_cutoff" for name in unknown)
         place = "settings of the map of columns" if draft.format == "CSV" else "record's cutoffs"
@@ -797,32 +772,27 @@ def _check_units(draft: LogDraft, channels: Mapping[str, Channel], flights: np.n
         resting &= _hold_values(ts, rates.ts, np.linalg.norm(rates.values, axis=1)) < 0.2
     period = float(np.median(np.diff(ts))) if len(ts) > 1 else 1.0
     is_checked = np.sum(resting) * period > 0.5
-    mean = (
-        np.mean(channel.values[in_flight], axis=0) if np.any(in_flight) else np.array([0, 0, 1.0])
-    )
+    flies = bool(np.any(in_flight))
+    mean = np.mean(channel.values[in_flight], axis=0) if flies else np.array([0, 0, 1.0])
     if mean[2] < _UPRIGHT * np.linalg.norm(mean):
         numbers = ", ".join(f"{x:.3g}" for x in mean)
         draft.refuse(
             f"The accelerometer measures ({numbers}) m/s^2 on average in flight, where thrust along +z would be "
             "valid: are its axes others, such as forward-right-down?"
         )
-    if not is_checked and not np.any(in_flight):
+    if not is_checked and not flies:
         return
-    (low, high), place = (
-        (_GRAVITY, "at rest") if is_checked else (_IN_AIR, "in flight, as a median,")
-    )
+    (low, high), place = _GRAVITY, "at rest"
     if not is_checked:
+        (low, high), place = _IN_AIR, "in flight, as a median,"
         draft.notes.append(
             "The log has no rest, so gravity checks the accelerometer's scale by the mean in flight only."
         )
     gravity = float(np.median(force[resting if is_checked else in_flight]))
     if not low <= gravity <= high:
         # The unit by which the value would be gravity is most likely the true one.
-        hints = [
-            name
-            for name, size in UNITS["m/s^2"].items()
-            if size != 1 and low <= gravity * size <= high
-        ]
+        sizes = {name: size for name, size in UNITS["m/s^2"].items() if size != 1}
+        hints = [name for name, size in sizes.items() if low <= gravity * size <= high]
         hint = f": is its unit {hints[0]}?" if hints else ": its scale or its unit is not m/s^2."
         draft.refuse(
             f"The accelerometer measures {gravity:.4g} m/s^2 {place} where {low:g} to {high:g} m/s^2 would be "
@@ -849,10 +819,9 @@ def _check_commands(draft: LogDraft, channels: Mapping[str, Channel], flights: n
     # A firmware may limit its commands to less than the whole range: motors then stay at the largest or the
     # smallest of all commands, which in free flight few samples are.
     highest, lowest = float(np.max(values)), float(np.min(values))
-    for limit, bound, share in (
-        ("upper", highest, np.mean(values >= min(highest, 0.995), axis=0)),
-        ("lower", lowest, np.mean(values <= max(lowest, 0.005), axis=0)),
-    ):
+    shares = [values >= min(highest, 0.995), values <= max(lowest, 0.005)]
+    shares = [np.mean(at_limit, axis=0) for at_limit in shares]
+    for limit, bound, share in zip(("upper", "lower"), (highest, lowest), shares, strict=True):
         is_end = not 0.005 < bound < 0.995
         # One sentence on the worst motor is enough to doubt the record.
         k = int(np.argmax(share))
@@ -888,10 +857,9 @@ def read_rotor_layout(path: str | os.PathLike[str]) -> RotorLayout:
             raise SettingError(
                 f"{source} has an unknown entry {quote_name(name)}.{nearest_names(name, names)}"
             )
-    for name in ("positions", "spin"):
-        if name not in entries:
-            raise SettingError(f"{source} lacks the entry '{name}'.")
     for name in names:
+        if name in ("positions", "spin") and name not in entries:
+            raise SettingError(f"{source} lacks the entry '{name}'.")
         value = entries.get(name, 0.0)
         if name not in ("positions", "spin", "inertia") and type(value) not in (int, float):
             raise SettingError(

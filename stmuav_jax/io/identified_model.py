@@ -99,11 +99,9 @@ def _model_numbers(
     ) -> None:
         """A number that an estimate, times a scale, determines; None for one of the airframe's file."""
         deviation = None if e is None else abs(scale) * e.deviation
-        origin = (
-            "airframe's file"
-            if e is None
-            else f"{source}: {e.name}, deviation {deviation:.2g} {unit}"
-        )
+        origin = "airframe's file"
+        if e is not None:
+            origin = f"{source}: {e.name}, deviation {deviation:.2g} {unit}"
         numbers[name] = _Number(float(value), unit, deviation, origin)
 
     if layout.mass is None:
@@ -141,10 +139,8 @@ def _model_numbers(
         slope = 2 * hover * force.value
     else:
         slope = (1 - factor + 2 * factor * hover) * force.value
-    highest, relative = (
-        layout.highest_speed,
-        0.0 if force is None else force.deviation / force.value,
-    )
+    highest = layout.highest_speed
+    relative = 0.0 if force is None else force.deviation / force.value
     # curvature of the thrust by the command, halved, of the layout's shape; within two deviations of it another one
     # is not told from it
     quadratic = slope / (1 - factor + 2 * factor * hover) * factor
@@ -169,10 +165,8 @@ def _model_numbers(
         span, k_f = highest, quadratic / highest**2
         curve["thrust_linear"] = linear / highest, "N s/rad"
         if has_curve:
-            parts = (
-                estimates[f"thrust_{name}"].value for name in ("offset", "linear", "quadratic")
-            )
-            thrust = mass * float(np.polynomial.polynomial.polyval(hover, list(parts)))
+            parts = [estimates[f"thrust_{k}"].value for k in ("offset", "linear", "quadratic")]
+            thrust = mass * float(np.polynomial.polynomial.polyval(hover, parts))
             curve["thrust_offset"] = thrust - (linear + quadratic * hover) * hover, "N"
         lowest = 0.0
     text = f"slope of the thrust at the command {hover:.3g}, deviation {100 * relative:.2g} %"

@@ -56,11 +56,8 @@ def find_contradictions(
         return
     begin, end = flights[np.argmax(lengths)]
     grid = np.arange(begin, end, _STEP)
-    available = {
-        name: channel
-        for name, channel in channels.items()
-        if channel.rate > _SLOWEST and channel.ts[0] <= begin + 1 and channel.ts[-1] >= end - 1
-    }
+    covers = lambda ts: ts[0] <= begin + 1 and ts[-1] >= end - 1
+    available = {k: x for k, x in channels.items() if x.rate > _SLOWEST and covers(x.ts)}
     for pair in _list_pairs(available, grid):
         sentence = _compare_curves(pair)
         if sentence:
@@ -70,19 +67,20 @@ def find_contradictions(
         yield sentence, True
 
 
-def _interpolate(grid: np.ndarray, ts: np.ndarray, values: np.ndarray) -> np.ndarray:
+def interpolate(grid: np.ndarray, ts: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (k, m) at the times of a grid, linear between their own times."""
     return np.stack([np.interp(grid, ts, column) for column in values.T], axis=1)
 
 
 def _integrate(grid: np.ndarray, ts: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Integral of values (k, m) from the first of them to the times of a grid."""
     areas = 0.5 * np.diff(ts)[:, None] * (values[1:] + values[:-1])
-    return _interpolate(grid, ts, np.cumsum(np.insert(areas, 0, 0.0, axis=0), axis=0))
+    return interpolate(grid, ts, np.cumsum(np.insert(areas, 0, 0.0, axis=0), axis=0))
 
 
 def _list_pairs(channels: Mapping[str, Any], grid: np.ndarray) -> Iterator[_Pair]:
     """Pairs of channels; an identification uses the gyroscope, but neither attitude, position nor velocity."""
-    curves = lambda name: _interpolate(grid, channels[name].ts, channels[name].values)
+    curves = lambda name: interpolate(grid, channels[name].ts, channels[name].values)
     integral = lambda name: _integrate(grid, channels[name].ts, channels[name].values)
     attitude = channels.get("attitude")
     # quaternions without a length, which the log's check refuses, are no rotations
@@ -93,12 +91,11 @@ def _list_pairs(channels: Mapping[str, Any], grid: np.ndarray) -> Iterator[_Pair
         # The sum of small turns in body axes is the integral of the rates: a wrong factor stays one, however large.
         steps = np.zeros((len(attitude.ts), 3))
         steps[1:] = (turns[:-1].inv() * turns[1:]).as_rotvec()
-        angles = _interpolate(grid, attitude.ts, np.cumsum(steps, axis=0))
+        angles = interpolate(grid, attitude.ts, np.cumsum(steps, axis=0))
         yield _Pair("attitude", "gyroscope", (angles, integral("gyroscope")), 0.05, "rad/s", True)
     if "position" in channels and "velocity" in channels:
-        yield _Pair(
-            "position", "velocity", (curves("position"), integral("velocity")), 0.1, "m", False
-        )
+        pair = (curves("position"), integral("velocity"))
+        yield _Pair("position", "velocity", pair, 0.1, "m", False)
     if attitude is not None and turns is not None and "accelerometer" in channels:
         force = channels["accelerometer"]
         nearest = np.clip(np.searchsorted(attitude.ts, force.ts), 0, len(attitude.ts) - 1)
@@ -140,9 +137,8 @@ def _compare_curves(pair: _Pair) -> str:
             key=lambda match: np.sum(match[1]),
         )  # fmt: skip
         if np.sum(best) - np.sum(diagonal) > _BETTER * len(active) and np.min(best) > _ALIKE:
-            signed = ", ".join(
-                f"{'-' if alike[k, order[k]] < 0 else ''}{XYZ[order[k]]}" for k in active
-            )
+            sign = lambda k: "-" if alike[k, order[k]] < 0 else ""
+            signed = ", ".join(f"{sign(k)}{XYZ[order[k]]}" for k in active)
             return fault(
                 f"as the {pair.second} measures {signed}: the order or the signs of one's columns, or their axes, "
                 "are others."
@@ -166,11 +162,8 @@ def _compare_curves(pair: _Pair) -> str:
         return ""
     names = ", ".join(XYZ[k] for k in active[wrong])
     typical = float(np.median(factor[wrong]))
-    hints = [
-        name
-        for name, size in UNITS[pair.unit].items()
-        if size != 1 and min(abs(typical / size - 1), abs(typical * size - 1)) < _CLOSE
-    ]
+    fits = lambda size: min(abs(typical / size - 1), abs(typical * size - 1)) < _CLOSE
+    hints = [name for name, size in UNITS[pair.unit].items() if size != 1 and fits(size)]
     hint = f", as if one were in {hints[0]}" if hints else ""
     return fault(
         f"{typical:.3g} times as much as the {pair.second} measures{hint}; {_FACTORS[0]:g} to {_FACTORS[1]:g} would be "

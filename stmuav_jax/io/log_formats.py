@@ -161,19 +161,14 @@ class LogDraft:
 
     def chosen(self, channel: str) -> LogSource | None:
         """First source of a channel that the file has, at half the rate of the fastest one or more."""
-        available = [
-            source
-            for source in self.sources
-            if source.channel == channel
-            and source.topic in self.topics
-            and all(_is_numbers(self.topics[source.topic].fields.get(n)) for n in source.fields)
-        ]
+        are_numbers = lambda fields, names: all(_is_numbers(fields.get(name)) for name in names)
+        sources = [s for s in self.sources if s.channel == channel and s.topic in self.topics]
+        available = [s for s in sources if are_numbers(self.topics[s.topic].fields, s.fields)]
         # Firmwares log the same quantity in several messages at different rates; a slow copy is taken only
         # without a fast one.
-        counts = [len(self.topics[source.topic].stamps) for source in available]
-        return next(
-            (s for s, n in zip(available, counts, strict=True) if 2 * n >= max(counts)), None
-        )
+        count = lambda source: len(self.topics[source.topic].stamps)
+        most = max(map(count, available), default=0)
+        return next((source for source in available if 2 * count(source) >= most), None)
 
 
 def _decode_ulog(source: Path, data: bytes) -> LogDraft:
@@ -186,14 +181,12 @@ def _decode_ulog(source: Path, data: bytes) -> LogDraft:
         ) from None
     # A log that ends with the battery is truncated: what was written before is whole, and is read.
     draft, reader = LogDraft("PX4 ULog", is_down=True), _CutReader(data)
-    names = sorted(
-        {row.topic for row in _ULOG} | {"actuator_motors", "actuator_outputs", "esc_status"}
-    )
+    names = {row.topic for row in _ULOG} | {"actuator_motors", "actuator_outputs", "esc_status"}
     states = ["actuator_armed", "vehicle_land_detected", "vehicle_status"]
     with contextlib.redirect_stdout(io.StringIO()):
         try:
             # Only the topics that are used are decoded; a log has many others.
-            log = pyulog.ULog(reader, [*names, *states])
+            log = pyulog.ULog(reader, [*sorted(names), *states])
         # a damaged head can fail in any of its parts
         except Exception as error:
             raise FileError(
@@ -326,10 +319,8 @@ def _read_px4_vehicle(draft: LogDraft, parameters: Mapping[str, Any]) -> None:
     if rotors and all(f"{name}PX" in parameters for name in rotors):
         places = [[parameters.get(f"{name}P{axis}", 0.0) for axis in "XYZ"] for name in rotors]
         # Rotors push along (AX, AY, AZ), by default up; those of the model push along z.
-        axes = [
-            [parameters.get(f"{name}A{axis}", usual) for axis, usual in zip("XYZ", (0.0, 0.0, -1.0), strict=True)]
-            for name in rotors
-        ]  # fmt: skip
+        usual = {"X": 0.0, "Y": 0.0, "Z": -1.0}
+        axes = [[parameters.get(f"{name}A{k}", x) for k, x in usual.items()] for name in rotors]
         tilts = [np.degrees(np.arctan2(np.hypot(x, y), -z)) for x, y, z in axes]
         if max(tilts) > _TILTED:
             draft.refuse(
@@ -364,11 +355,8 @@ def _px4_motors(draft: LogDraft, parameters: Mapping[str, Any]) -> list[LogSourc
     topic = draft.topics.get("actuator_outputs")
     if draft.refusals or not topic:
         return []
-    functions = {
-        int(parameters.get(f"PWM_MAIN_FUNC{k + 1}", 0)) - 101: k
-        for k in range(16)
-        if 101 <= int(parameters.get(f"PWM_MAIN_FUNC{k + 1}", 0)) <= 112
-    }
+    function_of = lambda k: int(parameters.get(f"PWM_MAIN_FUNC{k + 1}", 0))
+    functions = {function_of(k) - 101: k for k in range(16) if 101 <= function_of(k) <= 112}
     count = _ROTORS.get(int(parameters.get("MAV_TYPE", 0)), 0)
     # Outputs are in the order of the pins, motors in that of their functions: the second is the
     # order of the rotors' positions.
@@ -502,23 +490,14 @@ def _decode_bin(source: Path, data: bytes) -> LogDraft:
             if _is_numbers(part.get(clock)) and len(part[clock]):
                 stamps = part[clock].astype(np.int64) * (1 if clock == "TimeUS" else 1000)
                 draft.topics[f"{kind}.{number}" if number else kind] = LogTopic(stamps, part)
-    parameter_table, texts = (
-        tables.get("PARM", {}),
-        tables.get("MSG", {}).get("Message", np.array([], "S1")),
-    )
-    texts = [str(text, "ascii", "replace") for text in texts]
-    named_values = zip(
-        parameter_table.get("Name", ()), parameter_table.get("Value", ()), strict=False
-    )
-    parameters = {str(name, "ascii", "replace"): float(value) for name, value in named_values}
-    parameters = _finite_parameters(parameters)
+    decode = lambda text: str(text, "ascii", "replace")
+    texts = [decode(text) for text in tables.get("MSG", {}).get("Message", ())]
+    pairs = zip(*(tables.get("PARM", {}).get(c, ()) for c in ("Name", "Value")), strict=False)
+    parameters = _finite_parameters({decode(name): float(value) for name, value in pairs})
     _read_ardupilot_vehicle(draft, parameters, texts)
     draft.sources = [*_BIN, *_ardupilot_motors(draft, parameters, texts), *_ardupilot_speeds(draft)]
-    filters = {
-        "gyroscope": ("IMU", "INS_GYRO_FILTER"),
-        "accelerometer": ("IMU", "INS_ACCEL_FILTER"),
-    }
-    draft.set_cutoffs(parameters, filters)
+    filters = {"gyroscope": "INS_GYRO_FILTER", "accelerometer": "INS_ACCEL_FILTER"}
+    draft.set_cutoffs(parameters, {channel: ("IMU", name) for channel, name in filters.items()})
     draft.set_factor(parameters, "MOT_THST_EXPO")
     if "EV" in draft.topics and "Id" in draft.topics["EV"].fields:
         stamps, events = draft.topics["EV"].stamps, draft.topics["EV"].fields["Id"]
@@ -595,9 +574,8 @@ def _ardupilot_motors(
     outputs = [motors[k] for k in sorted(motors)]
     if not outputs:
         frame = re.search(r"\b(TRI|QUAD|HEXA|Y6|OCTA)", " ".join(texts).upper())
-        count = _CLASSES.get(
-            int(parameters.get("FRAME_CLASS", 0)), _FRAMES[frame[1]] if frame else 0
-        )
+        by_text = _FRAMES[frame[1]] if frame else 0
+        count = _CLASSES.get(int(parameters.get("FRAME_CLASS", 0)), by_text)
         outputs = list(range(1, count + 1))
         if outputs:
             draft.assume(
@@ -615,13 +593,10 @@ def _ardupilot_motors(
     # The command of the thrust curve f u^2 + (1 - f) u, f = MOT_THST_EXPO, is 0 at MOT_SPIN_MIN and 1 at MOT_SPIN_MAX.
     # Source: ardupilot, libraries/AP_Motors/AP_Motors_Thrust_Linearization.cpp (thrust_to_actuator).
     span = high - low
-    low, high = (
-        low + span * parameters.get(name, usual)
-        for name, usual in (("MOT_SPIN_MIN", 0.0), ("MOT_SPIN_MAX", 1.0))
-    )
-    return _pulse_source(
-        draft, "RCOU", [f"{prefix}{k}" for k in outputs], [(low, high)] * len(outputs)
-    )
+    high = low + span * parameters.get("MOT_SPIN_MAX", 1.0)
+    low = low + span * parameters.get("MOT_SPIN_MIN", 0.0)
+    names = [f"{prefix}{k}" for k in outputs]
+    return _pulse_source(draft, "RCOU", names, [(low, high)] * len(outputs))
 
 
 def _ardupilot_speeds(draft: LogDraft) -> list[LogSource]:
@@ -766,26 +741,17 @@ class _ChannelColumns(Entries):
     range: Annotated[tuple[Finite, Finite] | None, Tuples] = None
 
 
-class _ColumnMap(Entries):
+class _MapHead(Entries):
     axes: Literal["forward-left-up", "forward-right-down"] = "forward-left-up"
     separator: Literal[",", ";", "\t"] | None = None
     decimal: Literal[".", ","] | None = None
     vehicle: str = "multirotor"
     time: _TimeColumn
-    motor_commands: _ChannelColumns | None = None
-    thrust_commands: _ChannelColumns | None = None
-    rotor_speeds: _ChannelColumns | None = None
-    accelerometer: _ChannelColumns | None = None
-    gyroscope: _ChannelColumns | None = None
-    attitude: _ChannelColumns | None = None
-    euler_angles: _ChannelColumns | None = None
-    position: _ChannelColumns | None = None
-    velocity: _ChannelColumns | None = None
-    acceleration: _ChannelColumns | None = None
-    battery_voltage: _ChannelColumns | None = None
-    battery_current: _ChannelColumns | None = None
     settings: dict[str, Any] = pydantic.Field(default_factory=dict)
 
+
+_CHANNELS: Any = dict.fromkeys(QUANTITIES, (_ChannelColumns | None, None))
+_ColumnMap = pydantic.create_model("_ColumnMap", __base__=_MapHead, **_CHANNELS)
 
 _SETTING_UNITS = {
     "gyroscope_cutoff": "Hz", "accelerometer_cutoff": "Hz", "filter_rate": "Hz", "thrust_model_factor": "1",
@@ -817,9 +783,8 @@ def decode_csv(source: Path, columns: Any) -> LogDraft:
     if _OTHER_WORDS.search(plan.vehicle):
         draft.refuse_vehicle(f"a {plan.vehicle} (the map's vehicle)")
     if cells.is_cut:
-        draft.notes.append(
-            "The file is truncated: its last row is not whole or has no end of line, and was left out."
-        )
+        cut = "its last row is not whole or has no end of line, and was left out"
+        draft.notes.append(f"The file is truncated: {cut}.")
     if "axes" not in plan.model_fields_set and columns is not None:
         draft.assume(
             "x is forward, y left and z up",
@@ -865,12 +830,10 @@ def decode_csv(source: Path, columns: Any) -> LogDraft:
             raise FileError(
                 f"{source} has no row in which time and all columns of {name} are numbers."
             )
-        if quantity.is_held and (
-            np.min(values[complete]) < -0.01 or np.max(values[complete]) > 1.01
-        ):
-            ends = f"{np.min(values[complete]):g} to {np.max(values[complete]):g}"
+        low, high = np.min(values[complete]), np.max(values[complete])
+        if quantity.is_held and not -0.01 <= low <= high <= 1.01:
             raise SettingError(
-                f"The {name} must be 0 to 1, but they are {ends}: give their range in the map, such as "
+                f"The {name} must be 0 to 1, but they are {low:g} to {high:g}: give their range in the map, such as "
                 "range = [1000, 2000]."
             )
         # channels with the same rows have one clock
@@ -897,10 +860,8 @@ def _map_setting(name: str, value: Any) -> Any:
         numbers = np.array(value, float)
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
-    good = (
-        np.all(np.isfinite(numbers)) and numbers.ndim == shape and numbers.shape[1:] in ((), (3,))
-    )
-    if not good:
+    fits = numbers.ndim == shape and numbers.shape[1:] in ((), (3,))
+    if not (fits and np.all(np.isfinite(numbers))):
         kind = ("a number", "a list of numbers", "a list of points [x, y, z]")[shape]
         raise SettingError(f"The setting {name} must be {kind}, but it is {format_value(value)}.")
     if _SETTING_UNITS[name] == "Hz" and not numbers > 0:

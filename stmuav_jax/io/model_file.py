@@ -27,7 +27,7 @@ from ..math.rotation import rotation_matrix_in
 from ..mechanics.body import GROUND, Body
 from ..mechanics.forces import Gravity
 from ..mechanics.internal import counted_hinges, internal_states, with_start_angles
-from ..mechanics.joint import Joint, Mate, free_coordinates
+from ..mechanics.joint import Joint, free_coordinates
 from ..mechanics.joint_states import coordinates_of
 from ..mechanics.load import SineMotion
 from ..mechanics.parameters import Parameter, Parameters
@@ -95,9 +95,8 @@ class ParametricModel:
 
     def used_parameters(self) -> frozenset[str]:
         """Names of the parameters to which the entries refer."""
-        return frozenset(_nested_texts(self.file.model_dump(exclude={"parameters"}))) & frozenset(
-            self.table
-        )
+        texts = _nested_texts(self.file.model_dump(exclude={"parameters"}))
+        return frozenset(texts) & frozenset(self.table)
 
     def of_start(self) -> frozenset[str]:
         """Names of the parameters to which the entries of the start refer."""
@@ -183,23 +182,12 @@ def read_model(path: str | os.PathLike[str]) -> ParametricModel:
             sensors[name] = _read_instrument(name, entry, table, system)
     with _locate_errors(f"{source}, [start]"):
         state0 = _read_start(system, model_data, table)
+    same = ("title", "t0", "t1", "save_every", "notes", "watch", "links_between")
     scene = Scene(
-        name=model_data.name or source.stem,
-        title=model_data.title,
-        system=system,
-        state0=state0,
-        t0=model_data.t0,
-        t1=model_data.t1,
-        save_every=model_data.save_every,
-        parameters={
-            name: parameter.model_dump(mode="json")
-            for name, parameter in model_data.parameters.items()
-        },
-        notes=model_data.notes,
-        watch=model_data.watch,
-        links_between=model_data.links_between,
-        sensors=sensors,
-    )
+        name=model_data.name or source.stem, system=system, state0=state0, sensors=sensors,
+        parameters={name: p.model_dump(mode="json") for name, p in entries_of},
+        **{name: getattr(model_data, name) for name in same},
+    )  # fmt: skip
     return ParametricModel(f"{source}", model_data, scene, table)
 
 
@@ -218,12 +206,10 @@ def _build_system(source: str, model_data: ModelFile, parameters: Table) -> Syst
     # The sort is stable: apart from hovering rotors, forces keep the order of the file.
     for name, table in sorted(model_data.forces.items(), key=lambda entry: hovering(entry[1])):
         with _locate_errors(f"{source}, [forces.{name}]"):
-            carried = (
-                _carried_weight([b for b, _ in bodies], forces.values())
-                if hovering(table)
-                else None
-            )
-            forces[name] = _read_force(table, parameters, joints, carried)
+            carried = {}
+            if hovering(table):
+                carried["carried"] = _carried_weight([b for b, _ in bodies], forces.values())
+            forces[name] = _read_force(table, parameters, joints, **carried)
     with _locate_errors(f"{source}"):
         # Inputs are numbered in the order of the file, whatever was read first.
         ordered_forces = [forces[name] for name in model_data.forces]
@@ -235,7 +221,12 @@ def _build_system(source: str, model_data: ModelFile, parameters: Table) -> Syst
         # Springs that count turns need the start's angles before the state exists, which has angles up to
         # whole turns only.
         system = _count_turns(system, model_data, parameters)
-    return _place_centres(system, [place for _, place in bodies])
+    # The given centres of mass themselves, where positions only come near them.
+    places, reference_positions = [place for _, place in bodies], system.reference.r
+    if all(place is None for place in places):
+        return system
+    rows = [reference_positions[k] if place is None else place for k, place in enumerate(places)]
+    return eqx.tree_at(lambda s: s.reference.r, system, stack_arrays(rows))
 
 
 def _count_turns(system: System, model: ModelFile, parameters: Table) -> System:
@@ -250,10 +241,8 @@ def _count_turns(system: System, model: ModelFile, parameters: Table) -> System:
         # another number of coordinates is refused where the start is made
         if len(values) == len(labels):
             angles[name] = values[labels.index("angle")]
-    angles |= {
-        k: _fill_numbers(v, parameters, f"angles.{k}", ("rad",))
-        for k, v in model.start.angles.items()
-    }
+    for name, value in model.start.angles.items():
+        angles[name] = _fill_numbers(value, parameters, f"angles.{name}", ("rad",))
     return with_start_angles(system, angles)
 
 
@@ -285,28 +274,14 @@ def _read_body(name: str, table: Mapping[str, Any], parameters: Table) -> tuple[
         return Body(name, **entry_values), None
     if "position" in entry_values:
         raise SettingError("A body has a position or a com_position, not both.")
-    com, p, place = (
-        as_floats(x)
-        for x in (
-            entry_values.get("com", np.zeros(3)),
-            entry_values.get("orientation", (1.0, 0.0, 0.0, 0.0)),
-            place,
-        )
-    )
+    com = entry_values.get("com", np.zeros(3))
+    p = entry_values.get("orientation", (1.0, 0.0, 0.0, 0.0))
+    com, p, place = (as_floats(x) for x in (com, p, place))
     # Numbers of a file stay in NumPy, without a compilation; parameters that JAX traces need its
     # functions.
     module = array_module(com, p, place)
     com, p, place = (module.asarray(x) for x in (com, p, place))
     return Body(name, position=place - rotation_matrix_in(module, p) @ com, **entry_values), place
-
-
-def _place_centres(system: System, places: list[Any]) -> System:
-    """System with the given centres of mass themselves, where positions only come near them."""
-    if all(place is None for place in places):
-        return system
-    reference_positions = system.reference.r
-    rows = [reference_positions[k] if place is None else place for k, place in enumerate(places)]
-    return eqx.tree_at(lambda s: s.reference.r, system, stack_arrays(rows))
 
 
 def _read_joint(
@@ -387,7 +362,7 @@ def _choose_units(
 
 
 def _read_force(
-    table: Mapping[str, Any], parameters: Table, joints: Sequence[Joint], carried: Any = None
+    table: Mapping[str, Any], parameters: Table, joints: Sequence[Joint], **carried: Any
 ) -> Any:
     """Force of a table; rotors whose speeds are left out hover with what is `carried`."""
     kind = kind_of(table, FORCES, "A force element")
@@ -396,9 +371,7 @@ def _read_force(
     entry_values = read_entries(table, slots, parameters, subject, owner=kind.owner, kind=True)
     del entry_values["kind"]
     owner = entry_values.pop(kind.owner) if kind.owner else ()
-    if carried is not None:
-        entry_values["carried"] = carried
-    return kind.make(*((owner,) if isinstance(owner, str) else owner), **entry_values)
+    return kind.make(*((owner,) if isinstance(owner, str) else owner), **entry_values, **carried)
 
 
 def _carried_weight(bodies: Iterable[Body], forces: Iterable[Any]) -> tuple[Array, Array]:
@@ -421,14 +394,12 @@ def _read_instrument(
     subject = f"A sensor of kind {table['kind']}"
     slots = _choose_units(kind.slots, table, system.joints)
     entry_values = read_entries(table, slots, parameters, subject, owner=kind.owner, kind=True)
-    owner, sensor_arguments = (
-        entry_values[kind.owner],
-        {k: v for k, v in entry_values.items() if k in kind.slots},
-    )
+    owner = entry_values[kind.owner]
     if kind.owner == "body":
         system.index(owner)
-    sheet = {key: sensor_arguments.pop(key) for key in DATASHEET if key in sensor_arguments}
-    instrument = kind.make(owner, name=name, own=sensor_arguments, **sheet)
+    sheet = {key: entry_values[key] for key in DATASHEET if key in entry_values}
+    arguments = {k: v for k, v in entry_values.items() if k in kind.slots.keys() - sheet.keys()}
+    instrument = kind.make(owner, name=name, own=arguments, **sheet)
     # A list of one number for three components would be broadcast without a word.
     count = len(instrument.sensor.components(system))
     for key in ("noise", "bias"):
@@ -460,25 +431,14 @@ def _read_start(system: System, model_data: ModelFile, parameters: Table) -> Sta
     state = State(**{field: stack_arrays(rows) for field, rows in arrays.items()})
     if not (start.coordinates or start.rates):
         return state
-    units = {
-        joint.name: [unit for _, unit in coordinates_of(joint.kind)] for joint in system.joints
-    }
-    coordinates, rates = (
-        {
-            name: _fill_numbers(
-                value,
-                parameters,
-                f"{table_name}.{name}",
-                [unit + per for unit in units.get(name, ())],
-            )
-            for name, value in table.items()
-        }
-        for table_name, table, per in (
-            ("coordinates", start.coordinates, ""),
-            ("rates", start.rates, "/s"),
-        )
-    )
-    return state_from_joints(system, coordinates, rates, start=state, t=model_data.t0)
+    kinds = {joint.name: coordinates_of(joint.kind) for joint in system.joints}
+    filled: dict[str, dict[str, Any]] = {"coordinates": {}, "rates": {}}
+    for table_name, per in (("coordinates", ""), ("rates", "/s")):
+        for name, value in getattr(start, table_name).items():
+            units = [unit + per for _, unit in kinds.get(name, ())]
+            numbers = _fill_numbers(value, parameters, f"{table_name}.{name}", units)
+            filled[table_name][name] = numbers
+    return state_from_joints(system, *filled.values(), start=state, t=model_data.t0)
 
 
 def _fill_numbers(value: Any, parameters: Table, key: str, units: Sequence[str] = ()) -> Any:
@@ -574,11 +534,8 @@ def _floating_rows(system: System) -> set[int]:
         ends = [{joint.body_i, joint.body_j} for joint in system.joints]
         new = set().union(*(pair for pair in ends if pair & attached_names)) - attached_names
         attached_names, has_grown = attached_names | new, bool(new)
-    return {
-        k
-        for k, name in enumerate(system.names)
-        if name in system.bodies.free or name not in attached_names
-    }
+    floats = lambda name: name in system.bodies.free or name not in attached_names
+    return {k for k, name in enumerate(system.names) if floats(name)}
 
 
 def _body_table(system: System, k: int) -> dict[str, Any]:
@@ -595,7 +552,12 @@ def _body_table(system: System, k: int) -> dict[str, Any]:
 
 def _joint_table(joint: Joint, before: tuple[Joint, ...]) -> dict[str, Any]:
     if joint.mate is not None:
-        return _coupling_table(joint.mate)
+        coordinate, mate_coordinate = joint.mate.coordinates
+        return {
+            "kind": "mimic", "joint": joint.mate.dependent, "mate": joint.mate.joint.name,
+            "ratio": joint.mate.ratio, "offset": joint.mate.offset, "coordinate": coordinate,
+            "mate_coordinate": mate_coordinate,
+        }  # fmt: skip
     if joint.kind not in JOINTS:
         raise SettingError(
             f"A model's file cannot hold joint '{joint.name}': {joint.kind} is no kind of the package."
@@ -618,22 +580,11 @@ def _driver_table(driver: Joint, before: tuple[Joint, ...]) -> dict[str, Any]:
         # nothing else.
         other = dataclasses.replace(joint, name=driver.name, kind=driver.kind, motion=driver.motion)
         if joint.motion is None and eqx.tree_equal(other, driver):
-            return {
-                "kind": driver.kind,
-                "joint": joint.name,
-                **{key: getattr(driver.motion, key) for key in JOINTS[driver.kind].slots},
-            }
+            numbers = {key: getattr(driver.motion, key) for key in JOINTS[driver.kind].slots}
+            return {"kind": driver.kind, "joint": joint.name, **numbers}
     raise SettingError(
         f"The driver '{driver.name}' must follow the joint that it drives, but no joint before it is that one."
     )
-
-
-def _coupling_table(mate: Mate) -> dict[str, Any]:
-    coordinate, mate_coordinate = mate.coordinates
-    return {
-        "kind": "mimic", "joint": mate.dependent, "mate": mate.joint.name, "ratio": mate.ratio,
-        "offset": mate.offset, "coordinate": coordinate, "mate_coordinate": mate_coordinate,
-    }  # fmt: skip
 
 
 def _force_table(force: Any) -> dict[str, Any]:
@@ -668,10 +619,8 @@ def _wind_table(system: System) -> dict[str, Any]:
     winds: list[Any] = [force.wind for force in airframes]
     if all(wind is None for wind in winds):
         return {}
-    if (
-        any(wind is None or callable(wind) for wind in winds)
-        or np.ptp(np.stack(winds), axis=0).any()
-    ):
+    steady = not any(wind is None or callable(wind) for wind in winds)
+    if not steady or np.ptp(np.stack(winds), axis=0).any():
         raise SettingError(
             "A model's file cannot hold gusts or a wind that is a function of time, and only one wind for all "
             "airframes: give the system a steady one by stmuav_jax.uav.with_wind."

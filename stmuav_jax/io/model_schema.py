@@ -7,7 +7,7 @@ entries of either are the arguments of the function that makes it. docs/models.m
 import functools
 import inspect
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -55,8 +55,8 @@ Several = Annotated[tuple[Finite, ...], Tuples]
 Triples = Annotated[tuple[Triple, ...], Tuples]
 
 
-def _shape_type(kinds: Any, requirement: str) -> AfterValidator:
-    """Check that a value is of one of some shapes; a message says what it must be."""
+def _shape_type(kinds: Any, requirement: str) -> Any:
+    """Type of a value of one of some shapes, with its schema for editors; a message says what it must be."""
     # The error of a union lists why each of its shapes does not fit; one sentence on what would fit
     # is what the user needs.
     shape = pydantic.TypeAdapter(kinds)
@@ -67,23 +67,14 @@ def _shape_type(kinds: Any, requirement: str) -> AfterValidator:
         except pydantic.ValidationError:
             raise ValueError(f"must be {requirement}, but it is {format_value(value)}.") from None
 
-    return AfterValidator(check_shapes)
+    schema = pydantic.WithJsonSchema(shape.json_schema())
+    return Annotated[Any, AfterValidator(check_shapes), schema]
 
 
-def _in_schema(kinds: Any) -> pydantic.WithJsonSchema:
-    """Schema for editors of values of one of some shapes."""
-    return pydantic.WithJsonSchema(pydantic.TypeAdapter(kinds).json_schema())
-
-
-_INERTIA, _VALUE, _SIZE = Triple | Rows, Finite | Several | Triples, Finite | Several
-Inertia = Annotated[
-    Any,
-    _shape_type(_INERTIA, "three moments or three rows of three numbers"),
-    _in_schema(_INERTIA),
-]
-Value = Annotated[Any, _shape_type(_VALUE, "finite numbers"), _in_schema(_VALUE)]
+Inertia = _shape_type(Triple | Rows, "three moments or three rows of three numbers")
+Value = _shape_type(Finite | Several | Triples, "finite numbers")
 # One number, or one for each component.
-Size = Annotated[Any, _shape_type(_SIZE, "a number or a list of numbers"), _in_schema(_SIZE)]
+Size = _shape_type(Finite | Several, "a number or a list of numbers")
 
 
 def _check_format(value: int) -> int:
@@ -164,30 +155,22 @@ _ARGUMENTS = {
 }
 
 
-def _joint_kind(kind: str) -> Kind:
-    """Table of a kind of joint, from the signature of its function."""
-    # The signature is the only list of a joint's arguments, so that files cannot deviate from it.
-    need_by_argument = _keyword_flags(kind)
-    slots = {
-        name: _ARGUMENTS[name]._replace(needed=need_by_argument[name]) for name in need_by_argument
-    }
-    return Kind(getattr(joints, kind), "bodies", slots)
+def _joint_kinds() -> Iterator[tuple[str, Kind]]:
+    """Tables of the kinds of joints whose functions take what a file can hold, so none of a user.
 
-
-def _keyword_flags(kind: str) -> dict[str, bool]:
-    """Keyword arguments of a joint's function, and for each whether it is needed."""
-    signature_parameters = inspect.signature(getattr(joints, kind)).parameters.values()
-    return {p.name: p.default is p.empty for p in signature_parameters if p.kind is p.KEYWORD_ONLY}
-
-
-def _joint_kinds() -> list[str]:
-    """Kinds of joints whose functions take what a file can hold; those of a user are not among them."""
-    library_kinds = [kind for kind in joints.CATALOGUE if hasattr(joints, kind)]
-    return [kind for kind in library_kinds if _keyword_flags(kind).keys() <= _ARGUMENTS.keys()]
+    The signature is the only list of a joint's arguments, so that files cannot deviate from it.
+    """
+    for kind in joints.CATALOGUE:
+        if make := getattr(joints, kind, None):
+            arguments = inspect.signature(make).parameters.values()
+            needs = {p.name: p.default is p.empty for p in arguments if p.kind is p.KEYWORD_ONLY}
+            if needs.keys() <= _ARGUMENTS.keys():
+                slots = {k: _ARGUMENTS[k]._replace(needed=needed) for k, needed in needs.items()}
+                yield kind, Kind(make, "bodies", slots)
 
 
 JOINTS: dict[str, Kind] = {
-    **{kind: _joint_kind(kind) for kind in _joint_kinds()},
+    **dict(_joint_kinds()),
     "drive_angle": Kind(_driver_maker("angle"), "joint", _MOTION),
     "drive_displacement": Kind(_driver_maker("displacement"), "joint", _MOTION),
     "mimic": Kind(joints.mimic, "joint", {
@@ -270,12 +253,9 @@ def _make_motors(
 
 def _read_motors(motors: MotorRotors, name: str) -> Any:
     if name in ("lowest", "highest"):
-        return None if motors.limits is None else getattr(motors.limits, name)
-    if name in ("time_constant", "inertia"):
-        return getattr(motors, name)
-    if name == "start":
-        return motors.start
-    return getattr(motors.rotors, name, None)
+        return getattr(motors.limits, name, None)
+    is_of_motors = name in ("time_constant", "inertia", "start")
+    return getattr(motors if is_of_motors else motors.rotors, name, None)
 
 
 _ROTORS = {
@@ -385,7 +365,7 @@ START_BODY: dict[str, Entry] = {
 class ModelParameter(Entries):
     """Entry of a parameter, to which the entries of bodies, joints and forces may refer."""
 
-    value: Value
+    value: Value  # pyright: ignore[reportInvalidTypeForm]
     unit: str
     source: str
 
@@ -481,12 +461,8 @@ def with_parameters(
     """Value in which each text is replaced by the value of the parameter that it names."""
     if isinstance(value, list):
         # arrays have at most two axes; what is deeper is refused later
-        return [
-            with_parameters(x, parameters, key, unit)
-            if not isinstance(x, list) or _is_flat(x)
-            else x
-            for x in value
-        ]
+        is_deep = lambda x: isinstance(x, list) and any(isinstance(y, list) for y in x)
+        return [x if is_deep(x) else with_parameters(x, parameters, key, unit) for x in value]
     if not isinstance(value, str):
         return value
     if value not in parameters:
@@ -504,10 +480,6 @@ def with_parameters(
     return _as_lists(parameter.value)
 
 
-def _is_flat(value: list[Any]) -> bool:
-    return not any(isinstance(x, list) for x in value)
-
-
 def _as_lists(value: Any) -> Any:
     return [_as_lists(x) for x in value] if isinstance(value, tuple) else value
 
@@ -517,7 +489,7 @@ def _as_lists(value: Any) -> Any:
 
 def model_json_schema() -> dict[str, Any]:
     """JSON schema of a model's file, for editors that complete and check entries."""
-    geometry = {name: Entry(Any, needed=False) for name in ("in_bodies",)}
+    geometry = {"in_bodies": Entry(Any, needed=False)}
     joint_kinds = {
         name: kind._replace(
             slots={key: _optional_entry(slot) for key, slot in kind.slots.items()} | geometry

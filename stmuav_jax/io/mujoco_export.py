@@ -43,12 +43,7 @@ _HARD = {"solref": "2e-4 1", "solimp": "0.9999 0.9999 0.001"}
 # Largest difference from the reference posture, at rest, that is no start of its own.
 _SAME = 1e-15
 _TREE = ("weld", "revolute", "translational", "cylindrical", "spherical", "universal")
-_LOOPS = (
-    "spherical",
-    "weld",
-    "revolute",
-    *(kind for kind in CATALOGUE if kind.startswith("mimic")),
-)
+_LOOPS = ("spherical", "weld", "revolute", *(k for k in CATALOGUE if k.startswith("mimic")))
 
 
 class LeftOut(NamedTuple):
@@ -121,10 +116,8 @@ def _write_document(scene: Scene) -> tuple[str, tuple[str, ...]]:
     tree = spanning_tree(system, base=next(iter(carriers), None))
     cut = [system.joints[k] for k in tree.cut]
     tree_joints = [system.joints[link.joint] for link in tree.links if link.joint is not None]
-    for joints, kinds, where in (
-        (cut, _LOOPS, "that closes a loop"),
-        (tree_joints, _TREE, "of a tree"),
-    ):
+    rules = ((cut, _LOOPS, "that closes a loop"), (tree_joints, _TREE, "of a tree"))
+    for joints, kinds, where in rules:
         for joint in joints:
             if joint.kind not in kinds:
                 raise SettingError(
@@ -172,12 +165,8 @@ def _add_body(draft: _Draft, k: int, parent: str, pos: Any, quat: Any) -> Elemen
     J = np.asarray(bodies.inertia[k])
     # The full tensor avoids a principal-axes rotation, whose order is not unique for symmetric bodies.
     full = xml_numbers([J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]])
-    inertial = {
-        "pos": xml_numbers(bodies.com[k]),
-        "mass": xml_numbers(bodies.mass[k]),
-        "fullinertia": full,
-    }
-    ElementTree.SubElement(body, "inertial", inertial)
+    inertial = {"pos": xml_numbers(bodies.com[k]), "mass": xml_numbers(bodies.mass[k])}
+    ElementTree.SubElement(body, "inertial", inertial | {"fullinertia": full})
     draft.bodies[name] = body
     return body
 
@@ -354,36 +343,21 @@ def _add_line(draft: _Draft, force: LinearSpringDamper) -> bool:
     return True
 
 
-def _add_effort(draft: _Draft, force: JointEffort) -> bool:
-    return _add_actuator(draft, force, "motor", "effort", force.effort)
-
-
-def _add_servo(draft: _Draft, force: JointServo) -> bool:
-    numbers = {"kp": xml_numbers(force.stiffness), "kv": xml_numbers(force.damping)}
-    return _add_actuator(draft, force, "position", "target", force.target, numbers)
-
-
-def _add_actuator(
-    draft: _Draft,
-    force: JointEffort | JointServo,
-    tag: str,
-    control_name: str,
-    value: Any,
-    numbers: dict[str, str] | None = None,
-) -> bool:
+def _add_actuator(draft: _Draft, force: JointEffort | JointServo) -> bool:
     """Write an actuator of a joint's axis, named by what its control is; false if there is no axis."""
     axis = _add_axis(draft, force.joint, force.coordinate)
     if axis is None:
         return False
-    name = f"{control_name}_{axis.get('name')}"
-    attributes = {"name": name, "joint": str(axis.get("name"))} | (numbers or {})
+    is_servo = isinstance(force, JointServo)
+    name = f"{'target' if is_servo else 'effort'}_{axis.get('name')}"
+    attributes = {"name": name, "joint": str(axis.get("name"))}
+    if is_servo:
+        attributes |= {"kp": xml_numbers(force.stiffness), "kv": xml_numbers(force.damping)}
     if force.limit is not None:
-        attributes |= {
-            "forcelimited": "true",
-            "forcerange": xml_numbers([-force.limit, force.limit]),
-        }
-    ElementTree.SubElement(draft.actuators, tag, attributes)
-    _set_control(draft, name, value)
+        limits = xml_numbers([-force.limit, force.limit])
+        attributes |= {"forcelimited": "true", "forcerange": limits}
+    ElementTree.SubElement(draft.actuators, "position" if is_servo else "motor", attributes)
+    _set_control(draft, name, force.target if is_servo else force.effort)
     return True
 
 
@@ -431,8 +405,8 @@ _WRITERS: dict[type, Callable[[_Draft, Any], bool]] = {
     TorsionalSpringDamper: _add_spring,
     JointDamping: _add_joint_damping,
     LinearSpringDamper: _add_line,
-    JointEffort: _add_effort,
-    JointServo: _add_servo,
+    JointEffort: _add_actuator,
+    JointServo: _add_actuator,
     Rotors: _add_rotors,
     MotorRotors: _add_rotors,
 }

@@ -9,7 +9,7 @@ import contextlib
 import dataclasses
 import importlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,7 +100,7 @@ def load_robot(
                 model = _compile_model(spec, source, urdf, floating, link_share, massless)
             except (ValueError, mujoco.FatalError, UserWarning) as error:
                 # a warning of MuJoCo is raised where warnings are errors
-                advice = _advise_error(_specification_for_words(source), str(error))
+                advice = _advise_error(source, str(error))
                 raise FileError(f"{source}: MuJoCo cannot read it: {error}{advice}") from error
         if nans := [warning_text for warning_text in warned if "NaN" in warning_text]:
             # MuJoCo goes on with a default in its place, such as the mass of the body's shape
@@ -122,20 +122,15 @@ def load_robot(
     scene = dataclasses.replace(scene, notes=notes)
     if not massless:
         return scene
-    without_mass = ", ".join(name for name, mass in massless.items() if not mass)
-    without_inertia = ", ".join(name for name, mass in massless.items() if mass)
     sentences = [
-        f"Links without mass have {share:g} of the robot's mass (link_share): {without_mass}."
-    ] * bool(without_mass)
-    sentences += [
-        f"Links without inertia have the moment of {share:g} of the robot's mass (link_share) at "
-        f"{_SHARE_RADIUS:g} m: {without_inertia}."
-    ] * bool(without_inertia)
-    return dataclasses.replace(
-        scene,
-        notes=(*scene.notes, *sentences),
-        links_between=(*scene.links_between, *massless),
-    )
+        f"Links without {lack} {share:g} of the robot's mass (link_share){place}: {', '.join(names)}."
+        for lack, place, names in (
+            ("mass have", "", [name for name, mass in massless.items() if not mass]),
+            ("inertia have the moment of", f" at {_SHARE_RADIUS:g} m", [n for n, m in massless.items() if m]),
+        ) if names
+    ]  # fmt: skip
+    links_between = (*scene.links_between, *massless)
+    return dataclasses.replace(scene, notes=(*scene.notes, *sentences), links_between=links_between)
 
 
 @contextlib.contextmanager
@@ -181,7 +176,16 @@ def _compile_model(
     reduced = False
     while True:
         try:
-            return _with_shares(spec, share, massless).compile()
+            # Relative to the whole robot: a given mass would be heavy for a gripper and lost beside an
+            # excavator.
+            stated = [b.mass for b in spec.bodies if b.explicitinertial and b.mass > 0]
+            added = (share or 0.0) * (sum(stated) or 1.0)
+            for name, mass in massless.items():
+                body = spec.body(name)
+                body.explicitinertial, body.mass = True, mass or added
+                body.inertia = [added * _SHARE_RADIUS**2] * 3
+                body.fullinertia = [np.nan] * 6
+            return spec.compile()
         except ValueError as error:
             name = massless_body(str(error))
             mass = _stated_mass(spec, name) if name else 0.0
@@ -202,29 +206,11 @@ def _stated_mass(spec: Any, name: str) -> float:
     return float(body.mass) if body is not None and body.explicitinertial else 0.0
 
 
-def _with_shares(spec: Any, share: float | None, massless: Mapping[str, float]) -> Any:
-    # Relative to the whole robot: a given mass would be heavy for a gripper and lost beside an
-    # excavator.
-    total = sum(body.mass for body in spec.bodies if body.explicitinertial and body.mass > 0) or 1.0
-    for name, mass in massless.items():
-        body, added = spec.body(name), (share or 0.0) * total
-        body.explicitinertial, body.mass = True, mass or added
-        body.inertia = [added * _SHARE_RADIUS**2] * 3
-        body.fullinertia = [np.nan] * 6
-    return spec
-
-
-def _specification_for_words(source: Path) -> Any:
-    """Specification of a file for messages; None where it cannot be read."""
-    try:
-        return _import_mujoco().MjSpec.from_file(str(source))
-    except (ValueError, UserWarning):
-        return None
-
-
-def _advise_error(spec: Any, message: str) -> str:
+def _advise_error(source: Path, message: str) -> str:
     """Sentence on what to do about an error of MuJoCo's compiler; empty if there is none."""
-    name = massless_body(message)
+    spec, name = None, massless_body(message)
+    with contextlib.suppress(ValueError, UserWarning):
+        spec = _import_mujoco().MjSpec.from_file(str(source))
     if name:
         mass = _stated_mass(spec, name)
         if mass < 0:
@@ -302,6 +288,9 @@ def _quaternion_matrix(quaternion: np.ndarray) -> np.ndarray:
     return np.asarray(rotation_matrix_in(np, quaternion))
 
 
+_WORLD = _Pose(np.zeros(3), np.eye(3))
+
+
 class _Reader(NamedTuple):
     """Model of MuJoCo, with the poses of its bodies at qpos0 and their names in here."""
 
@@ -319,6 +308,14 @@ class _Reader(NamedTuple):
     def body(self, number: int) -> str:
         """Name of the body of which a body is part, or ground."""
         return self.names[self.root(number)]
+
+    def joint(self, name: str, kind: str, bodies: Sequence[str], i: _Pose, j: _Pose) -> Joint:
+        """Joint between two bodies, by its poses in their frames."""
+        return Joint(
+            name=name, kind=kind, body_i=bodies[0], body_j=bodies[1], in_world=False,
+            point_i=as_floats(i.r), point_j=as_floats(j.r),
+            frame_i=as_floats(i.R), frame_j=as_floats(j.R), length=as_floats(0.0),
+        )  # fmt: skip
 
     def inside(self, number: int, r: np.ndarray, R: np.ndarray) -> _Pose:
         """Pose, in the frame of the body of which a body is part, of a frame on the latter."""
@@ -373,17 +370,16 @@ def _make_scene(
     """Scene of a compiled model, of what its URDF says beyond that, and of further closures of loops."""
     _check_finite(model)
     # Poses at qpos0 are composed from the root outwards, as MuJoCo stores them relative to the parent.
-    poses = [_Pose(np.zeros(3), np.eye(3))]
+    poses = [_WORLD]
     for b in range(1, model.nbody):
         parent = poses[model.body_parentid[b]]
         poses.append(parent.of(model.body_pos[b], _quaternion_matrix(model.body_quat[b])))
     names = [GROUND, *(model.body(b).name or f"body_{b}" for b in range(1, model.nbody))]
     names = [f"{entry}_body" if k and entry == GROUND else entry for k, entry in enumerate(names)]
-    reader, left_out, disabled_flags = (
-        _Reader(model, poses, names),
-        LeftOut({}, []),
-        _switched_off(model),
-    )
+    reader, left_out = _Reader(model, poses, names), LeftOut({}, [])
+    # What the model's own options switch off, such as "GRAVITY".
+    bits, flags = _import_mujoco().mjtDisableBit.__members__, int(model.opt.disableflags)
+    disabled_flags = {k.removeprefix("mjDSBL_") for k, bit in bits.items() if flags & int(bit)}
     _add_left_out(model, left_out, disabled_flags)
     # MuJoCo has an equality for a mimic, which is soft; the URDF's own numbers make an exact one.
     mimics = {} if urdf is None else {(m.joint, m.leader): m for m in urdf.mimics}
@@ -397,14 +393,11 @@ def _make_scene(
             between += [entry.name for entry in chain_bodies[:-1]]
             joints_by_number |= links
     equalities = range(0 if disabled_flags & {"EQUALITY", "CONSTRAINT"} else model.neq)
-    loops = [
-        loop
-        for k in equalities
-        if (loop := _make_loop(reader, k, left_out, joints_by_number, mimics))
-    ]
-    loops += [loop for m in mimics.values() if (loop := _mimic(m, joints_by_number, left_out))]
+    built = [_make_loop(reader, k, left_out, joints_by_number, mimics) for k in equalities]
+    built += [_mimic(m, joints_by_number, left_out) for m in mimics.values()]
     closures = (*(() if urdf is None else urdf.loops), *closures)
-    loops += [loop for closure in closures if (loop := _loop_of_urdf(reader, closure, left_out))]
+    built += [_loop_of_urdf(reader, closure, left_out) for closure in closures]
+    loops = [loop for loop in built if loop is not None]
     # Gravity is an option of MuJoCo's model and a force here, so that a system without it has
     # none.
     forces: list[AbstractForce] = (
@@ -439,16 +432,24 @@ def _make_scene(
             )
         notes += urdf.notes
         left_out.lost.extend(urdf.lost)
-        left_out.lost.extend(_masses_of_shapes(model, urdf))
-    system = System(
-        bodies, [*joints_by_number.values(), *_rename_loops(loops, joints_by_number)], forces
-    )
+        # MuJoCo gives these links the mass of their collision shapes.
+        shape_masses = {model.body(b).name: float(model.body_mass[b]) for b in range(model.nbody)}
+        left_out.lost.extend(
+            f"The link '{name}' has no <inertial>: its mass of {shape_masses[name]:.6g} kg is "
+            "that of its collision shapes at 1000 kg/m^3."
+            for name in urdf.without_inertial
+            if shape_masses.get(name, 0.0) > 0
+        )
+    # Loops get names that no joint has.
+    joint_names = {joint.name for joint in joints_by_number.values()}
+    loops = [
+        dataclasses.replace(x, name=f"{x.name}_loop") if x.name in joint_names else x for x in loops
+    ]
+    system = System(bodies, [*joints_by_number.values(), *loops], forces)
     # Loops that the file leaves open by rounding are closed at the start: soft equalities tolerate
     # a gap, rigid joints do not.
-    state, open_by = (
-        system.reference,
-        max((_measure_opening(system, loop) for loop in loops), default=0.0),
-    )
+    state = system.reference
+    open_by = max((_measure_opening(system, loop) for loop in loops), default=0.0)
     if open_by > _CLOSED:
         state = assemble(system, state).state
         distances = np.linalg.norm(np.asarray(state.r) - np.asarray(system.reference.r), axis=1)
@@ -457,16 +458,19 @@ def _make_scene(
             f"The start is not at qpos0, where loops are open by {open_by:.2g} m or rad: closing them moves "
             f"the body '{system.names[farthest]}' by {distances[farthest]:.2g} m."
         )
+    # Bodies without joints are frames in the bodies that they are part of.
+    merged = [b for b in range(1, model.nbody) if reader.root(b) != b]
+    merged_poses = [reader.inside(b, np.zeros(3), np.eye(3)) for b in merged]
     return Scene(
-        name=name,
-        title=f"{name}, from MuJoCo's model",
-        system=system,
-        state0=state,
+        name=name, title=f"{name}, from MuJoCo's model", system=system, state0=state,
         links_between=tuple(between),
         notes=(*_describe_inputs(system, model, driven, passive), *notes, *left_out.sentences()),
         warnings=tuple(left_out.lost),
-        frames=_merged_frames(reader),
-    )
+        frames={
+            names[b]: Frame(reader.body(b), pose.r, pose.R)
+            for b, pose in zip(merged, merged_poses, strict=True)
+        },
+    )  # fmt: skip
 
 
 def _describe_loss(constraint: str) -> str:
@@ -474,33 +478,6 @@ def _describe_loss(constraint: str) -> str:
         f"Lost, a constraint: {constraint} has no counterpart here, and the mechanism has more degrees "
         "of freedom than the file's."
     )
-
-
-def _masses_of_shapes(model: Any, urdf: UrdfSource) -> list[str]:
-    """Sentences on links to which MuJoCo gives the mass of their collision shapes."""
-    return [
-        f"The link '{name}' has no <inertial>: its mass of {float(model.body(name).mass[0]):.6g} kg is "
-        "that of its collision shapes at 1000 kg/m^3."
-        for name in urdf.without_inertial
-        if name in [model.body(b).name for b in range(model.nbody)] and model.body(name).mass[0] > 0
-    ]
-
-
-def _merged_frames(reader: _Reader) -> dict[str, Frame]:
-    """Frames of the bodies without joints, by name, in the bodies that they are part of."""
-    frames = {}
-    for b in range(1, reader.model.nbody):
-        if reader.root(b) != b:
-            pose = reader.inside(b, np.zeros(3), np.eye(3))
-            frames[reader.names[b]] = Frame(reader.body(b), pose.r, pose.R)
-    return frames
-
-
-def _switched_off(model: Any) -> set[str]:
-    """Names of what the model's own options switch off, such as "GRAVITY"."""
-    bits = _import_mujoco().mjtDisableBit.__members__
-    flags = int(model.opt.disableflags)
-    return {name.removeprefix("mjDSBL_") for name, bit in bits.items() if flags & int(bit)}
 
 
 def _make_body(reader: _Reader, b: int, share: float) -> tuple[list[Body], dict[int, Joint]]:
@@ -571,29 +548,6 @@ def _add_left_out(model: Any, left_out: LeftOut, disabled_flags: set[str]) -> No
     touching = int(np.sum((model.geom_contype != 0) | (model.geom_conaffinity != 0)))
     if touching and "CONTACT" not in disabled_flags:
         left_out.add(f"contacts between its {touching} shapes", "")
-    _add_left_out_of_joints(model, left_out)
-    for k in range(model.ntendon):
-        left_out.add("tendons", model.tendon(k).name or f"tendon_{k}")
-    for k in range(model.nbody):
-        if model.body_gravcomp[k]:
-            left_out.add("compensation of gravity", model.body(k).name)
-        if model.body_mocapid[k] >= 0:
-            left_out.add("motion capture, whose bodies stand still", model.body(k).name)
-    for k in range(model.nu):
-        is_damper = model.actuator_biasprm[k, 1] == 0 and model.actuator_biasprm[k, 2] != 0
-        is_lost = model.actuator_forcelimited[k] and (is_damper or _effort_limit(model, k) is None)
-        # those of a site are left to the rotors, which keep limits of their speeds
-        if is_lost or (model.actuator_ctrllimited[k] and model.actuator_trntype[k] != _AT_SITE):
-            left_out.add("limits of actuators", model.actuator(k).name)
-    if model.opt.density or model.opt.viscosity:
-        left_out.add("forces of the surrounding medium", "")
-    for feature, count in (("flexible bodies", model.nflex), ("plugins", model.nplugin)):
-        if count:
-            left_out.add(feature, "")
-
-
-def _add_left_out_of_joints(model: Any, left_out: LeftOut) -> None:
-    """Add limits, dry friction, rotor inertia and nonlinear springs and dampers of joints."""
     # newer versions of MuJoCo have polynomial springs and dampers
     none = np.zeros((max(model.njnt, model.nv), 1))
     spring = getattr(model, "jnt_stiffnesspoly", none)
@@ -614,6 +568,24 @@ def _add_left_out_of_joints(model: Any, left_out: LeftOut) -> None:
         for feature, is_present in checks:
             if is_present:
                 left_out.add(feature, name)
+    for k in range(model.ntendon):
+        left_out.add("tendons", model.tendon(k).name or f"tendon_{k}")
+    for k in range(model.nbody):
+        if model.body_gravcomp[k]:
+            left_out.add("compensation of gravity", model.body(k).name)
+        if model.body_mocapid[k] >= 0:
+            left_out.add("motion capture, whose bodies stand still", model.body(k).name)
+    for k in range(model.nu):
+        is_damper = model.actuator_biasprm[k, 1] == 0 and model.actuator_biasprm[k, 2] != 0
+        is_lost = model.actuator_forcelimited[k] and (is_damper or _effort_limit(model, k) is None)
+        # those of a site are left to the rotors, which keep limits of their speeds
+        if is_lost or (model.actuator_ctrllimited[k] and model.actuator_trntype[k] != _AT_SITE):
+            left_out.add("limits of actuators", model.actuator(k).name)
+    if model.opt.density or model.opt.viscosity:
+        left_out.add("forces of the surrounding medium", "")
+    for feature, count in (("flexible bodies", model.nflex), ("plugins", model.nplugin)):
+        if count:
+            left_out.add(feature, "")
 
 
 # --- loops
@@ -665,13 +637,9 @@ def _make_loop(
     if names[0] == names[1]:
         left_out.add("equality constraints", name)
         return None
-    joint_frames = (i.R, j.R) if kind == _WELD else (np.eye(3), np.eye(3))
-    return Joint(
-        name=name, kind="weld" if kind == _WELD else "spherical",
-        body_i=names[0], body_j=names[1], in_world=False,
-        point_i=as_floats(i.r), point_j=as_floats(j.r),
-        frame_i=as_floats(joint_frames[0]), frame_j=as_floats(joint_frames[1]), length=as_floats(0.0),
-    )  # fmt: skip
+    if kind == _WELD:
+        return reader.joint(name, "weld", names, i, j)
+    return reader.joint(name, "spherical", names, _Pose(i.r, np.eye(3)), _Pose(j.r, np.eye(3)))
 
 
 def _mimic(mimic: Mimic, joints_by_number: dict[int, Joint], left_out: LeftOut) -> Joint | None:
@@ -747,32 +715,19 @@ def _loop_of_urdf(reader: _Reader, loop: LoopJoint, left_out: LeftOut) -> Joint 
             f"Lost, a constraint: the loop_joint '{loop.name}' joins two parts of '{names[0]}'."
         )
         return None
-    # the second frame is turned about its own axis to where the coordinate is zero at the start
-    in_world = [
-        (_Pose(np.zeros(3), np.eye(3)) if b == 0 else reader.poses[b]).of(pose.r, pose.R)
-        for b, pose in zip(map(reader.root, numbers), (i, j), strict=True)
-    ]
-    frame = j.R
-    if loop.kind in ("revolute", "translational"):
-        # The file gives both frames of a loop without saying where its coordinate is zero: the
-        # start is taken for that, as in every other joint.
-        turn = in_world[1].R.T @ in_world[0].R
+    if loop.kind == "revolute":
+        # The file gives both frames of a loop without saying where its coordinate is zero: the start is taken
+        # for that, as in every other joint, to which the second frame is turned about its own axis.
+        R_i, R_j = (
+            (np.eye(3) if b == 0 else reader.poses[b].R) @ pose.R
+            for b, pose in zip(map(reader.root, numbers), (i, j), strict=True)
+        )
+        turn = R_j.T @ R_i
         angle = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
         c, s = np.cos(angle), np.sin(angle)
         about_axis = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        frame = j.R @ about_axis if loop.kind == "revolute" else j.R
-    return Joint(
-        name=loop.name, kind=loop.kind, body_i=names[0], body_j=names[1], in_world=False,
-        point_i=as_floats(i.r), point_j=as_floats(j.r),
-        frame_i=as_floats(i.R), frame_j=as_floats(frame), length=as_floats(0.0),
-    )  # fmt: skip
-
-
-def _rename_loops(loops: list[Joint], joints_by_number: dict[int, Joint]) -> list[Joint]:
-    """Loops with names that no joint has."""
-    joint_names = {joint.name for joint in joints_by_number.values()}
-    rename = lambda loop: f"{loop.name}_loop" if loop.name in joint_names else loop.name
-    return [dataclasses.replace(loop, name=rename(loop)) for loop in loops]
+        j = _Pose(j.r, j.R @ about_axis)
+    return reader.joint(loop.name, loop.kind, names, i, j)
 
 
 def _measure_opening(system: System, loop: Joint) -> float:
@@ -784,7 +739,7 @@ def _measure_opening(system: System, loop: Joint) -> float:
     for name, point, frame in (
         (loop.body_i, loop.point_i, loop.frame_i), (loop.body_j, loop.point_j, loop.frame_j),
     ):  # fmt: skip
-        pose = _Pose(np.zeros(3), np.eye(3))
+        pose = _WORLD
         if name != GROUND:
             k = system.index(name)
             pose = _Pose(r[k] - _quaternion_matrix(p[k]) @ com[k], _quaternion_matrix(p[k]))
@@ -850,11 +805,8 @@ def _make_actuator(
     if not (plain and stiffness >= 0 and damping >= 0):
         left_out.add("actuators", model.actuator(a).name or f"actuator_{a}")
         return None
-    name, push, zero = (
-        joints_by_number[j].name,
-        gear * float(model.actuator_gainprm[a, 0]),
-        gear * bias[0],
-    )
+    name, zero = joints_by_number[j].name, gear * bias[0]
+    push = gear * float(model.actuator_gainprm[a, 0])
     if stiffness:
         # A position actuator is a spring to its control: its bias is the stiffness, and the gain
         # over it the scale of the target.
@@ -882,11 +834,8 @@ def _thrusters(
         if model.actuator_trntype[a] != _AT_SITE:
             continue
         site, gain = int(model.actuator_trnid[a, 0]), float(model.actuator_gainprm[a, 0])
-        pose = reader.inside(
-            int(model.site_bodyid[site]),
-            model.site_pos[site],
-            _quaternion_matrix(model.site_quat[site]),
-        )
+        owner, turn = int(model.site_bodyid[site]), _quaternion_matrix(model.site_quat[site])
+        pose = reader.inside(owner, model.site_pos[site], turn)
         gear = np.asarray(model.actuator_gear[a])
         push = np.concatenate([pose.R @ gear[:3], pose.R @ gear[3:]]) * gain
         plain = model.actuator_gaintype[a] == 0 and not model.actuator_biastype[a]
@@ -895,8 +844,8 @@ def _thrusters(
         if not plain or push[2] <= 0 or across > _UPRIGHT * push[2]:
             left_out.add("actuators", model.actuator(a).name or f"actuator_{a}")
             continue
-        body = reader.body(int(model.site_bodyid[site]))
-        by_body.setdefault(body, []).append((a, pose.r, float(push[2]), float(push[5])))
+        entry = (a, pose.r, float(push[2]), float(push[5]))
+        by_body.setdefault(reader.body(owner), []).append(entry)
     forces: list[AbstractForce] = []
     notes: list[str] = []
     count = sum(map(len, by_body.values()))
@@ -915,10 +864,8 @@ def _thrusters(
         )  # fmt: skip
         low, high = model.actuator_ctrlrange[list(numbers)].T
         is_limited = np.asarray(model.actuator_ctrllimited)[list(numbers)] != 0
-        has_limits = bool(np.all(is_limited & (low >= 0)))
-        if has_limits:
-            limits = RotorLimits(np.sqrt(low), np.sqrt(high))
-            forces.append(MotorRotors(rotors, limits=limits))
+        if np.all(is_limited & (low >= 0)):
+            forces.append(MotorRotors(rotors, limits=RotorLimits(np.sqrt(low), np.sqrt(high))))
         else:
             forces.append(rotors)
             for a in np.array(numbers)[is_limited]:
@@ -947,11 +894,8 @@ def _describe_inputs(
     sentences = []
     for a, actuator in driven:
         name, unit = names[first]
-        shift = (
-            f" {'+' if actuator.zero >= 0 else '-'} {abs(actuator.zero):.9g}"
-            if actuator.zero
-            else ""
-        )
+        sign = "+" if actuator.zero >= 0 else "-"
+        shift = f" {sign} {abs(actuator.zero):.9g}" if actuator.zero else ""
         sentences.append(
             f"The input {name} [{unit}] is {actuator.slope:.9g} times the control of the actuator "
             f"'{model.actuator(a).name or a}'{shift}."

@@ -37,12 +37,11 @@ LOOP_FORMAT, LOOP_VERSION = "stmuav_jax closed loop", 1
 _READ = {FORMAT: FORMAT_VERSION, LOOP_FORMAT: LOOP_VERSION}
 # Signals of missions by their names in files of version 0.3.0 and before, which have the same content.
 _FORMER_NAMES = {
-    "wanted_force": "commanded_force",
-    "wanted_effort": "commanded_effort",
-    "wanted_position": "reference_position",
-    "wanted_heading": "reference_heading",
-    "wanted_panel_angles": "reference_panel_angles",
-    "wanted_joint_position": "reference_joint_position",
+    **{f"wanted_{name}": f"commanded_{name}" for name in ("force", "effort")},
+    **{
+        f"wanted_{name}": f"reference_{name}"
+        for name in ("position", "heading", "panel_angles", "joint_position")
+    },
     "believed_centre_of_mass": "estimated_centre_of_mass",
 }
 
@@ -80,6 +79,7 @@ class Labelled:
             checksums: add Fletcher's checksum to the numbers, which any reader of HDF5 verifies.
         """
         import h5netcdf
+        import h5py
 
         buffer = io.BytesIO()
         with h5netcdf.File(buffer, "w") as file:
@@ -88,8 +88,19 @@ class Labelled:
                 for name, size in zip(dims, np.shape(values), strict=True):
                     if name not in file.dimensions:
                         file.dimensions[name] = size
-            for name, parts in arrays.items():
-                _write_array(file, name, parts, checksums)
+            for name, (dims, values, attributes) in arrays.items():
+                values, about, more = np.asarray(values), dict(attributes), {}
+                if values.dtype.kind == "b":
+                    # NetCDF has no truth values; xarray's mark for them
+                    values, about["dtype"] = values.astype(np.int8), "bool"
+                # HDF5 has no checksums of scalars
+                if checksums and values.dtype.kind == "f" and values.ndim and values.size:
+                    more["fletcher32"] = True
+                kind = h5py.string_dtype() if values.dtype.kind in "UO" else values.dtype
+                values = values.astype(object) if values.dtype.kind == "U" else values
+                variable = file.create_variable(name, dims, kind, data=values, **more)
+                for key, value in about.items():
+                    variable.attrs[key] = value
             # Coordinates that are not named as their dimension have to be listed, or xarray reads them as
             # variables.
             others = [k for k, (dims, *_) in self.coordinates.items() if (k,) != dims]
@@ -97,26 +108,6 @@ class Labelled:
             for key, value in {**self.attributes, **named}.items():
                 file.attrs[key] = value
         return buffer.getvalue()
-
-
-def _write_array(file: Any, name: str, parts: Parts, checksums: bool) -> None:
-    """Write one array with its attributes."""
-    import h5py
-
-    dims, values, attributes = parts
-    values, about, more = np.asarray(values), dict(attributes), {}
-    if values.dtype.kind == "b":
-        # NetCDF has no truth values; xarray's mark for them
-        values, about["dtype"] = values.astype(np.int8), "bool"
-    # HDF5 has no checksums of scalars
-    checked = checksums and values.dtype.kind == "f" and values.ndim and values.size
-    if checked:
-        more["fletcher32"] = True
-    kind = h5py.string_dtype() if values.dtype.kind in "UO" else values.dtype
-    values = values.astype(object) if values.dtype.kind == "U" else values
-    variable = file.create_variable(name, dims, kind, data=values, **more)
-    for key, value in about.items():
-        variable.attrs[key] = value
 
 
 class FileError(ValueError):
@@ -131,17 +122,16 @@ def regular_file(path: str | os.PathLike[str]) -> Path:
     """
     source = Path(path)
     try:
-        if not source.exists():
-            raise FileError(f"There is no file {format_value(str(source))}.")
-        if not source.is_file():
-            raise FileError(f"{source} is no file but a folder, a pipe or a device.")
+        exists, is_file = source.exists(), source.is_file()
     # a forbidden folder, or a name that the system cannot have
     except OSError as error:
         raise FileError(f"{source} cannot be read: {error.strerror}.") from None
     except ValueError as error:
-        if isinstance(error, FileError):
-            raise
         raise FileError(f"{format_value(str(source))} names no file: {error}.") from None
+    if not exists:
+        raise FileError(f"There is no file {format_value(str(source))}.")
+    if not is_file:
+        raise FileError(f"{source} is no file but a folder, a pipe or a device.")
     return source
 
 

@@ -60,30 +60,22 @@ def machine_table(system: System) -> Table:
     `centre_of_mass` away from the centre of mass; those of ground are in the world.
     """
     bodies, joints = system.bodies, system.joints
-    axes, point = ("axis", "axis_2"), ("joint", "axis")
+    axes = ("axis", "axis_2")
     table: Table = {
         "mass": (("body",), bodies.mass, "kg", "of each body"),
         "centre_of_mass": (("body", "axis"), bodies.com, "m", "in the body's reference frame"),
         "inertia": (("body", *axes), bodies.inertia, "kg m^2", "about the centre, body axes"),
     }
     if joints:
-        field_stack = lambda name: np.stack([np.asarray(getattr(joint, name)) for joint in joints])
-        table |= {
-            "joint_point_i": (point, field_stack("point_i"), "m", "of the joint on body i"),
-            "joint_point_j": (point, field_stack("point_j"), "m", "of the joint on body j"),
-            "joint_frame_i": (
-                ("joint", *axes),
-                field_stack("frame_i"),
-                "1",
-                "axes as columns, on body i",
-            ),
-            "joint_frame_j": (
-                ("joint", *axes),
-                field_stack("frame_j"),
-                "1",
-                "axes as columns, on body j",
-            ),
-        }
+        stack = lambda name: np.stack([np.asarray(getattr(joint, name)) for joint in joints])
+        for part, dims, unit, description in (
+            ("point", ("joint", "axis"), "m", "of the joint"),
+            ("frame", ("joint", *axes), "1", "axes as columns,"),
+        ):
+            for side in "ij":
+                description_of_side = f"{description} on body {side}"
+                name = f"{part}_{side}"
+                table[f"joint_{name}"] = (dims, stack(name), unit, description_of_side)
     return table
 
 
@@ -171,8 +163,8 @@ def _squared_speeds(
         speed_names, names = force.internal_names(), internal_names(system)
         return np.asarray(saved.internal)[:, [names.index(name) for name in speed_names]] ** 2
     if callable(plain.speed_squared) or input_history is not None:
-        inputs = input_history.inputs if input_history is not None else Inputs(())
-        values = input_history.values if input_history is not None else np.zeros((len(saved.ts), 0))
+        no_inputs = Held(Inputs(()), np.zeros((len(saved.ts), 0)))
+        inputs, values = no_inputs if input_history is None else input_history
         # Blocks of one size bound the memory and share one program.
         function = lambda *at: _commanded_speeds(
             set_index, system, inputs, *jax.tree.map(as_jax, at)
@@ -243,33 +235,28 @@ def _labelled_run(run: Run) -> Labelled:
     }  # fmt: skip
     table |= machine_table(system) | rotor_table(system, saved_states(run.trajectory))
     if run.model is not None:
-        table |= _analysis_variables(run)
+        view, worst = run.snapshot, run.trajectory.worst
+        vector, wrench = ("time", "body", "axis"), ("time", "joint", "axis")
+        table |= {
+            "acceleration": (vector, view.accelerations.v_rate, "m/s^2", "of the centre of mass"),
+            "angular_acceleration": (vector, view.accelerations.omega_rate, "rad/s^2", "body axes"),
+            "reaction_force": (wrench, view.reactions.force, "N", "of body i on body j, world axes"),
+            "reaction_moment": (
+                wrench, view.reactions.moment, "N m",
+                "of body i on body j about the joint's point on body j, world axes",
+            ),
+            "kinetic_energy": (("time",), view.kinetic, "J", "of all bodies"),
+            "potential_energy": (("time",), view.potential, "J", "of gravity and springs"),
+            "work": (("time",), run.trajectory.work, "J", "done by forces without potential"),
+            "position_violation": (("time",), worst.position, "m", "of lengths, the largest so far"),
+            "velocity_violation": (("time",), worst.velocity, "m/s", "of their rates, the largest so far"),
+        }  # fmt: skip
     coordinates = _motion_coordinates(system, run.ts, "saved times")
     return label_table(
         table, coordinates, format=FORMAT, format_version=FORMAT_VERSION, scene=run.scene.name,
         title=run.scene.title, notes=(*run.scene.warnings, *run.scene.notes), parameters=run.scene.parameters,
         settings=run.settings, certificate=run.certificate.to_dict(), watch=list(run.scene.watch),
     )  # fmt: skip
-
-
-def _analysis_variables(run: Run) -> dict[str, tuple[tuple[str, ...], Any, str, str]]:
-    """Dimensions, values, unit and description of the analysis's results."""
-    view, worst = run.snapshot, run.trajectory.worst
-    vector, wrench = ("time", "body", "axis"), ("time", "joint", "axis")
-    return {
-        "acceleration": (vector, view.accelerations.v_rate, "m/s^2", "of the centre of mass"),
-        "angular_acceleration": (vector, view.accelerations.omega_rate, "rad/s^2", "body axes"),
-        "reaction_force": (wrench, view.reactions.force, "N", "of body i on body j, world axes"),
-        "reaction_moment": (
-            wrench, view.reactions.moment, "N m",
-            "of body i on body j about the joint's point on body j, world axes",
-        ),
-        "kinetic_energy": (("time",), view.kinetic, "J", "of all bodies"),
-        "potential_energy": (("time",), view.potential, "J", "of gravity and springs"),
-        "work": (("time",), run.trajectory.work, "J", "done by forces without potential"),
-        "position_violation": (("time",), worst.position, "m", "of lengths, the largest so far"),
-        "velocity_violation": (("time",), worst.velocity, "m/s", "of their rates, the largest so far"),
-    }  # fmt: skip
 
 
 def save(run: Run, path: str | os.PathLike[str]) -> Path:
@@ -332,9 +319,15 @@ def labelled_loop(
     past = Saved(run.ts, run.states, internal)
     input_history = Held(run.plant.inputs, np.asarray(rollout.inputs))
     table |= machine_table(system) | rotor_table(system, past, input_history)
-    for name, values in _flatten_signals(rollout.signals).items():
-        dims, unit, description = (labels or {}).get(name, _signal_variable(name, values))
-        table[name] = (dims, values, unit, description)
+    for signal, tree in rollout.signals.items():
+        # leaves of a pytree have its name and their own place
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+            leaf_path = jax.tree_util.keystr(path, simple=True, separator=".")
+            name, values = f"{signal}.{leaf_path}" if leaf_path else signal, np.asarray(leaf)
+            dims = ("time", *(f"{name}_{k}" for k in range(1, values.ndim)))
+            label = (dims, "see description", f"signal '{name}' of the loop")
+            dims, unit, description = (labels or {}).get(name, label)
+            table[name] = (dims, values, unit, description)
     inputs = run.plant.inputs.names
     coordinates = _motion_coordinates(system, run.ts, "samples") | {
         "input": [name for name, _ in inputs],
@@ -345,21 +338,6 @@ def labelled_loop(
         rate=run.plant.rate, certificate=run.certificate.to_dict(), failure=run.failure,
         **attributes,
     )  # fmt: skip
-
-
-def _flatten_signals(signals: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Arrays of all signals by name; leaves of a pytree have its name and their own place."""
-    arrays = {}
-    for name, tree in signals.items():
-        for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-            leaf_path = jax.tree_util.keystr(path, simple=True, separator=".")
-            arrays[f"{name}.{leaf_path}" if leaf_path else name] = np.asarray(leaf)
-    return arrays
-
-
-def _signal_variable(name: str, values: np.ndarray) -> Label:
-    dims = [f"{name}_{k}" for k in range(1, values.ndim)]
-    return ("time", *dims), "see description", f"signal '{name}' of the loop"
 
 
 def save_loop(

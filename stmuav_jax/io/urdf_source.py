@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..checks.errors import ModelError
 
@@ -131,25 +132,21 @@ def read_urdf(robot: Element) -> UrdfSource:
     return UrdfSource(
         roots[0] if roots else "",
         tuple(loops),
-        tuple(_read_mimics(robot)),
+        tuple(
+            Mimic(
+                joint.get("name", ""), mimic.get("joint", ""), mimic.get("multiplier", "1"),
+                mimic.get("offset", "0"),
+            )
+            for joint in robot.findall("joint")
+            for mimic in joint.findall("mimic")
+        ),
         tuple(
             link.get("name", "") for link in robot.findall("link") if link.find("inertial") is None
         ),
         any(joint.get("type") == "floating" for joint in robot.findall("joint")),
         tuple(lost),
         tuple(notes),
-    )
-
-
-def _read_mimics(robot: Element) -> list[Mimic]:
-    return [
-        Mimic(
-            joint.get("name", ""), mimic.get("joint", ""), mimic.get("multiplier", "1"),
-            mimic.get("offset", "0"),
-        )
-        for joint in robot.findall("joint")
-        for mimic in joint.findall("mimic")
-    ]  # fmt: skip
+    )  # fmt: skip
 
 
 def _unknown_elements(robot: Element) -> dict[str, list[str]]:
@@ -176,15 +173,6 @@ def _read_numbers(text: str | None, usual: str) -> np.ndarray:
     return values
 
 
-def _rpy_matrix(rpy: np.ndarray) -> np.ndarray:
-    """Rotation matrix of roll, pitch and yaw about the fixed axes x, y and z."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return z @ y @ x
-
-
 def _loop_joint(element: Element, links: set[str]) -> LoopJoint:
     """Joint of a complete definition; raises `ValueError` in words for another one."""
     name, kind = element.get("name", ""), element.get("type", "")
@@ -204,7 +192,7 @@ def _loop_joint(element: Element, links: set[str]) -> LoopJoint:
         end = element.find(tag)
         if end is None or end.get("link") not in links:
             raise ValueError(f"its <{tag}> names no link of the robot")
-        turn = _rpy_matrix(_read_numbers(end.get("rpy"), "0 0 0"))
+        turn = Rotation.from_euler("xyz", _read_numbers(end.get("rpy"), "0 0 0")).as_matrix()
         ends.append((end.get("link", ""), _read_numbers(end.get("xyz"), "0 0 0"), turn @ own_frame))
     (link_i, point_i, frame_i), (link_j, point_j, frame_j) = ends
     return LoopJoint(name, _KINDS[kind], (link_i, link_j), (point_i, point_j), (frame_i, frame_j))
