@@ -11,10 +11,9 @@ of the thrust at hover differs from that of the layout's shape, c is wrong by th
 import numpy as np
 from jaxtyping import Float
 
-from ...analysis.fit_statistics import compare_estimates
 from ...checks.errors import SettingError
 from .record import RotorLayout, compute_thrust_shape
-from .stages import ParameterEstimate
+from .stages import ParameterEstimate, combine_parts
 
 # Block of correlated values and shortest hover [s], and number of windows.
 _BLOCK, _SHORTEST, _WINDOWS = 1.0, 4.0, 4
@@ -61,11 +60,7 @@ def identify_hover_centre(
         windows = np.array_split(np.arange(count), min(_WINDOWS, count))
         values = np.array([np.sum(moment[w]) / np.sum(total[w]) for w in windows])
         spread = np.array([blocks * np.sqrt(count / len(w)) for w in windows])
-        scatter, p_value = compare_estimates(values, np.diag(spread**2))
-        estimates.append(
-            ParameterEstimate(
-                f"centre of mass {letter} by hover, equal motors", "m", value, float(np.hypot(blocks, scatter)),
-                float(np.sqrt(np.sum(white**2)) / np.sum(total)), blocks, scatter, 0.0, values, spread, p_value,
-            )
-        )  # fmt: skip
+        parts = (np.sqrt(np.sum(white**2)) / np.sum(total), blocks, 0.0, values, spread)
+        name = f"centre of mass {letter} by hover, equal motors"
+        estimates.append(combine_parts(name, "m", value, *parts))
     return estimates[0], estimates[1]

@@ -88,9 +88,7 @@ class PredictionErrorFit(NamedTuple):
     def white_covariance(self) -> Float[np.ndarray, "n n"]:
         """Covariance of the values if e is white; zero for lags at a bound."""
         J = self.slopes.reshape(-1, len(self.values))
-        return _expand_covariance(
-            _invert_information((J.T @ J)[np.ix_(self.free, self.free)]), self.free
-        )
+        return _invert_information((J.T @ J)[np.ix_(self.free, self.free)], self.free)
 
     def compute_covariance(self, block: float) -> Float[np.ndarray, "n n"]:
         """Covariance of the values by sums of scores over blocks [s]."""
@@ -117,7 +115,7 @@ class PredictionErrorFit(NamedTuple):
         changes, covariances = [], []
         for rows in np.array_split(np.arange(len(self.errors)), count):
             J = self.slopes[rows].reshape(-1, len(size))[:, free]
-            V = _expand_covariance(_invert_information(J.T @ J), free)
+            V = _invert_information(J.T @ J, free)
             changes.append(V[:, free] @ (J.T @ self.errors[rows].ravel()))
             covariances.append(V * ratio[:, None] * ratio)
         return np.array(changes), np.array(covariances)
@@ -169,7 +167,13 @@ def fit_prediction_error(
     state = _compute_errors(y, X, theta, order)
     while True:
         error, pasts, A, e, sigma = state
-        slopes = np.concatenate([X, _slopes_by_lags(build, eta, X, theta, high)], axis=2)
+        # derivatives of the predictions by theta and by eta
+        slopes = np.concatenate([X, np.zeros((*X.shape[:2], len(eta)))], axis=2)
+        for j in range(len(eta)):
+            h = _DIFFERENCE * max(eta[j], 0.005)
+            h = -h if eta[j] + h > high[j] else h
+            changed = eta + h * (np.arange(len(eta)) == j)
+            slopes[:, :, p + j] = (build(changed).X - X) @ theta / h
         J = _project_columns(pasts, _whiten_columns(A, slopes) / sigma[:, None])
         free = np.ones(p + len(eta), bool)
         step = np.zeros(p + len(eta))
@@ -183,7 +187,7 @@ def fit_prediction_error(
             if not np.any(stuck & free[p:]):
                 break
             free[p:] &= ~stuck
-        V = np.diag(_expand_covariance(_invert_information(columns.T @ columns), free))
+        V = np.diag(_invert_information(columns.T @ columns, free))
         size = np.abs(step[free]) / np.sqrt(V[free])
         is_converged = iteration > 2 and bool(np.all(size < _CONVERGED))
         if not is_converged and iteration < _ITERATIONS:
@@ -213,17 +217,9 @@ def fit_prediction_error(
             if iteration < _ITERATIONS:
                 theta, eta, X = new_theta, new_eta, new_X
                 continue
+        values = np.append(theta, eta)
         return PredictionErrorFit(
-            np.append(theta, eta),
-            len(eta),
-            e / sigma,
-            J,
-            error,
-            A,
-            sigma,
-            dt,
-            free,
-            is_converged,
+            values, len(eta), e / sigma, J, error, A, sigma, dt, free, is_converged
         )
 
 
@@ -247,23 +243,6 @@ def _compute_errors(y: np.ndarray, X: np.ndarray, theta: np.ndarray, order: int)
     ])  # fmt: skip
     e = _whiten_columns(A, v[:, :, None])[:, :, 0]
     return _Errors(v, pasts, A, e, np.sqrt(np.mean(e**2, axis=0)))
-
-
-def _slopes_by_lags(
-    build: Callable[[np.ndarray], Regression],
-    eta: np.ndarray,
-    X: np.ndarray,
-    theta: np.ndarray,
-    high: np.ndarray,
-) -> np.ndarray:
-    """Derivatives of the predictions by the lags (k, c, l)."""
-    slopes = np.zeros((*X.shape[:2], len(eta)))
-    for j in range(len(eta)):
-        h = _DIFFERENCE * max(eta[j], 0.005)
-        h = -h if eta[j] + h > high[j] else h
-        changed = eta + h * (np.arange(len(eta)) == j)
-        slopes[:, :, j] = (build(changed).X - X) @ theta / h
-    return slopes
 
 
 class _Past:
@@ -303,18 +282,16 @@ def _solve_columns(J: np.ndarray, r: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(J / scale, r, rcond=None)[0] / scale
 
 
-def _invert_information(M: np.ndarray) -> np.ndarray:
-    """Inverse of an information matrix; what it does not determine has a very large variance."""
+def _invert_information(M: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Inverse of the free values' information, with rows and columns of zeros for the others.
+
+    What it does not determine has a very large variance.
+    """
     size = np.sqrt(np.diag(M))
     size = np.where(size > 0, size, 1.0)
     # On a diagonal of ones the floor of the eigenvalues does not depend on units.
     values, vectors = np.linalg.eigh(M / size[:, None] / size)
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
-    return inverse / size[:, None] / size
-
-
-def _expand_covariance(V: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Covariance with rows and columns of zeros for values that are not free."""
     whole = np.zeros((len(free), len(free)))
-    whole[np.ix_(free, free)] = V
+    whole[np.ix_(free, free)] = inverse / size[:, None] / size
     return whole
