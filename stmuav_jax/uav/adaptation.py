@@ -32,12 +32,7 @@ from ..estimation.inertial import update_sequentially
 from ..math.rotation import rotation_matrix, skew
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .flight_controller import (
-    FlightController,
-    FlightMemory,
-    UavController,
-    central_properties,
-)
+from .flight_controller import FlightController, FlightMemory, UavController, central_properties
 from .motion_estimator import MotionEstimate
 from .motor import MotorRotors, only_rotors
 from .panel_servo import PanelBodies

@@ -32,7 +32,6 @@ from ..analysis.mass_properties import Moments, mass_moments
 from ..analysis.sensors import gravity_of
 from ..checks.errors import ModelError, has_values
 from ..checks.numbers import array_module, as_floats, as_numpy, check_nonnegative, check_positive
-from ..checks.shapes import Numbers
 from ..control.references import Waypoint
 from ..math import lapack
 from ..math.compiler import quick_jit
@@ -75,26 +74,18 @@ class FlightGains(eqx.Module):
         attitude: k_R / J [1/s^2]. rate: k_W / J [1/s].
     """
 
-    position: Float[Array, ""]
-    velocity: Float[Array, ""]
-    integral: Float[Array, ""]
-    attitude: Float[Array, ""]
-    rate: Float[Array, ""]
+    position: Float[Array, ""] = eqx.field(converter=as_floats, default=9.0)
+    velocity: Float[Array, ""] = eqx.field(converter=as_floats, default=5.0)
+    integral: Float[Array, ""] = eqx.field(converter=as_floats, default=0.0)
+    attitude: Float[Array, ""] = eqx.field(converter=as_floats, default=200.0)
+    rate: Float[Array, ""] = eqx.field(converter=as_floats, default=25.0)
 
-    def __init__(
-        self,
-        position: Numbers = 9.0,
-        velocity: Numbers = 5.0,
-        integral: Numbers = 0.0,
-        attitude: Numbers = 200.0,
-        rate: Numbers = 25.0,
-    ) -> None:
-        gain_label = "gain of the flight controller"
-        self.position = check_positive(position, f"The position {gain_label}", "1/s^2")
-        self.velocity = check_positive(velocity, f"The velocity {gain_label}", "1/s")
-        self.integral = check_nonnegative(integral, f"The integral {gain_label}", "1/s^3")
-        self.attitude = check_positive(attitude, f"The attitude {gain_label}", "1/s^2")
-        self.rate = check_positive(rate, f"The rate {gain_label}", "1/s")
+    def __check_init__(self) -> None:
+        units = {"position": "1/s^2", "velocity": "1/s", "attitude": "1/s^2", "rate": "1/s"}
+        subject = "The {} gain of the flight controller"
+        for name, unit in units.items():
+            check_positive(getattr(self, name), subject.format(name), unit)
+        check_nonnegative(self.integral, subject.format("integral"), "1/s^3")
 
 
 class BaseMotion(NamedTuple):

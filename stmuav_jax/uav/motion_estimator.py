@@ -191,7 +191,8 @@ class MotionEstimator(eqx.Module):
         # Noise is that of the instruments as simulated, so that the covariance is consistent by construction
         # and not by tuning.
         noise = [_instrument_noise(instrument, system) for instrument in selected]
-        self.variance = _stack_deviations(*noise[2:])
+        deviations = as_numpy(noise[2:])
+        self.variance = as_floats(array_module(*deviations).concatenate(deviations) ** 2)
         self.arm = _fix_arm(selected[2], system)
         self.gravity = gravity_of(system)
         subject, unit = "The drift of the {}'s bias", "/sqrt(s)"
@@ -358,11 +359,6 @@ def _panel_noise(h: Float[Array, ""], density: Float[Array, ""], n: int) -> Floa
 def _panel_step(h: Float[Array, ""], n: int) -> Float[Array, "m m"]:
     """Matrix of n coordinates and their rates over a step h [s]."""
     return jnp.eye(2 * n).at[:n, n:].add(h * jnp.eye(n))
-
-
-def _stack_deviations(*deviations: Float[Array, "..."]) -> Float[Array, " n"]:
-    deviation_arrays = as_numpy(deviations)
-    return as_floats(array_module(*deviation_arrays).concatenate(deviation_arrays) ** 2)
 
 
 def _fix_arm(fix: Instrument, system: System) -> Float[Array, "3"]:

@@ -127,10 +127,9 @@ class PredictionErrorFit(NamedTuple):
         Z = self.whiten(columns)
         m = Z.shape[2]
         J, z = self.slopes[:, :, self.free].reshape(self.errors.size, -1), Z.reshape(-1, m)
-        scale = np.linalg.norm(J, axis=0)
         # Only what the fitted values cannot explain is new: their errors would otherwise show as
         # coefficients.
-        z = z - J @ (np.linalg.lstsq(J / scale, z, rcond=None)[0] / scale[:, None])
+        z = z - J @ solve_columns(J, z)
         information = z.T @ z
         coefficients = linalg.solve(information, z.T @ self.errors.ravel(), assume_a="pos")
         scores = np.einsum("kcm,kc->km", z.reshape(Z.shape), self.errors)
@@ -161,7 +160,7 @@ def fit_prediction_error(
     p = X.shape[2]
     # a regression with white noise starts the search
     scale = np.std(y, axis=0)
-    theta = _solve_columns((X / scale[:, None]).reshape(-1, p), (y / scale).ravel())
+    theta = solve_columns((X / scale[:, None]).reshape(-1, p), (y / scale).ravel())
     low, high = np.array(bounds, float).reshape(-1, 2).T
     iteration = 0
     state = _compute_errors(y, X, theta, order)
@@ -180,7 +179,7 @@ def fit_prediction_error(
         while True:
             columns = J[:, :, free].reshape(-1, int(np.sum(free)))
             step[:] = 0.0
-            step[free] = _solve_columns(columns, (e / sigma).ravel())
+            step[free] = solve_columns(columns, (e / sigma).ravel())
             # A lag at a bound that would leave it is held, and the step is solved again: a step
             # that was merely clipped would leave theta at values that belong to other lags.
             stuck = ((eta <= low) & (step[p:] < 0)) | ((eta >= high) & (step[p:] > 0))
@@ -274,12 +273,12 @@ def _whiten_columns(A: np.ndarray, values: np.ndarray) -> np.ndarray:
     return oaconvolve(values, A.T[:, :, None], mode="valid", axes=0)
 
 
-def _solve_columns(J: np.ndarray, r: np.ndarray) -> np.ndarray:
+def solve_columns(J: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Least-squares solution; columns of zeros have none."""
     scale = np.linalg.norm(J, axis=0)
     # With columns of one length the rank that least squares sees does not depend on units.
     scale = np.where(scale > 0, scale, 1.0)
-    return np.linalg.lstsq(J / scale, r, rcond=None)[0] / scale
+    return (np.linalg.lstsq(J / scale, r, rcond=None)[0].T / scale).T
 
 
 def _invert_information(M: np.ndarray, free: np.ndarray) -> np.ndarray:

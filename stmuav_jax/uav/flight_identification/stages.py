@@ -25,6 +25,7 @@ and forces may be coloured and fed back.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -35,11 +36,7 @@ from scipy.constants import g as GRAVITY
 from ...analysis.fit_statistics import compare_estimates, compute_autocorrelation
 from ...checks.errors import SettingError
 from .combinations import describe_combinations
-from .prediction_error import (
-    PredictionErrorFit,
-    Regression,
-    fit_prediction_error,
-)
+from .prediction_error import PredictionErrorFit, Regression, fit_prediction_error, solve_columns
 from .record import (
     SHORTEST_RECORD,
     FlightRecord,
@@ -502,6 +499,20 @@ def _identify_voltage(
     return record.correct_voltage(e.value), record.correct_voltage(e.value + e.deviation)
 
 
+def _observe(
+    record: FlightRecord, layout: RotorLayout, levers: np.ndarray, imu: np.ndarray, drag: np.ndarray,
+    pace: float = 1.0,
+) -> _Signals:  # fmt: skip
+    force = record.accelerometer - levers @ imu
+    signals = _Signals(record, layout, force, *observe_motion(record, force, drag, pace))
+    if not np.all(np.abs(signals.velocity) < _FASTEST):
+        raise SettingError(
+            f"By gyroscope and accelerometer the vehicle would exceed {_FASTEST:g} m/s: are their units rad/s and "
+            "m/s^2?"
+        )
+    return signals
+
+
 def _observe_signals(
     record: FlightRecord, layout: RotorLayout
 ) -> tuple[_Signals, _Signals, _Signals]:
@@ -509,18 +520,8 @@ def _observe_signals(
 
     One is faster, the other has a drag that is larger by its standard deviation.
     """
-    drag, levers = np.full(2, _DRAG), _lever_columns(record)
-
-    def observe(imu: np.ndarray, drag: np.ndarray, pace: float = 1.0) -> _Signals:
-        force = record.accelerometer - levers @ imu
-        signals = _Signals(record, layout, force, *observe_motion(record, force, drag, pace))
-        if not np.all(np.abs(signals.velocity) < _FASTEST):
-            raise SettingError(
-                f"By gyroscope and accelerometer the vehicle would exceed {_FASTEST:g} m/s: are their units rad/s and "
-                "m/s^2?"
-            )
-        return signals
-
+    drag = np.full(2, _DRAG)
+    observe = partial(_observe, record, layout, _lever_columns(record))
     # Drag and lever are found from the velocity, which is observed with drag and lever: a few
     # passes agree, since either depends little on the other.
     imu, fit = np.zeros(3), None
@@ -672,10 +673,7 @@ def _difference_gradient(
 
 
 def identify_flight(
-    record: FlightRecord,
-    layout: RotorLayout,
-    *,
-    progress: Callable[[float], object] | None = None,
+    record: FlightRecord, layout: RotorLayout, *, progress: Callable[[float], object] | None = None
 ) -> FlightIdentification:
     """Identify lag, thrust, effectiveness, IMU position, drag and centre of mass from a flight.
 
@@ -751,11 +749,10 @@ def explain_rotation(
     assert result.rotation is not None
     record = result.correct_voltage(record)
     layout, theta = result.layout, result.rotation.values
-    drag, imu = result.translation.values[3:5], result.translation.values[:3]
-    force = record.accelerometer - _lever_columns(record) @ imu
+    imu, drag = np.split(result.translation.values[:5], [3])
     drag = np.maximum(drag, 0.1 * _DRAG)
-    slope = _compute_slope(layout, result.hover, result.estimates)
-    signals = _Signals(record, layout, force, *observe_motion(record, force, drag), slope)
+    signals = _observe(record, layout, _lever_columns(record), imu, drag)
+    signals = signals._replace(slope=_compute_slope(layout, result.hover, result.estimates))
     n, first = _sample_step(record, _FORCE_RATE), round(_SETTLING / record.dt)
     build = _rotation_regression(signals, [0, 1], _Variant(_FORCE_RATE))
     X = build(result.rotation.lags).X
@@ -947,20 +944,26 @@ def _identify_rotation(
         # Effectiveness of two thrust shapes is compared at the hover, where the record is: its
         # number at the command 1 differs by the shape alone.
         hover = signals.hover
-        ratio = _shape_slope(other_factor, hover) / _shape_slope(factor, hover)
-        slopes = [1.0, 1.0, 1.0, ratio][: 1 + len(variants)]
+        relative_slope = _shape_slope(other_factor, hover) / _shape_slope(factor, hover)
+        slopes = [1.0, 1.0, 1.0, relative_slope][: 1 + len(variants)]
         quantities: list[tuple[Any, ...]] = [
             ("lag", "lag", "s", lambda z: z[-2]), ("delay", "delay", "s", lambda z: z[-1]),
         ]  # fmt: skip
         for place, axis in enumerate(axes):
             k, name, letter = (2 + _MOMENT) * place, AXES[axis], "yx"[axis % 2]
-            ratio, arm = f"{name} effectiveness over lag", layout.arms[axis % 2]
+            over_lag, arm = f"{name} effectiveness over lag", layout.arms[axis % 2]
             centre = lambda z, k=k, arm=arm, origin=layout.centre[1 - axis]: (
                 origin + z[k + 1] / z[k] * arm
             )
             quantities += [
                 (name, f"{name} effectiveness", "rad/s^2", lambda z, f, k=k: z[k] * f, *slopes),
-                (f"{name}_over_lag", ratio, "rad/s^3", lambda z, f, k=k: z[k] * f / z[-2], *slopes),
+                (
+                    f"{name}_over_lag",
+                    over_lag,
+                    "rad/s^3",
+                    lambda z, f, k=k: z[k] * f / z[-2],
+                    *slopes,
+                ),
             ]
             if axis == 2:
                 quantities.append(("spin_up", "yaw by spin-up", "rad/s", lambda z, k=k: z[k + 1]))
@@ -1308,8 +1311,13 @@ def _judge_estimates(
             )
         tests = _test_terms(signals, rotation.fit, translation, estimates)
         if rotation.fit.free[-2] and not rotation.fit.free[-1]:
+            # The score of the delay, less what the free values can take on.
+            fit = rotation.fit
+            J = fit.slopes.reshape(-1, len(fit.values))
+            column = J[:, -1] - J[:, fit.free] @ solve_columns(J[:, fit.free], J[:, -1])
+            score = abs(column @ fit.errors.ravel()) / np.linalg.norm(column)
             tests["delay"] = (
-                _test_bound(rotation.fit),
+                float(stats.norm.sf(score)),
                 "The gyroscope follows the commands best with a delay beyond its bound: their time stamps differ.",
             )
         p_values |= {name: p_value for name, (p_value, _) in tests.items()}
@@ -1411,15 +1419,6 @@ def _test_terms(
         p = float(stats.norm.sf(share * np.sqrt(np.sum(weights))))
         results[name] = (p, sentence.format(share))
     return results
-
-
-def _test_bound(fit: PredictionErrorFit) -> float:
-    """P-value of the score of the last value, which ended at a bound."""
-    J = fit.slopes.reshape(-1, len(fit.values))
-    free = J[:, fit.free]
-    scale = np.linalg.norm(free, axis=0)
-    column = J[:, -1] - free @ (np.linalg.lstsq(free / scale, J[:, -1], rcond=None)[0] / scale)
-    return float(stats.norm.sf(abs(column @ fit.errors.ravel()) / np.linalg.norm(column)))
 
 
 def _test_whiteness(fit: PredictionErrorFit, share: float = 1.0) -> float:

@@ -28,13 +28,7 @@ from ..drag import AirframeDrag
 from ..environment.wind import Gusts, dryden, low_altitude
 from ..motor import MotorRotors
 from ..rotor import Rotors
-from ..tracker.bodies import (
-    OptionForces,
-    PanelStart,
-    place_on_base,
-    posture,
-    replace_numbers,
-)
+from ..tracker.bodies import OptionForces, PanelStart, place_on_base, posture, replace_numbers
 from ..tracker.geometry import initial_angles, tracker_geometry
 
 

@@ -207,9 +207,7 @@ def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RIS
 
 @quick_jit
 def posture(
-    geometry: TrackerGeometry,
-    angles: Float[Array, "2"],
-    rates: Float[Array, "2"] | None = None,
+    geometry: TrackerGeometry, angles: Float[Array, "2"], rates: Float[Array, "2"] | None = None
 ) -> State:
     """State of the six bodies on a base at rest.
 
@@ -316,26 +314,19 @@ def tracker_joints(
     """
     _, _, points, axes = _place_tracker(parameters, displacement)
 
-    def make_slide(name: str, slider: str) -> Joint:
-        return translational(name, base, slider, axis=axes[name], point=points[name])
-
-    def make_hinge(name: str, i: str, j: str) -> Joint:
-        return revolute(name, i, j, point=points[name], axis=axes[name])
-
-    def make_cross(name: str, i: str, j: str) -> Joint:
-        axis_i, axis_j = axes[f"{name}.i"], axes[f"{name}.j"]
-        return universal(name, i, j, point=points[name], axis_i=axis_i, axis_j=axis_j)
-
-    return (
-        make_slide("T12", "slider_2"),
-        make_slide("T13", "slider_3"),
-        make_hinge("R14", base, "post_4"),
-        make_hinge("R26", "slider_2", "rod_6"),
-        make_cross("U35", "slider_3", "rod_5"),
-        make_cross("U47", "post_4", "panel_7"),
-        spherical("S57", "rod_5", "panel_7", point=points["S57"]),
-        spherical("S67", "rod_6", "panel_7", point=points["S67"]),
-    )
+    rows = (
+        (translational, "T12", base, "slider_2"), (translational, "T13", base, "slider_3"),
+        (revolute, "R14", base, "post_4"), (revolute, "R26", "slider_2", "rod_6"),
+        (universal, "U35", "slider_3", "rod_5"), (universal, "U47", "post_4", "panel_7"),
+        (spherical, "S57", "rod_5", "panel_7"), (spherical, "S67", "rod_6", "panel_7"),
+    )  # fmt: skip
+    joints = []
+    for make_joint, name, i, j in rows:
+        # a universal joint has an axis in each body, a spherical one none
+        numbers = {"axis": name, "axis_i": f"{name}.i", "axis_j": f"{name}.j"}
+        numbers = {key: axes[place] for key, place in numbers.items() if place in axes}
+        joints.append(make_joint(name, i, j, point=points[name], **numbers))
+    return tuple(joints)
 
 
 class LinearActuator(AbstractForce):
