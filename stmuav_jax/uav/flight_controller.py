@@ -181,8 +181,8 @@ def wrench_for(
         R_d, rate = jax.jvp(attitude, (s,), (jnp.ones_like(s),))
         return R_d, vee_vector(R_d.T @ rate)
 
-    zero, one = jnp.zeros_like(thrust), jnp.ones_like(thrust)
-    (R_d, W_d), (_, W_d_rate) = jax.jvp(target_turning, (zero,), (one,))
+    zero, unit = jnp.zeros_like(thrust), jnp.ones_like(thrust)
+    (R_d, W_d), (_, W_d_rate) = jax.jvp(target_turning, (zero,), (unit,))
     e_R = vee_vector(R_d.T @ R)
     R_error = R.T @ R_d
     e_W = W - R_error @ W_d

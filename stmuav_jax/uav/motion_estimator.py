@@ -306,9 +306,9 @@ class MotionEstimator(eqx.Module):
         estimate = MotionEstimate(
             state, base, panel, fixes.nis, fixes.components, specific_force, missing, gated
         )
-        begun = jnp.ones((), bool)
+        has_started = jnp.ones((), bool)
         return estimate, EstimatorMemory(
-            base, panel, turning, force, begun, gaps, streak, missing, gated
+            base, panel, turning, force, has_started, gaps, streak, missing, gated
         )
 
     def _update_panel(

@@ -151,8 +151,9 @@ class PanelServo(eqx.Module):
     ) -> PanelReaction:
         """Actuator forces, and the moment that the motion takes; see `inverse_dynamics`."""
         w, d = self.frequency, self.damping
-        damped = target.acceleration + 2 * d * w * (target.rate - angles.rate)
-        motion = angles._replace(acceleration=damped + w**2 * (target.value - angles.value))
+        acceleration = target.acceleration + 2 * d * w * (target.rate - angles.rate)
+        acceleration = acceleration + w**2 * (target.value - angles.value)
+        motion = angles._replace(acceleration=acceleration)
         return inverse_dynamics(self.bodies, motion, gravity_b, about)
 
 
@@ -181,6 +182,7 @@ class StrokeServo(eqx.Module):
     ) -> PanelReaction:
         """Actuator forces; the moment of the motion is not known, and zero."""
         del gravity_b, about
-        now, goal = (stroke_motion(self.bodies.geometry, motion) for motion in (angles, target))
-        stiff = self.stiffness * (goal.value - now.value)
-        return PanelReaction(stiff + self.damping * (goal.rate - now.rate), jnp.zeros(3))
+        measured, desired = (stroke_motion(self.bodies.geometry, x) for x in (angles, target))
+        forces = self.stiffness * (desired.value - measured.value)
+        forces = forces + self.damping * (desired.rate - measured.rate)
+        return PanelReaction(forces, jnp.zeros(3))

@@ -17,7 +17,7 @@ Identification (1967), paper 3.17 (generalised least squares).
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -203,7 +203,7 @@ def fit_prediction_error(
                 new_eta = np.clip(eta + share * step[p:], low, high)
                 new_X = build(new_eta).X if len(eta) else X
                 state = _compute_errors(y, new_X, new_theta, order)
-                decrease = -float(np.sum(np.log(state.sigma / sigma)))
+                decrease = -float(np.sum(np.log(state[-1] / sigma)))
                 if decrease >= _DECREASE * share * expected:
                     break
                 share = 0.5 * share
@@ -222,18 +222,12 @@ def fit_prediction_error(
         )
 
 
-class _Errors(NamedTuple):
-    """Noise v (k + o, c), its earlier values, A(z) (c, o + 1), errors e (k, c) and their deviations (c,)."""
+def _compute_errors(y: np.ndarray, X: np.ndarray, theta: np.ndarray, order: int) -> tuple[Any, ...]:
+    """Prediction errors of theta with the A(z) that makes them smallest.
 
-    noise: np.ndarray
-    pasts: "list[_Past]"
-    denominators: np.ndarray
-    errors: np.ndarray
-    sigma: np.ndarray
-
-
-def _compute_errors(y: np.ndarray, X: np.ndarray, theta: np.ndarray, order: int) -> _Errors:
-    """Prediction errors of theta with the A(z) that makes them smallest."""
+    Returns:
+        noise v (k + o, c), its earlier values, A(z) (c, o + 1), errors e (k, c) and their deviations (c,).
+    """
     v = y - X @ theta
     pasts = [_Past(column, order) for column in v.T]
     A = np.array([
@@ -241,7 +235,7 @@ def _compute_errors(y: np.ndarray, X: np.ndarray, theta: np.ndarray, order: int)
         for past, column in zip(pasts, v.T, strict=True)
     ])  # fmt: skip
     e = _whiten_columns(A, v[:, :, None])[:, :, 0]
-    return _Errors(v, pasts, A, e, np.sqrt(np.mean(e**2, axis=0)))
+    return v, pasts, A, e, np.sqrt(np.mean(e**2, axis=0))
 
 
 class _Past:

@@ -162,7 +162,7 @@ class FlightRecord(NamedTuple):
     def between(self, t0: float, t1: float) -> "FlightRecord":
         """Record from t0 to t1 [s]."""
         inside = (self.ts >= t0) & (self.ts <= t1)
-        return FlightRecord(*(x[inside] if isinstance(x, np.ndarray) else x for x in self))
+        return self._make(x[inside] if isinstance(x, np.ndarray) else x for x in self)
 
 
 def compute_rotor_states(

@@ -194,7 +194,7 @@ class FlightIdentification(NamedTuple):
     def describe(self) -> str:
         """Table of the estimates, the refusals and the verdict."""
         parts = ("deviation", "blocks", "windows", "variants", "white")
-        rows = [("quantity", "value", *parts, "unit")]
+        rows: list[tuple[str, ...]] = [("quantity", "value", *parts, "unit")]
         for e in self.estimates.values():
             numbers = (f"{getattr(e, part):.2g}" for part in parts)
             rows.append((e.name, f"{e.value:.4g}", *numbers, e.unit))
@@ -649,7 +649,8 @@ class _Evaluation:
         # its drag or of the voltage's exponent, of one deviation, change.
         variants += sum((float(of(fit.values)) - value) ** 2 for fit in self.shifted)
         parts = np.sqrt([variance(self.white), blocks, variants])
-        return combine_parts(name, unit, value, *parts, value + changes @ G, spread)
+        windows = {"window_values": value + changes @ G, "window_deviations": spread}
+        return combine_parts(name, unit, value, *parts, **windows)
 
 
 def _exceed_chance(differences: Sequence[tuple[float, float]], variance: float) -> float:
@@ -1200,7 +1201,7 @@ def _identify_free_centre(signals: _Signals, estimates: dict[str, ParameterEstim
         window_values = layout.centre[k] + np.array([part[0][k] for part in parts])
         estimates[f"free_centre_{letter}"] = combine_parts(
             f"centre of mass {letter}, motors free", "m", layout.centre[k] + c[k], *np.sqrt(variances),
-            window_values, np.sqrt([part[1][k, k] for part in parts]),
+            window_values=window_values, window_deviations=np.sqrt([part[1][k, k] for part in parts]),
         )  # fmt: skip
 
 
@@ -1384,38 +1385,33 @@ def _test_terms(
         total = np.sum(T, axis=1, keepdims=True)
         return -T * filter_columns([1 - keep], [1.0, -keep], total / np.mean(total) - 1)
 
-    def test(name: str) -> tuple[float, float]:
-        """Share of a term by the moments, and its variance: what is wrong is wrong about all axes alike."""
-        terms = apply_filter(b, a, change(name, rotation.lags) @ (sides[:, axes] * effectiveness))
-        share, V, _ = rotation.test_columns(terms[round(_SETTLING / dt) :, :, None], _BLOCK)
-        return float(share[0]), float(V[0, 0])
-
     results = {}
     for name, sentence in (
         ("trend", "Effectiveness changes by {:.0f} % through the flight."),
         ("curve", "Thrust has a linear part of {:.0f} % of the slope beside the assumed curve."),
-    ):
-        share, variance = test(name)
-        excess = max(abs(share) - _NEGLIGIBLE, 0.0)
-        p = min(1.0, 2 * float(stats.norm.sf(excess / np.sqrt(variance))))
-        results[name] = (p, sentence.format(100 * share))
-    n = _sample_step(record, _FORCE_RATE)
-    for name, sentence in (
         ("lag", "Thrust responds to commands as if by a second lag behind the first."),
         (
             "sag",
             "Thrust falls by {:.2g} % with 1 % of collective within seconds, as a battery sags.",
         ),
     ):
+        # Share of the term by the moments: what is wrong is wrong about all axes alike.
+        terms = apply_filter(b, a, change(name, rotation.lags) @ (sides[:, axes] * effectiveness))
+        by_moments, V, _ = rotation.test_columns(terms[round(_SETTLING / dt) :, :, None], _BLOCK)
+        share, variance = float(by_moments[0]), float(V[0, 0])
+        if name in ("trend", "curve"):
+            excess = max(abs(share) - _NEGLIGIBLE, 0.0)
+            p = min(1.0, 2 * float(stats.norm.sf(excess / np.sqrt(variance))))
+            results[name] = (p, sentence.format(100 * share))
+            continue
         thrust = translation.values[_FORCE] * np.sum(change(name, translation.lags), axis=1)
         column = np.zeros((len(translation.noise), 3, 1))
-        column[:, 2] = _thrust_columns(record, n, thrust[:, None])
+        column[:, 2] = _thrust_columns(record, _sample_step(record, _FORCE_RATE), thrust[:, None])
         by_force, V, _ = translation.test_columns(column, _BLOCK)
-        by_moments, variance = test(name)
         # Forces and moments estimate the same quantity independently: weighted together they
         # detect a smaller one than either does.
         weights = np.array([1 / V[0, 0], 1 / variance])
-        share = float(weights @ [by_force[0], by_moments] / np.sum(weights))
+        share = float(weights @ [by_force[0], share] / np.sum(weights))
         p = float(stats.norm.sf(share * np.sqrt(np.sum(weights))))
         results[name] = (p, sentence.format(share))
     return results

@@ -134,9 +134,10 @@ def _make_model(
         return observable_model(Q=Q[OBSERVABLE], R=R, parameters=parameters), np.eye(5)
     if kind == "attitude":
         model = attitude_model(Q, R, parameters=parameters)
+    elif kind == "printed":
+        model = report_model("printed", "euler", Q=Q, R=R, parameters=parameters)
     else:
-        equations = ("printed", "euler") if kind == "printed" else ()
-        model = report_model(*equations, Q=Q, R=R, parameters=parameters)
+        model = report_model(Q=Q, R=R, parameters=parameters)
     return model, np.eye(5, 8, k=3)
 
 

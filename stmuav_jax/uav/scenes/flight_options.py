@@ -8,6 +8,7 @@ number of entries.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -154,7 +155,7 @@ def flight_forces(
         )
     table = replace_numbers(parameters, {"drag": drag, "motor": motor, "gear": gear})
     take = lambda group, *names: {k: table.value(f"{group}.{k}") for k in names}
-    air = wind
+    air: Any = wind
     if isinstance(wind, Wind):
         wind_values = {
             "wind.mean": wind.mean, "gust.height": wind.height, "gust.speed_20ft": wind.speed_20ft,
@@ -183,12 +184,9 @@ def flight_forces(
         forces.append(GroundContact(rotors.body, feet=feet, height=height, **numbers))
     is_wind = isinstance(wind, Wind)
     used = {
-        "drag.": drag is not None,
-        "wind.": is_wind,
-        "gust.": is_wind and wind.gusts,
-        "motor.": motor is not None,
-        "gear.": gear is not None,
-    }
+        "drag.": drag is not None, "wind.": is_wind, "gust.": is_wind and wind.gusts,
+        "motor.": motor is not None, "gear.": gear is not None,
+    }  # fmt: skip
     options_by_label = {"drag": drag, "wind": wind, "motors": motor, "landing gear": gear}
     names = ", ".join(name for name, option in options_by_label.items() if option is not None)
     notes = (f"Not in the report: {names}.",) if names else ()

@@ -265,10 +265,10 @@ def _search_angles(
         # A step that leaves the reach or changes the side is taken again with a quarter of its length.
         allowed = jnp.isfinite(step[0] + step[1]) & (side * margin > 0)
         take = allowed & is_open(s)
-        new, old = (angles, step, margin), (s.angles, s.step, s.margin)
-        taken = (jnp.where(take, x, before) for x, before in zip(new, old, strict=True))
+        pairs = zip((angles, step, margin), (s.angles, s.step, s.margin), strict=True)
+        parts = (jnp.where(take, candidate, present) for candidate, present in pairs)
         scale = jnp.where(allowed, jnp.minimum(1.0, 2 * s.scale), s.scale / 4)
-        return _Search(*taken, scale, s.steps + 1)
+        return _Search(*parts, scale=scale, steps=s.steps + 1)
 
     initial_search = _Search(start, step, margin, jnp.ones_like(margin), jnp.asarray(0))
     final_search = jax.lax.while_loop(is_unfinished, newton_update, initial_search)
