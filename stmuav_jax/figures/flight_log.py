@@ -12,7 +12,7 @@ from scipy import signal, stats
 from scipy.constants import g as GRAVITY
 
 from ..io.flight_log import FlightLog
-from ..uav.flight_identification.centre_filter import FilteredCentre
+from ..uav.flight_identification.centre import FilteredCentre
 from ..uav.flight_identification.record import (
     FlightRecord,
     apply_filter,

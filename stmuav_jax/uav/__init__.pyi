@@ -75,12 +75,10 @@ from .flight_controller import (
     within_limits as within_limits,
     wrench_for as wrench_for,
 )
-from .flight_identification.centre_filter import (
+from .flight_identification.centre import (
     FilteredCentre as FilteredCentre,
     filter_centre as filter_centre,
     filter_hover_centre as filter_hover_centre,
-)
-from .flight_identification.hover import (
     identify_hover_centre as identify_hover_centre,
 )
 from .flight_identification.record import (

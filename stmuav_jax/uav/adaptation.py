@@ -32,12 +32,7 @@ from ..estimation.inertial import update_sequentially
 from ..math.rotation import rotation_matrix, skew
 from ..mechanics.state import State
 from ..mechanics.system import System
-from .flight_controller import (
-    FlightController,
-    FlightMemory,
-    UavController,
-    central_properties,
-)
+from .flight_controller import FlightController, FlightMemory, UavController, central_properties
 from .motion_estimator import MotionEstimate
 from .motor import MotorRotors, only_rotors
 from .panel_servo import PanelBodies
@@ -219,41 +214,42 @@ class PayloadFilter(eqx.Module):
         self.period = h = jnp.asarray(1.0 / rate)
         constant = motors.time_constant if isinstance(motors, MotorRotors) else None
         self.lag = None if constant is None else jnp.exp(-h / constant)
-        owner_text = "of the payload's filter"
-        spread = (
-            check_nonnegative(mass, f"The mass {owner_text}", "kg"),
-            check_nonnegative(moment, f"The moment {owner_text}", "kg m") * jnp.ones(3),
-            check_nonnegative(inertia, f"The inertia {owner_text}", "1") * jnp.ones(3),
+        subject = "The {} of the payload's filter"
+        repeat = lambda count, value, name, unit: jnp.full(
+            count, check_nonnegative(value, subject.format(name), unit)
         )
-        self.prior = jnp.concatenate([jnp.atleast_1d(x) for x in spread])
-        densities = (
-            check_nonnegative(torque, f"The torque {owner_text}", "N m/sqrt(Hz)") * jnp.ones(3),
-            check_nonnegative(mass_drift, f"The mass's drift {owner_text}", "kg/sqrt(s)"),
-            check_nonnegative(moment_drift, f"The moment's drift {owner_text}", "kg m/sqrt(s)")
-            * jnp.ones(3),
+        positive = lambda value, name, unit: check_positive(value, subject.format(name), unit)
+        spread = [
+            repeat(1, mass, "mass", "kg"),
+            repeat(3, moment, "moment", "kg m"),
+            repeat(3, inertia, "inertia", "1"),
+        ]
+        self.prior = jnp.concatenate(spread)
+        densities = [
+            repeat(3, torque, "torque", "N m/sqrt(Hz)"),
+            repeat(1, mass_drift, "mass's drift", "kg/sqrt(s)"),
+            repeat(3, moment_drift, "moment's drift", "kg m/sqrt(s)"),
             jnp.zeros(3),
-        )
+        ]
         # Densities are per root of a hertz, so that another control rate gives the same spread after a
         # second.
-        self.walk = h * jnp.concatenate([jnp.atleast_1d(x) for x in densities]) ** 2
-        self.thrust = check_positive(thrust, f"The thrust {owner_text}", "N/sqrt(Hz)")
-        self.gyroscope = check_positive(gyroscope, f"The gyroscope's noise {owner_text}", "rad/s")
+        self.walk = h * jnp.concatenate(densities) ** 2
+        self.thrust = positive(thrust, "thrust", "N/sqrt(Hz)")
+        self.gyroscope = positive(gyroscope, "gyroscope's noise", "rad/s")
         if momentum is None:
             momentum = 0.0 if len(system.names) == 1 else 1e-3
-        self.momentum = check_nonnegative(momentum, f"The momentum {owner_text}", "N m s")
-        self.bound = check_positive(bound, f"The bound {owner_text}", "1")
+        self.momentum = repeat((), momentum, "momentum", "N m s")
+        self.bound = positive(bound, "bound", "1")
 
     def start(self) -> PayloadMemory:
         """First memory: no payload, with the prior standard deviations."""
-        spread = jnp.concatenate([jnp.full(3, _UNKNOWN), self.prior])
-        command_queue = jnp.tile(self.before, (self.late + 1, 1))
+        covariance = jnp.diag(jnp.concatenate([jnp.full(3, _UNKNOWN), self.prior]) ** 2)
         # a machine that hovers
         felt = jnp.zeros(3).at[2].set(jnp.linalg.norm(gravity_of(self.system)))
-        prior_fields, speeds = (
-            (jnp.zeros(10), jnp.diag(spread**2), jnp.zeros(3)),
-            jnp.sqrt(self.before),
+        sent = jnp.tile(self.before, (self.late + 1, 1))
+        return PayloadMemory(
+            jnp.zeros(10), covariance, jnp.zeros(3), felt, jnp.sqrt(self.before), sent
         )
-        return PayloadMemory(*prior_fields, felt, speeds, command_queue)
 
     def payload(self, memory: PayloadMemory) -> Payload:
         """Payload that is fed forward: the mean within `bound`."""
@@ -283,14 +279,18 @@ class PayloadFilter(eqx.Module):
         """
         # The wrench is that of the commands that reach the rotors in this period, which are late by the delay
         # and lag by the motors' time constant.
-        speeds, wrench = self._mean_wrench(memory)
+        speeds, squared = memory.speeds, memory.sent[0]
+        if self.lag is not None:
+            goal = jnp.sqrt(squared)
+            # The first-order lag of the motors is integrated exactly over a period with a held command.
+            speeds = goal + self.lag * (memory.speeds - goal)
+            squared = ((memory.speeds + speeds) / 2) ** 2
+        wrench = self.wrench_of(squared)
         turning, felt = estimate.state.omega[0], estimate.force
         # Without a reading the momentum is integrated on with the smoothed ones, and the update is skipped.
         has_reading = jnp.all(jnp.isfinite(turning)) & jnp.all(jnp.isfinite(felt))
-        turning, felt = (
-            jnp.where(has_reading, turning, memory.turning),
-            jnp.where(has_reading, felt, memory.felt),
-        )
+        turning = jnp.where(has_reading, turning, memory.turning)
+        felt = jnp.where(has_reading, felt, memory.felt)
         L, F = self.onwards(memory.mean, about, on, wrench[1:], turning, felt, memory.felt)
         # F is taken at smoothed readings: their noise would otherwise correlate with the innovation and find
         # payloads in noise.
@@ -305,10 +305,8 @@ class PayloadFilter(eqx.Module):
         move, P, _ = update_sequentially(0.5 * (P + P.T), H, noise, error, jnp.full(4, has_reading))
         share = 1 - jnp.exp(-_SMOOTHING * self.period)
         smooth = lambda old, new: old + share * (new - old)
-        smoothed_readings = smooth(memory.turning, turning), smooth(memory.felt, felt)
-        return PayloadMemory(
-            z + move, P, smoothed_readings[0], smoothed_readings[1], speeds, memory.sent
-        )
+        readings = smooth(memory.turning, turning), smooth(memory.felt, felt)
+        return PayloadMemory(z + move, P, *readings, speeds, memory.sent)
 
     def onwards(
         self,
@@ -348,13 +346,15 @@ class PayloadFilter(eqx.Module):
             turning: smoothed W (3,) [rad/s]. thrust: T [N].
         """
         whole = lambda numbers: add_payload(about, on, payload_of(numbers))
-        total_moments, inertia_derivative = (
-            whole(z[3:]),
-            jax.jacfwd(lambda numbers: whole(numbers).inertia)(z[3:]),
-        )
+        total_moments = whole(z[3:])
+        inertia_derivative = jax.jacfwd(lambda numbers: whole(numbers).inertia)(z[3:])
         # The rate follows from the momentum by the inertia, which the payload changes: that makes its mass
         # visible to the gyroscope.
-        inverse_inertia = _invert_cofactors(total_moments.inertia)
+        # Cofactors are a dozen products that fuse with their neighbours; a library call for three rows costs
+        # more.
+        a, b, c = total_moments.inertia
+        cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
+        inverse_inertia = cofactors / (a @ cofactors[:, 0])
         W = inverse_inertia @ (z[:3] - total_moments.momentum)
         by_payload = -inverse_inertia @ jnp.einsum("ijk,j->ik", inertia_derivative, turning)
         rates = jnp.concatenate([inverse_inertia, by_payload], axis=1)
@@ -367,25 +367,6 @@ class PayloadFilter(eqx.Module):
     def wrench_of(self, squared: Float[Array, " k"]) -> Float[Array, "4"]:
         """Thrust [N] and moments about O [N m] of squared rotor speeds [rad^2/s^2]."""
         return self.rotors.wrench(squared, self.centre)[2:]
-
-    def _mean_wrench(self, memory: PayloadMemory) -> tuple[Float[Array, " k"], Float[Array, "4"]]:
-        """Speeds of the rotors at the end of the period, and their mean wrench in it."""
-        squared_speeds = memory.sent[0]
-        if self.lag is None:
-            return memory.speeds, self.wrench_of(squared_speeds)
-        goal = jnp.sqrt(squared_speeds)
-        # The first-order lag of the motors is integrated exactly over a period with a held command.
-        end_speeds = goal + self.lag * (memory.speeds - goal)
-        return end_speeds, self.wrench_of(((memory.speeds + end_speeds) / 2) ** 2)
-
-
-def _invert_cofactors(J: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Inverse by cofactors."""
-    a, b, c = J
-    # Cofactors are a dozen products that fuse with their neighbours; a library call for three rows costs
-    # more.
-    cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
-    return cofactors / (a @ cofactors[:, 0])
 
 
 class AdaptiveMemory(NamedTuple):
@@ -435,37 +416,24 @@ class AdaptiveController(eqx.Module):
         self, estimate: Any, reference: Any, memory: AdaptiveMemory
     ) -> tuple[Float[Array, " m"], AdaptiveMemory]:
         """Inputs of the controller (m,), and the memory."""
-        state = self._read_state(estimate)
-        machine_moments, carrier_motion = (
-            mass_moments(self.filter.system, state),
-            find_carrier_motion(state),
-        )
-        filter_memory = self.filter.updated(
-            estimate, machine_moments, carrier_motion, memory.payload
-        )
-        payload = self.filter.payload(filter_memory)
-        mass, controller = (
-            central_properties(add_payload(machine_moments, carrier_motion, payload)),
-            self.controller,
-        )
-        if isinstance(controller, UavController):
-            bodies = bodies_carrying(controller.servo.bodies, payload)
-            servo = eqx.tree_at(lambda s: s.bodies, controller.servo, bodies)
-            inputs, flight = controller.command(state, reference, memory.flight, mass, servo)
-        else:
-            inputs, flight = controller.command(state, reference, memory.flight, mass)
-        payload_memory = self.filter.sent(filter_memory, inputs[: filter_memory.sent.shape[1]])
-        return inputs, AdaptiveMemory(flight, payload_memory, mass.centre)
-
-    def _read_state(self, estimate: Any) -> Any:
         if not isinstance(estimate, MotionEstimate):
             raise SettingError(
                 "A payload is estimated from a MotionEstimate, whose accelerometer and gyroscope it needs, "
                 f"but the estimate is of the kind {type(estimate).__name__}."
             )
-        estimate_count, body_count = estimate.state.r.shape[0], len(self.filter.system.names)
-        if estimate_count != body_count:
+        state, controller, system = estimate.state, self.controller, self.filter.system
+        if len(state.r) != len(system.names):
             raise SettingError(
-                f"The payload's filter is of a machine of {body_count} bodies, but the estimate has {estimate_count}."
+                f"The payload's filter is of a machine of {len(system.names)} bodies, but the estimate has "
+                f"{len(state.r)}."
             )
-        return estimate.state
+        moments, carrier = mass_moments(system, state), find_carrier_motion(state)
+        filter_memory = self.filter.updated(estimate, moments, carrier, memory.payload)
+        payload = self.filter.payload(filter_memory)
+        mass, servo = central_properties(add_payload(moments, carrier, payload)), ()
+        if isinstance(controller, UavController):
+            bodies = bodies_carrying(controller.servo.bodies, payload)
+            servo = (eqx.tree_at(lambda s: s.bodies, controller.servo, bodies),)
+        inputs, flight = controller.command(state, reference, memory.flight, mass, *servo)
+        payload_memory = self.filter.sent(filter_memory, inputs[: filter_memory.sent.shape[1]])
+        return inputs, AdaptiveMemory(flight, payload_memory, mass.centre)

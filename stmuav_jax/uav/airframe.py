@@ -10,6 +10,8 @@ and their reasons are in docs/report_machine.md.
 Lengths are in the frame of Part I (tracker frame); Part II adds "mount.shift".
 """
 
+from dataclasses import replace
+
 from ..mechanics.parameters import Parameter, Parameters
 
 _FIT = "reconstructed from report Part I, Table 6.1 (docs/report_machine.md)"
@@ -27,6 +29,18 @@ def _inertia_tensor(
 ) -> tuple[tuple[float, float, float], ...]:
     """Symmetric inertia tensor from its six entries."""
     return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+
+
+def _list_bodies(
+    mass_source: str, inertia_source: str, rows: dict[str, tuple[float, ...]]
+) -> dict[str, Parameter]:
+    """Masses and inertia tensors of bodies from the rows of a table."""
+    parameters = {}
+    for name, (mass, *moments) in rows.items():
+        parameters[f"mass.{name}"] = Parameter(mass, "kg", mass_source)
+        tensor = _inertia_tensor(*moments)
+        parameters[f"inertia.{name}"] = Parameter(tensor, "kg m^2", inertia_source)
+    return parameters
 
 
 # fmt: off
@@ -49,54 +63,32 @@ _GEOMETRY = {
     "posture.theta": Parameter(-0.3088, "rad", _FIT),
 }
 
-_BODIES_I = {
-    "mass.base_1": Parameter(0.47509, "kg", _T61),
-    "inertia.base_1": Parameter(
-        _inertia_tensor(0.002, 0.002, 0.0026, 0.0008, -0.0001, 0.0001), "kg m^2", _T62),
-    "mass.slider_2": Parameter(0.1897, "kg", _T61),
-    "inertia.slider_2": Parameter(
-        _inertia_tensor(2.774e-05, 2.0150000000000002e-05, 1.987e-05, 0.0, -1.0200000000000002e-06), "kg m^2", _T62),
-    "mass.slider_3": Parameter(0.1897, "kg", _T61),
-    "inertia.slider_3": Parameter(
-        _inertia_tensor(2.0150000000000002e-05, 2.774e-05, 1.987e-05, 0.0, 0.0, 1.0200000000000002e-06), "kg m^2", _T62),
-    "mass.post_4": Parameter(0.10445, "kg", _T61),
-    "inertia.post_4": Parameter(
-        _inertia_tensor(0.0001217, 0.0001248, 5.400000000000001e-06), "kg m^2", _T62),
-    "mass.rod_5": Parameter(0.05325, "kg", _T61),
-    "inertia.rod_5": Parameter(
-        _inertia_tensor(5.827e-05, 5.94e-05, 1.72e-06, 0.0, -8.24e-06), "kg m^2", _T62),
-    "mass.rod_6": Parameter(0.0544, "kg", _T61),
-    "inertia.rod_6": Parameter(_inertia_tensor(6.242e-05, 6.231e-05, 5.8e-07), "kg m^2", _T62),
-    "mass.panel_7": Parameter(0.8905, "kg", _T61),
-    # rounded in print: the largest principal moment exceeds the others' sum by 0.7 %
-    "inertia.panel_7": Parameter(
-        _inertia_tensor(0.0012, 0.0012, 0.0024, 0.0, 0.0001), "kg m^2", _T62, tolerance=0.008),
-}
+# mass [kg], then xx, yy, zz, xy, xz, yz of the inertia [kg m^2]
+_BODIES_I = _list_bodies(_T61, _T62, {
+    "base_1": (0.47509, 0.002, 0.002, 0.0026, 0.0008, -0.0001, 0.0001),
+    "slider_2": (0.1897, 2.774e-05, 2.0150000000000002e-05, 1.987e-05, 0.0, -1.0200000000000002e-06),
+    "slider_3": (0.1897, 2.0150000000000002e-05, 2.774e-05, 1.987e-05, 0.0, 0.0, 1.0200000000000002e-06),
+    "post_4": (0.10445, 0.0001217, 0.0001248, 5.400000000000001e-06),
+    "rod_5": (0.05325, 5.827e-05, 5.94e-05, 1.72e-06, 0.0, -8.24e-06),
+    "rod_6": (0.0544, 6.242e-05, 6.231e-05, 5.8e-07),
+    "panel_7": (0.8905, 0.0012, 0.0012, 0.0024, 0.0, 0.0001),
+})
+# rounded in print: the largest principal moment exceeds the others' sum by 0.7 %
+_BODIES_I["inertia.panel_7"] = replace(_BODIES_I["inertia.panel_7"], tolerance=0.008)
 
-_BODIES_II = {
-    "mass.hexacopter_1": Parameter(5.88295, "kg", _T51),
-    "inertia.hexacopter_1": Parameter(
-        _inertia_tensor(0.06245975468000001, 0.06280445983, 0.08929810247, 4.1801e-07, 0.00052075455, 0.00021503033), "kg m^2", _T53),
-    "mass.slider_2": Parameter(0.1897, "kg", _T51),
-    "inertia.slider_2": Parameter(
-        _inertia_tensor(2.7742820000000003e-05, 2.0147820000000002e-05, 1.9872580000000002e-05, 0.0, -1.01542e-06), "kg m^2", _T53),
-    "mass.slider_3": Parameter(0.1897, "kg", _T51),
-    # (1, 1) is printed 27742.83e-9; the mirror of slider_2 and Table 6.2 give this
-    "inertia.slider_3": Parameter(
-        _inertia_tensor(2.0147820000000002e-05, 2.7743240000000002e-05, 1.9872580000000002e-05, 0.0, 0.0, 1.01542e-06), "kg m^2", _T53 + ", (1, 1) corrected"),
-    "mass.post_4": Parameter(0.10445, "kg", _T51),
-    "inertia.post_4": Parameter(
-        _inertia_tensor(0.000121732, 0.00012476270000000002, 5.357600000000001e-06, 1.0000000000000002e-10), "kg m^2", _T53),
-    "mass.rod_5": Parameter(0.05325, "kg", _T51),
-    "inertia.rod_5": Parameter(
-        _inertia_tensor(5.944735e-05, 5.93967e-05, 5.469500000000001e-07), "kg m^2", _T53),
-    "mass.rod_6": Parameter(0.0544, "kg", _T51),
-    "inertia.rod_6": Parameter(
-        _inertia_tensor(6.24182e-05, 6.23117e-05, 5.8075e-07, 0.0, 0.0, -5.000000000000001e-11), "kg m^2", _T53),
-    "mass.panel_7": Parameter(0.89085, "kg", _T51),
-    "inertia.panel_7": Parameter(
-        _inertia_tensor(0.00123305505, 0.0012197628000000002, 0.00243241635, 4.090655e-05, -2.729e-06, -4.355e-07), "kg m^2", _T53),
-}
+_BODIES_II = _list_bodies(_T51, _T53, {
+    "hexacopter_1": (5.88295, 0.06245975468000001, 0.06280445983, 0.08929810247, 4.1801e-07, 0.00052075455, 0.00021503033),
+    "slider_2": (0.1897, 2.7742820000000003e-05, 2.0147820000000002e-05, 1.9872580000000002e-05, 0.0, -1.01542e-06),
+    # yy is printed 27742.83e-9; the mirror of slider_2 and Table 6.2 give this
+    "slider_3": (0.1897, 2.0147820000000002e-05, 2.7743240000000002e-05, 1.9872580000000002e-05, 0.0, 0.0, 1.01542e-06),
+    "post_4": (0.10445, 0.000121732, 0.00012476270000000002, 5.357600000000001e-06, 1.0000000000000002e-10),
+    "rod_5": (0.05325, 5.944735e-05, 5.93967e-05, 5.469500000000001e-07),
+    "rod_6": (0.0544, 6.24182e-05, 6.23117e-05, 5.8075e-07, 0.0, 0.0, -5.000000000000001e-11),
+    "panel_7": (0.89085, 0.00123305505, 0.0012197628000000002, 0.00243241635, 4.090655e-05, -2.729e-06, -4.355e-07),
+})
+_BODIES_II["inertia.slider_3"] = replace(
+    _BODIES_II["inertia.slider_3"], source=_T53 + ", (1, 1) corrected")
+
 _SPIN = {
     "spin.mass": Parameter(0.1897, "kg", _T61 + ", body 2; drops out of the closed form"),
     "spin.inertia": Parameter(

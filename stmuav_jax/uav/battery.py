@@ -17,12 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..checks.errors import (
-    ModelError,
-    StateError,
-    check_finite,
-    has_values,
-)
+from ..checks.errors import ModelError, StateError, check_finite, has_values
 from ..checks.numbers import as_floats, as_numpy, check_nonnegative, check_positive
 from ..checks.shapes import Numbers
 from ..math.derivative import safe_sqrt
@@ -49,26 +44,16 @@ class Battery(eqx.Module):
         ModelError: numbers out of range, or a table that does not rise from 0 to 1.
     """
 
-    capacity: Float[Array, ""]
-    resistance: Float[Array, ""]
-    state_of_charge: Float[Array, " n"]
-    open_circuit_voltage: Float[Array, " n"]
-    reserve: Float[Array, ""]
+    capacity: Float[Array, ""] = eqx.field(converter=as_floats)
+    resistance: Float[Array, ""] = eqx.field(converter=as_floats)
+    state_of_charge: Float[Array, " n"] = eqx.field(converter=as_floats)
+    open_circuit_voltage: Float[Array, " n"] = eqx.field(converter=as_floats)
+    reserve: Float[Array, ""] = eqx.field(converter=as_floats, default=0.0)
 
-    def __init__(
-        self,
-        *,
-        capacity: Numbers,
-        resistance: Numbers,
-        state_of_charge: Numbers,
-        open_circuit_voltage: Numbers,
-        reserve: Numbers = 0.0,
-    ) -> None:
-        self.capacity = check_positive(capacity, "The battery's capacity", "C")
-        self.resistance = check_nonnegative(resistance, "The battery's resistance", "ohm")
-        self.reserve = check_nonnegative(reserve, "The battery's reserve", "")
-        self.state_of_charge = as_floats(state_of_charge)
-        self.open_circuit_voltage = as_floats(open_circuit_voltage)
+    def __check_init__(self) -> None:
+        check_positive(self.capacity, "The battery's capacity", "C")
+        check_nonnegative(self.resistance, "The battery's resistance", "ohm")
+        check_nonnegative(self.reserve, "The battery's reserve", "")
         _check_table(self.state_of_charge, self.open_circuit_voltage)
         if has_values(self.reserve) and float(self.reserve) >= 1.0:
             raise ModelError(
@@ -174,15 +159,14 @@ def _check_power(battery: Battery, power: Numbers, soc: Numbers) -> None:
             f"The power of a battery must be finite, but it is {powers[~np.isfinite(powers)][0]:g} W."
         )
     excess = 4.0 * battery.resistance * powers - voltage**2
-    if not np.any(excess > 0):
-        return
-    k = np.unravel_index(np.argmax(excess), excess.shape)
-    largest = float(battery.largest_power(charges[k]))
-    raise StateError(
-        f"The battery cannot deliver {powers[k]:g} W at a state of charge of {charges[k]:g}: with "
-        f"{voltage[k]:.4g} V behind {float(battery.resistance):g} ohm no current gives more than "
-        f"{largest:.4g} W."
-    )
+    if np.any(excess > 0):
+        k = np.unravel_index(np.argmax(excess), excess.shape)
+        largest = float(battery.largest_power(charges[k]))
+        raise StateError(
+            f"The battery cannot deliver {powers[k]:g} W at a state of charge of {charges[k]:g}: with "
+            f"{voltage[k]:.4g} V behind {float(battery.resistance):g} ohm no current gives more than "
+            f"{largest:.4g} W."
+        )
 
 
 def _check_table(soc: Array, voltage: Array) -> None:

@@ -121,11 +121,10 @@ class Uav(eqx.Module):
 
     def with_steady_motors(self) -> "Uav":
         """The UAV with its motors at steady speeds, see `MotorRotors.steady`."""
-        propulsion = self.propulsion
-        if isinstance(propulsion, Rotors):
+        if isinstance(self.propulsion, Rotors):
             return self
         forces = list(self.system.forces)
-        forces[self.rotor_place] = propulsion.steady()
+        forces[self.rotor_place] = self.propulsion.steady()
         system = eqx.tree_at(lambda s: s.forces, self.system, tuple(forces))
         return Uav(self.space.with_system(system), self.geometry, self.displacement, self.limits)
 
@@ -146,23 +145,19 @@ class Uav(eqx.Module):
             r, p, v, omega: of the base, see `place_on_base`.
         """
         rates = None if rates is None else as_floats(rates)
-        base = (as_floats(part) for part in (r, p, v, omega))
+        base = map(as_floats, (r, p, v, omega))
         return place_on_base(self.geometry, self.displacement, as_floats(angles), rates, *base)
 
     def point(self, angles: Numbers, rates: Numbers | None = None, **base: Numbers) -> TreePoint:
         """Point of the space at this `state`."""
         return self.space.from_state(self.state(angles, rates, **base))
 
+    @quick_jit
     def panel_angles(self, x: TreePoint) -> Float[Array, "2"]:
         """Panel angles (phi, theta) (2,) [rad] at a point."""
-        return _panel_angles(self, x)
-
-
-@quick_jit
-def _panel_angles(uav: Uav, x: TreePoint) -> Float[Array, "2"]:
-    state = uav.space.to_state(x)
-    R_wb, R_wp = (rotation_matrix(state.p[k]) for k in (0, uav.system.index(_PANEL)))
-    return panel_angles(R_wb.T @ R_wp[:, 2])
+        state = self.space.to_state(x)
+        R_wb, R_wp = (rotation_matrix(state.p[k]) for k in (0, self.system.index(_PANEL)))
+        return panel_angles(R_wb.T @ R_wp[:, 2])
 
 
 class TrimReason(AbstractReason):
@@ -301,7 +296,7 @@ def trim_flight(
     # limits are arrays, so that other values do not need another compilation
     bounds: Any = jax.tree.map(as_floats, limits)
     trim = _trim_flight(uav.with_steady_motors(), condition, bounds)
-    if throw and has_values(trim.reason):
+    if throw and has_values(trim.reason) and int(trim.reason) != TrimReason.VALID:
         _raise_reason(TrimReason(int(trim.reason)), trim, uav, limits)
     if not has_values(trim.reason) or int(trim.reason) not in _BALANCED:
         is_balanced = jnp.isin(trim.reason, jnp.array(_BALANCED, trim.reason.dtype))
@@ -316,8 +311,7 @@ def trim_flight(
 @kept_jit
 def _trim_flight(uav: Uav, condition: FlightCondition, limits: TrimLimits) -> FlightTrim:
     """General trim, converged or not, with the reason code."""
-    count, sun = uav.rotors.spin.shape[0], condition.sun
-    angles = condition.angles
+    count, sun, angles = uav.rotors.spin.shape[0], condition.sun, condition.angles
     if angles is None:
         assert sun is not None
         # The attitude is not known yet; level flight is close enough for a start of Newton's method.
@@ -339,8 +333,7 @@ def _trim_flight(uav: Uav, condition: FlightCondition, limits: TrimLimits) -> Fl
     if sun is not None:
         angles = jnp.where(trim.converged, uav.panel_angles(trim.point), angles)
     # Squared speeds are the unknowns, as the wrench is linear in them; negative ones are found below.
-    squared = trim.values[:count]
-    values, speeds = trim.values, sharp_sqrt(squared)
+    values, squared = trim.values, trim.values[:count]
     lower, upper = (0.0, jnp.inf) if limits.rotors is None else limits.rotors.squared(count)
     assert limits.workspace is not None
     strokes, margins, _ = measure(uav.geometry, limits.workspace, turn_by_angles(angles))
@@ -356,7 +349,7 @@ def _trim_flight(uav: Uav, condition: FlightCondition, limits: TrimLimits) -> Fl
         *((outside == workspace_reason, code) for code, workspace_reason in _OUTSIDE.items()),
     )
     return FlightTrim(
-        trim.point, angles, values, speeds, trim.residuals, trim.conditioning, reason, trim.steps,
+        trim.point, angles, values, sharp_sqrt(squared), trim.residuals, trim.conditioning, reason, trim.steps,
         trim.residual_units,
     )  # fmt: skip
 
@@ -410,8 +403,6 @@ def _check_kinds(uav: Any, condition: Any, limits: Any) -> None:
 
 def _raise_reason(reason: TrimReason, trim: FlightTrim, uav: Uav, limits: TrimLimits) -> None:
     """Raise the `StateError` of a flight without a trim."""
-    if reason is TrimReason.VALID:
-        return
     phi, theta = np.degrees(np.asarray(trim.angles))
     angles = f"phi = {phi:.4g}, theta = {theta:.4g} degrees"
     if reason in _OUTSIDE:

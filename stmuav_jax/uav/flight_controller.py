@@ -32,7 +32,6 @@ from ..analysis.mass_properties import Moments, mass_moments
 from ..analysis.sensors import gravity_of
 from ..checks.errors import ModelError, has_values
 from ..checks.numbers import array_module, as_floats, as_numpy, check_nonnegative, check_positive
-from ..checks.shapes import Numbers
 from ..control.references import Waypoint
 from ..math import lapack
 from ..math.compiler import quick_jit
@@ -75,26 +74,18 @@ class FlightGains(eqx.Module):
         attitude: k_R / J [1/s^2]. rate: k_W / J [1/s].
     """
 
-    position: Float[Array, ""]
-    velocity: Float[Array, ""]
-    integral: Float[Array, ""]
-    attitude: Float[Array, ""]
-    rate: Float[Array, ""]
+    position: Float[Array, ""] = eqx.field(converter=as_floats, default=9.0)
+    velocity: Float[Array, ""] = eqx.field(converter=as_floats, default=5.0)
+    integral: Float[Array, ""] = eqx.field(converter=as_floats, default=0.0)
+    attitude: Float[Array, ""] = eqx.field(converter=as_floats, default=200.0)
+    rate: Float[Array, ""] = eqx.field(converter=as_floats, default=25.0)
 
-    def __init__(
-        self,
-        position: Numbers = 9.0,
-        velocity: Numbers = 5.0,
-        integral: Numbers = 0.0,
-        attitude: Numbers = 200.0,
-        rate: Numbers = 25.0,
-    ) -> None:
-        gain_label = "gain of the flight controller"
-        self.position = check_positive(position, f"The position {gain_label}", "1/s^2")
-        self.velocity = check_positive(velocity, f"The velocity {gain_label}", "1/s")
-        self.integral = check_nonnegative(integral, f"The integral {gain_label}", "1/s^3")
-        self.attitude = check_positive(attitude, f"The attitude {gain_label}", "1/s^2")
-        self.rate = check_positive(rate, f"The rate {gain_label}", "1/s")
+    def __check_init__(self) -> None:
+        units = {"position": "1/s^2", "velocity": "1/s", "attitude": "1/s^2", "rate": "1/s"}
+        subject = "The {} gain of the flight controller"
+        for name, unit in units.items():
+            check_positive(getattr(self, name), subject.format(name), unit)
+        check_nonnegative(self.integral, subject.format("integral"), "1/s^3")
 
 
 class BaseMotion(NamedTuple):
@@ -172,7 +163,6 @@ def wrench_for(
     )
     thrust_axis_rate = R @ jnp.cross(W, jnp.array([0.0, 0.0, 1.0]))
     a_rate = ((F_rate @ R[:, 2] + F @ thrust_axis_rate) * R[:, 2] + thrust * thrust_axis_rate) / m
-    zero = jnp.zeros_like(thrust)
 
     def force_after(s: Array) -> Array:
         """F a time s later, along the motion with this acceleration's own rate."""
@@ -191,7 +181,8 @@ def wrench_for(
         R_d, rate = jax.jvp(attitude, (s,), (jnp.ones_like(s),))
         return R_d, vee_vector(R_d.T @ rate)
 
-    (R_d, W_d), (_, W_d_rate) = jax.jvp(target_turning, (zero,), (jnp.ones_like(zero),))
+    zero, unit = jnp.zeros_like(thrust), jnp.ones_like(thrust)
+    (R_d, W_d), (_, W_d_rate) = jax.jvp(target_turning, (zero,), (unit,))
     e_R = vee_vector(R_d.T @ R)
     R_error = R.T @ R_d
     e_W = W - R_error @ W_d
@@ -205,26 +196,12 @@ def wrench_for(
 _TURNS = 1e-9
 
 
-def working_rotors(lost: Sequence[int], count: int) -> tuple[int, ...] | None:
-    """Places of the rotors that work; None where none is lost.
-
-    Args:
-        lost: numbers of the lost rotors, the first being 1. count: number of all rotors.
-    """
-    for rotor in lost:
-        if rotor != int(rotor) or not 1 <= rotor <= count:
-            raise ModelError(
-                f"The machine has rotors 1 to {count}, but no rotor {rotor} to be lost."
-            )
-    return tuple(k for k in range(count) if k + 1 not in lost) if len(lost) else None
-
-
 def inverse_without_yaw(
     wrenches: Float[Array, "4 k"],
     working: tuple[int, ...],
     limits: tuple[Float[Array, " k"], Float[Array, " k"]] | None,
     weight: Float[Array, ""],
-    quantity: tuple[str, str] = ("squared speeds", "rad^2/s^2"),
+    quantity: tuple[str, str],
 ) -> Float[Array, "w 4"]:
     """Squared speeds, or thrusts, of the working rotors per unit of thrust and moments.
 
@@ -238,10 +215,8 @@ def inverse_without_yaw(
     Raises:
         ModelError: no limits, or limits within which the working rotors do not hover.
     """
-    lost_rotors = [k + 1 for k in range(wrenches.shape[1]) if k not in working]
-    loss_text = (
-        f"without rotor{'s' if len(lost_rotors) > 1 else ''} {', '.join(map(str, lost_rotors))}"
-    )
+    lost = [str(k + 1) for k in range(wrenches.shape[1]) if k not in working]
+    loss_text = f"without rotor{'s' if len(lost) > 1 else ''} {', '.join(lost)}"
     if limits is None:
         raise ModelError(
             f"A flight {loss_text} needs limits of the rotor speeds: rotors cannot push down."
@@ -264,11 +239,8 @@ def inverse_without_yaw(
     # them.
     turn = working_wrenches[3] - inverse @ (working_wrenches[:3] @ working_wrenches[3])
     size = turn @ turn
-    turn = (
-        turn / size
-        if size > _TURNS**2 * (working_wrenches[3] @ working_wrenches[3])
-        else np.zeros_like(turn)
-    )
+    is_turning = size > _TURNS**2 * (working_wrenches[3] @ working_wrenches[3])
+    turn = turn / size if is_turning else np.zeros_like(turn)
     return jnp.asarray(np.concatenate([inverse, turn[:, None]], axis=1))
 
 
@@ -371,7 +343,7 @@ class FlightController(eqx.Module):
             raise ModelError(
                 "A flight controller needs gravity: add Gravity() to the forces of the system."
             )
-        rotors = motors.rotors
+        rotors, count = motors.rotors, motors.rotors.spin.shape[0]
         motor_limits = getattr(motors, "squared_limits", None)
         # The motors clip commands beyond their range; the controller has to know these limits to keep tilt
         # before thrust.
@@ -382,7 +354,8 @@ class FlightController(eqx.Module):
         weight = as_floats(xp.sum(mass_of_all) * xp.linalg.norm(g))
         if limits is not None:
             check_lift(rotors, limits, weight)
-            _check_reached(limits, motor_limits, rotors.spin.shape[0])
+            if motor_limits is not None and has_values(limits, motor_limits):
+                _check_reached(as_numpy(limits.squared(count)), as_numpy(motor_limits))
         hovering = rotors.hover(xp.sum(mass_of_all), g)
         # moments are about the base's centre of mass: the map does not change with the posture
         self.wrenches = wrench_map(rotors, system.bodies.com[0], hovering)
@@ -390,7 +363,12 @@ class FlightController(eqx.Module):
         if rotors.has_curves:
             self.rotors = rotors
             self.wrenches = self.wrenches / jax.grad(lambda u: jnp.sum(rotors.thrusts(u)))(hovering)
-        self.working = working_rotors(lost, rotors.spin.shape[0])
+        for rotor in lost:
+            if rotor != int(rotor) or not 1 <= rotor <= count:
+                raise ModelError(
+                    f"The machine has rotors 1 to {count}, but no rotor {rotor} to be lost."
+                )
+        self.working = tuple(k for k in range(count) if k + 1 not in lost) if len(lost) else None
         if self.working is None:
             self.inverse = _wrench_pseudoinverse(self.wrenches)
             if not np.all(np.asarray(self.inverse)[:, 0] > 0):
@@ -400,10 +378,8 @@ class FlightController(eqx.Module):
                 )
         else:
             bounds = None if limits is None else self._bounds()
-            quantity = () if self.rotors is None else (("thrusts", "N"),)
-            self.inverse = inverse_without_yaw(
-                self.wrenches, self.working, bounds, weight, *quantity
-            )
+            names = ("squared speeds", "rad^2/s^2") if self.rotors is None else ("thrusts", "N")
+            self.inverse = inverse_without_yaw(self.wrenches, self.working, bounds, weight, names)
         self.gains = FlightGains() if gains is None else gains
         self.period = as_floats(1.0 / rate)
         self.mass = mass_properties(system, system.reference) if mass is None else mass
@@ -432,20 +408,17 @@ class FlightController(eqx.Module):
         # the whole machine, which moves with the panel.
         lever = jnp.cross(mass.centre, jnp.array([0.0, 0.0, 1.0]) * demand.wrench[0])
         wrench = demand.wrench.at[1:].add(lever)
-        if self.working is None:
-            allocate = self._allocate_wrench
-        else:
+        if self.working is not None:
             # Without control of yaw its rate is only damped.
             wrench = wrench.at[3].add(-self.gains.rate * mass.J[2, 2] * base.omega[2])
-            allocate = self._allocated_to_working
-        squared, is_attained = allocate(wrench)
+        squared, is_attained = self._allocate(wrench)
         if self.rotors is not None:
             thrusts = squared
             for _ in range(_YAW_STEPS):
                 squared = self.rotors.squared_speeds(thrusts)
                 yaw = -self.rotors.spin @ self.rotors.torques(squared)
                 beside_tangent = yaw - self.wrenches[3] @ thrusts
-                thrusts, is_attained = allocate(wrench.at[3].add(-beside_tangent))
+                thrusts, is_attained = self._allocate(wrench.at[3].add(-beside_tangent))
             squared = self.rotors.squared_speeds(thrusts)
         # The integral stands still while the rotors saturate or a foot carries weight: it would wind up
         # against a force that it cannot overcome.
@@ -455,12 +428,6 @@ class FlightController(eqx.Module):
         integral = memory.integral + jnp.where(is_attained, self.period, 0.0) * error
         return squared, FlightMemory(integral)
 
-    def _allocate_wrench(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
-        """Squared speeds, or thrusts of rotors with curves, and whether they give the wrench."""
-        if self.limits is None:
-            return self.inverse @ wrench, jnp.ones((), bool)
-        return within_limits(self.inverse, wrench, *self._bounds())
-
     def _bounds(self) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
         """Lower and upper squared speeds (k,), or thrusts of rotors with curves."""
         assert self.limits is not None
@@ -469,22 +436,24 @@ class FlightController(eqx.Module):
             return lower, upper
         return self.rotors.thrusts(lower), self.rotors.thrusts(upper)
 
-    def _allocated_to_working(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
-        """Squared speeds, or thrusts, those of lost rotors zero, and whether they give thrust and tilt."""
-        places, count = jnp.array(self.working), self.wrenches.shape[1]
-        lower, upper = (x[places] for x in self._bounds())
-        u, is_attained = _allocate_tilt(self.inverse, wrench, lower, upper)
-        # yaw is what the others leave of it, and is changed where the limits still allow it
-        turn = self.inverse[:, 3] * (wrench[3] - self.wrenches[3, places] @ u)
-        b = _largest_share(jnp.abs(turn), jnp.where(turn > 0, upper - u, u - lower))
-        return jnp.zeros(count).at[places].set(u + b * turn), is_attained
+    def _allocate(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
+        """Squared speeds, or thrusts of rotors with curves, those of lost rotors zero; whether they give the wrench."""
+        if self.working is not None:
+            places, count = jnp.array(self.working), self.wrenches.shape[1]
+            lower, upper = (x[places] for x in self._bounds())
+            u, is_attained = _allocate_tilt(self.inverse, wrench, lower, upper)
+            # yaw is what the others leave of it, and is changed where the limits still allow it
+            turn = self.inverse[:, 3] * (wrench[3] - self.wrenches[3, places] @ u)
+            b = _largest_share(jnp.abs(turn), jnp.where(turn > 0, upper - u, u - lower))
+            return jnp.zeros(count).at[places].set(u + b * turn), is_attained
+        if self.limits is None:
+            return self.inverse @ wrench, jnp.ones((), bool)
+        return within_limits(self.inverse, wrench, *self._bounds())
 
 
-def _check_reached(limits: RotorLimits, squared_limits: Any, count: int) -> None:
-    """Raise `ModelError` for limits beyond those of the motors, as squared speeds; None for no motors'."""
-    if squared_limits is None or not has_values(limits, squared_limits):
-        return
-    (low, high), (lowest, highest) = as_numpy((limits.squared(count), squared_limits))
+def _check_reached(squared: Any, squared_motors: Any) -> None:
+    """Raise `ModelError` for limits beyond those of the motors, both as squared speeds."""
+    (low, high), (lowest, highest) = squared, squared_motors
     # round-off of the squares
     if np.any(low < lowest * (1 - _ROUND_OFF)) or np.any(high > highest * (1 + _ROUND_OFF)):
         raise ModelError(
@@ -535,11 +504,8 @@ def _allocate_tilt(
     rise = slope[None, :] - slope[:, None]
     room = (upper / lift)[None, :] - (lower / lift)[:, None]
     a = _largest_share(rise, room)
-    smallest_thrust, largest_thrust = (
-        jnp.max((lower - a * tilt) / lift),
-        jnp.min((upper - a * tilt) / lift),
-    )
-    thrust = jnp.minimum(jnp.maximum(wrench[0], smallest_thrust), largest_thrust)
+    smallest, largest = jnp.max((lower - a * tilt) / lift), jnp.min((upper - a * tilt) / lift)
+    thrust = jnp.minimum(jnp.maximum(wrench[0], smallest), largest)
     return lift * thrust + a * tilt, (a == 1.0) & (thrust == wrench[0])
 
 

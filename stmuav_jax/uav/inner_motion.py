@@ -4,7 +4,8 @@ A machine's tracker is moved by two panel angles and seen by the strokes of its 
 joints is moved by their coordinates, which encoders read.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -40,21 +41,13 @@ class TrackerMotion(eqx.Module):
         bodies: bodies of the tracker. reference: state at which encoders read zero.
     """
 
+    names: ClassVar[tuple[str, ...]] = ("phi", "theta")
+    encoders: ClassVar[tuple[str, ...]] = SLIDER_JOINTS
     bodies: PanelBodies
     home: Float[Array, "2"]
 
     def __init__(self, bodies: PanelBodies, reference: State) -> None:
         self.bodies, self.home = bodies, _read_strokes(bodies, reference)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the coordinates."""
-        return ("phi", "theta")
-
-    @property
-    def encoders(self) -> tuple[str, ...]:
-        """Joints whose coordinates encoders read."""
-        return SLIDER_JOINTS
 
     def read(self, state: State) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
         """Coordinates and their rates at a state."""
@@ -83,6 +76,8 @@ def _read_strokes(bodies: PanelBodies, state: State) -> Float[Array, "2"]:
 class JointChain(eqx.Module):
     """Motion of an open chain by the angles [rad] and displacements [m] of its joints (n,), which encoders read.
 
+    Its coordinates, and the joints that encoders read, have the `names` of the joints.
+
     Args:
         system: machine, whose first body is the base.
 
@@ -92,7 +87,8 @@ class JointChain(eqx.Module):
 
     space: TreeSpace
     home: TreePoint
-    joints: tuple[str, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    encoders: tuple[str, ...] = eqx.field(static=True)
     turning: tuple[bool, ...] = eqx.field(static=True)
 
     def __init__(self, system: System) -> None:
@@ -111,18 +107,8 @@ class JointChain(eqx.Module):
         self.space = TreeSpace(system)
         self.home = self.space.from_state(system.reference)
         names = [name for name, _ in self.space.names[6 : self.space.dof]]
-        self.joints = tuple(name.rpartition(".")[0] for name in names)
+        self.names = self.encoders = tuple(name.rpartition(".")[0] for name in names)
         self.turning = tuple(name.endswith(".angle") for name in names)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the coordinates."""
-        return self.joints
-
-    @property
-    def encoders(self) -> tuple[str, ...]:
-        """Joints whose coordinates encoders read."""
-        return self.joints
 
     def read(self, state: State) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """Coordinates and their rates at a state."""
@@ -131,11 +117,9 @@ class JointChain(eqx.Module):
 
     def innovation(self, readings: Float[Array, " n"], x: Float[Array, " n"]) -> Float[Array, " n"]:
         """Readings of the encoders less those at coordinates x, angles by the nearer way round."""
-        turns = 2 * jnp.pi * np.array(self.turning, dtype=float)
         # An encoder of a hinge repeats after a turn, the estimate does not: the innovation is the
         # difference by the nearer way.
-        difference = readings - x
-        return difference - turns * jnp.round(difference / (2 * jnp.pi))
+        return shorten_turns(readings - x, self.turning)
 
     def jacobian(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         """Derivatives of the readings by the coordinates."""
@@ -146,6 +130,12 @@ class JointChain(eqx.Module):
         six = jnp.zeros(6)
         point = self.space.retract(self.home, jnp.concatenate([six, x, six, rates]))
         return set_on_base(self.space.to_state(point), base)
+
+
+def shorten_turns(difference: Float[Array, " n"], turning: Sequence[bool]) -> Float[Array, " n"]:
+    """Differences of coordinates (n,), those of angles by the nearer way round."""
+    turns = 2 * jnp.pi * np.array(turning, dtype=float)
+    return difference - turns * jnp.round(difference / (2 * jnp.pi))
 
 
 def set_on_base(state: State, base: BasePose) -> State:

@@ -45,6 +45,7 @@ from ..mechanics.state import State
 from ..mechanics.system import System
 from .drag import AirframeDrag
 from .flight_controller import FlightController, FlightMemory, MassProperties, mass_properties
+from .inner_motion import shorten_turns
 from .motion_estimator import MotionEstimate, state_of
 from .motor import MotorRotors
 
@@ -81,19 +82,18 @@ def driven_joints(system: System) -> tuple[DrivenJoint, ...]:
     driven = []
     names = {entry.force: entry.name for entry in inputs_of(system).entries}
     for k, force in enumerate(system.forces):
-        if not isinstance(force, JointEffort | JointServo):
-            continue
         is_effort = isinstance(force, JointEffort)
         # A prescribed history is part of the machine and no input: a controller can neither read
         # nor set it.
-        if callable(force.effort if isinstance(force, JointEffort) else force.target):
+        if not isinstance(force, JointEffort | JointServo) or callable(
+            force.effort if isinstance(force, JointEffort) else force.target
+        ):
             continue
         joint = system.joints[system.joint_index(force.joint)]
         kind = choose_coordinate(joint, force.coordinate, type(force).__name__)
         driven.append(DrivenJoint(joint.name, joint.name, kind, k, names[k], is_effort))
-    places = [(drive.joint, drive.kind) for drive in driven]
-    for joint_name, kind in places:
-        if places.count((joint_name, kind)) > 1:
+    for (joint_name, kind), count in Counter((drive.joint, drive.kind) for drive in driven).items():
+        if count > 1:
             raise ModelError(
                 f"The {kind} of joint '{joint_name}' has several efforts or servos: a controller needs one."
             )
@@ -127,9 +127,7 @@ def joint_errors(
     joints: tuple[DrivenJoint, ...], values: Float[Array, " n"], targets: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """Values less targets, angles by the nearer way round."""
-    turning = np.array([drive.kind == "angle" for drive in joints], dtype=float)
-    error = values - targets
-    return error - 2 * jnp.pi * turning * jnp.round(error / (2 * jnp.pi))
+    return shorten_turns(values - targets, [drive.kind == "angle" for drive in joints])
 
 
 class JointGains(NamedTuple):
@@ -242,10 +240,7 @@ class JointController(eqx.Module):
         closed = targets.acceleration + 2 * ratio * W * rate_error + W**2 * error
         accelerations = jnp.where(is_servo | is_direct, targets.acceleration, closed)
         none, count = jnp.zeros(len(self.joints)), self.flight.wrenches.shape[1]
-        hover, servo_targets = (
-            self.inputs.values(system)[:count],
-            targets.value[np.flatnonzero(is_servo)],
-        )
+        servo_targets, hover = targets.value[is_servo], self.inputs.values(system)[:count]
         mass = self.flight.mass
         G, body_rates = jnp.eye(len(self.joints)), []
         if self.feedforward or not all(is_servo | is_direct):

@@ -50,7 +50,6 @@ from ..estimation.inertial import (
 )
 from ..math.compiler import quick_jit
 from ..math.rotation import rotation_matrix
-from ..math.space import Point
 from ..mechanics.state import State
 from ..mechanics.system import System
 from .inner_motion import BasePose, JointChain, TrackerMotion
@@ -165,11 +164,10 @@ class MotionEstimator(eqx.Module):
         turning_change: Numbers = 10.0,
         force_change: Numbers = 50.0,
     ) -> None:
-        name = system.names[0]
         kinds = ("gyroscope", "accelerometer", "position", "attitude")
         # Instruments are matched by the names that sensors of these kinds have: a list in any
         # order, with others in between, serves the same estimator.
-        sensors = [SENSORS[kind](name) for kind in kinds]
+        sensors = [SENSORS[kind](system.names[0]) for kind in kinds]
         self.inner = joints if tracker is None else TrackerMotion(tracker, system.reference)
         encoders = () if self.inner is None else self.inner.encoders
         sensors += [SENSORS["encoder"](joint) for joint in encoders]
@@ -193,28 +191,26 @@ class MotionEstimator(eqx.Module):
         # Noise is that of the instruments as simulated, so that the covariance is consistent by construction
         # and not by tuning.
         noise = [_instrument_noise(instrument, system) for instrument in selected]
-        self.variance = _stack_deviations(*noise[2:])
+        deviations = as_numpy(noise[2:])
+        self.variance = as_floats(array_module(*deviations).concatenate(deviations) ** 2)
         self.arm = _fix_arm(selected[2], system)
         self.gravity = gravity_of(system)
-        drift = [
-            check_numbers(value, (), f"The drift of the {sensor_kind}'s bias", unit)
-            for value, sensor_kind, unit in (
-                (gyroscope_drift, "gyroscope", "rad/s/sqrt(s)"),
-                (accelerometer_drift, "accelerometer", "m/s^2/sqrt(s)"),
-            )
-        ]
+        subject, unit = "The drift of the {}'s bias", "/sqrt(s)"
+        drift = (
+            check_numbers(gyroscope_drift, (), subject.format("gyroscope"), "rad/s" + unit),
+            check_numbers(accelerometer_drift, (), subject.format("accelerometer"), "m/s^2" + unit),
+        )
         q = check_numbers(panel_noise, (), "The noise of the panel", "rad/s^2/sqrt(Hz)")
         # Gyroscope and accelerometer drive the prediction, so that their noise is process noise;
         # it is the same in every period and is made once.
         self.walk = step_noise(self.period, *noise[:2], *drift)
         self.panel_walk = _panel_noise(self.period, q, len(encoders))
         self.limits = gate_limits(gate)
-        self.changes = stack_arrays(
-            [
-                check_nonnegative(turning_change, "The change of the angular velocity", "rad/s^2"),
-                check_nonnegative(force_change, "The change of the force", "m/s^3"),
-            ]
+        turning_change = check_nonnegative(
+            turning_change, "The change of the angular velocity", "rad/s^2"
         )
+        force_change = check_nonnegative(force_change, "The change of the force", "m/s^3")
+        self.changes = stack_arrays([turning_change, force_change])
 
     def start(
         self,
@@ -260,25 +256,21 @@ class MotionEstimator(eqx.Module):
     ) -> tuple[MotionEstimate, EstimatorMemory]:
         """Estimate at a sample, and the memory."""
         del inputs
-        selected_readings = [readings[name] for name in self.names]
-        is_finite = jnp.stack(
-            [jnp.all(jnp.isfinite(reading.value)) for reading in selected_readings]
-        )
+        selected = [readings[name] for name in self.names]
+        is_finite = jnp.stack([jnp.all(jnp.isfinite(reading.value)) for reading in selected])
         # A sensor slower than the control rate holds its last value between its readings, which must not be
         # used twice.
-        new = jnp.stack([reading.fresh for reading in selected_readings])
+        new = jnp.stack([reading.fresh for reading in selected])
         missing, fresh = memory.missing + (new & ~is_finite), new & is_finite
-        position, attitude, *encoders = selected_readings[2:]
+        position, attitude, *encoders = selected[2:]
         turning, force = (
-            jnp.where(is_finite[k], self.axes[k].T @ selected_readings[k].value, last_reading)
-            for k, last_reading in enumerate((memory.turning, memory.force))
+            jnp.where(is_finite[k], self.axes[k].T @ selected[k].value, last)
+            for k, last in enumerate((memory.turning, memory.force))
         )
         # The first call has no period before it and only takes readings.
         h = jnp.where(memory.has_started, self.period, 0.0)
-        previous_turning, previous_force = (
-            jnp.where(memory.has_started, old_value, new_value)
-            for old_value, new_value in ((memory.turning, turning), (memory.force, force))
-        )
+        previous_turning = jnp.where(memory.has_started, memory.turning, turning)
+        previous_force = jnp.where(memory.has_started, memory.force, force)
         gaps = jnp.where(is_finite[:2], 0, memory.gaps + 1)
         # Gyroscope and accelerometer are inputs of the prediction and not measurements: a missing one is
         # replaced by the last, with the error that it may have grown.
@@ -296,29 +288,27 @@ class MotionEstimator(eqx.Module):
             lambda belief: (belief, keep_covariance(belief.covariance, memory.streak[:2])),
             predicted,
         )  # fmt: skip
-        gated, streak, panel = [fixes.gated], [fixes.streak], None
-        if memory.panel is not None:
-            panel, strokes_taken = self._update_panel(
+        updates, panel = [fixes], None
+        x, omega = base.mean, turning - base.mean["gyroscope_bias"]
+        # The angular velocity is the gyroscope's less its bias: a state of its own would only delay it.
+        if memory.panel is None or self.inner is None:
+            state = State(x["r"][None], x["p"][None], x["v"][None], omega[None])
+        else:
+            panel, update = self._update_panel(
                 memory.panel, h, encoders, fresh[4:], memory.streak[2:]
             )
-            gated, streak = [*gated, strokes_taken.gated], [*streak, strokes_taken.streak]
-        # The angular velocity is the gyroscope's less its bias: a state of its own would only delay it.
-        state = self._make_state(base.mean, turning - base.mean["gyroscope_bias"], panel)
-        specific_force = force - base.mean["accelerometer_bias"]
-        rejection_counts = memory.gated + jnp.concatenate([jnp.zeros(2, bool), *gated])
+            updates.append(update)
+            pose = BasePose(x["r"], x["p"], x["v"], omega)
+            state = self.inner.place(pose, *jnp.split(panel.mean, 2))
+        rejected = jnp.concatenate([jnp.zeros(2, bool), *(update.gated for update in updates)])
+        gated, streak = memory.gated + rejected, jnp.concatenate([u.streak for u in updates])
+        specific_force = force - x["accelerometer_bias"]
         estimate = MotionEstimate(
-            state,
-            base,
-            panel,
-            fixes.nis,
-            fixes.components,
-            specific_force,
-            missing,
-            rejection_counts,
+            state, base, panel, fixes.nis, fixes.components, specific_force, missing, gated
         )
-        has_begun, streaks = jnp.ones((), bool), jnp.concatenate(streak)
+        has_started = jnp.ones((), bool)
         return estimate, EstimatorMemory(
-            base, panel, turning, force, has_begun, gaps, streaks, missing, rejection_counts
+            base, panel, turning, force, has_started, gaps, streak, missing, gated
         )
 
     def _update_panel(
@@ -353,12 +343,6 @@ class MotionEstimator(eqx.Module):
         )  # fmt: skip
         return Belief(x + gated_update.move, gated_update.covariance), gated_update
 
-    def _make_state(self, x: Point, omega: Float[Array, "3"], panel: Belief | None) -> State:
-        if panel is None or self.inner is None:
-            return State(x["r"][None], x["p"][None], x["v"][None], omega[None])
-        coordinates, rates = jnp.split(panel.mean, 2)
-        return self.inner.place(BasePose(x["r"], x["p"], x["v"], omega), coordinates, rates)
-
 
 def _panel_noise(h: Float[Array, ""], density: Float[Array, ""], n: int) -> Float[Array, "m m"]:
     """Covariance that accelerations of n coordinates add to them and their rates over a period h [s]."""
@@ -375,11 +359,6 @@ def _panel_noise(h: Float[Array, ""], density: Float[Array, ""], n: int) -> Floa
 def _panel_step(h: Float[Array, ""], n: int) -> Float[Array, "m m"]:
     """Matrix of n coordinates and their rates over a step h [s]."""
     return jnp.eye(2 * n).at[:n, n:].add(h * jnp.eye(n))
-
-
-def _stack_deviations(*deviations: Float[Array, "..."]) -> Float[Array, " n"]:
-    deviation_arrays = as_numpy(deviations)
-    return as_floats(array_module(*deviation_arrays).concatenate(deviation_arrays) ** 2)
 
 
 def _fix_arm(fix: Instrument, system: System) -> Float[Array, "3"]:
@@ -403,23 +382,14 @@ def _check_observed(
     The test is that of `check_observable`, about rest at the reference, on the estimator's own matrices F
     over a period h and H at the fixes, as the rate (F - 1) / h, whose modes have the same states.
     """
-    instruments_by_name = {
-        instrument.name: instrument
-        for instrument in instruments
-        if isinstance(instrument, Instrument)
-    }
-    fixes, gravity, h = (
-        [instruments_by_name.get(instrument.name) for instrument in required_instruments[2:]],
-        gravity_of(system),
-        1 / rate,
-    )
-    delays = as_floats([0.0 if instrument is None else instrument.delay for instrument in fixes])
+    by_name = {x.name: x for x in instruments if isinstance(x, Instrument)}
+    names_of_fixes = [instrument.name for instrument in required_instruments[2:]]
+    fixes, h = [by_name.get(name) for name in names_of_fixes], 1 / rate
+    delays = as_floats([0.0 if fix is None else fix.delay for fix in fixes])
     arm = as_floats(np.zeros(3)) if fixes[0] is None else _fix_arm(fixes[0], system)
     # At rest the fewest states are seen: motion only adds to what the sensors determine.
-    F, H = _at_rest(inner, system.reference, gravity, arm, delays, as_floats(h))
-    measured_mask = np.repeat(
-        [instrument is not None for instrument in fixes], [3, 3] + [1] * len(fixes[2:])
-    )
+    F, H = _at_rest(inner, system.reference, gravity_of(system), arm, delays, as_floats(h))
+    measured_mask = np.repeat([fix is not None for fix in fixes], [3, 3] + [1] * len(fixes[2:]))
     names = list(ERRORS)
     if inner is not None:
         names += [*inner.names, *(f"rate of {name}" for name in inner.names)]
@@ -433,16 +403,8 @@ def _check_observed(
     try:
         check_observable(Linear(A, none, C, none[: len(C)], states, (), ()))
     except ModelError as error:
-        absent_names = [
-            instrument.name
-            for instrument, fix in zip(required_instruments[2:], fixes, strict=True)
-            if fix is None
-        ]
-        shortage = (
-            f": there is no {', no '.join(repr(name) for name in absent_names)}"
-            if absent_names
-            else ""
-        )
+        absent = [repr(name) for name in names_of_fixes if name not in by_name]
+        shortage = f": there is no {', no '.join(absent)}" if absent else ""
         raise SettingError(
             f"The estimator's instruments do not suffice{shortage}. {error}"
         ) from error
@@ -482,10 +444,10 @@ def _spread_deviations(deviations: Sequence[Numbers], size: int) -> Float[Array,
 
 
 def _of_name(instruments: Sequence[Any], name: str) -> Instrument:
-    candidates = [instrument for instrument in instruments if isinstance(instrument, Instrument)]
+    candidates = [x for x in instruments if isinstance(x, Instrument)]
     matches = [instrument for instrument in candidates if instrument.name == name]
     if len(matches) != 1:
-        names_text = ", ".join(f"'{instrument.name}'" for instrument in candidates) or "none"
+        names_text = ", ".join(f"'{x.name}'" for x in candidates) or "none"
         raise SettingError(
             f"The estimator needs one Instrument '{name}', but there are: {names_text}."
         )

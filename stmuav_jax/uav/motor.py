@@ -61,33 +61,28 @@ class MotorRotors(AbstractInternalForce):
         limits: RotorLimits | None = None,
         start: Numbers | None = None,
     ) -> None:
-        count = rotors.spin.shape[0]
         owner_text = f"of the rotors of body '{rotors.body}'"
         constant = not callable(rotors.speed_squared)
         self.rotors = rotors
         self.time_constant = self.inertia = self.squared_limits = None
         if time_constant is not None:
-            self.time_constant = _per_rotor(
-                time_constant, count, f"The time constant {owner_text}", "s"
-            )
-            _check_least(self.time_constant, f"The time constant {owner_text}", "s", strictly=True)
+            self.time_constant = _per_rotor(time_constant, rotors, "time constant", "s", "positive")
         if inertia is not None:
             if time_constant is None and not constant:
                 raise ModelError(
                     f"The inertia {owner_text} needs their time constant, because their commands are a "
                     "function: without lag their acceleration is not known."
                 )
-            self.inertia = _per_rotor(inertia, count, f"The inertia {owner_text}", "kg m^2")
-            _check_least(self.inertia, f"The inertia {owner_text}", "kg m^2", strictly=False)
+            self.inertia = _per_rotor(inertia, rotors, "inertia", "kg m^2", "not negative")
         if limits is not None:
-            self.squared_limits = limits.squared(count)
+            self.squared_limits = limits.squared(rotors.spin.shape[0])
             _check_rising(rotors, self.squared_limits[0])
         self.internal = jnp.zeros((0,))
         if time_constant is None:
             if start is not None:
                 raise ModelError(f"The starting speeds {owner_text} need their time constant.")
         elif start is not None:
-            self.internal = _per_rotor(start, count, f"The starting speeds {owner_text}", "rad/s")
+            self.internal = _per_rotor(start, rotors, "starting speeds", "rad/s")
         elif constant:
             self.internal = self.speeds_of(jnp.asarray(rotors.speed_squared))
         else:
@@ -171,13 +166,8 @@ class MotorRotors(AbstractInternalForce):
                 # A rotor that gains speed turns the base against it; only with a lag does its speed have a rate.
                 faster = self.inertia * self.rotors.spin * self.internal_rate(t, kin)
                 moment = moment - jnp.sum(faster) * z
-        R_wb = kin.R_wb[k]
-        return push(
-            kin,
-            self.rotors.body,
-            apply_matrix(R_wb, wrench[:3]),
-            moment_w=apply_matrix(R_wb, moment),
-        )
+        force_w, moment_w = (apply_matrix(kin.R_wb[k], part) for part in (wrench[:3], moment))
+        return push(kin, self.rotors.body, force_w, moment_w=moment_w)
 
 
 def only_rotors(system: System, owner: str) -> Rotors | MotorRotors:
@@ -201,13 +191,23 @@ def only_rotors(system: System, owner: str) -> Rotors | MotorRotors:
     return rotor_sets[0]
 
 
-def _per_rotor(value: Numbers, count: int, quantity: str, unit: str) -> Float[Array, " k"]:
+def _per_rotor(
+    value: Numbers, rotors: Rotors, name: str, unit: str, requirement: str = "finite"
+) -> Float[Array, " k"]:
+    """Numbers of the rotors (k,) that are finite, "positive" or "not negative"; one number is that of each."""
+    quantity, count = f"The {name} of the rotors of body '{rotors.body}'", rotors.spin.shape[0]
     check_finite(value, quantity, unit)
     values = jnp.asarray(value, dtype=float)
     if values.shape not in ((), (count,)):
         raise ModelError(
             f"{quantity} must be one number or one for each of {count} rotors, but the shape is {values.shape}."
         )
+    if has_values(values) and requirement != "finite":
+        # NumPy: inside of a traced function an operation of JAX is traced, though its numbers are known.
+        numbers = np.atleast_1d(values)
+        wrong = numbers[numbers <= 0 if requirement == "positive" else numbers < 0]
+        if wrong.size:
+            raise ModelError(f"{quantity} must be {requirement}, but it is {wrong[0]:g} {unit}.")
     return jnp.broadcast_to(values, (count,))
 
 
@@ -222,17 +222,4 @@ def _check_rising(rotors: Rotors, lowest: Float[Array, " k"]) -> None:
         raise ModelError(
             f"The thrust of the rotors of body '{rotors.body}' falls with their speed below {turning_point}, but "
             f"their lowest speed is {slowest:g} rad/s: the lowest speed must be where the thrust rises."
-        )
-
-
-def _check_least(value: Float[Array, " k"], quantity: str, unit: str, *, strictly: bool) -> None:
-    if not has_values(value):
-        return
-    # NumPy: inside of a traced function an operation of JAX is traced, though its numbers are known.
-    numbers = np.asarray(value)
-    violation_mask = numbers <= 0 if strictly else numbers < 0
-    if np.any(violation_mask):
-        requirement = "positive" if strictly else "not negative"
-        raise ModelError(
-            f"{quantity} must be {requirement}, but it is {numbers[violation_mask][0]:g} {unit}."
         )

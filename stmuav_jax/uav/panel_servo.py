@@ -85,17 +85,13 @@ def facing(direction_w: Float[Array, "3"], state: State) -> PairMotion:
     turns; their accelerations are left out."""
     R = rotation_matrix(state.p[0])
     direction_b = R.T @ direction_w
-    angles, rates = jax.jvp(
-        panel_angles, (direction_b,), (-jnp.cross(state.omega[0], direction_b),)
-    )
+    direction_rate = -jnp.cross(state.omega[0], direction_b)
+    angles, rates = jax.jvp(panel_angles, (direction_b,), (direction_rate,))
     return PairMotion(angles, rates, jnp.zeros_like(rates))
 
 
 def inverse_dynamics(
-    bodies: PanelBodies,
-    angles: PairMotion,
-    gravity_b: Float[Array, "3"],
-    about: Float[Array, "3"],
+    bodies: PanelBodies, angles: PairMotion, gravity_b: Float[Array, "3"], about: Float[Array, "3"]
 ) -> PanelReaction:
     """Actuator forces for a motion of the panel on a base at rest.
 
@@ -107,13 +103,8 @@ def inverse_dynamics(
     geometry = bodies.geometry
 
     def body_speeds(x: Array, rates: Array) -> tuple[Array, Array, Array, Array]:
-        body_states = posture(geometry, x, rates)
-        return (
-            body_states.v,
-            body_states.omega,
-            body_states.r,
-            jax.vmap(rotation_matrix)(body_states.p),
-        )
+        state = posture(geometry, x, rates)
+        return state.v, state.omega, state.r, jax.vmap(rotation_matrix)(state.p)
 
     primals, rates = (angles.value, angles.rate), (angles.rate, angles.acceleration)
     # One derivative along the motion gives accelerations with all terms of the rates squared.
@@ -124,9 +115,8 @@ def inverse_dynamics(
     spin = angular_momenta(alpha) + jnp.cross(omega, angular_momenta(omega))
     inertial = bodies.mass[:, None] * a
     load = inertial - bodies.mass[:, None] * gravity_b[None]
-    generalised_forces = jnp.einsum("kni,ni->k", partial_velocities, load) + jnp.einsum(
-        "kni,ni->k", turns, spin
-    )
+    generalised_forces = jnp.einsum("kni,ni->k", partial_velocities, load)
+    generalised_forces = generalised_forces + jnp.einsum("kni,ni->k", turns, spin)
     J = stroke_jacobian(geometry, angles.value)
     arms = r + (bodies.shift - about)[None]
     moment = jnp.sum(jnp.cross(arms, inertial), axis=0) + jnp.einsum("nij,nj->i", R, spin)
@@ -145,15 +135,12 @@ class PanelServo(eqx.Module):
     """
 
     bodies: PanelBodies
-    frequency: Float[Array, ""]
-    damping: Float[Array, ""]
+    frequency: Float[Array, ""] = eqx.field(converter=as_floats, default=120.0)
+    damping: Float[Array, ""] = eqx.field(converter=as_floats, default=1.0)
 
-    def __init__(
-        self, bodies: PanelBodies, frequency: Numbers = 120.0, damping: Numbers = 1.0
-    ) -> None:
-        self.bodies = bodies
-        self.frequency = check_positive(frequency, "The frequency of the panel's servo", "rad/s")
-        self.damping = check_positive(damping, "The damping ratio of the panel's servo", "1")
+    def __check_init__(self) -> None:
+        check_positive(self.frequency, "The frequency of the panel's servo", "rad/s")
+        check_positive(self.damping, "The damping ratio of the panel's servo", "1")
 
     def command(
         self,
@@ -164,14 +151,10 @@ class PanelServo(eqx.Module):
     ) -> PanelReaction:
         """Actuator forces, and the moment that the motion takes; see `inverse_dynamics`."""
         w, d = self.frequency, self.damping
-        acceleration_command = (
-            target.acceleration
-            + 2 * d * w * (target.rate - angles.rate)
-            + w**2 * (target.value - angles.value)
-        )
-        return inverse_dynamics(
-            self.bodies, angles._replace(acceleration=acceleration_command), gravity_b, about
-        )
+        acceleration = target.acceleration + 2 * d * w * (target.rate - angles.rate)
+        acceleration = acceleration + w**2 * (target.value - angles.value)
+        motion = angles._replace(acceleration=acceleration)
+        return inverse_dynamics(self.bodies, motion, gravity_b, about)
 
 
 class StrokeServo(eqx.Module):
@@ -183,15 +166,12 @@ class StrokeServo(eqx.Module):
     """
 
     bodies: PanelBodies
-    stiffness: Float[Array, ""]
-    damping: Float[Array, ""]
+    stiffness: Float[Array, ""] = eqx.field(converter=as_floats, default=2e4)
+    damping: Float[Array, ""] = eqx.field(converter=as_floats, default=200.0)
 
-    def __init__(
-        self, bodies: PanelBodies, stiffness: Numbers = 2e4, damping: Numbers = 200.0
-    ) -> None:
-        self.bodies = bodies
-        self.stiffness = check_positive(stiffness, "The stiffness of the strokes' servo", "N/m")
-        self.damping = check_positive(damping, "The damping of the strokes' servo", "N s/m")
+    def __check_init__(self) -> None:
+        check_positive(self.stiffness, "The stiffness of the strokes' servo", "N/m")
+        check_positive(self.damping, "The damping of the strokes' servo", "N s/m")
 
     def command(
         self,
@@ -202,9 +182,7 @@ class StrokeServo(eqx.Module):
     ) -> PanelReaction:
         """Actuator forces; the moment of the motion is not known, and zero."""
         del gravity_b, about
-        stroke_state = stroke_motion(self.bodies.geometry, angles)
-        stroke_target = stroke_motion(self.bodies.geometry, target)
-        forces = self.stiffness * (stroke_target.value - stroke_state.value) + self.damping * (
-            stroke_target.rate - stroke_state.rate
-        )
+        measured, desired = (stroke_motion(self.bodies.geometry, x) for x in (angles, target))
+        forces = self.stiffness * (desired.value - measured.value)
+        forces = forces + self.damping * (desired.rate - measured.rate)
         return PanelReaction(forces, jnp.zeros(3))

@@ -79,9 +79,8 @@ class Rotors(AbstractForce):
         self.spin = as_floats(spin)
         owner_text = f"of the rotors of body '{body}'"
         self.k_f = check_nonnegative(k_f, f"The thrust coefficient k_f {owner_text}", "N s^2/rad^2")
-        self.k_tau = check_nonnegative(
-            k_tau, f"The torque coefficient k_tau {owner_text}", "N m s^2/rad^2"
-        )
+        quantity = f"The torque coefficient k_tau {owner_text}"
+        self.k_tau = check_nonnegative(k_tau, quantity, "N m s^2/rad^2")
         parts = (thrust_linear, thrust_offset, torque_linear, torque_offset)
         check_finite(parts, f"The thrust and torque curves {owner_text}", "")
         self.thrust_linear, self.thrust_offset, self.torque_linear, self.torque_offset = (
@@ -174,10 +173,8 @@ class Rotors(AbstractForce):
     def load(self, t: Float[Array, ""], kin: Kinematics) -> Load:
         k = kin.index(self.body)
         wrench = self.wrench(self.commands(t, kin), kin.com[k])
-        R_wb = kin.R_wb[k]
-        return push(
-            kin, self.body, apply_matrix(R_wb, wrench[:3]), moment_w=apply_matrix(R_wb, wrench[3:])
-        )
+        force_w, moment_w = (apply_matrix(kin.R_wb[k], part) for part in (wrench[:3], wrench[3:]))
+        return push(kin, self.body, force_w, moment_w=moment_w)
 
 
 def _evaluate_curve(

@@ -179,11 +179,12 @@ def make_hover(
 
 def _with_speeds(system: System, squared: Matrix) -> System:
     """System whose motors turn with the squared speeds (k,) that they are commanded."""
-    speeds_of = lambda motors: motors.speeds_of(jnp.asarray(squared))
-    lags = lambda force: isinstance(force, MotorRotors) and force.time_constant is not None
-    settle = lambda force: eqx.tree_at(lambda f: f.internal, force, speeds_of(force))
-    forces = tuple(settle(force) if lags(force) else force for force in system.forces)
-    return eqx.tree_at(lambda s: s.forces, system, forces)
+    forces = list(system.forces)
+    for k, force in enumerate(forces):
+        if isinstance(force, MotorRotors) and force.time_constant is not None:
+            speeds = force.speeds_of(jnp.asarray(squared))
+            forces[k] = eqx.tree_at(lambda f: f.internal, force, speeds)
+    return eqx.tree_at(lambda s: s.forces, system, tuple(forces))
 
 
 def _level(state: State) -> State:
@@ -224,9 +225,8 @@ def _respond(
         inputs, after = evaluate(pilot, observed, reference, unravel(z[space.size :]))
         return inputs, ravel_pytree(after)[0]
 
-    (inputs, _), (K, stored) = value_and_jacobian(
-        command, jnp.concatenate([jnp.zeros(space.size), memory])
-    )
+    start = jnp.concatenate([jnp.zeros(space.size), memory])
+    (inputs, _), (K, stored) = value_and_jacobian(command, start)
     return _Response(inputs, K, stored)
 
 

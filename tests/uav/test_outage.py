@@ -21,7 +21,7 @@ def test_speeds_without_a_rotor_keep_thrust_and_tilt(plant):
     """The allocation gives thrust and tilt, and turns towards the wanted yaw up to a limit."""
     pilot = stm.uav.FlightController(plant.system, plant.rate, limits=LIMITS, lost=[3])
     B, low, high = np.asarray(pilot.wrenches), 200.0**2, 1900.0**2
-    found = quick_jit(lambda w: pilot._allocated_to_working(w))
+    found = quick_jit(lambda w: pilot._allocate(w))
     rng = np.random.default_rng(7)
     weight = 9.81 * float(plant.system.bodies.mass[0])
     kept = 0

@@ -132,11 +132,8 @@ def local_time(day: date, hours: float, zone: tzinfo) -> datetime:
     day_bounds(day, zone)
     when = datetime.combine(day, time(), zone) + timedelta(hours=hours)
     check_exists(when)
-    offsets = [when.replace(fold=fold).utcoffset() for fold in (0, 1)]
-    if offsets[0] != offsets[1]:
-        first, second = (
-            when.replace(fold=fold).isoformat(timespec="seconds")[19:] for fold in (0, 1)
-        )
+    first, second = (when.replace(fold=k).isoformat(timespec="seconds")[19:] for k in (0, 1))
+    if first != second:
         raise SettingError(
             f"The time {when:%Y-%m-%d %H:%M:%S} happens twice in {zone}, where clocks are put back: "
             f"give the time zone as an offset, {first} for the first or {second} for the second."

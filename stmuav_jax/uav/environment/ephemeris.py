@@ -87,28 +87,24 @@ class Place(eqx.Module):
 
 
 def _check_place(place: Place) -> None:
-    check_finite(place.latitude, "The latitude", "rad", SettingError)
-    check_finite(place.longitude, "The longitude", "rad", SettingError)
-    check_finite(place.altitude, "The altitude", "m", SettingError)
-    low, high = ALTITUDES
-    outside = (np.asarray(place.altitude) < low) | (np.asarray(place.altitude) > high)
-    if np.any(outside):
-        altitude = float(np.asarray(place.altitude)[outside].flat[0])
+    for name, unit in (("latitude", "rad"), ("longitude", "rad"), ("altitude", "m")):
+        check_finite(getattr(place, name), f"The {name}", unit, SettingError)
+    (low, high), altitudes = ALTITUDES, np.atleast_1d(place.altitude)
+    outside = altitudes[(altitudes < low) | (altitudes > high)]
+    if outside.size:
         raise SettingError(
-            f"The altitude must lie within {low:g} and {high:g} m, but it is {altitude:g} m."
+            f"The altitude must lie within {low:g} and {high:g} m, but it is {outside.flat[0]:g} m."
         )
-    latitude = math.degrees(float(place.latitude))
-    if abs(float(place.latitude)) > math.pi / 2 + ROUNDING:
-        raise SettingError(
-            f"The latitude must lie within -90 and 90 degrees, but it is {latitude:g} degrees. "
-            "Place(...) takes radians, Place.degrees(...) degrees."
-        )
-    if np.any(np.abs(place.longitude) > 2 * math.pi + ROUNDING):
-        longitude = float(np.degrees(np.max(np.abs(place.longitude))))
-        raise SettingError(
-            f"The longitude must lie within -360 and 360 degrees, but it is {longitude:g} degrees. "
-            "Place(...) takes radians, Place.degrees(...) degrees."
-        )
+    for name, value, most in (
+        ("latitude", place.latitude, 90),
+        ("longitude", place.longitude, 360),
+    ):
+        angle = max(np.ravel(value), key=abs)
+        if abs(angle) > math.radians(most) + ROUNDING:
+            raise SettingError(
+                f"The {name} must lie within -{most} and {most} degrees, but it is {np.degrees(angle):g} degrees. "
+                "Place(...) takes radians, Place.degrees(...) degrees."
+            )
 
 
 class Air(eqx.Module):
@@ -237,9 +233,8 @@ def sun_azimuth(s_w: Float[Array | np.ndarray, "3 *s"]) -> Float[Array, "*s"]:
     """
     x, y = s_w[0], s_w[1]
     is_off_zenith = x**2 + y**2 > 0.0
-    return jnp.arctan2(jnp.where(is_off_zenith, x, 0.0), jnp.where(is_off_zenith, y, 1.0)) % (
-        2.0 * jnp.pi
-    )
+    x, y = jnp.where(is_off_zenith, x, 0.0), jnp.where(is_off_zenith, y, 1.0)
+    return jnp.arctan2(x, y) % (2.0 * jnp.pi)
 
 
 def refract_direction(s_w: Float[Array | np.ndarray, "3 *s"], air: Air) -> Float[Array, "3 *s"]:

@@ -43,6 +43,11 @@ class ClearSky(NamedTuple):
     turbidity: Samples
 
 
+def _sun_angles(sun: Sun) -> tuple[Samples, Samples]:
+    """Zenith angle and azimuth of the sun [degrees]."""
+    return 90.0 - np.degrees(np.asarray(sun.elevation)), np.degrees(np.asarray(sun.azimuth))
+
+
 def clear_sky(
     unix: Samples, place: Place, sun: Sun, air: Air, *, turbidity: float | None = None
 ) -> ClearSky:
@@ -62,7 +67,7 @@ def clear_sky(
             f"Linke's turbidity must be at least 1 (clean, dry air) and finite, but it is {turbidity}."
         )
     times = pd.DatetimeIndex(pd.to_datetime(unix, unit="s", utc=True))
-    zenith = 90.0 - np.degrees(np.asarray(sun.elevation))
+    zenith, _ = _sun_angles(sun)
     with warnings.catch_warnings():
         # pvlib 0.16 uses names of pandas 2 that are deprecated in pandas 3
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -106,20 +111,12 @@ def panel_irradiance(
     tilt = np.degrees(np.arctan2(np.hypot(normals_w[0], normals_w[1]), normals_w[2]))
     panel_azimuth = np.degrees(np.arctan2(normals_w[0], normals_w[1])) % 360.0
     up = np.asarray(sun.is_up)
+    # Sky light is brighter around the sun, which favours a panel that faces it; an isotropic sky would
+    # hide that.
     total = pvlib.irradiance.get_total_irradiance(
-        tilt,
-        panel_azimuth,
-        90.0 - np.degrees(np.asarray(sun.elevation)),
-        np.degrees(np.asarray(sun.azimuth)),
-        sky.beam,
-        sky.global_horizontal,
-        sky.diffuse,
-        dni_extra=sky.extraterrestrial,
-        albedo=albedo,
-        # Sky light is brighter around the sun, which favours a panel that faces it; an isotropic sky would
-        # hide that.
-        model="haydavies",
-    )
+        tilt, panel_azimuth, *_sun_angles(sun), sky.beam, sky.global_horizontal, sky.diffuse,
+        dni_extra=sky.extraterrestrial, albedo=albedo, model="haydavies",
+    )  # fmt: skip
     return np.where(up, np.asarray(total["poa_global"]), 0.0)
 
 
@@ -136,21 +133,16 @@ def single_axis_normals(sun: Sun, *, limit: float = math.radians(60.0)) -> Norma
     import pvlib
 
     singleaxis: Any = pvlib.tracking.singleaxis  # without types
+    # Backtracking avoids shade from neighbouring rows, and there are none here.
     with np.errstate(invalid="ignore"):
         orientation = singleaxis(
-            90.0 - np.degrees(np.asarray(sun.elevation)),
-            np.degrees(np.asarray(sun.azimuth)),
-            axis_tilt=0.0,
-            axis_azimuth=180.0,
-            max_angle=math.degrees(limit),
-            # Backtracking avoids shade from neighbouring rows, and there are none here.
+            *_sun_angles(sun), axis_tilt=0.0, axis_azimuth=180.0, max_angle=math.degrees(limit),
             backtrack=False,
-        )
+        )  # fmt: skip
     tilt = np.radians(np.nan_to_num(np.asarray(orientation["surface_tilt"])))
     panel_azimuth = np.radians(np.nan_to_num(np.asarray(orientation["surface_azimuth"])))
-    return np.stack(
-        [np.sin(tilt) * np.sin(panel_azimuth), np.sin(tilt) * np.cos(panel_azimuth), np.cos(tilt)]
-    )
+    east, north = np.sin(panel_azimuth), np.cos(panel_azimuth)
+    return np.stack([np.sin(tilt) * east, np.sin(tilt) * north, np.cos(tilt)])
 
 
 def level_normals(n: int) -> Normals:

@@ -164,7 +164,7 @@ def dryden(
             gusts pass between them (dt > L / V).
     """
     for value, quantity in ((duration, "duration"), (dt, "spacing of the samples")):
-        if not (np.isfinite(value) and value > 0):
+        if not 0 < value < np.inf:
             raise ModelError(f"The {quantity} of gusts must be positive, but it is {value} s.")
     speed = check_positive(airspeed, "The airspeed of gusts", "m/s")
     for name, value, unit in zip(turbulence._fields, turbulence, ("m", "m/s"), strict=True):
@@ -201,9 +201,7 @@ def _gust_axes(mean: Float[Array, "3"]) -> Float[Array, "3 3"]:
     calm = without_derivative(jnp.array([1.0, 0.0], mean.dtype) + 0 * mean[:2], ~blows)
     x, y = jnp.where(blows, direction, calm)
     zero, unit = jnp.zeros_like(x), jnp.ones_like(x)
-    return jnp.stack(
-        [jnp.stack([x, -y, zero]), jnp.stack([y, x, zero]), jnp.stack([zero, zero, unit])]
-    )
+    return jnp.stack([x, -y, zero, y, x, zero, zero, zero, unit]).reshape(3, 3)
 
 
 def shaping_matrices(
@@ -217,14 +215,9 @@ def shaping_matrices(
     fade, zero = jnp.exp(-r), jnp.zeros_like(r)
     # integrals of q^k exp(-2 q) up to r, without cancellation for short steps
     # The transition is exact for any spacing, and so is the spectrum; an Euler step's would depend on it.
-    Q_11, Q_12, Q_22 = (
-        0.5 * _lower_gamma(1, 2 * r),
-        0.25 * _lower_gamma(2, 2 * r),
-        0.25 * _lower_gamma(3, 2 * r),
-    )
-    a = jnp.sqrt(Q_11)
-    b = Q_12 / a
-    c = jnp.sqrt(Q_22 - b * b)
+    a = jnp.sqrt(0.5 * _lower_gamma(1, 2 * r))
+    b = 0.25 * _lower_gamma(2, 2 * r) / a
+    c = jnp.sqrt(0.25 * _lower_gamma(3, 2 * r) - b * b)
     matrix = lambda p, q, u, v: jnp.stack([jnp.stack([p, q], -1), jnp.stack([u, v], -1)], -2)
     return matrix(fade, zero, r * fade, fade), matrix(a, zero, b, c)
 
@@ -247,21 +240,17 @@ OUTPUT = np.array(
 
 @eqx.filter_jit
 def _sample_path(
-    seed: Integer[Array, ""], times: Float[Array, "3"], sigma: Float[Array, "3"], dt: Float[Array, ""],
-    count: int,
-) -> Float[Array, "k 3"]:  # fmt: skip
+    seed: Array, times: Float[Array, "3"], sigma: Float[Array, "3"], dt: Array, count: int
+) -> Float[Array, "k 3"]:
     key = jax.random.key(seed)
     # A key for each sample: a longer path begins with the same gusts.
     draw = lambda i: jax.random.normal(jax.random.fold_in(key, i), (3, 2), dtype=times.dtype)
     noise = jax.vmap(draw)(jnp.arange(count))
     step, spread = shaping_matrices(dt / times)
 
-    def filter_step(
-        state: Float[Array, "3 2"], white_noise: Float[Array, "3 2"]
-    ) -> tuple[Array, Array]:
-        state = jnp.einsum("aij,aj->ai", step, state) + jnp.einsum(
-            "aij,aj->ai", spread, white_noise
-        )
+    def filter_step(state: Array, white_noise: Array) -> tuple[Array, Array]:
+        kick = jnp.einsum("aij,aj->ai", spread, white_noise)
+        state = jnp.einsum("aij,aj->ai", step, state) + kick
         return state, state
 
     # A start at zero would need several time constants until the gusts have their strength.

@@ -17,7 +17,7 @@ Identification (1967), paper 3.17 (generalised least squares).
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -88,9 +88,7 @@ class PredictionErrorFit(NamedTuple):
     def white_covariance(self) -> Float[np.ndarray, "n n"]:
         """Covariance of the values if e is white; zero for lags at a bound."""
         J = self.slopes.reshape(-1, len(self.values))
-        return _expand_covariance(
-            _invert_information((J.T @ J)[np.ix_(self.free, self.free)]), self.free
-        )
+        return _invert_information((J.T @ J)[np.ix_(self.free, self.free)], self.free)
 
     def compute_covariance(self, block: float) -> Float[np.ndarray, "n n"]:
         """Covariance of the values by sums of scores over blocks [s]."""
@@ -117,7 +115,7 @@ class PredictionErrorFit(NamedTuple):
         changes, covariances = [], []
         for rows in np.array_split(np.arange(len(self.errors)), count):
             J = self.slopes[rows].reshape(-1, len(size))[:, free]
-            V = _expand_covariance(_invert_information(J.T @ J), free)
+            V = _invert_information(J.T @ J, free)
             changes.append(V[:, free] @ (J.T @ self.errors[rows].ravel()))
             covariances.append(V * ratio[:, None] * ratio)
         return np.array(changes), np.array(covariances)
@@ -129,10 +127,9 @@ class PredictionErrorFit(NamedTuple):
         Z = self.whiten(columns)
         m = Z.shape[2]
         J, z = self.slopes[:, :, self.free].reshape(self.errors.size, -1), Z.reshape(-1, m)
-        scale = np.linalg.norm(J, axis=0)
         # Only what the fitted values cannot explain is new: their errors would otherwise show as
         # coefficients.
-        z = z - J @ (np.linalg.lstsq(J / scale, z, rcond=None)[0] / scale[:, None])
+        z = z - J @ solve_columns(J, z)
         information = z.T @ z
         coefficients = linalg.solve(information, z.T @ self.errors.ravel(), assume_a="pos")
         scores = np.einsum("kcm,kc->km", z.reshape(Z.shape), self.errors)
@@ -163,27 +160,33 @@ def fit_prediction_error(
     p = X.shape[2]
     # a regression with white noise starts the search
     scale = np.std(y, axis=0)
-    theta = _solve_columns((X / scale[:, None]).reshape(-1, p), (y / scale).ravel())
+    theta = solve_columns((X / scale[:, None]).reshape(-1, p), (y / scale).ravel())
     low, high = np.array(bounds, float).reshape(-1, 2).T
     iteration = 0
     state = _compute_errors(y, X, theta, order)
     while True:
         error, pasts, A, e, sigma = state
-        slopes = np.concatenate([X, _slopes_by_lags(build, eta, X, theta, high)], axis=2)
+        # derivatives of the predictions by theta and by eta
+        slopes = np.concatenate([X, np.zeros((*X.shape[:2], len(eta)))], axis=2)
+        for j in range(len(eta)):
+            h = _DIFFERENCE * max(eta[j], 0.005)
+            h = -h if eta[j] + h > high[j] else h
+            changed = eta + h * (np.arange(len(eta)) == j)
+            slopes[:, :, p + j] = (build(changed).X - X) @ theta / h
         J = _project_columns(pasts, _whiten_columns(A, slopes) / sigma[:, None])
         free = np.ones(p + len(eta), bool)
         step = np.zeros(p + len(eta))
         while True:
             columns = J[:, :, free].reshape(-1, int(np.sum(free)))
             step[:] = 0.0
-            step[free] = _solve_columns(columns, (e / sigma).ravel())
+            step[free] = solve_columns(columns, (e / sigma).ravel())
             # A lag at a bound that would leave it is held, and the step is solved again: a step
             # that was merely clipped would leave theta at values that belong to other lags.
             stuck = ((eta <= low) & (step[p:] < 0)) | ((eta >= high) & (step[p:] > 0))
             if not np.any(stuck & free[p:]):
                 break
             free[p:] &= ~stuck
-        V = np.diag(_expand_covariance(_invert_information(columns.T @ columns), free))
+        V = np.diag(_invert_information(columns.T @ columns, free))
         size = np.abs(step[free]) / np.sqrt(V[free])
         is_converged = iteration > 2 and bool(np.all(size < _CONVERGED))
         if not is_converged and iteration < _ITERATIONS:
@@ -200,7 +203,7 @@ def fit_prediction_error(
                 new_eta = np.clip(eta + share * step[p:], low, high)
                 new_X = build(new_eta).X if len(eta) else X
                 state = _compute_errors(y, new_X, new_theta, order)
-                decrease = -float(np.sum(np.log(state.sigma / sigma)))
+                decrease = -float(np.sum(np.log(state[-1] / sigma)))
                 if decrease >= _DECREASE * share * expected:
                     break
                 share = 0.5 * share
@@ -213,32 +216,18 @@ def fit_prediction_error(
             if iteration < _ITERATIONS:
                 theta, eta, X = new_theta, new_eta, new_X
                 continue
+        values = np.append(theta, eta)
         return PredictionErrorFit(
-            np.append(theta, eta),
-            len(eta),
-            e / sigma,
-            J,
-            error,
-            A,
-            sigma,
-            dt,
-            free,
-            is_converged,
+            values, len(eta), e / sigma, J, error, A, sigma, dt, free, is_converged
         )
 
 
-class _Errors(NamedTuple):
-    """Noise v (k + o, c), its earlier values, A(z) (c, o + 1), errors e (k, c) and their deviations (c,)."""
+def _compute_errors(y: np.ndarray, X: np.ndarray, theta: np.ndarray, order: int) -> tuple[Any, ...]:
+    """Prediction errors of theta with the A(z) that makes them smallest.
 
-    noise: np.ndarray
-    pasts: "list[_Past]"
-    denominators: np.ndarray
-    errors: np.ndarray
-    sigma: np.ndarray
-
-
-def _compute_errors(y: np.ndarray, X: np.ndarray, theta: np.ndarray, order: int) -> _Errors:
-    """Prediction errors of theta with the A(z) that makes them smallest."""
+    Returns:
+        noise v (k + o, c), its earlier values, A(z) (c, o + 1), errors e (k, c) and their deviations (c,).
+    """
     v = y - X @ theta
     pasts = [_Past(column, order) for column in v.T]
     A = np.array([
@@ -246,24 +235,7 @@ def _compute_errors(y: np.ndarray, X: np.ndarray, theta: np.ndarray, order: int)
         for past, column in zip(pasts, v.T, strict=True)
     ])  # fmt: skip
     e = _whiten_columns(A, v[:, :, None])[:, :, 0]
-    return _Errors(v, pasts, A, e, np.sqrt(np.mean(e**2, axis=0)))
-
-
-def _slopes_by_lags(
-    build: Callable[[np.ndarray], Regression],
-    eta: np.ndarray,
-    X: np.ndarray,
-    theta: np.ndarray,
-    high: np.ndarray,
-) -> np.ndarray:
-    """Derivatives of the predictions by the lags (k, c, l)."""
-    slopes = np.zeros((*X.shape[:2], len(eta)))
-    for j in range(len(eta)):
-        h = _DIFFERENCE * max(eta[j], 0.005)
-        h = -h if eta[j] + h > high[j] else h
-        changed = eta + h * (np.arange(len(eta)) == j)
-        slopes[:, :, j] = (build(changed).X - X) @ theta / h
-    return slopes
+    return v, pasts, A, e, np.sqrt(np.mean(e**2, axis=0))
 
 
 class _Past:
@@ -295,26 +267,24 @@ def _whiten_columns(A: np.ndarray, values: np.ndarray) -> np.ndarray:
     return oaconvolve(values, A.T[:, :, None], mode="valid", axes=0)
 
 
-def _solve_columns(J: np.ndarray, r: np.ndarray) -> np.ndarray:
+def solve_columns(J: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Least-squares solution; columns of zeros have none."""
     scale = np.linalg.norm(J, axis=0)
     # With columns of one length the rank that least squares sees does not depend on units.
     scale = np.where(scale > 0, scale, 1.0)
-    return np.linalg.lstsq(J / scale, r, rcond=None)[0] / scale
+    return (np.linalg.lstsq(J / scale, r, rcond=None)[0].T / scale).T
 
 
-def _invert_information(M: np.ndarray) -> np.ndarray:
-    """Inverse of an information matrix; what it does not determine has a very large variance."""
+def _invert_information(M: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Inverse of the free values' information, with rows and columns of zeros for the others.
+
+    What it does not determine has a very large variance.
+    """
     size = np.sqrt(np.diag(M))
     size = np.where(size > 0, size, 1.0)
     # On a diagonal of ones the floor of the eigenvalues does not depend on units.
     values, vectors = np.linalg.eigh(M / size[:, None] / size)
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
-    return inverse / size[:, None] / size
-
-
-def _expand_covariance(V: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Covariance with rows and columns of zeros for values that are not free."""
     whole = np.zeros((len(free), len(free)))
-    whole[np.ix_(free, free)] = V
+    whole[np.ix_(free, free)] = inverse / size[:, None] / size
     return whole

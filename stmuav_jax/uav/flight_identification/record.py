@@ -162,11 +162,7 @@ class FlightRecord(NamedTuple):
     def between(self, t0: float, t1: float) -> "FlightRecord":
         """Record from t0 to t1 [s]."""
         inside = (self.ts >= t0) & (self.ts <= t1)
-        voltage = None if self.voltage is None else self.voltage[inside]
-        return FlightRecord(
-            self.ts[inside], self.commands[inside], self.gyroscope[inside], self.accelerometer[inside],
-            voltage, self.cutoffs, self.resolution, self.filter_rate,
-        )  # fmt: skip
+        return self._make(x[inside] if isinstance(x, np.ndarray) else x for x in self)
 
 
 def compute_rotor_states(

@@ -25,7 +25,8 @@ and forces may be coloured and fed back.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -35,11 +36,7 @@ from scipy.constants import g as GRAVITY
 from ...analysis.fit_statistics import compare_estimates, compute_autocorrelation
 from ...checks.errors import SettingError
 from .combinations import describe_combinations
-from .prediction_error import (
-    PredictionErrorFit,
-    Regression,
-    fit_prediction_error,
-)
+from .prediction_error import PredictionErrorFit, Regression, fit_prediction_error, solve_columns
 from .record import (
     SHORTEST_RECORD,
     FlightRecord,
@@ -138,6 +135,22 @@ class ParameterEstimate(NamedTuple):
     window_p_value: float
 
 
+def combine_parts(
+    name: str, unit: str, value: float, white: float, blocks: float, variants: float,
+    window_values: Float[np.ndarray, " w"], window_deviations: Float[np.ndarray, " w"],
+) -> ParameterEstimate:  # fmt: skip
+    """Estimate with the scatter between its windows, from the other parts of its deviation."""
+    scatter, p_value = 0.0, 1.0
+    # a lag at its bound has no deviation
+    if np.all(window_deviations > 0):
+        scatter, p_value = compare_estimates(window_values, np.diag(window_deviations**2), _LEVEL)
+    deviation = float(np.sqrt(blocks**2 + scatter**2 + variants**2))
+    return ParameterEstimate(
+        name, unit, float(value), deviation, float(white), float(blocks), scatter, float(variants),
+        window_values, window_deviations, p_value,
+    )  # fmt: skip
+
+
 class FlightVerdict(NamedTuple):
     """Verdict on an identification.
 
@@ -180,17 +193,13 @@ class FlightIdentification(NamedTuple):
 
     def describe(self) -> str:
         """Table of the estimates, the refusals and the verdict."""
-        rows: list[tuple[str, ...]] = [
-            ("quantity", "value", "deviation", "blocks", "windows", "variants", "white", "unit")
-        ]
+        parts = ("deviation", "blocks", "windows", "variants", "white")
+        rows: list[tuple[str, ...]] = [("quantity", "value", *parts, "unit")]
         for e in self.estimates.values():
-            parts = (e.deviation, e.blocks, e.windows, e.variants, e.white)
-            rows.append((e.name, f"{e.value:.4g}", *(f"{x:.2g}" for x in parts), e.unit))
-        widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-        lines = [
-            "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip()
-            for row in rows
-        ]
+            numbers = (f"{getattr(e, part):.2g}" for part in parts)
+            rows.append((e.name, f"{e.value:.4g}", *numbers, e.unit))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
         return "\n".join([*lines, "", *self.refusals.values(), self.verdict.explanation])
 
 
@@ -207,6 +216,11 @@ class _Signals(NamedTuple):
     gravity: np.ndarray
     slope: float | None = None
 
+    @property
+    def hover(self) -> float:
+        """Mean command of the rotors."""
+        return float(np.mean(self.record.commands))
+
     def compute_thrusts(
         self, states: Float[np.ndarray, "k n"], factor: float
     ) -> Float[np.ndarray, "k n"]:
@@ -214,12 +228,18 @@ class _Signals(NamedTuple):
         shape = compute_thrust_shape(states, factor)
         if self.slope is None:
             return shape
-        hover = float(np.mean(self.record.commands))
-        coefficient = self.slope / (1 - factor + 2 * factor * hover)
+        coefficient = self.slope / _shape_slope(factor, self.hover)
         # The moment of the centre of mass takes the whole thrust, of which a shape through zero has another
         # share by its slope than a curve with an offset or with an idle speed.
         level = float(np.mean(self.record.accelerometer[:, 2])) / states.shape[1]
         return shape + level / coefficient - np.mean(shape)
+
+
+class _Results(NamedTuple):
+    """Estimates and refusals of the stages so far."""
+
+    estimates: dict[str, ParameterEstimate]
+    refusals: dict[str, str]
 
 
 class _Variant(NamedTuple):
@@ -232,6 +252,16 @@ class _Variant(NamedTuple):
 
 def _sample_step(record: FlightRecord, rate: float) -> int:
     return max(round(1 / (record.dt * rate)), 1)
+
+
+def _other_factor(layout: RotorLayout) -> float:
+    """Thrust model factor of a variant: that of another shape than the layout's."""
+    return 0.5 if layout.thrust_model_factor > 0.75 else 1.0
+
+
+def _shape_slope(factor: float, command: float) -> float:
+    """Slope of the thrust's shape at a command."""
+    return 1 - factor + 2 * factor * command
 
 
 def _rotation_regression(
@@ -257,8 +287,9 @@ def _rotation_regression(
     y = filter_columns(np.convolve(box, change) / (n * dt), [1.0], w)[first::n]
     b, a = low_pass(record.cutoffs[0], dt, record.filter_step)
     # integrals over a step by the trapezoidal rule, and of a derivative exactly
+    trapezoids = np.convolve(boxes, [0.5, 0.5])
     integral, derivative = (
-        np.convolve(b, np.convolve(boxes, x)) for x in ([0.5, 0.5], [1 / dt, -1 / dt])
+        np.convolve(b, x) for x in (trapezoids, np.convolve(boxes, [1 / dt, -1 / dt]))
     )
     through = lambda numerator, x: apply_filter(numerator, a, x)[first::n]
     measured = []
@@ -266,7 +297,7 @@ def _rotation_regression(
         # Regressors that were measured have noise of their own. From before the step it is not
         # correlated with that of the output, which would bias their coefficients.
         i, j = [k for k in range(3) if k != axis]
-        product = filter_columns(np.convolve(boxes, [0.5, 0.5]), [1.0], w[:, i] * w[:, j])
+        product = filter_columns(trapezoids, [1.0], w[:, i] * w[:, j])
         columns = [w[:, axis]] + ([signals.velocity[:, 1 - axis]] if axis < 2 else [])
         # the newest sample is that before the step of the output
         older = filter_columns(np.append(np.zeros(n), boxes), [1.0], np.stack(columns, axis=1))
@@ -280,7 +311,7 @@ def _rotation_regression(
         s = compute_rotor_states(record.commands, dt, *lags)
         T = signals.compute_thrusts(s, factor)
         momentum = apply_filter(b, a, s @ layout.spin)[:, None] * w[:, :2]
-        gyroscopic = filter_columns(np.convolve(boxes, [0.5, 0.5]), [1.0], momentum)[first::n]
+        gyroscopic = filter_columns(trapezoids, [1.0], momentum)[first::n]
         parts = []
         for axis, columns in zip(axes, measured, strict=True):
             sign = 1 if axis == 0 else -1
@@ -296,11 +327,10 @@ def _rotation_regression(
                 rotors = sign * through(integral, np.stack([moment, -np.sum(T, axis=1)], axis=1))
             coupling = [] if axis == 2 else [sign * -gyroscopic[:, [1 - axis]]]
             parts.append(np.hstack([rotors, columns, *coupling]))
-        X = np.zeros((len(y), len(axes), sum(part.shape[1] for part in parts)))
-        place = 0
+        ends = np.cumsum([0, *(part.shape[1] for part in parts)])
+        X = np.zeros((len(y), len(axes), ends[-1]))
         for c, part in enumerate(parts):
-            X[:, c, place : place + part.shape[1]] = part
-            place += part.shape[1]
+            X[:, c, ends[c] : ends[c + 1]] = part
         return Regression(y[:, list(axes)], X, n * dt)
 
     return build
@@ -328,9 +358,8 @@ def _integrate_relation(record: FlightRecord, n: int, values: np.ndarray) -> np.
     # The integral forgets, since a bias that turns with the body would otherwise grow without
     # bound in it.
     pole, share = np.exp(-record.dt / _LEAK), record.dt / n
-    return filter_columns(np.full(n, share), [1.0, -pole], values)[
-        round(_SETTLING / record.dt) :: n
-    ]
+    integral = filter_columns(np.full(n, share), [1.0, -pole], values)
+    return integral[round(_SETTLING / record.dt) :: n]
 
 
 def _thrust_columns(record: FlightRecord, n: int, thrust: np.ndarray) -> np.ndarray:
@@ -388,11 +417,8 @@ def _force_regression(
     # so does the velocity along z, which nothing tells either: a polygon over the flight
     places = np.linspace(record.ts[0], record.ts[-1], nodes)
     for j, node in enumerate(np.eye(nodes)):
-        share = np.interp(record.ts, places, node)
-        columns[:, 0, _FORCE + j], columns[:, 1, _FORCE + j] = (
-            share * rates[:, 1],
-            -share * rates[:, 0],
-        )
+        share = np.interp(record.ts, places, node)[:, None]
+        columns[:, :2, _FORCE + j] = share * rates[:, [1, 0]] * [1, -1]
     # integrals over a step by the trapezoidal rule, as those of the derivatives are exact
     mean = [3, 4, 5, 6, 7, 8, 9, *range(_FORCE, _FORCE + nodes)]
     columns[1:, :, mean] = 0.5 * (columns[1:, :, mean] + columns[:-1, :, mean])
@@ -419,10 +445,7 @@ def _force_regression(
 
 
 def _identify_voltage(
-    record: FlightRecord,
-    layout: RotorLayout,
-    estimates: dict[str, ParameterEstimate],
-    refusals: dict[str, str],
+    record: FlightRecord, layout: RotorLayout, results: _Results
 ) -> tuple[FlightRecord, FlightRecord | None]:
     """Record with commands as the motors feel them, and that for an exponent larger by its deviation.
 
@@ -438,53 +461,56 @@ def _identify_voltage(
             "positive voltages throughout, or none, would be valid."
         )
     if np.ptp(voltage) < _STEADY * np.mean(voltage):
-        refusals["voltage"] = (
+        results.refusals["voltage"] = (
             f"The voltage's part in the thrust is not determined: it changes by {np.ptp(voltage):.2g} V; "
             f"{100 * _STEADY:g} % of it or more would be valid."
         )
         return bare, None
     logarithm = np.log(voltage / np.mean(voltage))
     signals, *_ = _observe_signals(bare, layout)
-    factor, exponent, e = layout.thrust_model_factor, 0.0, None
+    exponent, e = 0.0, None
     for _ in range(_PASSES):
-        felt = record.correct_voltage(exponent)
-        hover = float(np.mean(felt.commands))
-        per_shape = 1 - factor + 2 * factor * hover
-        step = lambda z, h=hover, k=per_shape: (
-            z[_FORCE + 2] * k / (z[_FORCE] + 2 * h * z[_FORCE + 1])
-        )
-        fit, other = [
-            fit_prediction_error(
-                _force_regression(
-                    signals._replace(record=felt), _Variant(_FORCE_RATE), curve=True, voltage=logarithm
-                ),
-                np.array(_START), _BOUNDS, memory,
-            )
+        felt, base = signals._replace(record=record.correct_voltage(exponent)), exponent
+        hover, k = felt.hover, _shape_slope(layout.thrust_model_factor, felt.hover)
+        build = _force_regression(felt, _Variant(_FORCE_RATE), curve=True, voltage=logarithm)
+        fit, other = (
+            fit_prediction_error(build, np.array(_START), _BOUNDS, memory)
             for memory in (_MEMORY, 2 * _MEMORY)
-        ]  # fmt: skip
-        base = exponent
-        e = _Evaluation(fit, [other], _window_count(record)).estimate(
-            "exponent of the voltage", "1", lambda z, b=base, f=step: b + f(z)
         )
+        e = _Evaluation(fit, [other], _window_count(record)).estimate(
+            "exponent of the voltage", "1",
+            lambda z, b=base, h=hover, k=k: b + z[_FORCE + 2] * k / (z[_FORCE] + 2 * h * z[_FORCE + 1]),
+        )  # fmt: skip
         exponent = e.value
         if not e.deviation <= _EXPONENT_DETERMINED or abs(exponent - base) < 0.1 * e.deviation:
             break
     assert e is not None
     if not e.deviation <= _EXPONENT_DETERMINED:
         level = np.log(np.maximum(np.mean(record.commands, axis=1), 1e-3))
-        alike = float(
-            np.corrcoef(filter_columns([1.0], [1.0, -0.99], level - np.mean(level)), logarithm)[
-                0, 1
-            ]
-        )
-        refusals["voltage"] = (
+        level = filter_columns([1.0], [1.0, -0.99], level - np.mean(level))
+        alike = float(np.corrcoef(level, logarithm)[0, 1])
+        results.refusals["voltage"] = (
             f"The voltage's part in the thrust is not determined: its exponent has a deviation of {e.deviation:.2g}; "
             f"{_EXPONENT_DETERMINED:g} or less would be valid. Commands and voltage change together (correlation "
             f"{alike:.2f}); quick manoeuvres in thrust at several voltages would separate them."
         )
         return bare, None
-    estimates["voltage_exponent"] = e
+    results.estimates["voltage_exponent"] = e
     return record.correct_voltage(e.value), record.correct_voltage(e.value + e.deviation)
+
+
+def _observe(
+    record: FlightRecord, layout: RotorLayout, levers: np.ndarray, imu: np.ndarray, drag: np.ndarray,
+    pace: float = 1.0,
+) -> _Signals:  # fmt: skip
+    force = record.accelerometer - levers @ imu
+    signals = _Signals(record, layout, force, *observe_motion(record, force, drag, pace))
+    if not np.all(np.abs(signals.velocity) < _FASTEST):
+        raise SettingError(
+            f"By gyroscope and accelerometer the vehicle would exceed {_FASTEST:g} m/s: are their units rad/s and "
+            "m/s^2?"
+        )
+    return signals
 
 
 def _observe_signals(
@@ -494,18 +520,8 @@ def _observe_signals(
 
     One is faster, the other has a drag that is larger by its standard deviation.
     """
-    drag, levers = np.full(2, _DRAG), _lever_columns(record)
-
-    def observe(imu: np.ndarray, drag: np.ndarray, pace: float = 1.0) -> _Signals:
-        force = record.accelerometer - levers @ imu
-        signals = _Signals(record, layout, force, *observe_motion(record, force, drag, pace))
-        if not np.all(np.abs(signals.velocity) < _FASTEST):
-            raise SettingError(
-                f"By gyroscope and accelerometer the vehicle would exceed {_FASTEST:g} m/s: are their units rad/s and "
-                "m/s^2?"
-            )
-        return signals
-
+    drag = np.full(2, _DRAG)
+    observe = partial(_observe, record, layout, _lever_columns(record))
     # Drag and lever are found from the velocity, which is observed with drag and lever: a few
     # passes agree, since either depends little on the other.
     imu, fit = np.zeros(3), None
@@ -556,8 +572,7 @@ def _compute_slope(
     if "thrust_slope" in estimates:
         return 2 * hover * estimates["thrust_slope"].value
     if "thrust" in estimates:
-        factor = layout.thrust_model_factor
-        return (1 - factor + 2 * factor * hover) * estimates["thrust"].value
+        return _shape_slope(layout.thrust_model_factor, hover) * estimates["thrust"].value
     return None
 
 
@@ -614,42 +629,36 @@ class _Evaluation:
         self, name: str, unit: str, quantity: Callable[..., float], *others: float
     ) -> ParameterEstimate:
         """Estimate of quantity(values), or of quantity(values, other) with other settings of variants."""
-        values = self.fit.values
         of = lambda z: quantity(z, *others[:1])
-        G = _difference_gradient(of, values, self.white)
-        value = float(of(values))
+        G = _difference_gradient(of, self.fit.values, self.white)
+        value = float(of(self.fit.values))
         variance = lambda V: float(max(G @ V @ G, 0.0))
-        blocks, white = variance(self.covariance), variance(self.white)
+        blocks = variance(self.covariance)
         is_of_lags = np.any(G[len(G) - self.fit.lag_count :] != 0)
         # Each window has its own estimate. Scatter beyond the windows' own deviations is what the
         # model leaves out, such as a sagging battery.
         changes, covariances = self.lag_windows if is_of_lags else self.windows
-        window_values = value + changes @ G
-        spread = np.array([variance(V) for V in covariances])
-        scatter, p_value = 0.0, 1.0
-        # a lag at its bound has no deviation
-        if np.all(spread > 0):
-            scatter, p_value = compare_estimates(window_values, np.diag(spread), _LEVEL)
+        spread = np.sqrt([variance(V) for V in covariances])
         excess = []
         for k, (fit, V) in enumerate(self.variants):
             of_variant = lambda z, k=k: quantity(z, *others[k + 1 : k + 2])
             H = _difference_gradient(of_variant, fit.values, fit.white_covariance)
-            difference = float(of_variant(fit.values)) - value
-            # the difference of two estimates of the same quantity has at least this variance
-            # Of two estimates from one record the less efficient one has the larger variance, and
-            # their difference has the excess (Hausman): only a larger difference speaks against
-            # the model.
-            chance = abs(float(H @ V @ H) - blocks)
-            excess.append(max(difference**2 - chance, 0.0))
-        variants = float(np.mean(excess)) if excess else 0.0
+            excess.append((float(of_variant(fit.values)) - value, float(H @ V @ H)))
+        variants = _exceed_chance(excess, blocks)
         # What another pace of the observer, whose errors are then about twice as large, and an error of
         # its drag or of the voltage's exponent, of one deviation, change.
         variants += sum((float(of(fit.values)) - value) ** 2 for fit in self.shifted)
-        deviation = np.sqrt(blocks + scatter**2 + variants)
-        return ParameterEstimate(
-            name, unit, value, float(deviation), np.sqrt(white), np.sqrt(blocks), scatter,
-            np.sqrt(variants), window_values, np.sqrt(spread), p_value,
-        )  # fmt: skip
+        parts = np.sqrt([variance(self.white), blocks, variants])
+        windows = {"window_values": value + changes @ G, "window_deviations": spread}
+        return combine_parts(name, unit, value, *parts, **windows)
+
+
+def _exceed_chance(differences: Sequence[tuple[float, float]], variance: float) -> float:
+    """Mean square of differences of variants beyond chance, by pairs of a difference and the variant's variance."""
+    # Of two estimates from one record the less efficient one has the larger variance, and their
+    # difference has the excess (Hausman): only a larger difference speaks against the model.
+    excess = [max(d**2 - abs(other - variance), 0.0) for d, other in differences]
+    return float(np.mean(excess)) if excess else 0.0
 
 
 def _difference_gradient(
@@ -665,10 +674,7 @@ def _difference_gradient(
 
 
 def identify_flight(
-    record: FlightRecord,
-    layout: RotorLayout,
-    *,
-    progress: Callable[[float], object] | None = None,
+    record: FlightRecord, layout: RotorLayout, *, progress: Callable[[float], object] | None = None
 ) -> FlightIdentification:
     """Identify lag, thrust, effectiveness, IMU position, drag and centre of mass from a flight.
 
@@ -688,9 +694,9 @@ def identify_flight(
     """
     report = progress or (lambda share: None)
     _check_record(record, layout)
-    refusals: dict[str, str] = {}
-    estimates: dict[str, ParameterEstimate] = {}
-    record, further = _identify_voltage(record, layout, estimates, refusals)
+    results = _Results({}, {})
+    estimates, refusals = results
+    record, further = _identify_voltage(record, layout, results)
     report(0.1)
     # Forces come first: they give the lever of the IMU and the drag, without which the moments'
     # regression lacks the velocity.
@@ -698,13 +704,10 @@ def identify_flight(
     bias = _check_gravity(signals)
     other = [] if further is None else [signals._replace(record=further)]
     report(0.2)
-    hover = float(np.mean(record.commands))
     noisy = signals._replace(record=_double_noise(record))
-    translation = _identify_translation(
-        signals, [faster, shifted, noisy, *other], hover, estimates, refusals
-    )
+    translation = _identify_translation(signals, [faster, shifted, noisy, *other], results)
     report(0.35)
-    slope = _compute_slope(signals.layout, hover, estimates)
+    slope = _compute_slope(layout, signals.hover, estimates)
     signals, *shifted = (x._replace(slope=slope) for x in (signals, faster, *other))
     if slope is not None:
         # The accelerometer's bias along z is an error of the thrust that carries, as the slope's is.
@@ -713,27 +716,21 @@ def identify_flight(
         )
         shifted.append(signals._replace(slope=slope * (1 + float(relative))))
     axes = _screen_axes(signals, refusals)
-    excited = list(axes)
     report(0.4)
-    rotation = _identify_rotation(signals, shifted, axes, hover, estimates, refusals)
-    _name_combinations(signals, excited, estimates, refusals)
+    rotation = _identify_rotation(signals, shifted, axes, results)
+    _name_combinations(signals, axes, results)
     report(0.8)
     if {"roll", "pitch"} <= set(estimates):
         _identify_free_centre(signals, estimates)
     report(1.0)
     size = _check_size(layout, estimates)
-    if layout.mass is not None:
-        _scale_by_mass(layout, estimates, refusals)
-    else:
-        refusals["mass"] = (
-            "Masses, forces and inertias: the log determines ratios only; give the mass for SI values."
-        )
+    _scale_by_mass(layout, results)
     if further is None:
         _allow_for_sag(layout, estimates)
     verdict = _judge_estimates(signals, rotation, translation.fit, estimates)
     verdict = verdict._replace(explanation=verdict.explanation + size)
     fits = (rotation.fit if rotation else None, translation.fit)
-    return FlightIdentification(estimates, refusals, verdict, layout, *fits, hover)
+    return FlightIdentification(estimates, refusals, verdict, layout, *fits, signals.hover)
 
 
 def explain_rotation(
@@ -753,11 +750,10 @@ def explain_rotation(
     assert result.rotation is not None
     record = result.correct_voltage(record)
     layout, theta = result.layout, result.rotation.values
-    drag, imu = result.translation.values[3:5], result.translation.values[:3]
-    force = record.accelerometer - _lever_columns(record) @ imu
+    imu, drag = np.split(result.translation.values[:5], [3])
     drag = np.maximum(drag, 0.1 * _DRAG)
-    slope = _compute_slope(layout, result.hover, result.estimates)
-    signals = _Signals(record, layout, force, *observe_motion(record, force, drag), slope)
+    signals = _observe(record, layout, _lever_columns(record), imu, drag)
+    signals = signals._replace(slope=_compute_slope(layout, result.hover, result.estimates))
     n, first = _sample_step(record, _FORCE_RATE), round(_SETTLING / record.dt)
     build = _rotation_regression(signals, [0, 1], _Variant(_FORCE_RATE))
     X = build(result.rotation.lags).X
@@ -784,20 +780,19 @@ def _check_record(record: FlightRecord, layout: RotorLayout) -> None:
         raise SettingError(
             f"The record has {rate:.3g} samples a second; {_FORCE_RATE:g} or more would be valid."
         )
-    for name in ("commands", "gyroscope", "accelerometer"):
-        if not np.all(np.isfinite(getattr(record, name))):
-            raise SettingError(f"The {name} of the record must be finite numbers throughout.")
-    for name, columns in (
-        ("command of motor", record.commands),
-        ("gyroscope's axis", record.gyroscope),
-        ("accelerometer's axis", record.accelerometer),
+    for field, name, labels in (
+        ("commands", "command of motor", range(1, count + 1)),
+        ("gyroscope", "gyroscope's axis", "xyz"),
+        ("accelerometer", "accelerometer's axis", "xyz"),
     ):
+        columns = getattr(record, field)
+        if not np.all(np.isfinite(columns)):
+            raise SettingError(f"The {field} of the record must be finite numbers throughout.")
         constant = np.flatnonzero(np.ptp(columns, axis=0) < _SMALLEST)
         if len(constant):
-            label = constant[0] + 1 if name.endswith("motor") else "xyz"[constant[0]]
             raise SettingError(
-                f"The {name} {label} is {columns[0, constant[0]]:g} throughout the flight; values that change would "
-                "be valid."
+                f"The {name} {labels[constant[0]]} is {columns[0, constant[0]]:g} throughout the flight; values that "
+                "change would be valid."
             )
     changes = np.sum(np.abs(np.diff(record.commands, axis=0)).max(axis=1) > _SMALLEST) / length
     if changes < _SLOWEST:
@@ -814,8 +809,7 @@ def _channel_effect(fit: PredictionErrorFit, channel: int, columns: slice) -> fl
 
 def _screen_axes(signals: _Signals, refusals: dict[str, str]) -> list[int]:
     """Axes that the commands excite, with the order of the motors checked."""
-    layout = signals.layout
-    count = len(layout.positions)
+    layout, count = signals.layout, len(signals.layout.positions)
     axes, responses = [], {}
 
     def fit_axis(axis: int, *, free: bool) -> PredictionErrorFit:
@@ -845,25 +839,19 @@ def _screen_axes(signals: _Signals, refusals: dict[str, str]) -> list[int]:
     return axes
 
 
-def _name_combinations(
-    signals: _Signals,
-    excited: list[int],
-    estimates: dict[str, ParameterEstimate],
-    refusals: dict[str, str],
-) -> None:
+def _name_combinations(signals: _Signals, excited: list[int], results: _Results) -> None:
     """Add which combinations of the motors' responses about roll and pitch an axis that is not excited still tells.
 
     They have no values: without excitation little noise suffices to bias the fit.
     """
     layout, count = signals.layout, len(signals.layout.positions)
-    lag = estimates.get("lag", estimates.get("thrust_lag"))
+    lag = results.estimates.get("lag", results.estimates.get("thrust_lag"))
     lags = np.array([_START[0] if lag is None else lag.value, _START[1]])
     shape = compute_thrust_shape(signals.record.commands, layout.thrust_model_factor)
     for axis in {0, 1} - set(excited):
         # Where the controller alone moves the vehicle, errors of averages over a coarser grid, which depend on the
         # commands, would make its own gain of the responses.
-        build = _rotation_regression(signals, [axis], _Variant(), free=True)
-        regression = build(lags)
+        regression = _rotation_regression(signals, [axis], _Variant(), free=True)(lags)
         fit = fit_prediction_error(lambda _, same=regression: same, np.zeros(0), (), _MEMORY)
         # a vehicle whose radius of gyration is its arm has this effectiveness
         usual = GRAVITY / (count * float(np.mean(shape)) * layout.arms[axis])
@@ -871,25 +859,22 @@ def _name_combinations(
             [f"motor {k + 1}" for k in range(count)], "", fit.values[:count],
             fit.compute_covariance(_BLOCK)[:count, :count], np.full(count, _COMBINED * usual),
         )  # fmt: skip
-        refusals[AXES[axis]] += sentence.replace("Only", "Of the motors' responses only")
+        results.refusals[AXES[axis]] += sentence.replace("Only", "Of the motors' responses only")
 
 
 def _check_order(layout: RotorLayout, responses: dict[int, np.ndarray]) -> None:
     """Refuse motors whose responses about roll and pitch are those of other places."""
-    levers = layout.positions - layout.centre
+    levers, count = layout.positions - layout.centre, len(layout.positions)
     # what motor i does at the place of rotor j
-    match = np.zeros((len(levers), len(levers)))
+    match = np.zeros((count, count))
     for axis, response in responses.items():
         match += np.outer(response, levers[:, 1 - axis] / np.std(levers[:, 1 - axis]))
-    if not responses:
-        return
     # All orders are compared at once by the assignment problem; the layout's own order is refused
     # only if another is clearly better.
     best = optimize.linear_sum_assignment(-match)[1]
-    count = len(levers)
     score, best_score = np.trace(match), np.sum(match[np.arange(count), best])
     most = count * len(responses)
-    if score > 0.7 * most or score > best_score - 0.2 * most:
+    if not responses or score > 0.7 * most or score > best_score - 0.2 * most:
         return
     names = " and ".join(AXES[axis] for axis in responses)
     if len(responses) < 2 or best_score < 0.7 * most:
@@ -919,18 +904,19 @@ def _check_spin(layout: RotorLayout, fit: PredictionErrorFit) -> None:
         )
 
 
+def _fit_rotation(
+    signals: _Signals, axes: list[int], variant: _Variant, start: np.ndarray
+) -> PredictionErrorFit:
+    build = _rotation_regression(signals, axes, variant)
+    return fit_prediction_error(build, start, _BOUNDS, variant.memory)
+
+
 def _identify_rotation(
-    signals: _Signals,
-    shifted: Sequence[_Signals],
-    axes: list[int],
-    hover: float,
-    estimates: dict[str, ParameterEstimate],
-    refusals: dict[str, str],
+    signals: _Signals, shifted: Sequence[_Signals], axes: list[int], results: _Results
 ) -> _Evaluation | None:
     """Estimates of the angular motion about the axes that are excited and determined."""
-    layout = signals.layout
-    factor = layout.thrust_model_factor
-    other_factor = 0.5 if factor > 0.75 else 1.0
+    layout, refusals = signals.layout, results.refusals
+    factor, other_factor = layout.thrust_model_factor, _other_factor(layout)
     # An axis that is not determined is left out and the others are fitted again: its noise would
     # spoil the lag that all of them share.
     while axes:
@@ -940,76 +926,66 @@ def _identify_rotation(
             fit = _fit_rotation(signals, axes, _Variant(memory=memory), np.array(_START))
             if _test_whiteness(fit, 0.0) >= _LEVEL:
                 break
-        variants, factors = [], []
-        for variant in (
-            _Variant(_FORCE_RATE),
-            _Variant(memory=2 * memory),
-            _Variant(memory=memory, factor=other_factor),
-        ):
-            result = _fit_rotation(signals, axes, variant, fit.lags)
-            if variant.factor is None or not _is_rejected(result, fit):
-                variants.append(result)
-                factors.append(factor if variant.factor is None else variant.factor)
+        variants = [
+            _fit_rotation(signals, axes, variant, fit.lags)
+            for variant in (_Variant(_FORCE_RATE), _Variant(memory=2 * memory))
+        ]
+        result = _fit_rotation(
+            signals, axes, _Variant(memory=memory, factor=other_factor), fit.lags
+        )
+        # A variant that the record itself rejects, on the same grid, says nothing about the uncertainty
+        # of the one that fits.
+        difference = len(fit.errors) * 2 * float(np.sum(np.log(result.sigma / fit.sigma)))
+        if not difference > stats.chi2.isf(_LEVEL, 1) * fit.errors.shape[1]:
+            variants.append(result)
         further = [
             _fit_rotation(other, axes, _Variant(memory=memory), fit.lags) for other in shifted
         ]
         evaluation = _Evaluation(fit, variants, _window_count(signals.record), further, _BLOCK)
-        # a thrust shape with another factor has another slope at hover
         # Effectiveness of two thrust shapes is compared at the hover, where the record is: its
         # number at the command 1 differs by the shape alone.
-        slope = lambda f: (1 - f + 2 * f * hover) / (1 - factor + 2 * factor * hover)
-        slopes = [slope(f) for f in (factor, *factors)]
-        new = {
-            "lag": evaluation.estimate("lag", "s", lambda z: z[-2]),
-            "delay": _add_resolution(
-                evaluation.estimate("delay", "s", lambda z: z[-1]), signals.record
-            ),
-        }
-        places = {axis: (2 + _MOMENT) * k for k, axis in enumerate(axes)}
-        for axis, k in places.items():
-            name = AXES[axis]
-            new[name] = evaluation.estimate(
-                f"{name} effectiveness", "rad/s^2", lambda z, f, k=k: z[k] * f, *slopes
+        hover = signals.hover
+        relative_slope = _shape_slope(other_factor, hover) / _shape_slope(factor, hover)
+        slopes = [1.0, 1.0, 1.0, relative_slope][: 1 + len(variants)]
+        quantities: list[tuple[Any, ...]] = [
+            ("lag", "lag", "s", lambda z: z[-2]), ("delay", "delay", "s", lambda z: z[-1]),
+        ]  # fmt: skip
+        for place, axis in enumerate(axes):
+            k, name, letter = (2 + _MOMENT) * place, AXES[axis], "yx"[axis % 2]
+            over_lag, arm = f"{name} effectiveness over lag", layout.arms[axis % 2]
+            centre = lambda z, k=k, arm=arm, origin=layout.centre[1 - axis]: (
+                origin + z[k + 1] / z[k] * arm
             )
-            new[f"{name}_over_lag"] = evaluation.estimate(
-                f"{name} effectiveness over lag",
-                "rad/s^3",
-                lambda z, f, k=k: z[k] * f / z[-2],
-                *slopes,
-            )
-            if axis == 2:
-                new["spin_up"] = evaluation.estimate(
-                    "yaw by spin-up", "rad/s", lambda z, k=k: z[k + 1]
-                )
-                continue
-            new[f"{name}_speed"] = evaluation.estimate(
-                f"{name} by horizontal speed", "rad/(m s)", lambda z, k=k: z[k + 4]
-            )
-            other, letter = 1 - axis, "xy"[1 - axis]
-            new[f"centre_{letter}"] = evaluation.estimate(
-                f"centre of mass {letter}, equal motors",
-                "m",
-                lambda z, k=k, axis=axis, other=other: (
-                    layout.centre[other] + z[k + 1] / z[k] * layout.arms[axis]
+            quantities += [
+                (name, f"{name} effectiveness", "rad/s^2", lambda z, f, k=k: z[k] * f, *slopes),
+                (
+                    f"{name}_over_lag",
+                    over_lag,
+                    "rad/s^3",
+                    lambda z, f, k=k: z[k] * f / z[-2],
+                    *slopes,
                 ),
-            )
+            ]
+            if axis == 2:
+                quantities.append(("spin_up", "yaw by spin-up", "rad/s", lambda z, k=k: z[k + 1]))
+            else:
+                quantities += [
+                    (f"{name}_speed", f"{name} by horizontal speed", "rad/(m s)", lambda z, k=k: z[k + 4]),
+                    (f"centre_{letter}", f"centre of mass {letter}, equal motors", "m", centre),
+                ]  # fmt: skip
         if {0, 1} <= set(axes):
-            new["inertia_ratio"] = evaluation.estimate(
-                "inertia ratio Jy / Jx",
-                "1",
-                lambda z: z[0] / z[2 + _MOMENT] * layout.arms[1] / layout.arms[0],
-            )
-        doubtful = {axis: new[AXES[axis]] for axis in axes}
+            inertia_ratio = lambda z: z[0] / z[2 + _MOMENT] * layout.arms[1] / layout.arms[0]
+            quantities.append(("inertia_ratio", "inertia ratio Jy / Jx", "1", inertia_ratio))
+        new = {key: evaluation.estimate(*quantity) for key, *quantity in quantities}
+        new["delay"] = _add_resolution(new["delay"], signals.record)
         doubtful = {
-            axis: abs(e.deviation / e.value)
-            for axis, e in doubtful.items()
-            if not e.deviation <= _DETERMINED * e.value
+            axis: abs(new[AXES[axis]].deviation / new[AXES[axis]].value)
+            for axis in axes
+            if not new[AXES[axis]].deviation <= _DETERMINED * new[AXES[axis]].value
         }
         if not doubtful:
             if not fit.free[-2]:
-                new = {
-                    name: e for name, e in new.items() if name != "lag" and "over_lag" not in name
-                }
+                new = {name: e for name, e in new.items() if not name.endswith("lag")}
                 refusals["lag"] = (
                     f"The lag is not determined: it ends at the bound of {1e3 * fit.values[-2]:g} ms; rotor speeds "
                     "that were measured have none."
@@ -1021,7 +997,7 @@ def _identify_rotation(
                     "without a delay do so; commands whose time stamps are late or early against the gyroscope's do "
                     "so too, and then lag and effectiveness are biased."
                 )
-            estimates |= new
+            results.estimates.update(new)
             return evaluation
         for axis, relative in doubtful.items():
             refusals[AXES[axis]] = (
@@ -1037,13 +1013,6 @@ def _identify_rotation(
     return None
 
 
-def _fit_rotation(
-    signals: _Signals, axes: list[int], variant: _Variant, start: np.ndarray
-) -> PredictionErrorFit:
-    build = _rotation_regression(signals, axes, variant)
-    return fit_prediction_error(build, start, _BOUNDS, variant.memory)
-
-
 def _add_resolution(delay: ParameterEstimate, record: FlightRecord) -> ParameterEstimate:
     """Estimate whose deviation allows for the times at which commands changed and for the clock of on-board filters."""
     cutoff, clock = record.cutoffs[0], 0.0
@@ -1056,40 +1025,25 @@ def _add_resolution(delay: ParameterEstimate, record: FlightRecord) -> Parameter
     return delay._replace(**dict(zip(("deviation", "variants"), map(float, parts), strict=True)))
 
 
-def _is_rejected(variant: PredictionErrorFit, main: PredictionErrorFit) -> bool:
-    """Test whether the record tells that a variant, on the same grid, is worse than the main fit."""
-    # A variant that the record itself rejects says nothing about the uncertainty of the one that
-    # fits.
-    difference = len(main.errors) * 2 * float(np.sum(np.log(variant.sigma / main.sigma)))
-    return bool(difference > stats.chi2.isf(_LEVEL, 1) * main.errors.shape[1])
-
-
 def _identify_translation(
-    signals: _Signals,
-    shifted: Sequence[_Signals],
-    hover: float,
-    estimates: dict[str, ParameterEstimate],
-    refusals: dict[str, str],
+    signals: _Signals, shifted: Sequence[_Signals], results: _Results
 ) -> _Evaluation:
     """Estimates of thrust, drag and the IMU's position from the specific force."""
-    windows = _window_count(signals.record)
-
+    estimates, refusals = results
     start = np.array(_START)
 
-    def run(setting: tuple[_Signals, _Variant], *, curve: bool) -> PredictionErrorFit:
+    def evaluate(*, curve: bool) -> _Evaluation:
         nonlocal start
-        build = _force_regression(*setting, curve=curve)
-        fit = fit_prediction_error(build, start, _BOUNDS, setting[1].memory)
-        start = fit.lags
-        return fit
+        fits = []
+        for k, setting in enumerate((signals, signals, *shifted)):
+            variant = _Variant(_FORCE_RATE, memory=2 * _MEMORY if k == 1 else _MEMORY)
+            build = _force_regression(setting, variant, curve=curve)
+            fits.append(fit_prediction_error(build, start, _BOUNDS, variant.memory))
+            start = fits[-1].lags
+        return _Evaluation(fits[0], fits[1:2], _window_count(signals.record), fits[2:])
 
-    settings = (
-        (signals, _Variant(_FORCE_RATE)),
-        (signals, _Variant(_FORCE_RATE, memory=2 * _MEMORY)),
-        *((other, _Variant(_FORCE_RATE)) for other in shifted),
-    )
-    main, *others = [run(setting, curve=False) for setting in settings]
-    evaluation = _Evaluation(main, others[:1], windows, others[1:])
+    evaluation = evaluate(curve=False)
+    main = evaluation.fit
     thrust = evaluation.estimate("thrust of a rotor over mass", "m/s^2", lambda z: z[_FORCE])
     effect = _channel_effect(main, 2, slice(_FORCE, _FORCE + 1))
     record, factor = signals.record, signals.layout.thrust_model_factor
@@ -1105,89 +1059,68 @@ def _identify_translation(
         estimates["thrust"] = thrust
         if main.free[-2]:
             estimates["thrust_lag"] = evaluation.estimate("lag of thrust", "s", lambda z: z[-2])
-        curves = [run(setting, curve=True) for setting in settings]
-        _identify_curve(
-            signals,
-            _Evaluation(curves[0], curves[1:2], windows, curves[2:]),
-            hover,
-            estimates,
-            refusals,
-        )
+        _identify_curve(signals, evaluate(curve=True), results)
     else:
         refusals["thrust"] = (
             f"The thrust curve is not excited: collective commands cause {effect:.2g} times what nobody "
             f"commands, and the slope's deviation is {100 * thrust.deviation / abs(thrust.value):.0f} % of it; "
             f"{_EXCITED / 4:g} times or more and {100 * _DETERMINED:.0f} % or less would be valid."
         )
-    for k, letter in enumerate("xyz"):
-        position = evaluation.estimate(
-            f"IMU from centre of mass, {letter}", "m", lambda z, k=k: z[k]
-        )
-        if position.deviation > _IMU_DETERMINED:
-            refusals[f"imu_{letter}"] = (
-                f"The IMU's position along {letter} is not determined: its deviation is "
-                f"{1e3 * position.deviation:.2g} mm; {1e3 * _IMU_DETERMINED:g} mm or less would be valid."
+    for k, x in enumerate("xyz"):
+        e = evaluation.estimate(f"IMU from centre of mass, {x}", "m", lambda z, k=k: z[k])
+        estimates[f"imu_{x}"] = e
+        if e.deviation > _IMU_DETERMINED:
+            del estimates[f"imu_{x}"]
+            refusals[f"imu_{x}"] = (
+                f"The IMU's position along {x} is not determined: its deviation is "
+                f"{1e3 * e.deviation:.2g} mm; {1e3 * _IMU_DETERMINED:g} mm or less would be valid."
             )
-        else:
-            estimates[f"imu_{letter}"] = position
-    for k, letter in enumerate("xyz"):
-        drag = evaluation.estimate(f"drag over mass, {letter}", "1/s", lambda z, k=k: z[3 + k])
-        if not drag.deviation <= _DRAG_DETERMINED or drag.value < -2 * drag.deviation:
-            refusals[f"drag_{letter}"] = (
-                f"The drag along {letter} is not determined: it is {drag.value:.2g} 1/s with a deviation of "
-                f"{drag.deviation:.2g} 1/s; one that is not negative, with {_DRAG_DETERMINED:g} 1/s or less, would be "
+    for k, x in enumerate("xyz"):
+        e = evaluation.estimate(f"drag over mass, {x}", "1/s", lambda z, k=k: z[3 + k])
+        estimates[f"drag_{x}"] = e
+        if not e.deviation <= _DRAG_DETERMINED or e.value < -2 * e.deviation:
+            del estimates[f"drag_{x}"]
+            refusals[f"drag_{x}"] = (
+                f"The drag along {x} is not determined: it is {e.value:.2g} 1/s with a deviation of "
+                f"{e.deviation:.2g} 1/s; one that is not negative, with {_DRAG_DETERMINED:g} 1/s or less, would be "
                 "valid."
             )
-        else:
-            estimates[f"drag_{letter}"] = drag
     return evaluation
 
 
-def _identify_curve(
-    signals: _Signals,
-    evaluation: _Evaluation,
-    hover: float,
-    estimates: dict[str, ParameterEstimate],
-    refusals: dict[str, str],
-) -> None:
+def _identify_curve(signals: _Signals, evaluation: _Evaluation, results: _Results) -> None:
     """Estimates of the curve T/m = c0 + c1 s + c2 s^2 of one rotor.
 
     The offset, which follows from the mean specific force, contains the accelerometer's bias along z.
     """
-    record = signals.record
-    slope = estimates["thrust"].value
+    record, hover, slope = signals.record, signals.hover, results.estimates["thrust"].value
     s = compute_rotor_states(record.commands, record.dt, *evaluation.fit.lags)
     # The integral relation has no constant part: the offset of the curve follows from the mean
     # force, once its slope is known.
     level = float(np.mean(record.accelerometer[:, 2])) / s.shape[1]
     first, second = float(np.mean(s)), float(np.mean(s**2))
-    curve = [
-        evaluation.estimate(f"thrust over mass, {name}", "m/s^2", quantity)
-        for name, quantity in (
-            ("offset", lambda z: level - z[_FORCE] * first - z[_FORCE + 1] * second),
-            ("linear", lambda z: z[_FORCE]),
-            ("quadratic", lambda z: z[_FORCE + 1]),
+    curve = {
+        f"thrust_{name}": evaluation.estimate(f"thrust over mass{text}", "m/s^2", quantity)
+        for name, text, quantity in (
+            ("offset", ", offset", lambda z: level - z[_FORCE] * first - z[_FORCE + 1] * second),
+            ("linear", ", linear", lambda z: z[_FORCE]),
+            ("quadratic", ", quadratic", lambda z: z[_FORCE + 1]),
+            ("slope", " by the square of the command at hover", lambda z: z[_FORCE + 1] + z[_FORCE] / (2 * hover)),
         )
-    ]
-    if curve[2].deviation > _CURVE_DETERMINED * slope:
-        refusals["curve"] = (
-            f"The curvature of the thrust is not determined: its deviation is {curve[2].deviation:.2g} m/s^2 "
-            f"at a slope of {slope:.2g} m/s^2 by the square of the command."
-        )
+    }  # fmt: skip
+    deviation = curve["thrust_quadratic"].deviation
+    if deviation > _CURVE_DETERMINED * slope:
         place = slice(_FORCE, _FORCE + 2)
-        refusals["curve"] += describe_combinations(
+        sentence = describe_combinations(
             ["the linear part", "the quadratic part"], "m/s^2", evaluation.fit.values[place],
             evaluation.covariance[place, place], _CURVE_DETERMINED * slope * np.array([2 * hover, 1.0]),
         )  # fmt: skip
+        results.refusals["curve"] = (
+            f"The curvature of the thrust is not determined: its deviation is {deviation:.2g} m/s^2 "
+            f"at a slope of {slope:.2g} m/s^2 by the square of the command.{sentence}"
+        )
         return
-    estimates |= dict(
-        zip(("thrust_offset", "thrust_linear", "thrust_quadratic"), curve, strict=True)
-    )
-    estimates["thrust_slope"] = evaluation.estimate(
-        "thrust over mass by the square of the command at hover",
-        "m/s^2",
-        lambda z: z[_FORCE + 1] + z[_FORCE] / (2 * hover),
-    )
+    results.estimates.update(curve)
 
 
 def _fit_free_motors(
@@ -1224,16 +1157,14 @@ def _identify_free_centre(signals: _Signals, estimates: dict[str, ParameterEstim
     """
     layout = signals.layout
     n, places = len(layout.positions), _strengths(layout)
-    factor = layout.thrust_model_factor
-    common = _fit_free_motors(signals, _Variant(memory=_MOMENT_MEMORY))
+    variant = _Variant(memory=_MOMENT_MEMORY)
+    common = _fit_free_motors(signals, variant)
     fit, *variants = [
-        _fit_free_motors(signals, variant, common.lags)
-        for variant in (
-            _Variant(memory=_MOMENT_MEMORY),
-            _Variant(_FORCE_RATE),
-            _Variant(memory=_MOMENT_MEMORY, factor=0.5 if factor > 0.75 else 1.0),
+        _fit_free_motors(signals, setting, common.lags)
+        for setting in (
+            variant, _Variant(_FORCE_RATE), variant._replace(factor=_other_factor(layout))
         )
-    ]
+    ]  # fmt: skip
     evaluation = _Evaluation(fit, [common, *variants], _window_count(signals.record), block=_BLOCK)
     levers = layout.positions - layout.centre
     mean = np.mean(np.abs(fit.values[:n])) / layout.arms[0]
@@ -1265,17 +1196,12 @@ def _identify_free_centre(signals: _Signals, estimates: dict[str, ParameterEstim
     ]
     others = [solve(z.values[places], V_z[block]) for z, V_z in evaluation.variants]
     for k, letter in enumerate("xy"):
-        values = np.array([part[0][k] for part in parts])
-        variances = np.array([part[1][k, k] for part in parts])
-        scatter, p_value = compare_estimates(values, np.diag(variances), _LEVEL)
-        blocks = float(np.sqrt(V[k, k]))
-        excess = [max((x[k] - c[k]) ** 2 - abs(W[k, k] - V[k, k]), 0.0) for x, W, _ in others]
-        spread = float(np.sqrt(np.mean(excess)))
-        estimates[f"free_centre_{letter}"] = ParameterEstimate(
-            f"centre of mass {letter}, motors free", "m", float(layout.centre[k] + c[k]),
-            float(np.linalg.norm([blocks, scatter, spread])), float(np.sqrt(V_white[k, k])), blocks,
-            scatter, spread,
-            layout.centre[k] + values, np.sqrt(variances), p_value,
+        differences = [(x[k] - c[k], W[k, k]) for x, W, _ in others]
+        variances = [V_white[k, k], V[k, k], _exceed_chance(differences, V[k, k])]
+        window_values = layout.centre[k] + np.array([part[0][k] for part in parts])
+        estimates[f"free_centre_{letter}"] = combine_parts(
+            f"centre of mass {letter}, motors free", "m", layout.centre[k] + c[k], *np.sqrt(variances),
+            window_values=window_values, window_deviations=np.sqrt([part[1][k, k] for part in parts]),
         )  # fmt: skip
 
 
@@ -1303,42 +1229,41 @@ def _check_size(layout: RotorLayout, estimates: dict[str, ParameterEstimate]) ->
     return sentence
 
 
-def _scale_by_mass(
-    layout: RotorLayout,
-    estimates: dict[str, ParameterEstimate],
-    refusals: dict[str, str],
-) -> None:
+def _scale_by_mass(layout: RotorLayout, results: _Results) -> None:
     """Thrust and moments of inertia in SI units, which scale with the mass and the arms."""
+    estimates, refusals = results
     if layout.mass is None:
-        return
-    if "thrust" not in estimates:
-        for axis, letter in ((0, "x"), (1, "y")):
-            if AXES[axis] in estimates:
-                B, arm = estimates[AXES[axis]], layout.arms[axis]
-                refusals[f"inertia_{letter}"] = (
-                    f"J{letter} and the thrust of a rotor at the command 1 are not determined; only their ratio is: "
-                    f"thrust / J{letter} = {B.value / arm:.4g} +- {B.deviation / arm:.2g} N/(kg m^2)."
-                )
+        refusals["mass"] = (
+            "Masses, forces and inertias: the log determines ratios only; give the mass for SI values."
+        )
         return
     # the slope of the curve where that is determined, else that of the layout's shape
-    thrust = estimates.get("thrust_slope", estimates["thrust"])
-    force = _scale_estimate(thrust, layout.mass, "thrust of a rotor", "N")
-    estimates["force"] = force
-    for axis, letter in ((0, "x"), (1, "y")):
-        if AXES[axis] in estimates:
-            B = estimates[AXES[axis]]
-            value = force.value * layout.arms[axis] / B.value
-            parts = {
-                part: float(
-                    np.hypot(getattr(B, part) / B.value, getattr(force, part) / force.value) * value
-                )
-                for part in ("deviation", "white", "blocks", "windows", "variants")
-            }
-            estimates[f"inertia_{letter}"] = B._replace(
-                name=f"moment of inertia J{letter}", unit="kg m^2", value=value, **parts,
-                window_values=value * B.value / B.window_values,
-                window_deviations=value * B.window_deviations / B.value,
-            )  # fmt: skip
+    thrust = estimates.get("thrust_slope", estimates.get("thrust"))
+    parts = ("deviation", "white", "blocks", "windows", "variants")
+    if thrust is not None:
+        scaled = ("value", *parts, "window_values", "window_deviations")
+        numbers = {part: getattr(thrust, part) * layout.mass for part in scaled}
+        estimates["force"] = thrust._replace(name="thrust of a rotor", unit="N", **numbers)
+    for axis, arm in zip("xy", layout.arms, strict=True):
+        B, force = estimates.get(AXES["xy".index(axis)]), estimates.get("force")
+        if B is None:
+            continue
+        if force is None:
+            refusals[f"inertia_{axis}"] = (
+                f"J{axis} and the thrust of a rotor at the command 1 are not determined; only their ratio is: "
+                f"thrust / J{axis} = {B.value / arm:.4g} +- {B.deviation / arm:.2g} N/(kg m^2)."
+            )
+            continue
+        value = force.value * arm / B.value
+        relative = lambda part, B=B, force=force: np.hypot(
+            getattr(B, part) / B.value, getattr(force, part) / force.value
+        )
+        estimates[f"inertia_{axis}"] = B._replace(
+            name=f"moment of inertia J{axis}", unit="kg m^2", value=value,
+            window_values=value * B.value / B.window_values,
+            window_deviations=value * B.window_deviations / B.value,
+            **{part: float(relative(part) * value) for part in parts},
+        )  # fmt: skip
 
 
 def _allow_for_sag(layout: RotorLayout, estimates: dict[str, ParameterEstimate]) -> None:
@@ -1352,34 +1277,18 @@ def _allow_for_sag(layout: RotorLayout, estimates: dict[str, ParameterEstimate])
         (np.sqrt(12) * estimates[name].windows / estimates[name].value for name in AXES if name in estimates),
         default=0.0,
     )  # fmt: skip
-    sizes = {
-        f"centre_{x}": estimates[f"centre_{x}"].value - layout.centre[k]
-        for k, x in enumerate("xy")
-        if f"centre_{x}" in estimates
+    origins = {
+        "centre_x": layout.centre[0],
+        "centre_y": layout.centre[1],
+        "inertia_x": 0,
+        "inertia_y": 0,
     }
-    sizes |= {
-        name: estimates[name].value for name in ("inertia_x", "inertia_y") if name in estimates
-    }
-    for name, size in sizes.items():
-        e, part = estimates[name], float(change * size)
+    for name in estimates.keys() & origins.keys():
+        e = estimates[name]
+        part = float(change * (e.value - origins[name]))
         estimates[name] = e._replace(
             deviation=float(np.hypot(e.deviation, part)), variants=float(np.hypot(e.variants, part))
         )
-
-
-def _scale_estimate(e: ParameterEstimate, scale: float, name: str, unit: str) -> ParameterEstimate:
-    """Estimate of a multiple of a quantity."""
-    parts = (
-        "value",
-        "deviation",
-        "white",
-        "blocks",
-        "windows",
-        "variants",
-        "window_values",
-        "window_deviations",
-    )
-    return e._replace(name=name, unit=unit, **{part: getattr(e, part) * scale for part in parts})
 
 
 def _judge_estimates(
@@ -1402,16 +1311,18 @@ def _judge_estimates(
                 f"Windows disagree most about the {estimates[least].name}; its deviation contains the scatter."
             )
         tests = _test_terms(signals, rotation.fit, translation, estimates)
-        for name, (p_value, sentence) in tests.items():
-            p_values[name] = p_value
-            if p_value < _LEVEL:
-                sentences.append(sentence)
         if rotation.fit.free[-2] and not rotation.fit.free[-1]:
-            p_values["delay"] = _test_bound(rotation.fit)
-            if p_values["delay"] < _LEVEL:
-                sentences.append(
-                    "The gyroscope follows the commands best with a delay beyond its bound: their time stamps differ."
-                )
+            # The score of the delay, less what the free values can take on.
+            fit = rotation.fit
+            J = fit.slopes.reshape(-1, len(fit.values))
+            column = J[:, -1] - J[:, fit.free] @ solve_columns(J[:, fit.free], J[:, -1])
+            score = abs(column @ fit.errors.ravel()) / np.linalg.norm(column)
+            tests["delay"] = (
+                float(stats.norm.sf(score)),
+                "The gyroscope follows the commands best with a delay beyond its bound: their time stamps differ.",
+            )
+        p_values |= {name: p_value for name, (p_value, _) in tests.items()}
+        sentences += [sentence for p_value, sentence in tests.values() if p_value < _LEVEL]
         p_values["whiteness"] = _test_whiteness(rotation.fit)
         if p_values["whiteness"] < _LEVEL / 6:
             sentences.append("Prediction errors are correlated in time; blocks allow for it.")
@@ -1424,17 +1335,14 @@ def _judge_estimates(
     if rotation is not None and not rotation.fit.is_converged:
         significant.append("search")
         sentences.append("The search for lag and effectiveness did not converge.")
+    status, summary = "consistent", f"none of {len(p_values)} tests rejects the model."
+    if significant:
+        names = ", ".join(significant)
+        status, summary = "inconsistent", f"{names} (family-wise level {_LEVEL:g})."
     if not p_values:
         status = "undecided"
-        sentences = ["Undecided: no axis of the angular motion is identified, so no test is made."]
-    elif significant:
-        status = "inconsistent"
-        sentences.insert(
-            0, f"Inconsistent: {', '.join(significant)} (family-wise level {_LEVEL:g})."
-        )
-    else:
-        status = "consistent"
-        sentences.insert(0, f"Consistent: none of {len(p_values)} tests rejects the model.")
+        summary = "no axis of the angular motion is identified, so no test is made."
+    sentences.insert(0, f"{status.capitalize()}: {summary}")
     return FlightVerdict(status, p_values, " ".join(sentences))
 
 
@@ -1477,50 +1385,36 @@ def _test_terms(
         total = np.sum(T, axis=1, keepdims=True)
         return -T * filter_columns([1 - keep], [1.0, -keep], total / np.mean(total) - 1)
 
-    def test(name: str) -> tuple[float, float]:
-        """Share of a term by the moments, and its variance: what is wrong is wrong about all axes alike."""
-        terms = apply_filter(b, a, change(name, rotation.lags) @ (sides[:, axes] * effectiveness))
-        share, V, _ = rotation.test_columns(terms[round(_SETTLING / dt) :, :, None], _BLOCK)
-        return float(share[0]), float(V[0, 0])
-
     results = {}
     for name, sentence in (
         ("trend", "Effectiveness changes by {:.0f} % through the flight."),
         ("curve", "Thrust has a linear part of {:.0f} % of the slope beside the assumed curve."),
-    ):
-        share, variance = test(name)
-        excess = max(abs(share) - _NEGLIGIBLE, 0.0)
-        p = min(1.0, 2 * float(stats.norm.sf(excess / np.sqrt(variance))))
-        results[name] = (p, sentence.format(100 * share))
-    n = _sample_step(record, _FORCE_RATE)
-    for name, sentence in (
         ("lag", "Thrust responds to commands as if by a second lag behind the first."),
         (
             "sag",
             "Thrust falls by {:.2g} % with 1 % of collective within seconds, as a battery sags.",
         ),
     ):
+        # Share of the term by the moments: what is wrong is wrong about all axes alike.
+        terms = apply_filter(b, a, change(name, rotation.lags) @ (sides[:, axes] * effectiveness))
+        by_moments, V, _ = rotation.test_columns(terms[round(_SETTLING / dt) :, :, None], _BLOCK)
+        share, variance = float(by_moments[0]), float(V[0, 0])
+        if name in ("trend", "curve"):
+            excess = max(abs(share) - _NEGLIGIBLE, 0.0)
+            p = min(1.0, 2 * float(stats.norm.sf(excess / np.sqrt(variance))))
+            results[name] = (p, sentence.format(100 * share))
+            continue
         thrust = translation.values[_FORCE] * np.sum(change(name, translation.lags), axis=1)
         column = np.zeros((len(translation.noise), 3, 1))
-        column[:, 2] = _thrust_columns(record, n, thrust[:, None])
+        column[:, 2] = _thrust_columns(record, _sample_step(record, _FORCE_RATE), thrust[:, None])
         by_force, V, _ = translation.test_columns(column, _BLOCK)
-        by_moments, variance = test(name)
         # Forces and moments estimate the same quantity independently: weighted together they
         # detect a smaller one than either does.
         weights = np.array([1 / V[0, 0], 1 / variance])
-        share = float(weights @ [by_force[0], by_moments] / np.sum(weights))
+        share = float(weights @ [by_force[0], share] / np.sum(weights))
         p = float(stats.norm.sf(share * np.sqrt(np.sum(weights))))
         results[name] = (p, sentence.format(share))
     return results
-
-
-def _test_bound(fit: PredictionErrorFit) -> float:
-    """P-value of the score of the last value, which ended at a bound."""
-    J = fit.slopes.reshape(-1, len(fit.values))
-    free = J[:, fit.free]
-    scale = np.linalg.norm(free, axis=0)
-    column = J[:, -1] - free @ (np.linalg.lstsq(free / scale, J[:, -1], rcond=None)[0] / scale)
-    return float(stats.norm.sf(abs(column @ fit.errors.ravel()) / np.linalg.norm(column)))
 
 
 def _test_whiteness(fit: PredictionErrorFit, share: float = 1.0) -> float:

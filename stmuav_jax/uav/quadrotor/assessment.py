@@ -14,7 +14,7 @@ are white, so that NIS is averaged over times and seeds. All are of the settled 
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -40,13 +40,12 @@ from .model import (
     attitude_model,
     observable_model,
     report_model,
-    report_prior,
     swinging_model,
 )
 
 Kind = Literal["observable", "report", "printed", "attitude"]
 
-KINDS = ("observable", "report", "printed", "attitude")
+KINDS = get_args(Kind)
 
 # Period of the chosen motion of cases 5 to 8 [s].
 PERIOD = 2.0
@@ -81,11 +80,7 @@ class FilterTuning(eqx.Module):
         return jnp.tensordot(jnp.asarray(self.output_matrix), mean, axes=1)
 
 
-def report_tuning(
-    kind: Kind = "report",
-    *,
-    parameters: Parameters = PART_III,
-) -> FilterTuning:
+def report_tuning(kind: Kind = "report", *, parameters: Parameters = PART_III) -> FilterTuning:
     """Tuning of Table 2.4.2: prior, Q, R and the rule's alpha, beta, kappa.
 
     Args:
@@ -96,18 +91,12 @@ def report_tuning(
     value = parameters.value
     rule = Unscented(value("filter.alpha"), value("filter.beta"), value("filter.kappa"))
     model, state_map = _make_model(kind, value("filter.Q"), value("filter.R"), parameters)
-    if kind == "attitude":
-        prior = _on_rotations(report_prior(parameters))
-    else:
-        prior = report_prior(parameters, states=state_map.shape[1])
+    prior = _make_prior(kind, value("filter.start"), value("filter.P0"))
     return FilterTuning("report", model, prior, GaussianFilter(rule), state_map)
 
 
 def consistent_tuning(
-    case: int,
-    kind: Kind = "observable",
-    *,
-    parameters: Parameters = PART_III,
+    case: int, kind: Kind = "observable", *, parameters: Parameters = PART_III
 ) -> FilterTuning:
     """Tuning whose covariances are consistent with the errors; see the module.
 
@@ -130,11 +119,7 @@ def consistent_tuning(
     # The prior covers the report's start, which lies up to 6 rad/s from the truth; its own P_0 allows
     # errors of 0.001 rad/s.
     deviations = np.array([*[WIDE["angle"]] * 3, *rates, *wide])
-    if kind == "observable":
-        prior = gaussian(start[OBSERVABLE], np.diag(deviations[OBSERVABLE]) ** 2)
-    else:
-        prior = gaussian(start, np.diag(deviations) ** 2)
-        prior = _on_rotations(prior) if kind == "attitude" else prior
+    prior = _make_prior(kind, start, deviations**2)
     return FilterTuning("consistent", model, prior, DEFAULT, state_map)
 
 
@@ -142,21 +127,26 @@ def _make_model(
     kind: Kind, Q: Any, R: Any, parameters: Parameters
 ) -> tuple[StateSpaceModel, np.ndarray]:
     """Model with a constant centre of mass, and the matrix from its errors to (Omega, offset)."""
+    if kind not in KINDS:
+        raise SettingError(f"The model must be one of {', '.join(KINDS)}, not '{kind}'.")
     Q = np.asarray(Q)
-    last = np.eye(5, 8, k=3)
     if kind == "observable":
         return observable_model(Q=Q[OBSERVABLE], R=R, parameters=parameters), np.eye(5)
     if kind == "attitude":
-        return attitude_model(Q, R, parameters=parameters), last
-    if kind == "printed":
-        return report_model("printed", "euler", Q=Q, R=R, parameters=parameters), last
-    if kind != "report":
-        raise SettingError(f"The model must be one of {', '.join(KINDS)}, not '{kind}'.")
-    return report_model(Q=Q, R=R, parameters=parameters), last
+        model = attitude_model(Q, R, parameters=parameters)
+    elif kind == "printed":
+        model = report_model("printed", "euler", Q=Q, R=R, parameters=parameters)
+    else:
+        model = report_model(Q=Q, R=R, parameters=parameters)
+    return model, np.eye(5, 8, k=3)
 
 
-def _on_rotations(prior: Gaussian) -> Gaussian:
-    """Prior of 8 states with Euler parameters for its angles (roll, pitch, yaw of R_Z R_X R_Y)."""
+def _make_prior(kind: Kind, mean: Any, variances: Any) -> Gaussian:
+    """Prior from those of 8 states, for "attitude" with Euler parameters for the angles (R_Z R_X R_Y)."""
+    states = OBSERVABLE if kind == "observable" else slice(8)
+    prior = gaussian(np.asarray(mean)[states], np.diag(np.asarray(variances)[states]))
+    if kind != "attitude":
+        return prior
     phi, theta, psi = (prior.mean[i] for i in range(3))
     p = product(turn_about(psi, 2), product(turn_about(phi, 0), turn_about(theta, 1)))
     return Gaussian({"p": p, "omega": prior.mean[3:6], "offset": prior.mean[6:]}, prior.factor)

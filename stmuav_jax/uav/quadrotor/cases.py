@@ -24,13 +24,7 @@ from ...estimation.model import rk4_step
 from ...math.compiler import outer_jit
 from ...math.rotation import from_rotation_vector, product
 from ...mechanics.parameters import Parameters
-from .model import (
-    PART_III,
-    Quadrotor,
-    state_rates,
-    thrust_moment,
-    turn_attitude,
-)
+from .model import PART_III, Quadrotor, state_rates, thrust_moment, turn_attitude
 
 CASES = tuple(range(1, 9))
 
@@ -47,10 +41,8 @@ def thrusts(case: int, t: Any) -> Float[Array, "4 *s"]:
     t = jnp.asarray(t)
     ones, phase = jnp.ones_like(t), 2 * jnp.pi * t
     kind = (case - 1) % 4
-    if kind == 0:
-        return jnp.stack([10.0 * ones] * 4)
-    if kind == 1:
-        return jnp.stack([7.0 * ones, 9.0 * ones, 11.0 * ones, 13.0 * ones])
+    if kind <= 1:
+        return jnp.stack([F * ones for F in ((10.0,) * 4, (7.0, 9.0, 11.0, 13.0))[kind]])
     if kind == 2:
         return jnp.stack([10 + 5 * jnp.sin(phase)] * 4)
     s, c = 2 * jnp.sin(phase), 2 * jnp.cos(phase)
@@ -190,11 +182,27 @@ def _simulate_case(
     kicks = kicks if world.walk else kicks.at[:, 6:].set(0.0)
     dt = t[1] - t[0]
 
+    h = dt / world.substeps
+
     def simulate_step(carry: tuple, now: tuple) -> tuple:
         p, omega, walk = carry
         t0, thrust, kick = now
         thrust = thrust[:, None]
-        p, omega = _step_motion(equations, world, moves, p, omega, walk, t0, dt, thrust)
+
+        def turn(w: Array, t: Array) -> Array:
+            offset = _centre_path(moves, t, walk)
+            moment = thrust_moment(offset, thrust, equations.arm, equations.moments)
+            return equations.spin(w, moment)
+
+        # written out, one substep after the other, the compiler computes each again for those after it,
+        # which takes six times as long
+        def integrate_substep(k: Array, motion: tuple[Array, Array]) -> tuple[Array, Array]:
+            p, omega = motion
+            now = t0 + k * h
+            end = rk4_step(lambda w, s: turn(w, now + s), omega, h)
+            return turn_attitude(p, omega, end, turn(omega, now), turn(end, now + h), h), end
+
+        p, omega = jax.lax.fori_loop(0, world.substeps, integrate_substep, (p, omega))
         p = product(p, from_rotation_vector(kick[:3]))
         omega, walk = omega + kick[3:6], walk + kick[6:]
         offset = _centre_path(moves, t0 + dt, walk)
@@ -214,32 +222,3 @@ def _simulate_case(
 def _centre_path(moves: bool, t: Array, walk: Array) -> Float[Array, "2 s"]:
     """Centre of mass [m]: that of the case plus the random walk's displacement."""
     return case_offsets(5 if moves else 1, t)[:, None] + walk
-
-
-def _step_motion(
-    equations: Quadrotor,
-    world: World,
-    moves: bool,
-    p: Array,
-    omega: Array,
-    walk: Array,
-    t: Array,
-    dt: Array,
-    thrust: Array,
-) -> tuple[Array, Array]:
-    """Attitude and body rates after one step, by substeps of RK4."""
-    h = dt / world.substeps
-
-    def f(w: Array, t: Array) -> Array:
-        offset = _centre_path(moves, t, walk)
-        return equations.spin(w, thrust_moment(offset, thrust, equations.arm, equations.moments))
-
-    # written out, one substep after the other, the compiler computes each again for those after it,
-    # which takes six times as long
-    def integrate_substep(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        p, omega = carry
-        now = t + k * h
-        end = rk4_step(lambda w, s: f(w, now + s), omega, h)
-        return turn_attitude(p, omega, end, f(omega, now), f(end, now + h), h), end
-
-    return jax.lax.fori_loop(0, world.substeps, integrate_substep, (p, omega))

@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 
 from ...checks.errors import ModelError, SettingError
 from ...estimation.gaussians import Gaussian, gaussian
-from ...estimation.model import Sensor, StateSpaceModel, Step, euler, rk4, rk4_step
+from ...estimation.model import Sensor, StateSpaceModel, euler, rk4, rk4_step
 from ...math import lapack
 from ...math.rotation import cross, from_rotation_vector, product, relative_acceleration
 from ...math.space import Composite, Rotation, Vector
@@ -73,12 +73,9 @@ PART_III = Parameters("PART_III", {
 
 _ANGLES = ("phi (roll angle)", "theta (pitch angle)", "psi (yaw angle)")
 _OBSERVABLE = (
-    "Omega_x (roll rate)",
-    "Omega_y (pitch rate)",
-    "Omega_z (yaw rate)",
-    "offset_x (centre of mass, x)",
-    "offset_y (centre of mass, y)",
-)
+    "Omega_x (roll rate)", "Omega_y (pitch rate)", "Omega_z (yaw rate)",
+    "offset_x (centre of mass, x)", "offset_y (centre of mass, y)",
+)  # fmt: skip
 _SWING = ("swing_x [m]", "swing_y [m]", "swing rate_x [m]", "swing rate_y [m]")
 
 # the observable components of q
@@ -164,25 +161,18 @@ class Quadrotor(eqx.Module):
         """Centre of mass relative to the epicentre [m], of the states without the angles."""
         return x[3:5] if self.frequency is None else x[3:5] + x[5:7]
 
-    def spin(
-        self, omega: Float[Array, "3 *s"], moment: Float[Array, "3 *s"]
-    ) -> Float[Array, "3 *s"]:
+    def spin(self, omega: Float[Array, "3 *s"], moment: Array) -> Float[Array, "3 *s"]:
         """Angular acceleration [rad/s^2] under a moment [N m]."""
         lanes = (1,) * (omega.ndim - 1)
         J, back = (matrix.reshape(3, 3, *lanes) for matrix in (self.J, self.J_inverse))
         return apply_matrix(back, moment - cross(omega, apply_matrix(J, omega)))
 
-    def turning(
-        self, x: Float[Array, "n *s"], u: Float[Array, "rotors *#s"]
-    ) -> Float[Array, "3 *s"]:
-        """Angular acceleration [rad/s^2] under thrusts u [N], of the states without the angles."""
-        moment = thrust_moment(self.centre(x), u, self.arm, self.moments)
-        return self.spin(x[:3], moment)
+    def turning(self, x: Float[Array, "n *s"], u: Array) -> Float[Array, "3 *s"]:
+        """Angular acceleration [rad/s^2] under thrusts u (4, ...) [N], of the states without the angles."""
+        return self.spin(x[:3], thrust_moment(self.centre(x), u, self.arm, self.moments))
 
-    def __call__(
-        self, x: Float[Array, "n *s"], u: Float[Array, "rotors *#s"]
-    ) -> Float[Array, "n *s"]:
-        """Rates of all states under thrusts u [N]."""
+    def __call__(self, x: Float[Array, "n *s"], u: Array) -> Float[Array, "n *s"]:
+        """Rates of all states under thrusts u (4, ...) [N]."""
         angles, rest = self.split(x)
         # The centre of mass is constant; process noise lets its estimate follow changes.
         parts = [self.turning(rest, u), jnp.zeros_like(rest[3:5])]
@@ -207,9 +197,7 @@ class Quadrotor(eqx.Module):
 
 
 def state_rates(
-    parameters: Parameters = PART_III,
-    kinematics: Kinematics | None = "corrected",
-    **options: Any,
+    parameters: Parameters = PART_III, kinematics: Kinematics | None = "corrected", **options: Any
 ) -> Quadrotor:
     """Function q'(q, u) of the 8 states, or the last 5 if kinematics=None, and thrusts (4,) [N]."""
     J = jnp.asarray(parameters.value("inertia"))
@@ -239,11 +227,8 @@ class AttitudeStep(eqx.Module):
         w, offset = x["omega"], x["offset"]
         rate = lambda w: self.equations.turning(jnp.concatenate([w, offset]), u)
         end = rk4_step(lambda w, _: rate(w), w, h)
-        return {
-            "p": turn_attitude(x["p"], w, end, rate(w), rate(end), h),
-            "omega": end,
-            "offset": offset,
-        }
+        p = turn_attitude(x["p"], w, end, rate(w), rate(end), h)
+        return {"p": p, "omega": end, "offset": offset}
 
 
 class AttitudeReadings(eqx.Module):
@@ -286,9 +271,8 @@ def report_model(
         Q: covariance of the process noise (8,) or (8, 8), per step; by default that of Table 2.4.2.
         R: covariance of the measurements' noise (3,) or (3, 3) [rad^2/s^2]; by default likewise.
     """
-    equations = state_rates(parameters, kinematics)
     Q = parameters.value("filter.Q") if Q is None else Q
-    return _make_model(equations, _make_stepper(equations, propagation), Q, R, parameters)
+    return _make_model(state_rates(parameters, kinematics), propagation, Q, R, parameters)
 
 
 def observable_model(
@@ -307,9 +291,8 @@ def observable_model(
         Q: covariance of the process noise (5,) or (5, 5), per step.
         R: covariance of the measurements' noise (3,) or (3, 3).
     """
-    equations = state_rates(parameters, None)
     Q = np.asarray(parameters.value("filter.Q"))[OBSERVABLE] if Q is None else Q
-    return _make_model(equations, _make_stepper(equations, propagation), Q, R, parameters)
+    return _make_model(state_rates(parameters, None), propagation, Q, R, parameters)
 
 
 def attitude_model(
@@ -359,24 +342,19 @@ def swinging_model(
     if Q is None:
         Q = np.append(np.array(parameters.value("true.Q"))[OBSERVABLE], np.zeros(4))
     R = parameters.value("true.R") if R is None else R
-    return _make_model(equations, rk4(equations), Q, R, parameters)
-
-
-def _make_stepper(equations: Quadrotor, propagation: Propagation) -> Step:
-    if propagation not in ("rk4", "euler"):
-        raise SettingError(f"propagation is 'rk4' or 'euler', not '{propagation}'.")
-    return rk4(equations) if propagation == "rk4" else euler(equations)
+    return _make_model(equations, "rk4", Q, R, parameters)
 
 
 def _make_model(
-    equations: Quadrotor, step: Step, Q: Any, R: Any, parameters: Parameters
+    equations: Quadrotor, propagation: Propagation, Q: Any, R: Any, parameters: Parameters
 ) -> StateSpaceModel:
+    if propagation not in ("rk4", "euler"):
+        raise SettingError(f"propagation is 'rk4' or 'euler', not '{propagation}'.")
+    step = rk4(equations) if propagation == "rk4" else euler(equations)
     R = parameters.value("filter.R") if R is None else R
     sensor = _make_sensor(BodyRates(equations), R, accelerometer=False)
-    space = Vector(len(equations.names))
-    return StateSpaceModel(
-        step, noise_matrix(Q), sensor, space=space, names=equations.names, stacked=True
-    )
+    space, names = Vector(len(equations.names)), equations.names
+    return StateSpaceModel(step, noise_matrix(Q), sensor, space=space, names=names, stacked=True)
 
 
 def _make_sensor(readings: Any, R: Any, accelerometer: bool) -> Sensor:

@@ -8,7 +8,7 @@ number of entries.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +29,7 @@ from ..drag import AirframeDrag
 from ..environment.wind import Gusts, dryden, low_altitude
 from ..motor import MotorRotors
 from ..rotor import Rotors
-from ..tracker.bodies import PanelStart, place_on_base, posture
+from ..tracker.bodies import OptionForces, PanelStart, place_on_base, posture, replace_numbers
 from ..tracker.geometry import initial_angles, tracker_geometry
 
 
@@ -127,20 +127,6 @@ class FlightStart(AbstractStart):
 # --- what the options build
 
 
-class RotorsAndAir(NamedTuple):
-    """Rotors, air and gear of a scene.
-
-    Attributes:
-        forces: the elements. parameters: the scene's table with the numbers they have.
-        unused: prefixes of the table's lines that nothing uses. notes: a sentence, or none.
-    """
-
-    forces: tuple[AbstractForce, ...]
-    parameters: Parameters
-    unused: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
 def flight_forces(
     rotors: Rotors,
     weight: Numbers,
@@ -150,7 +136,7 @@ def flight_forces(
     wind: Wind | Numbers | Callable[..., object] | None = None,
     motor: Motor | None = None,
     gear: Gear | None = None,
-) -> RotorsAndAir:
+) -> OptionForces:
     """The rotors and what the given options add; None costs nothing.
 
     Args:
@@ -167,57 +153,45 @@ def flight_forces(
         raise ModelError(
             "Wind acts through the airframe's drag: give drag=Drag() with it (--drag)."
         )
-    groups: dict[str, object] = {"drag": drag, "motor": motor, "gear": gear}
-    for group, option in groups.items():
-        if option is not None:
-            option_values = {f"{group}.{k}": v for k, v in vars(option).items() if v is not None}
-            parameters = parameters.replaced(option_values)
+    table = replace_numbers(parameters, {"drag": drag, "motor": motor, "gear": gear})
+    take = lambda group, *names: {k: table.value(f"{group}.{k}") for k in names}
+    air: Any = wind
     if isinstance(wind, Wind):
         wind_values = {
             "wind.mean": wind.mean, "gust.height": wind.height, "gust.speed_20ft": wind.speed_20ft,
         }  # fmt: skip
-        parameters = parameters.replaced({k: v for k, v in wind_values.items() if v is not None})
-        air = _make_wind(parameters, wind)
-    else:
-        air = wind
-    forces: list[AbstractForce] = [_make_motors(rotors, weight, parameters) if motor else rotors]
+        table = table.replaced({k: v for k, v in wind_values.items() if v is not None})
+        air = _make_wind(table, wind)
+    forces: list[AbstractForce] = [rotors]
+    if motor is not None:
+        limits = RotorLimits(**take("motor", "lowest", "highest"))
+        check_lift(rotors, limits, weight)
+        numbers = take("motor", "time_constant", "inertia")
+        forces = [MotorRotors(rotors, **numbers, limits=limits)]
     if drag is not None:
-        numbers = {k: parameters.value(f"drag.{k}") for k in ("linear", "quadratic")}
-        centre = parameters.value("drag.centre")
+        numbers, centre = take("drag", "linear", "quadratic"), table.value("drag.centre")
         forces.append(AirframeDrag(rotors.body, **numbers, point=centre, wind=air))
     if gear is not None:
-        forces.append(_make_gear(rotors.body, parameters))
+        # Plain numbers stay with NumPy, since each operation of JAX outside of a program costs a compilation.
+        lengths = take("gear", "spread", "depth").values()
+        spread, depth = as_numpy([as_floats(length) for length in lengths])
+        corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+        feet = array_module(spread, depth).concatenate(
+            [spread * corners, -depth * np.ones((4, 1))], axis=1
+        )
+        numbers = take("gear", "stiffness", "damping", "width", "friction", "slip_speed")
+        height = table.value("gear.ground")
+        forces.append(GroundContact(rotors.body, feet=feet, height=height, **numbers))
+    is_wind = isinstance(wind, Wind)
     used = {
-        "drag.": drag is not None,
-        "wind.": isinstance(wind, Wind),
-        "gust.": isinstance(wind, Wind) and wind.gusts,
-        "motor.": motor is not None,
-        "gear.": gear is not None,
-    }
+        "drag.": drag is not None, "wind.": is_wind, "gust.": is_wind and wind.gusts,
+        "motor.": motor is not None, "gear.": gear is not None,
+    }  # fmt: skip
     options_by_label = {"drag": drag, "wind": wind, "motors": motor, "landing gear": gear}
     names = ", ".join(name for name, option in options_by_label.items() if option is not None)
     notes = (f"Not in the report: {names}.",) if names else ()
     unused = tuple(group for group, is_used in used.items() if not is_used)
-    return RotorsAndAir(tuple(forces), parameters, unused, notes)
-
-
-def _make_motors(rotors: Rotors, weight: Numbers, parameters: Parameters) -> MotorRotors:
-    limits = RotorLimits(parameters.value("motor.lowest"), parameters.value("motor.highest"))
-    check_lift(rotors, limits, weight)
-    numbers = {k: parameters.value(f"motor.{k}") for k in ("time_constant", "inertia")}
-    return MotorRotors(rotors, **numbers, limits=limits)
-
-
-def _make_gear(body: str, parameters: Parameters) -> GroundContact:
-    lengths = [as_floats(parameters.value(f"gear.{k}")) for k in ("spread", "depth")]
-    spread, depth = as_numpy(lengths)
-    # Plain numbers stay with NumPy, since each operation of JAX outside of a program costs a compilation.
-    module = array_module(spread, depth)
-    corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    feet = module.concatenate([spread * corners, -depth * np.ones((4, 1))], axis=1)
-    keys = ("stiffness", "damping", "width", "friction", "slip_speed")
-    numbers = {k: parameters.value(f"gear.{k}") for k in keys}
-    return GroundContact(body, feet=feet, height=parameters.value("gear.ground"), **numbers)
+    return OptionForces(tuple(forces), table, unused, notes)
 
 
 def _make_wind(parameters: Parameters, wind: Wind) -> Numbers | Gusts:

@@ -63,10 +63,19 @@ def tracker(
     drive = slider_drive(parameters, servo=servo, stops=stops, friction=friction)
     unused = ("spin.", "workspace.", *drive.unused)
     joints = tracker_joints(parameters, GROUND)
+    loads: tuple[AbstractForce, ...]
+    if case == 2:
+        loads = (AppliedForce("panel_7", parameters.value("case_2.force")),)
+    elif case == 3:
+        loads = (AppliedMoment("panel_7", parameters.value("case_3.moment"), frame="body"),)
+    else:
+        peak = jnp.array([0.0, 0.0, 1.0]) * parameters.value("case_1.force")
+        lift = Sine(peak, parameters.value("case_1.angular_frequency"))
+        loads = tuple(AppliedForce(name, lift) for name in ("slider_2", "slider_3"))
     system = System(
         tracker_bodies(parameters),
         (*joints, *stroke_drivers(joints, strokes)),
-        (*_actuator_loads(case, parameters), *drive.forces),
+        (*loads, *drive.forces),
     )
     return Scene(
         name=f"tracker_{case}",
@@ -79,18 +88,8 @@ def tracker(
         notes=(
             "Joint positions are reconstructed, not printed (docs/report_machine.md).",
             "J'_7 of Table 6.2 violates the triangle inequality by 0.7 % through rounding; admitted.",
-            f"{drive.note} No gravity, as printed.",
+            f"{drive.notes[0]} No gravity, as printed.",
             *((STARTED,) if start is not None else ()),
         ),
         watch=("slider_2", "slider_3", "panel_7"),
     )
-
-
-def _actuator_loads(case: int, parameters: Parameters) -> tuple[AbstractForce, ...]:
-    if case == 2:
-        return (AppliedForce("panel_7", parameters.value("case_2.force")),)
-    if case == 3:
-        return (AppliedMoment("panel_7", parameters.value("case_3.moment"), frame="body"),)
-    peak = jnp.array([0.0, 0.0, 1.0]) * parameters.value("case_1.force")
-    lift = Sine(peak, parameters.value("case_1.angular_frequency"))
-    return tuple(AppliedForce(name, lift) for name in ("slider_2", "slider_3"))

@@ -39,7 +39,6 @@ from .flight_options import (
     FlightStart,
     Gear,
     Motor,
-    RotorsAndAir,
     Wind,
     flight_forces,
     flight_state,
@@ -99,13 +98,34 @@ def uav_tracker(
         BASE, parameters.value(f"mass.{BASE}"), parameters.value(f"inertia.{BASE}"), free=True
     )
     drive = slider_drive(parameters, servo=servo, stops=stops, friction=friction)
-    air = _flight_forces(case, drive.parameters, drag=drag, wind=wind, motor=motor, gear=gear)
+    gravity, *masses = as_numpy([
+        as_floats(parameters.value(key))
+        for key in ("gravity", *(f"mass.{name}" for name in (BASE, *TRACKER_BODIES)))
+    ])  # fmt: skip
+    hover = hover_speed_squared(sum(masses), gravity, parameters.value("rotor.k_f"), 6)
+    lift = parameters.value("lift_factor") if case == 3 else 1.0
+    air = flight_forces(
+        hexacopter_rotors(BASE, drive.parameters, lift * as_numpy(hover)),
+        sum(masses) * array_module(gravity).linalg.norm(gravity), drive.parameters,
+        drag=drag, wind=wind, motor=motor, gear=gear,
+    )  # fmt: skip
+    forces: list[AbstractForce] = [Gravity(gravity), *air.forces]
+    if case > 1:
+        names = ("actuator.force", "actuator.angular_frequency")
+        push = Sine(*(parameters.value(name) for name in names))
+        forces += [
+            LinearActuator(
+                BASE, f"slider_{k}", axis_point=parameters.value(f"actuator.axis_{k}"), force=push,
+                couple=actuators,
+            )
+            for k in (2, 3)
+        ]  # fmt: skip
     unused = ("bare.", "workspace.", *drive.unused, *air.unused)
     joints = tracker_joints(parameters, BASE, shift)
     system = System(
         [base, *tracker_bodies(parameters, shift)],
         (*joints, *stroke_drivers(joints, strokes)),
-        (*_case_forces(case, air, actuators), *drive.forces),
+        (*forces, *drive.forces),
     )
     return Scene(
         name=f"uav_tracker_{case}",
@@ -117,7 +137,7 @@ def uav_tracker(
             "Joint positions are reconstructed, not printed (docs/report_machine.md).",
             "J'_3 (1, 1) of Table 5.3 is corrected to the mirror of J'_2.",
             f"Actuator couple: {actuators}. Equal rotor speeds are not a trim.",
-            drive.note,
+            *drive.notes,
             *air.notes,
             *((STARTED,) if start is not None else ()),
         ),
@@ -142,32 +162,3 @@ def make_uav(parameters: Parameters = PART_II, **options: Any) -> Uav:
     space = TreeSpace(system, selection=Selection(panel, others, tuple(range(len(others)))))
     shift, limits = parameters.value("mount.shift"), tracker_limits(parameters)
     return Uav(space, tracker_geometry(parameters), shift, limits)
-
-
-def _flight_forces(case: int, parameters: Parameters, **options: Any) -> RotorsAndAir:
-    names = (BASE, *TRACKER_BODIES)
-    gravity, *masses = as_numpy(
-        [as_floats(parameters.value(key)) for key in ("gravity", *(f"mass.{n}" for n in names))]
-    )
-    total = sum(masses)
-    hover = hover_speed_squared(total, gravity, parameters.value("rotor.k_f"), 6)
-    lift = parameters.value("lift_factor") if case == 3 else 1.0
-    weight = total * array_module(gravity).linalg.norm(gravity)
-    return flight_forces(
-        hexacopter_rotors(BASE, parameters, lift * as_numpy(hover)), weight, parameters, **options
-    )
-
-
-def _case_forces(case: int, air: RotorsAndAir, couple: Any) -> tuple[AbstractForce, ...]:
-    parameters = air.parameters
-    forces: list[AbstractForce] = [Gravity(parameters.value("gravity")), *air.forces]
-    if case == 1:
-        return tuple(forces)
-    push = Sine(parameters.value("actuator.force"), parameters.value("actuator.angular_frequency"))
-    for slider, axis in (("slider_2", "actuator.axis_2"), ("slider_3", "actuator.axis_3")):
-        forces.append(
-            LinearActuator(
-                BASE, slider, axis_point=parameters.value(axis), force=push, couple=couple
-            )
-        )
-    return tuple(forces)

@@ -7,7 +7,7 @@ All positions follow from a table's lengths ("geometry.") and the panel's initia
 
 Source: report Part II, section 3.1 (joints); docs/report_machine.md (lengths)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -17,7 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...checks.errors import ModelError, SettingError, check_finite, check_shape, has_values
+from ...checks.errors import (
+    ModelError,
+    SettingError,
+    check_finite,
+    check_shape,
+    has_values,
+    shape_of,
+)
 from ...checks.numbers import as_floats, as_numpy
 from ...checks.schema import quantity
 from ...checks.shapes import Numbers
@@ -200,9 +207,7 @@ def place(geometry: TrackerGeometry, angles: Float[Array, "2"], rods: Rods = RIS
 
 @quick_jit
 def posture(
-    geometry: TrackerGeometry,
-    angles: Float[Array, "2"],
-    rates: Float[Array, "2"] | None = None,
+    geometry: TrackerGeometry, angles: Float[Array, "2"], rates: Float[Array, "2"] | None = None
 ) -> State:
     """State of the six bodies on a base at rest.
 
@@ -309,26 +314,19 @@ def tracker_joints(
     """
     _, _, points, axes = _place_tracker(parameters, displacement)
 
-    def make_slide(name: str, slider: str) -> Joint:
-        return translational(name, base, slider, axis=axes[name], point=points[name])
-
-    def make_hinge(name: str, i: str, j: str) -> Joint:
-        return revolute(name, i, j, point=points[name], axis=axes[name])
-
-    def make_cross(name: str, i: str, j: str) -> Joint:
-        axis_i, axis_j = axes[f"{name}.i"], axes[f"{name}.j"]
-        return universal(name, i, j, point=points[name], axis_i=axis_i, axis_j=axis_j)
-
-    return (
-        make_slide("T12", "slider_2"),
-        make_slide("T13", "slider_3"),
-        make_hinge("R14", base, "post_4"),
-        make_hinge("R26", "slider_2", "rod_6"),
-        make_cross("U35", "slider_3", "rod_5"),
-        make_cross("U47", "post_4", "panel_7"),
-        spherical("S57", "rod_5", "panel_7", point=points["S57"]),
-        spherical("S67", "rod_6", "panel_7", point=points["S67"]),
-    )
+    rows = (
+        (translational, "T12", base, "slider_2"), (translational, "T13", base, "slider_3"),
+        (revolute, "R14", base, "post_4"), (revolute, "R26", "slider_2", "rod_6"),
+        (universal, "U35", "slider_3", "rod_5"), (universal, "U47", "post_4", "panel_7"),
+        (spherical, "S57", "rod_5", "panel_7"), (spherical, "S67", "rod_6", "panel_7"),
+    )  # fmt: skip
+    joints = []
+    for make_joint, name, i, j in rows:
+        # a universal joint has an axis in each body, a spherical one none
+        numbers = {"axis": name, "axis_i": f"{name}.i", "axis_j": f"{name}.j"}
+        numbers = {key: axes[place] for key, place in numbers.items() if place in axes}
+        joints.append(make_joint(name, i, j, point=points[name], **numbers))
+    return tuple(joints)
 
 
 class LinearActuator(AbstractForce):
@@ -453,20 +451,33 @@ def stroke_drivers(
     )
 
 
-class Drive(NamedTuple):
-    """Force elements in the slider joints of a scene.
+class OptionForces(NamedTuple):
+    """Force elements that options of a scene build.
 
     Attributes:
-        forces: force elements.
-        parameters: parameter table of the scene with the elements' numbers.
-        unused: prefixes of the table's lines that nothing uses.
-        note: description of the elements in one or two sentences.
+        forces: the elements. parameters: the scene's table with the numbers they have.
+        unused: prefixes of the table's lines that nothing uses. notes: sentences about the elements.
     """
 
     forces: tuple[AbstractForce, ...]
     parameters: Parameters
     unused: tuple[str, ...]
-    note: str
+    notes: tuple[str, ...]
+
+
+def replace_numbers(parameters: Parameters, options: Mapping[str, object]) -> Parameters:
+    """Table with the numbers of options, by their groups in the table; one number stands for a pair of them.
+
+    Numbers that a user leaves out, which are None, stay those of the table, with their sources.
+    """
+    values = {}
+    for group, option in options.items():
+        for key, value in vars(option).items() if option is not None else ():
+            if value is not None and (name := f"{group}.{key}") in parameters:
+                pair = np.shape(parameters.value(name)) == (2,) and shape_of(value) == ()
+                values[name] = jnp.stack([value, value]) if pair else value
+    # Results carry the table with which they were computed, so that a run can be repeated from its file.
+    return parameters.replaced(values)
 
 
 def slider_drive(
@@ -475,67 +486,42 @@ def slider_drive(
     servo: Servo | None = None,
     stops: Stops | None = None,
     friction: Friction | None = None,
-) -> Drive:
+) -> OptionForces:
     """Force elements of the given options in the slider joints; None adds no element.
 
     Raises:
         ModelError: a number that an element refuses, or targets that are not two.
     """
     options = {"servo": servo, "stop": stops, "friction": friction}
-    for group, option in options.items():
-        if option is not None:
-            # Results carry the table with which they were computed, so that a run can be repeated from its file.
-            parameters = parameters.replaced(_list_options(group, option))
+    table = replace_numbers(parameters, options)
+    take = lambda group, *names: {k: table.value(f"{group}.{k}") for k in names}
     forces: list[AbstractForce] = []
     if servo is not None:
-        forces += _make_servos(parameters, servo)
+        if len(servo.targets) != len(SLIDER_JOINTS):
+            raise ModelError(
+                f"The targets of the servo must be two, for the sliders of {' and '.join(SLIDER_JOINTS)}, "
+                f"but they are {len(servo.targets)}."
+            )
+        numbers = take("servo", "stiffness", "damping")
+        for joint, target in zip(SLIDER_JOINTS, servo.targets, strict=True):
+            forces.append(JointServo(joint, target=target, coordinate="displacement", **numbers))
     if stops is not None:
-        forces += _make_stops(parameters)
+        numbers = take("stop", "stiffness", "damping", "width")
+        ends = (table.value("stop.lower"), table.value("stop.upper"))
+        for joint, low, high in zip(SLIDER_JOINTS, *ends, strict=True):
+            forces.append(
+                EndStop(joint, lower=low, upper=high, coordinate="displacement", **numbers)
+            )
     if friction is not None:
-        numbers = {k: parameters.value(f"friction.{k}") for k in ("coulomb", "viscous", "speed")}
+        numbers = take("friction", "coulomb", "viscous", "speed")
         forces += [JointFriction(j, coordinate="displacement", **numbers) for j in SLIDER_JOINTS]
     # A user who sets a parameter of an element that is not there is told so.
     unused = tuple(f"{group}." for group, option in options.items() if option is None)
-    return Drive(tuple(forces), parameters, unused, _scene_note(servo, stops, friction))
-
-
-def _list_options(group: str, option: Servo | Stops | Friction) -> dict[str, Numbers]:
-    """Numbers of an option that are not left to the table, by their names in the table."""
-    # Numbers that a user leaves out stay those of the table, with their sources.
-    option_values = {k: v for k, v in vars(option).items() if v is not None and k != "targets"}
-    for key in ("lower", "upper"):
-        if key in option_values:
-            limits = jnp.asarray(option_values[key], dtype=float)
-            option_values[key] = jnp.stack([limits, limits]) if limits.ndim == 0 else limits
-    return {f"{group}.{key}": value for key, value in option_values.items()}
-
-
-def _make_servos(parameters: Parameters, servo: Servo) -> list[AbstractForce]:
-    if len(servo.targets) != len(SLIDER_JOINTS):
-        raise ModelError(
-            f"The targets of the servo must be two, for the sliders of {' and '.join(SLIDER_JOINTS)}, "
-            f"but they are {len(servo.targets)}."
-        )
-    numbers = {k: parameters.value(f"servo.{k}") for k in ("stiffness", "damping")}
-    return [
-        JointServo(joint, target=target, coordinate="displacement", **numbers)
-        for joint, target in zip(SLIDER_JOINTS, servo.targets, strict=True)
-    ]
-
-
-def _make_stops(parameters: Parameters) -> list[AbstractForce]:
-    numbers = {k: parameters.value(f"stop.{k}") for k in ("stiffness", "damping", "width")}
-    limits = zip(parameters.value("stop.lower"), parameters.value("stop.upper"), strict=True)
-    return [
-        EndStop(joint, lower=lower, upper=upper, coordinate="displacement", **numbers)
-        for joint, (lower, upper) in zip(SLIDER_JOINTS, limits, strict=True)
-    ]
-
-
-def _scene_note(servo: Servo | None, stops: Stops | None, friction: Friction | None) -> str:
-    if servo is stops is friction is None:
-        return "Nothing holds the sliders: no friction, no stops, no servo."
-    options = (("servo", servo), ("stops", stops), ("friction", friction))
-    used = ", ".join(name for name, option in options if option is not None)
-    note = f"Not in the report, in both slider joints: {used}."
-    return note if servo is None else f"{note} The servos work against the case's own forces."
+    labels = {"servo": servo, "stops": stops, "friction": friction}
+    used = ", ".join(name for name, option in labels.items() if option is not None)
+    note = "Nothing holds the sliders: no friction, no stops, no servo."
+    if used:
+        note = f"Not in the report, in both slider joints: {used}."
+    if servo is not None:
+        note += " The servos work against the case's own forces."
+    return OptionForces(tuple(forces), table, unused, (note,))

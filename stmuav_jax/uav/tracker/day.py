@@ -263,9 +263,8 @@ def _find_daylight(
 
     def sun_heights(times: np.ndarray) -> np.ndarray:
         # always as many, so that all days and searches share one program
-        return np.asarray(_sun_positions(np.resize(times, _SCAN), place, air).elevation)[
-            : len(times)
-        ]
+        sun = _sun_positions(np.resize(times, _SCAN), place, air)
+        return np.asarray(sun.elevation)[: len(times)]
 
     times = np.linspace(begin, end, _SCAN)
     height = sun_heights(times)
@@ -455,23 +454,16 @@ def best_heading(
     Raises:
         StateError, SettingError, ModelError: see `track_day`.
     """
-
     grid = reachable_grid(tracker_geometry(parameters), tracker_limits(parameters))
-    day_options: dict[str, Any] = {
-        "parameters": parameters, "step": _STEP, "samples": _SAMPLES, "grid": grid, **settings,
-    }  # fmt: skip
+    options: Any = dict(parameters=parameters, step=_STEP, samples=_SAMPLES, grid=grid) | settings
+    of_day = lambda degrees: track_day(place, day, zone, turn(math.radians(degrees)), **options)
+    energies: dict[int, float] = {}
 
-    def heading_energy(degrees: int) -> float:
-        return track_day(place, day, zone, turn(math.radians(degrees)), **day_options).energy[
-            "tracker"
-        ]
+    def find_best(*headings: int) -> int:
+        energies.update({degrees: of_day(degrees).energy["tracker"] for degrees in headings})
+        return max(energies, key=lambda degrees: energies[degrees])
 
-    energies = {degrees: heading_energy(degrees) for degrees in range(-180 + _COARSE, 181, _COARSE)}
     # The energy is taken to be smooth over the heading: finer headings are tried beside the best coarse
     # one only.
-    coarse_degrees = max(energies, key=lambda degrees: energies[degrees])
-    energies |= {
-        degrees: heading_energy(degrees)
-        for degrees in (coarse_degrees - _FINE, coarse_degrees + _FINE)
-    }
-    return math.radians(max(energies, key=lambda degrees: energies[degrees]))
+    coarse = find_best(*range(-180 + _COARSE, 181, _COARSE))
+    return math.radians(find_best(coarse - _FINE, coarse + _FINE))

@@ -150,9 +150,8 @@ def stroke_jacobian(
     """Stroke Jacobian dq_i / d(phi, theta) [m/rad] in closed form; NaN out of reach."""
     turn = turn_by_angles(angles)
     (leg_2, leg_3), (c2, c3) = loop_jacobian(geometry, turn, close_loops(geometry, turn), rods)
-    return jnp.stack(
-        [jnp.stack([leg_2[0] / c2, leg_2[1] / c2]), jnp.stack([leg_3[0] / c3, leg_3[1] / c3])]
-    )
+    rows = ((leg_2[0] / c2, leg_2[1] / c2), (leg_3[0] / c3, leg_3[1] / c3))
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
 # --- rates and accelerations
@@ -215,13 +214,13 @@ class Found(NamedTuple):
 
 
 def _newton_step(
-    geometry: TrackerGeometry, q: Array, angles: Array, rods: Rods
+    geometry: TrackerGeometry, q: Array, angles: Array
 ) -> tuple[Float[Array, "2 *s"], Float[Array, "*s"]]:
     """Full Newton step [rad] towards strokes q, and the parallel margin."""
     turn = turn_by_angles(angles)
     loops = close_loops(geometry, turn)
-    (a, b), c = loop_jacobian(geometry, turn, loops, rods)
-    current_strokes = strokes_of(geometry, loops, rods)
+    (a, b), c = loop_jacobian(geometry, turn, loops)
+    current_strokes = strokes_of(geometry, loops)
     # rows of the loop equations and not of q, which would be divided by zero for a level rod
     loop_residuals = [c[k] * (q[k] - current_strokes[k]) for k in (0, 1)]
     step = solve_2x2(jnp.stack([jnp.stack(a), jnp.stack(b)]), jnp.stack(loop_residuals))
@@ -244,10 +243,10 @@ def _step_size(step: Array) -> Array:
 
 
 def _search_angles(
-    geometry: TrackerGeometry, q: Array, start: Array, rods: Rods
+    geometry: TrackerGeometry, q: Array, start: Array
 ) -> tuple[Float[Array, "2 *s"], Bool[Array, "*s"]]:
     """Newton's method with every iterate on the start's side of det A = 0 and within reach."""
-    step, margin = _newton_step(geometry, q, start, rods)
+    step, margin = _newton_step(geometry, q, start)
     side = jnp.sign(margin)
     finite = jnp.isfinite(step[0] + step[1])
 
@@ -262,17 +261,14 @@ def _search_angles(
         # another assembly has the same strokes.
         part = s.scale * jnp.minimum(1.0, _LONGEST_STEP / jnp.maximum(_step_size(s.step), _CLOSE))
         angles = s.angles + part * s.step
-        step, margin = _newton_step(geometry, q, angles, rods)
+        step, margin = _newton_step(geometry, q, angles)
         # A step that leaves the reach or changes the side is taken again with a quarter of its length.
         allowed = jnp.isfinite(step[0] + step[1]) & (side * margin > 0)
         take = allowed & is_open(s)
-        return _Search(
-            jnp.where(take, angles, s.angles),
-            jnp.where(take, step, s.step),
-            jnp.where(take, margin, s.margin),
-            jnp.where(allowed, jnp.minimum(1.0, 2 * s.scale), s.scale / 4),
-            s.steps + 1,
-        )
+        pairs = zip((angles, step, margin), (s.angles, s.step, s.margin), strict=True)
+        parts = (jnp.where(take, candidate, present) for candidate, present in pairs)
+        scale = jnp.where(allowed, jnp.minimum(1.0, 2 * s.scale), s.scale / 4)
+        return _Search(*parts, scale=scale, steps=s.steps + 1)
 
     initial_search = _Search(start, step, margin, jnp.ones_like(margin), jnp.asarray(0))
     final_search = jax.lax.while_loop(is_unfinished, newton_update, initial_search)
@@ -283,9 +279,8 @@ def angles_from_strokes(
     geometry: TrackerGeometry,
     q: Float[Array | np.ndarray, "2 *s"],
     start: Float[Array | np.ndarray, "2 *#s"] | None = None,
-    rods: Rods = RISING,
 ) -> Found:
-    """Panel angles that given strokes hold, on the branch of `start`.
+    """Panel angles that given strokes hold with rods that rise, on the branch of `start`.
 
     There is no closed form. Newton's method starts from `start`, takes steps of at most 0.2
     rad, and refuses those that leave the reach or pass det A = 0: the solution has the start's
@@ -298,7 +293,6 @@ def angles_from_strokes(
     Args:
         q: strokes (2, ...) [m].
         start: initial angles (2, ...) [rad]; by default those of a level panel.
-        rods: sense in which the rods rise (+1) or fall (-1).
 
     Returns:
         angles, and `Reason.NOT_FINITE` or `Reason.NOT_CONVERGED` where there are none.
@@ -311,11 +305,11 @@ def angles_from_strokes(
     # The search finds numbers alone; two full Newton steps after it carry the derivatives, as each of
     # them doubles the order to which the series of the solution is right.
     fixed = jax.lax.stop_gradient((geometry, q, begin))
-    angles, converged = _search_angles(*fixed, rods)
+    angles, converged = _search_angles(*fixed)
     # each full step squares the error of the value and of its Taylor series in q and lengths
     for _ in (0, 1):
-        angles = angles + _newton_step(geometry, q, angles, rods)[0]
-    _, margin = _newton_step(geometry, q, angles, rods)
+        angles = angles + _newton_step(geometry, q, angles)[0]
+    _, margin = _newton_step(geometry, q, angles)
     reason = first_reason((~finite, Reason.NOT_FINITE), (~converged, Reason.NOT_CONVERGED))
     valid = reason == Reason.VALID
     return Found(jnp.where(valid, angles, jnp.nan), reason, jnp.where(valid, margin, jnp.nan))
@@ -325,7 +319,6 @@ def follow(
     geometry: TrackerGeometry,
     q: Float[Array | np.ndarray, "2 n"],
     start: Float[Array | np.ndarray, "2"],
-    rods: Rods = RISING,
     *,
     max_distance: float = 0.2,
 ) -> Found:
@@ -343,17 +336,14 @@ def follow(
 
     def next_point(at: tuple[Array, Array], target: Array) -> tuple[tuple[Array, Array], Found]:
         angles, lost = at
-        candidate = angles_from_strokes(geometry, target, angles, rods)
+        candidate = angles_from_strokes(geometry, target, angles)
         is_too_far = _step_size(candidate.angles - angles) > max_distance
         branch_causes = (lost, Reason.BRANCH), (is_too_far, Reason.BRANCH)
         reason = jnp.where(candidate.reason == 0, first_reason(*branch_causes), candidate.reason)
         reason = jnp.where(lost, jnp.int8(Reason.BRANCH), reason)
         is_valid = reason == Reason.VALID
-        path_point = Found(
-            jnp.where(is_valid, candidate.angles, jnp.nan),
-            reason,
-            jnp.where(is_valid, candidate.margin, jnp.nan),
-        )
+        hide = lambda x: jnp.where(is_valid, x, jnp.nan)
+        path_point = Found(hide(candidate.angles), reason, hide(candidate.margin))
         return (jnp.where(is_valid, candidate.angles, angles), ~is_valid), path_point
 
     initial_carry = (jnp.asarray(start, dtype=float), jnp.asarray(False))

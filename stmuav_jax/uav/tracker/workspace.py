@@ -181,21 +181,18 @@ def measure(
     (a, b), _ = rows
     # Divided by the arms, the determinant has no unit, and one margin holds for any size of tracker.
     determinant = (a[1] * b[0] - a[0] * b[1]) / (geometry.panel_arms[0] * geometry.panel_arms[1])
-    displacements = q - align_pair(limits.home, q)
+    home, lower, upper = (align_pair(pair, q) for pair in (limits.home, limits.lower, limits.upper))
+    displacements = q - home
     horizontal_length = jnp.sqrt(turn.sin_theta**2 + (turn.sin_phi * turn.cos_theta) ** 2)
-    return (
-        q,
-        Margins(
-            # The arc tangent keeps its digits near zero tilt, where an arc cosine loses half of them.
-            limits.tilt - jnp.arctan2(horizontal_length, turn.cos_phi * turn.cos_theta),
-            loops.post_square / geometry.post**2,
-            jnp.stack([loops.squares[k] / geometry.rods[k] ** 2 for k in (0, 1)]),
-            determinant - limits.margin,
-            displacements - align_pair(limits.lower, q),
-            align_pair(limits.upper, q) - displacements,
-        ),
-        rows,
-    )
+    # The arc tangent keeps its digits near zero tilt, where an arc cosine loses half of them.
+    tilt = jnp.arctan2(horizontal_length, turn.cos_phi * turn.cos_theta)
+    post = loops.post_square / geometry.post**2
+    rods = jnp.stack([loops.squares[k] / geometry.rods[k] ** 2 for k in (0, 1)])
+    margins = Margins(
+        limits.tilt - tilt, post, rods, determinant - limits.margin, displacements - lower,
+        upper - displacements,
+    )  # fmt: skip
+    return q, margins, rows
 
 
 def reasons(margins: Margins, *before: tuple[Array, Reason]) -> Int[Array, "*s"]:
@@ -215,30 +212,19 @@ def reasons(margins: Margins, *before: tuple[Array, Reason]) -> Int[Array, "*s"]
 
 
 def survey(
-    geometry: TrackerGeometry,
-    angles: Float[Array | np.ndarray, "2 *s"],
-    limits: Limits,
+    geometry: TrackerGeometry, angles: Float[Array | np.ndarray, "2 *s"], limits: Limits
 ) -> Survey:
     """Kinematics and margins at any postures (2, ...) [rad]; elementwise."""
     angles = jnp.asarray(angles)
     q, margins, ((a, b), c) = measure(geometry, limits, turn_by_angles(angles))
-    finite = jnp.isfinite(angles[0] + angles[1])
-    return Survey(
-        angles,
-        panel_normal(angles),
-        q,
-        q - align_pair(limits.home, q),
-        reasons(margins, (~finite, Reason.NOT_FINITE)),
-        margins,
-        _condition(a[0] / c[0], a[1] / c[0], b[0] / c[1], b[1] / c[1]),
-    )
-
-
-def _condition(a: Array, b: Array, c: Array, d: Array) -> Array:
-    """Condition number of [[a, b], [c, d]]; its squared singular values solve a quadratic."""
+    reason = reasons(margins, (~jnp.isfinite(angles[0] + angles[1]), Reason.NOT_FINITE))
+    displacements = q - align_pair(limits.home, q)
+    # condition number of the matrix of strokes by angles: its squared singular values solve a quadratic
+    a, b, c, d = a[0] / c[0], a[1] / c[0], b[0] / c[1], b[1] / c[1]
     squares, det = a * a + b * b + c * c + d * d, jnp.abs(a * d - b * c)
     spread = jnp.sqrt(jnp.maximum(squares - 2 * det, 0.0) * (squares + 2 * det))
-    return (squares + spread) / (2 * det)
+    condition = (squares + spread) / (2 * det)
+    return Survey(angles, panel_normal(angles), q, displacements, reason, margins, condition)
 
 
 # --- grids over the whole workspace
@@ -299,15 +285,9 @@ def aim(
     n = direction / jnp.where(usable, largest, 1.0)
     # phi is not determined along x, and is taken as zero
     pole = (n[1] == 0) & (n[2] == 0)
-    n = jnp.stack(
-        [
-            jnp.where(usable, n[0], 0.0),
-            jnp.where(usable, n[1], 0.0),
-            jnp.where(usable & ~pole, n[2], jnp.where(usable, _POLE, 1.0)),
-        ]
-    )
-    turn = turn_by_direction(n)
-    q, margins, _ = measure(geometry, limits, turn)
+    z = jnp.where(usable & ~pole, n[2], jnp.where(usable, _POLE, 1.0))
+    n = jnp.stack([jnp.where(usable, n[0], 0.0), jnp.where(usable, n[1], 0.0), z])
+    q, margins, _ = measure(geometry, limits, turn_by_direction(n))
     reason = reasons(margins, (~finite, Reason.NOT_FINITE), (~usable, Reason.ZERO_LENGTH))
     if throw and direction.ndim == 1 and has_values(geometry, direction, limits):
         code, components = Reason(int(reason)), np.asarray(direction).tolist()
@@ -354,12 +334,8 @@ def why_outside(geometry: TrackerGeometry, limits: Limits, margins: Margins, rea
             f"(margin {margin:.3g}, at least {limit:.3g} is needed)."
         )
     k = reason - Reason.STROKE_2
-    lower_margin, upper_margin = (
-        float(np.asarray(margins.lower)[k]),
-        float(np.asarray(margins.upper)[k]),
-    )
-    end, excess = ("lower", lower_margin) if lower_margin < 0 else ("upper", upper_margin)
-    limit = float(np.asarray(getattr(limits, end))[k])
+    end = "lower" if float(np.asarray(margins.lower)[k]) < 0 else "upper"
+    excess, limit = (float(np.asarray(getattr(part, end))[k]) for part in (margins, limits))
     displacement = limit + excess if end == "lower" else limit - excess
     return (
         f"slider {k + 2} would have to stand at {1e3 * displacement:.4g} mm from its initial place, "
@@ -460,18 +436,16 @@ def _refine(
 ) -> Float[Array, "2 n"]:
     """Refine postures by a pattern search_pattern: the best of 91 around each, on ever finer patterns."""
 
-    def measure_closeness(angles: Array) -> Array:
-        return jnp.sum(panel_normal(angles) * directions_b, axis=0)
+    closeness = lambda angles: jnp.sum(panel_normal(angles) * directions_b, axis=0)
 
     def search_pattern(count: int | Array, best: Array) -> Array:
-        value, pull = jax.vjp(measure_closeness, best)
+        value, pull = jax.vjp(closeness, best)
         (slope,) = pull(jnp.ones_like(value))
-        gradient_direction = slope / jnp.maximum(jnp.linalg.norm(slope, axis=0), 1e-12)
-        tangent = jnp.stack([-gradient_direction[1], gradient_direction[0]])
+        uphill = slope / jnp.maximum(jnp.linalg.norm(slope, axis=0), 1e-12)
+        tangent = jnp.stack([-uphill[1], uphill[0]])
         size = _COARSE * _FINER ** -jnp.floor(count / _AGAIN)
-        candidates = best[:, None] + size * (
-            _ALONG * tangent[:, None] + _TOWARDS * gradient_direction[:, None]
-        )
+        offsets = _ALONG * tangent[:, None] + _TOWARDS * uphill[:, None]
+        candidates = best[:, None] + size * offsets
         close = jnp.sum(panel_normal(candidates) * directions_b[:, None], axis=0)
         # A pattern search needs no derivative of the boundary, which has corners where two limits meet.
         close = jnp.where(_inside(geometry, limits, candidates), close, -jnp.inf)

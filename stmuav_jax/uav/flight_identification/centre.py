@@ -1,7 +1,14 @@
-"""Centre of mass of a multirotor as states of a filter over a flight, beside the estimate of the whole record.
+"""Centre of mass of a multirotor: from the commands of a hover alone, and as states of a filter over a flight.
 
-About roll and pitch, with what the identified numbers explain of the angular acceleration, a_k, its change g_k
-by the centre of mass c, and unknown moments m,
+On average a hovering vehicle does not turn, so its centre of mass is that of the thrusts,
+
+    c = sum_k sum_i T_i(u_ik) a_i / sum_k sum_i T_i(u_ik),
+
+if the motors are equal. A battery's voltage that scales all thrusts alike cancels. If the relative slope
+of the thrust at hover differs from that of the layout's shape, c is wrong by the ratio of the two.
+
+The filter stands beside the estimate of the whole record. About roll and pitch, with what the identified
+numbers explain of the angular acceleration, a_k, its change g_k by the centre of mass c, and unknown moments m,
 
     w_k = w_(k-1) + dt (a_k + g_k c_k + m_k),   m_k = rho m_(k-1) + noise,   c_k = c_(k-1) + drift,
 
@@ -23,11 +30,13 @@ from ...estimation.gaussians import gaussian
 from ...estimation.model import Sensor, StateSpaceModel
 from ...estimation.sigma import Unscented
 from .record import FlightRecord, RotorLayout, compute_thrust_shape
-from .stages import FlightIdentification, explain_rotation
+from .stages import FlightIdentification, ParameterEstimate, combine_parts, explain_rotation
 
 # Rate of the filter on hovers [Hz], deviation of the centre of mass before the flight [m], and lags at which the
 # decay of the unknown moments is read [steps].
 _HOVER_RATE, _PRIOR, _LAGS = 20.0, 0.02, (2, 6)
+# Block of correlated values and shortest hover [s], and number of windows of an estimate from a hover.
+_HOVER_BLOCK, _SHORTEST_HOVER, _WINDOWS = 1.0, 4.0, 4
 
 
 class FilteredCentre(NamedTuple):
@@ -88,6 +97,51 @@ def filter_centre(
     return _run(ts, rates[1:], inputs, step, entry, prior, noise, slice(4, 6), origin)
 
 
+def identify_hover_centre(
+    ts: Float[np.ndarray, " k"], commands: Float[np.ndarray, "k n"], layout: RotorLayout
+) -> tuple[ParameterEstimate, ParameterEstimate]:
+    """Centre of mass along x and y from a hover, from the layout's origin [m].
+
+    The deviation has those of blocks of one second, and the scatter of four windows beyond theirs. What
+    is common to flights of one machine, such as motors that differ, is not in it: the difference of two
+    flights shows a payload.
+
+    Args:
+        ts: times [s]. commands: of the rotors, 0 to 1. layout: rotors in the order of the commands.
+
+    Raises:
+        SettingError: the hover is shorter than 4 s, or has another number of rotors.
+    """
+    T = _hover_thrusts(commands, layout)
+    if not ts[-1] - ts[0] >= _SHORTEST_HOVER:
+        raise SettingError(
+            f"The hover is {ts[-1] - ts[0]:.3g} s long; {_SHORTEST_HOVER:g} s or more would be valid."
+        )
+    # The incomplete second at the end joins the block before it: a block of a few samples would
+    # scatter more than the others.
+    block = np.minimum((ts - ts[0]) // _HOVER_BLOCK, (ts[-1] - ts[0]) // _HOVER_BLOCK - 1).astype(
+        int
+    )
+    count = block[-1] + 1
+    total = np.bincount(block, np.sum(T, axis=1))
+    estimates = []
+    for axis, letter in enumerate("xy"):
+        moment = np.bincount(block, T @ layout.positions[:, axis])
+        value = float(np.sum(moment) / np.sum(total))
+        rest = moment - value * total
+        # The value was fitted to the blocks, which takes one of their degrees of freedom.
+        scale = np.sqrt(count / (count - 1)) / np.sum(total)
+        blocks = float(np.sqrt(np.sum(rest**2)) * scale)
+        white = T @ layout.positions[:, axis] - value * np.sum(T, axis=1)
+        windows = np.array_split(np.arange(count), min(_WINDOWS, count))
+        values = np.array([np.sum(moment[w]) / np.sum(total[w]) for w in windows])
+        spread = np.array([blocks * np.sqrt(count / len(w)) for w in windows])
+        parts = (np.sqrt(np.sum(white**2)) / np.sum(total), blocks, 0.0, values, spread)
+        name = f"centre of mass {letter} by hover, equal motors"
+        estimates.append(combine_parts(name, "m", value, *parts))
+    return estimates[0], estimates[1]
+
+
 def filter_hover_centre(
     ts: Float[np.ndarray, " k"],
     commands: Float[np.ndarray, "k n"],
@@ -104,13 +158,9 @@ def filter_hover_centre(
     Raises:
         SettingError: fewer than 100 means of the hover at 20 Hz, another number of rotors, or a drift below zero.
     """
-    if commands.shape[1] != len(layout.positions):
-        raise SettingError(
-            f"The hover has commands of {commands.shape[1]} rotors, but the layout has {len(layout.positions)}."
-        )
+    T = _hover_thrusts(commands, layout)
     # Round-off of a time at a boundary must not put its sample in the mean before.
     place = np.floor((ts - ts[0]) * _HOVER_RATE + 1e-9).astype(int)
-    T = compute_thrust_shape(commands, layout.thrust_model_factor)
     total = np.bincount(place, np.sum(T, axis=1))
     present = total > 0
     if np.sum(present) < 100:
@@ -141,6 +191,15 @@ def filter_hover_centre(
     return _run(
         np.r_[times[0] - dt, times], z, None, step, entry, prior, 0.05 * size, slice(2, 4), np.zeros(2), read
     )  # fmt: skip
+
+
+def _hover_thrusts(commands: np.ndarray, layout: RotorLayout) -> np.ndarray:
+    """Thrusts over their coefficient (k, n), of commands for each rotor of the layout."""
+    if commands.shape[1] != len(layout.positions):
+        raise SettingError(
+            f"The hover has commands of {commands.shape[1]} rotors, but the layout has {len(layout.positions)}."
+        )
+    return compute_thrust_shape(commands, layout.thrust_model_factor)
 
 
 def _run(
