@@ -19,13 +19,13 @@ def flight_figures(data: xr.Dataset) -> dict[str, Figure]:
     joints, hinges apart from slides.
     """
     values = lambda name: data[name].values
-    each = lambda dim: tuple(f"{dim} {x}" for x in values(dim))
+    labels_of = lambda dim: tuple(f"{dim} {x}" for x in values(dim))
     panels: dict[str, list[Any]] = {
         "errors": [
             ("position error [m]", ("x", "y", "z"), values("position_error")),
             ("tilt error [degrees]", ("tilt error",), values("tilt_error")[:, None] / _DEGREE),
         ],
-        "rotors": [("rotor speed [rad/s]", each("rotor"), values("rotor_speed"))],
+        "rotors": [("rotor speed [rad/s]", labels_of("rotor"), values("rotor_speed"))],
     }
     margins = {
         label: 100 * np.nanmin(margin_history(data, name, limit), axis=1, initial=0.5)
@@ -47,10 +47,10 @@ def flight_figures(data: xr.Dataset) -> dict[str, Figure]:
         panels["panel"] = [("panel angles [degrees]", names, angles)]
         panels["panel"].append(("panel error [degrees]", ("error",), error))
     if "displacement" in data:
-        panels["strokes"] = [("displacement [m]", each("slider"), values("displacement"))]
+        panels["strokes"] = [("displacement [m]", labels_of("slider"), values("displacement"))]
     if "commanded_force" in data:
         # the forces that the servo asks of the tracker's actuators
-        panels["forces"] = [("commanded force [N]", each("slider"), values("commanded_force"))]
+        panels["forces"] = [("commanded force [N]", labels_of("slider"), values("commanded_force"))]
     for unit, unit_text, scale in (("rad", "degrees", _DEGREE), ("m", "m", 1.0)):
         if "joint_error" in data and unit in values("driven_joint_unit"):
             places = np.flatnonzero(values("driven_joint_unit") == unit)

@@ -68,7 +68,7 @@ def fly(
         memory = mission.controller.start()
         while completed < total and not ending:
             program = cached_program(_fly_chunk, run, plant, start, memory)
-            compiled, left = time.perf_counter(), total - completed
+            compiled, remaining = time.perf_counter(), total - completed
 
             def fly_chunk(
                 start: PlantState, memory: Any, most: int, program: Any = program
@@ -76,13 +76,13 @@ def fly(
                 rows = first_rows(program(run, plant, start, memory), most)
                 return _replace_rows(rows, signals=dict(rows.signals["gauges"]))
 
-            rows = fly_chunk(start, memory, left)
+            rows = fly_chunk(start, memory, remaining)
             end: Ending = "failed" if np.any(rows.reason) else ""
             if battery is not None:
                 charge = _discharge_battery(battery, soc, rows, plant.rate)
-                if charge.ending == "overloaded" and not end and len(rows.ts) < left:
+                if charge.ending == "overloaded" and not end and len(rows.ts) < remaining:
                     # a motion that diverges asks for it too, and its numbers break off within a second
-                    beyond = fly_chunk(rows.end, rows.memory, left - len(rows.ts))
+                    beyond = fly_chunk(rows.end, rows.memory, remaining - len(rows.ts))
                     if np.any(beyond.reason):
                         rows, end = _join_rows([rows, beyond]), "failed"
                         charge = _discharge_battery(battery, soc, rows, plant.rate)

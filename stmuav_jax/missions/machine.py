@@ -395,7 +395,7 @@ def _make_instruments(
     if not joints and any(fault.sensor == "encoders" for fault in faults):
         raise SettingError("A fault of encoders needs a machine with joints.")
     owner = lambda x: (type(x), getattr(x, "body", None), getattr(x, "joint", None))
-    of_model = {owner(own.sensor): own for own in reversed([*machine.scene.sensors.values()])}
+    of_model = {owner(x.sensor): x for x in reversed([*machine.scene.sensors.values()])}
     instruments = []
     for name, sensors in kinds.items():
         entry = getattr(sensor_entries, name)
@@ -414,12 +414,12 @@ def _make_instruments(
         # the more special file decides.
         for sensor in sensors:
             sheet: dict[str, Any] = {}
-            if (own := of_model.get(owner(sensor))) is not None:
+            if (of_file := of_model.get(owner(sensor))) is not None:
                 # The estimator finds instruments by the usual names; a model's file gives them names
                 # of its own.
-                usual_name, sensor = sensor.name, copy.copy(own.sensor)
+                usual_name, sensor = sensor.name, copy.copy(of_file.sensor)
                 object.__setattr__(sensor, "name", usual_name)
-                sheet = {k: x for k in DATASHEET if (x := getattr(own, k)) is not None}
+                sheet = {k: x for k in DATASHEET if (x := getattr(of_file, k)) is not None}
             instruments.append(Instrument(sensor, **(INSTRUMENTS[name] | sheet | numbers)))
     return instruments
 
