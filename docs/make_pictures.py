@@ -80,12 +80,13 @@ def flight() -> dict[str, float]:
     data = stm.missions.to_data(flown)
     scene = stm.make_scene("uav_tracker")
     k = int(np.argmin(np.abs(data.time.values - SHOWN)))
+    curves = stm.missions.flight_figures(data)
     drawn = {
         "controlled": sketch_alone(
             stm.draw(scene, state_at(data, k)), f"under control, {data.time.values[k]:.1f} s"
         ),
-        "panel": stm.missions.FLIGHT_FIGURES["panel"](data),
-        "errors": stm.missions.FLIGHT_FIGURES["errors"](data),
+        "panel": curves["panel"],
+        "errors": curves["errors"],
     }
     stm.figures.save_figures(drawn, FIGURES / "flight", "png", dpi=90)
     # the page moves at 25 pictures a second

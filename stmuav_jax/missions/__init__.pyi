@@ -5,10 +5,7 @@ from .ensemble import (
     load_mission_study as load_mission_study,
     make_mission_study as make_mission_study,
 )
-from .figures import (
-    FLIGHT_FIGURES as FLIGHT_FIGURES,
-    flight_figures as flight_figures,
-)
+from .figures import flight_figures as flight_figures
 from .flight import (
     MissionFlight as MissionFlight,
     fly as fly,

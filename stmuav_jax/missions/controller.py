@@ -278,10 +278,8 @@ class MissionController(eqx.Module):
     def start(self) -> MissionMemory:
         """First memory."""
         # not weakly typed, as no later memory is: a flight's program is compiled for one type
-        jam_strokes = jnp.full(2, jnp.inf, dtype=float)
-        return MissionMemory(
-            self.pilot.start(), jam_strokes, jnp.zeros(jnp.shape(self.force), dtype=float)
-        )
+        zeros = jnp.zeros(jnp.shape(self.force), dtype=float)
+        return MissionMemory(self.pilot.start(), jnp.full(2, jnp.inf, dtype=float), zeros)
 
     def __call__(
         self, estimate: Any, reference: MissionReference, memory: MissionMemory
@@ -291,14 +289,9 @@ class MissionController(eqx.Module):
         inputs, after = _command_pilot(self.pilot, estimate, reference, memory.flight)
         for pilot_change in self.pilot_changes:
             # the parts that all pilots share are compiled once
-            candidate_command = _command_pilot(
-                pilot_change.pilot, estimate, reference, memory.flight
-            )
-            inputs, after = jax.tree.map(
-                lambda new, old, late=t >= pilot_change.at: jnp.where(late, new, old),
-                candidate_command,
-                (inputs, after),
-            )
+            candidate = _command_pilot(pilot_change.pilot, estimate, reference, memory.flight)
+            choose = lambda new, old, late=t >= pilot_change.at: jnp.where(late, new, old)
+            inputs, after = jax.tree.map(choose, candidate, (inputs, after))
         k, faults = self.lost.shape
         # Faults act behind the controller, on its commands: it is not informed of them.
         share = jnp.ones(k)
@@ -322,20 +315,12 @@ def _command_pilot(pilot: Any, estimate: Any, reference: MissionReference, memor
     if isinstance(inner_pilot, JointController):
         assert reference.joints is not None
         return pilot(estimate, JointReference(reference.waypoint, reference.joints), memory)
-    state = getattr(estimate, "state", estimate)
-    return pilot(
-        estimate,
-        UavReference(reference.waypoint, compute_panel_reference(reference, state)),
-        memory,
-    )
+    panel = compute_panel_reference(reference, getattr(estimate, "state", estimate))
+    return pilot(estimate, UavReference(reference.waypoint, panel), memory)
 
 
 def compute_panel_reference(reference: MissionReference, state: State) -> PairMotion:
     """Reference motion of the panel angles, at the base's attitude in a state."""
-    panel_reference = reference.panel
-    assert panel_reference is not None
-    return (
-        panel_reference
-        if isinstance(panel_reference, PairMotion)
-        else facing_motion(panel_reference, state)
-    )
+    target = reference.panel
+    assert target is not None
+    return target if isinstance(target, PairMotion) else facing_motion(target, state)

@@ -112,20 +112,14 @@ class MissionEvaluation(eqx.Module):
     relative: frozenset[str] = eqx.field(static=True)
 
     def __init__(self, mission: Mission, relative: frozenset[str] = frozenset()) -> None:
-        machine = mission.machine
-        self.nominal = _Nominal(
-            mission.truth, mission.controller, mission.references, machine.limits
-        )
-        self.mission, self.relative = mission, relative
-        self.table = mission.table
+        controller, limits = mission.controller, mission.machine.limits
+        self.nominal = _Nominal(mission.truth, controller, mission.references, limits)
+        self.mission, self.table, self.relative = mission, mission.table, relative
 
     def __reduce__(self) -> Any:
         """State as entries of the mission's file, from which it is made again."""
-        return _remake_evaluation, (
-            self.mission.file.model_dump(),
-            self.mission.folder,
-            self.relative,
-        )
+        mission = self.mission
+        return _remake_evaluation, (mission.file.model_dump(), mission.folder, self.relative)
 
     def __call__(self, sample: Mapping[str, Array], key: Array) -> dict[str, Any]:
         """Outcomes of one flight by column."""
@@ -177,15 +171,11 @@ class MissionEvaluation(eqx.Module):
 
         def fly_chunk(now: tuple[PlantState, Any, Worst], _: None) -> tuple[Any, None]:
             start, memory, worst = now
-            chunk_rollout = rollout(
+            rows = rollout(
                 plant, of.controller, samples, reference=of.references, memory=memory,
                 signals={"gauges": gauges}, start=start,
             )  # fmt: skip
-            return (
-                chunk_rollout.end,
-                chunk_rollout.memory,
-                _join_worst(mission, of, worst, chunk_rollout),
-            ), None
+            return (rows.end, rows.memory, _join_worst(mission, of, worst, rows)), None
 
         zero, top = jnp.zeros(()), jnp.ones(())
         reason = jnp.zeros((), jnp.int8)
@@ -202,24 +192,22 @@ class MissionEvaluation(eqx.Module):
 
 def _check_judged(mission_file: MissionFile) -> None:
     """Raise `SettingError` for entries of a mission that no flight of its study comes to."""
-    tolerances = mission_file.tolerances
+    tolerances, t1 = mission_file.tolerances, mission_file.t1
     for name in ("touchdown", "sink"):
         if getattr(tolerances, name) is not None:
             raise SettingError(
                 f"A study of a mission does not support 'tolerances.{name}': leave it out."
             )
-    late = list_unreached(json.loads(mission_file.model_dump_json()), mission_file.t1)
+    late = list_unreached(json.loads(mission_file.model_dump_json()), t1)
+    starts = {"position and tilt": tolerances.after, "the panel": tolerances.panel_after}
     late += [
         f"the tolerances of {subject}, which hold from t = {t:g} s on"
-        for subject, t in (
-            ("position and tilt", tolerances.after),
-            ("the panel", tolerances.panel_after),
-        )
-        if t is not None and t > mission_file.t1 + AT_ONCE
+        for subject, t in starts.items()
+        if t is not None and t > t1 + AT_ONCE
     ]
     if late:
         raise SettingError(
-            f"The flights of a study end at t = {mission_file.t1:g} s, before {', '.join(late)}: give the study a "
+            f"The flights of a study end at t = {t1:g} s, before {', '.join(late)}: give the study a "
             "later 't1', or leave these entries out of its mission."
         )
 
@@ -227,92 +215,81 @@ def _check_judged(mission_file: MissionFile) -> None:
 def _join_worst(mission: Mission, of: _Nominal, worst: Worst, chunk_rollout: Rollout) -> Worst:
     """Largest errors and smallest margins after further samples."""
     entries, gauges, ts = mission.file, chunk_rollout.signals["gauges"], chunk_rollout.ts
-    target = entries.tolerances
+    target, rate = entries.tolerances, mission.plant.rate
     flight_mask = ts <= entries.t1 + AT_ONCE
-    charge, next_charge, is_drained = worst.charge, worst.next_charge, worst.is_drained
     ends_here = jnp.zeros_like(flight_mask)
     if of.truth.battery is not None:
         battery, demand = of.truth.battery.battery, gauges["electric_power"]
         charges, currents, _, next_charge = drain_samples(
-            battery, next_charge, demand, jnp.asarray(1.0 / mission.plant.rate)
+            battery, worst.next_charge, demand, jnp.asarray(1.0 / rate)
         )
         is_over = (charges <= battery.reserve) | (jnp.isfinite(demand) & ~jnp.isfinite(currents))
         # the sample at which the battery ends is the last of the flight
-        flight_mask &= (jnp.cumsum(is_over) - is_over == 0) & ~is_drained
+        flight_mask &= (jnp.cumsum(is_over) - is_over == 0) & ~worst.is_drained
         ends_here = flight_mask & is_over
-        is_drained = is_drained | jnp.any(ends_here)
-        charge = jnp.minimum(charge, jnp.min(jnp.where(flight_mask, charges, 1.0)))
+        worst = worst._replace(
+            charge=jnp.minimum(worst.charge, jnp.min(jnp.where(flight_mask, charges, 1.0))),
+            next_charge=next_charge,
+            is_drained=worst.is_drained | jnp.any(ends_here),
+        )
     base = flight_mask & (ts >= target.after - AT_ONCE)
     if "gear_load" in gauges:
         # as in a verdict, what the ground carries is not in flight
         base = base & (gauges["gear_load"] == 0.0)
     later = target.after if target.panel_after is None else target.panel_after
     panel = flight_mask & (ts >= later - AT_ONCE)
+
     # Samples that do not count become the value that changes nothing: shapes are fixed in a
     # compiled program.
-    most = lambda values, of: jnp.max(jnp.where(of, values, 0.0))
+    def join_largest(before: Array, values: Array, counted: Array) -> Array:
+        return jnp.maximum(before, jnp.max(jnp.where(counted, values, 0.0), axis=0))
+
+    def join_margin(before: Array, signal: str, low: Array, high: Array, counted: Array) -> Array:
+        """Smallest distance from limits as a share of the range, of those values that count."""
+        margins = jnp.minimum(gauges[signal] - low, high - gauges[signal]) / (high - low)
+        return jnp.minimum(before, jnp.min(jnp.where(counted, margins, 1.0)))
+
+    valid = flight_mask & (chunk_rollout.reason == LoopReason.VALID)
+    valid &= worst.reason == LoopReason.VALID
+    # Energy is a sum of rectangles, which begins at each sample: the last one begins none.
+    used = flight_mask & ~ends_here & (ts < (mission.samples - 1.5) / rate)
+    power = jnp.where(used, gauges["electric_power"], 0.0)
     distances = jnp.sqrt(jnp.sum(gauges["position_error"] ** 2, axis=1))
     # a reason stays for the rest of a chunk
     now = jnp.max(jnp.where(flight_mask, chunk_rollout.reason, 0))
-    reason = jnp.where(worst.reason == LoopReason.VALID, now, worst.reason)
-    valid = (
-        flight_mask
-        & (chunk_rollout.reason == LoopReason.VALID)
-        & (worst.reason == LoopReason.VALID)
+    worst = worst._replace(
+        position=join_largest(worst.position, distances, base),
+        tilt=join_largest(worst.tilt, gauges["tilt_error"], base),
+        energy=worst.energy + jnp.sum(power) / rate,
+        reason=jnp.where(worst.reason == LoopReason.VALID, now, worst.reason),
+        end=join_largest(worst.end, ts, valid),
     )
-    last = mission.samples - 1
-    # Energy is a sum of rectangles, which begins at each sample: the last one begins none.
-    power = jnp.where(
-        flight_mask & ~ends_here & (ts < (last - 0.5) / mission.plant.rate),
-        gauges["electric_power"],
-        0.0,
-    )
-    rotors, strokes, forces = worst.rotors, worst.strokes, worst.forces
+    if "panel_error" in gauges:
+        worst = worst._replace(panel=join_largest(worst.panel, gauges["panel_error"], panel))
     if of.truth.speeds is not None:
-        low, high = (
-            jnp.sqrt(x) for x in of.truth.speeds.squared(mission.machine.rotors.spin.shape[0])
-        )
+        count = mission.machine.rotors.spin.shape[0]
+        low, high = (jnp.sqrt(x) for x in of.truth.speeds.squared(count))
         # a rotor that has failed is within no limits
         counted = flight_mask[:, None] & (ts[:, None] < of.controller.lost[:, 0])
-        rotors = jnp.minimum(rotors, _smallest_margin(gauges["rotor_speed"], low, high, counted))
+        rotors = join_margin(worst.rotors, "rotor_speed", low, high, counted)
+        worst = worst._replace(rotors=rotors)
     if of.limits is not None:
-        low, high = of.limits.lower, of.limits.upper
-        strokes = jnp.minimum(
-            strokes, _smallest_margin(gauges["displacement"], low, high, flight_mask[:, None])
-        )
+        low, high, counted = of.limits.lower, of.limits.upper, flight_mask[:, None]
+        strokes = join_margin(worst.strokes, "displacement", low, high, counted)
+        worst = worst._replace(strokes=strokes)
     if mission.machine.force is not None:
         top, jam = of.controller.force, of.controller.jam
         counted = flight_mask[:, None] & (True if jam is None else ts[:, None] < jam.at)
-        forces = jnp.minimum(
-            forces, _smallest_margin(gauges["commanded_force"], -top, top, counted)
-        )
-    efforts, joints = worst.efforts, worst.joints
+        forces = join_margin(worst.forces, "commanded_force", -top, top, counted)
+        worst = worst._replace(forces=forces)
     if "joint_error" in gauges:
-        counted = base[:, None]
-        errors = jnp.where(counted, jnp.abs(gauges["joint_error"]), 0.0)
-        joints = jnp.maximum(joints, jnp.max(errors, axis=0))
-        top = of.truth.gauges.efforts
-        is_limited = np.isfinite(mission.machine.efforts)
-        counted = flight_mask[:, None] & is_limited
-        efforts = jnp.minimum(
-            efforts, _smallest_margin(gauges["commanded_effort"], -top, top, counted)
+        errors, top = jnp.abs(gauges["joint_error"]), of.truth.gauges.efforts
+        counted = flight_mask[:, None] & np.isfinite(mission.machine.efforts)
+        worst = worst._replace(
+            joints=join_largest(worst.joints, errors, base[:, None]),
+            efforts=join_margin(worst.efforts, "commanded_effort", -top, top, counted),
         )
-    panel_error = worst.panel
-    if "panel_error" in gauges:
-        panel_error = jnp.maximum(panel_error, most(gauges["panel_error"], panel))
-    return Worst(
-        jnp.maximum(worst.position, most(distances, base)),
-        jnp.maximum(worst.tilt, most(gauges["tilt_error"], base)),
-        panel_error, joints, rotors, strokes, forces, efforts,
-        worst.energy + jnp.sum(power) / mission.plant.rate, charge, next_charge, is_drained, reason,
-        jnp.maximum(worst.end, jnp.max(jnp.where(valid, ts, 0.0))),
-    )  # fmt: skip
-
-
-def _smallest_margin(values: Array, low: Array, high: Array, counted: Array) -> Float[Array, ""]:
-    """Smallest distance from limits as a share of the range, of those values that count."""
-    margins = jnp.minimum(values - low, high - values) / (high - low)
-    return jnp.min(jnp.where(counted, margins, 1.0))
+    return worst
 
 
 def _remake_evaluation(
@@ -402,19 +379,17 @@ def load_mission_study(
 
 def _list_quantities(mission: Mission) -> dict[str, tuple[str, str]]:
     """Units and descriptions of the quantities that a mission's flights have."""
-    machine, none = mission.machine, set()
-    if mission.battery is None:
-        none |= {"state_of_charge"}
-    if machine.bodies is None:
-        none |= {"panel_error", "stroke_margin"}
-    if machine.speeds is None:
-        none |= {"rotor_margin"}
-    if machine.force is None:
-        none |= {"force_margin"}
-    if not np.any(np.isfinite(machine.efforts)):
-        none |= {"effort_margin"}
+    machine = mission.machine
+    absent = {
+        "state_of_charge": mission.battery is None,
+        "panel_error": machine.bodies is None,
+        "stroke_margin": machine.bodies is None,
+        "rotor_margin": machine.speeds is None,
+        "force_margin": machine.force is None,
+        "effort_margin": not np.any(np.isfinite(machine.efforts)),
+    }
     of_joints = {
         f"{column_name(drive.name)}_error": (drive.unit, f"largest error of joint {drive.name}")
         for drive in machine.joints
     }
-    return {name: _QUANTITIES[name] for name in _QUANTITIES if name not in none} | of_joints
+    return {k: text for k, text in _QUANTITIES.items() if not absent.get(k)} | of_joints

@@ -1,170 +1,75 @@
 """Figures of a mission's flight, from its dataset."""
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..figures.plot import STYLES, grid, plot_histories
+from ..figures.plot import draw_histories
 from .outcome import MARGINS, margin_history
 
 _DEGREE = np.pi / 180
 
 
-def _label_axes(ax: Axes, label: str, *, legend: bool = True) -> None:
-    ax.set_ylabel(label, fontsize=9)
-    if legend:
-        ax.legend(fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.22))
+def flight_figures(data: xr.Dataset) -> dict[str, Figure]:
+    """Figures of a mission's flight by name: errors, margins of the limits, rotor speeds, power.
 
-
-def _add_title(figure: Figure, data: xr.Dataset) -> Figure:
-    figure.suptitle(data.attrs.get("title", ""), fontsize=11)
-    return figure
-
-
-def flight_errors(data: xr.Dataset) -> Figure:
-    """Figure of the position error along the world's axes, and of the tilt error."""
-    figure, axes = grid(2, 1, 5.0)
-    ts = data.time.values
-    plot_histories(axes[0, 0], ts, data.position_error.values, ("x", "y", "z"))
-    _label_axes(axes[0, 0], "position error [m]")
-    tilt = data.tilt_error.values[:, None] / _DEGREE
-    plot_histories(axes[1, 0], ts, tilt, ("tilt error",))
-    _label_axes(axes[1, 0], "tilt error [degrees]", legend=False)
-    return _add_title(figure, data)
-
-
-def flight_panel(data: xr.Dataset) -> Figure:
-    """Figure of the panel angles against their reference, and of the angle between both normals."""
-    figure, axes = grid(2, 1, 5.0)
-    both = np.concatenate([data.panel_angles.values, data.reference_panel_angles.values], axis=1)
-    labels = ("phi", "theta", "phi reference", "theta reference")
-    plot_histories(axes[0, 0], data.time.values, both / _DEGREE, labels)
-    _label_axes(axes[0, 0], "panel angles [degrees]")
-    plot_histories(
-        axes[1, 0], data.time.values, data.panel_error.values[:, None] / _DEGREE, ("error",)
-    )
-    _label_axes(axes[1, 0], "panel error [degrees]", legend=False)
-    return _add_title(figure, data)
-
-
-def _plot_many(ax: Axes, data: xr.Dataset, name: str, limit: str, dim: str) -> None:
-    """Plot all histories of a signal, and its limits as thin lines."""
-    values = data[name].values
-    for k, label in enumerate(data[dim].values):
-        color, dash = STYLES[k % len(STYLES)]
-        width = 1.4 if k < len(STYLES) else 0.7
-        ax.plot(
-            data.time.values, values[:, k], label=f"{dim} {label}", linewidth=width, color=color,
-            linestyle=dash,
-        )  # fmt: skip
-    for end in ("lowest", "highest"):
-        if f"{end}_{limit}" in data:
-            for value in np.unique(data[f"{end}_{limit}"].values):
-                ax.axhline(value, color="0.3", linewidth=0.6)
-    ax.set_xlabel("time [s]", fontsize=9)
-
-
-def flight_rotors(data: xr.Dataset) -> Figure:
-    """Figure of the rotor speeds with their limits."""
-    figure, axes = grid(1, 1, 3.4)
-    _plot_many(axes[0, 0], data, "rotor_speed", "speed", "rotor")
-    _label_axes(axes[0, 0], "rotor speed [rad/s]")
-    return _add_title(figure, data)
-
-
-def flight_strokes(data: xr.Dataset) -> Figure:
-    """Figure of the sliders' displacements with their limits."""
-    figure, axes = grid(1, 1, 3.4)
-    _plot_many(axes[0, 0], data, "displacement", "displacement", "slider")
-    _label_axes(axes[0, 0], "displacement [m]")
-    return _add_title(figure, data)
-
-
-def flight_forces(data: xr.Dataset) -> Figure:
-    """Figure of the forces that the servo asks of the tracker's actuators, with their limits."""
-    figure, axes = grid(1, 1, 3.4)
-    _plot_many(axes[0, 0], data, "commanded_force", "force", "slider")
-    _label_axes(axes[0, 0], "commanded force [N]")
-    return _add_title(figure, data)
-
-
-def flight_joints(data: xr.Dataset) -> Figure:
-    """Figure of the driven joints against their references, and of their errors; hinges and slides apart."""
-    units = data.driven_joint_unit.values
-    scales = [x for x in (("rad", "degrees", _DEGREE), ("m", "m", 1.0)) if x[0] in units]
-    figure, axes = grid(2 * len(scales), 1, 5.0 * len(scales))
-    for row, (unit, unit_text, scale) in enumerate(scales):
-        places = np.flatnonzero(units == unit)
-        names = [str(name) for name in data.driven_joint.values[places]]
-        position, reference, error = (
-            data[signal].values[:, places] / scale
-            for signal in ("joint_position", "reference_joint_position", "joint_error")
-        )
-        labels = (*names, *(f"{name} reference" for name in names))
-        both = np.concatenate([position, reference], axis=1)
-        plot_histories(axes[2 * row, 0], data.time.values, both, labels)
-        _label_axes(axes[2 * row, 0], f"joints [{unit_text}]")
-        plot_histories(axes[2 * row + 1, 0], data.time.values, error, tuple(names))
-        _label_axes(axes[2 * row + 1, 0], f"error [{unit_text}]")
-    return _add_title(figure, data)
-
-
-def flight_power(data: xr.Dataset) -> Figure:
-    """Figure of the powers, and of the battery's charge if there is one."""
-    charge = "state_of_charge" in data
-    figure, axes = grid(2 if charge else 1, 1, 5.0 if charge else 3.0)
-    both = np.stack([data.electric_power.values, data.rotor_power.values], axis=1)
-    plot_histories(axes[0, 0], data.time.values, both, ("electrical", "of the rotors, mechanical"))
-    _label_axes(axes[0, 0], "power [W]")
-    if charge:
-        remaining_charge = 100 * data.state_of_charge.values[:, None]
-        plot_histories(axes[1, 0], data.time.values, remaining_charge, ("charge",))
-        _label_axes(axes[1, 0], "charge left [%]", legend=False)
-    return _add_title(figure, data)
-
-
-def flight_margins(data: xr.Dataset) -> Figure | None:
-    """Figure of the smallest margins of rotor speeds, strokes and forces, as shares of their ranges.
-
-    None for a machine without limits.
+    A machine with a tracker has those of panel, strokes and forces, one with driven joints those of its
+    joints, hinges apart from slides.
     """
-    margins_by_label = {
+    values = lambda name: data[name].values
+    labels_of = lambda dim: tuple(f"{dim} {x}" for x in values(dim))
+    panels: dict[str, list[Any]] = {
+        "errors": [
+            ("position error [m]", ("x", "y", "z"), values("position_error")),
+            ("tilt error [degrees]", ("tilt error",), values("tilt_error")[:, None] / _DEGREE),
+        ],
+        "rotors": [("rotor speed [rad/s]", labels_of("rotor"), values("rotor_speed"))],
+    }
+    margins = {
         label: 100 * np.nanmin(margin_history(data, name, limit), axis=1, initial=0.5)
         for name, label, limit in MARGINS
         if f"lowest_{limit}" in data
     }
-    if not margins_by_label:
-        return None
-    figure, axes = grid(1, 1, 3.0)
-    plot_histories(
-        axes[0, 0],
-        data.time.values,
-        np.stack(list(margins_by_label.values()), axis=1),
-        tuple(margins_by_label),
-    )
-    axes[0, 0].axhline(0.0, color="0.3", linewidth=0.6)
-    _label_axes(axes[0, 0], "smallest margin\n[% of the range]")
-    return _add_title(figure, data)
-
-
-FLIGHT_FIGURES = {
-    "errors": flight_errors, "margins": flight_margins, "rotors": flight_rotors, "power": flight_power,
-    "panel": flight_panel, "strokes": flight_strokes, "forces": flight_forces, "joints": flight_joints,
-}  # fmt: skip
-
-
-# Variables without which a figure is left out.
-_NEEDED = {
-    "joints": "joint_error",
-    "panel": "panel_error",
-    "strokes": "displacement",
-    "forces": "commanded_force",
-}
-
-
-def flight_figures(data: xr.Dataset) -> dict[str, Figure]:
-    """Figures of a mission's flight by name; those of the panel only for a machine with a tracker."""
-    names = [name for name in FLIGHT_FIGURES if _NEEDED.get(name, "time") in data.variables]
-    figures = {name: FLIGHT_FIGURES[name](data) for name in names}
-    return {name: figure for name, figure in figures.items() if figure is not None}
+    if margins:
+        label = "smallest margin\n[% of the range]"
+        panels["margins"] = [(label, tuple(margins), np.stack([*margins.values()], axis=1))]
+    powers = np.stack([values("electric_power"), values("rotor_power")], axis=1)
+    panels["power"] = [("power [W]", ("electrical", "of the rotors, mechanical"), powers)]
+    if "state_of_charge" in data:
+        charge = 100 * values("state_of_charge")[:, None]
+        panels["power"].append(("charge left [%]", ("charge",), charge))
+    if "panel_error" in data:
+        names = ("phi", "theta", "phi reference", "theta reference")
+        angles = np.hstack([values("panel_angles"), values("reference_panel_angles")]) / _DEGREE
+        error = values("panel_error")[:, None] / _DEGREE
+        panels["panel"] = [("panel angles [degrees]", names, angles)]
+        panels["panel"].append(("panel error [degrees]", ("error",), error))
+    if "displacement" in data:
+        panels["strokes"] = [("displacement [m]", labels_of("slider"), values("displacement"))]
+    if "commanded_force" in data:
+        # the forces that the servo asks of the tracker's actuators
+        panels["forces"] = [("commanded force [N]", labels_of("slider"), values("commanded_force"))]
+    for unit, unit_text, scale in (("rad", "degrees", _DEGREE), ("m", "m", 1.0)):
+        if "joint_error" in data and unit in values("driven_joint_unit"):
+            places = np.flatnonzero(values("driven_joint_unit") == unit)
+            names = tuple(map(str, values("driven_joint")[places]))
+            position, reference, error = (
+                values(signal)[:, places] / scale
+                for signal in ("joint_position", "reference_joint_position", "joint_error")
+            )
+            labels = (*names, *(f"{name} reference" for name in names))
+            panels.setdefault("joints", []).extend([
+                (f"joints [{unit_text}]", labels, np.hstack([position, reference])),
+                (f"error [{unit_text}]", names, error),
+            ])  # fmt: skip
+    title = data.attrs.get("title", "")
+    figures = {name: draw_histories(title, values("time"), of) for name, of in panels.items()}
+    lines = {"margins": [0.0]}
+    for name, limit in (("rotors", "speed"), ("strokes", "displacement"), ("forces", "force")):
+        lines[name] = [values(x) for x in (f"lowest_{limit}", f"highest_{limit}") if x in data]
+    for name in lines.keys() & figures.keys():
+        for value in np.unique(lines[name]):
+            figures[name].axes[0].axhline(value, color="0.3", linewidth=0.6)
+    return figures

@@ -23,45 +23,19 @@ CHUNK = 1.0
 Ending = Literal["", "interrupted", "battery empty", "failed"]
 
 
-class FlightProgress(NamedTuple):
-    """Flight as far as it has come.
-
-    Attributes:
-        rows: samples, NumPy arrays; their `end` and `memory` continue the flight. None at the start.
-        soc: state of charge after them [1].
-        seconds: times of compiling and running [s].
-    """
-
-    rows: Rollout | None
-    soc: float
-    seconds: tuple[float, float]
-
-    @property
-    def samples(self) -> int:
-        """Number of samples."""
-        return 0 if self.rows is None else len(self.rows.ts)
-
-
 @dataclass(frozen=True)
 class MissionFlight:
     """Flight of a mission.
 
     Attributes:
-        mission: the mission. run: run of its closed loop, with the signals of `GAUGES`.
-        progress: samples, and the state of plant and controller after them.
+        mission: the mission. run: run of its closed loop, with the signals of `GAUGES`; its `rollout` has
+            NumPy arrays.
         ending: reason for an early end; empty if the flight reached its end.
     """
 
     mission: Mission
     run: LoopRun
-    progress: FlightProgress
     ending: Ending
-
-
-def start_of(mission: Mission) -> FlightProgress:
-    """Flight that has not begun."""
-    battery = mission.truth.battery
-    return FlightProgress(None, 1.0 if battery is None else float(battery.charge), (0.0, 0.0))
 
 
 def fly(
@@ -78,33 +52,68 @@ def fly(
     Raises:
         KeyboardInterrupt: an interruption before anything was flown.
     """
-    now = start_of(mission)
-    ending: Ending = ""
+    plant, battery, total = mission.plant, mission.battery, mission.samples
     # Chunks of one length share a program; samples beyond the end are computed and left out, which
     # costs less than a program for the rest.
-    chunk = min(max(round(CHUNK * mission.plant.rate), 2), mission.samples)
-    run = _Chunk(mission.controller, mission.references, mission.gauges, chunk)
+    count = min(max(round(CHUNK * plant.rate), 2), total)
+    run = _Chunk(mission.controller, mission.references, mission.gauges, count)
+    parts: list[Rollout] = []
+    completed, compile_seconds, run_seconds, ending = 0, 0.0, 0.0, ""
+    soc = 1.0 if mission.truth.battery is None else float(mission.truth.battery.charge)
+    clock = time.perf_counter()
     try:
-        while now.samples < mission.samples and not ending:
-            now, ending = _fly_onwards(mission, run, now)
+        # The noise is that of the mission's seed: the same mission is the same flight.
+        key = jax.random.key(0 if mission.file.sensors is None else mission.file.sensors.seed)
+        start = cached_program(_reset_plant, plant, key)(plant, key)
+        memory = mission.controller.start()
+        while completed < total and not ending:
+            program = cached_program(_fly_chunk, run, plant, start, memory)
+            compiled, remaining = time.perf_counter(), total - completed
+
+            def fly_chunk(
+                start: PlantState, memory: Any, most: int, program: Any = program
+            ) -> Rollout:
+                rows = first_rows(program(run, plant, start, memory), most)
+                return _replace_rows(rows, signals=dict(rows.signals["gauges"]))
+
+            rows = fly_chunk(start, memory, remaining)
+            end: Ending = "failed" if np.any(rows.reason) else ""
+            if battery is not None:
+                charge = _discharge_battery(battery, soc, rows, plant.rate)
+                if charge.ending == "overloaded" and not end and len(rows.ts) < remaining:
+                    # a motion that diverges asks for it too, and its numbers break off within a second
+                    beyond = fly_chunk(rows.end, rows.memory, remaining - len(rows.ts))
+                    if np.any(beyond.reason):
+                        rows, end = _join_rows([rows, beyond]), "failed"
+                        charge = _discharge_battery(battery, soc, rows, plant.rate)
+                rows, soc = _replace_rows(rows, signals=rows.signals | charge.signals), charge.soc
+                if charge.ending == "empty" or (charge.ending and not end):
+                    rows, end = first_rows(rows, charge.samples), "battery empty"
+            parts.append(rows)
+            start, memory, ending = rows.end, rows.memory, end
+            completed += len(rows.ts)
+            compile_seconds += compiled - clock
+            run_seconds += time.perf_counter() - compiled
             if progress is not None:
-                progress(now.samples / mission.samples)
+                progress(completed / total)
+            clock = time.perf_counter()
     except KeyboardInterrupt:
         ending = "interrupted"
-    if now.rows is None:
+    if not parts:
         raise KeyboardInterrupt
-    run = run_of(mission.plant, now.rows, now.seconds)
-    if run.failure:
+    rows = _join_rows(parts)
+    loop_run = run_of(plant, rows, (compile_seconds, run_seconds))
+    if loop_run.failure:
         # numbers until the failure: what follows it is no flight
         # The battery may be the first without a number: a demand beyond its largest power has no
         # current.
-        broken = now.rows.reason != 0
-        if mission.battery is not None:
-            broken |= ~np.isfinite(now.rows.signals["battery_current"])
-        rows = first_rows(now.rows, max(int(np.argmax(broken)), 1))
-        message = describe_failure(mission, rows, run)
-        now, run = now._replace(rows=rows), dataclasses.replace(run, rollout=rows, failure=message)
-    return MissionFlight(mission, run, now, ending)
+        broken = rows.reason != 0
+        if battery is not None:
+            broken |= ~np.isfinite(rows.signals["battery_current"])
+        rows = first_rows(rows, max(int(np.argmax(broken)), 1))
+        message = describe_failure(mission, rows, loop_run)
+        loop_run = dataclasses.replace(loop_run, rollout=rows, failure=message)
+    return MissionFlight(mission, loop_run, ending)
 
 
 def describe_failure(mission: Mission, rows: Rollout, run: LoopRun) -> str:
@@ -167,48 +176,6 @@ def _fly_chunk(run: _Chunk, plant: Plant, start: PlantState, memory: Any) -> Rol
     )  # fmt: skip
 
 
-def _fly_onwards(
-    mission: Mission, run: _Chunk, now: FlightProgress
-) -> tuple[FlightProgress, Ending]:
-    """Flight after one more chunk, and the reason if it ends there early."""
-    clock = time.perf_counter()
-    plant = mission.plant
-    if now.rows is None:
-        seed = 0 if mission.file.sensors is None else mission.file.sensors.seed
-        # The noise is that of the mission's seed: the same mission is the same flight.
-        key = jax.random.key(seed)
-        start, memory = (
-            cached_program(_reset_plant, plant, key)(plant, key),
-            mission.controller.start(),
-        )
-    else:
-        start, memory = now.rows.end, now.rows.memory
-    chunk_program = cached_program(_fly_chunk, run, plant, start, memory)
-    compiled = time.perf_counter()
-
-    def fly_chunk(start: PlantState, memory: Any, count: int) -> Rollout:
-        rows = first_rows(chunk_program(run, plant, start, memory), count)
-        return _replace_rows(rows, signals=dict(rows.signals["gauges"]))
-
-    remaining_count = mission.samples - now.samples
-    rows = fly_chunk(start, memory, remaining_count)
-    ending: Ending = "failed" if np.any(rows.reason) else ""
-    soc = now.soc
-    if mission.battery is not None:
-        charge = _discharge_battery(mission.battery, soc, rows, plant.rate)
-        if charge.ending == "overloaded" and not ending and len(rows.ts) < remaining_count:
-            # a motion that diverges asks for it too, and its numbers break off within a second
-            beyond = fly_chunk(rows.end, rows.memory, remaining_count - len(rows.ts))
-            if np.any(beyond.reason):
-                rows, ending = _join_rows(rows, beyond), "failed"
-                charge = _discharge_battery(mission.battery, soc, rows, plant.rate)
-        rows, soc = _replace_rows(rows, signals=rows.signals | charge.signals), charge.soc
-        if charge.ending == "empty" or (charge.ending and not ending):
-            rows, ending = first_rows(rows, charge.samples), "battery empty"
-    seconds = now.seconds[0] + compiled - clock, now.seconds[1] + time.perf_counter() - compiled
-    return FlightProgress(_join_rows(now.rows, rows), soc, seconds), ending
-
-
 def _sample_arrays(flight_rollout: Rollout) -> dict[str, Any]:
     """Arrays with a row for each sample."""
     names = [field.name for field in dataclasses.fields(flight_rollout)]
@@ -229,13 +196,10 @@ def first_rows(samples: Rollout, count: int) -> Rollout:
     )
 
 
-def _join_rows(before: Rollout | None, after: Rollout) -> Rollout:
-    if before is None:
-        return after
-    both = jax.tree.map(
-        lambda a, b: np.concatenate([a, b]), _sample_arrays(before), _sample_arrays(after)
-    )
-    return _replace_rows(after, **both)
+def _join_rows(parts: list[Rollout]) -> Rollout:
+    """Rollout of parts that follow one another, as NumPy arrays."""
+    rows = jax.tree.map(lambda *x: np.concatenate(x), *map(_sample_arrays, parts))
+    return _replace_rows(parts[-1], **rows)
 
 
 def drain_samples(

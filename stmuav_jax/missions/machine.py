@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,7 +34,7 @@ from ..uav.flight_controller import FlightController, FlightGains, UavController
 from ..uav.inner_motion import JointChain
 from ..uav.joint_controller import DrivenJoint, JointController, JointGains, driven_joints
 from ..uav.motion_estimator import MotionEstimator
-from ..uav.motor import MotorRotors, only_rotors
+from ..uav.motor import only_rotors
 from ..uav.panel_servo import PanelBodies, PanelServo, StrokeServo, panel_bodies
 from ..uav.rotor import Rotors
 from ..uav.scenes.registry import entry_of, make_scene, options_from_plain
@@ -161,48 +160,50 @@ def machine_of(mission_file: MissionFile, folder: Path) -> Machine:
             rotors that are none.
         ModelError: numbers that the scene refuses. FileError: see `load_model`.
     """
-    entry = mission_file.machine
+    entry, controller = mission_file.machine, mission_file.controller
     if (entry.scene is None) == (entry.model is None):
         raise SettingError("'machine' needs a scene or a model's file, and not both.")
-    if entry.model is not None:
-        return _model_machine(mission_file, folder / entry.model)
-    assert entry.scene is not None
-    has_panel = entry.scene == "uav_tracker"
+    has_panel, model = entry.scene == "uav_tracker", None
     if not has_panel:
-        _without_tracker(mission_file, f"The scene {entry.scene}")
-    _check_joints(mission_file, ())
+        _without_tracker(mission_file)
+    if entry.scene is None:
+        assert entry.model is not None
+        if entry.options:
+            raise SettingError(
+                "'machine.options' is for built-in scenes (machine.scene): a model's file has drag, motors and "
+                "landing gear as forces of its own."
+            )
+        model = read_model(folder / entry.model)
     # A scene's own options and a mission's tables would set the same thing twice.
     for name, instead in (("wind", "[wind]"), ("strokes", "[[panel]]"), ("case", "[push]")):
         if name in entry.options:
             raise SettingError(f"'machine.options' of a mission has no {name}: use {instead}.")
     # One table for scene, controller and limits: a mass that is changed is changed in all of them,
     # unless it is drawn for the true machine alone.
-    table = entry_of(entry.scene).parameters.replaced(entry.parameters)
-    scene = scene_of(mission_file, table)
+    table = entry_of(str(entry.scene)).parameters if model is None else model.table
+    table = table.replaced(entry.parameters)
+    scene = scene_of(mission_file, table, model=model)
     motors = only_rotors(scene.system, "A mission")
-    rotors, rotor_limits = motors.rotors, getattr(motors, "limits", None)
-    usual = RotorLimits(table.value("motor.lowest"), table.value("motor.highest"))
-    speeds = _speed_limits(mission_file, rotor_limits or usual)
+    speeds = getattr(motors, "limits", None)
+    if model is None and speeds is None:
+        speeds = RotorLimits(table.value("motor.lowest"), table.value("motor.highest"))
+    joints = () if model is None else driven_joints(scene.system)
+    _check_joints(mission_file, joints)
+    speeds = _speed_limits(mission_file, speeds)
+    machine = Machine(scene, motors.rotors, table, None, None, speeds, model=model, joints=joints)
     if not has_panel:
-        return Machine(scene, rotors, table, None, None, speeds)
-    geometry, shift = tracker_geometry(table), table.value("mount.shift")
-    bodies = panel_bodies(scene.system, geometry, shift)
-    limits, force = tracker_limits(table), mission_file.controller.force
-    empty = Machine(scene, rotors, table, bodies, limits, speeds, force=force)
-    return empty if mission_file.payload is None else _add_payload(empty, mission_file)
-
-
-def _add_payload(empty: Machine, entries: MissionFile) -> Machine:
-    """Machine with the mission's payload, from the one without."""
-    assert entries.payload is not None
-    assert empty.bodies is not None
-    bodies = tracker_carrying(empty.bodies, entries.payload)
-    table = table_carrying(empty.table, bodies)
-    loaded = empty._replace(scene=scene_of(entries, table), table=table)
-    if entries.controller.payload == "known":
+        return machine
+    bodies = panel_bodies(scene.system, tracker_geometry(table), table.value("mount.shift"))
+    machine = machine._replace(bodies=bodies, limits=tracker_limits(table), force=controller.force)
+    if mission_file.payload is None:
+        return machine
+    bodies = tracker_carrying(bodies, mission_file.payload)
+    table = table_carrying(table, bodies)
+    loaded = machine._replace(scene=scene_of(mission_file, table), table=table)
+    if controller.payload == "known":
         return loaded._replace(bodies=bodies)
     # A controller that does not know of the payload flies by the model of the empty machine.
-    return loaded._replace(nominal=empty.scene.system)
+    return loaded._replace(nominal=scene.system)
 
 
 def scene_of(
@@ -220,23 +221,29 @@ def scene_of(
         SettingError: wind without drag, gusts without wind, options that the scene does not have.
         ModelError: numbers that the scene refuses.
     """
-    entry = mission_file.machine
-    if model is None:
-        assert entry.scene is not None
-        # case 2 has actuators; a mission's own forces take the place of the report's
-        has_panel = entry.scene == "uav_tracker"
-        options = options_from_plain(entry.scene, entry.options)
-        scene = make_scene(entry.scene, 2 if has_panel else None, table, **options)
-        scene, wind, advice = (
-            _add_pushes(scene, mission_file),
-            mission_file.wind,
-            "'options.drag = {}' to [machine]",
-        )
-    else:
+    entry, wind, push = mission_file.machine, mission_file.wind, mission_file.push
+    if model is not None:
         system = model.system(table)
         scene = dataclasses.replace(model.scene, system=system, state0=model.start(system, table))
-        wind = mission_file.wind or model.file.wind
+        wind = wind or model.file.wind
         advice = "a force of the kind 'drag' to the model's file"
+    else:
+        assert entry.scene is not None
+        # case 2 has actuators, whose forces are the controller's in place of the report's
+        case = 2 if entry.scene == "uav_tracker" else None
+        options = options_from_plain(entry.scene, entry.options)
+        scene = make_scene(entry.scene, case, table, **options)
+        forces = list(scene.system.forces)
+        for k, actuator in enumerate(scene.system.forces):
+            if isinstance(actuator, LinearActuator):
+                with_force = lambda x, f=actuator: eqx.tree_at(lambda f: f.force, f, x)
+                forces[k] = with_force(as_floats(0.0))
+                if push is not None:
+                    numbers = jnp.asarray(push.force), jnp.asarray(push.angular_frequency)
+                    forces.append(with_force(Sine(*numbers)))
+        system = eqx.tree_at(lambda s: s.forces, scene.system, tuple(forces))
+        scene = dataclasses.replace(scene, system=system)
+        advice = "'options.drag = {}' to [machine]"
     if wind is None:
         return scene
     if not any(isinstance(force, AirframeDrag) for force in scene.system.forces):
@@ -250,62 +257,42 @@ def scene_of(
     return dataclasses.replace(scene, system=with_wind(scene.system, air))
 
 
-def _model_machine(entries: MissionFile, path: Path) -> Machine:
-    _without_tracker(entries, "A model's file")
-    if entries.machine.options:
-        raise SettingError(
-            "'machine.options' is for built-in scenes (machine.scene): a model's file has drag, motors and landing "
-            "gear as forces of its own."
-        )
-    model = read_model(path)
-    table = model.table.replaced(entries.machine.parameters)
-    scene = scene_of(entries, table, model=model)
-    motors = only_rotors(scene.system, "A mission")
-    rotors, limits = motors.rotors, getattr(motors, "limits", None)
-    joints = driven_joints(scene.system)
-    _check_joints(entries, joints)
-    return Machine(
-        scene, rotors, table, None, None, _speed_limits(entries, limits), model=model, joints=joints
-    )
-
-
 def _check_joints(entries: MissionFile, joints: tuple[DrivenJoint, ...]) -> None:
     """Raise `SettingError` for entries of joints that no effort and no servo of the machine drives."""
-    controller, tolerances = entries.controller, entries.tolerances
+    controller = entries.controller
     if entries.machine.model is not None and controller.feedforward is not None and not joints:
         raise SettingError(
             "'controller.feedforward' needs a model with moving joints, which this model does not have: leave it out."
         )
     names = [drive.name for drive in joints]
-    used = {
-        "[[joints]]": [move.joint for move in entries.joints],
-        "'controller.joints'": list(controller.joints),
-        "'tolerances.joints'": list(tolerances.joints),
-    }
-    for place, of_place in used.items():
-        for name in of_place:
-            if name not in names:
-                raise SettingError(
-                    f"{place} names {quote_name(name)}, but no effort or servo of the machine drives a joint of this "
-                    f"name.{nearest_names(name[:SHOWN], names)}"
-                )
+    used = [("[[joints]]", move.joint) for move in entries.joints]
+    used += [("'controller.joints'", name) for name in controller.joints]
+    used += [("'tolerances.joints'", name) for name in entries.tolerances.joints]
+    for place, name in used:
+        if name not in names:
+            raise SettingError(
+                f"{place} names {quote_name(name)}, but no effort or servo of the machine drives a joint of this "
+                f"name.{nearest_names(name[:SHOWN], names)}"
+            )
 
 
-def _without_tracker(entries: MissionFile, machine_label: str) -> None:
+def _without_tracker(entries: MissionFile) -> None:
     """Raise `SettingError` for entries that only a machine with a tracker can have."""
+    controller, tolerances, sensors = entries.controller, entries.tolerances, entries.sensors
+    is_scene = entries.machine.scene is not None
     used = {
-        "[[panel]]": entries.panel, "[push]": entries.push, "'controller.servo'": entries.controller.servo,
-        "'controller.feedforward'": entries.controller.feedforward is not None and not entries.machine.model,
-        "'controller.force'": entries.controller.force is not None,
-        "'sensors.encoders'": entries.sensors and entries.sensors.encoders and not entries.machine.model,
-        "'tolerances.panel'": entries.tolerances.panel, "[payload]": entries.payload,
-        "'tolerances.panel_after'": entries.tolerances.panel_after is not None,
+        "[[panel]]": entries.panel, "[push]": entries.push, "'controller.servo'": controller.servo,
+        "'controller.feedforward'": is_scene and controller.feedforward is not None,
+        "'controller.force'": controller.force, "'sensors.encoders'": is_scene and sensors and sensors.encoders,
+        "'tolerances.panel'": tolerances.panel, "[payload]": entries.payload,
+        "'tolerances.panel_after'": tolerances.panel_after is not None,
         "A fault of a slider": any(fault.slider for fault in entries.faults),
     }  # fmt: skip
+    owner = f"The scene {entries.machine.scene}" if is_scene else "A model's file"
     for name, value in used.items():
         if value:
             raise SettingError(
-                f"{name} needs the tracker of the scene uav_tracker. {machine_label} has none."
+                f"{name} needs the tracker of the scene uav_tracker. {owner} has none."
             )
 
 
@@ -318,41 +305,21 @@ def _speed_limits(mission_file: MissionFile, motors: RotorLimits | None) -> Roto
         if low is None or high is None:
             raise SettingError("Limits of the rotor speeds need 'lowest' and 'highest'.")
         return RotorLimits(low, high)
-    slowest, fastest = (
-        float(np.max(np.asarray(motors.lowest))),
-        float(np.min(np.asarray(motors.highest))),
-    )
+    slowest, fastest = float(np.max(motors.lowest)), float(np.min(motors.highest))
     # round-off of limits that are kept as squares
-    if low is not None and low < slowest * (1 - AT_MOTORS):
-        raise SettingError(
-            f"'controller.lowest' is {low:g} rad/s, but the motors turn no more slowly than {slowest:g} rad/s: "
-            "give a limit within the motors' range, or other motors ('options.motor = {lowest = ...}' in "
-            "[machine], machine.parameters \"motor.lowest\", or 'lowest' in a model)."
-        )
-    if high is not None and high > fastest * (1 + AT_MOTORS):
-        raise SettingError(
-            f"'controller.highest' is {high:g} rad/s, but the motors turn no faster than {fastest:g} rad/s: "
-            "give a limit within the motors' range, or other motors ('options.motor = {highest = ...}' in "
-            '[machine], or machine.parameters "motor.highest").'
-        )
+    for name, speed, beyond, motion in (
+        ("lowest", low, low is not None and low < slowest * (1 - AT_MOTORS), f"no more slowly than {slowest:g}"),
+        ("highest", high, high is not None and high > fastest * (1 + AT_MOTORS), f"no faster than {fastest:g}"),
+    ):  # fmt: skip
+        if beyond:
+            raise SettingError(
+                f"'controller.{name}' is {speed:g} rad/s, but the motors turn {motion} rad/s: "
+                f"give a limit within the motors' range, or other motors ('options.motor = {{{name} = ...}}' in "
+                f"[machine], machine.parameters \"motor.{name}\", or '{name}' in a model)."
+            )
     return RotorLimits(
         motors.lowest if low is None else low, motors.highest if high is None else high
     )
-
-
-def _add_pushes(scene: Scene, entries: MissionFile) -> Scene:
-    """Scene whose own actuators have plain forces, and others with sinusoidal ones on request."""
-    forces, actuators = list(scene.system.forces), []
-    for k, force in enumerate(forces):
-        if isinstance(force, LinearActuator):
-            actuators.append(force)
-            # The scene's own forces would be added to those of the controller.
-            forces[k] = eqx.tree_at(lambda f: f.force, force, as_floats(0.0))
-    if entries.push is not None:
-        sine = Sine(jnp.asarray(entries.push.force), jnp.asarray(entries.push.angular_frequency))
-        forces += [eqx.tree_at(lambda f: f.force, f, sine) for f in actuators]
-    system = eqx.tree_at(lambda s: s.forces, scene.system, tuple(forces))
-    return dataclasses.replace(scene, system=system)
 
 
 def input_names(machine: Machine) -> list[str]:
@@ -368,28 +335,26 @@ def plant_of(mission_file: MissionFile, machine: Machine) -> Plant:
         SettingError: rates or delays that do not divide, instruments that do not suffice, a start that
             moves although it is to stand first.
     """
-    system, rate = machine.scene.system, mission_file.rates.control
+    system, rates = machine.scene.system, mission_file.rates
     # The controller uses its own numbers; only the plant has the true ones.
     nominal_system = system if machine.nominal is None else machine.nominal
-    names = input_names(machine)
-    count, mass = (
-        machine.rotors.spin.shape[0],
-        float(np.sum(np.asarray(nominal_system.bodies.mass))),
-    )
-    hover = machine.rotors.hover(mass, gravity_of(system))
-    rest = (
-        inputs_of(system, names).values(system)[count:]
-        if machine.joints
-        else np.zeros(len(names) - 1)
-    )
+    names, count = input_names(machine), machine.rotors.spin.shape[0]
+    mass = float(np.sum(np.asarray(nominal_system.bodies.mass)))
+    rest = np.zeros(len(names) - 1)
+    if machine.joints:
+        rest = inputs_of(system, names).values(system)[count:]
     # Until the first command arrives the rotors carry the weight: with a delay the machine would
     # otherwise begin with a fall.
-    before = np.concatenate([np.asarray(hover), np.asarray(rest)])
-    settings: dict[str, Any] = {"inputs": names, "before": before, "rate": rate}
-    settings |= {"steps": mission_file.rates.steps, "delay": mission_file.rates.delay}
-    payloads = payloads_of(mission_file, machine.scene)
-    scene = machine.scene if payloads is None else payloads.load(machine.scene)
-    settings["changes"] = () if payloads is None else payloads.changes(scene.system)
+    hover = np.asarray(machine.rotors.hover(mass, gravity_of(system)))
+    settings: dict[str, Any] = {
+        "inputs": names,
+        "before": np.concatenate([hover, np.asarray(rest)]),
+    }
+    settings |= {"rate": rates.control, "steps": rates.steps, "delay": rates.delay}
+    payloads, scene = payloads_of(mission_file, machine.scene), machine.scene
+    if payloads is not None:
+        scene = payloads.load(scene)
+        settings["changes"] = payloads.changes(scene.system)
     if mission_file.sensors is None:
         # True states are those of the true machine; a controller without the payload has to get
         # those of its own model.
@@ -398,10 +363,10 @@ def plant_of(mission_file: MissionFile, machine: Machine) -> Plant:
         return Plant(scene, observe=observe, **settings)
     chain = None if machine.model is None or not system.joints else JointChain(nominal_system)
     instruments = _make_instruments(mission_file.sensors, machine, chain, mission_file.faults)
-    estimator_settings: dict[str, Any] = {"tracker": machine.bodies}
-    if chain is not None:
-        estimator_settings = {"joints": chain, "panel_noise": JOINT_NOISE}
-    estimator = MotionEstimator(system, rate, instruments, **estimator_settings)
+    joint_settings = {} if chain is None else {"joints": chain, "panel_noise": JOINT_NOISE}
+    estimator = MotionEstimator(
+        system, rates.control, instruments, tracker=machine.bodies, **joint_settings
+    )
     # The estimator starts at the mission's start with its usual deviations, as a vehicle does
     # whose pose on the ground was measured.
     memory = estimator.start(machine.scene.state0)
@@ -421,28 +386,22 @@ def _make_instruments(
     faults: tuple[FaultEntry, ...],
 ) -> list[Instrument]:
     """Instruments of the estimator, with the numbers of the mission, else of the model, else the usual ones."""
-    if (
-        any(fault.sensor == "encoders" for fault in faults)
-        and machine.bodies is None
-        and chain is None
-    ):
-        raise SettingError("A fault of encoders needs a machine with joints.")
     body = machine.scene.system.names[0]
     names = ("gyroscope", "accelerometer", "position", "attitude")
     kinds: dict[str, list[Any]] = {name: [SENSORS[name](body)] for name in names}
-    if machine.bodies is not None:
-        kinds["encoders"] = [SENSORS["encoder"](joint) for joint in SLIDER_JOINTS]
-    if chain is not None:
-        kinds["encoders"] = [SENSORS["encoder"](joint) for joint in chain.joints]
+    joints = SLIDER_JOINTS if machine.bodies is not None else ()
+    joints = joints if chain is None else chain.joints
+    kinds["encoders"] = [SENSORS["encoder"](joint) for joint in joints]
+    if not joints and any(fault.sensor == "encoders" for fault in faults):
+        raise SettingError("A fault of encoders needs a machine with joints.")
+    owner = lambda x: (type(x), getattr(x, "body", None), getattr(x, "joint", None))
+    of_model = {owner(x.sensor): x for x in reversed([*machine.scene.sensors.values()])}
     instruments = []
     for name, sensors in kinds.items():
         entry = getattr(sensor_entries, name)
-        instrument_settings = {} if entry is None else entry.model_dump(exclude_none=True)
-        mission_numbers: dict[str, Any] = {
-            key: np.asarray(value) if key in ("noise", "bias") else value
-            for key, value in instrument_settings.items()
-        }
-        mission_numbers["faults"] = tuple(
+        numbers = {} if entry is None else entry.model_dump(exclude_none=True)
+        numbers |= {key: np.asarray(numbers[key]) for key in ("noise", "bias") if key in numbers}
+        numbers["faults"] = tuple(
             SensorFault(
                 fault.at,
                 np.inf if fault.until is None else fault.until,
@@ -453,51 +412,37 @@ def _make_instruments(
         )
         # Numbers of the mission come before those of the model, and these before the usual ones:
         # the more special file decides.
-        for usual in sensors:
-            sensor, numbers = _of_model(machine.scene, usual)
-            instruments.append(
-                Instrument(sensor, **(INSTRUMENTS[name] | numbers | mission_numbers))
-            )
+        for sensor in sensors:
+            sheet: dict[str, Any] = {}
+            if (of_file := of_model.get(owner(sensor))) is not None:
+                # The estimator finds instruments by the usual names; a model's file gives them names
+                # of its own.
+                usual_name, sensor = sensor.name, copy.copy(of_file.sensor)
+                object.__setattr__(sensor, "name", usual_name)
+                sheet = {k: x for k in DATASHEET if (x := getattr(of_file, k)) is not None}
+            instruments.append(Instrument(sensor, **(INSTRUMENTS[name] | sheet | numbers)))
     return instruments
-
-
-def _of_model(scene: Scene, usual: Any) -> tuple[Any, dict[str, Any]]:
-    """Sensor of a model's file that takes the place of the usual one, and its numbers; else this one, none."""
-    owner = lambda sensor: (
-        type(sensor),
-        getattr(sensor, "body", None),
-        getattr(sensor, "joint", None),
-    )
-    for instrument in scene.sensors.values():
-        if owner(instrument.sensor) == owner(usual):
-            sensor = copy.copy(instrument.sensor)
-            # The estimator finds instruments by the usual names; a model's file gives them names
-            # of its own.
-            object.__setattr__(sensor, "name", usual.name)
-            sheet = {key: getattr(instrument, key) for key in DATASHEET}
-            return sensor, {key: value for key, value in sheet.items() if value is not None}
-    return usual, {}
 
 
 def check_instruments(mission_file: MissionFile) -> None:
     """Raise `SettingError` for instruments' rates and delays that cannot be flown."""
-    if mission_file.sensors is None:
+    sensors, control_rate = mission_file.sensors, mission_file.rates.control
+    if sensors is None:
         return
-    rate = mission_file.rates.control
-    whole_periods(mission_file.sensors.standing, rate, "The time of standing")
+    whole_periods(sensors.standing, control_rate, "The time of standing")
     for name, usual in INSTRUMENTS.items():
-        entry = getattr(mission_file.sensors, name) or InstrumentEntry()
-        numbers = usual | entry.model_dump(exclude_none=True)
-        reading_rate, delay = numbers.get("rate", rate), numbers.get("delay", 0.0)
+        entry = getattr(sensors, name) or InstrumentEntry()
+        numbers = {"rate": control_rate, "delay": 0.0} | usual | entry.model_dump(exclude_none=True)
+        rate, delay = numbers["rate"], numbers["delay"]
         # The estimator's prediction runs on these two at each period.
-        if name in ("gyroscope", "accelerometer") and (reading_rate != rate or delay):
+        if name in ("gyroscope", "accelerometer") and (rate != control_rate or delay):
             raise SettingError(
-                f"'sensors.{name}' must read at every control period, at {rate:g} Hz, and without delay, because "
-                f"the estimator integrates it, but it reads at {reading_rate:g} Hz, late by {delay:g} s: leave "
+                f"'sensors.{name}' must read at every control period, at {control_rate:g} Hz, and without delay, "
+                f"because the estimator integrates it, but it reads at {rate:g} Hz, late by {delay:g} s: leave "
                 "'rate' and 'delay' out, or set 'rates.control' to its rate."
             )
-        count_periods(reading_rate, rate, f"'sensors.{name}'")
-        whole_periods(delay, rate, f"'sensors.{name}.delay'")
+        count_periods(rate, control_rate, f"'sensors.{name}'")
+        whole_periods(delay, control_rate, f"'sensors.{name}.delay'")
 
 
 def controller_of(mission_file: MissionFile, machine: Machine, plant: Plant) -> MissionController:
@@ -507,22 +452,15 @@ def controller_of(mission_file: MissionFile, machine: Machine, plant: Plant) -> 
         SettingError: entries that do not fit the servo, faults that the machine cannot have.
         ModelError: a machine that the controller cannot fly.
     """
-    pilot = _make_pilot(mission_file, machine, plant, ())
-    controller = _add_faults(mission_file, machine, pilot)
-    # Controllers for lost rotors differ in structure and cannot be made within the compiled
-    # flight.
-    known_losses: dict[float, list[int]] = {}
-    for fault in mission_file.faults:
-        if fault.known and fault.rotor is not None:
-            known_losses.setdefault(fault.at, []).append(fault.rotor)
-    lost: list[int] = []
+    controller = _add_faults(mission_file, machine, _make_pilot(mission_file, machine, plant, ()))
+    # Controllers for lost rotors differ in structure and cannot be made within the compiled flight. Each
+    # known loss has a controller for all losses so far; all of them are built before the flight.
+    losses = [(fault.at, fault.rotor) for fault in mission_file.faults if fault.known]
     pilot_changes = []
-    for at in sorted(known_losses):
-        # Each known loss has a controller for all losses so far; all of them are built before the flight.
-        lost = lost + known_losses[at]
-        pilot_changes.append(
-            PilotChange(jnp.asarray(at), _make_pilot(mission_file, machine, plant, tuple(lost)))
-        )
+    for at in sorted({t for t, _ in losses}):
+        lost = tuple(rotor for t, rotor in sorted(losses) if t <= at and rotor is not None)
+        pilot = _make_pilot(mission_file, machine, plant, lost)
+        pilot_changes.append(PilotChange(jnp.asarray(at), pilot))
     return dataclasses.replace(controller, pilot_changes=tuple(pilot_changes))
 
 
@@ -539,12 +477,8 @@ def _make_pilot(
     pilot: FlightController | UavController | JointController = flight
     if machine.joints:
         usual = JointGains(frequency=default_servo_frequency(entries.rates))
-        gains = {
-            name: _joint_gains(name, joint_entry, usual)
-            for name, joint_entry in entry.joints.items()
-        }
-        efforts = [drive.name for drive in machine.joints if drive.is_effort]
-        gains = dict.fromkeys(efforts, usual) | gains
+        gains = {drive.name: usual for drive in machine.joints if drive.is_effort}
+        gains |= {name: _joint_gains(name, of, usual) for name, of in entry.joints.items()}
         pilot = JointController(system, flight, gains, feedforward=entry.feedforward is not False)
     if machine.bodies is not None:
         servo = _make_servo(entry.servo or ServoEntry(), machine.bodies, entries.rates)
@@ -563,10 +497,8 @@ def _make_pilot(
             "[sensors] has."
         )
     # The filter of the payload is tuned by the gyroscope's datasheet, as on a real machine.
-    gyroscope_noise = entries.sensors.gyroscope.noise
-    noise = np.asarray(
-        INSTRUMENTS["gyroscope"]["noise"] if gyroscope_noise is None else gyroscope_noise
-    )
+    noise = entries.sensors.gyroscope.noise
+    noise = np.asarray(INSTRUMENTS["gyroscope"]["noise"] if noise is None else noise)
     payload_filter = PayloadFilter(
         system, plant.rate, delay=entries.rates.delay, gyroscope=float(np.sqrt(np.mean(noise**2)))
     )
@@ -585,16 +517,13 @@ def default_servo_frequency(rates: RatesEntry) -> float:
 def _joint_gains(name: str, entry: JointServoEntry, usual: JointGains) -> JointGains:
     """Gains of a joint's servo; what is left out is usual."""
     numbers = entry.model_dump(exclude_none=True, exclude={"kind"})
-    if entry.kind == "pd":
-        if "stiffness" not in numbers or "frequency" in numbers:
-            raise SettingError(
-                f"'controller.joints.{name}' of the kind pd needs 'stiffness' and 'damping', and no frequency."
-            )
+    is_direct = entry.kind == "pd"
+    if ("stiffness" in numbers) != is_direct or (is_direct and "frequency" in numbers):
+        rule = "has 'frequency' and 'damping', and no stiffness"
+        rule = "needs 'stiffness' and 'damping', and no frequency" if is_direct else rule
+        raise SettingError(f"'controller.joints.{name}' of the kind {entry.kind} {rule}.")
+    if is_direct:
         return JointGains(**numbers)
-    if "stiffness" in numbers:
-        raise SettingError(
-            f"'controller.joints.{name}' of the kind computed_torque has 'frequency' and 'damping', and no stiffness."
-        )
     ratio = numbers.pop("damping", usual.damping_ratio)
     return usual._replace(damping_ratio=ratio, **numbers)
 
@@ -602,70 +531,55 @@ def _joint_gains(name: str, entry: JointServoEntry, usual: JointGains) -> JointG
 def _make_servo(
     entry: ServoEntry, bodies: PanelBodies, rates: RatesEntry
 ) -> PanelServo | StrokeServo:
-    servo_settings = entry.model_dump(exclude_none=True, exclude={"kind"})
-    if entry.kind == "computed_torque":
-        servo_settings = {"frequency": default_servo_frequency(rates)} | servo_settings
-    kinds: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
-        "computed_torque": (PanelServo, ("frequency", "damping")),
-        "strokes": (StrokeServo, ("stiffness", "damping")),
-    }
-    make, setting_names = kinds[entry.kind]
-    for name in servo_settings:
-        if name not in setting_names:
+    numbers = entry.model_dump(exclude_none=True, exclude={"kind"})
+    is_torque = entry.kind == "computed_torque"
+    names = ("frequency" if is_torque else "stiffness", "damping")
+    for name in numbers:
+        if name not in names:
             raise SettingError(
-                f"'controller.servo' of the kind {entry.kind} has no {name}; it has {' and '.join(setting_names)}."
+                f"'controller.servo' of the kind {entry.kind} has no {name}; it has {' and '.join(names)}."
             )
-    return make(bodies, **servo_settings)
+    if is_torque:
+        return PanelServo(bodies, **({"frequency": default_servo_frequency(rates)} | numbers))
+    return StrokeServo(bodies, **numbers)
 
 
 def check_faults(mission_file: MissionFile) -> None:
     """Raise `SettingError` for faults that contradict themselves or each other."""
     places: dict[str, FaultEntry] = {}
     for fault in sorted(mission_file.faults, key=lambda fault: fault.at):
-        if sum(x is not None for x in (fault.rotor, fault.slider, fault.sensor)) != 1:
-            raise SettingError("A fault needs one of a rotor, a slider and a sensor.")
-        if fault.sensor is not None:
-            _check_sensor_fault(mission_file, fault)
-            continue
-        if fault.bias is not None or fault.until is not None:
-            raise SettingError(
-                "'bias' and 'until' are for faults of sensors: leave them out of a fault of a rotor or slider."
-            )
-        if fault.slider is not None and fault.share is not None:
-            raise SettingError("'share' is for faults of rotors: a jammed slider does not move.")
-        if fault.known and (fault.rotor is None or fault.share):
-            raise SettingError(
-                "A fault that is 'known' must be the loss of a rotor, without a share of its thrust: "
-                "the controller cannot compensate a jammed slider or a weak rotor."
-            )
+        of_sensor, until = fault.sensor is not None, np.inf if fault.until is None else fault.until
+        parts = [x for x in (fault.rotor, fault.slider, fault.sensor) if x is not None]
         place = f"Rotor {fault.rotor}" if fault.rotor is not None else f"Slider {fault.slider}"
         # Faults of one part are looked at in the order of time: one after a final fault, or at the
         # same time, would silently have no effect.
-        before = places.get(place)
-        if before is not None and before.at == fault.at:
-            raise SettingError(
-                f"{place} has two faults at t = {fault.at:g} s: leave one of them out."
-            )
-        if before is not None and (before.known or fault.slider is not None):
-            raise SettingError(
-                f"{place} {'is lost' if before.known else 'is jammed'} from t = {before.at:g} s on, so that "
-                f"its fault at t = {fault.at:g} s has no effect: leave one of them out."
-            )
-        places[place] = fault
-
-
-def _check_sensor_fault(entries: MissionFile, fault: FaultEntry) -> None:
-    """Raise `SettingError` for a fault of a sensor that the mission cannot have."""
-    if entries.sensors is None:
-        raise SettingError("A fault of a sensor needs a mission with [sensors].")
-    if fault.known or fault.share is not None:
-        raise SettingError(
-            "'known' and 'share' are for faults of rotors: leave them out of a fault of a sensor."
-        )
-    if fault.until is not None and fault.until <= fault.at:
-        raise SettingError(
-            f"A fault of a sensor must end after it begins, but it lasts from {fault.at:g} to {fault.until:g} s."
-        )
+        before = None if of_sensor else places.get(place)
+        is_final = before is not None and (before.known or fault.slider is not None)
+        ending = "is jammed" if fault.slider is not None else "is lost"
+        for is_wrong, message in (
+            (len(parts) != 1, "A fault needs one of a rotor, a slider and a sensor."),
+            (of_sensor and mission_file.sensors is None,
+             "A fault of a sensor needs a mission with [sensors]."),
+            (of_sensor and (fault.known or fault.share is not None),
+             "'known' and 'share' are for faults of rotors: leave them out of a fault of a sensor."),
+            (of_sensor and until <= fault.at, "A fault of a sensor must end after it begins, but it lasts from "
+             f"{fault.at:g} to {until:g} s."),
+            (not of_sensor and (fault.bias is not None or fault.until is not None),
+             "'bias' and 'until' are for faults of sensors: leave them out of a fault of a rotor or slider."),
+            (fault.slider is not None and fault.share is not None,
+             "'share' is for faults of rotors: a jammed slider does not move."),
+            (fault.known and (fault.rotor is None or fault.share),
+             "A fault that is 'known' must be the loss of a rotor, without a share of its thrust: the controller "
+             "cannot compensate a jammed slider or a weak rotor."),
+            (before is not None and before.at == fault.at,
+             f"{place} has two faults at t = {fault.at:g} s: leave one of them out."),
+            (is_final, f"{place} {ending} from t = {before.at if before else 0.0:g} s on, so that its fault at t = "
+             f"{fault.at:g} s has no effect: leave one of them out."),
+        ):  # fmt: skip
+            if is_wrong:
+                raise SettingError(message)
+        if not of_sensor:
+            places[place] = fault
 
 
 def _add_faults(entries: MissionFile, machine: Machine, pilot: Any) -> MissionController:
@@ -687,10 +601,9 @@ def _add_faults(entries: MissionFile, machine: Machine, pilot: Any) -> MissionCo
     # Arrays of times and shares, padded: the number of faults is structure, their times and sizes
     # are numbers that a study may draw.
     lost, share = np.moveaxis(np.array(rows), -1, 0)
-    motors = [f for f in machine.scene.system.forces if isinstance(f, MotorRotors)]
     # A lost rotor stands still, which motors with a lowest speed could not.
-    slowest = [f.limits.lowest for f in motors if f.limits is not None]
-    if np.any(np.isfinite(lost)) and slowest and float(np.max(np.asarray(slowest[0]))) > 0:
+    motors = getattr(only_rotors(machine.scene.system, "A mission"), "limits", None)
+    if np.any(np.isfinite(lost)) and motors is not None and float(np.max(motors.lowest)) > 0:
         raise SettingError(
             "A rotor that fails turns more slowly than the motors' lowest speed: give "
             "'options.motor = {lowest = 0.0}' (a model's motors 'lowest = 0.0'), and the controller's limit as "
@@ -704,12 +617,12 @@ def _add_faults(entries: MissionFile, machine: Machine, pilot: Any) -> MissionCo
             )
         assert machine.bodies is not None
         jam = Jam(machine.bodies.geometry, jnp.asarray(jammed))
-    most_force = np.inf if machine.force is None else machine.force
     # a servo's input is a target, which no limit of its effort cuts off
-    of_joints = [
-        x if drive.is_effort else np.inf
-        for drive, x in zip(machine.joints, machine.efforts, strict=True)
-    ]
-    force = as_floats(np.full(2, most_force) if machine.bodies is not None else np.array(of_joints))
+    is_effort = np.array([drive.is_effort for drive in machine.joints], bool)
+    force = np.where(is_effort, machine.efforts, np.inf)
+    if machine.bodies is not None:
+        force = np.full(2, np.inf if machine.force is None else machine.force)
     rotors = machine.rotors if machine.rotors.has_curves else None
-    return MissionController(pilot, as_floats(lost), as_floats(share), jam, force, rotors)
+    return MissionController(
+        pilot, as_floats(lost), as_floats(share), jam, as_floats(force), rotors
+    )

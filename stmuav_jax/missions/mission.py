@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -46,7 +46,6 @@ from ..uav.tracker.kinematics import PairMotion, Reason, panel_angles, panel_nor
 from ..uav.tracker.workspace import survey, why_outside
 from .controller import (
     AT_ONCE,
-    DirectionMotion,
     HeldPath,
     JointMoves,
     MissionController,
@@ -67,7 +66,7 @@ from .machine import (
     payloads_of,
     plant_of,
 )
-from .schema import MissionFile, MoveEntry, PathEntry, SunEntry
+from .schema import MissionFile, MoveEntry, PathEntry, TimedEntry
 from .signals import Gauges
 from .truth import FlightBattery, Truth, apply_truth, list_truth_parameters, make_truth
 
@@ -174,8 +173,6 @@ def load_mission(
         content["truth"] = {**content.get("truth", {}), **truth}
     try:
         return make_mission(content, path.parent)
-    except FileError:
-        raise
     except (ModelError, SettingError, StateError) as error:
         raise FileError(f"{path}: {error}") from error
 
@@ -199,21 +196,25 @@ def make_mission(plain: Mapping[str, Any], folder: str | os.PathLike[str] = ".")
     _check_moves(entries)
     battery = _make_battery(entries) if entries.machine.model is None else None
     machine = machine_of(entries, Path(folder))
-    battery = (
-        battery if machine.model is None else _make_battery(entries, machine.model.file.battery)
-    )
+    if machine.model is not None:
+        battery = _make_battery(entries, machine.model.file.battery)
     # From here on numbers are computed; the entries by themselves are consistent.
     plant = inspect_plant(plant_of(entries, machine))
     panel = _make_moves(entries, machine) if machine.bodies is not None else None
-    _check_gear(entries, plant)
+    has_gear = any(isinstance(force, GroundContact) for force in plant.system.forces)
+    for name in ("touchdown", "sink"):
+        if getattr(entries.tolerances, name) is not None and not has_gear:
+            raise SettingError(
+                f"'tolerances.{name}' needs a landing gear, which this machine does not have: add "
+                "'options.gear = {}' to [machine]."
+            )
     gauges = Gauges(machine, plant.system, payloads_of(entries, machine.scene))
-    believed, table = (
-        Truth(plant, gauges, machine.speeds, battery),
-        list_truth_parameters(entries, machine, battery),
-    )
+    believed = Truth(plant, gauges, machine.speeds, battery)
+    table = apply_truth(entries, machine, list_truth_parameters(entries, machine, battery))
+    controller = controller_of(entries, machine, plant)
+    path, joints = _make_path(entries.path, machine), _joint_moves(entries, machine)
     mission = Mission(
-        entries, machine, believed, apply_truth(entries, machine, table), controller_of(entries, machine, plant),
-        References(_make_path(entries.path, machine), panel, _joint_moves(entries, machine)), folder=Path(folder),
+        entries, machine, believed, table, controller, References(path, panel, joints), folder=Path(folder)
     )  # fmt: skip
     assert mission.samples > 1
     # Checks go from cheap to expensive: the start, thrusts along the path, the linear loop, and
@@ -227,12 +228,11 @@ def make_mission(plain: Mapping[str, Any], folder: str | os.PathLike[str] = ".")
     if not entries.truth:
         return mission
     # Checks are of the mission as the controller has it; from here on the truth flies.
-    truth = make_truth(entries, machine, believed, mission.table)
-    return dataclasses.replace(mission, truth=truth)
+    return dataclasses.replace(mission, truth=make_truth(entries, machine, believed, table))
 
 
 def _check_moves(mission_file: MissionFile) -> None:
-    """Raise `SettingError` for moves of the panel of two kinds, or that do not follow one another."""
+    """Raise `SettingError` for moves of the panel of two kinds, or moves that do not follow one another."""
     kinds = set()
     for move in mission_file.panel:
         goals = [name for name in ("angles", "direction", "sun") if getattr(move, name) is not None]
@@ -248,25 +248,17 @@ def _check_moves(mission_file: MissionFile) -> None:
             "The moves of the panel must all be to angles in the base's axes, or all to directions "
             "of the world and the sun."
         )
-    for k, (first, second) in enumerate(itertools.pairwise(mission_file.panel), 1):
-        if second.at < first.at + first.duration - AT_ONCE:
-            raise SettingError(
-                f"The moves of the panel must follow one another, but move {k + 1} begins at t = {second.at:g} s, "
-                f"before the end of move {k} at {first.at + first.duration:g} s: list them by their times, and "
-                "give each its time."
-            )
-
-
-def _check_gear(entries: MissionFile, plant: Plant) -> None:
-    """Raise `SettingError` for tolerances of a landing gear that the machine does not have."""
-    tolerance_names = [
-        k for k in ("touchdown", "sink") if getattr(entries.tolerances, k) is not None
-    ]
-    if tolerance_names and not any(isinstance(f, GroundContact) for f in plant.system.forces):
-        raise SettingError(
-            f"'tolerances.{tolerance_names[0]}' needs a landing gear, which this machine does not have: add "
-            "'options.gear = {}' to [machine]."
-        )
+    moves: dict[str, list[TimedEntry]] = {"the panel": [*mission_file.panel]}
+    for move in mission_file.joints:
+        moves.setdefault(f"joint '{move.joint[:SHOWN]}'", []).append(move)
+    for subject, of_subject in moves.items():
+        for k, (first, second) in enumerate(itertools.pairwise(of_subject), 1):
+            if second.at < first.at + first.duration - AT_ONCE:
+                raise SettingError(
+                    f"The moves of {subject} must follow one another, but move {k + 1} begins at t = {second.at:g} s, "
+                    f"before the end of move {k} at {first.at + first.duration:g} s: list them by their times, and "
+                    "give each its time."
+                )
 
 
 def _make_path(entry: PathEntry, machine: Machine) -> HeldPath | WaypointPath:
@@ -343,13 +335,19 @@ def _make_moves(entries: MissionFile, machine: Machine) -> PanelMoves:
     # angles from the angles.
     world = bool(entries.panel) and entries.panel[0].angles is None
     start = _panel_normal(state, angles) if world else angles
-    targets = tuple(_move_target(move, entries.t1) for move in entries.panel)
+    targets = [_move_target(move, entries.t1) for move in entries.panel]
+    return _follow_moves(start, targets, entries.panel, world)
+
+
+def _follow_moves(
+    start: Any, targets: Sequence[Any], moves: Sequence[TimedEntry], world: bool
+) -> PanelMoves:
+    """Moves to the targets with the times and shapes of their entries."""
     ats, durations = (
-        tuple(jnp.asarray(getattr(move, name)) for move in entries.panel)
-        for name in ("at", "duration")
+        tuple(jnp.asarray(getattr(move, name)) for move in moves) for name in ("at", "duration")
     )
-    shapes = tuple(jnp.asarray(move.shape, dtype=float) for move in entries.panel)
-    return PanelMoves(start, targets, ats, durations, world, shapes)
+    shapes = tuple(jnp.asarray(move.shape, dtype=float) for move in moves)
+    return PanelMoves(start, tuple(targets), ats, durations, world, shapes)
 
 
 @quick_jit
@@ -359,6 +357,7 @@ def _panel_normal(state: State, angles: Float[Array, "2"]) -> Float[Array, "3"]:
 
 
 def _move_target(move: MoveEntry, t1: float) -> Any:
+    """Target of a move: angles (2,) [rad], a direction of the world (3,), or a function of t [s] for the sun's."""
     if move.angles is not None:
         return _DEGREE * jnp.asarray(move.angles)
     if move.direction is not None:
@@ -366,12 +365,8 @@ def _move_target(move: MoveEntry, t1: float) -> Any:
         if length == 0.0:
             raise SettingError("A direction for the panel has zero length; give any vector to it.")
         return jnp.asarray(move.direction) / length
-    assert move.sun is not None
-    return _sun_direction(move.sun, t1)
-
-
-def _sun_direction(entry: SunEntry, t1: float) -> Sampled:
-    """Direction to the sun, world (3,), as a function of the flight's time [s]."""
+    entry = move.sun
+    assert entry is not None
     zone = day_zone(entry.timezone, entry.lon)
     begin = local_time(parse_date(entry.date), entry.hour, zone)
     place = Place.degrees(entry.lat, entry.lon, entry.altitude)
@@ -403,26 +398,12 @@ def _joint_moves(entries: MissionFile, machine: Machine) -> JointMoves | None:
     moves = []
     for drive, value in zip(machine.joints, values, strict=True):
         of_joint = [move for move in entries.joints if move.joint == drive.name]
-        for first, second in itertools.pairwise(of_joint):
-            if second.at < first.at + first.duration - AT_ONCE:
-                raise SettingError(
-                    f"The moves of joint '{drive.name}' must follow one another, but the one at t = {second.at:g} s "
-                    f"begins before the end of that before it, at {first.at + first.duration:g} s."
-                )
         unit = _DEGREE if drive.kind == "angle" else 1.0
         # A servo holds its target, from which a loaded joint differs by the load over the
         # stiffness: the reference goes on from there without a step.
-        start = value if drive.is_effort else forces[drive.force].target
-        moves.append(
-            PanelMoves(
-                as_floats([start]),
-                tuple(as_floats([unit * move.to]) for move in of_joint),
-                tuple(jnp.asarray(move.at) for move in of_joint),
-                tuple(jnp.asarray(move.duration) for move in of_joint),
-                False,
-                tuple(jnp.asarray(move.shape, dtype=float) for move in of_joint),
-            )
-        )
+        start = as_floats([value if drive.is_effort else forces[drive.force].target])
+        targets = [as_floats([unit * move.to]) for move in of_joint]
+        moves.append(_follow_moves(start, targets, of_joint, False))
     return JointMoves(tuple(moves))
 
 
@@ -497,10 +478,8 @@ def _check_stability(mission: Mission) -> float:
     The controllers for lost rotors are checked too, as if the machine did not turn. The
     estimator, limits and drag are left out.
     """
-    pilots = [
-        mission.controller.pilot,
-        *(pilot_change.pilot for pilot_change in mission.controller.pilot_changes),
-    ]
+    controller = mission.controller
+    pilots = [controller.pilot, *(change.pilot for change in controller.pilot_changes)]
     return max(_check_pilot(mission, pilot) for pilot in pilots)
 
 
@@ -530,6 +509,7 @@ def _check_pilot(mission: Mission, pilot: Pilot) -> float:
     delay = next((d for d in range(plant.late - 1, -1, -1) if is_stable(make_loop(d))), None)
     if delay is not None:
         advice.append(f"with these gains, a delay of {delay * period:g} ms is stable")
+    advice_text = "; ".join(advice) or "no slower gains are stable at this rate"
     loop_name = "panel's servo" if machine.bodies is not None else "joints"
     loop_name = loop_name if of_joints else "position and attitude"
     working = flight_of(pilot).working
@@ -540,8 +520,7 @@ def _check_pilot(mission: Mission, pilot: Pilot) -> float:
     raise SettingError(
         f"The closed loop of the {loop_name} is unstable, without any noise or wind: at {plant.rate:g} Hz, with "
         f"inputs late by {plant.late * period:g} ms ({plant.late} periods), small motions about hover grow by a "
-        f"factor of {radius:.4g} in a period. "
-        f"{_make_sentence('; '.join(advice) or 'no slower gains are stable at this rate')}"
+        f"factor of {radius:.4g} in a period. {advice_text[0].upper()}{advice_text[1:]}."
     )
 
 
@@ -566,10 +545,6 @@ def _gains_entry(pilot: Any, of_joints: bool) -> str:
     return f"servo = {{ {kind}{numbers} }}" if of_joints else f"gains = {{ {numbers} }}"
 
 
-def _make_sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}."
-
-
 def _check_panel(mission: Mission) -> None:
     """Raise `SettingError` for a panel's reference outside the workspace.
 
@@ -578,22 +553,9 @@ def _check_panel(mission: Mission) -> None:
     machine, references = mission.machine, mission.references
     assert machine.bodies is not None
     assert machine.limits is not None
-    gravity, panel = gravity_of(mission.plant.system), references.panel
-    ts = times_of(mission.file)
-
-    def target_angles(references: References, t: Any) -> Any:
-        at = references(t)
-        if not isinstance(at.panel, DirectionMotion):
-            return references.panel.value(t)  # pyright: ignore[reportOptionalMemberAccess]
-        # Directions of the world are turned into the base's axes, whose attitude follows from the
-        # thrust that the path needs.
-        R = attitude_of(at.waypoint.a - gravity, at.waypoint.heading)
-        return panel_angles(R.T @ at.panel.value)
-
-    angles = quick_jit(lambda r, ts: jax.vmap(lambda t: target_angles(r, t))(ts))(
-        references, as_floats(ts)
-    )
-    geometry, limits = machine.bodies.geometry, machine.limits
+    assert references.panel is not None
+    ts, geometry, limits = times_of(mission.file), machine.bodies.geometry, machine.limits
+    angles = _reference_angles(references, gravity_of(mission.plant.system), as_floats(ts))
     result = _surveyed(geometry, as_floats(np.asarray(angles).T), limits)
     reason = np.asarray(result.reason)
     if not np.any(reason):
@@ -602,11 +564,39 @@ def _check_panel(mission: Mission) -> None:
     margins = jax.tree.map(lambda x: x[..., k], result.margins)
     reason_text = why_outside(geometry, limits, margins, Reason(int(reason[k])))
     phi, theta = np.degrees(np.asarray(angles)[k])
-    frame = "a direction of the world" if panel is not None and panel.world else "these angles"
+    frame = "a direction of the world" if references.panel.world else "these angles"
     raise SettingError(
         f"The panel cannot follow its reference, {frame}: at t = {ts[k]:.4g} s it would have to stand at "
         f"phi = {phi:.4g} and theta = {theta:.4g} degrees in the base's axes, and {reason_text}"
     )
+
+
+def _base_pose(
+    references: References, gravity: Float[Array, "3"], t: Float[Array, ""]
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    """Attitude of the base that its path needs, and the acceleration of free fall less its own in its axes."""
+    at = references.path(t)
+    R = attitude_of(at.a - gravity, at.heading)
+    return R, R.T @ (gravity - at.a)
+
+
+def _panel_angles_at(
+    references: References, gravity: Float[Array, "3"], t: Float[Array, ""]
+) -> Float[Array, "2"]:
+    """Reference of the panel angles; directions of the world are turned into the axes of the base."""
+    assert references.panel is not None
+    value = references.panel.value(t)
+    if not references.panel.world:
+        return value
+    return panel_angles(_base_pose(references, gravity, t)[0].T @ value)
+
+
+@quick_jit
+def _reference_angles(
+    references: References, gravity: Float[Array, "3"], ts: Float[Array, " k"]
+) -> Float[Array, "k 2"]:
+    """Reference of the panel angles at times ts [s] (k, 2) [rad]."""
+    return jax.vmap(lambda t: _panel_angles_at(references, gravity, t))(ts)
 
 
 # Times of a flight and of each move at which forces are checked.
@@ -666,19 +656,9 @@ def needed_forces(
         gravity: acceleration of free fall (3,) [m/s^2].
     """
 
-    def base_pose(t: Array) -> tuple[Array, Array]:
-        """Attitude of the base, and the acceleration of free fall less its own in its axes."""
-        at = references.path(t)
-        R = attitude_of(at.a - gravity, at.heading)
-        return R, R.T @ (gravity - at.a)
-
-    def panel_angles_at(t: Array) -> Array:
-        assert references.panel is not None
-        value = references.panel.value(t)
-        return panel_angles(base_pose(t)[0].T @ value) if references.panel.world else value
-
     def at_one(t: Array) -> Array:
-        pair_motion = PairMotion(*motion_along(panel_angles_at, t))
-        return inverse_dynamics(bodies, pair_motion, base_pose(t)[1], jnp.zeros(3)).forces
+        motion = PairMotion(*motion_along(lambda t: _panel_angles_at(references, gravity, t), t))
+        free_fall = _base_pose(references, gravity, t)[1]
+        return inverse_dynamics(bodies, motion, free_fall, jnp.zeros(3)).forces
 
     return jax.vmap(at_one)(ts)

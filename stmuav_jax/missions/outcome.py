@@ -49,56 +49,49 @@ def labelled_flight(flight: MissionFlight) -> Labelled:
     """Labelled arrays with the content of `to_data`."""
     machine, entries = flight.mission.machine, flight.mission.file
     count = machine.rotors.spin.shape[0]
-    labels = GAUGES | _BATTERY
     units = [drive.unit for drive in machine.joints]
     effort_units = [{"rad": "N m", "m": "N"}[unit] for unit in units]
     # One unit of all joints is named where the reader looks first, several in coordinates.
     one_unit = {JOINT_UNIT: units[0], EFFORT_UNIT: effort_units[0]} if len({*units}) == 1 else {}
     labels = {
         name: (dims, one_unit.get(unit, unit), description)
-        for name, (dims, unit, description) in labels.items()
+        for name, (dims, unit, description) in (GAUGES | _BATTERY).items()
     }
     loop = labelled_loop(
         flight.run, labels, title=entries.title, ending=flight.ending,
         mission=json.loads(entries.model_dump_json()), scene=machine.scene.name,
         watch=list(machine.scene.watch), growth=flight.mission.growth,
     )  # fmt: skip
-    limits: dict[str, tuple[str, Any, str]] = {}
-    names: dict[str, Any] = {"rotor": (("rotor",), np.arange(1, count + 1), {})}
+    # dimension, lowest and highest values, and unit of what has limits
+    limits: dict[str, tuple[str, Any, Any, str]] = {}
+    names: dict[str, Any] = {"rotor": np.arange(1, count + 1)}
     speeds = flight.mission.truth.speeds
     if speeds is not None:
         low, high = (np.sqrt(np.asarray(x)) for x in speeds.squared(count))
-        limits |= {
-            "lowest_speed": ("rotor", low, "rad/s"),
-            "highest_speed": ("rotor", high, "rad/s"),
-        }
+        limits["speed"] = ("rotor", low, high, "rad/s")
     if machine.limits is not None:
-        limits |= {
-            "lowest_displacement": ("slider", np.asarray(machine.limits.lower), "m"),
-            "highest_displacement": ("slider", np.asarray(machine.limits.upper), "m"),
-        }
+        low, high = np.asarray(machine.limits.lower), np.asarray(machine.limits.upper)
+        limits["displacement"] = ("slider", low, high, "m")
         if machine.force is not None:
             most = np.full(2, machine.force)
-            limits |= {
-                "lowest_force": ("slider", -most, "N"),
-                "highest_force": ("slider", most, "N"),
-            }
-        names["slider"] = (("slider",), np.array([2, 3]), {})
-        names["panel_angle"] = (("panel_angle",), ["phi", "theta"], {})
+            limits["force"] = ("slider", -most, most, "N")
+        names |= {"slider": np.array([2, 3]), "panel_angle": ["phi", "theta"]}
     if machine.joints:
-        names["driven_joint"] = (("driven_joint",), [drive.name for drive in machine.joints], {})
-        names["driven_joint_unit"] = (("driven_joint",), units, {})
-        names["driven_joint_effort_unit"] = (("driven_joint",), effort_units, {})
-        if np.any(np.isfinite(machine.efforts)):
+        names["driven_joint"] = [drive.name for drive in machine.joints]
+        names |= {"driven_joint_unit": units, "driven_joint_effort_unit": effort_units}
+        efforts = machine.efforts
+        if np.any(np.isfinite(efforts)):
             effort_unit = one_unit.get(EFFORT_UNIT, EFFORT_UNIT)
-            limits["lowest_effort"] = ("driven_joint", -machine.efforts, effort_unit)
-            limits["highest_effort"] = ("driven_joint", machine.efforts, effort_unit)
+            limits["effort"] = ("driven_joint", -efforts, efforts, effort_unit)
     limit_variables = {
-        name: ((dim,), values, {"units": unit, "description": f"limit of {dim}s"})
-        for name, (dim, values, unit) in limits.items()
+        f"{end}_{name}": ((dim,), values, {"units": unit, "description": f"limit of {dim}s"})
+        for name, (dim, low, high, unit) in limits.items()
+        for end, values in (("lowest", low), ("highest", high))
     }
+    dims = {name: "driven_joint" if "driven_joint" in name else name for name in names}
+    coordinates = {name: ((dims[name],), values, {}) for name, values in names.items()}
     return Labelled(
-        {**loop.variables, **limit_variables}, {**loop.coordinates, **names}, loop.attributes
+        {**loop.variables, **limit_variables}, {**loop.coordinates, **coordinates}, loop.attributes
     )
 
 
@@ -110,11 +103,7 @@ def to_flight_record(flight: MissionFlight) -> FlightRecord:
     Raises:
         SettingError: the mission has no sensors, or its rotors have no limits.
     """
-    rollout, speeds, rotors = (
-        flight.run.rollout,
-        flight.mission.truth.speeds,
-        flight.mission.machine.rotors,
-    )
+    rollout, speeds = flight.run.rollout, flight.mission.truth.speeds
     if "gyroscope" not in rollout.signals:
         raise SettingError(
             "A log of a flight needs the mission's [sensors], whose readings it holds."
@@ -123,7 +112,7 @@ def to_flight_record(flight: MissionFlight) -> FlightRecord:
         raise SettingError(
             "A log of a flight needs limits of the rotor speeds, from which commands count."
         )
-    count = rotors.spin.shape[0]
+    count = flight.mission.machine.rotors.spin.shape[0]
     low, high = (np.sqrt(np.asarray(x)) for x in speeds.squared(count))
     squared = np.clip(np.asarray(rollout.inputs)[:, :count], low**2, high**2)
     signals = {name: np.asarray(value, float) for name, value in rollout.signals.items()}
@@ -142,6 +131,11 @@ class Measure(NamedTuple):
     allowed: float | None = None
     is_met: bool = True
 
+    @classmethod
+    def within(cls, name: str, value: float, unit: str, allowed: float | None) -> "Measure":
+        """Number that must not exceed an allowed value, if there is one."""
+        return cls(name, value, unit, allowed, allowed is None or value <= allowed)
+
     @property
     def text(self) -> str:
         """Value with its unit for a table; 0 for round-off."""
@@ -151,47 +145,62 @@ class Measure(NamedTuple):
 
 def measures(data: "xr.Dataset") -> list[Measure]:
     """Largest errors, smallest margins of the limits, and the energy used, of a flight's dataset."""
-    tolerances, times = _read_tolerances(data), _tolerance_times(data)
+    tolerances = _read_tolerances(data)
     distances = np.linalg.norm(data.position_error.values, axis=1)
     tilt = data.tilt_error.values / _DEGREE
     result = [
-        _largest_error(data, "position", distances, "m", tolerances.position, times[0]),
-        _largest_error(data, "tilt", tilt, "degrees", tolerances.tilt, times[0]),
+        _largest_error(data, "position", distances, "m", tolerances.position, tolerances.after),
+        _largest_error(data, "tilt", tilt, "degrees", tolerances.tilt, tolerances.after),
     ]
     if "panel_error" in data:
-        panel = data.panel_error.values / _DEGREE
-        result.append(_largest_error(data, "panel", panel, "degrees", tolerances.panel, times[-1]))
+        panel, after = data.panel_error.values / _DEGREE, tolerances.panel_after
+        result.append(_largest_error(data, "panel", panel, "degrees", tolerances.panel, after))
     if "joint_error" in data:
-        for k, (name, unit) in enumerate(
-            zip(data.driven_joint.values, data.driven_joint_unit.values, strict=True)
-        ):
-            scale, unit = (_DEGREE, "degrees") if unit == "rad" else (1.0, "m")
-            error = np.abs(data.joint_error.values[:, k]) / scale
-            allowed = tolerances.joints.get(str(name))
-            result.append(_largest_error(data, str(name), error, unit, allowed, times[0]))
+        for joint in data.driven_joint.values:
+            error = np.abs(data.joint_error.sel(driven_joint=joint))
+            is_angle = str(error.driven_joint_unit.values) == "rad"
+            scale, unit = (_DEGREE, "degrees") if is_angle else (1.0, "m")
+            name, most = str(joint), tolerances.joints.get(str(joint))
+            error = error.values / scale
+            result.append(_largest_error(data, name, error, unit, most, tolerances.after))
     for name, quantity_label, limit in MARGINS:
         if f"lowest_{limit}" in data:
-            result.append(_smallest_margin(data, name, quantity_label, limit))
-    gear = _of_gear(data, tolerances) if "gear_load" in data else []
-    return [*result, *gear, *_energy_measures(data)]
+            # smallest distance from the limits as a share of the range
+            least = float(np.nanmin(margin_history(data, name, limit), initial=0.5))
+            name = f"Smallest margin of the {quantity_label}"
+            result.append(Measure(name, 100 * least, "% of the range", 0.0, least >= -AT_LIMIT))
+    if "gear_load" in data:
+        result += _of_gear(data, tolerances)
+    # energies used, the powers held from sample to sample
+    durations = np.diff(data.time.values)
+    spent = lambda name: float(np.sum(durations * data[name].values[:-1])) / 3600
+    for quantity_label, name, factor, unit in _ENERGIES:
+        if name in data:
+            result.append(Measure(quantity_label, factor * spent(name), unit))
+    if "state_of_charge" in data:
+        result.append(Measure("Charge left", 100 * float(data.state_of_charge.values[-1]), "%"))
+    return result
+
+
+_ENERGIES = (
+    ("Energy of the rotors, mechanical", "rotor_power", 1, "Wh"),
+    ("Energy used, electrical", "electric_power", 1, "Wh"),
+    ("Work of the actuators", "actuator_power", 3600, "J"),
+    ("Work of the joints", "joint_power", 3600, "J"),
+)
 
 
 def _read_tolerances(data: "xr.Dataset") -> TolerancesEntry:
-    return TolerancesEntry(**json.loads(data.attrs["mission"])["tolerances"])
+    """Tolerances of a flight's mission, with the time from which the panel's holds."""
+    entries = json.loads(data.attrs["mission"])["tolerances"]
+    if entries.get("panel_after") is None:
+        entries["panel_after"] = entries.get("after", 0.0)
+    return TolerancesEntry(**entries)
 
 
-def _tolerance_times(data: "xr.Dataset") -> tuple[float, float]:
-    """Times from which the tolerances of the base and that of the panel hold [s]."""
-    tolerances = _read_tolerances(data)
-    return (
-        tolerances.after,
-        tolerances.after if tolerances.panel_after is None else tolerances.panel_after,
-    )
-
-
-def _has_reached(data: "xr.Dataset", after: float) -> bool:
+def _has_reached(data: "xr.Dataset", after: float | None) -> bool:
     """True if the flight came to the time from which a tolerance holds."""
-    return bool(data.time.values[-1] >= after - AT_ONCE)
+    return bool(data.time.values[-1] >= (after or 0.0) - AT_ONCE)
 
 
 def _largest_error(
@@ -200,7 +209,7 @@ def _largest_error(
     values: np.ndarray,
     unit: str,
     allowed: float | None,
-    after: float,
+    after: float | None,
 ) -> Measure:
     """Largest error from the time on from which its tolerance holds.
 
@@ -210,12 +219,11 @@ def _largest_error(
     if not _has_reached(data, after):
         after, allowed = 0.0, None
     since = f" from {after:g} s on" if after else ""
-    late = data.time.values >= after - AT_ONCE
+    late = data.time.values >= (after or 0.0) - AT_ONCE
     if "gear_load" in data:
         late, since = late & (data.gear_load.values == 0.0), f"{since} in flight"
     value = float(np.max(values[late], initial=0.0))
-    is_within_tolerance = allowed is None or value <= allowed
-    return Measure(f"Largest {of} error{since}", value, unit, allowed, is_within_tolerance)
+    return Measure.within(f"Largest {of} error{since}", value, unit, allowed)
 
 
 def _of_gear(data: "xr.Dataset", tolerances: TolerancesEntry) -> list[Measure]:
@@ -230,28 +238,15 @@ def _of_gear(data: "xr.Dataset", tolerances: TolerancesEntry) -> list[Measure]:
     result = []
     if len(down):
         fastest = float(np.max(-data.velocity.values[down - 1, 0, 2]))
-        is_within_tolerance = tolerances.touchdown is None or fastest <= tolerances.touchdown
-        result.append(
-            Measure(
-                "Largest touchdown speed", fastest, "m/s", tolerances.touchdown, is_within_tolerance
-            )
-        )
+        name = "Largest touchdown speed"
+        result.append(Measure.within(name, fastest, "m/s", tolerances.touchdown))
     deepest = max(float(np.max(data.gear_depth.values)), 0.0)
-    is_within_tolerance = tolerances.sink is None or deepest <= tolerances.sink
-    result.append(
-        Measure(
-            "Deepest sink of the landing gear", deepest, "m", tolerances.sink, is_within_tolerance
-        )
-    )
     carried = float(data.gear_load.values[-1])
-    return [*result, Measure("Load of the landing gear at the end", carried, "N")]
-
-
-def _smallest_margin(data: "xr.Dataset", name: str, quantity_label: str, limit: str) -> Measure:
-    """Smallest distance from the limits as a share of the range."""
-    least = float(np.nanmin(margin_history(data, name, limit), initial=0.5))
-    name, is_within_limits = f"Smallest margin of the {quantity_label}", least >= -AT_LIMIT
-    return Measure(name, 100 * least, "% of the range", 0.0, is_within_limits)
+    return [
+        *result,
+        Measure.within("Deepest sink of the landing gear", deepest, "m", tolerances.sink),
+        Measure("Load of the landing gear at the end", carried, "N"),
+    ]
 
 
 def margin_history(data: "xr.Dataset", name: str, limit: str) -> np.ndarray:
@@ -271,58 +266,32 @@ def margin_history(data: "xr.Dataset", name: str, limit: str) -> np.ndarray:
         return np.minimum(values - low, high - values) / (high - low)
 
 
-def _energy_measures(data: "xr.Dataset") -> list[Measure]:
-    """Energies used, the powers held from sample to sample."""
-    ts = data.time.values
-    spent = lambda name: float(np.sum(np.diff(ts) * data[name].values[:-1])) / 3600
-    result = [
-        Measure("Energy of the rotors, mechanical", spent("rotor_power"), "Wh"),
-        Measure("Energy used, electrical", spent("electric_power"), "Wh"),
-    ]
-    if "actuator_power" in data:
-        result.append(Measure("Work of the actuators", 3600 * spent("actuator_power"), "J"))
-    if "joint_power" in data:
-        result.append(Measure("Work of the joints", 3600 * spent("joint_power"), "J"))
-    if "state_of_charge" in data:
-        remaining_charge = float(data.state_of_charge.values[-1])
-        result.append(Measure("Charge left", 100 * remaining_charge, "%"))
-    return result
-
-
 def list_unreached(mission: Mapping[str, Any], end: float) -> list[str]:
     """Entries of a mission, plain data, that a flight until a time [s] does not come to."""
-    entries = [
+    # Name, time, and whether the last sample reaches it: a fault there needs some time to show.
+    entries: list[tuple[str, Any, bool]] = [
         (f"waypoint {k}", point["t"], True)
         for k, point in enumerate((mission.get("path") or {}).get("waypoints") or (), 1)
     ]
-    entries += [
-        (f"the end of move {k} of the panel", move["at"] + move["duration"], True)
-        for k, move in enumerate(mission.get("panel") or (), 1)
-    ]
-    entries += [
-        (f"the end of a move of joint {move['joint']}", move["at"] + move["duration"], True)
-        for move in mission.get("joints") or ()
-    ]
+    moves = [(f"move {k} of the panel", x) for k, x in enumerate(mission.get("panel") or (), 1)]
+    moves += [(f"a move of joint {move['joint']}", move) for move in mission.get("joints") or ()]
+    entries += [(f"the end of {name}", x["at"] + x["duration"], True) for name, x in moves]
     for fault in mission.get("faults") or ():
         kind = next(kind for kind in ("rotor", "slider", "sensor") if fault.get(kind) is not None)
-        entries.append((f"the fault of {kind} {fault[kind]}", fault["at"], False))
-        if fault.get("until") is not None:
-            entries.append((f"the end of the fault of {kind} {fault[kind]}", fault["until"], True))
+        name = f"the fault of {kind} {fault[kind]}"
+        entries.append((name, fault["at"], False))
+        entries.append((f"the end of {name}", fault.get("until"), True))
     for payload in mission.get("payloads") or ():
-        times = {"pick-up": payload["at"] or None, "drop": payload["until"]}
-        entries += [
-            (f"the {event} of the payload of {payload['body']}", t, False)
-            for event, t in times.items()
-            if t is not None
-        ]
+        name = f"of the payload of {payload['body']}"
+        entries.append((f"the pick-up {name}", payload["at"] or None, False))
+        entries.append((f"the drop {name}", payload["until"], False))
     change = (mission.get("wind") or {}).get("change")
     if change is not None:
         entries.append(("the end of the wind's change", change["at"] + change["rise"], True))
-    # what happens at the last sample is reached, but a fault needs some time to show
     return [
         f"{name} at t = {t:g} s"
         for name, t, counts in entries
-        if (t > end + AT_ONCE if counts else t >= end - AT_ONCE)
+        if t is not None and (t > end + AT_ONCE if counts else t >= end - AT_ONCE)
     ]
 
 
@@ -331,11 +300,10 @@ def verdict(data: "xr.Dataset") -> tuple[bool, str]:
 
     A flight that ends before a waypoint, a move of the panel, a fault or a change of the wind fails.
     """
-    mission = json.loads(data.attrs["mission"])
-    end, t1 = float(data.time.values[-1]), mission["t1"]
-    ending = data.attrs["ending"]
+    mission, tolerances = json.loads(data.attrs["mission"]), _read_tolerances(data)
+    end, ending = float(data.time.values[-1]), data.attrs["ending"]
     broken = [measure.name.lower() for measure in measures(data) if not measure.is_met]
-    sentence = f"It flew to t = {end:g} s of {t1:g} s"
+    sentence = f"It flew to t = {end:g} s of {mission['t1']:g} s"
     sentence += f", and ended there: {ending}" if ending else ""
     unreached = list_unreached(mission, end)
     sentence += f". It ended before {', '.join(unreached)}" if unreached else ""
@@ -346,18 +314,15 @@ def verdict(data: "xr.Dataset") -> tuple[bool, str]:
         sentence += ". With lost rotors its closed loop was checked as if the machine did not turn"
     if broken:
         return False, f"{sentence}. Not met: {', '.join(broken)}."
-    if not _read_tolerances(data).model_dump(
-        exclude={"after", "panel_after"}, exclude_defaults=True
-    ):
-        return is_complete, f"{sentence}. Limits were met; the mission has no tolerances."
-    base, panel = _tolerance_times(data)
-    if not _has_reached(data, base):
-        return is_complete, f"{sentence}. Limits were met; tolerances hold from {base:g} s on."
-    if "panel_error" in data and not _has_reached(data, panel):
-        sentence = (
-            f"{sentence}. Tolerances and limits were met; the panel's holds from {panel:g} s on."
-        )
-        return is_complete, sentence
-    if not is_complete:
-        return False, f"{sentence}. Until then, tolerances and limits were met."
-    return True, f"{sentence}. All tolerances and limits were met."
+    if not tolerances.model_dump(exclude={"after", "panel_after"}, exclude_defaults=True):
+        judged = "Limits were met; the mission has no tolerances."
+    elif not _has_reached(data, tolerances.after):
+        judged = f"Limits were met; tolerances hold from {tolerances.after:g} s on."
+    elif "panel_error" in data and not _has_reached(data, tolerances.panel_after):
+        after = tolerances.panel_after
+        judged = f"Tolerances and limits were met; the panel's holds from {after:g} s on."
+    elif not is_complete:
+        judged = "Until then, tolerances and limits were met."
+    else:
+        judged = "All tolerances and limits were met."
+    return is_complete, f"{sentence}. {judged}"

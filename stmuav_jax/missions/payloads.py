@@ -92,21 +92,15 @@ class Payloads(eqx.Module):
             R = [rotation_matrix(x) for x in p]
             arms = jnp.stack([a @ x for a, x in zip(R, self.position, strict=True)])
             turning = [a @ jnp.cross(w, x) for a, w, x in zip(R, omega, self.position, strict=True)]
-            rows = State(state.r[carriers] + arms, p, state.v[carriers] + jnp.stack(turning), omega)
-            return State(
-                *(inserted(*pair) for pair in zip(_parts(state), _parts(rows), strict=True))
-            )
+            rows = state.r[carriers] + arms, p, state.v[carriers] + jnp.stack(turning), omega
+            return State(*map(inserted, _parts(state), rows))
 
-        welds = [
-            dataclasses.replace(
-                weld(f"{name}_weld", body, name),
-                in_world=False,
-                point_i=bodies.com[place] + position,
-            )
-            for name, body, place, position in zip(
-                names, self.bodies, carriers, self.position, strict=True
-            )
-        ]
+        welds = []
+        for name, body, place, position in zip(
+            names, self.bodies, carriers, self.position, strict=True
+        ):
+            joint, point = weld(f"{name}_weld", body, name), bodies.com[place] + position
+            welds.append(dataclasses.replace(joint, in_world=False, point_i=point))
         loaded = System(
             stacked, (*system.joints, *welds), system.forces, reference=extended(system.reference),
             allow_float32=system.allow_float32,

@@ -189,28 +189,29 @@ class SunEntry(Entries):
     speed: Annotated[float, Field(ge=0, le=3600)] = 1.0
 
 
-class MoveEntry(Entries):
+class TimedEntry(Entries):
+    """Entries for a move that begins at a time [s] and is done after a duration [s], with the coefficients of
+    `stmuav_jax.control.Slew` as its shape."""
+
+    at: NotNegative = 0.0
+    duration: Positive = 1.0
+    shape: Annotated[tuple[Finite, ...], Tuples] = ()
+
+
+class MoveEntry(TimedEntry):
     """Entry for a move of the panel: to angles [degrees] in the base's axes, to a direction of the
-    world, or to the sun; begun at a time [s], done after a duration [s]. Its shape has the coefficients
-    of `stmuav_jax.control.Slew`."""
+    world, or to the sun."""
 
     angles: PanelAngles | None = None
     direction: Triple | None = None
     sun: SunEntry | None = None
-    at: NotNegative = 0.0
-    duration: Positive = 1.0
-    shape: Annotated[tuple[Finite, ...], Tuples] = ()
 
 
-class JointMoveEntry(Entries):
-    """Entry for a move of a driven joint of a model: to a value [degrees] or [m], begun at a time [s], done
-    after a duration [s]; its shape is as of `MoveEntry`."""
+class JointMoveEntry(TimedEntry):
+    """Entry for a move of a driven joint of a model: to a value [degrees] or [m]."""
 
     joint: str
     to: Finite
-    at: NotNegative = 0.0
-    duration: Positive = 1.0
-    shape: Annotated[tuple[Finite, ...], Tuples] = ()
 
 
 class PushEntry(Entries):

@@ -13,8 +13,8 @@ from ..math.rotation import rotation_matrix
 from ..mechanics.forces import GroundContact
 from ..mechanics.internal import internal_names
 from ..mechanics.joint_forces import JointServo
-from ..mechanics.state import State
 from ..mechanics.system import System
+from ..studies.signal import angle_between
 from ..uav.adaptation import AdaptiveMemory
 from ..uav.airframe import ENERGY
 from ..uav.joint_controller import DrivenJoint, joint_errors, read_joints
@@ -22,7 +22,7 @@ from ..uav.motion_estimator import MotionEstimate
 from ..uav.panel_servo import PanelBodies, panel_motion
 from ..uav.rotor import Rotors
 from ..uav.tracker.kinematics import PairMotion, panel_normal, stroke_motion
-from .controller import MissionReference, compute_panel_reference
+from .controller import compute_panel_reference
 from .machine import Machine
 from .payloads import Payloads
 
@@ -133,7 +133,7 @@ class Gauges(eqx.Module):
             "position_error": state.r[0] - targets.r,
             "reference_heading": targets.heading,
             "heading_error": jnp.arctan2(jnp.sin(yaw), jnp.cos(yaw)),
-            "tilt_error": _angle_between(R[:, 2], targets.a - self.gravity),
+            "tilt_error": angle_between(R[:, 2], targets.a - self.gravity),
             "rotor_speed": jnp.sqrt(squared),
             "rotor_power": power,
         }
@@ -142,37 +142,33 @@ class Gauges(eqx.Module):
             for kind in ("gyroscope", "accelerometer"):
                 result[kind] = sample.readings[f"{kind} {self.base}"].value
         if self.grounded is not None:
-            result |= gear_signals(self.grounded, state)
+            kin = self.grounded.kinematics(state)
+            contacts = [f for f in self.grounded.forces if isinstance(f, GroundContact)]
+            result["gear_load"] = sum(jnp.sum(contact.normal_forces(kin)) for contact in contacts)
+            depths = [jnp.max(contact.depths(kin)) for contact in contacts]
+            result["gear_depth"] = jnp.max(jnp.stack(depths))
         flight = getattr(sample.memory, "flight", None)
         if isinstance(flight, AdaptiveMemory):
-            result |= self._payload_signals(sample.t, state, flight)
+            payload, payloads = flight.payload, self.payloads
+            spread = jnp.sqrt(jnp.diagonal(payload.covariance))
+            mass = self.mass if payloads is None else payloads.masses_of_all(self.mass, sample.t)
+            centre = mass @ (state.r - state.r[0]) / jnp.sum(mass)
+            result |= {
+                "payload_mass": payload.mean[3], "payload_mass_deviation": spread[3],
+                "payload_moment": payload.mean[4:7], "payload_moment_deviation": spread[4:7],
+                "centre_of_mass": R.T @ centre, "estimated_centre_of_mass": flight.centre,
+            }  # fmt: skip
         pushing = jnp.zeros(())
         if self.bodies is not None:
-            panel_signals = self._panel_signals(state, sample.reference, sample.held_inputs[count:])
-            panel_signals["commanded_force"] = sample.memory.commanded
+            panel_signals, powers = self._panel_signals(sample, sample.held_inputs[count:])
             # each actuator of its own: what one brakes does not drive the other
-            pushing = jnp.sum(jnp.maximum(panel_signals.pop("powers"), 0.0))
+            pushing = jnp.sum(jnp.maximum(powers, 0.0))
             result |= panel_signals
         if self.jointed is not None:
             joint_signals, powers = self._joint_signals(self.jointed, sample)
             pushing = pushing + jnp.sum(jnp.maximum(powers, 0.0))
             result |= joint_signals | {"joint_power": jnp.sum(powers)}
         return result | {"electric_power": power / self.efficiency + pushing + self.other}
-
-    def _payload_signals(
-        self, t: Float[Array, ""], state: State, memory: AdaptiveMemory
-    ) -> dict[str, Any]:
-        spread = jnp.sqrt(jnp.diagonal(memory.payload.covariance))
-        mass = self.mass if self.payloads is None else self.payloads.masses_of_all(self.mass, t)
-        centre = mass @ (state.r - state.r[0]) / jnp.sum(mass)
-        return {
-            "payload_mass": memory.payload.mean[3],
-            "payload_mass_deviation": spread[3],
-            "payload_moment": memory.payload.mean[4:7],
-            "payload_moment_deviation": spread[4:7],
-            "centre_of_mass": rotation_matrix(state.p[0]).T @ centre,
-            "estimated_centre_of_mass": memory.centre,
-        }
 
     def _joint_signals(
         self, system: System, sample: Sample
@@ -199,38 +195,25 @@ class Gauges(eqx.Module):
         return signals, jnp.clip(demanded_efforts, -self.efforts, self.efforts) * rates
 
     def _panel_signals(
-        self, state: State, reference: MissionReference, forces: Float[Array, "2"]
-    ) -> dict[str, Any]:
+        self, sample: Sample, forces: Float[Array, "2"]
+    ) -> tuple[dict[str, Any], Float[Array, "2"]]:
+        """Signals of the panel, and the powers of its actuators (2,) [W]."""
         assert self.bodies is not None
         assert self.home is not None
-        angles, targets = panel_motion(state), compute_panel_reference(reference, state)
+        state, target = sample.state, sample.reference.panel
+        angles, targets = panel_motion(state), compute_panel_reference(sample.reference, state)
         slider_motion = stroke_motion(self.bodies.geometry, angles)
-        target = reference.panel
         if isinstance(target, PairMotion):
-            error = _angle_between(panel_normal(angles.value), panel_normal(target.value))
+            error = angle_between(panel_normal(angles.value), panel_normal(target.value))
         else:
             assert target is not None
-            error = _angle_between(rotation_matrix(state.p[-1])[:, 2], target.value)
-        return {
+            error = angle_between(rotation_matrix(state.p[-1])[:, 2], target.value)
+        signals = {
             "panel_angles": angles.value,
             "reference_panel_angles": targets.value,
             "panel_error": error,
             "displacement": slider_motion.value - self.home,
+            "commanded_force": sample.memory.commanded,
             "actuator_power": forces @ slider_motion.rate,
-            "powers": forces * slider_motion.rate,
         }
-
-
-def gear_signals(system: System, state: State) -> dict[str, Any]:
-    """Load on a landing gear [N] and depth of its lowest foot [m]."""
-    kin = system.kinematics(state)
-    contacts = [force for force in system.forces if isinstance(force, GroundContact)]
-    loads = [jnp.sum(force.normal_forces(kin)) for force in contacts]
-    depths = [jnp.max(force.depths(kin)) for force in contacts]
-    return {"gear_load": sum(loads), "gear_depth": jnp.max(jnp.stack(depths))}
-
-
-def _angle_between(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
-    """Angle between two directions of any length [rad]."""
-    across = jnp.cross(a, b)
-    return jnp.arctan2(jnp.sqrt(jnp.sum(across * across)), jnp.sum(a * b))
+        return signals, forces * slider_motion.rate

@@ -21,9 +21,8 @@ from ..studies.disturbed_flights import (
 )
 from ..uav.allocation import RotorLimits
 from ..uav.battery import Battery
-from ..uav.motor import MotorRotors, only_rotors
+from ..uav.motor import only_rotors
 from .machine import Machine, input_names, scene_of
-from .payloads import Payloads
 from .schema import MissionFile
 from .signals import Gauges
 
@@ -78,8 +77,6 @@ def apply_truth(entries: MissionFile, machine: Machine, table: Parameters) -> Pa
     Raises:
         SettingError: names that are unknown or of no effect. ModelError: masses and inertias that no body has.
     """
-    if not entries.truth:
-        return table
     for name in entries.truth:
         find_target(table, machine, name, relative=False)
     values = {name: as_floats(value) for name, value in entries.truth.items()}
@@ -99,24 +96,34 @@ def make_truth(
         believed: parts with the numbers that the controller has. gusts: seed in place of the mission's.
     """
     scene = scene_of(entries, table, gusts, machine.model)
-    payloads = believed.gauges.payloads
+    rotors = only_rotors(scene.system, "A mission").rotors
+    nominal, gauges, payloads = believed.plant, believed.gauges, believed.gauges.payloads
+    # another scene with the instruments, estimator and inputs of the mission's plant
+    loaded, changes = scene, ()
     if payloads is not None:
         masses = [table.value(f"payload_{k + 1}.mass") for k in range(len(payloads.bodies))]
         payloads = eqx.tree_at(lambda p: p.mass, payloads, as_floats(masses))
-    plant = _plant_of(believed.plant, machine, scene, payloads)
+        loaded = payloads.load(scene)
+        changes = payloads.changes(loaded.system)
+    plant = Plant(
+        loaded, rate=nominal.rate, changes=changes, observe=nominal.observe, inputs=input_names(machine),
+        before=nominal.before, delay=nominal.late / nominal.rate, standing=nominal.stood / nominal.rate,
+        sensors=nominal.bench.instruments, estimator=nominal.estimator, memory=nominal.memory,
+        steps=nominal.motion.steps,
+    )  # fmt: skip
+    formulation = nominal.motion.problem.method.formulation
+    plant = plant.with_motions(lambda motion: motion.with_method(formulation=formulation))
     gauges = eqx.tree_at(
-        lambda g: (g.rotors, g.payloads),
-        believed.gauges,
-        (only_rotors(scene.system, "A mission").rotors, payloads),
+        lambda g: (g.rotors, g.payloads, g.jointed),
+        gauges,
+        (rotors, payloads, None if gauges.jointed is None else plant.system),
         is_leaf=lambda x: x is None,
     )
-    if gauges.jointed is not None:
-        gauges = eqx.tree_at(lambda g: g.jointed, gauges, plant.system)
     battery = believed.battery
     if battery is not None:
-        value = lambda name: as_floats(table.value(f"battery.{name}"))
+        names = ("capacity", "resistance", "state_of_charge")
+        numbers = [as_floats(table.value(f"battery.{name}")) for name in names]
         where = lambda b: (b.battery.capacity, b.battery.resistance, b.charge)
-        numbers = value("capacity"), value("resistance"), value("state_of_charge")
         battery = eqx.tree_at(where, battery, numbers)
     return Truth(plant, gauges, narrow_limits(believed.speeds, scene), battery)
 
@@ -127,20 +134,14 @@ def find_target(table: Parameters, machine: Machine, name: str, relative: bool) 
     Raises:
         SettingError: a name that is unknown, or of no effect.
     """
-    fault_of = lambda key, shown: (
-        _describe_fault(machine, shown, key) if key in machine.table else ""
-    )
 
     def unknown() -> str:
-        names = [key for key in table if not fault_of(key, key)]
-        return (
-            f"is no parameter of {machine.scene.name}."
-            f"{suggest_names(name.partition('[')[0][:SHOWN], names)}"
-        )
+        names = [key for key in table if not _describe_fault(machine, key, key)]
+        hint = suggest_names(name.partition("[")[0][:SHOWN], names)
+        return f"is no parameter of {machine.scene.name}.{hint}"
 
     target = table_entry(table, name, relative, unknown)
-    fault = fault_of(target.name, name)
-    if fault:
+    if fault := _describe_fault(machine, name, target.name):
         raise SettingError(fault)
     return target
 
@@ -148,6 +149,8 @@ def find_target(table: Parameters, machine: Machine, name: str, relative: bool) 
 def _describe_fault(machine: Machine, factor: str, name: str) -> str:
     """Why no flight of the machine would have a number, or not rightly; empty if it would."""
     scene, model = machine.scene, machine.model
+    if name not in machine.table:
+        return ""
     if model is None and name.startswith(_FIXED) and name not in _FREE:
         return (
             f"{quote_name(factor)} cannot be a factor of a mission's study or part of its truth: loops and limits "
@@ -166,24 +169,10 @@ def _describe_fault(machine: Machine, factor: str, name: str) -> str:
 
 def narrow_limits(speeds: RotorLimits | None, scene: Scene) -> RotorLimits | None:
     """Limits of the rotor speeds within those of a scene's motors."""
-    limits = [f.limits for f in scene.system.forces if isinstance(f, MotorRotors)]
-    if speeds is None or not limits or limits[0] is None:
+    motors = getattr(only_rotors(scene.system, "A mission"), "limits", None)
+    if speeds is None or motors is None:
         return speeds
     return RotorLimits(
-        jnp.maximum(as_floats(speeds.lowest), as_floats(limits[0].lowest)),
-        jnp.minimum(as_floats(speeds.highest), as_floats(limits[0].highest)),
+        jnp.maximum(as_floats(speeds.lowest), as_floats(motors.lowest)),
+        jnp.minimum(as_floats(speeds.highest), as_floats(motors.highest)),
     )
-
-
-def _plant_of(nominal: Plant, machine: Machine, scene: Scene, payloads: Payloads | None) -> Plant:
-    """Plant of another scene with the instruments, estimator and inputs of a mission's plant."""
-    rate, method = nominal.rate, nominal.motion.problem.method
-    scene = scene if payloads is None else payloads.load(scene)
-    changes = () if payloads is None else payloads.changes(scene.system)
-    plant = Plant(
-        scene, rate=rate, changes=changes, observe=nominal.observe, inputs=input_names(machine), before=nominal.before,
-        delay=nominal.late / rate, standing=nominal.stood / rate,
-        sensors=nominal.bench.instruments, estimator=nominal.estimator, memory=nominal.memory,
-        steps=nominal.motion.steps,
-    )  # fmt: skip
-    return plant.with_motions(lambda motion: motion.with_method(formulation=method.formulation))

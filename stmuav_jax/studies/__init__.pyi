@@ -19,13 +19,15 @@ from .examples import (
     load_builtin_study as load_builtin_study,
 )
 from .flights import (
-    Failure as Failure,
     FlightEvaluation as FlightEvaluation,
-    Quantity as Quantity,
     make_flight_study as make_flight_study,
 )
 from .sampling import (
     Sampling as Sampling,
+)
+from .schema import (
+    Failure as Failure,
+    Quantity as Quantity,
 )
 from .sensitivity import (
     SobolIndices as SobolIndices,

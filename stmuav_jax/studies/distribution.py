@@ -194,40 +194,31 @@ def as_distribution(source: Any, factor: str = "") -> Distribution:
             raise SettingError(
                 f"A factor needs the entry 'distribution' with a name.{nearest_names('', KINDS)}"
             )
-        rest = {name: value for name, value in source.items() if name != "distribution"}
-        name = source["distribution"]
-        return Distribution(name if isinstance(name, str) else format_value(name), rest)
+        parameters = dict(source)
+        name = parameters.pop("distribution")
+        return Distribution(name if isinstance(name, str) else format_value(name), parameters)
     except SettingError as error:
-        raise SettingError(
-            f"Factor {quote_name(factor)}: {error}" if factor else str(error)
-        ) from None
+        subject = f"Factor {quote_name(factor)}: " if factor else ""
+        raise SettingError(f"{subject}{error}") from None
 
 
-def _read_frozen(scipy_distribution: Any) -> Distribution:
+def _read_frozen(frozen: Any) -> Distribution:
     """Distribution from one of SciPy's frozen ones, by name and named parameters."""
-    name = f"{_SCIPY}{scipy_distribution.dist.name}"
+    of, name = frozen.dist, f"{_SCIPY}{frozen.dist.name}"
     # A class of the user's own with a name of SciPy's could not be made again from a file.
-    if type(_of_scipy(name)) is not type(scipy_distribution.dist):
-        raise SettingError(
-            f"The distribution {quote_name(scipy_distribution.dist.name)} is not one of scipy.stats."
-        )
-    arguments = (
-        dict(zip(_argument_names(scipy_distribution.dist), scipy_distribution.args, strict=False))
-        | scipy_distribution.kwds
+    if type(_of_scipy(name)) is not type(of):
+        raise SettingError(f"The distribution {quote_name(of.name)} is not one of scipy.stats.")
+    return Distribution(
+        name, dict(zip(_argument_names(of), frozen.args, strict=False)) | frozen.kwds
     )
-    return Distribution(name, arguments)
 
 
 def _of_scipy(name: str) -> Any:
     """Distribution of `scipy.stats` by its prefixed name; None for other names."""
     import scipy.stats
 
-    if not name.startswith(_SCIPY):
-        return None
-    distribution = getattr(scipy.stats, name.removeprefix(_SCIPY), None)
-    return (
-        distribution if hasattr(distribution, "freeze") and hasattr(distribution, "ppf") else None
-    )
+    of = getattr(scipy.stats, name.removeprefix(_SCIPY), None) if name.startswith(_SCIPY) else None
+    return of if hasattr(of, "freeze") and hasattr(of, "ppf") else None
 
 
 def _argument_names(of: Any) -> list[str]:
@@ -249,19 +240,17 @@ def _parameters_model(name: str) -> type[Entries]:
 
 def _check_parameters(name: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Checked parameters with defaults, as floats and tuples."""
-    kind, of = KINDS.get(name), _of_scipy(name)
-    if kind is None and of is None:
+    kind = KINDS.get(name)
+    if kind is None and _of_scipy(name) is None:
         suggestion = nearest_names(name[:SHOWN], KINDS)
         raise SettingError(f"There is no distribution {quote_name(name)}.{suggestion}")
-    checked_parameters = validate_model(
-        _parameters_model(name), parameters, f"The distribution '{name}'"
-    ).model_dump()
+    entries = validate_model(_parameters_model(name), parameters, f"The distribution '{name}'")
+    checked = entries.model_dump()
     for holds, relation in kind.relations if kind else ():
-        if not holds(checked_parameters):
-            raise SettingError(
-                f"In the distribution '{name}' {relation}, but it has {_format_parameters(checked_parameters)}."
-            )
-    return checked_parameters
+        if not holds(checked):
+            text = _format_parameters(checked)
+            raise SettingError(f"In the distribution '{name}' {relation}, but it has {text}.")
+    return checked
 
 
 def _format_parameters(parameters: Mapping[str, Any]) -> str:

@@ -97,23 +97,20 @@ def table_entry(
         raise SettingError(
             f"{quote_name(factor)} must name one entry, such as {name}[0, 1]."
         ) from None
-    value = np.asarray(table.value(name), dtype=float)
+    shape = np.shape(table.value(name))
     if place and (
-        len(place) != value.ndim or any(k >= n for k, n in zip(place, value.shape, strict=True))
+        len(place) != len(shape) or any(k >= n for k, n in zip(place, shape, strict=True))
     ):
-        raise SettingError(f"'{name}' has shape {value.shape}; it has no entry {list(place)}.")
-    if not place and value.ndim and not relative:
+        raise SettingError(f"'{name}' has shape {shape}; it has no entry {list(place)}.")
+    if not place and shape and not relative:
         raise SettingError(
-            f"'{name}' has shape {value.shape}: name one entry, such as "
-            f"{name}[{', '.join('0' * value.ndim)}], or make the factor relative."
+            f"'{name}' has shape {shape}: name one entry, such as {name}[{', '.join('0' * len(shape))}], "
+            "or make the factor relative."
         )
-    places = (place,) if place else ()
     # an inertia tensor stays symmetric, "bare.inertia" of the hexacopter too
-    tensor = table[name].unit == "kg m^2" and len(place) == 2
-    across = place[::-1]
-    if tensor and place != across:
-        places = (place, across)
-    return FactorTarget(name, places, "1" if relative else table[name].unit)
+    is_tensor = table[name].unit == "kg m^2" and len(place) == 2
+    places = dict.fromkeys((place, place[::-1]) if is_tensor else (place,) if place else ())
+    return FactorTarget(name, tuple(places), "1" if relative else table[name].unit)
 
 
 def factor_columns(
@@ -164,15 +161,13 @@ def drawn_table(
     new: dict[str, Array] = {}
     for factor, value in values.items():
         name, places, _ = table_entry(table, factor, factor in relative)
-        now = new.get(name, table.value(name))
-        if factor in relative:
+        now = jnp.asarray(new.get(name, table.value(name)), dtype=float)
+        if factor in relative and not places:
             # A relative factor multiplies a whole array by one number, such as all rotors' coefficients.
-            share = lambda x, value=value: jnp.asarray(x, dtype=float) * value
-            if not places:
-                new[name] = share(now)
-                continue
-            value = share(np.asarray(table.value(name))[places[0]])
-        now = jnp.asarray(now, dtype=float)
+            new[name] = now * value
+            continue
+        if factor in relative:
+            value = jnp.asarray(np.asarray(table.value(name))[places[0]], dtype=float) * value
         for place in places or ((),):
             now = now.at[place].set(value)
         new[name] = now
@@ -338,8 +333,7 @@ class _Shift(eqx.Module):
     more: Array
 
     def __call__(self, t: Any, kin: Any) -> Array:
-        first: Any = self.of(t, kin) if callable(self.of) else self.of
-        return first + self.more
+        return self.of(t, kin) + self.more
 
 
 @dataclass(frozen=True)
@@ -375,19 +369,15 @@ class Flights(AbstractFlights):
     duration: float = 1.0
     held_inputs: Float[np.ndarray, " m"] | None = None
 
-    @property
-    def trimmed_case(self) -> int | None:
-        """Case of the scene: with a trim's inputs that of the UAV whose inputs are constant."""
-        return 2 if self.inputs == "trim" and self.scene == "uav_tracker" else self.case
-
     @cached_property
     def system(self) -> System:  # pyright: ignore[reportIncompatibleMethodOverride]
         """System of the scene with the table's numbers."""
-        return self._make_scene().system
+        return self._make_scene(self.table, options_from_plain(self.scene, self.options)).system
 
-    def _make_scene(self) -> Scene:
-        options = options_from_plain(self.scene, self.options)
-        return make_scene(self.scene, self.trimmed_case, self.table, **options)
+    def _make_scene(self, table: Parameters, options: Mapping[str, Any]) -> Scene:
+        # with a trim's inputs the case of the UAV is that whose inputs are constant
+        case = 2 if self.inputs == "trim" and self.scene == "uav_tracker" else self.case
+        return make_scene(self.scene, case, table, **options)
 
     def _check_parameter(self, name: str) -> None:
         if name in self.option_names:
@@ -404,7 +394,7 @@ class Flights(AbstractFlights):
             drawn_start = {k[6:]: v for k, v in sample.items() if k.startswith("start.")}
             first = options.get("start", scene_options["start"].kind())
             options["start"] = replace(first, **drawn_start)
-        scene = make_scene(self.scene, self.trimmed_case, table, **options)
+        scene = self._make_scene(table, options)
         return self._drive_inputs(scene.system, sample), scene.state0
 
     def plain(self) -> dict[str, Any]:
@@ -420,13 +410,10 @@ class Flights(AbstractFlights):
         if not self.gusts:
             return mean
         kind = low_altitude(table.value("gust.height"), table.value("gust.speed_20ft"))
-        speed = jnp.sqrt(jnp.sum(mean * mean))
-        options = Wind()
+        speed, spacing = jnp.sqrt(jnp.sum(mean * mean)), Wind().spacing
         # One spacing more: the last step of a run may end beyond its last sample by round-off.
-        return dryden(
-            seed, kind, airspeed=speed, duration=self.duration + options.spacing,
-            dt=options.spacing, mean=mean,
-        )  # fmt: skip
+        duration = self.duration + spacing
+        return dryden(seed, kind, airspeed=speed, duration=duration, dt=spacing, mean=mean)
 
     def _drive_inputs(self, system: System, values: Mapping[str, Any]) -> System:
         """System with the inputs of the trim, and their changes by the factors."""
@@ -435,10 +422,10 @@ class Flights(AbstractFlights):
         forces = list(system.forces)
         for k, force in enumerate(forces):
             if isinstance(force, Rotors):
+                # Factors of rotors multiply, as errors of thrust are in proportion to it; those of the
+                # actuators add a force.
                 shares = [values.get(name) for name in _rotor_inputs(force)]
                 if any(share is not None for share in shares):
-                    # Factors of rotors multiply, as errors of thrust are in proportion to it; those of the
-                    # actuators add a force.
                     ones = [jnp.asarray(1.0 if x is None else x, dtype=float) for x in shares]
                     squared: Any = force.speed_squared
                     squared = squared * jnp.stack(ones)
@@ -499,24 +486,24 @@ def make_flights(
     table = entry.parameters if table is None else table
     case = entry.default_case if case is None else case
     settings = Flights(scene, case, table, {}, **options)
-    if settings.inputs == "trim" and "motor" in settings.options:
-        raise SettingError("Inputs of a trim are steady speeds of the rotors: leave motor out.")
-    if settings.drag and "drag" not in entry.options:
-        raise SettingError(f"The scene {scene} has no airframe for drag: leave drag out.")
-    if settings.gusts and not settings.drag:
-        raise SettingError("Gusts act through the airframe's drag: set drag too.")
-    if settings.drag and "wind" in settings.options:
-        raise SettingError(
-            "A study with drag = true has the wind of the table, of its factors and of gusts: leave "
-            "the option wind out."
-        )
-    built = settings._make_scene()
+    drag = settings.drag
+    for is_wrong, message in (
+        (settings.inputs == "trim" and "motor" in settings.options,
+         "Inputs of a trim are steady speeds of the rotors: leave motor out."),
+        (drag and "drag" not in entry.options, f"The scene {scene} has no airframe for drag: leave drag out."),
+        (settings.gusts and not drag, "Gusts act through the airframe's drag: set drag too."),
+        (drag and "wind" in settings.options, "A study with drag = true has the wind of the table, of its factors "
+         "and of gusts: leave the option wind out."),
+    ):  # fmt: skip
+        if is_wrong:
+            raise SettingError(message)
+    built = settings._make_scene(table, options_from_plain(scene, settings.options))
     # A parameter that an option has set would silently override its factor.
     option_parameters = frozenset(
         name for name, line in built.parameters.items() if line != table[name].plain()
     )
     # A scene lists what it is built from; the study itself adds drag and its wind. One of a user may list nothing.
-    of_air = (("drag.", "wind.") if settings.drag else ()) + (("gust.",) if settings.gusts else ())
+    of_air = (("drag.", "wind.") if drag else ()) + (("gust.",) if settings.gusts else ())
     unused = {
         name for name in table if name not in built.parameters and not name.startswith(of_air)
     }
@@ -650,14 +637,12 @@ class ModelFlights(AbstractFlights):
         if not sample:
             return system, scene.state0
         labels = [f"start.{name}" for name, _ in space.names[: 2 * space.dof]]
-        departure_entries = [jnp.asarray(sample.get(name, 0.0), dtype=float) for name in labels]
-        departure_entries += [jnp.zeros(())] * (space.size - len(departure_entries))
+        departure = [jnp.asarray(sample.get(name, 0.0), dtype=float) for name in labels]
+        departure += [jnp.zeros(())] * (space.size - len(departure))
         # Departures from the start on the space of coordinates: loops stay closed, and rotations stay
         # rotations.
-        sampled_space = space.with_system(system)
-        return system, sampled_space.to_state(
-            sampled_space.retract(x, jnp.stack(departure_entries)), scene.t0
-        )
+        space = space.with_system(system)
+        return system, space.to_state(space.retract(x, jnp.stack(departure)), scene.t0)
 
     def plain(self) -> dict[str, Any]:
         """Plain data that identify the model."""

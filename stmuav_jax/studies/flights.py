@@ -26,7 +26,7 @@ from ..math.compiler import compute_untraced
 from ..mechanics.state import State
 from .columns import Axis, Column
 from .disturbed_flights import AbstractFlights, digest_table, factor_columns
-from .schema import STEPS_OF_A_RUN, FailureEntry, Flying, Integrating, QuantityEntry
+from .schema import STEPS_OF_A_RUN, Failure, Flying, Integrating, Quantity
 from .signal import RunPoint, Signal, find_signal
 from .study import AbstractBatch, Study
 
@@ -38,72 +38,6 @@ MOST_TIMES = 100_000
 USUAL_METHOD = Method(max_steps=STEPS_OF_A_RUN)
 # Columns that every study has.
 OWN = {"status", "sample", "time", "end", "steps", "rejected", "residual", "records"}
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """Quantity, a number or a history, that is stored for each run.
-
-    Attributes:
-        signal: name of a signal, see `stmuav_jax.studies.signal`.
-        take: "final" value; "largest", "smallest" over the run; "path": values every
-            `Study.every` seconds; "when_above", "when_below": time at which the signal first
-            crosses `level` [s], infinite if it never does.
-        level: level in the signal's unit.
-        stop: end the run when the signal crosses the level; final values are then those of that
-            step, and paths are NaN from there on.
-
-    Raises:
-        SettingError: an unknown take, or a level that is missing or superfluous.
-    """
-
-    signal: str
-    take: str
-    level: float | None = None
-    stop: bool = False
-
-    def __post_init__(self) -> None:
-        validate_model(QuantityEntry, vars(self), "A quantity")
-        crossing = self.take.startswith("when_")
-        if crossing != (self.level is not None):
-            level_rule = "needs a level" if crossing else "has no level"
-            raise SettingError(f"'{self.take}' of signal {quote_name(self.signal)} {level_rule}.")
-        if self.stop and not crossing:
-            raise SettingError(
-                f"'stop' needs take = \"when_above\" or \"when_below\", not '{self.take}'."
-            )
-
-    def column(self, of: Signal) -> tuple[str, str]:
-        """Unit and description of the column that holds the quantity."""
-        level = f"{self.level:g} {of.unit}" if self.level is not None else ""
-        description = {
-            "final": f"{of.label}, at the end",
-            "path": of.label,
-            "when_above": f"time at which {of.label} exceeds {level}",
-            "when_below": f"time at which {of.label} falls below {level}",
-        }.get(self.take, f"{of.label}, {self.take}")
-        return ("s" if self.take.startswith("when_") else of.unit), description
-
-
-@dataclass(frozen=True)
-class Failure:
-    """Condition under which a completed run counts as a failure; reports give its probability.
-
-    Attributes:
-        quantity: name of one of the study's quantities, not a path.
-        above, below: limits in the quantity's unit: a run above the one or below the other has
-            failed. A crossing without limits is a failure if it happens at all.
-
-    Raises:
-        SettingError: limits that are not finite.
-    """
-
-    quantity: str
-    above: float | None = None
-    below: float | None = None
-
-    def __post_init__(self) -> None:
-        validate_model(FailureEntry, vars(self), "A failure")
 
 
 @dataclass(frozen=True)
@@ -161,7 +95,7 @@ class FlightEvaluation(AbstractBatch):
 
     @property
     def times(self) -> np.ndarray:
-        """Times of paths and of the end, after the start [s]."""
+        """Times of paths and of the end, after the start [s]; without paths the end alone."""
         if not any(q.take == "path" for q in self.quantities.values()):
             return np.array([self.t1])
         every = self.t1 / 30 if self.every is None else self.every
@@ -177,19 +111,17 @@ class FlightEvaluation(AbstractBatch):
             "signal": q.signal, "take": q.take,
             **({} if q.level is None else {"level": q.level, "stop": q.stop}),
         }  # fmt: skip
-        return (
-            self.flights.plain()
-            | {"t1": self.t1}
-            | method_plain(self.method)
-            | {
-                "kind": "flights",
-                "parameters": digest_table(self.flights.table),
-                "relative": sorted(self.flights.relative),
-                "quantities": {name: plain(q) for name, q in self.quantities.items()},
-                "times": self.times.tolist(),
-                "direction": None if self.direction is None else list(self.direction),
-            }
-        )
+        return {
+            **self.flights.plain(),
+            "t1": self.t1,
+            **method_plain(self.method),
+            "kind": "flights",
+            "parameters": digest_table(self.flights.table),
+            "relative": sorted(self.flights.relative),
+            "quantities": {name: plain(q) for name, q in self.quantities.items()},
+            "times": self.times.tolist(),
+            "direction": None if self.direction is None else list(self.direction),
+        }
 
     @cached_property
     def signals(self) -> dict[str, Signal]:
@@ -201,24 +133,31 @@ class FlightEvaluation(AbstractBatch):
     def columns(self) -> dict[str, Column]:
         """Columns of the outcomes: quantities, diagnostics of the integration, and status."""
         result: dict[str, Column] = {}
-        for name, of in self.signals.items():
-            unit, description = self.quantities[name].column(of)
-            dims = ("time",) if self.quantities[name].take == "path" else ()
+        for name, quantity in self.quantities.items():
+            of, dims = self.signals[name], ("time",) if quantity.take == "path" else ()
+            level = f"{quantity.level:g} {of.unit}" if quantity.level is not None else ""
+            description = {
+                "final": f"{of.label}, at the end",
+                "path": of.label,
+                "when_above": f"time at which {of.label} exceeds {level}",
+                "when_below": f"time at which {of.label} falls below {level}",
+            }.get(quantity.take, f"{of.label}, {quantity.take}")
+            unit = "s" if quantity.is_crossing else of.unit
             result[name] = Column("float64", unit, description, "quantity", dims)
-        diagnostics = {
-            "end": ("float64", "s", "where the flight ended"),
-            "steps": ("int32", "1", "steps accepted"),
-            "rejected": ("int32", "1", "steps rejected"),
-            "residual": ("float64", "m", "largest constraint residual at any step"),
+        return result | {
+            "end": Column("float64", "s", "where the flight ended", "diagnostic"),
+            "steps": Column("int32", "1", "steps accepted", "diagnostic"),
+            "rejected": Column("int32", "1", "steps rejected", "diagnostic"),
+            "residual": Column(
+                "float64", "m", "largest constraint residual at any step", "diagnostic"
+            ),
+            "status": Column("int8", "1", "how the flight ended", "status"),
         }
-        result |= {name: Column(*rest, "diagnostic") for name, rest in diagnostics.items()}
-        return result | {"status": Column("int8", "1", "how the flight ended", "status")}
 
     @property
     def axes(self) -> dict[str, Axis]:
         """Time axis of the paths, if there are any."""
-        paths = any(q.take == "path" for q in self.quantities.values())
-        return {"time": Axis(self.times, "s")} if paths else {}
+        return {"time": Axis(self.times, "s")} if len(self.times) > 1 else {}
 
     @cached_property
     def _facing(self) -> np.ndarray:
@@ -239,12 +178,8 @@ class FlightEvaluation(AbstractBatch):
                     "The system has dependent constraint rows, which "
                     f"{self.method.formulation} does not support."
                 )
-        method = dataclasses.replace(
-            self.method,
-            formulation=formulation,
-            adjoint=diffrax.ForwardMode(),
-            steps="state",
-        )
+        parts = {"formulation": formulation, "adjoint": diffrax.ForwardMode(), "steps": "state"}
+        method = dataclasses.replace(self.method, **parts)
 
         def make(numbers: tuple[Mapping[str, Any], Any]) -> tuple[Problem, State]:
             sample, key_data = numbers
@@ -283,19 +218,18 @@ class FlightEvaluation(AbstractBatch):
     ) -> dict[str, Any]:
         """Outcomes (n, ...) of the first `count` of n samples, by column."""
         numbers = samples, jax.random.key_data(keys)
-        return jax.vmap(self._summarise_run)(
-            numbers, integrate_batch(self.plan, numbers, count, lanes)
-        )
+        runs = integrate_batch(self.plan, numbers, count, lanes)
+        return jax.vmap(self._summarise_run)(numbers, runs)
 
     def _summarise_run(
-        self, numbers: tuple[Mapping[str, Any], Any], run_result: RunResult
+        self, numbers: tuple[Mapping[str, Any], Any], run: RunResult
     ) -> dict[str, Any]:
         """Outcomes of one run."""
-        real = run_result.last.dtype
+        real = run.last.dtype
         problem, _ = self.plan.make(numbers)
         direction = jnp.asarray(self._facing, real)
         watched = list(self._watched)
-        is_fine = run_result.ending == Ending.FINE
+        is_fine = run.ending == Ending.FINE
         value = lambda name, t, y: self.signals[name].of(RunPoint(problem, t, y, direction))
         result: dict[str, Any] = {}
         for name, quantity in self.quantities.items():
@@ -303,29 +237,21 @@ class FlightEvaluation(AbstractBatch):
             # them; final values and paths follow from the kept states.
             if name in watched:
                 k = watched.index(name)
-                measure = (
-                    run_result.when[k]
-                    if quantity.take.startswith("when_")
-                    else run_result.extreme[k]
-                )
+                measure = run.when[k] if quantity.is_crossing else run.extreme[k]
                 result[name] = -measure if quantity.take == "smallest" else measure
-            elif quantity.take == "path":
+                continue
+            if quantity.take == "path":
                 path_signal = jax.vmap(lambda t, y, name=name: value(name, t, y))
-                path = path_signal(jnp.asarray(self.times, real), run_result.saved)
-                result[name] = jnp.where(is_fine, path, jnp.nan)
+                measure = path_signal(jnp.asarray(self.times, real), run.saved)
             else:
-                result[name] = jnp.where(
-                    is_fine, value(name, run_result.t, run_result.last), jnp.nan
-                )
+                measure = value(name, run.t, run.last)
+            result[name] = jnp.where(is_fine, measure, jnp.nan)
+        possible = self.flights.is_possible(numbers[0])
         return result | {
-            "end": run_result.t,
-            "steps": run_result.accepted,
-            "rejected": run_result.rejected,
-            "residual": run_result.residual[0],
-            "status": jnp.where(
-                self.flights.is_possible(numbers[0]), run_result.ending, Ending.NOT_PHYSICAL
-            ),
-        }
+            "end": run.t, "steps": run.accepted, "rejected": run.rejected,
+            "residual": run.residual[0],
+            "status": jnp.where(possible, run.ending, Ending.NOT_PHYSICAL),
+        }  # fmt: skip
 
 
 def _orient_signal(quantity: Quantity, g: Any) -> Any:
@@ -355,26 +281,24 @@ def make_flight_study(
         SettingError: factors and quantities that are unknown or share a column, a failure of an unknown
             quantity; also as for `Study`.
     """
-    flights = evaluation.flights
+    flights, quantities = evaluation.flights, evaluation.quantities
     # Quantities, factors and diagnostics are columns of one dataset.
-    if clash := sorted(OWN & {*evaluation.quantities}):
+    if clash := sorted(OWN & {*quantities}):
         name_list = ", ".join(clash)
         raise SettingError(f"Quantities must not have the names of other columns: {name_list}.")
     identity = evaluation.plain()
     if failure is not None:
-        quantities = evaluation.quantities
         scalars = [name for name, quantity in quantities.items() if quantity.take != "path"]
         if failure.quantity not in scalars:
             raise SettingError(
                 f"The failure is of {quote_name(failure.quantity)}, which is no quantity with one number "
                 f"a flight.{nearest_names(failure.quantity[:SHOWN], scalars)}"
             )
-        is_crossing = quantities[failure.quantity].take.startswith("when_")
-        if not is_crossing and failure.above is None and failure.below is None:
+        identity["failure"] = failure.model_dump(exclude_none=True)
+        if len(identity["failure"]) == 1 and not quantities[failure.quantity].is_crossing:
             raise SettingError(
                 f"The failure by '{failure.quantity}' needs a limit: above = ... or below = ..."
             )
-        identity["failure"] = {k: v for k, v in vars(failure).items() if v is not None}
     columns = factor_columns(factors, flights.entry, flights.relative, evaluation.columns)
     reasons = {int(code): reason for code, reason in REASONS.items()}
     return Study(
@@ -408,8 +332,8 @@ def method_plain(method: Method) -> dict[str, Any]:
     # A study's file has names for solvers; one with other settings could not be read back.
     names = [name for name, solver in solvers.items() if eqx.tree_equal(method.solver, solver)]
     if not names:
-        is_text = isinstance(method.solver, str)
-        solver_name = method.solver if is_text else type(method.solver).__name__
+        solver: Any = method.solver
+        solver_name = solver if isinstance(solver, str) else type(solver).__name__
         valid = " or ".join(f"{type(solver).__name__}()" for solver in solvers.values())
         raise SettingError(f"The solver of a study must be diffrax's {valid}, not {solver_name}.")
     usual = Method()

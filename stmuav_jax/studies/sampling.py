@@ -27,7 +27,7 @@ from jaxtyping import Float
 
 from ..checks.errors import SettingError, nearest_names
 from ..checks.schema import SHOWN, quote_name, validate_model
-from .distribution import Distribution, as_distribution
+from .distribution import as_distribution
 from .schema import Design, Drawing
 
 DESIGNS = get_args(Design)
@@ -84,20 +84,8 @@ class Sampling:
         """Largest number of samples; None for an unlimited design."""
         if self.design == "table":
             return max(len(factor.parameters.get("values", ())) for factor in self.factors.values())
-        if self.design in ("sobol", "saltelli"):
-            return SOBOL_POINTS * self.together
-        return None
-
-    @property
-    def together(self) -> int:
-        """Number of consecutive samples that belong together; a study has a multiple of it."""
-        if self.design == "latin":
-            return self.stratum or 1
-        return len(self.factors) + 2 if self.design == "saltelli" else 1
-
-    def whole(self, count: int) -> int:
-        """Smallest number of samples >= count that is a multiple of `together`."""
-        return -(-count // self.together) * self.together
+        rows = {"sobol": 1, "saltelli": len(self.factors) + 2}.get(self.design)
+        return None if rows is None else SOBOL_POINTS * rows
 
     def draw(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
         """Values of the factors in samples first, ..., first + count - 1, in their own units.
@@ -114,23 +102,24 @@ class Sampling:
             raise SettingError(
                 f"The {limit_text}, but samples up to {first + count} were requested."
             )
-        if self.design == "table":
-            columns = [
-                _table_column(distribution, first, count) for distribution in self.factors.values()
-            ]
-            return np.stack(columns, axis=1)
-        # Every design gives uniform numbers in (0, 1) as a function of the sample's number alone, so that any
-        # range of samples can be computed anywhere and in any order.
-        u = _UNIFORM[self.design](self, first, count)
+        # Every design but a table gives uniform numbers in (0, 1) as a function of the sample's number alone,
+        # so that any range of samples can be computed anywhere and in any order.
+        is_table = self.design == "table"
+        u = np.empty((count, 0)) if is_table else _UNIFORM[self.design](self, first, count)
         if self.correlation:
             # A Gaussian copula correlates the factors without a change of their own distributions.
             u = _join_copula(self._correlation_root(), u)
-        columns = [
-            _count_up(distribution, first, count)
-            if distribution.name == "counter"
-            else distribution.quantile(np.ascontiguousarray(u[:, j]))
-            for j, distribution in enumerate(self.factors.values())
-        ]
+        columns = []
+        for j, factor in enumerate(self.factors.values()):
+            p = factor.parameters
+            if factor.name == "counter":
+                columns.append(p["first"] + np.arange(first, first + count))
+            elif not is_table:
+                columns.append(factor.quantile(np.ascontiguousarray(u[:, j])))
+            elif factor.name == "constant":
+                columns.append(np.full(count, p["value"]))
+            else:
+                columns.append(np.asarray(p["values"][first : first + count]))
         return np.stack(columns, axis=1)
 
     def plain(self) -> dict[str, Any]:
@@ -149,9 +138,9 @@ class Sampling:
     def _correlation_root(self) -> np.ndarray:
         """Cholesky factor of the correlation matrix (d, d)."""
         matrix = np.eye(len(self.factors))
-        place = {name: k for k, name in enumerate(self.names)}
         for a, b, rho in self.correlation:
-            matrix[place[a], place[b]] = matrix[place[b], place[a]] = rho
+            i, k = self.names.index(a), self.names.index(b)
+            matrix[i, k] = matrix[k, i] = rho
         least = float(np.linalg.eigvalsh(matrix)[0])
         # below this bound, round-off could hide a negative eigenvalue
         if least < len(matrix) * np.finfo(float).eps:
@@ -180,13 +169,10 @@ def _draw_random(sampling: Sampling, first: int, count: int) -> np.ndarray:
 
 
 def _draw_latin(sampling: Sampling, first: int, count: int) -> np.ndarray:
-    size = sampling.stratum or 1
-    d = len(sampling.factors)
-    parts = [np.empty((0, d))]
-    for b in range(first // size, -(-(first + count) // size)):
-        start, stop = max(first - b * size, 0), min(first + count - b * size, size)
-        parts.append(_make_hypercube(sampling.seed, b, size, d)[start:stop])
-    return np.concatenate(parts)
+    size, d = sampling.stratum or 1, len(sampling.factors)
+    cubes = range(first // size, -(-(first + count) // size))
+    points = [np.empty((0, d)), *(_make_hypercube(sampling.seed, b, size, d) for b in cubes)]
+    return np.concatenate(points)[first % size :][:count]
 
 
 @functools.lru_cache(maxsize=2)
@@ -253,23 +239,20 @@ def _join_copula(root: np.ndarray, u: np.ndarray) -> np.ndarray:
     return np.clip(ndtr(joined), np.nextafter(0.0, 1.0), np.nextafter(1.0, 0.0))
 
 
-def _table_column(distribution: Distribution, first: int, count: int) -> np.ndarray:
-    if distribution.name == "constant":
-        return np.full(count, distribution.parameters["value"])
-    if distribution.name == "counter":
-        return _count_up(distribution, first, count)
-    return np.asarray(distribution.parameters["values"][first : first + count])
-
-
-def _count_up(distribution: Distribution, first: int, count: int) -> np.ndarray:
-    return distribution.parameters["first"] + np.arange(first, first + count)
-
-
-# --- checks
-
-
-def _check_pairs(s: Sampling) -> None:
-    """Check that correlations name two factors, each pair once."""
+def _check_sampling(s: Sampling) -> None:
+    validate_model(Drawing, {name: getattr(s, name) for name in Drawing.model_fields}, "A sampling")
+    if not s.factors:
+        raise SettingError("A sampling needs at least one factor.")
+    if (s.stratum is not None) != (s.design == "latin"):
+        raise SettingError(
+            "A design 'latin', and no other, needs 'stratum', the number of samples of one hypercube; "
+            f"here the design is '{s.design}' and the stratum {s.stratum}."
+        )
+    refusals = {"saltelli": "takes factors one by one", "table": "has its rows as they are"}
+    if s.correlation and s.design in refusals:
+        reason = refusals[s.design]
+        raise SettingError(f"The design '{s.design}' {reason}: it cannot have correlations.")
+    # correlations name two factors, each pair once
     pairs = set()
     for a, b, _ in s.correlation:
         for name in (a, b):
@@ -285,37 +268,16 @@ def _check_pairs(s: Sampling) -> None:
                 f"The correlation of {quote_name(a)} with {quote_name(b)} is given twice or with itself."
             )
         pairs.add(frozenset((a, b)))
-
-
-def _check_sampling(s: Sampling) -> None:
-    validate_model(Drawing, {name: getattr(s, name) for name in Drawing.model_fields}, "A sampling")
-    if not s.factors:
-        raise SettingError("A sampling needs at least one factor.")
-    if (s.stratum is not None) != (s.design == "latin"):
-        raise SettingError(
-            "A design 'latin', and no other, needs 'stratum', the number of samples of one hypercube; "
-            f"here the design is '{s.design}' and the stratum {s.stratum}."
-        )
-    if s.correlation and s.design in ("saltelli", "table"):
-        reason = (
-            "takes factors one by one" if s.design == "saltelli" else "has its rows as they are"
-        )
-        raise SettingError(f"The design '{s.design}' {reason}: it cannot have correlations.")
-    _check_pairs(s)
-    if s.design == "table":
-        _check_table(s.factors)
-
-
-def _check_table(factors: Mapping[str, Distribution]) -> None:
-    sizes: dict[str, int] = {}
-    for name, distribution in factors.items():
-        if distribution.name not in ("empirical", "constant", "counter"):
+    if s.design != "table":
+        return
+    for name, factor in s.factors.items():
+        if factor.name not in ("empirical", "constant", "counter"):
             raise SettingError(
                 f"Factor '{name}': in a table factors are columns ('empirical') or constants, but it is "
-                f"'{distribution.name}'."
+                f"'{factor.name}'."
             )
-        if distribution.name == "empirical":
-            sizes[name] = len(distribution.parameters["values"])
+    columns = {name: factor for name, factor in s.factors.items() if factor.name == "empirical"}
+    sizes = {name: len(factor.parameters["values"]) for name, factor in columns.items()}
     if not sizes:
         raise SettingError(
             "A table of samples needs a factor with a column of values ('empirical'), but all of its factors "

@@ -7,7 +7,7 @@ by the scene that is simulated.
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_validator
 
 from ..checks.errors import SettingError, nearest_names
 from ..checks.schema import (
@@ -86,17 +86,49 @@ Design = Literal["random", "latin", "sobol", "saltelli", "table"]
 Pair = tuple[str, str, Annotated[float, Field(gt=-1, lt=1)]]
 
 
-class QuantityEntry(Entries):
-    """Entry for a quantity that is stored for each run."""
+class Quantity(Entries):
+    """Quantity, a number or a history, that is stored for each run.
+
+    Attributes:
+        signal: name of a signal, see `stmuav_jax.studies.signal`.
+        take: "final" value; "largest", "smallest" over the run; "path": values every
+            `Study.every` seconds; "when_above", "when_below": time at which the signal first
+            crosses `level` [s], infinite if it never does.
+        level: level in the signal's unit, of a crossing alone.
+        stop: end the run when the signal crosses the level; final values are then those of that
+            step, and paths are NaN from there on.
+    """
 
     signal: str
     take: Take
     level: Finite | None = None
     stop: bool = False
 
+    @property
+    def is_crossing(self) -> bool:
+        """True for the time of a crossing."""
+        return self.take.startswith("when_")
 
-class FailureEntry(Entries):
-    """Entry for the condition under which a completed run counts as a failure."""
+    @model_validator(mode="after")
+    def _check_crossing(self) -> "Quantity":
+        if self.is_crossing != (self.level is not None):
+            rule = "needs a level" if self.is_crossing else "has no level"
+            raise ValueError(f"is wrong: '{self.take}' of signal {quote_name(self.signal)} {rule}.")
+        if self.stop and not self.is_crossing:
+            raise ValueError(
+                f"has 'stop', which needs take = \"when_above\" or \"when_below\", not '{self.take}'."
+            )
+        return self
+
+
+class Failure(Entries):
+    """Condition under which a completed run counts as a failure; reports give its probability.
+
+    Attributes:
+        quantity: name of one of the study's quantities, not a path.
+        above, below: limits in the quantity's unit: a run above the one or below the other has
+            failed. A crossing without limits is a failure if it happens at all.
+    """
 
     quantity: str
     above: Finite | None = None
@@ -137,7 +169,7 @@ class FlightsFile(Drawing, Flying, Integrating):
     model: Annotated[Any, BeforeValidator(_check_model)] = None
     factors: Annotated[dict[str, Factor], Field(min_length=1, max_length=1000)]
     quantities: Annotated[
-        dict[Annotated[str, AfterValidator(_check_column)], QuantityEntry], Field(max_length=1000)
+        dict[Annotated[str, AfterValidator(_check_column)], Quantity], Field(max_length=1000)
     ]
     kind: Literal["flights"] = "flights"
     case: Annotated[int, Field(ge=1, le=100)] | None = None
@@ -148,7 +180,7 @@ class FlightsFile(Drawing, Flying, Integrating):
     drag: bool = False
     gusts: bool = False
     options: dict[str, Any] = Field(default_factory=dict)
-    failure: FailureEntry | None = None
+    failure: Failure | None = None
 
 
 class EstimationFile(Entries):

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Integer, Shaped
 
 from ..checks.errors import SettingError
 from .columns import FINE, MISSING
-from .statistics import LEVEL, Intervals
+from .statistics import LEVEL, Intervals, check_samples
 
 # Largest number of doubles in one batch of the bootstrap, 128 MiB.
 _BATCH = 2**24
@@ -81,7 +81,15 @@ def sobol(
     # A base point counts only with all of its d + 2 samples: a difference of two needs both.
     complete_mask = np.all(codes == FINE, axis=1)
     used, lost = int(np.sum(complete_mask)), int(np.sum(~complete_mask & ~pending))
-    _check_points(used, lost, allowed)
+    if lost > allowed * (used + lost):
+        raise SettingError(
+            f"{lost} of {used + lost} base points have samples that failed, more than the share "
+            f"{allowed:g} that is allowed: indices of the others would be biased."
+        )
+    if used < 2:
+        raise SettingError(
+            f"Sobol indices need at least 2 whole base points, but there are {used}."
+        )
     y = _check_varying(table[complete_mask].ravel(), "Sobol indices").reshape(used, rows)
     # Products of values with a large mean would lose the digits of the variance; the mean over A and B is
     # subtracted first.
@@ -106,18 +114,6 @@ def _sobol_indices(a: np.ndarray, b: np.ndarray, *mixed: np.ndarray, axis: int) 
     first = [np.mean(b * x, axis) / variance for x in differences]
     total = [np.mean(x**2, axis) / (2 * variance) for x in differences]
     return np.stack(first + total)
-
-
-def _check_points(used: int, lost: int, allowed: float) -> None:
-    if lost > allowed * (used + lost):
-        raise SettingError(
-            f"{lost} of {used + lost} base points have samples that failed, more than the share "
-            f"{allowed:g} that is allowed: indices of the others would be biased."
-        )
-    if used < 2:
-        raise SettingError(
-            f"Sobol indices need at least 2 whole base points, but there are {used}."
-        )
 
 
 def spline_shares(
@@ -239,10 +235,7 @@ def separation(
 
 
 def _check_varying(values: np.ndarray, statistic_name: str) -> np.ndarray:
-    y = np.asarray(values, dtype=float)
-    bad = int(np.sum(~np.isfinite(y)))
-    if bad:
-        raise SettingError(f"{statistic_name} need finite values, but {bad} of {len(y)} are not.")
+    y = check_samples(values, f"{statistic_name} need")
     if len(y) == 0 or np.ptp(y) == 0:
         raise SettingError(
             f"{statistic_name} need values that vary, but all {len(y)} are the same."

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..analysis.sensors import Output, joint_outputs
+from ..analysis.sensors import joint_outputs
 from ..checks.errors import SettingError, nearest_names
 from ..checks.schema import SHOWN, quote_name
 from ..dynamics.evaluation import energy
@@ -20,7 +20,7 @@ from ..mechanics.state import State
 from ..mechanics.system import System
 from ..uav.tracker.kinematics import panel_angles
 
-PANEL, SLIDERS = "panel_7", ("slider_2", "slider_3")
+PANEL = "panel_7"
 
 
 class RunPoint:
@@ -60,6 +60,11 @@ class RunPoint:
         """Row of the base."""
         return self.system.base
 
+    @property
+    def up(self) -> Float[Array, "3"]:
+        """Unit vector upwards, world (3,)."""
+        return jnp.array((0.0, 0.0, 1.0), self.y.dtype)
+
     @cached_property
     def R_wb(self) -> Float[Array, "3 3"]:
         """Attitude of the base; the world's axes where the mechanism stands on the ground."""
@@ -87,12 +92,11 @@ class RunPoint:
     def stroke(self, name: str) -> Float[Array, ""]:
         """Height of a slider above its place in the reference posture, base axes [m]."""
         k, now, reference = self.system.index(name), self.state, self.system.reference
-        base = (
-            (now.r[self.base], reference.r[self.base])
-            if self.system.floating
-            else (jnp.zeros(3), jnp.zeros(3))
-        )
-        return (self.R_wb.T @ (now.r[k] - base[0]))[2] - (reference.r[k] - base[1])[2]
+        offset, reference_offset = now.r[k], reference.r[k]
+        if self.system.floating:
+            offset = offset - now.r[self.base]
+            reference_offset = reference_offset - reference.r[self.base]
+        return (self.R_wb.T @ offset)[2] - reference_offset[2]
 
 
 @dataclass(frozen=True)
@@ -117,70 +121,49 @@ def angle_between(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""
     return jnp.arctan2(safe_norm(jnp.cross(a, b)), a @ b)
 
 
-_UP = (0.0, 0.0, 1.0)
-
 _BASE = {
     "x": Signal(lambda v: v.state.r[v.base, 0], "m", "base, x"),
     "y": Signal(lambda v: v.state.r[v.base, 1], "m", "base, y"),
     "z": Signal(lambda v: v.state.r[v.base, 2], "m", "base, height"),
-    "distance": Signal(
-        lambda v: safe_norm(v.state.r[v.base]), "m", "base, distance from the origin"
-    ),
+    "distance": Signal(lambda v: safe_norm(v.state.r[v.base]), "m", "base, distance from the origin"),
     "speed": Signal(lambda v: safe_norm(v.state.v[v.base]), "m/s", "base, speed"),
     "spin": Signal(lambda v: safe_norm(v.state.omega[v.base]), "rad/s", "base, angular velocity"),
-    "tilt": Signal(
-        lambda v: angle_between(v.R_wb[:, 2], jnp.array(_UP, v.y.dtype)), "rad", "base, tilt"
-    ),
-}
+    "tilt": Signal(lambda v: angle_between(v.R_wb[:, 2], v.up), "rad", "base, tilt"),
+}  # fmt: skip
 _PANEL = {
     "phi": Signal(lambda v: v.angles[0], "rad", "panel, phi in the base"),
     "theta": Signal(lambda v: v.angles[1], "rad", "panel, theta in the base"),
-    "panel_tilt": Signal(
-        lambda v: angle_between(v.normal_w, jnp.array(_UP, v.y.dtype)), "rad", "panel, tilt"
-    ),
-    "pointing": Signal(
-        lambda v: angle_between(v.normal_w, v.direction), "rad", "panel, pointing error"
-    ),
+    "panel_tilt": Signal(lambda v: angle_between(v.normal_w, v.up), "rad", "panel, tilt"),
+    "pointing": Signal(lambda v: angle_between(v.normal_w, v.direction), "rad", "panel, pointing error"),
     "panel_spin": Signal(
-        lambda v: safe_norm(v.state.omega[v.system.index(PANEL)]),
-        "rad/s",
-        "panel, angular velocity",
+        lambda v: safe_norm(v.state.omega[v.system.index(PANEL)]), "rad/s", "panel, angular velocity"
     ),
-    "stroke_2": Signal(lambda v: v.stroke(SLIDERS[0]), "m", "slider 2, stroke"),
-    "stroke_3": Signal(lambda v: v.stroke(SLIDERS[1]), "m", "slider 3, stroke"),
-}
+    "stroke_2": Signal(lambda v: v.stroke("slider_2"), "m", "slider 2, stroke"),
+    "stroke_3": Signal(lambda v: v.stroke("slider_3"), "m", "slider 3, stroke"),
+}  # fmt: skip
 _ANY = {
     "energy": Signal(lambda v: energy(v.system, v.state, v.t).total, "J", "energy"),
     "kinetic": Signal(lambda v: energy(v.system, v.state, v.t).kinetic, "J", "kinetic energy"),
 }
 
 
-def _at_joint(kind: str, k: int) -> Callable[[RunPoint], Array]:
-    return lambda v: safe_norm(getattr(v.reactions, kind)[k])
-
-
-def _joint_signal(output: Output) -> Signal:
-    return Signal(lambda v: output.of(v.system, v.state), output.unit, output.label)
-
-
 def list_signals(system: System) -> dict[str, Signal]:
     """Signals of a system, by name."""
     result = dict(_ANY)
-    result |= {name: _joint_signal(output) for name, output in joint_outputs(system).items()}
+    for name, output in joint_outputs(system).items():
+        value = lambda v, output=output: output.of(v.system, v.state)
+        result[name] = Signal(value, output.unit, output.label)
     if system.floating:
         result |= _BASE
     if PANEL in system.names:
         result |= _PANEL
     for k, joint in enumerate(system.joints):
-        name = joint.name
-        # A reaction depends on accelerations, whose rate would be a third derivative: its extremes are found
-        # by samples.
-        result[f"force.{name}"] = Signal(
-            _at_joint("force", k), "N", f"joint {name}, reaction force", smooth=False
-        )
-        result[f"moment.{name}"] = Signal(
-            _at_joint("moment", k), "N m", f"joint {name}, reaction moment", smooth=False
-        )
+        for kind, unit in (("force", "N"), ("moment", "N m")):
+            # A reaction depends on accelerations, whose rate would be a third derivative: its extremes are
+            # found by samples.
+            norm = lambda v, kind=kind, k=k: safe_norm(getattr(v.reactions, kind)[k])
+            label = f"joint {joint.name}, reaction {kind}"
+            result[f"{kind}.{joint.name}"] = Signal(norm, unit, label, smooth=False)
     return result
 
 
@@ -190,9 +173,9 @@ def find_signal(system: System, name: str) -> Signal:
     Raises:
         SettingError: the system has no such signal.
     """
-    available_signals = list_signals(system)
-    if name not in available_signals:
+    signals = list_signals(system)
+    if name not in signals:
         raise SettingError(
-            f"There is no signal {quote_name(name)}.{nearest_names(name[:SHOWN], available_signals)}"
+            f"There is no signal {quote_name(name)}.{nearest_names(name[:SHOWN], signals)}"
         )
-    return available_signals[name]
+    return signals[name]

@@ -115,17 +115,15 @@ def outcomes(
     status: Int[np.ndarray, " n"], reasons: Mapping[int, str], level: float = LEVEL
 ) -> Outcomes:
     """Counts of the codes of a study's status, and probabilities among the computed samples."""
-    result, number = np.unique(status, return_counts=True)
-    counts = {int(code): int(k) for code, k in zip(result, number, strict=True)}
+    counts = dict(zip(*(x.tolist() for x in np.unique(status, return_counts=True)), strict=True))
     missing, fine_count = counts.pop(MISSING, 0), counts.pop(FINE, 0)
-    computed = len(status) - missing
+    computed, failed = len(status) - missing, sum(counts.values())
     share = lambda k: probability(k, computed, level) if computed else None
     # A code that nobody explains still counts, and a reason without samples shows that it never
     # occurred.
-    reason_by_code = {code: reasons.get(code, "no reason known") for code in [*reasons, *counts]}
-    failed = sum(counts.values())
     outcome_by_code = {
-        code: (reason_by_code[code], share(counts.get(code, 0))) for code in sorted(reason_by_code)
+        code: (reasons.get(code, "no reason known"), share(counts.get(code, 0)))
+        for code in sorted({*reasons, *counts})
     }
     return Outcomes(missing, fine_count, failed, counts, share(failed), outcome_by_code)
 
@@ -139,7 +137,7 @@ def mean(values: Values, level: float = LEVEL) -> IntervalEstimate:
     from scipy.special import stdtrit
 
     _check_level(level)
-    y, n = _check_finite(values, "A mean", 1), len(values)
+    y, n = check_samples(values, "A mean needs", 1), len(values)
     middle = float(np.mean(y))
     if n == 1:
         return IntervalEstimate(middle, None, None)
@@ -161,7 +159,7 @@ def standard_deviation(values: Values, level: float = LEVEL) -> IntervalEstimate
     from scipy.special import ndtri
 
     _check_level(level)
-    y, n = _check_finite(values, "A standard deviation", 2), len(values)
+    y, n = check_samples(values, "A standard deviation needs", 2), len(values)
     spread = _standard_deviation(y)
     z = float(ndtri(0.5 + level / 2))
     # The trimmed mean and the correction c exist for more values only, and equal values have no
@@ -279,15 +277,18 @@ def _standard_deviation(y: np.ndarray) -> float:
     return scale * math.sqrt(float(np.sum((deviations / scale) ** 2)) / (len(y) - 1))
 
 
-def _check_finite(values: np.ndarray, statistic_name: str, least: int) -> np.ndarray:
+def check_samples(values: np.ndarray, need: str, least: int = 0) -> np.ndarray:
+    """Values as doubles, all of which have to be finite.
+
+    Args:
+        need: subject and verb of the error's sentence, such as "A mean needs". least: smallest number of values.
+    """
     y = np.asarray(values, dtype=float)
     if len(y) < least:
-        raise SettingError(
-            f"{statistic_name} needs at least {least} values, but there are {len(y)}."
-        )
+        raise SettingError(f"{need} at least {least} values, but there are {len(y)}.")
     bad = int(np.sum(~np.isfinite(y)))
     if bad:
-        raise SettingError(f"{statistic_name} needs finite values, but {bad} of {len(y)} are not.")
+        raise SettingError(f"{need} finite values, but {bad} of {len(y)} are not.")
     return y
 
 

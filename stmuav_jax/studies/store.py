@@ -15,7 +15,7 @@ import os
 import platform
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ import xarray as xr
 import zarr
 from zarr.codecs import Crc32cCodec
 
-from ..checks.errors import SettingError, nearest_names
+from ..checks.errors import SettingError
 from ..checks.schema import format_value
 from ..checks.sources import source_digest
 from ..io.netcdf import FileError, flatten_tables, list_versions as package_versions
@@ -37,13 +37,6 @@ FORMAT, FORMAT_VERSION = "stmuav_jax study", 2
 SAMPLE = "sample"
 # Longest text of a value in a message.
 _SHOWN_TEXT = 60
-_DISK_ADVICE = {
-    errno.ENOSPC: "free space on the disk",
-    errno.EDQUOT: "free space on the disk",
-    errno.EROFS: "make the folder writable",
-    errno.EACCES: "make the folder writable",
-    errno.EPERM: "make the folder writable",
-}
 
 
 def computing_versions() -> dict[str, str]:
@@ -53,13 +46,11 @@ def computing_versions() -> dict[str, str]:
         SettingError: the package's sources were changed after this process imported them.
     """
     libraries = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
-    package = {name: package_versions()[name] for name in ("stmuav-jax", "device")}
-    digests = {
-        "processor": describe_processor(),
-        "sources": source_digest(),
-        "equations": describe_code(),
-    }
-    return package | {name: version(name) for name in libraries} | digests
+    return {
+        **{name: package_versions()[name] for name in ("stmuav-jax", "device")},
+        **{name: version(name) for name in libraries},
+        "processor": describe_processor(), "sources": source_digest(), "equations": describe_code(),
+    }  # fmt: skip
 
 
 @functools.cache
@@ -215,23 +206,12 @@ class Store:
                 "samples are complete there, and the study is resumed under that name."
             )
 
-    def confirm(self) -> None:
-        """Compare the samples on disk with those that this run has stored, after the last chunk.
-
-        Raises:
-            FileError: the folder was removed or replaced, or chunks are missing.
-        """
-        self.check_folder()
-        # Files may vanish while a run writes others; only a look at the disk at the end tells.
-        lost = self.finished - int(np.count_nonzero(np.asarray(self._arrays["status"][:])))
-        if lost:
-            raise FileError(
-                f"{self.path} lacks {lost} of the {self.finished} samples that were stored: parts of it "
-                "were removed while the study ran. Resume the study to have them computed again."
-            )
-
     def _describe_disk(self, error: OSError) -> FileError:
-        advice = _DISK_ADVICE.get(error.errno or 0, "check the disk")
+        advice = "check the disk"
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            advice = "free space on the disk"
+        elif error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+            advice = "make the folder writable"
         return FileError(
             f"{self.path} cannot be written ({error.strerror or error}); it keeps {self.finished} of "
             f"{self.total} samples. To resume the study, {advice} first."
@@ -260,22 +240,19 @@ class Store:
         self._is_stored = np.append(self._is_stored, np.zeros(total - self.total, bool))
         self.total = total
 
-    def verify(self, columns: Iterable[str] | None = None) -> None:
-        """Read all axes and all stored chunks of the columns (default all), and check their sums.
+    def verify(self) -> None:
+        """Read all axes and all stored chunks of the columns, and check their sums.
 
         Raises:
             FileError: a file is missing, truncated or altered; the message names it.
         """
         for name, axis in self._axes.items():
             self._check_chunk(name, axis, 0, "The store is damaged.")
-        for start in range(0, self.total, self.chunk):
-            index = start // self.chunk
+        for index, start in enumerate(range(0, self.total, self.chunk)):
+            status = self.path / "status" / "c" / str(index)
+            advice = f"Delete it and {status} and resume the study to have it computed again."
             if np.any(self._is_stored[start : start + self.chunk]):
-                for name in self._choose_columns(columns):
-                    status = self.path / "status" / "c" / str(index)
-                    advice = (
-                        f"Delete it and {status} and resume the study to have it computed again."
-                    )
+                for name in self.columns:
                     self._check_chunk(name, self._arrays[name], index, advice)
 
     def _check_chunk(self, name: str, array: Any, index: int, advice: str) -> None:
@@ -295,27 +272,15 @@ class Store:
                 f"{file} was truncated or altered: {format_value(str(error))}. {advice}"
             ) from None
 
-    def _choose_columns(self, columns: Iterable[str] | None) -> list[str]:
-        chosen = set(self.columns if columns is None else columns)
-        for name in chosen - set(self.columns):
-            suggestion = nearest_names(name, self.columns)
-            raise SettingError(f"{self.path} has no column '{name}'.{suggestion}")
-        return [name for name in self.columns if name in chosen]
-
-    def dataset(self, columns: Iterable[str] | None = None) -> xr.Dataset:
+    def dataset(self) -> xr.Dataset:
         """Dataset of the finished samples, read lazily, with their numbers as coordinate "sample".
 
         Attributes `total` and `finished` are the numbers of samples of the study and of finished
-        ones. `dataset(...).load()` reads all of them; `load` verifies them too.
-
-        Args:
-            columns: names of the columns to read; default all.
+        ones. `dataset().load()` reads all of them; `load` verifies them too.
         """
-        chosen = self._choose_columns(columns)
-        others = [name for name in self.columns if name not in chosen]
         settings: Any = {"consolidated": False, "chunks": None, "decode_cf": False}
         try:
-            whole = xr.open_zarr(self.path, drop_variables=others, **settings)[chosen]
+            whole = xr.open_zarr(self.path, **settings)[list(self.columns)]
         except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
             reason = format_value(str(error))
             raise FileError(f"A description in {self.path} is damaged: {reason}.") from error
@@ -328,10 +293,10 @@ class Store:
             total=self.total, finished=int(numbers.size)
         )
 
-    def load(self, columns: Iterable[str] | None = None) -> xr.Dataset:
-        """Dataset of the finished samples in memory, after `verify` of the chosen columns."""
-        self.verify(columns)
-        return self.dataset(columns).load()
+    def load(self) -> xr.Dataset:
+        """Dataset of the finished samples in memory, after `verify`."""
+        self.verify()
+        return self.dataset().load()
 
 
 def create_store(
@@ -405,15 +370,15 @@ def resume_store(
             differs); one that another run is writing; or files missing, truncated or altered.
     """
     source = Path(path)
-    # The lock comes before anything is read: another run could otherwise change the store between
-    # its verification and the first write.
-    lock = _lock_folder(source)
-    try:
+    with contextlib.ExitStack() as stack:
+        # The lock comes before anything is read: another run could otherwise change the store between
+        # its verification and the first write.
+        lock = _lock_folder(source)
+        stack.callback(os.close, lock)
         store = Store(source, lock)
         stored: Any = dict(store._group.attrs)
         present = _describe_study(study, computing_versions() if versions is None else versions)
-        unlike = _list_differences(stored, present)
-        if unlike:
+        if unlike := _list_differences(stored, present):
             more = f"; and {len(unlike) - 8} more" if len(unlike) > 8 else ""
             differences = f"{'; '.join(unlike[:8])}{more}."
             if all(entry.startswith("versions.") for entry in unlike):
@@ -429,10 +394,7 @@ def resume_store(
         # the length of every array.
         store.extend(store.total)
         store.verify()
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.close(lock)
-        raise
+        stack.pop_all()
     return store
 
 
@@ -463,7 +425,7 @@ def _describe_study(study: Any, versions: Mapping[str, str]) -> dict[str, Any]:
     """
     columns, axes = dict(study.columns), dict(study.axes)
     status = columns.get("status")
-    if status is None or status[0] != "int8" or status.role != "status" or status.dims:
+    if status is None or (status.dtype, status.role, status.dims) != ("int8", "status", ()):
         raise SettingError("A study needs a column 'status' of type int8, that role and no axes.")
     for name in (*columns, *axes):
         if not name.isidentifier() or name == SAMPLE or (name in columns and name in axes):
@@ -476,8 +438,8 @@ def _describe_study(study: Any, versions: Mapping[str, str]) -> dict[str, Any]:
             raise SettingError(f"Column '{name}' has type {column.dtype}; numbers can be stored.")
         if unknown := [dim for dim in column.dims if dim not in axes]:
             raise SettingError(f"Column '{name}' has axes that are not given: {unknown}.")
-    for name, axis in axes.items():
-        values = np.asarray(axis.values)
+    axes = {name: (np.asarray(axis.values), axis.unit) for name, axis in axes.items()}
+    for name, (values, _) in axes.items():
         if values.ndim != 1 or not values.size or values.dtype.kind not in "fiu":
             raise SettingError(
                 f"Axis '{name}' needs numbers (k,), not {values.dtype} {values.shape}."
@@ -488,7 +450,7 @@ def _describe_study(study: Any, versions: Mapping[str, str]) -> dict[str, Any]:
         raise SettingError(f"A study's identity must be plain data for JSON: {error}.") from None
     layout = {
         "column": {n: [c.dtype, c.unit, c.role, list(c.dims)] for n, c in columns.items()},
-        "axis": {n: [np.asarray(a.values).tolist(), a.unit] for n, a in axes.items()},
+        "axis": {name: [values.tolist(), unit] for name, (values, unit) in axes.items()},
     }
     return {
         "format": FORMAT, "format_version": FORMAT_VERSION, "columns": list(columns),
@@ -501,17 +463,21 @@ def _write_arrays(group: Any, study: Any, total: int, chunk: int) -> None:
     """Create the empty arrays of the columns, and the axes."""
     plain: dict[str, Any] = {"filters": None, "compressors": [Crc32cCodec()]}
     for name, column in study.columns.items():
-        row = tuple(len(study.axes[dim].values) for dim in column.dims)
+        row = row_shape(study, column)
         attributes = {"units": column.unit, "long_name": column.label, "role": column.role}
+        # Fill value where a sample is missing. Whole numbers have no NaN, so the end of their range marks a
+        # gap: the smallest number, but of unsigned ones, whose smallest is an ordinary 0, the largest.
+        kind, fill = np.dtype(column.dtype).kind, {"b": False, "f": np.nan, "c": np.nan}
+        if kind in "iu":
+            limits = np.iinfo(column.dtype)
+            fill = {"i": limits.min, "u": limits.max}
         if column.role == "status":
+            fill = {kind: MISSING}
             codes = {MISSING: "missing", FINE: "fine"} | dict(study.reasons)
-            attributes["meanings"] = json.dumps(
-                {str(code): meaning for code, meaning in codes.items()}
-            )
+            attributes["meanings"] = json.dumps({str(code): text for code, text in codes.items()})
         group.create_array(
-            name, shape=(total, *row), chunks=(chunk, *row), dtype=column.dtype,
-            fill_value=_missing_value(column), dimension_names=[SAMPLE, *column.dims],
-            attributes=attributes, **plain,
+            name, shape=(total, *row), chunks=(chunk, *row), dtype=column.dtype, fill_value=fill[kind],
+            dimension_names=[SAMPLE, *column.dims], attributes=attributes, **plain,
         )  # fmt: skip
     for name, axis in study.axes.items():
         values = np.asarray(axis.values)
@@ -521,34 +487,19 @@ def _write_arrays(group: Any, study: Any, total: int, chunk: int) -> None:
         )  # fmt: skip
 
 
-def _missing_value(column: Column) -> Any:
-    """Fill value of a column where a sample is missing."""
-    kind = np.dtype(column.dtype).kind
-    if column.role == "status":
-        return MISSING
-    if kind in "fc":
-        return np.nan
-    if kind == "b":
-        return False
-    # Whole numbers have no NaN, so the end of their range marks a gap: the smallest number, but of
-    # unsigned ones, whose smallest is an ordinary 0, the largest.
-    limits = np.iinfo(column.dtype)
-    return limits.min if kind == "i" else limits.max
+def row_shape(study: Any, column: Column) -> tuple[int, ...]:
+    """Shape of a column's value for one sample."""
+    return tuple(len(study.axes[dim].values) for dim in column.dims)
 
 
 def _list_differences(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
     """Differences between a store and a study, such as 'seed is 1 there and 2 here'."""
 
-    def flatten_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    def flatten_attributes(attributes: Mapping[str, Any]) -> dict[str, str]:
         parts = {key: json.loads(attributes[key]) for key in ("layout", "reasons", "versions")}
-        identity = json.loads(attributes["identity"])
-        return dict(flatten_tables(identity | parts["layout"] | parts))
-
-    def as_json(side: dict[str, Any], key: str) -> str:
+        entries = json.loads(attributes["identity"]) | parts["layout"] | parts
         # as text, since NaN does not equal itself
-        return json.dumps(side[key]) if key in side else "not given"
-
-    stored_entries, present_entries = flatten_attributes(stored), flatten_attributes(present)
+        return {key: json.dumps(value) for key, value in dict(flatten_tables(entries)).items()}
 
     def shorten(text: str, other: str) -> str:
         """Text, of a long one the part around its first difference from another."""
@@ -559,10 +510,11 @@ def _list_differences(stored: Mapping[str, Any], present: Mapping[str, Any]) -> 
         last = first + _SHOWN_TEXT - 6
         return "..." * (first > 0) + text[first:last] + "..." * (last < len(text))
 
+    stored_entries, present_entries = flatten_attributes(stored), flatten_attributes(present)
     differences = []
     for key in dict.fromkeys([*stored_entries, *present_entries]):
-        old, new = as_json(stored_entries, key), as_json(present_entries, key)
+        old = stored_entries.get(key, "not given")
+        new = present_entries.get(key, "not given")
         if not key.startswith("layout") and old != new:
-            texts = f"{shorten(old, new)} there and {shorten(new, old)} here"
-            differences.append(f"{key} is {texts}")
+            differences.append(f"{key} is {shorten(old, new)} there and {shorten(new, old)} here")
     return differences

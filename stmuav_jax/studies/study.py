@@ -8,7 +8,9 @@ all of them. The cores of a CPU share it as threads, and other devices have a co
 
 import abc
 import contextlib
+import functools
 import itertools
+import math
 import os
 import queue
 import signal
@@ -26,13 +28,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..checks.digest import digest_value
-from ..checks.errors import SettingError, SimulationError
+from ..checks.errors import SettingError
 from ..checks.schema import quote_name
 from ..math.compiler import compile_for_shapes
 from ..math.native.structure import find_structure
 from .columns import FINE, Axis, Column, column_name
 from .sampling import Sampling
-from .store import Store, check_absent, computing_versions, create_store, resume_store
+from .store import check_absent, computing_versions, create_store, resume_store, row_shape
 
 # Samples evaluated together on one device: on a CPU as many as fit its cache, by measurement
 # (docs/studies.md); a GPU needs thousands.
@@ -243,23 +245,21 @@ class Study:
                 of other versions; or the disk is full (written chunks are kept).
             SettingError: impossible settings, outcomes other than the declared columns, no scheduler at
                 the address, or a worker with other versions than the store's.
-            SimulationError: not even a single sample fits in memory; or the scheduler was lost, or
-                workers of the same chunk died repeatedly (written chunks are kept).
+            SimulationError: the scheduler was lost, or workers of the same chunk died repeatedly
+                (written chunks are kept).
         """
         target, begin = Path(store), time.monotonic()
         total = self.samples if samples is None else samples
+        chunk = self.chunk if chunk is None else chunk
         if not resume:
             # A store is hours of work, and is never overwritten.
             check_absent(target)
         tell = progress or (lambda _: None)
+        note = lambda text: tell(StudyProgress(0, total, text))
         with contextlib.ExitStack() as stack:
-            stop = stack.enter_context(
-                delayed_interrupt(lambda note: tell(StudyProgress(0, total, note)))
-            )
-            compute: Callable[[Iterable[tuple[int, int]]], Iterator[tuple[int, Any]]]
-            compute = lambda pieces: (
-                (first, self.compute_in_parts(first, count)) for first, count in pieces
-            )
+            stop = stack.enter_context(delayed_interrupt(note))
+            compute: Callable[[Iterable[tuple[int, int]]], Iterable[tuple[int, Any]]]
+            compute = lambda pieces: ((first, self.compute(first, n)) for first, n in pieces)
             versions = computing_versions
             if scheduler is not None or workers is not None:
                 from .cluster import WorkerPool
@@ -267,10 +267,18 @@ class Study:
                 pool = stack.enter_context(WorkerPool.connect(self, scheduler, workers, patience))
                 compute, versions = pool.compute, lambda: pool.versions
                 if not pool.client.nthreads():
-                    note = f"Waiting for a worker of {pool.client.scheduler.address}."
-                    tell(StudyProgress(0, total, note))
-            chunk = self.chunk if chunk is None else chunk
-            opened = stack.enter_context(_open_to_write(self, target, total, chunk, versions))
+                    note(f"Waiting for a worker of {pool.client.scheduler.address}.")
+            if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+                size = default_chunk(self) if chunk is None else chunk
+                opened = stack.enter_context(create_store(target, self, total, size, versions()))
+            else:
+                opened = stack.enter_context(resume_store(target, self, versions()))
+                # A chunk is one file of each column, and samples that are stored are not grouped anew.
+                if chunk not in (None, opened.chunk):
+                    raise SettingError(
+                        f"{target} has chunks of {opened.chunk} samples, which cannot change to {chunk}."
+                    )
+                opened.extend(total)
             before = opened.finished
             tell(StudyProgress(before, total))
             # Pieces end at an interrupt, and those in work are still stored.
@@ -278,8 +286,7 @@ class Study:
             for first, arrays in compute(pieces):
                 opened.write(first, arrays)
                 tell(StudyProgress(opened.finished, total))
-            # Chunks may have vanished from the disk while others were written.
-            opened.confirm()
+            opened.check_folder()
             finished = opened.finished
             is_stopped, seconds = stop.is_set() and finished < total, time.monotonic() - begin
             return StudyOutcome(target, finished, total, finished - before, seconds, is_stopped)
@@ -287,8 +294,10 @@ class Study:
     def compute(self, first: int, count: int) -> dict[str, np.ndarray]:
         """Columns (count, ...) of the samples first, first + 1, ..., which are not stored."""
         if not count:
-            row = lambda c: tuple(len(self.axes[dim].values) for dim in c.dims)
-            return {name: np.zeros((0, *row(c)), c.dtype) for name, c in self.columns.items()}
+            return {
+                name: np.zeros((0, *row_shape(self, column)), column.dtype)
+                for name, column in self.columns.items()
+            }
         # A sample has the same place among the lanes whichever chunk asks for it: whole fillings
         # are computed, and what was not asked for is cut off.
         begin, end = first - first % self.lanes, -(-(first + count) // self.lanes) * self.lanes
@@ -296,48 +305,29 @@ class Study:
         end = max(first + count, min(end, self.sampling.limit or end))
         values = self.sampling.draw(begin, end - begin)
         ranges = _split_ranges(first + count - begin, self._block, self.lanes, len(self._places))
-        parts = self._on_all([(values, begin, *part) for part in ranges])
+        parts = self._on_all(values, begin, list(ranges))
         skip = slice(first - begin, first - begin + count)
         names = [column_name(name) for name in self.sampling.names]
         joined = dict(zip(names, values.T, strict=True))
         joined |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return {name: joined[name][skip].astype(c.dtype) for name, c in self.columns.items()}
 
-    def compute_in_parts(self, first: int, count: int) -> dict[str, np.ndarray]:
-        """Columns (count, ...) of samples, in halves where they do not fit in memory together.
+    def _on_all(
+        self, values: np.ndarray, begin: int, ranges: list[tuple[int, int]]
+    ) -> list[dict[str, np.ndarray]]:
+        """Outcomes of ranges of the samples begin, begin + 1, ... with these values of the factors.
 
-        Raises:
-            SimulationError: not even a single sample fits in memory.
+        Each device takes the next range that is not taken yet.
         """
-        try:
-            return self.compute(first, count)
-        except (MemoryError, RuntimeError) as error:
-            if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
-                raise
-            if count == 1:
-                raise SimulationError(
-                    f"Sample {first} alone does not fit in memory: let the function return smaller arrays."
-                ) from error
-        # Halving finds a size that fits after a few attempts, without an estimate of the memory that a
-        # program needs.
-        half = -(-count // 2)
-        if self.unit < count:
-            half = min(-(-half // self.unit) * self.unit, count - 1)
-        halves = (first, half), (first + half, count - half)
-        parts = [self.compute_in_parts(*piece) for piece in halves]
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-    def _on_all(self, parts: list[tuple[np.ndarray, int, int, int]]) -> list[dict[str, np.ndarray]]:
-        """Outcomes of the parts; each device takes the next part that is not taken yet."""
-        places, idle = self._places[: len(parts)], queue.SimpleQueue()
+        places, idle = self._places[: len(ranges)], queue.SimpleQueue()
         with jax.enable_x64(True):
             # programs are compiled here, once for each device, before the threads need them
             for place in places:
                 idle.put(self._device_program(place))
 
-        def carry_out(part: tuple[np.ndarray, int, int, int]) -> dict[str, np.ndarray]:
+        def carry_out(part: tuple[int, int]) -> dict[str, np.ndarray]:
             # samples begin + start, ..., begin + stop - 1
-            values, begin, start, stop = part
+            start, stop = part
             # The block is always full, so that one program of fixed shape serves every part; the next
             # samples, or repeats of the last, fill it, and their outcomes are cut off.
             rows = np.minimum(np.arange(start, start + self._block), len(values) - 1)
@@ -349,17 +339,16 @@ class Study:
             try:
                 with jax.enable_x64(True):
                     outcomes = program(values[rows], key_data, np.int32(stop - start))
-                    return {
-                        k: np.array(v[: stop - start]) for k, v in jax.device_get(outcomes).items()
-                    }
+                    outcomes = jax.device_get(outcomes)
             finally:
                 idle.put(program)
+            return {name: np.array(of[: stop - start]) for name, of in outcomes.items()}
 
         if len(places) == 1:
-            return [carry_out(part) for part in parts]
+            return [carry_out(part) for part in ranges]
         with ThreadPoolExecutor(len(places), thread_name_prefix="study") as pool:
             try:
-                return list(pool.map(carry_out, parts))
+                return list(pool.map(carry_out, ranges))
             finally:
                 # after Ctrl-C or an error no further part is begun
                 pool.shutdown(wait=False, cancel_futures=True)
@@ -383,9 +372,8 @@ class Study:
             # Arrays of the function are arguments: constants would be folded at compilation.
             arrays, rest = eqx.partition(self.evaluate, eqx.is_array)
 
-            def run_block(arrays: Any, values: Any, key_data: Any, count: Any) -> dict[str, Any]:
-                evaluate = eqx.combine(arrays, rest)
-                return self._evaluate_block(evaluate, values, key_data, count)
+            def run_block(arrays: Any, *block: Any) -> dict[str, Any]:
+                return self._evaluate_block(eqx.combine(arrays, rest), *block)
 
             # where there is one device, the program is that of later processes too
             at = None if place.platform == "cpu" else jax.sharding.SingleDeviceSharding(place)
@@ -447,41 +435,20 @@ class Study:
         return result | {"status": Column("int8", "1", "how the sample ended", "status")}
 
 
-def _open_to_write(
-    study: Study, path: Path, total: int, chunk: int | None, versions: Callable[[], dict[str, str]]
-) -> Store:
-    """Store of the study, made or resumed and extended."""
-    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-        size = default_chunk(study) if chunk is None else chunk
-        return create_store(path, study, total, size, versions())
-    store = resume_store(path, study, versions())
-    try:
-        # A chunk is one file of each column, and samples that are stored are not grouped anew.
-        if chunk not in (None, store.chunk):
-            raise SettingError(
-                f"{path} has chunks of {store.chunk} samples, which cannot change to {chunk}."
-            )
-        store.extend(total)
-    except BaseException:
-        store.close()
-        raise
-    return store
-
-
 def default_chunk(study: Study) -> int:
-    """Number of samples in a chunk: those best computed together, as far as results fit in memory."""
-    row = lambda column: int(
-        np.prod([len(study.axes[dim].values) for dim in column.dims], dtype=int)
+    """Number of samples in a chunk: those best computed together, as far as results fit in 64 MiB."""
+    size = sum(
+        np.dtype(column.dtype).itemsize * math.prod(row_shape(study, column))
+        for column in study.columns.values()
     )
-    size = sum(np.dtype(column.dtype).itemsize * row(column) for column in study.columns.values())
     return max(1, min(study.unit, MOST_BYTES // max(size, 1)))
 
 
 def _name_outcomes(outcomes: Any) -> dict[str, Any]:
     """Leaves of a pytree of outcomes by column, such as "position_x" for {"position": {"x": ...}}."""
+    keystr = functools.partial(jax.tree_util.keystr, simple=True, separator="_")
     leaves = jax.tree_util.tree_leaves_with_path(outcomes)
-    path_text = lambda path: jax.tree_util.keystr(path, simple=True, separator="_") or "outcome"
-    return {column_name(path_text(path)): jnp.asarray(leaf) for path, leaf in leaves}
+    return {column_name(keystr(path) or "outcome"): jnp.asarray(leaf) for path, leaf in leaves}
 
 
 def _split_ranges(count: int, block: int, lanes: int, devices: int) -> Iterator[tuple[int, int]]:
@@ -504,10 +471,8 @@ def delayed_interrupt(tell: Callable[[str], object]) -> Iterator[threading.Event
     """
     stop = threading.Event()
     # Python lets only the main thread set handlers of signals.
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    signals = (signal.SIGINT, signal.SIGTERM)
+    in_main = threading.current_thread() is threading.main_thread()
+    signals = (signal.SIGINT, signal.SIGTERM) if in_main else ()
     before = {number: signal.getsignal(number) for number in signals}
 
     def restore() -> None:

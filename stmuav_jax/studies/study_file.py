@@ -21,7 +21,7 @@ from ..io.netcdf import FileError, read_toml
 from ..mechanics.parameters import Parameters
 from .disturbed_flights import AbstractFlights, ModelFlights, make_flights, start_states
 from .estimates import make_estimation_study
-from .flights import Failure, FlightEvaluation, Quantity, make_flight_study
+from .flights import FlightEvaluation, make_flight_study
 from .sampling import Sampling
 from .schema import Drawing, EstimationFile, FlightsFile, Integrating, MissionStudyFile
 from .study import Study
@@ -88,16 +88,15 @@ def make_study(plain: Mapping[str, Any], table: Parameters | None = None, **sett
         return make_estimation_study(entries, **settings)
     entries = validate_model(FlightsFile, plain, "A study")
     factors, relative = factors_of(entries.factors)
-    quantities, failure = _read_results(entries)
     method = entries.model_dump(include=set(Integrating.model_fields))
     evaluation = FlightEvaluation(
-        _read_flights(entries, table, relative), quantities, entries.t1, entries.every,
+        _read_flights(entries, table, relative), entries.quantities, entries.t1, entries.every,
         Method(**method | {"solver": solver_named(entries.solver)}), entries.direction,
     )  # fmt: skip
     if settings.get("lanes") is None:
         settings["lanes"] = entries.lanes
     return make_flight_study(
-        evaluation, factors, failure=failure, **study_settings(entries), **settings
+        evaluation, factors, failure=entries.failure, **study_settings(entries), **settings
     )
 
 
@@ -111,12 +110,6 @@ def factors_of(entries: Mapping[str, Any]) -> tuple[dict[str, Any], frozenset[st
 def study_settings(entries: FlightsFile | MissionStudyFile) -> dict[str, Any]:
     """Settings of a `Study` among the entries of its file: name, samples, chunk and design."""
     return entries.model_dump(include={"name", "samples", "chunk", *Drawing.model_fields})
-
-
-def _read_results(entries: FlightsFile) -> tuple[dict[str, Quantity], Failure | None]:
-    """Quantities of each run, and the condition under which it counts as a failure."""
-    quantities = {k: Quantity(**dict(q)) for k, q in entries.quantities.items()}
-    return quantities, None if entries.failure is None else Failure(**dict(entries.failure))
 
 
 def study_kind(plain: Mapping[str, Any]) -> str:
@@ -139,20 +132,16 @@ def check_study(plain: Mapping[str, Any]) -> None:
     kind = study_kind(plain)
     if kind == "estimation":
         validate_model(EstimationFile, plain, "A study of estimation")
-    elif kind == "missions":
-        _check_factors(validate_model(MissionStudyFile, plain, "A study of a mission"))
-    else:
-        entries = validate_model(FlightsFile, plain, "A study")
-        _check_factors(entries)
-        # Quantities and failures check themselves as they are made; nothing else is wanted here.
-        _read_results(entries)
-
-
-def _check_factors(entries: FlightsFile | MissionStudyFile) -> None:
-    # The sampling is made for its checks alone, so that files and Python share one set of them.
-    Sampling(
-        factors_of(entries.factors)[0], **entries.model_dump(include=set(Drawing.model_fields))
+        return
+    model, owner = (
+        (MissionStudyFile, "A study of a mission")
+        if kind == "missions"
+        else (FlightsFile, "A study")
     )
+    entries = validate_model(model, plain, owner)
+    # The sampling is made for its checks alone, so that files and Python share one set of them.
+    design = entries.model_dump(include=set(Drawing.model_fields))
+    Sampling(factors_of(entries.factors)[0], **design)
 
 
 def _read_flights(

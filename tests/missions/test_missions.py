@@ -169,7 +169,7 @@ def test_powers_and_the_battery_by_hand(data):
 
 def test_a_flight_goes_on_with_the_program_of_its_first_second(flight):
     """Where it stands after a second has the shapes and types that it had at the start."""
-    mission, rows = flight.mission, flight.progress.rows
+    mission, rows = flight.mission, flight.run.rollout
     key = jax.random.key(0)
     first = jax.eval_shape(lambda: (mission.plant.reset(key), mission.controller.start()))
     later = jax.eval_shape(lambda: (rows.end, rows.memory))

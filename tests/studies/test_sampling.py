@@ -105,7 +105,7 @@ def test_plain_form_goes_through_json_with_sorted_keys(name):
 def test_marginals(name):
     """Kolmogorov and Smirnov, at the level 1e-4 over nine factors and seven designs."""
     sampling = SAMPLINGS[name]
-    x = sampling.draw(0, sampling.whole(3000))
+    x = sampling.draw(0, 3003 if sampling.design == "saltelli" else 3000)
     if sampling.design == "saltelli":
         x = x.reshape(-1, 11, 9)[:, 0]
     truths = {
@@ -147,14 +147,12 @@ def test_correlation_in_ranks():
         assert np.max(np.abs(found - truth)) < 4.5 / np.sqrt(n)
 
 
-def test_latin_fills_every_stratum_and_is_extended_by_whole_ones():
+def test_latin_fills_every_stratum_of_each_hypercube():
     sampling = Sampling({"x": st.uniform(), "y": st.uniform()}, 3, "latin", stratum=50)
     x = sampling.draw(0, 150).reshape(3, 50, 2)
     cells = np.sort((x * 50).astype(int), axis=1)
     np.testing.assert_array_equal(cells, np.broadcast_to(np.arange(50)[:, None], (3, 50, 2)))
     assert not np.array_equal(x[0], x[1])
-    assert sampling.whole(101) == 150
-    assert sampling.whole(100) == 100
 
 
 def test_sobol_is_a_net():
@@ -180,8 +178,6 @@ def test_saltelli_layout():
     halves = np.concatenate([a[:, :1], a[:, 1:2] / 2, b[:, :1], b[:, 1:2] / 2], axis=1)
     cells = np.sort((halves * 64).astype(int), axis=0)
     np.testing.assert_array_equal(cells, np.broadcast_to(np.arange(64)[:, None], (64, 4)))
-    assert sampling.together == 5
-    assert sampling.whole(11) == 15
 
 
 def test_table_gives_its_rows():

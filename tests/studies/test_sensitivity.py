@@ -24,7 +24,7 @@ TOTAL = FIRST + np.array([1.0, 0.0, 1.0]) * 0.01 * 8 * PI**8 / 225 / VARIANCE
 
 
 def flown(sampling, points, f):
-    x = sampling.draw(0, sampling.whole(points * sampling.together))
+    x = sampling.draw(0, points * (len(sampling.factors) + 2))
     return x, f(x), np.ones(len(x), dtype=np.int8)
 
 
