@@ -365,21 +365,11 @@ def trim(
 
 
 def _solve_trim(
-    space: AbstractStateSpace,
-    displace: Displace,
-    states: int,
-    free: Sequence[str],
-    start: Point,
-    *,
-    inputs: Inputs | None,
-    values: Numbers | None,
-    accelerations: Numbers | None,
-    conditions: Conditions | None,
-    sizes: Numbers | None,
-    directions: Numbers | None,
+    space: AbstractStateSpace, displace: Displace, states: int, free: Sequence[str], start: Point, *,
+    inputs: Inputs | None, values: Numbers | None, accelerations: Numbers | None,
+    conditions: Conditions | None, sizes: Numbers | None, directions: Numbers | None, throw: bool,
     t: Time = 0.0,
-    throw: bool,
-) -> Trim:
+) -> Trim:  # fmt: skip
     """Trim whose states follow from `states` unknowns by `displace`; see `trim`."""
     inputs = inputs_of(space.system) if inputs is None else inputs
     m = len(inputs)
@@ -393,9 +383,8 @@ def _solve_trim(
         # would leave Newton's method with a condition of 1e14.
         scales = jax.lax.stop_gradient(jnp.where(start_values == 0, 1.0, jnp.abs(start_values)))
     else:
-        columns = check_numbers(
-            directions, (m, np.shape(directions)[-1]), "The inputs' directions", ""
-        )
+        shape = (m, np.shape(directions)[-1])
+        columns = check_numbers(directions, shape, "The inputs' directions", "")
         scales = jnp.ones(columns.shape[1])
     state_sizes = jnp.ones(states)
     if sizes is not None:
@@ -425,7 +414,15 @@ def _solve_trim(
     # A point that did not converge is returned as NaN and never as a guess that looks like a trim.
     converged = residual <= TOLERANCE
     if throw and has_values(efforts) and bool(converged):
-        _check_efforts(problem, np.asarray(efforts))
+        for k, ratio in zip(problem.limited, np.asarray(efforts), strict=True):
+            force: Any = space.system.forces[k]
+            limit = float(force.limit)
+            if abs(ratio) > 1 + _LIMIT_ROUND_OFF:
+                unit = effort_unit(space.system, force.joint, force.coordinate)
+                raise StateError(
+                    f"The trim needs an effort of {ratio * limit:.6g} {unit} of the {type(force).__name__} in joint "
+                    f"'{force.joint}', but its limit is {limit:.6g}: raise the limit, or choose another posture."
+                )
     converged = converged & jnp.all(jnp.abs(efforts) <= 1 + _LIMIT_ROUND_OFF)
     if throw and has_values(residual) and not bool(converged):
         hint = ""
@@ -441,9 +438,22 @@ def _solve_trim(
             f"{'of ' * bool(is_finite)}{residual_text} (tolerance {TOLERANCE:.0e}) over the unknowns {chosen}.{hint}"
         )
     point, trim_values = problem.at(z)
-    lowest, highest = _find_speed_limits(space.system, inputs)
+    # squared speeds of rotors with limits, with a margin for round-off
+    pairs = []
+    for entry in inputs.entries:
+        limits: Any = getattr(space.system.forces[entry.force], "squared_limits", None)
+        low, high = (-jnp.inf, jnp.inf) if limits is None else (x[entry.place] for x in limits)
+        pairs.append((low * (1 - _LIMIT_ROUND_OFF), high * (1 + _LIMIT_ROUND_OFF)))
+    lowest, highest = (jnp.array([pair[k] for pair in pairs]) for k in (0, 1))
     if throw and has_values(trim_values, lowest, highest):
-        _check_speeds(inputs, np.asarray(trim_values), np.asarray(lowest), np.asarray(highest))
+        numbers = (np.asarray(x).tolist() for x in (trim_values, lowest, highest))
+        for entry, value, low, high in zip(inputs.entries, *numbers, strict=True):
+            if not low <= value <= high:
+                text = f"{np.sqrt(value):.6g} rad/s" if value >= 0 else "a thrust downwards"
+                raise StateError(
+                    f"The trim needs {text} of the rotor with the input '{entry.name}', but its limits are "
+                    f"{np.sqrt(low):.6g} to {np.sqrt(high):.6g} rad/s."
+                )
     converged = converged & jnp.all((trim_values >= lowest) & (trim_values <= highest))
     keep = lambda tree: jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), tree)
     point, trim_values = keep((point, trim_values))
@@ -464,54 +474,12 @@ def _suggest_free_states(space: AbstractStateSpace, inputs: Inputs, free: Sequen
         for name, _ in space.names[: space.dof]
         if "." in name and name.rpartition(".")[0] not in driven and name not in free
     ]
-    if not names:
-        return ""
+    listed = ", ".join(names)
     return (
-        f" No input acts in the joint of {', '.join(names)}: a free state usually is one of these."
+        f" No input acts in the joint of {listed}: a free state usually is one of these."
+        if names
+        else ""
     )
-
-
-def _check_efforts(problem: _Problem, efforts: Float[np.ndarray, " l"]) -> None:
-    """Raise `StateError` where a trim needs more than the limit of a servo or an effort."""
-    for k, ratio in zip(problem.limited, efforts, strict=True):
-        if abs(ratio) <= 1 + _LIMIT_ROUND_OFF:
-            continue
-        force: Any = problem.space.system.forces[k]
-        limit = float(force.limit)
-        unit = effort_unit(problem.space.system, force.joint, force.coordinate)
-        raise StateError(
-            f"The trim needs an effort of {ratio * limit:.6g} {unit} of the {type(force).__name__} in joint "
-            f"'{force.joint}', but its limit is {limit:.6g}: raise the limit, or choose another posture."
-        )
-
-
-def _find_speed_limits(
-    system: System, inputs: Inputs
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Smallest and largest squared speeds of rotors with limits, with a margin for round-off; else infinite."""
-    lowest, highest = [], []
-    for entry in inputs.entries:
-        limits: Any = getattr(system.forces[entry.force], "squared_limits", None)
-        low, high = (-jnp.inf, jnp.inf) if limits is None else (x[entry.place] for x in limits)
-        lowest.append(low * (1 - _LIMIT_ROUND_OFF))
-        highest.append(high * (1 + _LIMIT_ROUND_OFF))
-    return jnp.array(lowest), jnp.array(highest)
-
-
-def _check_speeds(
-    inputs: Inputs,
-    values: Float[np.ndarray, " m"],
-    lowest: Float[np.ndarray, " m"],
-    highest: Float[np.ndarray, " m"],
-) -> None:
-    """Raise `StateError` where a trim needs a rotor beyond the limits of its speed."""
-    for entry, value, low, high in zip(inputs.entries, values, lowest, highest, strict=True):
-        if not low <= value <= high:
-            text = f"{np.sqrt(value):.6g} rad/s" if value >= 0 else "a thrust downwards"
-            raise StateError(
-                f"The trim needs {text} of the rotor with the input '{entry.name}', but its limits are "
-                f"{np.sqrt(low):.6g} to {np.sqrt(high):.6g} rad/s."
-            )
 
 
 # --- steady flight
@@ -573,12 +541,6 @@ def steady_turn(
     """A level turn at a speed [m/s] and a rate [rad/s], positive from x to y; at its start."""
     straight = cruise(speed, course, angles, yaw)
     return straight._replace(rate=check_numbers(rate, (), "The rate of turn", "rad/s"))
-
-
-def turn_acceleration(condition: FlightCondition) -> Float[Array, "3"]:
-    """Acceleration of the base, world (3,) [m/s^2]: that of the turn plus that of the condition."""
-    x, y, _ = condition.v
-    return condition.rate * jnp.stack([-y, x, jnp.zeros_like(x)]) + condition.acceleration
 
 
 class _Attitude(eqx.Module):
@@ -668,9 +630,12 @@ def trim_condition(
     displace = _Attitude(_FreeStates(space, chosen), condition.yaw, condition.rate)
     # The velocity is given: drag and the turn's acceleration follow from it.
     start = displace(at._replace(v=condition.v), jnp.zeros(2 + len(chosen)))
+    # acceleration of the base: that of the turn plus that of the condition
+    x, y, _ = condition.v
+    turning = condition.rate * jnp.stack([-y, x, jnp.zeros_like(x)]) + condition.acceleration
     return _solve_trim(
         space, displace, 2 + len(chosen), ["roll", "pitch", *free], start, inputs=inputs, values=values,
-        accelerations=jnp.zeros(space.dof).at[:3].set(turn_acceleration(condition)),
+        accelerations=jnp.zeros(space.dof).at[:3].set(turning),
         conditions=towards, sizes=sizes, directions=directions, throw=throw,
     )  # fmt: skip
 

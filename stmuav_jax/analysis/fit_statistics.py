@@ -68,12 +68,18 @@ class Fit(NamedTuple):
     def information(self) -> Float[np.ndarray, "n n"]:
         """Matrix A with that of the prior of the start."""
         J = self.slopes.reshape(-1, self.slopes.shape[2])
-        return J.T @ J + self._prior_information(J.shape[1])
+        return J.T @ J + self.prior
 
     @property
     def scores(self) -> Float[np.ndarray, "k n"]:
         """Scores J_i^T r_i of the rows."""
         return np.einsum("kmn,km->kn", self.slopes, self.residuals)
+
+    @property
+    def gradient(self) -> Float[np.ndarray, " n"]:
+        """Half the derivative of the sum of squares by the unknowns."""
+        prior = np.append(np.zeros(self.parameters), self.start)
+        return np.sum(self.scores, axis=0) + prior
 
     @property
     def projected(self) -> Float[np.ndarray, "r p"]:
@@ -86,8 +92,10 @@ class Fit(NamedTuple):
         Q, _ = np.linalg.qr(J[:, p:])
         return J[:, :p] - Q @ (Q.T @ J[:, :p])
 
-    def _prior_information(self, n: int) -> Float[np.ndarray, "n n"]:
-        return np.diag(np.arange(n) >= n - len(self.start)).astype(float)
+    @property
+    def prior(self) -> Float[np.ndarray, "n n"]:
+        """Information of the prior of the start."""
+        return np.diag(np.arange(self.slopes.shape[2]) >= self.parameters).astype(float)
 
 
 @dataclass(frozen=True)
@@ -248,7 +256,6 @@ def compute_deviations(
     """
     limit, p = LEVEL / len(TESTS), fit.parameters
     n, k = fit.slopes.shape[2], len(fit.residuals)
-    prior = fit._prior_information(n)
     # The Gauss-Newton matrix is the information of white residuals; its inverse is the first of the
     # deviations' parts.
     C = np.linalg.inv(fit.information)
@@ -264,34 +271,33 @@ def compute_deviations(
         reach = max(_correlation_rows(fit), 1)
         block_rows = max(_REACHES * reach, k // _STRETCHES if drift and not whiteness else 2)
         length = max(min(block_rows, k // max(_FEWEST_BLOCKS, 2 * p)), 1)
-        total = compute_block_covariance(C, fit.scores, prior, length, p)
+        total = compute_block_covariance(C, fit.scores, fit.prior, length, p)
         blocks = np.sqrt(np.diag(total)[:p])
     scatter, p_windows, estimates, spread = np.zeros(p), None, None, None
     windows = _fit_windows(fit)
     if windows is not None:
-        scatter, p_windows = _compare_windows(windows)
-        estimates = values + windows.change
-        spread = np.sqrt(np.diag(windows.covariance)).reshape(estimates.shape)
+        change, covariance, degrees = windows
+        estimates = values + change
+        spread = np.sqrt(np.diag(covariance)).reshape(estimates.shape)
+        of_parameter = [
+            compare_estimates(change[:, j], covariance[j::p, j::p], limit / p, degrees)
+            for j in range(p)
+        ]
+        scatter, p_each = np.array(of_parameter).T
+        p_windows = min(1.0, float(np.min(p_each)) * p)
     total = total + np.diag(np.append(scatter**2, np.zeros(n - p)))
     deviations = Deviations(white, scale, blocks, length, reach, scatter, estimates, spread)
     return total, deviations, p_windows
 
 
-class Windows(NamedTuple):
+def _fit_windows(
+    fit: Fit,
+) -> tuple[Float[np.ndarray, "w p"], Float[np.ndarray, "j j"], float | int] | None:
     """Fit in which every window of a record has parameters of its own; the start is common.
 
-    Attributes:
-        change: of the parameters from those of the whole record (w, p).
-        covariance: of all these parameters (w p, w p). degrees: degrees of freedom behind it.
-    """
-
-    change: Float[np.ndarray, "w p"]
-    covariance: Float[np.ndarray, "j j"]
-    degrees: float
-
-
-def _fit_windows(fit: Fit) -> Windows | None:
-    """Fit of as many windows as the record allows; None if it is too short for two.
+    There are as many windows as the record allows; the result is None if it is too short for two, else
+    the change of the parameters from those of the whole record (w, p), the covariance of all these
+    parameters (w p, w p), and the degrees of freedom behind it.
 
     The linear model at the minimum has residuals of its own: those of the whole record are correlated already
     if its parameters change.
@@ -313,10 +319,8 @@ def _fit_windows(fit: Fit) -> Windows | None:
         if np.any(size == 0) or np.linalg.cond(M / size[:, None] / size) > _SINGULAR:
             continue
         C = np.linalg.inv(M)
-        gradient = np.sum(joint_fit.scores, axis=0)
-        gradient[count * p :] += fit.start
         # One Gauss-Newton step from the common minimum is enough, as the windows are a linear model about it.
-        step = -C @ gradient
+        step = -C @ joint_fit.gradient
         residuals = np.where(fit.measured, fit.residuals + X @ step, 0.0)
         window_fit = joint_fit._replace(residuals=residuals, start=fit.start + step[count * p :])
         degrees = max(int(np.sum(fit.measured)) - count * p, 1)
@@ -327,28 +331,11 @@ def _fit_windows(fit: Fit) -> Windows | None:
             length = _REACHES * max(_correlation_rows(window_fit), 1)
             if k < count * _WINDOW_BLOCKS * length:
                 continue
-            V, degrees = (
-                compute_block_covariance(
-                    C, window_fit.scores, window_fit._prior_information(len(M)), length, count * p
-                ),
-                k / length,
-            )
+            V = compute_block_covariance(C, window_fit.scores, window_fit.prior, length, count * p)
+            degrees = k / length
         places = slice(0, count * p)
-        return Windows(step[places].reshape(count, p), V[places, places], degrees)
+        return step[places].reshape(count, p), V[places, places], degrees
     return None
-
-
-def _compare_windows(windows: Windows) -> tuple[Float[np.ndarray, " p"], float]:
-    """Scatter of the parameters between windows beyond their deviations (p,), and the p-value."""
-    count, p = windows.change.shape
-    pairs = []
-    for j in range(p):
-        places = np.arange(count) * p + j
-        V = windows.covariance[np.ix_(places, places)]
-        level = LEVEL / len(TESTS) / p
-        pairs.append(compare_estimates(windows.change[:, j], V, level, windows.degrees))
-    scatter, p_values = np.array(pairs).T
-    return scatter, min(1.0, float(np.min(p_values)) * p)
 
 
 def compare_estimates(
@@ -425,117 +412,68 @@ def judge_fit(
         bound_labels: parameters that ended at a bound. faults: sentences on physical bounds that the
             estimates break. is_start_exact: the motion's start was taken as exact.
     """
-    limit = LEVEL / len(TESTS)
-    significant = [name for name in TESTS if p_values.get(name, 1.0) < limit]
-    step = _step_to_minimum(fit, covariance, labels, bound_labels)
-    missing = 1 - np.mean(fit.measured)
-    sentences: list[str] = []
-    spare = int(np.sum(fit.measured)) - fit.parameters
-    status: Status = "consistent"
-    if step:
-        status = "failed"
-        sentences.append(
-            f"Failed: the search is not at a minimum; {step}: values and deviations mean little."
-        )
-    elif significant or faults:
-        status = "inconsistent"
-        named = significant + ["physical bounds"] * bool(faults)
-        sentences.append(f"Inconsistent: {', '.join(named)} (family-wise level {LEVEL:g}).")
-    elif spare < _FEWEST:
-        status = "undecided"
-        sentences.append(
-            f"Undecided: the record has {spare} numbers beyond the parameters, and {_FEWEST} are needed."
-        )
-    else:
-        sentences.append(
-            f"Consistent: none of {len(p_values)} tests at a family-wise level of {LEVEL:g} rejects the "
-            f"model; chi-squared per degree of freedom {chi_square:.3g}, expected {interval[0]:.3g} to "
-            f"{interval[1]:.3g}."
-        )
-    sentences += faults
-    sentences += _explain_tests(
-        significant, chi_square, interval, deviations, is_start_exact, p_values
-    )
-    sentences += _describe_deviations(deviations, labels)
-    for name in bound_labels:
-        sentences.append(
-            f"The parameter {name} ended at its bound: its deviation is not that of a free one."
-        )
-    if missing > 0:
-        sentences.append(f"{missing:.1%} of the record is missing and was left out.")
-    if p_values.get("windows") is None and status != "failed":
-        sentences.append("The record is too short to compare windows of it.")
-    return FitVerdict(status, p_values, interval, LEVEL, " ".join(sentences))
-
-
-def _step_to_minimum(
-    fit: Fit, covariance: np.ndarray, labels: tuple[str, ...], bound_labels: tuple[str, ...]
-) -> str:
-    """Words on the largest step to the minimum of the linear model, empty where it is small."""
-    p = fit.parameters
-    gradient = np.sum(fit.scores, axis=0)
-    gradient[p:] += fit.start
+    significant = [name for name in TESTS if p_values.get(name, 1.0) < LEVEL / len(TESTS)]
+    # the largest step to the minimum of the linear model, in deviations
+    p, gradient = fit.parameters, fit.gradient
     free = np.array([k >= p or labels[k] not in bound_labels for k in range(len(gradient))])
     step = np.zeros(len(gradient))
-    A = fit.information[np.ix_(free, free)]
-    step[free] = np.linalg.solve(A, gradient[free])
+    step[free] = np.linalg.solve(fit.information[np.ix_(free, free)], gradient[free])
     share = np.abs(step[:p]) / np.sqrt(np.diag(covariance)[:p])
-    k = int(np.argmax(share))
-    if share[k] <= _AT_MINIMUM:
-        return ""
-    return f"a step of the linear model moves {labels[k]} by {share[k]:.2g} of its deviations"
-
-
-def _explain_tests(
-    significant: list[str],
-    chi_square: float,
-    interval: tuple[float, float],
-    deviations: Deviations,
-    is_start_exact: bool,
-    p_values: dict[str, float],
-) -> list[str]:
-    """Sentences on what the significant tests point to."""
-    sentences = []
-    if "size" in significant:
-        side = "larger" if chi_square > 1 else "smaller"
-        sentences.append(
-            f"Chi-squared per degree of freedom is {chi_square:.3g}, expected {interval[0]:.3g} to "
-            f"{interval[1]:.3g} (p = {p_values['size']:.2g}): residuals are {side} than the record's "
-            "deviations say."
-        )
-    if "whiteness" in significant or "drift" in significant:
-        sentences.append(
-            "Residuals are correlated in time: the model leaves something out (a lag, a bias, a force), or "
-            "the record's errors are not white; values may be off by more than their deviations."
-        )
-    if "windows" in significant:
-        sentences.append(
-            "Windows of the record disagree: the parameters are not constant, or the model is wrong."
-        )
-    if "outliers" in significant:
-        sentences.append(
-            "Single readings lie far out: mark them as missing (NaN) if they are faulty."
-        )
-    if "start" in significant:
-        sentences.append("The start is further from its prior than its deviations allow.")
+    worst = int(np.argmax(share))
+    missing, spare = 1 - np.mean(fit.measured), int(np.sum(fit.measured)) - p
+    expected = f"expected {interval[0]:.3g} to {interval[1]:.3g}"
+    status: Status
+    if share[worst] > _AT_MINIMUM:
+        status, sentence = "failed", (
+            f"Failed: the search is not at a minimum; a step of the linear model moves {labels[worst]} by "
+            f"{share[worst]:.2g} of its deviations: values and deviations mean little."
+        )  # fmt: skip
+    elif significant or faults:
+        named = ", ".join(significant + ["physical bounds"] * bool(faults))
+        status = "inconsistent"
+        sentence = f"Inconsistent: {named} (family-wise level {LEVEL:g})."
+    elif spare < _FEWEST:
+        status, sentence = "undecided", (
+            f"Undecided: the record has {spare} numbers beyond the parameters, and {_FEWEST} are needed."
+        )  # fmt: skip
+    else:
+        status, sentence = "consistent", (
+            f"Consistent: none of {len(p_values)} tests at a family-wise level of {LEVEL:g} rejects the "
+            f"model; chi-squared per degree of freedom {chi_square:.3g}, {expected}."
+        )  # fmt: skip
+    sentences = [sentence, *faults]
+    # what the significant tests point to
+    causes = {
+        ("size",): f"Chi-squared per degree of freedom is {chi_square:.3g}, {expected} (p = "
+        f"{p_values['size']:.2g}): residuals are {'larger' if chi_square > 1 else 'smaller'} than the record's "
+        "deviations say.",
+        (
+            "whiteness",
+            "drift",
+        ): "Residuals are correlated in time: the model leaves something out (a lag, a "
+        "bias, a force), or the record's errors are not white; values may be off by more than their deviations.",
+        (
+            "windows",
+        ): "Windows of the record disagree: the parameters are not constant, or the model is wrong.",
+        (
+            "outliers",
+        ): "Single readings lie far out: mark them as missing (NaN) if they are faulty.",
+        ("start",): "The start is further from its prior than its deviations allow.",
+    }
+    sentences += [text for tests, text in causes.items() if set(tests) & set(significant)]
     if significant and is_start_exact:
         sentences.append(
             "The start was taken as exact: if it is not, give its standard deviations (start_deviations)."
         )
-    return sentences
-
-
-def _describe_deviations(deviations: Deviations, labels: tuple[str, ...]) -> list[str]:
-    """Sentences on how the standard deviations were made."""
-    sentences = []
+    # how the standard deviations were made
+    rows, reach = deviations.block_rows, deviations.correlation_rows
     if deviations.blocks is not None:
         ratio = deviations.blocks / deviations.white
         sentences.append(
-            f"Standard deviations are by blocks of {deviations.block_rows} rows, since residuals are "
-            f"correlated over some {deviations.correlation_rows} rows: they are {np.min(ratio):.3g} to "
-            f"{np.max(ratio):.3g} times those of white residuals."
+            f"Standard deviations are by blocks of {rows} rows, since residuals are correlated over some "
+            f"{reach} rows: they are {np.min(ratio):.3g} to {np.max(ratio):.3g} times those of white residuals."
         )
-        if deviations.block_rows < _REACHES * deviations.correlation_rows:
+        if rows < _REACHES * reach:
             sentences.append(
                 "The record has too few correlation times for blocks that are long enough: "
                 "the deviations are lower bounds."
@@ -545,9 +483,16 @@ def _describe_deviations(deviations: Deviations, labels: tuple[str, ...]) -> lis
             f"Standard deviations are {deviations.scale:.3g} times those of the given noise, as the "
             "residuals are."
         )
-    wide = [label for label, x in zip(labels, deviations.windows, strict=True) if x > 0]
-    if wide:
+    if wide := [label for label, x in zip(labels, deviations.windows, strict=True) if x > 0]:
         sentences.append(
             f"The scatter between windows is added to the deviations of {', '.join(wide)}."
         )
-    return sentences
+    sentences += [
+        f"The parameter {name} ended at its bound: its deviation is not that of a free one."
+        for name in bound_labels
+    ]
+    if missing > 0:
+        sentences.append(f"{missing:.1%} of the record is missing and was left out.")
+    if p_values.get("windows") is None and status != "failed":
+        sentences.append("The record is too short to compare windows of it.")
+    return FitVerdict(status, p_values, interval, LEVEL, " ".join(sentences))

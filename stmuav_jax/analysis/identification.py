@@ -280,10 +280,17 @@ def motion_model(
         if callable(outputs):
             of: Any = outputs
             return jax.vmap(lambda now: of(model_space, now))(path)
-        parts = [
-            _read_output(model_space, system, origin, times, path, output)
-            for output, _ in _list_outputs(model_space, system, outputs)
-        ]
+        parts = []
+        for output, _ in _list_outputs(model_space, system, outputs):
+            if isinstance(output, tuple):
+                places = np.array(places_of(model_space, output, "The outputs"))
+                departure = lambda now, k=places: model_space.difference(now, origin)[k]
+                parts.append(jax.vmap(departure)(path))
+            else:
+                see = lambda t, now, sensor=output: jnp.atleast_1d(
+                    sensor.read(sensed_motion_at(model_space, now, t, system))
+                )
+                parts.append(jax.vmap(see)(times, path))
         return jnp.concatenate(parts, axis=1)
 
     def row_space(q: Float[Array, " q"]) -> AbstractSpace:
@@ -441,51 +448,35 @@ def _list_outputs(
     space: AbstractStateSpace, system: System, outputs: Sequence[str | AbstractSensor]
 ) -> list[tuple[tuple[str, ...] | AbstractSensor, AbstractSpace]]:
     """Sensors and groups of states, one column or the three of a rotation vector, with their spaces."""
-    names, parts, k = [name for name, _ in space.names], [], 0
+    names, parts, rest = [name for name, _ in space.names], [], list(outputs)
     turning = dict(zip(names, getattr(space, "periodic", [False] * len(names)), strict=True))
-    while k < len(outputs):
-        output = outputs[k]
-        if isinstance(output, str):
-            places_of(space, [output], "The outputs")
-            stem = output[:-1]
-            if output[-2:] in ("_x", "_y", "_z") and stem.endswith(("theta_", "rotation_")):
-                # A whole turn changes all three components of a rotation vector, so that one of them alone cannot
-                # be compared with a record.
-                group = tuple(f"{stem}{axis}" for axis in "xyz")
-                if tuple(outputs[k : k + 3]) != group:
-                    raise SettingError(
-                        f"The outputs name '{output}', one component of a rotation vector, which whole "
-                        f"turns change with the others: name {', '.join(group)} together, in this order."
-                    )
-                parts.append((group, RotationVector()))
-                k += 3
-                continue
-            parts.append(((output,), CyclicVector((bool(turning[output]),))))
-        else:
-            reading_space = output.space(system)
+    while rest:
+        output = rest[0]
+        if not isinstance(output, str):
+            group, reading_space = output, output.space(system)
             if not isinstance(reading_space, Vector | CyclicVector | Rotation):
                 raise SettingError(
                     f"The readings of the sensor '{output.name}' are no array: record the states instead."
                 )
-            parts.append((output, reading_space))
-        k += 1
+        else:
+            places_of(space, [output], "The outputs")
+            group, reading_space, stem = (
+                (output,),
+                CyclicVector((bool(turning[output]),)),
+                output[:-1],
+            )
+            if output[-2:] in ("_x", "_y", "_z") and stem.endswith(("theta_", "rotation_")):
+                # A whole turn changes all three components of a rotation vector, so that one of them alone cannot
+                # be compared with a record.
+                group, reading_space = tuple(f"{stem}{axis}" for axis in "xyz"), RotationVector()
+                if tuple(rest[:3]) != group:
+                    raise SettingError(
+                        f"The outputs name '{output}', one component of a rotation vector, which whole "
+                        f"turns change with the others: name {', '.join(group)} together, in this order."
+                    )
+        parts.append((group, reading_space))
+        rest = rest[len(group) if isinstance(group, tuple) else 1 :]
     return parts
-
-
-def _read_output(
-    space: AbstractStateSpace,
-    system: System,
-    origin: Point,
-    ts: Float[Array, " k"],
-    path: Point,
-    output: tuple[str, ...] | AbstractSensor,
-) -> Float[Array, "k c"]:
-    """One output along a path."""
-    if isinstance(output, tuple):
-        places = np.array(places_of(space, output, "The outputs"))
-        return jax.vmap(lambda now: space.difference(now, origin)[places])(path)
-    see = lambda t, now: jnp.atleast_1d(output.read(sensed_motion_at(space, now, t, system)))
-    return jax.vmap(see)(ts, path)
 
 
 @eqx.filter_jit
@@ -494,13 +485,6 @@ def predict_columns(
 ) -> Float[Array, "k c"]:
     """Predictions at parameters q, traced once for their shapes, their derivatives and the search."""
     return predict(q, errors) if isinstance(predict, MotionModel) else predict(q)
-
-
-@eqx.filter_jit
-def _first_point(predict: MotionModel, q: Float[Array, " q"]) -> tuple[Point, Float[Array, "n s"]]:
-    """Start of a motion and the root of its prior's covariance, also where no mechanism has the values."""
-    space, _, first = predict.start(q)
-    return first, jnp.asarray(predict.spread(space))
 
 
 class Misfit(eqx.Module):
@@ -543,7 +527,11 @@ class Misfit(eqx.Module):
         )
         measured = self.measured
         if self.readings is not None:
-            turning = np.array(_angle_flags(self.readings), dtype=bool)
+            # components of an error that are angles
+            turning = np.concatenate([
+                part.angular if isinstance(part, CyclicVector) else np.zeros(part.size, bool)
+                for part in _list_spaces(self.readings)
+            ])  # fmt: skip
             if np.any(turning):
                 whole = jax.lax.stop_gradient(_count_turns(residuals, measured))
                 residuals = residuals + jnp.where(
@@ -575,36 +563,22 @@ class Misfit(eqx.Module):
     @property
     def measured(self) -> Bool[Array, "k m"]:
         """False where a number of the errors is missing: one component of a rotation takes the others."""
-        present = ~jnp.isnan(self.record)
+        present, flags, k = ~jnp.isnan(self.record), [], 0
         if self.readings is None:
             return present
-        return jnp.concatenate(_by_errors(self.readings, present), axis=1)
+        for part in _list_spaces(self.readings):
+            columns = 4 if isinstance(part, Rotation) else part.size
+            part_flags = present[:, k : k + columns]
+            if not isinstance(part, Vector | CyclicVector):
+                whole = jnp.all(part_flags, axis=1, keepdims=True)
+                part_flags = jnp.repeat(whole, part.size, axis=1)
+            flags.append(part_flags)
+            k += columns
+        return jnp.concatenate(flags, axis=1)
 
 
 def _list_spaces(space: AbstractSpace) -> tuple[AbstractSpace, ...]:
     return space.parts if isinstance(space, Concatenated) else (space,)
-
-
-def _angle_flags(space: AbstractSpace) -> list[bool]:
-    """Flags of the components of an error that are angles."""
-    flags = [
-        part.angular if isinstance(part, CyclicVector) else (False,) * part.size
-        for part in _list_spaces(space)
-    ]
-    return [flag for part in flags for flag in part]
-
-
-def _by_errors(space: AbstractSpace, present: Bool[Array, "k c"]) -> list[Bool[Array, "k e"]]:
-    """Flags of the components of each part's error, from those of its columns."""
-    flags, k = [], 0
-    for part in _list_spaces(space):
-        columns = 4 if isinstance(part, Rotation) else part.size
-        part_flags = present[:, k : k + columns]
-        if not isinstance(part, Vector | CyclicVector):
-            part_flags = jnp.repeat(jnp.all(part_flags, axis=1, keepdims=True), part.size, axis=1)
-        flags.append(part_flags)
-        k += columns
-    return flags
 
 
 def _count_turns(misfit: Float[Array, "k m"], measured: Bool[Array, "k m"]) -> Float[Array, "k m"]:
@@ -702,22 +676,96 @@ def identify(
     if isinstance(start, Mapping):
         labels, start = tuple(start), list(start.values())
     q0 = jnp.asarray(start, dtype=float)
-    names = tuple(f"q_{k}" for k in range(len(q0))) if labels is None else tuple(labels)
-    record = filled_record(record)
-    _check_arguments(predict, record, sigma, q0, sizes, names, readings)
-    y, deviations, widths = (jnp.asarray(x, dtype=float) for x in (record, sigma, sizes))
+    p = len(q0)
+    names = tuple(f"q_{k}" for k in range(p)) if labels is None else tuple(labels)
+    y = filled_record(record)
+    if readings is None and isinstance(predict, MotionModel):
+        unknowns = jnp.concatenate([q0, jnp.zeros(predict.start_count)])
+        readings = eqx.filter_eval_shape(predict.readings, unknowns)
+    if readings is not None and all(isinstance(x, Vector) for x in _list_spaces(readings)):
+        readings = None
+    check_finite(sigma, "The deviations of the record", "")
+    if np.shape(sigma) != (np.shape(y)[-1:] if readings is None else (readings.size,)) or not (
+        np.all(np.asarray(sigma) > 0)
+    ):
+        # which of the two is wrong, only the predictions tell
+        shape = eqx.filter_eval_shape(predict_columns, predict, q0).shape
+        _check_shape(y, shape)
+        count = shape[-1] if readings is None else readings.size
+        raise SettingError(f"The record needs {count} positive deviations, not {sigma}.")
+    if np.shape(sizes) != (p,) or not np.all(np.asarray(sizes) > 0):
+        raise SettingError(f"There must be {p} positive sizes, not {sizes}.")
+    if len(names) != p:
+        raise SettingError(f"There are {p} parameters, but {len(names)} names.")
     lower, upper = _parameter_limits(bounds, q0, names)
     residuals = Misfit(
-        predict, y, deviations, q0, widths, _row_space(predict, q0, readings), lower, upper,
-        follows_turns=jnp.asarray(True),
+        predict, jnp.asarray(y, dtype=float), jnp.asarray(sigma, dtype=float), q0, jnp.asarray(sizes, dtype=float),
+        readings, lower, upper, follows_turns=jnp.asarray(True),
     )  # fmt: skip
-    z = _zero_errors(residuals)
+    z = jnp.zeros(p + getattr(predict, "start_count", 0))
     # Identifiability is judged before the search, which would run along an undetermined direction without
     # end, and once more at its result.
     r, J = residuals_and_jacobian(residuals, z)
-    _check_start(r, J, q0, names)
-    _check_determined(residuals, r, J, names, min_singular_value)
-    return _fit_parameters(residuals, names, min_singular_value, steps, report, resume)
+    for numbers, name in ((r, "predictions"), (J, "derivatives of the predictions")):
+        # a start that cannot be flown has derivatives without information
+        if not np.all(np.isfinite(numbers)):
+            values = ", ".join(f"{name} = {float(q):g}" for name, q in zip(names, q0, strict=True))
+            raise SettingError(
+                f"The {name} at the start of the search are not finite: the model cannot be evaluated with "
+                f"{values}. Start from valid values."
+            )
+    _check_determined(residuals, z, r, J, names, min_singular_value)
+    # Six digits are a thousandth of a standard deviation in any record that passed the test of
+    # identifiability.
+    method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
+    run = lambda misfit, before: search(
+        misfit, z, method, steps=steps, report=report, resume=before
+    )
+    outcome = run(residuals, resume)
+    # in the end angles are compared by their nearest difference: a reading far out, or a gap in the record,
+    # may have been taken for a turn
+    residuals = eqx.tree_at(lambda m: m.follows_turns, residuals, jnp.asarray(False))
+    r, J = residuals_and_jacobian(residuals, outcome.values)
+    if 0.5 * float(r @ r) < outcome.loss * (1 - 1e-6):
+        outcome = run(residuals, outcome)
+        r, J = residuals_and_jacobian(residuals, outcome.values)
+    singular_values, fit = _check_determined(
+        residuals, outcome.values, r, J, names, min_singular_value
+    )
+    sizes = np.asarray(residuals.sizes)
+    values = np.asarray(residuals.values(outcome.values[:p]))
+    p_values, chi_square, interval = compute_p_values(fit)
+    # Deviations depend on the residuals found to be white or not: the tests come first.
+    total, deviations, p_windows = compute_deviations(fit, p_values, chi_square, values / sizes)
+    if p_windows is not None:
+        p_values["windows"] = p_windows
+    scale = np.append(sizes, np.ones(len(fit.start)))
+    covariance = scale[:, None] * total * scale
+    deviations = deviations.scaled(sizes)
+    distance = np.full(p, np.inf)
+    if lower is not None and upper is not None:
+        distance = np.minimum(values - np.asarray(lower), np.asarray(upper) - values)
+    at_bounds = np.array(names)[distance < 0.1 * deviations.white].tolist()
+    faults, is_start_exact, estimated_start = (), False, None
+    if isinstance(predict, MotionModel):
+        unknowns = jnp.asarray(np.append(values, fit.start))
+        faults, is_start_exact = predict.faults(unknowns), not predict.start_count
+        if predict.start_count:
+            # The estimate of the start is a Gaussian in the state space's errors; products of roots keep its
+            # covariance symmetric and positive. It exists also where no mechanism has the values.
+            first, spread = _start_and_spread(predict, unknowns)
+            L = np.asarray(spread) @ np.linalg.cholesky(covariance[p:, p:])
+            P = L @ L.T
+            root = covariance_root((P + P.T) / 2, "The start's covariance")
+            estimated_start = Gaussian(first, root)
+    verdict = judge_fit(
+        fit, p_values, chi_square, interval, deviations, total, names, bound_labels=tuple(at_bounds),
+        faults=faults, is_start_exact=is_start_exact,
+    )  # fmt: skip
+    return Identified(
+        names, values, covariance[:p, :p], np.sqrt(np.diag(covariance)[:p]), deviations, singular_values,
+        chi_square, verdict, np.where(fit.measured, fit.residuals, np.nan), estimated_start, outcome,
+    )  # fmt: skip
 
 
 def filled_record(record: Any, subject: str = "The record") -> np.ndarray:
@@ -737,20 +785,6 @@ def filled_record(record: Any, subject: str = "The record") -> np.ndarray:
     if values.size and np.all(np.isnan(values)):
         raise ModelError(f"{subject} has no numbers: all of them are missing.")
     return values
-
-
-def _row_space(predict: Predict, q0: Array, readings: AbstractSpace | None) -> AbstractSpace | None:
-    """Space of a row of the record, None for a vector."""
-    if readings is None and isinstance(predict, MotionModel):
-        unknowns = jnp.concatenate([q0, jnp.zeros(predict.start_count)])
-        readings = eqx.filter_eval_shape(predict.readings, unknowns)
-    flat = readings is None or all(isinstance(part, Vector) for part in _list_spaces(readings))
-    return None if flat else readings
-
-
-def _zero_errors(residuals: Misfit) -> Array:
-    errors = getattr(residuals.predict, "start_count", 0)
-    return jnp.zeros(len(residuals.start) + errors)
 
 
 def _parameter_limits(
@@ -774,85 +808,23 @@ def _parameter_limits(
     return jnp.asarray(lower), jnp.asarray(upper)
 
 
-def _fit_parameters(
-    residuals: Misfit,
-    names: tuple[str, ...],
-    min_singular_value: float,
-    steps: int,
-    report: Callable[[Search], None] | None,
-    resume: Search | None,
-) -> Identified:
-    # Six digits are a thousandth of a standard deviation in any record that passed the test of
-    # identifiability.
-    method = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
-    run = lambda misfit, before: search(
-        misfit, _zero_errors(residuals), method, steps=steps, report=report, resume=before
-    )
-    outcome = run(residuals, resume)
-    # in the end angles are compared by their nearest difference: a reading far out, or a gap in the record,
-    # may have been taken for a turn
-    residuals = eqx.tree_at(lambda m: m.follows_turns, residuals, jnp.asarray(False))
-    r, J = residuals_and_jacobian(residuals, outcome.values)
-    if 0.5 * float(r @ r) < outcome.loss * (1 - 1e-6):
-        outcome = run(residuals, outcome)
-        r, J = residuals_and_jacobian(residuals, outcome.values)
-    singular_values, fit = _check_determined(
-        residuals, r, J, names, min_singular_value, outcome.values
-    )
-    p = len(names)
-    sizes = np.asarray(residuals.sizes)
-    values = np.asarray(residuals.values(outcome.values[:p]))
-    p_values, chi_square, interval = compute_p_values(fit)
-    # Deviations depend on the residuals found to be white or not: the tests come first.
-    total, deviations, p_windows = compute_deviations(fit, p_values, chi_square, values / sizes)
-    if p_windows is not None:
-        p_values["windows"] = p_windows
-    scale = np.append(sizes, np.ones(len(fit.start)))
-    predict, faults = residuals.predict, ()
-    if isinstance(predict, MotionModel):
-        faults = predict.faults(jnp.asarray(np.append(values, fit.start)))
-    verdict = judge_fit(
-        fit, p_values, chi_square, interval, deviations, total, names,
-        bound_labels=_at_bounds(residuals, values, deviations.white * sizes, names), faults=faults,
-        is_start_exact=isinstance(predict, MotionModel) and not predict.start_count,
-    )  # fmt: skip
-    covariance = scale[:, None] * total * scale
-    deviations = deviations.scaled(sizes)
-    masked_residuals = np.where(fit.measured, fit.residuals, np.nan)
-    return Identified(
-        names, values, covariance[:p, :p], np.sqrt(np.diag(covariance)[:p]), deviations, singular_values,
-        chi_square, verdict, masked_residuals,
-        _estimated_start(predict, values, fit.start, covariance[p:, p:]), outcome,
-    )  # fmt: skip
-
-
-def _estimated_start(
-    predict: Predict, values: np.ndarray, errors: np.ndarray, covariance: np.ndarray
-) -> Gaussian | None:
-    """Start of the motion by the whole record, from its errors in units of the prior."""
-    if not len(errors) or not isinstance(predict, MotionModel):
-        return None
-    first, spread = _first_point(predict, jnp.asarray(np.append(values, errors)))
-    # The estimate of the start is a Gaussian in the state space's errors; products of roots keep its
-    # covariance symmetric and positive.
-    L = np.asarray(spread) @ np.linalg.cholesky(covariance)
-    P = L @ L.T
-    return Gaussian(first, covariance_root((P + P.T) / 2, "The start's covariance"))
+@eqx.filter_jit
+def _start_and_spread(
+    predict: MotionModel, q: Float[Array, " q"]
+) -> tuple[Point, Float[Array, "n s"]]:
+    """Start of a motion and the root of its prior's covariance."""
+    space, _, first = predict.start(q)
+    return first, jnp.asarray(predict.spread(space))
 
 
 def _check_determined(
-    residuals: Misfit,
-    r: np.ndarray,
-    J: np.ndarray,
-    names: Sequence[str],
+    residuals: Misfit, z: Any, r: np.ndarray, J: np.ndarray, names: Sequence[str],
     min_singular_value: float,
-    z: Any = None,
-) -> tuple[Float[np.ndarray, " p"], Fit]:
+) -> tuple[Float[np.ndarray, " p"], Fit]:  # fmt: skip
     """Singular values, as of `check_identifiable`, of an uncertain start's rest, and the fit at unknowns z."""
     p = len(names)
-    z = jnp.zeros(p) if z is None else z[:p]
     # derivatives by the parameters over their sizes, whatever their bounds make of the unknowns
-    _, slope = jax.jvp(residuals.values, (z,), (jnp.ones(p),))
+    _, slope = jax.jvp(residuals.values, (z[:p],), (jnp.ones(p),))
     J = J / np.append(np.asarray(slope / residuals.sizes), np.ones(J.shape[1] - p))
     measured = np.asarray(residuals.measured)
     k, m = measured.shape
@@ -860,58 +832,6 @@ def _check_determined(
     return check_identifiable(fit.projected, names, min_singular_value), fit
 
 
-def _at_bounds(
-    residuals: Misfit, values: np.ndarray, deviations: np.ndarray, names: tuple[str, ...]
-) -> tuple[str, ...]:
-    """Parameters that ended within a tenth of a deviation of a bound."""
-    if residuals.lower is None or residuals.upper is None:
-        return ()
-    distance = np.minimum(
-        values - np.asarray(residuals.lower), np.asarray(residuals.upper) - values
-    )
-    return tuple(
-        name for name, is_near in zip(names, distance < 0.1 * deviations, strict=True) if is_near
-    )
-
-
-def _check_start(r: np.ndarray, J: np.ndarray, q0: Array, names: Sequence[str]) -> None:
-    """Raise if the start cannot be flown, so that its derivatives carry no information."""
-    if np.all(np.isfinite(r)) and np.all(np.isfinite(J)):
-        return
-    quantity_name = (
-        "predictions" if not np.all(np.isfinite(r)) else "derivatives of the predictions"
-    )
-    values = ", ".join(f"{name} = {float(q):g}" for name, q in zip(names, q0, strict=True))
-    raise SettingError(
-        f"The {quantity_name} at the start of the search are not finite: the model cannot be evaluated with "
-        f"{values}. Start from valid values."
-    )
-
-
 def _check_shape(record: Any, shape: tuple[int, ...]) -> None:
     if np.shape(record) != shape:
         raise ModelError(f"The record has shape {np.shape(record)}, but predictions have {shape}.")
-
-
-def _check_arguments(
-    predict: Predict,
-    record: Any,
-    sigma: Any,
-    q0: Array,
-    sizes: Any,
-    names: Sequence[str],
-    readings: AbstractSpace | None,
-) -> None:
-    check_finite(sigma, "The deviations of the record", "")
-    space = _row_space(predict, q0, readings)
-    count = np.shape(record)[-1:] if space is None else (space.size,)
-    if np.shape(sigma) != count or not np.all(np.asarray(sigma) > 0):
-        # which of the two is wrong, only the predictions tell
-        shape = eqx.filter_eval_shape(predict_columns, predict, q0).shape
-        _check_shape(record, shape)
-        size = shape[-1] if space is None else space.size
-        raise SettingError(f"The record needs {size} positive deviations, not {sigma}.")
-    if np.shape(sizes) != q0.shape or not np.all(np.asarray(sizes) > 0):
-        raise SettingError(f"There must be {len(q0)} positive sizes, not {sizes}.")
-    if len(names) != len(q0):
-        raise SettingError(f"There are {len(q0)} parameters, but {len(names)} names.")

@@ -105,7 +105,13 @@ class Linear:
             # equal shares, as of an angle and its rate, keep the order of the states
             order = np.argsort(-np.round(shares, 9), kind="stable")[:3]
             top = [(self.states[j][0], float(shares[j])) for j in order]
-            size = abs(s)
+            size, refusal = abs(s), ""
+            if not determined:
+                gaps = np.abs(np.delete(values, k) - values[k])
+                refusal = (
+                    "shares are not determined: the eigenvalue is in a cluster, the next one is "
+                    f"{float(np.min(gaps, initial=np.inf)):.1g} 1/s away"
+                )
             modes.append(
                 Mode(
                     s,
@@ -113,7 +119,7 @@ class Linear:
                     -s.real / size if size > 0 else 1.0,
                     float(np.log(2) / s.real) if _is_real_part_resolved(A, s) else float("inf"),
                     tuple(top) if determined else (),
-                    "" if determined else _cluster_words(values, k),
+                    refusal,
                 )
             )
         return modes
@@ -209,48 +215,20 @@ def _is_real_part_resolved(A: np.ndarray, s: complex) -> bool:
     )
 
 
-def _cluster_words(values: np.ndarray, k: int) -> str:
-    """Reason why the shares of mode k are not determined."""
-    gap = float(np.min(np.abs(np.delete(values, k) - values[k]), initial=np.inf))
-    return (
-        "shares are not determined: the eigenvalue is in a cluster, the next one is "
-        f"{gap:.1g} 1/s away"
-    )
-
-
 def _hautus_distances(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     # Inputs in rad^2/s^2 and in N differ by six orders: columns of unit length make the measure
     # independent of units.
     sizes = np.linalg.norm(B, axis=0)
     unit = B / np.where(sizes > 0, sizes, 1.0)
-    singular_values = []
-    for s in np.linalg.eigvals(A):
-        matrix = np.hstack([s * np.eye(len(A)) - A, unit])
-        singular_values.append(np.linalg.svd(matrix, compute_uv=False)[-1])
-    return np.array(singular_values)
-
-
-def compute_matrices(
-    space: AbstractStateSpace,
-    x: Point,
-    inputs: Inputs,
-    values: Float[Array, " m"],
-    t: Time = 0.0,
-) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
-    """Matrices A and B by forward derivatives; they may be differentiated and vmapped."""
-    return _compute_matrices(
-        space, x, inputs, jnp.asarray(values, dtype=float), jnp.asarray(t, dtype=float)
-    )
+    pencils = [np.hstack([s * np.eye(len(A)) - A, unit]) for s in np.linalg.eigvals(A)]
+    return np.array([np.linalg.svd(pencil, compute_uv=False)[-1] for pencil in pencils])
 
 
 @kept_jit
 def _compute_matrices(
-    space: AbstractStateSpace,
-    x: Point,
-    inputs: Inputs,
-    values: Float[Array, " m"],
-    t: Float[Array, ""],
+    space: AbstractStateSpace, x: Point, inputs: Inputs, values: Array, t: Array
 ) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
+    """Matrices A and B at values of the inputs (m,) by forward derivatives."""
     # One forward pass over states and inputs together: both matrices come from the same evaluations of
     # the equations of motion.
     n = space.size
@@ -284,23 +262,18 @@ def linearize(
         StateError: a posture that is singular for the independent coordinates, or derivatives that
             are not finite.
     """
-    names = [name for name, _ in space.names]
-    subject = "The outputs"
+    names, subject = [name for name, _ in space.names], "The outputs"
     if outputs is not None and not isinstance(outputs, str) and not len(outputs):
         raise SettingError(
             f"{subject} must be a list of names of states, such as ['{names[0]}'], not {outputs!r}."
         )
-    chosen = (
-        range(len(names)) if outputs is None else named_places(outputs, names, subject, "state")
-    )
+    chosen = named_places(names if outputs is None else outputs, names, subject, "state")
     inputs = inputs_of(space.system) if inputs is None else inputs
-    input_values = (
-        inputs.values(space.system)
-        if values is None
-        else check_numbers(values, (len(inputs),), "The vector of the inputs", "")
-    )
+    values = inputs.values(space.system) if values is None else values
+    input_values = check_numbers(values, (len(inputs),), "The vector of the inputs", "")
     check_regular(space, x, t)
-    A, B = (np.asarray(matrix) for matrix in compute_matrices(space, x, inputs, input_values, t))
+    numbers = jnp.asarray(input_values, dtype=float), jnp.asarray(t, dtype=float)
+    A, B = (np.asarray(matrix) for matrix in _compute_matrices(space, x, inputs, *numbers))
     if not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
         raise StateError(
             "The motion cannot be linearised at this point: the accelerations or their derivatives "

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ..checks.errors import SettingError
 from ..checks.numbers import as_floats, as_jax, as_numpy, stack_arrays
@@ -57,32 +57,19 @@ class SegmentStart(NamedTuple):
     internal: Float[Array, " m"]
 
 
-def begin_flight(space: AbstractStateSpace, start: Point, t: Float[Array, ""]) -> SegmentStart:
-    """Start of a flight at a point of a state space at time t [s]."""
-    # a state of all bodies has no states of forces: those of the point are set, and read, apart
-    return SegmentStart(space.to_state(start, t), space.internal_at(start))
-
-
 def go_on(
-    space: AbstractStateSpace,
-    system: System,
-    origin_state: SegmentStart,
-    ts: Float[Array, " k"],
+    space: AbstractStateSpace, system: System, origin_state: SegmentStart, ts: Float[Array, " k"],
     method: Method,
-) -> tuple[Point, SegmentStart]:
+) -> tuple[Point, SegmentStart]:  # fmt: skip
     """The points of a motion at times ts [s], the first that of the start, and its end."""
     if isinstance(space, TreeSpace) and space.has_dependent_rows:
         # A segment may begin in a posture in which rows depend on each other, although the machine's
         # reference posture has none.
         allowing = method.formulation.allowing_dependent_rows()
         method = method if allowing is None else replace(method, formulation=allowing)
-    has_internal = origin_state.internal.shape[0] > 0
-    run = integrate(
-        with_internal(system, origin_state.internal) if has_internal else system,
-        origin_state.state,
-        ts,
-        method,
-    )
+    if origin_state.internal.shape[0]:
+        system = with_internal(system, origin_state.internal)
+    run = integrate(system, origin_state.state, ts, method)
     points = jax.vmap(space.from_state)(run.states, run.internal)
     return points, SegmentStart(*jax.tree.map(lambda x: x[-1], (run.states, run.internal)))
 
@@ -91,7 +78,9 @@ def integrate_points(
     space: AbstractStateSpace, system: System, start: Point, ts: Float[Array, " k"], method: Method
 ) -> Point:
     """The points of a motion at times ts [s], the first that of the start; a stack (k, .)."""
-    return go_on(space, system, begin_flight(space, start, ts[0]), ts, method)[0]
+    # a state of all bodies has no states of forces: those of the point are set, and read, apart
+    origin_state = SegmentStart(space.to_state(start, ts[0]), space.internal_at(start))
+    return go_on(space, system, origin_state, ts, method)[0]
 
 
 class Legs(eqx.Module):
@@ -135,8 +124,14 @@ class Legs(eqx.Module):
         self, origin: Point, step: Float[Array, " k"]
     ) -> tuple[SegmentStart, SegmentStart]:
         """Start of a segment, and its derivatives by the error there with their axis last."""
-        at = lambda step: begin_flight(self.space, self.space.retract(origin, step), self.ts[0])
-        return value_and_jacobian(at, step)
+
+        def begin_segment(step: Array) -> SegmentStart:
+            start = self.space.retract(origin, step)
+            return SegmentStart(
+                self.space.to_state(start, self.ts[0]), self.space.internal_at(start)
+            )
+
+        return value_and_jacobian(begin_segment, step)
 
     def with_columns(
         self, values: Any, origin_state: SegmentStart, slopes: SegmentStart, has_columns: Any
@@ -165,46 +160,27 @@ class Legs(eqx.Module):
             # points and end are the same along every direction
             return None, (*jax.tree.map(lambda x: x[0], (points, end)), columns)
 
-        count, groups = _group_directions(flat, slopes)
-        _, (points, ends, columns) = jax.lax.scan(
-            push_group, None, (jnp.arange(len(groups[0])), groups)
+        n, k = flat.shape[0], slopes.internal.shape[-1]
+        # Directions go in groups of limited size: all at once, the integrator's state would no longer fit
+        # into the processor's cache.
+        groups = max(1, -(-(n + k) // _GROUP))
+        size = -(-(n + k) // groups)
+
+        def group_columns(first: Any, last: Any) -> Array:
+            every = jnp.concatenate([first, last])
+            none = jnp.zeros((groups * size - n - k, *every.shape[1:]), every.dtype)
+            return jnp.concatenate([every, none]).reshape(groups, size, *every.shape[1:])
+
+        zero_changes = lambda J: jnp.zeros((n, *J.shape[:-1]), J.dtype)
+        tangents = (
+            group_columns(jnp.eye(n, dtype=flat.dtype), jnp.zeros((k, n), flat.dtype)),
+            jax.tree.map(lambda J: group_columns(zero_changes(J), jnp.moveaxis(J, -1, 0)), slopes),
         )
+        _, (points, ends, columns) = jax.lax.scan(push_group, None, (jnp.arange(groups), tangents))
         # the length is given explicitly, since a point may have parts of size zero
         long = lambda J: jnp.moveaxis(J, 0, -2).reshape(*J.shape[1:-1], J.shape[0] * J.shape[-1])
         points, end = jax.tree.map(lambda x: x[0], (points, ends))
-        return (points, jax.tree.map(lambda J: long(J)[..., :count], columns)), end
-
-
-def _group_directions(
-    values: Float[Array, " n"], slopes: SegmentStart
-) -> tuple[int, tuple[Array, SegmentStart]]:
-    """Number of a segment's unknowns, and changes of values and start along them, in groups."""
-    n, k = values.shape[0], slopes.internal.shape[-1]
-    # Directions go in groups of limited size: all at once, the integrator's state would no longer fit
-    # into the processor's cache.
-    groups = max(1, -(-(n + k) // _GROUP))
-    size = -(-(n + k) // groups)
-
-    def group_columns(first: Any, last: Any) -> Array:
-        every = jnp.concatenate([first, last])
-        none = jnp.zeros((groups * size - n - k, *every.shape[1:]), every.dtype)
-        return jnp.concatenate([every, none]).reshape(groups, size, *every.shape[1:])
-
-    zero_changes = lambda J: jnp.zeros((n, *J.shape[:-1]), J.dtype)
-    value_changes = group_columns(jnp.eye(n, dtype=values.dtype), jnp.zeros((k, n), values.dtype))
-    return n + k, (
-        value_changes,
-        jax.tree.map(lambda J: group_columns(zero_changes(J), jnp.moveaxis(J, -1, 0)), slopes),
-    )
-
-
-def _differentiate_points(columns: Point, unknowns: Any, moves: Any) -> Point:
-    """Derivative of a segment's points along changes of its unknowns, None where there is no change."""
-    leaf_change = lambda x, move: jnp.zeros_like(x) if move is None else move
-    direction = ravel_pytree(
-        jax.tree.map(leaf_change, unknowns, moves, is_leaf=lambda x: x is None)
-    )[0]
-    return jax.tree.map(lambda J: J @ direction, columns)
+        return (points, jax.tree.map(lambda J: long(J)[..., : n + k], columns)), end
 
 
 @eqx.filter_custom_jvp
@@ -219,7 +195,11 @@ def _segment_points(
 @_segment_points.def_jvp
 def _segment_points_jvp(primals: Any, tangents: Any) -> tuple[Point, Point]:
     (unknowns, (points, columns)), (moves, _) = primals, tangents
-    return points, _differentiate_points(columns, unknowns, moves)
+    # the change is None where there is none
+    change = lambda x, move: jnp.zeros_like(x) if move is None else move
+    changes = jax.tree.map(change, unknowns, moves, is_leaf=lambda x: x is None)
+    direction = ravel_pytree(changes)[0]
+    return points, jax.tree.map(lambda J: J @ direction, columns)
 
 
 @quick_jit
@@ -232,11 +212,7 @@ def start_legs(
 
 @quick_jit
 def fly_legs(
-    legs: Legs,
-    values: Any,
-    origin_state: SegmentStart,
-    slopes: SegmentStart,
-    has_columns: Bool[Array, ""],
+    legs: Legs, values: Any, origin_state: SegmentStart, slopes: SegmentStart, has_columns: Array
 ) -> tuple[tuple[Point, Point], SegmentStart]:
     """Points of all segments (n, m, .) and their derivatives by values and own start; their ends."""
     fly_leg = lambda leg, origin_state, slopes: leg.with_columns(
@@ -334,9 +310,8 @@ class Shooting(eqx.Module):
         """
         origins, steps, legs = self._split_unknowns(as_numpy(unknowns), np)
         origin_state, slopes = start_legs(legs, origins, steps)
-        segments, _ = fly_legs(
-            legs, unknowns["values"], origin_state, slopes, _exact_value(columns)
-        )
+        has_columns = as_jax(np.asarray(columns))
+        segments, _ = fly_legs(legs, unknowns["values"], origin_state, slopes, has_columns)
         return _assemble_jacobian(self, unknowns, segments)
 
     def motion(self, values: Any, ts: Float[np.ndarray, " m"]) -> Point:
@@ -347,7 +322,7 @@ class Shooting(eqx.Module):
         """
         origins, steps, legs = self._split_unknowns(as_numpy(self.unknowns(values)), np)
         every, slopes = start_legs(legs, origins, 0 * steps)
-        count, size = len(steps), self.outputs_per_segment
+        count, size, without = len(steps), self.outputs_per_segment, as_jax(np.asarray(False))
         now = jax.tree.map(lambda x: x[0], every)
         path = [jax.tree.map(lambda x: np.asarray(x)[None], self.start)]
         for k in range(0, len(ts) - 1, size):
@@ -355,20 +330,11 @@ class Shooting(eqx.Module):
             part[: len(ts) - k] = ts[k : k + size + 1]
             # the first segment flies, and the others stay where they are
             times = np.concatenate([part[None], np.full((count - 1, size + 1), ts[k])])
-            origin_state = jax.tree.map(
-                lambda x: np.broadcast_to(x, (count, *x.shape)), as_numpy(now)
-            )
-            part_legs = replace(legs, ts=times)
-            (points, _), ends = fly_legs(
-                part_legs, values, origin_state, slopes, _exact_value(False)
-            )
+            every = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), as_numpy(now))
+            (points, _), ends = fly_legs(replace(legs, ts=times), values, every, slopes, without)
             path.append(jax.tree.map(lambda x: np.asarray(x)[0, 1:], points))
             now = jax.tree.map(lambda x: x[0], ends)
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(ts)], *path)
-
-
-def _exact_value(value: bool) -> Bool[Array, ""]:
-    return as_jax(np.asarray(value))
 
 
 def make_shooting(
@@ -394,12 +360,10 @@ def make_shooting(
         raise SettingError(f"A segment needs at least one output time, not {outputs_per_segment}.")
     method = Method(rtol=1e-9, atol=1e-9) if method is None else method
     method = replace(method, adjoint=diffrax.ForwardMode())
-    points = [guess(float(t)) for t in edges[:-1]]
-    start = points[0]
-    if len(points) > 1:
-        nodes = jax.tree.map(lambda *x: stack_arrays(x), *points[1:])
-    else:
-        nodes = jax.tree.map(lambda x: as_floats(np.zeros((0, *x.shape))), start)
+    start, *points = (guess(float(t)) for t in edges[:-1])
+    nodes = jax.tree.map(lambda x: as_floats(np.zeros((0, *x.shape))), start)
+    if points:
+        nodes = jax.tree.map(lambda *x: stack_arrays(x), *points)
     return Shooting(
         space, system, cost, start, nodes, as_floats(edges), method, outputs_per_segment, weight
     )

@@ -58,11 +58,7 @@ class PathEfforts(NamedTuple):
 
 @kept_jit
 def _actuations(
-    space: TreeSpace,
-    states: State,
-    rates: tuple[Float[Array, "k n 3"], Float[Array, "k n 3"]],
-    inputs: Inputs,
-    ts: Float[Array, " k"],
+    space: TreeSpace, states: State, rates: tuple[Array, Array], inputs: Inputs, ts: Array
 ) -> tuple[Actuation, Float[Array, "k dof"]]:
     """Actuation at states, and the generalised forces that the accelerations need, in weights."""
     mass, inertia = space.system.bodies.mass, space.system.bodies.inertia
@@ -194,14 +190,11 @@ def compare_clearances(
     owner, angular = np.array(rows.owner), rows.angular
     result = []
     for k, joint in enumerate(locked_system.joints):
-        of_joint = lambda part, kind, k=k: _largest(moves[part][:, (owner == k) & kind])
-        translation, rotation = (
-            (of_joint(part, ~angular), of_joint(part, angular))
-            for part in (slice(0, 3), slice(3, 6))
-        )
-        result.append(Clearance(joint.name, translation, rotation))
+        parts = [
+            part[:, (owner == k) & kind]
+            for part in (moves[:3], moves[3:])
+            for kind in (~angular, angular)
+        ]
+        sizes = [float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts]
+        result.append(Clearance(joint.name, (sizes[0], sizes[1]), (sizes[2], sizes[3])))
     return tuple(sorted(result, key=lambda c: -max(*c.translation, *c.rotation)))
-
-
-def _largest(matrix: Float[np.ndarray, "3 r"]) -> float:
-    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0

@@ -60,11 +60,7 @@ class Survey(NamedTuple):
 
 @kept_jit
 def _evaluate_postures(
-    space: TreeSpace,
-    x: TreePoint,
-    steps: Float[Array, "k size"],
-    inputs: Inputs,
-    t: Float[Array, ""],
+    space: TreeSpace, x: TreePoint, steps: Float[Array, "k size"], inputs: Inputs, t: Array
 ) -> tuple[Actuation, Float[Array, " k"]]:
     """Actuation with inputs of zero, and conditioning, at the points retract(x, step)."""
 
@@ -119,11 +115,23 @@ def survey(
     if body is not None and body not in system.names:
         raise SettingError(f"There is no body '{body}'. Bodies: {', '.join(system.names)}.")
     inputs = inputs_of(system) if inputs is None else inputs
-    axes = [
-        _axis_values(limits, name, samples)
-        for limits, name in zip(ranges, coordinates, strict=True)
-    ]
-    starts = [_present_value(system, state, name) for name in coordinates]
+    axes, starts = [], []
+    for limits, name in zip(ranges, coordinates, strict=True):
+        axis = np.asarray(check_numbers(limits, np.shape(limits), f"The range of {name}", ""))
+        if axis.ndim != 1 or len(axis) < 2 or samples < 2:
+            raise SettingError(
+                f"The range of {name} must be two limits or a list of values, with at least 2 samples, not "
+                f"{axis.tolist()} and {samples} samples."
+            )
+        axes.append(np.linspace(axis[0], axis[1], samples) if len(axis) == 2 else axis)
+        joint, _, coordinate = name.rpartition(".")
+        if joint not in [candidate.name for candidate in system.joints]:
+            raise SettingError(
+                f"A survey is over coordinates of joints, such as hinge.angle, and '{name}' is not one."
+            )
+        kind = system.joints[system.joint_index(joint)].kind
+        place = [label for label, _ in coordinates_of(kind)].index(coordinate)
+        starts.append(float(joint_motion(system, state, joint).coordinates[place]))
     first, second = np.meshgrid(*axes, indexing="ij")
     steps = np.zeros((first.size, space.size))
     for place, values, start in zip(places, (first, second), starts, strict=True):
@@ -134,61 +142,38 @@ def survey(
         np.asarray,
         _evaluate_postures(space, point, jnp.asarray(steps), inputs, jnp.asarray(t, float)),
     )
-    grid = lambda values: values.reshape(*first.shape, *values.shape[1:])
-    reachable_mask = np.isfinite(postures.load).all(axis=1) & np.isfinite(postures.forces).all(
-        axis=(1, 2)
-    )
-    T, load = postures.forces[reachable_mask], postures.load[reachable_mask]
+    reachable = np.isfinite(postures.load).all(axis=1)
+    reachable &= np.isfinite(postures.forces).all(axis=(1, 2))
+    T, load = postures.forces[reachable], postures.load[reachable]
     # Inputs of least norm that hold the weight; what they cannot hold remains as the rest.
     shares = -np.einsum("kmd,kd->km", np.linalg.pinv(T, rcond=DEPENDENT**2), load)
     rest_load = load + np.einsum("kdm,km->kd", T, shares)
-    spread = lambda values: grid(_with_gaps(values, reachable_mask))
-    body, velocities = _moving_body(system, postures, reachable_mask, body)
+    # Rotations times the mechanism's size are lengths, comparable with displacements.
+    metric = np.where(np.arange(6) < 3, 1.0, postures.size[reachable][:, None])[..., None]
+    motions = postures.motions[reachable]
+    velocities = {
+        name: motions[:, 6 * k : 6 * k + 6] * metric for k, name in enumerate(system.names)
+    }
+    if body is None:
+        rank = lambda name: int(
+            np.max(np.linalg.matrix_rank(velocities[name], tol=DEPENDENT), initial=0)
+        )
+        # Most degrees of freedom: the end effector of a robot, or the platform.
+        body = max(system.names, key=rank)
+
+    def spread(values: np.ndarray) -> np.ndarray:
+        """Values of the postures that are reachable on the grid, NaN elsewhere."""
+        result = np.full((len(reachable), *values.shape[1:]), np.nan)
+        result[reachable] = values
+        return result.reshape(*first.shape, *values.shape[1:])
+
     return Survey(
-        (space.names[places[0]], space.names[places[1]]),
-        axes[0],
-        axes[1],
-        grid(reachable_mask),
-        grid(conditioning),
-        spread(shares * postures.scales[reachable_mask]),
-        spread(np.max(np.abs(rest_load), axis=1, initial=0.0)),
-        spread(_smallest_values(T)),
-        spread(_smallest_values(velocities)),
-        inputs,
-        body,
-        float(postures.weight[0]),
-        float(np.asarray(postures.size)[0]),
-    )
-
-
-def _axis_values(values: Numbers, name: str, samples: int) -> np.ndarray:
-    """Values of a coordinate: those given, or `samples` from the first to the last of two."""
-    axis = np.asarray(check_numbers(values, np.shape(values), f"The range of {name}", ""))
-    if axis.ndim != 1 or len(axis) < 2 or samples < 2:
-        raise SettingError(
-            f"The range of {name} must be two limits or a list of values, with at least 2 samples, not "
-            f"{axis.tolist()} and {samples} samples."
-        )
-    return np.linspace(axis[0], axis[1], samples) if len(axis) == 2 else axis
-
-
-def _present_value(system: System, state: State, name: str) -> float:
-    """Value of a coordinate of a joint at a state."""
-    joint, _, coordinate = name.rpartition(".")
-    if joint not in [candidate.name for candidate in system.joints]:
-        raise SettingError(
-            f"A survey is over coordinates of joints, such as hinge.angle, and '{name}' is not one."
-        )
-    kind = system.joints[system.joint_index(joint)].kind
-    place = [label for label, _ in coordinates_of(kind)].index(coordinate)
-    return float(joint_motion(system, state, joint).coordinates[place])
-
-
-def _with_gaps(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Values in the rows where there are some, and NaN elsewhere."""
-    spread = np.full((len(rows), *values.shape[1:]), np.nan)
-    spread[rows] = values
-    return spread
+        (space.names[places[0]], space.names[places[1]]), axes[0], axes[1], reachable.reshape(first.shape),
+        conditioning.reshape(first.shape), spread(shares * postures.scales[reachable]),
+        spread(np.max(np.abs(rest_load), axis=1, initial=0.0)), spread(_smallest_values(T)),
+        spread(_smallest_values(velocities[body])), inputs, body, float(postures.weight[0]),
+        float(postures.size[0]),
+    )  # fmt: skip
 
 
 def _smallest_values(matrices: np.ndarray) -> np.ndarray:
@@ -200,25 +185,3 @@ def _smallest_values(matrices: np.ndarray) -> np.ndarray:
     # that says something is at the largest rank of all postures.
     rank = np.sum(values > DEPENDENT * np.max(values, initial=0.0), axis=1)
     return values[:, max(int(np.max(rank)), 1) - 1]
-
-
-def _moving_body(
-    system: System, postures: Actuation, reachable_mask: np.ndarray, name: str | None
-) -> tuple[str, np.ndarray]:
-    """Body whose mobility counts, and its velocities in unit motions, rotations times the size."""
-    metric = np.ones((len(reachable_mask), 6, 1))
-    # Rotations times the mechanism's size are lengths, comparable with displacements.
-    metric[:, 3:] = np.asarray(postures.size)[:, None, None]
-    motions = np.asarray(postures.motions)
-    velocities = {
-        body: (motions[:, 6 * k : 6 * k + 6] * metric)[reachable_mask]
-        for k, body in enumerate(system.names)
-    }
-    if name is None:
-        ranks = {
-            body: int(np.max(np.linalg.matrix_rank(rows, tol=DEPENDENT), initial=0))
-            for body, rows in velocities.items()
-        }
-        # Most degrees of freedom: the end effector of a robot, or the platform.
-        name = max(ranks, key=lambda body: ranks[body])
-    return name, velocities[name]

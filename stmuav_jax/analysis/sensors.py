@@ -12,6 +12,7 @@ Source: P. D. Groves, Principles of GNSS, Inertial, and Multisensor Integrated N
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -88,11 +89,7 @@ class AbstractSensor(eqx.Module):
 
 
 def _check_axes(axes: Numbers | None) -> Float[Array, "3 3"]:
-    return (
-        as_floats(np.eye(3))
-        if axes is None
-        else check_numbers(axes, (3, 3), "The axes of a sensor", "")
-    )
+    return check_numbers(np.eye(3) if axes is None else axes, (3, 3), "The axes of a sensor", "")
 
 
 def _check_point(point: Numbers | None, sensor: str) -> Float[Array, "3"] | None:
@@ -112,11 +109,9 @@ class AbstractVectorSensor(AbstractSensor):
     body: eqx.AbstractVar[str]
 
     def space(self, system: System) -> AbstractSpace:
-        del system
         return Rotation() if self.is_rotation else Vector(3)
 
     def components(self, system: System) -> tuple[tuple[str, str], ...]:
-        del system
         return tuple((f"{self.name} {axis}", self.unit) for axis in "xyz")
 
 
@@ -159,13 +154,9 @@ class Accelerometer(AbstractVectorSensor):
     axes: Float[Array, "3 3"]
 
     def __init__(
-        self,
-        body: str,
-        point: Numbers | None = None,
-        axes: Numbers | None = None,
-        *,
+        self, body: str, point: Numbers | None = None, axes: Numbers | None = None, *,
         name: str | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.name, self.body, self.axes = name or f"accelerometer {body}", body, _check_axes(axes)
         self.point = _check_point(point, f"accelerometer on '{body}'")
 
@@ -289,25 +280,21 @@ def sensed_motion_at(
         system: system with the same mechanism and other forces; by default the space's own.
         accelerations: false to leave accelerations out, which are then NaN.
     """
-    sensed_system = space.system if system is None else system
+    system = space.system if system is None else system
     if not accelerations:
         state = space.to_state(x, t)
         none = jnp.full_like(state.v, jnp.nan)
-        return SensedMotion(
-            sensed_system.kinematics(state), state.p, none, none, gravity_of(sensed_system)
-        )
+        return SensedMotion(system.kinematics(state), state.p, none, none, gravity_of(system))
     # Accelerations of bodies are not part of a state space; they are the rates of the bodies'
     # velocities along its motion, so that one derivative of the placement gives them for any
     # mechanism.
-    rates = space.rates(x, t, sensed_system)
+    rates = space.rates(x, t, system)
     time, zero = jnp.asarray(t, rates.dtype), jnp.zeros((), rates.dtype)
     # The tangent of the point's motion; the state's derivative along it holds the accelerations of all
     # bodies.
     onwards = jax.jvp(lambda s: space.retract(x, s * rates), (zero,), (jnp.ones_like(zero),))[1]
     state, slope = jax.jvp(space.to_state, (x, time), (onwards, jnp.ones_like(time)))
-    return SensedMotion(
-        sensed_system.kinematics(state), state.p, slope.v, slope.omega, gravity_of(sensed_system)
-    )
+    return SensedMotion(system.kinematics(state), state.p, slope.v, slope.omega, gravity_of(system))
 
 
 def sensed_motion_along(run: Run) -> SensedMotion:
@@ -366,15 +353,20 @@ def joint_outputs(system: System) -> dict[str, Output]:
     """
     outputs: dict[str, Output] = {}
     for joint in system.joints:
-        for coordinate_kind in free_coordinates(joint):
-            unit = "rad" if coordinate_kind == "angle" else "m"
-            name = f"{joint.name}.{coordinate_kind}"
-            description = f"joint {joint.name}, {coordinate_kind}"
-            outputs[name] = Output(
-                _make_reader(joint.name, coordinate_kind, "value"), unit, description
+        for kind in free_coordinates(joint):
+
+            def read(
+                system: System, state: State, field: str, name: str = joint.name, kind: Which = kind
+            ) -> Float[Array, ""]:
+                kin = system.kinematics(state)
+                return getattr(evaluate_coordinate(kin, kin.joint(name), kind), field)
+
+            unit, name = "rad" if kind == "angle" else "m", f"{joint.name}.{kind}"
+            label = f"joint {joint.name}, {kind}"
+            outputs[name] = Output(partial(read, field="value"), unit, label)
+            outputs[f"{name}_rate"] = Output(
+                partial(read, field="rate"), f"{unit}/s", f"{label}, rate"
             )
-            rate = _make_reader(joint.name, coordinate_kind, "rate")
-            outputs[f"{name}_rate"] = Output(rate, f"{unit}/s", f"{description}, rate")
     return outputs
 
 
@@ -384,16 +376,6 @@ def joint_output(system: System, name: str) -> Output:
     if name not in outputs:
         raise SettingError(f"There is no output '{name[:80]}'.{nearest_names(name[:80], outputs)}")
     return outputs[name]
-
-
-def _make_reader(
-    joint: str, coordinate_kind: Which, field: str
-) -> Callable[[System, State], Float[Array, ""]]:
-    def read_coordinate(system: System, state: State) -> Float[Array, ""]:
-        kin = system.kinematics(state)
-        return getattr(evaluate_coordinate(kin, kin.joint(joint), coordinate_kind), field)
-
-    return read_coordinate
 
 
 # --- the simulator as the process model of a filter
@@ -419,26 +401,14 @@ def moved_over(
         return space.with_closed_loops(space.retract(x, v)), None
 
     # stages and substeps are loops: a mechanism's rates are compiled once, not in each of them
-    return (
-        take_step(x, None)[0] if substeps == 1 else jax.lax.scan(take_step, x, length=substeps)[0]
-    )
+    if substeps == 1:
+        return take_step(x, None)[0]
+    return jax.lax.scan(take_step, x, length=substeps)[0]
 
 
 def _covariance_matrix(variances: Numbers) -> Numbers:
     """The covariance of independent noises from their variances (n,); matrices stay."""
     return jnp.diag(jnp.asarray(variances)) if np.ndim(variances) == 1 else variances
-
-
-def _join_spaces(spaces: list[AbstractSpace]) -> AbstractSpace:
-    """The space of all readings: one vector where each sensor's are vectors or angles."""
-    # Plain vectors are joined to one, whose operations are single array operations; only attitudes
-    # need their own.
-    if not all(isinstance(part, Vector | CyclicVector) for part in spaces):
-        return Concatenated(*spaces)
-    parts = (
-        part.angular if isinstance(part, CyclicVector) else (False,) * part.size for part in spaces
-    )
-    return CyclicVector(tuple(turning for part in parts for turning in part))
 
 
 def system_model(
@@ -500,14 +470,22 @@ def system_model(
 
     # Accelerations cost a solution of the equations of motion, which most sensors do not need.
     felt = any(sensor.needs_accelerations for sensor in sensors)
-    seen_in = _join_spaces([sensor.space(space.system) for sensor in sensors])
+    parts = [sensor.space(space.system) for sensor in sensors]
+    reading_space = Concatenated(*parts)
+    if all(isinstance(part, Vector | CyclicVector) for part in parts):
+        # Plain vectors are joined to one, whose operations are single array operations; only attitudes
+        # need their own.
+        reading_space = CyclicVector(tuple(
+            turning for part in parts
+            for turning in (part.angular if isinstance(part, CyclicVector) else (False,) * part.size)
+        ))  # fmt: skip
     names = tuple(name for sensor in sensors for name, _ in sensor.components(space.system))
     # Unknown parameters are constants among the states, and are estimated with the motion.
     states = space if adapt is None else Composite(motion=space, parameters=Vector(len(parameters)))
     return StateSpaceModel(
         step_point,
         _covariance_matrix(Q),
-        Sensor(read_sensors, _covariance_matrix(R), space=seen_in, names=names),
+        Sensor(read_sensors, _covariance_matrix(R), space=reading_space, names=names),
         space=states,
         names=(*(name for name, _ in space.names), *parameters),
         noise_per=noise_per,

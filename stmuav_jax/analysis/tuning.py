@@ -99,22 +99,16 @@ def departures(
         sizes: errors that count as one, by the name of a state; others do not count. Default: all,
             with one in their units.
     """
-    return _make_departure(space, point, sizes, at_end=False)
+    sizes = dict.fromkeys([name for name, _ in space.names], 1.0) if sizes is None else sizes
+    places = places_of(space, list(sizes), "The departures")
+    return Departure(point, as_floats(list(sizes.values())), places, at_end=False)
 
 
 def end_at(
     space: AbstractStateSpace, point: Point, sizes: Mapping[str, float] | None = None
 ) -> Departure:
     """Residuals that bring a motion to a point at its end; see `departures`."""
-    return _make_departure(space, point, sizes, at_end=True)
-
-
-def _make_departure(
-    space: AbstractStateSpace, point: Point, sizes: Mapping[str, float] | None, *, at_end: bool
-) -> Departure:
-    sizes = dict.fromkeys([name for name, _ in space.names], 1.0) if sizes is None else sizes
-    places = places_of(space, list(sizes), "The departures")
-    return Departure(point, as_floats(list(sizes.values())), places, at_end)
+    return replace(departures(space, point, sizes), at_end=True)
 
 
 def roughness(motion: TunedMotion) -> Float[Array, "m k"]:
@@ -159,22 +153,20 @@ class _Signals(eqx.Module):
     def extremes(self, values: Float[Array, "*n k"]) -> Float[Array, "e k"]:
         """Inputs at the ends of all pieces and at their stationary points (e, k)."""
         history = self(values)
-        return history[None] if self.ts is None else _spline_extremes(history)
-
-
-def _spline_extremes(spline: Sampled) -> Float[Array, "e k"]:
-    """Values of a cubic spline at the ends of its pieces and where its slope vanishes (e, k)."""
-    a, b, c, d = spline.coefficients
-    lengths = jnp.diff(spline.breaks)[:, None]
-    # A limit must hold between the knots as well, where a cubic may overshoot: its extremes are known in
-    # closed form.
-    root = jnp.sqrt(jnp.maximum(b**2 - 3 * a * c, 0.0))
-    # of the two forms of each root the one without cancellation; one that is none becomes an end
-    q = -(b + jnp.where(b < 0, -root, root))
-    ratio = lambda x, y: jnp.clip(jnp.where(y == 0, 0.0, x / jnp.where(y == 0, 1.0, y)), 0, lengths)
-    # the slope is zero there, or the place is fixed: values do not depend on how it moves
-    places = [0 * a, *jax.lax.stop_gradient((ratio(q, 3 * a), ratio(c, q))), lengths + 0 * a]
-    return jnp.concatenate([((a * s + b) * s + c) * s + d for s in places])
+        if self.ts is None:
+            return history[None]
+        a, b, c, d = history.coefficients
+        lengths = jnp.diff(history.breaks)[:, None]
+        # A limit must hold between the knots as well, where a cubic may overshoot: its extremes are known in
+        # closed form.
+        root = jnp.sqrt(jnp.maximum(b**2 - 3 * a * c, 0.0))
+        # of the two forms of each root the one without cancellation; one that is none becomes an end
+        q = -(b + jnp.where(b < 0, -root, root))
+        safe = lambda y: jnp.where(y == 0, 1.0, y)
+        ratio = lambda x, y: jnp.clip(jnp.where(y == 0, 0.0, x / safe(y)), 0, lengths)
+        # the slope is zero there, or the place is fixed: values do not depend on how it moves
+        places = [0 * a, *jax.lax.stop_gradient((ratio(q, 3 * a), ratio(c, q))), lengths + 0 * a]
+        return jnp.concatenate([((a * s + b) * s + c) * s + d for s in places])
 
 
 class _Driven(eqx.Module):
@@ -243,11 +235,9 @@ class InputTuning:
 
     def excess(self, values: Any, samples: int = 200) -> tuple[float, ...]:
         """Largest excess of the motion over each `Limit`, in its shares; negative inside it."""
-        limits = self._list_limits()
-        if not limits:
+        if not (limits := self._list_limits()):
             return ()
-        excesses = _limit_excess(limits, self.motion(values, samples))
-        return tuple(float(x) for x in excesses)
+        return tuple(map(float, _limit_excess(limits, self.motion(values, samples))))
 
     def _list_limits(self) -> tuple[Limit, ...]:
         every = self.residuals.cost.residuals  # pyright: ignore
@@ -320,7 +310,11 @@ def tune_inputs(
         SettingError: a time that is not positive, too few knots or segments, no residuals, or an
             unknown input. ModelError: numbers of another shape.
     """
-    check_span(duration, segments)
+    check_finite(duration, "The time", "s")
+    if not duration > 0:
+        raise SettingError(f"The time must be positive, not {duration:g} s.")
+    if segments < 1:
+        raise SettingError(f"There must be at least one segment, not {segments}.")
     if knots is not None and knots < 4:
         raise SettingError(f"Cubic splines need four knots or more, not {knots}.")
     if not residuals:
@@ -330,9 +324,8 @@ def tune_inputs(
         inputs = inputs_of(space.system, inputs)
     if not len(inputs):
         raise SettingError("The system has no inputs that could be tuned.")
-    input_values: Any = as_numpy(
-        as_floats(inputs.values(space.system) if values is None else values)
-    )
+    values = inputs.values(space.system) if values is None else values
+    input_values: Any = as_numpy(as_floats(values))
     shape = (len(inputs),) if knots is None else (knots, len(inputs))
     if input_values.shape not in ((len(inputs),), shape):
         raise ModelError(
@@ -352,11 +345,8 @@ def tune_inputs(
         np.linspace(0.0, duration, segments + 1), method, outputs_per_segment=outputs_per_segment, weight=weight,
     )  # fmt: skip
     xp, input_sizes = array_module(input_values, sizes), as_numpy(sizes)
-    return InputTuning(
-        name,
-        problem,
-        problem.unknowns(as_floats(xp.broadcast_to(input_values, shape) / input_sizes)),
-    )
+    unknowns = as_floats(xp.broadcast_to(input_values, shape) / input_sizes)
+    return InputTuning(name, problem, problem.unknowns(unknowns))
 
 
 def tune_slew(
@@ -416,15 +406,6 @@ def tune_slew(
         duration=duration, inputs=inputs, values=(1 - share) * first + share * last, knots=knots,
         guess=guess_point, **options,
     )  # fmt: skip
-
-
-def check_span(span: float, segments: int) -> None:
-    """Raise `SettingError` for a time that is not positive or less than one segment."""
-    check_finite(span, "The time", "s")
-    if not span > 0:
-        raise SettingError(f"The time must be positive, not {span:g} s.")
-    if segments < 1:
-        raise SettingError(f"There must be at least one segment, not {segments}.")
 
 
 def joint_forces(motion: TunedMotion) -> Float[Array, "m joints"]:

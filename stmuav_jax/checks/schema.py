@@ -15,7 +15,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 import pydantic
 from pydantic import AfterValidator, ConfigDict, Field
 
-from .errors import SettingError, nearest_names
+from .errors import SettingError, closest_name, nearest_names
 
 Model = TypeVar("Model", bound=pydantic.BaseModel)
 Option = TypeVar("Option")
@@ -90,12 +90,9 @@ def validate_model(model: type[Model], data: Any, owner: str) -> Model:
     try:
         return model.model_validate(dict(data))
     except pydantic.ValidationError as error:
-        errors = error.errors(include_url=False)
         # an unknown name often explains why another name is missing
-        first = next(
-            (error_entry for error_entry in errors if error_entry["type"] == "extra_forbidden"),
-            errors[0],
-        )
+        is_late = lambda entry: entry["type"] != "extra_forbidden"
+        first = min(error.errors(include_url=False), key=is_late)
         raise SettingError(_describe_error(first, model, owner)) from None
     except (OverflowError, RecursionError) as error:
         raise SettingError(f"{owner} has entries that cannot be read: {error}.") from None
@@ -116,11 +113,8 @@ def _describe_error(error: Any, model: type[pydantic.BaseModel], subject: str) -
     kind, value, path = error["type"], error["input"], [x for x in error["loc"] if x != "[key]"]
     *outer, last = path
     inner = ".".join(str(part)[:SHOWN] for part in outer)
-    owner, where = (
-        f"'{inner}'" if inner else subject,
-        ".".join([*inner.split(".")[: len(outer)], ""]),
-    )
-    where += str(last)[:SHOWN]
+    owner = f"'{inner}'" if inner else subject
+    where = ".".join([*inner.split(".")[: len(outer)], str(last)[:SHOWN]])
     if kind == "missing" and isinstance(last, int):
         return f"'{inner}' must have more entries, but it is {format_value(value)}."
     if kind == "missing":
@@ -130,11 +124,8 @@ def _describe_error(error: Any, model: type[pydantic.BaseModel], subject: str) -
     if kind == "value_error":
         return f"'{where}' {error['ctx']['error']}"
     message, name_hint = error["msg"], ""
-    if kind == "literal_error":
-        choices = re.findall(r"'(.*?)'", message)
-        name_hint = (
-            nearest_names(value, choices).partition(" Known")[0] if isinstance(value, str) else ""
-        )
+    if kind == "literal_error" and isinstance(value, str):
+        name_hint = closest_name(value, re.findall(r"'(.*?)'", message))
     for pattern, replacement in _WORDS.items():
         message = re.sub(pattern, replacement, message)
     # pydantic writes small limits out
@@ -204,18 +195,17 @@ def option_from_plain(kind: type[Option], plain: Any, where: str) -> Option:
             raise SettingError(f"Option '{where}' has no field {quote_name(name)}.{name_hint}")
         _, unit, counts, number = field_quantities[name]
         entries = tuple(value) if isinstance(value, list | tuple) else (value,)
-        types = {float: (float, int), int: (int,), bool: (bool,)}[number]
+        types, noun = {
+            float: (float | int, "number"), int: (int, "whole number"), bool: (bool, "true or false"),
+        }[number]  # fmt: skip
+        # a truth value is an integer to Python
         fits = all(
             isinstance(x, types) and isinstance(x, bool) == (number is bool) for x in entries
         )
         if not fits or len(entries) not in counts:
-            requirement = {float: "number", int: "whole number", bool: "true or false"}[number]
-            if number is not bool:
-                requirement = (
-                    f"a {requirement}"
-                    if counts == (1,)
-                    else f"{' or '.join(map(str, counts))} {requirement}s"
-                )
+            requirement = noun if number is bool else f"a {noun}"
+            if number is not bool and counts != (1,):
+                requirement = f"{' or '.join(map(str, counts))} {noun}s"
             unit = f" [{unit}]" if unit else ""
             raise SettingError(
                 f"'{where}.{name}' must be {requirement}{unit}, not {format_value(value)}."

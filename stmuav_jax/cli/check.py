@@ -19,9 +19,7 @@ EXIT_CODES = {"note": 0, "warning": 1, "fault": 2}
 class CheckSettings:
     """Options of an inspection, which all scenes share."""
 
-    case: Annotated[int | None, shared_option("case"), default_text("the scene's first choice")] = (
-        None
-    )
+    case: Annotated[int | None, shared_option("case", "the scene's first choice")] = None
     params: Params = None
     floating: bool = False
     """Let the root link of a URDF float; without it the root is fixed to ground."""

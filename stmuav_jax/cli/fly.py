@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -10,10 +10,7 @@ from rich.console import Console
 from ..checks.errors import SimulationError
 from ..figures.terminal import add_row, make_table, print_line
 from .options import END, Cache, Figures, default_text, shared_option
-from .output import print_paths, results_folder, show_progress
-
-if TYPE_CHECKING:
-    from ..missions.flight import MissionFlight
+from .output import INTERRUPTED, print_paths, results_folder, show_progress
 
 
 @dataclasses.dataclass
@@ -28,14 +25,14 @@ class Fly:
 
     mission: tyro.conf.Positional[str]
     """TOML file, or the name of a built-in mission."""
-    t1: Annotated[float | None, END, shared_option("t1"), default_text("the mission's")] = None
+    t1: Annotated[float | None, END, shared_option("t1", "the mission's")] = None
     true_states: bool = False
     """Give the controller the true states in place of estimates from the mission's sensors."""
     truth: Annotated[tuple[str, ...], default_text("the mission's")] = ()
     """True parameters that differ from the controller's model, such as bare.mass=2.9; names as in studies."""
     log: bool = False
     """Also write log.csv, the readings and commands of the flight, which `identify` reads."""
-    out: Annotated[Path | None, shared_option("out"), default_text("runs/MISSION")] = None
+    out: Annotated[Path | None, shared_option("out", "runs/MISSION")] = None
     figures: Figures = "png"
     cache: Cache = True
 
@@ -49,8 +46,8 @@ def run_fly(command: Fly) -> int:
     from ..io.netcdf import save_sealed
     from ..missions.flight import fly
     from ..missions.mission import load_mission
-    from ..missions.outcome import labelled_flight, verdict
-    from .models.point import scalars_by_name
+    from ..missions.outcome import labelled_flight, measures, verdict
+    from .mechanism import scalars_by_name
 
     # All checks of a mission happen here, before the compilation.
     mission = load_mission(
@@ -75,41 +72,29 @@ def run_fly(command: Fly) -> int:
         from ..missions.figures import flight_figures
 
         paths += save_figures(flight_figures(data), folder, command.figures)
+    table = make_table("quantity", "value", "allowed", title=data.attrs["title"] or None)
+    for measure in measures(data):
+        allowed = "-" if measure.allowed is None else f"{measure.allowed:g}"
+        mark = "" if measure.is_met else "  (not met)"
+        add_row(table, measure.name, measure.text, f"{allowed}{mark}")
+    for truth, value in mission.file.truth.items():
+        unit = mission.table[truth.partition("[")[0]].unit
+        add_row(table, f"True {truth}, unknown to the controller", f"{value:.6g} {unit}", "-")
+    certificate = flight.run.certificate
+    seconds = f"{certificate.compile_seconds:.1f} s, {certificate.run_seconds:.1f} s"
+    violation = f"{certificate.position_violation:.2g} m"
+    add_row(table, "Constraint violation, lengths", violation, "-")
+    add_row(table, "Time to compile, to run", seconds, "-")
     out = Console()
-    _print_flight(out, data, flight)
+    out.print(table)
     if flight.ending == "interrupted":
-        print_line(out, f"Interrupted at t = {flight.run.certificate.t_end:g} s.")
+        print_line(out, f"Interrupted at t = {certificate.t_end:g} s.")
     print_paths(out, paths)
     if flight.ending == "interrupted":
-        return 130
+        return INTERRUPTED
     is_success, sentence = verdict(data)
     print_line(out, sentence)
     if flight.ending == "failed":
         raise SimulationError(f"{flight.run.failure} Results up to there are in {folder}.")
     # A script tells a flight that failed its aims from one that could not be computed.
     return 0 if is_success else NOT_KEPT
-
-
-def _print_flight(out: Console, data: Any, flight: "MissionFlight") -> None:
-    from ..missions.outcome import measures
-
-    measure_table = make_table("quantity", "value", "allowed", title=data.attrs["title"] or None)
-    for measure in measures(data):
-        allowed = "-" if measure.allowed is None else f"{measure.allowed:g}"
-        mark = "" if measure.is_met else "  (not met)"
-        add_row(measure_table, measure.name, measure.text, f"{allowed}{mark}")
-    for name, value in flight.mission.file.truth.items():
-        unit = flight.mission.table[name.partition("[")[0]].unit
-        add_row(
-            measure_table, f"True {name}, unknown to the controller", f"{value:.6g} {unit}", "-"
-        )
-    certificate = flight.run.certificate
-    seconds = f"{certificate.compile_seconds:.1f} s, {certificate.run_seconds:.1f} s"
-    add_row(
-        measure_table,
-        "Constraint violation, lengths",
-        f"{certificate.position_violation:.2g} m",
-        "-",
-    )
-    add_row(measure_table, "Time to compile, to run", seconds, "-")
-    out.print(measure_table)

@@ -2,9 +2,8 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -12,7 +11,7 @@ from rich.console import Console
 from ..checks.errors import SettingError
 from ..figures.terminal import print_line
 from .options import SEED, Cache, Figures, Resume, count_range, default_text, shared_option
-from .output import print_paths, results_folder, show_progress
+from .output import INTERRUPTED, print_paths, results_folder, show_progress
 
 if TYPE_CHECKING:
     from ..studies.study import Study, StudyOutcome, StudyProgress
@@ -31,7 +30,7 @@ class Montecarlo:
     """TOML file (docs/studies.md), or the name of a built-in study."""
     samples: Annotated[int | None, count_range("samples", 1e9), default_text("the study's")] = None
     """Number of samples. A larger number extends a finished store."""
-    seed: Annotated[int | None, SEED, shared_option("seed"), default_text("the study's")] = None
+    seed: Annotated[int | None, SEED, shared_option("seed", "the study's")] = None
     resume: Resume = False
     chunk: Annotated[
         int | None,
@@ -47,45 +46,26 @@ class Montecarlo:
     """Address of a Dask scheduler, such as tcp://10.0.0.1:8786."""
     workers: Annotated[int | None, count_range("workers", 256), default_text("none")] = None
     """Number of processes of a Dask cluster that is started here."""
-    params: Annotated[Path | None, shared_option("params"), default_text("the scene's table")] = (
-        None
-    )
-    out: Annotated[Path | None, shared_option("out"), default_text("runs/STUDY")] = None
+    params: Annotated[Path | None, shared_option("params", "the scene's table")] = None
+    out: Annotated[Path | None, shared_option("out", "runs/STUDY")] = None
     figures: Figures = "png"
     cache: Cache = True
-
-
-def plain_of(command: Montecarlo) -> dict[str, Any]:
-    """Plain data of the study, with the changes by the options."""
-    from ..studies.examples import load_builtin_study
-    from ..studies.study_file import load_study
-
-    is_file = command.study.endswith(".toml") or os.sep in command.study
-    plain = load_study(command.study) if is_file else load_builtin_study(command.study)
-    if command.seed is not None:
-        plain["seed"] = command.seed
-    return plain
-
-
-def _load_table(command: Montecarlo, plain: Mapping[str, Any]) -> Any:
-    from ..io.netcdf import load_parameters
-    from ..uav.scenes.registry import SCENES
-
-    if command.params is None:
-        return None
-    if plain.get("scene") not in SCENES:
-        raise SettingError("--params replaces values of a scene's table; this study has no scene.")
-    return load_parameters(command.params, SCENES[plain["scene"]].parameters)
 
 
 def _make_study(command: Montecarlo) -> "Study":
     """Study of the command; errors name the file."""
     import jax
 
-    from ..studies.examples import READY
-    from ..studies.study_file import make_study
+    from ..io.netcdf import load_parameters
+    from ..missions.ensemble import load_mission_study
+    from ..studies.examples import READY, load_builtin_study
+    from ..studies.study_file import load_study, make_study
+    from ..uav.scenes.registry import SCENES
 
-    plain = plain_of(command)
+    is_file = command.study.endswith(".toml") or os.sep in command.study
+    plain = load_study(command.study) if is_file else load_builtin_study(command.study)
+    if command.seed is not None:
+        plain["seed"] = command.seed
     devices = command.devices
     if command.scheduler is None and command.workers is None and jax.default_backend() == "cpu":
         # All cores of a CPU, unless a cluster's workers choose for themselves.
@@ -94,13 +74,20 @@ def _make_study(command: Montecarlo) -> "Study":
         devices = devices or cores or 1
     settings = {"lanes": command.lanes, "devices": devices}
     try:
-        if plain.get("kind") != "missions":
-            return make_study(plain, _load_table(command, plain), **settings)
-        from ..missions.ensemble import load_mission_study
-
+        if plain.get("kind") == "missions":
+            if command.params is not None:
+                raise SettingError(
+                    "A study of a mission has no --params: its file has the parameters."
+                )
+            return load_mission_study(plain, Path(command.study).parent, **settings)
+        table = None
         if command.params is not None:
-            raise SettingError("A study of a mission has no --params: its file has the parameters.")
-        return load_mission_study(plain, Path(command.study).parent, **settings)
+            if plain.get("scene") not in SCENES:
+                raise SettingError(
+                    "--params replaces values of a scene's table; this study has no scene."
+                )
+            table = load_parameters(command.params, SCENES[plain["scene"]].parameters)
+        return make_study(plain, table, **settings)
     # A message about an entry helps only with the file's name.
     except SettingError as error:
         if command.study in READY:
@@ -114,7 +101,15 @@ def run_montecarlo(command: Montecarlo) -> int:
         raise SettingError(
             "The options --scheduler and --workers exclude each other: give one of them."
         )
+    from ..figures.study_data import (
+        analyse,
+        save_summary,
+        study_data,
+        summary_lines,
+        summary_table,
+    )
     from ..studies.schema import check_count
+    from ..studies.store import open_store
 
     for name in ("samples", "chunk", "workers"):
         if (value := getattr(command, name)) is not None:
@@ -122,14 +117,26 @@ def run_montecarlo(command: Montecarlo) -> int:
     study = _make_study(command)
     folder = results_folder(command.out, study.name)
     outcome = _run_with_progress(command, study, folder / "study.zarr")
-    out = Console()
+    out, paths = Console(), [folder / "study.zarr"]
     print_line(out, outcome.describe())
-    paths = [folder / "study.zarr"]
     if command.figures != "none" or not outcome.interrupted:
-        paths += report_study(folder / "study.zarr", folder, command.figures, out)
+        with open_store(folder / "study.zarr") as store:
+            # A summary of damaged data would look like any other.
+            store.verify()
+            data = study_data(store.dataset())
+            analysis = analyse(data)
+            if command.figures != "none":
+                from ..figures.plot import save_figures
+                from ..figures.study import study_figures
+
+                paths.append(save_summary(data, analysis, folder / "summary.json"))
+                figures = {name: figure for name, _, figure in study_figures(data, analysis)}
+                paths += save_figures(figures, folder / "figures", command.figures, dpi=160)
+        out.print(summary_table(analysis), markup=False, emoji=False)
+        for line in summary_lines(analysis):
+            print_line(out, line)
     print_paths(out, paths)
-    # The exit code of a shell for a command that Ctrl-C has ended.
-    return 130 if outcome.interrupted else 0
+    return INTERRUPTED if outcome.interrupted else 0
 
 
 def _run_with_progress(command: Montecarlo, study: "Study", store: Path) -> "StudyOutcome":
@@ -147,33 +154,3 @@ def _run_with_progress(command: Montecarlo, study: "Study", store: Path) -> "Stu
             store, command.samples, chunk=command.chunk, resume=command.resume, progress=show_state,
             scheduler=command.scheduler, workers=command.workers,
         )  # fmt: skip
-
-
-def report_study(store: Path, folder: Path, figures: Any, out: Console) -> list[Path]:
-    """Verify the store, write its summary and its figures if there are to be any, and print a table."""
-    from ..figures.study_data import (
-        analyse,
-        save_summary,
-        study_data,
-        summary_lines,
-        summary_table,
-    )
-    from ..studies.store import open_store
-
-    with open_store(store) as opened:
-        # A summary of damaged data would look like any other.
-        opened.verify()
-        data = study_data(opened.dataset())
-        analysis = analyse(data)
-        paths = []
-        if figures != "none":
-            from ..figures.plot import save_figures
-            from ..figures.study import study_figures
-
-            paths.append(save_summary(data, analysis, folder / "summary.json"))
-            figure_by_name = {name: figure for name, _, figure in study_figures(data, analysis)}
-            paths += save_figures(figure_by_name, folder / "figures", figures, dpi=160)
-    out.print(summary_table(analysis), markup=False, emoji=False)
-    for line in summary_lines(analysis):
-        print_line(out, line)
-    return paths

@@ -31,29 +31,27 @@ class Number:
 
     def check(self, value: Any, option: str) -> None:
         """Raise SettingError unless a value, or each of a tuple, is None or within the range."""
-        for entry in value if isinstance(value, tuple) else (value,):
-            if entry is not None:
-                self._check_one(entry, option)
-
-    def _check_one(self, value: float | int, option: str) -> None:
         unit = f" {self.unit}" if self.unit else ""
-        text = f"{value:g}" if isinstance(value, float) else format_value(value)
-        tail = f"but it is {text}{unit} ({option})."
-        if not (isinstance(value, int) or math.isfinite(value)):
-            raise SettingError(f"The {self.quantity} must be finite, {tail}")
-        least = value > self.above if self.above is not None else value >= self.low
-        if least and value <= self.high:
-            return
-        if self.above is not None:
-            span = f"be above {self.above:g}"
-            span += f" and at most {self.high:g}" if self.high < math.inf else ""
-        elif self.high < math.inf and self.low > -math.inf:
-            span = f"lie within {self.low:g} and {self.high:g}"
-        else:
-            span = (
-                f"be at least {self.low:g}" if self.low > -math.inf else f"be at most {self.high:g}"
-            )
-        raise SettingError(f"The {self.quantity} must {span}{unit}, {tail}")
+        for entry in value if isinstance(value, tuple) else (value,):
+            if entry is None:
+                continue
+            text = f"{entry:g}" if isinstance(entry, float) else format_value(entry)
+            tail = f"but it is {text}{unit} ({option})."
+            if not (isinstance(entry, int) or math.isfinite(entry)):
+                raise SettingError(f"The {self.quantity} must be finite, {tail}")
+            least = entry > self.above if self.above is not None else entry >= self.low
+            if least and entry <= self.high:
+                continue
+            if self.above is not None:
+                span = f"be above {self.above:g}"
+                span += f" and at most {self.high:g}" if self.high < math.inf else ""
+            elif self.low == -math.inf:
+                span = f"be at most {self.high:g}"
+            elif self.high == math.inf:
+                span = f"be at least {self.low:g}"
+            else:
+                span = f"lie within {self.low:g} and {self.high:g}"
+            raise SettingError(f"The {self.quantity} must {span}{unit}, {tail}")
 
 
 def default_text(text: str) -> Any:
@@ -88,9 +86,14 @@ TEXTS = {
 }
 
 
-def shared_option(name: str) -> Any:
-    """Annotation with the text of an option that several commands have, by its name in `TEXTS`."""
-    return tyro.conf.arg(help=TEXTS[name])
+def shared_option(name: str, default: str | None = None) -> Any:
+    """Annotation with the text of an option that several commands have, by its name in `TEXTS`.
+
+    Args:
+        default: text in place of "default: None".
+    """
+    hint = None if default is None else f"(default: {default})"
+    return tyro.conf.arg(help=TEXTS[name], help_behavior_hint=hint)
 
 
 # Options that several commands have.
@@ -103,7 +106,7 @@ FORCE = Number("limit of the force", "N", above=0.0, high=1e6)
 TOLERANCE = Number("tolerance", "", above=0.0, high=1.0)
 
 # Options that all or most commands have; the words of a default stand beside them.
-Params = Annotated[Path | None, shared_option("params"), default_text("the report's values")]
+Params = Annotated[Path | None, shared_option("params", "the report's values")]
 Cache = Annotated[bool, shared_option("cache")]
 Figures = Annotated[Literal["png", "pdf", "svg", "none"], shared_option("figures")]
 Resume = Annotated[bool, shared_option("resume")]

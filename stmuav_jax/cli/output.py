@@ -14,8 +14,8 @@ from rich.text import Text
 from ..checks.errors import ModelError, SettingError, SimulationError, StateError
 from ..figures.terminal import print_line
 
-# Exit code after Ctrl-C.
-INTERRUPTED = 130
+# Exit codes: after Ctrl-C, and of a completed run whose result cannot be trusted.
+INTERRUPTED, UNTRUSTED = 130, 3
 
 # Largest length of a message, which may quote the user's input of any length; longer ones are cut.
 _LONGEST = 2000
@@ -79,53 +79,42 @@ def explain_error(error: BaseException, debug: bool) -> int:
 
     The code is 2 for bad input, 1 for a failed run or a fault of the program, 130 for Ctrl-C.
     """
-    out = Console(stderr=True)
-    code, message = _code_and_words(error)
-    if code is None:
-        code, message = 1, f"{message} {_save_traceback(error, debug)}"
-    _print_message(out, message)
-    if debug:
-        _print_message(out, "".join(traceback.format_exception(error)), cut=False)
-    return code
-
-
-def _code_and_words(error: BaseException) -> tuple[int | None, str]:
     from ..estimation import EstimationError
     from ..io.netcdf import FileError
 
-    if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED, "interrupted before anything was reached."
-    if isinstance(error, SimulationError | EstimationError):
-        return 1, str(error)
-    if isinstance(error, ModelError | StateError | SettingError | FileError):
-        return 2, str(error)
-    if isinstance(error, OSError):
-        message = error.strerror or str(error)
-        return 2, message if error.filename is None else f"{message}: {error.filename}"
-    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
-        return 1, "there is not enough memory for this. Ask for less: fewer samples, times or runs."
-    kind = type(error).__name__
-    return None, f"a fault of the program, not of what you gave it: {kind}: {error}."
-
-
-def _save_traceback(error: BaseException, debug: bool) -> str:
-    """Save the traceback, and return a sentence that says where it is."""
-    if debug:
-        return "Please report it with the traceback below."
-    with contextlib.suppress(OSError):
-        handle, path = tempfile.mkstemp(prefix="stmuav-fault-", suffix=".log")
-        with os.fdopen(handle, "w", encoding="utf-8", errors="replace") as log:
-            log.write(" ".join(sys.argv) + "\n" + "".join(traceback.format_exception(error)))
-        return f"Please report it; the traceback is in {path}."
-    return "Please report it with the traceback that --debug prints."
-
-
-def _print_message(out: Console, message: str, *, cut: bool = True) -> None:
-    message = "".join(c if c.isprintable() or c == "\n" else "?" for c in message)
-    if cut:
-        message = " ".join(message.split())
-    if cut and len(message) > _LONGEST:
+    trace = "".join(traceback.format_exception(error))
+    match error:
+        case KeyboardInterrupt():
+            code, message = INTERRUPTED, "interrupted before anything was reached."
+        case SimulationError() | EstimationError():
+            code, message = 1, str(error)
+        case ModelError() | StateError() | SettingError() | FileError():
+            code, message = 2, str(error)
+        case OSError():
+            code, message = 2, error.strerror or str(error)
+            message += "" if error.filename is None else f": {error.filename}"
+        case _ if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+            code, message = (
+                1, "there is not enough memory for this. Ask for less: fewer samples, times or runs.",
+            )  # fmt: skip
+        case _:
+            report = "Please report it with the traceback "
+            report += "below." if debug else "that --debug prints."
+            with contextlib.suppress(OSError):
+                if not debug:
+                    handle, path = tempfile.mkstemp(prefix="stmuav-fault-", suffix=".log")
+                    with os.fdopen(handle, "w", encoding="utf-8", errors="replace") as log:
+                        log.write(" ".join(sys.argv) + "\n" + trace)
+                    report = f"Please report it; the traceback is in {path}."
+            kind = type(error).__name__
+            code, message = (
+                1, f"a fault of the program, not of what you gave it: {kind}: {error}. {report}",
+            )  # fmt: skip
+    printable = lambda text: "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
+    message = " ".join(printable(message).split())
+    if len(message) > _LONGEST:
         message = f"{message[: _LONGEST // 2]} ... {message[-_LONGEST // 2 :]}"
     # in one line, which the terminal breaks: a message can be searched for
-    text = Text(f"stmuav: {message}" if cut else message, style="red")
-    out.print(text, highlight=False, soft_wrap=True)
+    for text in (f"stmuav: {message}", *[printable(trace)] * debug):
+        Console(stderr=True).print(Text(text, style="red"), highlight=False, soft_wrap=True)
+    return code

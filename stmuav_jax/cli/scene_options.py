@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import tyro
 
 from ..checks.errors import SettingError
-from ..checks.schema import OptionField, quantity_fields
+from ..checks.schema import quantity_fields
 from ..uav.scenes.registry import SCENES, SceneOption, make_scene, options_from_plain
 
 if TYPE_CHECKING:
@@ -43,20 +43,17 @@ def scene_command(
         ("settings", Annotated[settings, tyro.conf.arg(name="")]),
     ]
     if scene in SCENES:
-        flat = [
-            field for option in SCENES[scene].options.values() for field in _option_fields(option)
-        ]
-        options_class, titled = (
-            dataclasses.make_dataclass("SceneOptions", flat),
-            tyro.conf.arg(name=scene),
-        )
+        options = SCENES[scene].options.values()
+        flat = [field for option in options for field in _option_fields(option)]
+        options_class = dataclasses.make_dataclass("SceneOptions", flat)
+        titled = tyro.conf.arg(name=scene)
         fields.append(("options", Annotated[options_class, titled, tyro.conf.OmitArgPrefixes]))
     cache = property(lambda command: command.settings.cache)
     return dataclasses.make_dataclass(name, fields, namespace={"__doc__": about, "cache": cache})
 
 
 def command_or_scene(
-    command: type, name: str, settings: type, about: str, before: Sequence[Any] = ()
+    command: type, name: str, settings: type, about: str
 ) -> Callable[[Sequence[str]], type]:
     """Function of the words after a command: its own class, or a `scene_command` if they name a scene.
 
@@ -67,7 +64,7 @@ def command_or_scene(
     def make_options(arguments: Sequence[str]) -> type:
         if named_scene(settings, arguments) is None:
             return command
-        return scene_command(name, settings, about, arguments, before)
+        return scene_command(name, settings, about, arguments)
 
     return make_options
 
@@ -90,44 +87,38 @@ def named_scene(settings: type, arguments: Sequence[str]) -> str | None:
 
 def _option_fields(option: SceneOption) -> list[Any]:
     """Fields of a scene's option for tyro: one for each word that may be given."""
-    name = option.name
+
+    def make_field(name: str, kind: Any, default: Any, text: str, hint: str, **more: Any) -> Any:
+        word = name.replace("__", ".").replace("_", "-")
+        notes = tyro.conf.arg(name=word, help=text, help_behavior_hint=hint, **more)
+        return name, Annotated[kind, notes], dataclasses.field(default=default)
+
     if not option.is_group:
         hint = f"(default: {option.default})"
-        return [_make_field(name, option.kind | None, None, option.description, hint)]
+        return [make_field(option.name, option.kind | None, None, option.description, hint)]
+    switch = tyro.conf.FlagCreatePairsOff[bool]
     about = (option.kind.__doc__ or option.description).partition("\n")[0]
-    usual = {field.name: field.default for field in dataclasses.fields(option.kind)}
-    return [
-        _make_field(name, tyro.conf.FlagCreatePairsOff[bool], False, about, ""),
-        *(
-            _number_field(f"{name}__{k}", quantity, usual[k])
-            for k, quantity in quantity_fields(option.kind).items()
-        ),
-    ]
-
-
-def _number_field(name: str, number: OptionField, usual: Any) -> Any:
-    unit = f" [{number.unit}]" if number.unit else ""
-    help_text = f"{number.description[0].upper()}{number.description[1:]}{unit}."
-    if number.kind is bool:
-        return _make_field(name, tyro.conf.FlagCreatePairsOff[bool], False, help_text, "")
-    values = usual if isinstance(usual, tuple) else (usual,)
-    default_text = "the scene's" if usual is None else " ".join(f"{x:g}" for x in values)
-    kind: Any = number.kind
-    metavar = kind.__name__.upper()
-    if len(number.counts) > 1:
-        kind, metavar = tuple[kind, ...], f"{metavar} [{metavar} ...]"
-    elif number.counts != (1,):
-        count = max(number.counts)
-        kind = tuple.__class_getitem__((kind,) * count)
-        metavar = " ".join([metavar] * count)
-    hint = f"(default: {default_text})"
-    return _make_field(name, kind | None, None, help_text, hint, metavar=metavar)
-
-
-def _make_field(name: str, kind: Any, default: Any, help_text: str, hint: str, **more: Any) -> Any:
-    word = name.replace("__", ".").replace("_", "-")
-    notes = tyro.conf.arg(name=word, help=help_text, help_behavior_hint=hint, **more)
-    return name, Annotated[kind, notes], dataclasses.field(default=default)
+    fields = [make_field(option.name, switch, False, about, "")]
+    defaults = {field.name: field.default for field in dataclasses.fields(option.kind)}
+    for key, number in quantity_fields(option.kind).items():
+        name, default, kind = f"{option.name}__{key}", defaults[key], number.kind
+        unit = f" [{number.unit}]" if number.unit else ""
+        text = f"{number.description[0].upper()}{number.description[1:]}{unit}."
+        if kind is bool:
+            fields.append(make_field(name, switch, False, text, ""))
+            continue
+        values = default if isinstance(default, tuple) else (default,)
+        default_text = "the scene's" if default is None else " ".join(f"{x:g}" for x in values)
+        metavar = kind.__name__.upper()
+        if len(number.counts) > 1:
+            kind, metavar = tuple[kind, ...], f"{metavar} [{metavar} ...]"
+        elif number.counts != (1,):
+            count = max(number.counts)
+            kind = tuple.__class_getitem__((kind,) * count)
+            metavar = " ".join([metavar] * count)
+        hint = f"(default: {default_text})"
+        fields.append(make_field(name, kind | None, None, text, hint, metavar=metavar))
+    return fields
 
 
 def _plain_options(scene: str, options: Any) -> dict[str, Any]:

@@ -32,11 +32,10 @@ from .options import (
     default_text,
     shared_option,
 )
-from .output import print_paths, results_folder, show_progress
+from .output import INTERRUPTED, print_paths, results_folder, show_progress
 from .scene_options import chosen_scene, scene_command
 
 if TYPE_CHECKING:
-    from ..dynamics.loads import JointLoads
     from ..dynamics.method import Method
     from ..dynamics.simulation import Run, Scene
 
@@ -53,7 +52,7 @@ GAIN = Number("gain of Baumgarte's feedback", "1/s", 0.0, 1e6)
 class Settings(CheckSettings):
     """Options of a run and of its files, which all scenes share."""
 
-    t1: Annotated[float | None, END, shared_option("t1"), default_text("the scene's own")] = None
+    t1: Annotated[float | None, END, shared_option("t1", "the scene's own")] = None
     rtol: Annotated[float, dataclasses.replace(TOLERANCE, quantity="relative tolerance")] = (
         STEP_TOLERANCE
     )
@@ -86,9 +85,7 @@ class Settings(CheckSettings):
     """Estimate the run's error by a second run."""
     certificate: Literal["standard", "full"] = "standard"
     """With full, the accelerations are also compared with those of another formulation, which compiles longer."""
-    out: Annotated[
-        Path | None, shared_option("out"), default_text("runs/SCENE_CASE or runs/MODEL")
-    ] = None
+    out: Annotated[Path | None, shared_option("out", "runs/SCENE_CASE or runs/MODEL")] = None
     figures: Figures = "png"
     verbose: bool = False
     """Print all entries of the accuracy report; by default the six main ones."""
@@ -172,51 +169,42 @@ def run_scene(scene: "Scene", settings: Settings) -> "Run":
         )
 
 
-def write_results(run: "Run", settings: Settings) -> tuple[list[Path], "JointLoads | None"]:
-    """Write results, certificate, reaction loads and figures; their paths, and the loads."""
-    from ..dynamics.loads import resolved_loads
-    from ..io.run_file import save, save_certificate
-
-    folder = results_folder(settings.out, run.scene.name)
-    paths = [save(run, folder / "run.nc"), save_certificate(run, folder / "certificate.json")]
-    # after the run is written: nothing that happens here can lose it
-    loads = resolved_loads(run) if settings.loads else None
-    if loads is None and settings.figures == "none":
-        return paths, loads
-    # matplotlib is slow to import: only where figures are drawn
-    from ..figures.plot import save_figures
-    from ..figures.run import FIGURES, loads_figure, save_loads
-
-    figures: dict[str, Any] = dict(FIGURES)
-    if loads is not None:
-        paths.append(save_loads(run.scene, loads, folder / "loads.csv"))
-        figures["loads"] = loads_figure(run.scene, loads)
-    if settings.figures != "none":
-        paths += save_figures(figures, folder, settings.figures, run)
-    return paths, loads
-
-
 def run_simulate(command: Any) -> int:
     """Build and simulate the scene, print and write what comes out; the exit code."""
+    from ..dynamics.loads import resolved_loads
     from ..figures.terminal import certificate_table, loads_table
+    from ..io.run_file import save, save_certificate
 
     settings: Settings = command.settings
     run = run_scene(scene_of(command), settings)
     clock = time.perf_counter()
-    paths, loads = write_results(run, settings)
+    folder = results_folder(settings.out, run.scene.name)
+    paths = [save(run, folder / "run.nc"), save_certificate(run, folder / "certificate.json")]
+    # after the run is written: nothing that happens here can lose it
+    loads = resolved_loads(run) if settings.loads else None
+    if loads is not None or settings.figures != "none":
+        # matplotlib is slow to import: only where figures are drawn
+        from ..figures.plot import save_figures
+        from ..figures.run import FIGURES, loads_figure, save_loads
+
+        figures: dict[str, Any] = dict(FIGURES)
+        if loads is not None:
+            paths.append(save_loads(run.scene, loads, folder / "loads.csv"))
+            figures["loads"] = loads_figure(run.scene, loads)
+        if settings.figures != "none":
+            paths += save_figures(figures, folder, settings.figures, run)
     writing = time.perf_counter() - clock
     out = Console()
     out.print(certificate_table(run, verbose=settings.verbose))
     if loads is not None:
         out.print(loads_table(run.scene, loads))
-    for warning in run.scene.warnings:
-        print_line(out, f"Warning: {warning}")
-    for note in run.scene.notes:
-        print_line(out, f"Note: {note}")
+    for kind, sentences in (("Warning", run.scene.warnings), ("Note", run.scene.notes)):
+        for sentence in sentences:
+            print_line(out, f"{kind}: {sentence}")
     out.print(f"Results and figures {writing:.2f} s.", highlight=False)
     print_paths(out, paths)
     if run.certificate.result == "interrupted":
-        return 130
+        return INTERRUPTED
     if not run.successful:
-        raise SimulationError(f"{run.failure} Results up to there are in {paths[0].parent}.")
+        raise SimulationError(f"{run.failure} Results up to there are in {folder}.")
     return 0

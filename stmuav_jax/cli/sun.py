@@ -34,9 +34,9 @@ class SunDay:
     """Angle of the UAV about its x axis [degrees]."""
     pitch: Annotated[float, ANGLE] = 0.0
     """Angle of the UAV about its y axis [degrees]; a positive one lowers the x axis."""
-    yaw: Annotated[
-        float | None, ANGLE, shared_option("yaw"), default_text("the heading of the most energy")
-    ] = None
+    yaw: Annotated[float | None, ANGLE, shared_option("yaw", "the heading of the most energy")] = (
+        None
+    )
     attitude: Annotated[Path | None, default_text("a constant attitude")] = None
     """CSV file with a history of the attitude: columns t [s], roll, pitch, yaw [degrees]."""
     step: Annotated[float, Number("time step", "s", 1, 7200)] = 300.0
@@ -52,7 +52,7 @@ class SunDay:
     ] = None
     """Linke turbidity of the air."""
     params: Params = None
-    out: Annotated[Path | None, shared_option("out"), default_text("runs/sun_DATE")] = None
+    out: Annotated[Path | None, shared_option("out", "runs/sun_DATE")] = None
     figures: Figures = "png"
     cache: Cache = True
 

@@ -3,9 +3,9 @@
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -14,14 +14,20 @@ from rich.table import Table
 
 from ..checks.errors import ModelError, SettingError, named_places
 from ..figures.terminal import add_row, make_table, print_line
-from .models.point import inputs_named, scalars_by_name, starting_point
-from .models.postures import PostureSettings, write_path, write_survey
+from .mechanism import (
+    PointSettings,
+    inputs_named,
+    scalars_by_name,
+    starting_point,
+    values_by_name,
+)
 from .options import (
     ANGLE,
     FORCE,
     SPEED,
     TURN,
     Cache,
+    Figures,
     Number,
     Params,
     default_text,
@@ -33,15 +39,17 @@ from .simulate import chosen_scene
 
 if TYPE_CHECKING:
     from ..analysis.equilibrium import FlightCondition, Trim
-    from ..analysis.linear import Linear
     from ..dynamics.simulation import Scene
     from ..dynamics.statespace.tree import TreeSpace
     from ..mechanics.inputs import Inputs
     from ..mechanics.parameters import Parameters
+    from ..mechanics.state import State
     from ..mechanics.system import System
     from ..uav.flight import FlightTrim
 
 _ROTOR = Number("speed of the rotors", "rad/s", 0.0, 1e5)
+# Values of each coordinate of a survey between two limits.
+_SAMPLES = 21
 _ROUND_OFF = 1e-12  # numbers of a trim below it are round-off, in the units of the table
 
 
@@ -65,10 +73,7 @@ class SteadyFlight(FlightSettings):
     theta: Annotated[float | None, ANGLE, default_text("the initial one")] = None
     """Second angle of the panel [degrees]."""
     sun: Annotated[
-        tuple[float, float] | None,
-        ANGLE,
-        shared_option("sun"),
-        default_text("panel at --phi and --theta"),
+        tuple[float, float] | None, ANGLE, shared_option("sun", "panel at --phi and --theta")
     ] = None
 
 
@@ -109,22 +114,35 @@ class TrimCommand:
     """Parameters by which the trim is differentiated, such as mass.panel_7."""
     model: _Linear = dataclasses.field(default_factory=LinearSettings)
     params: Params = None
-    out: Annotated[Path | None, shared_option("out"), default_text("runs/trim")] = None
+    out: Annotated[Path | None, shared_option("out", "runs/trim")] = None
     cache: Cache = True
+
+
+@dataclasses.dataclass
+class PostureSettings(PointSettings):
+    """Options that ask for many postures instead of one trim."""
+
+    path: Annotated[Path | None, default_text("none")] = None
+    """CSV file with times t [s] and a column for each joint that moves, such as hinge [rad, m]: write the
+    inputs along this path."""
+    survey: Annotated[tuple[str, ...], default_text("none")] = ()
+    """Two coordinates with their limits, such as A.angle=-1,1 B.angle=-1,1 [rad, m]: write a map of the
+    postures between them."""
+    figures: Figures = "png"
 
 
 @dataclasses.dataclass
 class TrimSettings(LinearSettings, FlightSettings, PostureSettings):
     """Options of a steady motion of any mechanism."""
 
-    inputs: Annotated[tuple[str, ...], shared_option("inputs"), default_text("all")] = ()
+    inputs: Annotated[tuple[str, ...], shared_option("inputs", "all")] = ()
     free: Annotated[tuple[str, ...], default_text("none")] = ()
     """States that may differ from the start, such as hinge.angle."""
     accelerations: Annotated[tuple[str, ...], default_text("zero")] = ()
     """Target rates of velocities, such as rail.displacement_rate=2 [m/s^2, rad/s^2]."""
-    out: Annotated[
-        Path | None, shared_option("out"), default_text("runs/trim_SCENE_CASE or runs/trim_MODEL")
-    ] = None
+    out: Annotated[Path | None, shared_option("out", "runs/trim_SCENE_CASE or runs/trim_MODEL")] = (
+        None
+    )
 
 
 ABOUT = """Find the inputs, and optionally states, of a steady motion of any mechanism; write trim.json.
@@ -195,42 +213,21 @@ def trim_space(space: "TreeSpace", x: Any, settings: TrimSettings, t: float) -> 
     )
 
 
-class RotorSpeed(NamedTuple):
-    """Speed of a rotor [rad/s] with its thrust [N], and its share of the highest speed; None without limit."""
-
-    speed: float
-    thrust: float
-    share: float | None
-
-
-def _rotor_table(rotors: Mapping[str, RotorSpeed]) -> Table:
-    heads = ("rotor", "speed [rad/s]", "per minute", "thrust [N]", "of the highest speed")
-    rotor_table = make_table(*heads, title="Rotors", right=1)
-    for name, (speed, thrust, share) in rotors.items():
-        place = name.removeprefix("speed_squared_")
-        percent = "-" if share is None else f"{100 * share:.1f} %"
-        add_row(
-            rotor_table,
-            place,
-            f"{speed:.6g}",
-            f"{speed * 30 / math.pi:,.0f}",
-            f"{thrust:.4g}",
-            percent,
-        )
-    return rotor_table
-
-
 def rotor_speeds(
     system: "System", inputs: "Inputs", values: Sequence[float], highest: float | None = None
-) -> dict[str, RotorSpeed]:
-    """Speeds of the rotors whose squares are inputs, by the name of the input; none of a negative square.
+) -> tuple[dict[str, dict[str, float | None]], Table]:
+    """Speeds of the rotors whose squares are inputs, by the name of the input, and a table of them.
+
+    A rotor has its speed [rad/s], thrust [N], and share of the highest speed, None without limit; one of a
+    negative square is left out.
 
     Args:
         highest: highest speed of all rotors [rad/s], by default that of their motors, if they have one.
     """
     from ..uav.motor import MotorRotors
 
-    rotors = {}
+    heads = ("rotor", "speed [rad/s]", "per minute", "thrust [N]", "of the highest speed")
+    rotors, table = {}, make_table(*heads, title="Rotors", right=1)
     for entry, squared in zip(inputs.entries, values, strict=True):
         # A trim without limits may ask for thrust downwards, which no speed of the rotor gives.
         if not entry.field.endswith("speed_squared") or squared < 0:
@@ -241,17 +238,21 @@ def rotor_speeds(
         speed, limit = math.sqrt(squared), highest
         if limit is None and limits is not None:
             limit = float(np.asarray(limits.highest)[entry.place])
-        rotors[entry.name] = RotorSpeed(speed, thrust, None if limit is None else speed / limit)
-    return rotors
+        share = None if limit is None else speed / limit
+        rotors[entry.name] = {"speed": speed, "thrust": thrust, "share": share}
+        place = entry.name.removeprefix("speed_squared_")
+        percent = "-" if share is None else f"{100 * share:.1f} %"
+        per_minute = f"{speed * 30 / math.pi:,.0f}"
+        add_row(table, place, f"{speed:.6g}", per_minute, f"{thrust:.4g}", percent)
+    return rotors, table
 
 
 def modes_table(modes: Sequence[Any]) -> Table:
     """Table of the modes other than those of a free rigid body, whose eigenvalues are zero."""
     from ..analysis.linear import AT_ZERO
 
-    mode_table = make_table(
-        "s [1/s]", "doubles or halves in [s]", "states that take part", title="Modes"
-    )
+    heads = ("s [1/s]", "doubles or halves in [s]", "states that take part")
+    mode_table = make_table(*heads, title="Modes")
     for mode in modes:
         # Round-off splits the multiple eigenvalue at zero into a small circle, whose numbers mean nothing.
         if abs(mode.eigenvalue) < AT_ZERO:
@@ -306,10 +307,22 @@ def run_trim(command: Any) -> int:
 
 def _run_scene(command: Any) -> int:
     scene, settings = chosen_scene(command), command.settings
-    if settings.path is not None or settings.survey:
-        return _run_postures(scene, settings)
-    space, x = starting_point(scene, settings)
     folder, title = results_folder(settings.out, f"trim_{scene.name}"), scene.title or scene.name
+    flying = (settings.climb, settings.speed, settings.turn, settings.yaw)
+    if settings.path is not None or settings.survey:
+        if settings.path is not None and settings.survey:
+            raise SettingError(
+                "The options --path and --survey exclude each other: give one of them."
+            )
+        others = (settings.free, settings.accelerations, settings.outputs, *flying)
+        if settings.linear != "none" or any(others):
+            raise SettingError(
+                "--path and --survey exclude --linear, --free, --accelerations and the options of a flight: "
+                "leave those out."
+            )
+        (write_survey if settings.survey else write_path)(scene, settings, folder)
+        return 0
+    space, x = starting_point(scene, settings)
     inputs, values = None, None
     if settings.linear != "start":
         trim_result = trim_space(space, x, settings, scene.t0)
@@ -326,22 +339,6 @@ def _run_scene(command: Any) -> int:
     return 0
 
 
-def _run_postures(scene: "Scene", settings: TrimSettings) -> int:
-    if settings.path is not None and settings.survey:
-        raise SettingError("The options --path and --survey exclude each other: give one of them.")
-    trim_options = (settings.free, settings.accelerations, settings.outputs)
-    flying = (settings.climb, settings.speed, settings.turn, settings.yaw)
-    if settings.linear != "none" or any(trim_options) or any(flying):
-        raise SettingError(
-            "--path and --survey exclude --linear, --free, --accelerations and the options of a flight: "
-            "leave those out."
-        )
-    write = write_survey if settings.survey else write_path
-    folder = results_folder(settings.out, f"trim_{scene.name}")
-    write(scene, settings, folder)
-    return 0
-
-
 def _write_scene_trim(
     space: "TreeSpace", x: Any, trim_result: "Trim", folder: Path, title: str
 ) -> None:
@@ -355,27 +352,29 @@ def _write_scene_trim(
     }
     names = trim_result.inputs.names
     values = [float(v) for v in np.asarray(trim_result.values)]
-    unknown_table = make_table("unknown", "value", "unit", title=f"Trim: {title}")
-    cell = lambda value: f"{value:.6g}" if abs(value) > _ROUND_OFF else "0"
-    rotors = rotor_speeds(space.system, trim_result.inputs, values)
-    for (name, unit), value in zip(names, values, strict=True):
-        # A squared speed tells a reader little: the rotors' table has speeds and thrusts.
-        if name not in rotors:
-            add_row(unknown_table, f"input {name}", cell(value), unit)
-    for name, (value, unit) in changes.items():
-        # States of the motors are the speeds that the rotors' table lists already.
-        if not rotors or ": speed of rotor " not in name:
-            add_row(unknown_table, f"change of {name}", cell(value), unit)
+    rotors, rotor_table = rotor_speeds(space.system, trim_result.inputs, values)
+    # A squared speed tells a reader little: the rotors' table has speeds and thrusts.
+    unknowns = {
+        f"input {name}": (value, unit)
+        for (name, unit), value in zip(names, values, strict=True)
+        if name not in rotors
+    }
+    # States of the motors are the speeds that the rotors' table lists already.
+    unknowns |= {
+        f"change of {name}": change
+        for name, change in changes.items()
+        if not rotors or ": speed of rotor " not in name
+    }
     out = Console()
-    if unknown_table.row_count:
-        out.print(unknown_table)
+    if unknowns:
+        out.print(_trim_table(unknowns, f"Trim: {title}"))
     if rotors:
-        out.print(_rotor_table(rotors))
+        out.print(rotor_table)
     for note in trim_result.notes:
         print_line(out, f"Note: {note}")
     content = {
         "inputs": {name: v for (name, _), v in zip(names, values, strict=True)},
-        "rotors": {name: rotor._asdict() for name, rotor in rotors.items()},
+        "rotors": rotors,
         "changes": {name: value for name, (value, _) in changes.items()},
         "units": dict(names) | {name: unit for name, (_, unit) in changes.items()},
         "notes": list(trim_result.notes),
@@ -383,39 +382,115 @@ def _write_scene_trim(
     write_trim(out, trim_result, content, folder)
 
 
+# --- many postures instead of one trim
+
+
+def write_path(scene: "Scene", settings: Any, folder: Path) -> None:
+    """Print the largest inputs along the path of a file; write all of them to efforts.csv and a figure.
+
+    Raises:
+        SettingError: a file without joints, a column that is no joint, or times that do not increase.
+        ModelError: the path does not determine the motion. StateError: it stops.
+    """
+    from ..analysis.path_inverse_dynamics import inverse_dynamics
+    from ..checks.numbers import increasing_times
+    from ..dynamics.assembly.joint_start import state_from_joints
+    from ..io.csv_table import read_csv_table
+    from ..math.sampled import Sampled
+
+    table = read_csv_table(settings.path)
+    joints = [name for name in table.heads if name != "t"]
+    if not joints:
+        raise SettingError(f"{settings.path} needs a column for each joint that moves, beside t.")
+    ts = increasing_times(table.read_numbers("t"), f"The times of {settings.path}")
+    if len(ts) < 6:
+        raise SettingError(f"A path needs at least 6 times; {settings.path} has {len(ts)}.")
+    samples = {name: table.read_numbers(name) for name in joints}
+    motions = {name: Sampled(ts, values, 5) for name, values in samples.items()}
+    inputs, state = _start(scene, settings)
+    first_values = {name: float(values[0]) for name, values in samples.items()}
+    start = state_from_joints(scene.system, first_values, start=state, t=ts[0])
+    efforts = inverse_dynamics(scene.system, motions, ts, inputs=inputs, state=start)
+    largest = np.max(np.abs(efforts.values), axis=0)
+    largest_table = make_table("input", "largest size", "unit", title=f"Along {settings.path}")
+    for (name, unit), value in zip(efforts.inputs, largest, strict=True):
+        add_row(largest_table, name, f"{value:.6g}", unit)
+    out = Console()
+    out.print(largest_table)
+    rest = float(np.max(efforts.unbalanced))
+    print_line(out, f"Largest load that the inputs leave: {rest:.1e} of the weight.")
+    heads = ["t [s]", *_name_columns(efforts.inputs)]
+    _write_results(out, scene, settings, folder, "efforts", efforts, heads, [ts, efforts.values])
+
+
+def write_survey(scene: "Scene", settings: Any, folder: Path) -> None:
+    """Print what a survey of postures found; write each posture to survey.csv, and a map.
+
+    Raises:
+        SettingError: other than two coordinates with two limits each, or names that are unknown.
+        ModelError: coordinates that depend on each other, or a singular start.
+    """
+    from ..analysis.posture_survey import survey
+
+    limits = values_by_name(settings.survey, "--survey")
+    if len(limits) != 2 or any(np.shape(ends) != (2,) for ends in limits.values()):
+        raise SettingError(
+            "--survey takes two coordinates with two limits each, such as A.angle=-1,1 B.angle=-1,1."
+        )
+    inputs, state = _start(scene, settings)
+    result = survey(
+        scene.system, list(limits), list(limits.values()), inputs=inputs, state=state, samples=_SAMPLES, t=scene.t0,
+    )  # fmt: skip
+    out = Console()
+    count = int(np.sum(result.reachable))
+    print_line(out, f"Postures: {count} of {result.reachable.size} can be reached from the start.")
+    # the smallest of no numbers would be a warning
+    if count:
+        print_line(
+            out,
+            f"Smallest hold of the inputs {np.nanmin(result.hold):.3g}, mobility of {result.body} "
+            f"{np.nanmin(result.mobility):.3g}; both are 0 at a singular posture.",
+        )
+    heads = _name_columns(result.coordinates)
+    heads += ["reachable", "conditioning", "hold", f"mobility of {result.body}", "unbalanced"]
+    heads += _name_columns(result.inputs.names)
+    measures = (result.reachable, result.conditioning, result.hold, result.mobility)
+    grids = [*np.meshgrid(result.first, result.second, indexing="ij"), *measures, result.unbalanced]
+    columns = [*(grid.ravel() for grid in grids), result.values.reshape(grids[0].size, -1)]
+    _write_results(out, scene, settings, folder, "survey", result, heads, columns)
+
+
+def _start(scene: "Scene", settings: Any) -> tuple["Inputs", "State"]:
+    """Inputs that the options name, and the state at which the mechanism starts."""
+    space, x = starting_point(scene, settings)
+    inputs, _ = inputs_named(space, settings.inputs, x, scene.t0)
+    return inputs, space.to_state(x, scene.t0)
+
+
+def _name_columns(names: Iterable[tuple[str, str]]) -> list[str]:
+    return [f"{name} [{unit}]" for name, unit in names]
+
+
+def _write_results(
+    out: Console, scene: "Scene", settings: Any, folder: Path, name: str, result: Any,
+    heads: list[str], columns: list[np.ndarray],
+) -> None:  # fmt: skip
+    """Write the numbers of a result as a table, and its figure; print their paths."""
+    from ..io.csv_table import write_csv_table
+
+    paths = [write_csv_table(folder / f"{name}.csv", heads, columns, "%.17g")]
+    if settings.figures != "none":
+        # matplotlib is slow to import: only where figures are drawn
+        from ..figures.plot import save_figures
+        from ..figures.posture_survey import effort_histories, survey_map
+
+        draw = {"efforts": effort_histories, "survey": survey_map}[name]
+        figure = draw(result, scene.title or scene.name)
+        paths += save_figures({name: figure}, folder, settings.figures)
+    print_paths(out, paths)
+
+
 # --- the UAV with its tracker, whose trim observes limits
-
-
-def compute_flight_target(settings: SteadyFlight, values: "Parameters") -> Any:
-    """The flight condition that the options describe."""
-    from ..uav.tracker.geometry import initial_angles
-    from .view import towards_sun
-
-    if settings.sun is not None and (settings.phi is not None or settings.theta is not None):
-        raise SettingError("The option --sun excludes --phi and --theta: give one or the others.")
-    if settings.sun is not None:
-        if settings.turn:
-            raise SettingError(
-                "--sun is for straight flights, since in a turn the panel would have to move: give "
-                "--phi and --theta with --turn."
-            )
-        return flight_of(settings, sun=towards_sun(*settings.sun))
-    first = np.asarray(initial_angles(values))
-    option_angles = (settings.phi, settings.theta)
-    angles = [
-        a if x is None else math.radians(x) for a, x in zip(first, option_angles, strict=True)
-    ]
-    return flight_of(settings, angles)
-
-
-def _trim_limits(command: TrimCommand) -> Any:
-    from ..uav.allocation import RotorLimits
-    from ..uav.flight import TrimLimits
-
-    rotors = None if command.highest is None else RotorLimits(command.lowest, command.highest)
-    if rotors is None and command.lowest:
-        raise SettingError("--lowest is for rotors with a limit: give --highest too.")
-    return TrimLimits(rotors, math.inf if command.force is None else command.force)
 
 
 def _solve_uav(
@@ -425,8 +500,26 @@ def _solve_uav(
     from ..checks.numbers import as_floats
     from ..uav.flight import TrimReason, trim_flight, trim_slopes
     from ..uav.scenes.uav_tracker import make_uav
+    from ..uav.tracker.geometry import initial_angles
+    from .view import towards_sun
 
-    target, uav = compute_flight_target(command.flight, parameters), make_uav(parameters)
+    settings = command.flight
+    option_angles = (settings.phi, settings.theta)
+    if settings.sun is None:
+        first = np.asarray(initial_angles(parameters))
+        target = flight_of(settings, [
+            a if x is None else math.radians(x) for a, x in zip(first, option_angles, strict=True)
+        ])  # fmt: skip
+    elif option_angles != (None, None):
+        raise SettingError("The option --sun excludes --phi and --theta: give one or the others.")
+    elif settings.turn:
+        raise SettingError(
+            "--sun is for straight flights, since in a turn the panel would have to move: give "
+            "--phi and --theta with --turn."
+        )
+    else:
+        target = flight_of(settings, sun=towards_sun(*settings.sun))
+    uav = make_uav(parameters)
     # Parameters to be differentiated by are traced, so that the whole construction of the UAV is part of
     # the derivative.
     values = {name: as_floats(parameters.value(name)) for name in command.by}
@@ -441,6 +534,8 @@ def _solve_uav(
 def _run_uav(command: TrimCommand) -> int:
     from ..io.netcdf import load_parameters
     from ..uav.airframe import PART_II
+    from ..uav.allocation import RotorLimits
+    from ..uav.flight import TrimLimits
 
     is_linear = command.model.linear == "trim"
     if command.model.linear == "start":
@@ -450,15 +545,20 @@ def _run_uav(command: TrimCommand) -> int:
             "A turn has no constant matrices in the world's axes: linearise a straight flight."
         )
     parameters = load_parameters(command.params, PART_II)
-    uav, trim_result, slopes = _solve_uav(command, parameters, _trim_limits(command))
-    unknowns, labels = np.asarray(trim_result.vector), trim_result.names
+    limits = None if command.highest is None else RotorLimits(command.lowest, command.highest)
+    if limits is None and command.lowest:
+        raise SettingError("--lowest is for rotors with a limit: give --highest too.")
+    limits = TrimLimits(limits, math.inf if command.force is None else command.force)
+    uav, trim_result, slopes = _solve_uav(command, parameters, limits)
+    unknowns, labels = np.asarray(trim_result.vector).tolist(), trim_result.names
     out = Console()
-    rotors = rotor_speeds(
+    rotors, rotor_table = rotor_speeds(
         uav.system, uav.inputs, np.asarray(trim_result.values).tolist(), command.highest
     )
-    places = [k for k, (name, _) in enumerate(labels) if not name.startswith("speed_")]
-    out.print(trim_table(unknowns[places], [labels[k] for k in places]))
-    out.print(_rotor_table(rotors))
+    pairs = {name: (value, unit) for (name, unit), value in zip(labels, unknowns, strict=True)}
+    listed = {name: pair for name, pair in pairs.items() if not name.startswith("speed_")}
+    out.print(_trim_table(listed, "Trim"))
+    out.print(rotor_table)
     degrees = [math.degrees(float(a)) for a in np.asarray(trim_result.angles)]
     angles = ", ".join(f"{a:.4f}" for a in degrees)
     print_line(
@@ -467,15 +567,26 @@ def _run_uav(command: TrimCommand) -> int:
         "speeds, taken nearest each other.",
     )
     content = {
-        "values": {name: float(v) for (name, _), v in zip(labels, unknowns, strict=True)},
+        "values": {name: value for name, (value, _) in pairs.items()},
         "units": dict(labels),
-        "rotors": {name: rotor._asdict() for name, rotor in rotors.items()},
+        "rotors": rotors,
         "panel_angles_deg": degrees,
     }
     if slopes:
         content["sensitivities"] = {k: v.tolist() for k, v in slopes.items()}
-        for name, slope in slopes.items():
-            out.print(slope_table(name, parameters, slope, labels))
+    for by, slope in slopes.items():
+        # of an array its first three entries
+        heads = [by + (str(list(k)) if k else "") for k in np.ndindex(slope.shape[1:])]
+        title = (
+            f"Sensitivity, 3 of {len(heads)} entries; all in trim.json"
+            if heads[3:]
+            else "Sensitivity"
+        )
+        heads = [f"{head} [{parameters[by].unit}]" for head in heads[:3]]
+        slope_table = make_table("by", *heads, title=title)
+        for (name, unit), row in zip(labels, slope.reshape(len(labels), -1), strict=True):
+            add_row(slope_table, f"{name} [{unit}]", *(f"{x:.5g}" for x in row[:3]))
+        out.print(slope_table)
     folder = results_folder(command.out, "trim")
     write_trim(out, trim_result, content, folder)
     if is_linear:
@@ -486,26 +597,11 @@ def _run_uav(command: TrimCommand) -> int:
     return 0
 
 
-def trim_table(unknowns: Any, labels: Sequence[tuple[str, str]]) -> Table:
-    unknown_table = make_table("unknown", "value", "unit", title="Trim")
-    for (name, unit), value in zip(labels, unknowns, strict=True):
-        add_row(unknown_table, name, f"{value:.6g}" if abs(value) > 1e-12 else "0", unit)
+def _trim_table(unknowns: Mapping[str, tuple[float, str]], title: str) -> Table:
+    unknown_table = make_table("unknown", "value", "unit", title=title)
+    for name, (value, unit) in unknowns.items():
+        add_row(unknown_table, name, f"{value:.6g}" if abs(value) > _ROUND_OFF else "0", unit)
     return unknown_table
-
-
-def slope_table(
-    name: str, parameters: "Parameters", slope: np.ndarray, labels: Sequence[tuple[str, str]]
-) -> Table:
-    """Table of derivatives by one parameter; of an array by its first three entries."""
-    unit = parameters[name].unit
-    flat = slope.reshape(len(labels), -1)
-    entries = list(np.ndindex(slope.shape[1:]))
-    heads = [name + (str(list(entry)) if entry else "") for entry in entries]
-    title = "Sensitivity" + (f", 3 of {len(heads)} entries; all in trim.json" if heads[3:] else "")
-    sensitivity_table = make_table("by", *(f"{head} [{unit}]" for head in heads[:3]), title=title)
-    for (label, label_unit), values in zip(labels, flat, strict=True):
-        add_row(sensitivity_table, f"{label} [{label_unit}]", *(f"{x:.5g}" for x in values[:3]))
-    return sensitivity_table
 
 
 # --- the linear model
@@ -523,18 +619,14 @@ def _write_linear(
     linear = linearize(space, x, inputs, values, outputs=outputs, t=t)
     out, modes = Console(), linear.modes()
     out.print(modes_table(modes))
-    for sentence in (count_modes_at_zero(modes), *notes, measures_of(linear)):
-        if sentence:
-            print_line(out, sentence)
+    measures = f"of observability {np.min(linear.observability()):.2g}"
+    if linear.B.shape[1]:
+        measures = (
+            f"Smallest measure of controllability {np.min(linear.controllability()):.2g}, {measures}, over all "
+            "modes (1 is full, 0 is none)."
+        )
+    else:
+        measures = f"There are no inputs. Smallest measure {measures} (1: fully observable, 0: unobservable)."
+    for sentence in filter(None, (count_modes_at_zero(modes), *notes, measures)):
+        print_line(out, sentence)
     print_paths(out, [save_linear(linear, folder / "linear.npz")])
-
-
-def measures_of(linear: "Linear") -> str:
-    """Sentence on the modes that inputs move and outputs show."""
-    observability_text = f"of observability {np.min(linear.observability()):.2g}"
-    if not linear.B.shape[1]:
-        return f"There are no inputs. Smallest measure {observability_text} (1: fully observable, 0: unobservable)."
-    return (
-        f"Smallest measure of controllability {np.min(linear.controllability()):.2g}, {observability_text}, over all "
-        "modes (1 is full, 0 is none)."
-    )

@@ -1,5 +1,6 @@
 """Command `stmuav tune`: inputs that hold a mechanism, or move it to another posture."""
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,8 +11,14 @@ import tyro
 
 from ..checks.errors import SettingError, StateError
 from ..figures.terminal import add_row, make_table
-from .models.point import PointSettings, inputs_named, scalars_by_name, starting_point
-from .models.searching import HOLDS, has_converged, loss_figures, report_search, run_search
+from .mechanism import (
+    PointSettings,
+    inputs_named,
+    report_search,
+    run_search,
+    scalars_by_name,
+    starting_point,
+)
 from .options import END, FORCE, Figures, Number, Resume, count_range, default_text, shared_option
 from .output import results_folder
 from .scene_options import chosen_scene, scene_command
@@ -27,10 +34,8 @@ class TuneSettings(PointSettings):
 
     to: Annotated[tuple[str, ...], default_text("none")] = ()
     """slew: states at the end, as changes from the start, such as rail.displacement=0.5; the others return to it."""
-    t1: Annotated[float | None, END, shared_option("duration"), default_text("the scene's own")] = (
-        None
-    )
-    inputs: Annotated[tuple[str, ...], shared_option("inputs"), default_text("all")] = ()
+    t1: Annotated[float | None, END, shared_option("duration", "the scene's own")] = None
+    inputs: Annotated[tuple[str, ...], shared_option("inputs", "all")] = ()
     limit: Annotated[tuple[str, ...], default_text("none")] = ()
     """Largest magnitudes of inputs, such as effort=20."""
     reaction: Annotated[float | None, FORCE, default_text("none")] = None
@@ -40,9 +45,7 @@ class TuneSettings(PointSettings):
     steps: Annotated[int, count_range("steps", 1e6), shared_option("steps")] = 60
     resume: Resume = False
     out: Annotated[
-        Path | None,
-        shared_option("out"),
-        default_text("runs/tune_WHAT_SCENE_CASE or runs/tune_WHAT_MODEL"),
+        Path | None, shared_option("out", "runs/tune_WHAT_SCENE_CASE or runs/tune_WHAT_MODEL")
     ] = None
     figures: Figures = "png"
 
@@ -59,6 +62,8 @@ What = Literal["hold", "slew"]
 WHAT = [("what", Annotated[tyro.conf.Positional[What], shared_option("what")])]
 # Weight of a departure or of an end that is missed.
 _WEIGHT = 10.0
+# Loss below which inputs count as holding: departures of a millimetre or a milliradian.
+_HOLDS = 1e-6
 
 
 def tune_options(arguments: Sequence[str]) -> type:
@@ -68,6 +73,8 @@ def tune_options(arguments: Sequence[str]) -> type:
 
 def run_tune(command: Any) -> int:
     """Run the command; return the exit code."""
+    from ..math.least_squares import SearchReason
+
     settings = command.settings
     if (command.what == "slew") != bool(settings.to):
         needed = command.what == "slew"
@@ -75,80 +82,82 @@ def run_tune(command: Any) -> int:
     scene = chosen_scene(command)
     folder = results_folder(settings.out, f"tune_{command.what}_{scene.name}")
     search, input_table, is_done, figures = _tune_inputs(command, scene, folder)
-    if has_converged(search) and not is_done:
-        failure_text = (
-            f"no inputs hold the start: the smallest loss is {search.loss:.3g}, but at most {HOLDS:g} is "
+    failure = None
+    if search.reason is SearchReason.CONVERGED and not is_done:
+        failure = (
+            f"no inputs hold the start: the smallest loss is {search.loss:.3g}, but at most {_HOLDS:g} is "
             f"required. {folder} contains the best inputs."
         )
-    else:
-        failure_text = (
+    elif not is_done:
+        failure = (
             f"the search has not converged; {folder} has what it reached; try more --segments, or "
             "--resume with more --steps."
         )
-    return report_search(search, input_table, folder, figures, is_done, failure_text)
+    return report_search(search, input_table, folder, settings.figures, figures, failure)
 
 
 def _tune_inputs(
     command: Any, scene: "Scene", folder: Path
-) -> tuple["Search", Any, bool, list[Path]]:
-    from ..analysis.tuning import departures, tune_inputs, tune_slew
+) -> tuple["Search", Any, bool, dict[str, Any]]:
+    """The search, a table of its inputs, whether it has succeeded, and figures."""
+    from ..analysis.equilibrium import trim
+    from ..analysis.tuning import Limit, departures, tune_inputs, tune_slew
     from ..checks.numbers import as_floats
     from ..dynamics.statespace.base import places_of
     from ..figures.tuning import flight_figure, tuned_curves
+    from ..math.least_squares import SearchReason
 
     settings, slews = command.settings, command.what == "slew"
     space, x = starting_point(scene, settings)
     inputs, values = inputs_named(space, settings.inputs, x, scene.t0)
+    input_names, limits = [entry.name for entry in inputs.entries], []
+    for name, value in scalars_by_name(settings.limit, "--limit").items():
+        chosen = inputs.chosen([name]).entries
+        if not value > 0:
+            raise SettingError(f"The limit of {name} must be positive, but it is {value:g}.")
+        limits += [Limit(_Over(input_names.index(entry.name), value)) for entry in chosen]
+    if settings.reaction is not None:
+        limits.append(Limit(_Reaction(settings.reaction)))
+    options = {
+        "inputs": inputs, "segments": settings.segments, "weight": _WEIGHT,
+        "name": f"{command.what} {scene.name}",
+    }  # fmt: skip
     duration = scene.t1 - scene.t0 if settings.t1 is None else settings.t1
-    limits = _make_limits(inputs, settings)
-    name = f"{command.what} {scene.name}"
     if slews:
         to = scalars_by_name(settings.to, "--to")
         v = np.zeros(space.size)
         v[list(places_of(space, list(to), "The states at the end"))] = list(to.values())
         target = space.retract(x, as_floats(v))
-        ends = _end_inputs(space, (x, target), inputs, values)
+        # Without equilibrium at an end the search begins with the inputs given.
+        ends = [values, values]
+        for k, point in enumerate((x, target)):
+            with contextlib.suppress(SettingError, StateError):
+                ends[k] = trim(space, at=point, inputs=inputs, values=values).values
         tuning = tune_slew(
-            space, x, target, duration, limits, inputs=inputs, values=ends[0], end_values=ends[1],
-            knots=settings.knots, segments=settings.segments, weight=_WEIGHT, name=name,
+            space, x, target, duration, limits, values=ends[0], end_values=ends[1],
+            knots=settings.knots, **options,
         )  # fmt: skip
     else:
-        tuning = tune_inputs(
-            space, [departures(space, x), *limits], start=x, duration=duration, inputs=inputs,
-            values=values, segments=settings.segments, weight=_WEIGHT, name=name,
-        )  # fmt: skip
+        residuals = [departures(space, x), *limits]
+        tuning = tune_inputs(space, residuals, start=x, duration=duration, values=values, **options)
     # Steps without progress end the search; how many there are depends on the problem.
     run = lambda **options: tuning.search(patience=15, **options)
     search = run_search(settings, folder, tuning.name, tuning.start, run)
     # A converged search may still not hold the posture, if the inputs cannot.
-    is_done = has_converged(search) and (slews or search.loss < HOLDS)
+    has_converged = search.reason is SearchReason.CONVERGED
+    is_done = has_converged and (slews or search.loss < _HOLDS)
     every = np.asarray(tuning.motion(search.values).inputs)
     title = f"Inputs that {'lead there' if slews else 'hold'}"
     if not is_done:
-        state = "NOT HELD" if has_converged(search) else "NOT CONVERGED"
+        state = "NOT HELD" if has_converged else "NOT CONVERGED"
         title = f"{state}: the best of {search.steps} steps ({title.lower()})"
-    input_table = make_table(
-        "input", "at the start", "at the end", "smallest", "largest", "unit", title=title
-    )
+    heads = ("input", "at the start", "at the end", "smallest", "largest", "unit")
+    input_table = make_table(*heads, title=title)
     for k, (name, unit) in enumerate(inputs.names):
         numbers = (every[0, k], every[-1, k], every[:, k].min(), every[:, k].max())
         add_row(input_table, name, *(f"{value:.6g}" for value in numbers), unit)
-    more = {"motion": flight_figure(*tuned_curves(tuning, search.values), {})}
-    return search, input_table, is_done, loss_figures(search, folder, settings.figures, more)
-
-
-def _end_inputs(space: Any, points: Sequence[Any], inputs: Any, values: Any) -> list[Any]:
-    """Inputs at both ends of a slew: those of the trims there, or else those of the start."""
-    from ..analysis.equilibrium import trim
-
-    result = []
-    for point in points:
-        try:
-            result.append(trim(space, at=point, inputs=inputs, values=values).values)
-        except (SettingError, StateError):
-            # Without equilibrium at an end the search begins with the inputs given.
-            result.append(values)
-    return result
+    figures = {"motion": lambda: flight_figure(*tuned_curves(tuning, search.values), {})}
+    return search, input_table, is_done, figures
 
 
 class _Over:
@@ -172,15 +181,3 @@ class _Reaction:
         from ..analysis.tuning import joint_forces
 
         return joint_forces(motion) / self.limit - 1.0
-
-
-def _make_limits(inputs: Any, settings: TuneSettings) -> list[Any]:
-    from ..analysis.tuning import Limit
-
-    input_names, limits = [entry.name for entry in inputs.entries], []
-    for name, value in scalars_by_name(settings.limit, "--limit").items():
-        chosen = inputs.chosen([name]).entries
-        if not value > 0:
-            raise SettingError(f"The limit of {name} must be positive, but it is {value:g}.")
-        limits += [Limit(_Over(input_names.index(entry.name), value)) for entry in chosen]
-    return limits + ([] if settings.reaction is None else [Limit(_Reaction(settings.reaction))])

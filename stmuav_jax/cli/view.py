@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from ..checks.errors import SettingError
 from ..figures.terminal import add_row, make_table, print_line
@@ -20,8 +19,6 @@ from .scene_options import chosen_scene, command_or_scene
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from ..figures.page import RunPage
 
 
 # Files of results, by the commands that write them.
@@ -54,9 +51,10 @@ class View:
     html: Annotated[Path | None, default_text("a temporary file, which the browser opens")] = None
     """File for the page, which works without network; the browser is then not opened."""
     sun: Annotated[
-        tuple[float, float] | None, Number("direction of the sun", "degrees", -360, 360),
-        shared_option("sun"), default_text("no sun"),
-    ] = None  # fmt: skip
+        tuple[float, float] | None,
+        Number("direction of the sun", "degrees", -360, 360),
+        shared_option("sun", "no sun"),
+    ] = None
     gif: Annotated[Path | None, default_text("none")] = None
     """Write a film to this file, which ends with .gif, instead of opening the browser."""
     mp4: Annotated[Path | None, default_text("none")] = None
@@ -68,8 +66,8 @@ class View:
     size: Annotated[tuple[int, int], Number("size of the film", "pixels", 64, 4096)] = (640, 480)
     """Width and height of the film [pixels]."""
     span: Annotated[
-        tuple[float, float] | None, Number("span of the film", "s"), default_text("all of the run"),
-    ] = None  # fmt: skip
+        tuple[float, float] | None, Number("span of the film", "s"), default_text("all of the run")
+    ] = None
     """First and last time in the film [s]."""
     eye: Annotated[tuple[float, float], Number("direction of the eye", "degrees", -360, 360)] = (
         24.0, -53.0,
@@ -84,9 +82,7 @@ class SketchSettings(CheckSettings):
     """Options of a sketch, which all scenes share."""
 
     out: Annotated[
-        Path | None,
-        shared_option("out"),
-        default_text("that of simulate: runs/SCENE_CASE or runs/MODEL"),
+        Path | None, shared_option("out", "that of simulate: runs/SCENE_CASE or runs/MODEL")
     ] = None
     figures: Annotated[Literal["png", "pdf", "svg"], shared_option("figures")] = "png"
 
@@ -111,25 +107,45 @@ def run_view(command: Any) -> int:
     """Write report, page, films or sketch, or open the page; return the exit code."""
     if not isinstance(command, View):
         return _run_sketch(command)
-    films, out = _write_films(command), Console()
-    paths = []
+    targets = {suffix: getattr(command, suffix) for suffix in ("gif", "mp4")}
+    films = {suffix: target for suffix, target in targets.items() if target is not None}
+    for suffix, target in films.items():
+        if target.suffix.lower() != f".{suffix}":
+            raise SettingError(
+                f"The file of --{suffix} must end with .{suffix}, but it is '{target.name}'."
+            )
+    for option in ("beside", "sun"):
+        if films and command.html is None and getattr(command, option) is not None:
+            raise SettingError(
+                f"--{option} is for the page: a film shows one run without the sun. Give --html too, or "
+                f"leave --{option} out."
+            )
+    out, paths = Console(), []
     if command.report is not None:
         with show_activity("Reading the result and drawing"):
             paths.append(_write_report(command.result, command.report))
     if command.html is not None or not (films or paths):
         with show_activity("Reading the run and writing the page"):
             # The page holds its data and scripts, so that it can be sent to someone without this package.
-            page, run_table = _write_page(command)
+            from ..figures.page import dataset_of, view
+
+            sources = [command.result, *([] if command.beside is None else [command.beside])]
+            runs = [dataset_of(path) for path in sources]
+            page = view(*runs, sun=None if command.sun is None else towards_sun(*command.sun))
             paths += [page.save(command.html)] if command.html is not None else []
+        run_table = make_table("run", "bodies", "joints", "saved times", "from [s]", "to [s]")
+        for path, run in zip(sources, runs, strict=True):
+            ts = run["time"].values
+            sizes = (run.sizes["body"], run.sizes.get("joint", 0), len(ts))
+            add_row(run_table, path, *sizes, f"{ts[0]:g}", f"{ts[-1]:g}")
         out.print(run_table)
         if command.html is None:
-            path = page.show()
-            print_line(out, f"If no browser has opened, open this page: {path}")
+            print_line(out, f"If no browser has opened, open this page: {page.show()}")
             return 0
     if films:
         from ..figures.films import film
 
-        for target in films:
+        for target in films.values():
             with show_progress(f"Drawing {target.name}") as progress:
                 paths.append(
                     film(
@@ -151,14 +167,12 @@ def _run_sketch(command: Any) -> int:
     folder = results_folder(settings.out, scene.name)
     paths = save_figures({"mechanism": draw(scene)}, folder, settings.figures)
     closing = set(spanning_tree(scene.system).cut)
-    joint_table = make_table(
-        "joint", "kind", "from", "to", "graph", title=scene.title or scene.name
-    )
+    heads = ("joint", "kind", "from", "to", "graph")
+    joint_table = make_table(*heads, title=scene.title or scene.name)
     for k, joint in enumerate(scene.system.joints):
-        place = "closes a loop" if k in closing else "spanning tree"
-        add_row(
-            joint_table, joint.name, joint.kind.replace("_", " "), joint.body_i, joint.body_j, place
-        )
+        place, kind = "closes a loop" if k in closing else "spanning tree", joint.kind
+        kind = kind.replace("_", " ")
+        add_row(joint_table, joint.name, kind, joint.body_i, joint.body_j, place)
     out = Console()
     out.print(joint_table)
     print_paths(out, paths)
@@ -271,46 +285,6 @@ def _load_dataset(source: Path) -> "xr.Dataset":
             f"{source} is damaged, truncated or from another program. A report needs {', '.join(NAMES)}."
         )
     return data
-
-
-# --- pages and films
-
-
-def _write_films(command: View) -> list[Path]:
-    """Files of the films that are asked for."""
-    films = []
-    for suffix in ("gif", "mp4"):
-        target = getattr(command, suffix)
-        if target is None:
-            continue
-        if target.suffix.lower() != f".{suffix}":
-            raise SettingError(
-                f"The file of --{suffix} must end with .{suffix}, but it is '{target.name}'."
-            )
-        films.append(target)
-    if films and command.html is None:
-        for option in ("beside", "sun"):
-            if getattr(command, option) is not None:
-                raise SettingError(
-                    f"--{option} is for the page: a film shows one run without the sun. Give --html too, or "
-                    f"leave --{option} out."
-                )
-    return films
-
-
-def _write_page(command: View) -> "tuple[RunPage, Table]":
-    """The page, and a table of what it shows."""
-    from ..figures.page import dataset_of, view
-
-    paths = [command.result] if command.beside is None else [command.result, command.beside]
-    runs = [dataset_of(path) for path in paths]
-    page = view(*runs, sun=None if command.sun is None else towards_sun(*command.sun))
-    run_table = make_table("run", "bodies", "joints", "saved times", "from [s]", "to [s]")
-    for path, run in zip(paths, runs, strict=True):
-        ts = run["time"].values
-        sizes = (run.sizes["body"], run.sizes.get("joint", 0), len(ts))
-        add_row(run_table, path, *sizes, f"{ts[0]:g}", f"{ts[-1]:g}")
-    return page, run_table
 
 
 def towards_sun(azimuth: float, elevation: float) -> tuple[float, float, float]:

@@ -8,8 +8,8 @@ held until the next. A controller is any function
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
 import diffrax
@@ -168,8 +168,10 @@ def rollout(
         numbers = (now.state, now.internal, inputs, signal_values, plant.motion.work(now.motion.y))
         # After an invalid sample rows are NaN and not left as they are: a mean or a gradient over
         # a batch of loops cannot take them for results.
+        is_number = lambda x: jnp.issubdtype(jnp.asarray(x).dtype, jnp.inexact)
+        or_nan = lambda x: jnp.where(valid, x, jnp.nan) if is_number(x) else jnp.asarray(x)
         row = (
-            now.t, jax.tree.map(lambda x: _or_nan(valid, x), numbers), now.motion.counts,
+            now.t, jax.tree.map(or_nan, numbers), now.motion.counts,
             now.motion.worst, jnp.where(valid, reason_code, reason), jnp.where(valid, place, element),
         )  # fmt: skip
         return (plant.step(now, inputs), next_memory, row[-2], row[-1]), row
@@ -235,12 +237,6 @@ def _first_bad(part: Any) -> Int[Array, ""]:
     return jnp.where(jnp.any(bad_mask), jnp.argmax(bad_mask), -1)
 
 
-def _or_nan(valid: Array, x: Any) -> Any:
-    """Value where the loop is still valid; NaN for a number and the value itself for others."""
-    x = jnp.asarray(x)
-    return jnp.where(valid, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.inexact) else x
-
-
 @dataclass(frozen=True)
 class LoopCertificate:
     """Quality of a closed loop's run.
@@ -270,8 +266,8 @@ class LoopCertificate:
     norm_violation: float
     energy_error: float | None
     relative_energy_error: float | None
-    position_difference: float | None
-    angle_difference: float | None
+    position_difference: float | None = field(default=None, kw_only=True)
+    angle_difference: float | None = field(default=None, kw_only=True)
     steps: int
     rejected_steps: int
     compile_seconds: float
@@ -319,12 +315,11 @@ class LoopRun:
 
     def input(self, name: str) -> np.ndarray:
         """Commands of one input, or of all numbers of a vector: (k,) or (k, numbers)."""
-        chosen_entries = self.plant.inputs.chosen([name]).entries
-        entry_names = [entry.name for entry in self.plant.inputs.entries]
-        commands = np.asarray(self.rollout.inputs)[
-            :, [entry_names.index(entry.name) for entry in chosen_entries]
-        ]
-        return commands[:, 0] if entry_names.count(name) else commands
+        inputs = self.plant.inputs
+        names = [entry.name for entry in inputs.entries]
+        places = [names.index(entry.name) for entry in inputs.chosen([name]).entries]
+        commands = np.asarray(self.rollout.inputs)[:, places]
+        return commands[:, 0] if name in names else commands
 
     def signal(self, name: str) -> Any:
         """Saved signal (k, ...); raises `SettingError` if there is none of that name."""
@@ -382,25 +377,66 @@ def close_loop(
         plant = plant.with_motions(lambda motion: motion.with_method(balances=True))
     run = _Loop(controller, reference, memory, signals, samples)
     # Compilation is timed apart, as speed against real time is a figure of the running loop.
-    (loop_rollout, total), *times = _carried_out(run, plant, key)
-    compiling, running = times
-    difference = _compare_steps(run, plant, key, loop_rollout) if check_steps else (None, None)
-    certificate, failure = _certify_rollout(
-        plant, loop_rollout, total, (compiling, running), difference
-    )
-    result = LoopRun(plant, loop_rollout, certificate, failure)
-    if failure and throw:
-        raise SimulationError(failure, result)
+    (loop_rollout, total), *seconds = _carried_out(run, plant, key)
+    result = run_of(plant, loop_rollout, seconds, total)
+    if check_steps:
+        if plant.motion.steps is None:
+            raise SettingError("check_steps halves fixed steps; this plant's steps are adaptive.")
+        # Fixed steps have no error estimate; a run with half the step tells what they cost.
+        finer = lambda motion: dataclasses.replace(motion, steps=2 * motion.steps)
+        (finer_rollout, _), *_ = _carried_out(run, plant.with_motions(finer), key)
+        states, others = (
+            jax.tree.map(jnp.asarray, x.states) for x in (loop_rollout, finer_rollout)
+        )
+        turn = lambda p, q: to_rotation_vector(product(conjugate(p), q))
+        turns = jax.vmap(jax.vmap(turn))(states.p, others.p)
+        position, angle = (
+            float(np.max(np.linalg.norm(np.asarray(x), axis=-1)))
+            for x in (states.r - others.r, turns)
+        )
+        certificate = dataclasses.replace(
+            result.certificate, position_difference=position, angle_difference=angle
+        )
+        result = dataclasses.replace(result, certificate=certificate)
+    if result.failure and throw:
+        raise SimulationError(result.failure, result)
     return result
 
 
-def run_of(plant: Plant, samples: Rollout, seconds: tuple[float, float]) -> LoopRun:
-    """Run with its certificate, from a plant and the samples of its loop, without energy balance.
+def run_of(
+    plant: Plant, samples: Rollout, seconds: Sequence[float], total: np.ndarray | None = None
+) -> LoopRun:
+    """Run with its certificate, from a plant and the samples of its loop.
 
     Args:
         plant: as `inspect_plant` returns it. seconds: times of compiling and running [s].
+        total: total energies (k,) [J], for a plant with `balances`.
     """
-    certificate, failure = _certify_rollout(plant, samples, np.zeros(0), seconds, (None, None))
+    reason = np.asarray(samples.reason)
+    # Only samples before the first failure count: residuals, steps and the time of the end are
+    # those of the last valid one.
+    valid = int(np.argmax(reason != 0)) if np.any(reason) else len(reason)
+    last = max(valid - 1, 0)
+    failure = "" if valid == len(reason) else _describe_failure(plant, samples, valid)
+    energy_error, relative_energy_error = None, None
+    if total is not None and plant.motion.problem.method.balances:
+        work = samples.work[:valid]
+        # Energy of a loop is not constant; its change must equal the work of all inputs.
+        drift = total[:valid] - total[0] - work
+        energy_error = float(np.max(np.abs(drift), initial=0.0))
+        relative_energy_error = relative_error(drift, total[:valid], work)
+    certificate = LoopCertificate(
+        result=LoopReason(int(reason[-1])).label if failure else "successful",
+        t_end=float(samples.ts[last]),
+        **{f"{name}_violation": float(x[last]) for name, x in vars(samples.worst).items()},
+        energy_error=energy_error,
+        relative_energy_error=relative_energy_error,
+        steps=int(samples.counts.accepted[last]),
+        rejected_steps=int(samples.counts.rejected[last]),
+        compile_seconds=seconds[0],
+        run_seconds=seconds[1],
+        speed=float(samples.ts[-1] - samples.ts[0]) / seconds[1],
+    )
     return LoopRun(plant, samples, certificate, failure)
 
 
@@ -420,12 +456,10 @@ def _roll_out(run: _Loop, plant: Plant, key: Any) -> tuple[Rollout, Float[Array,
         plant, run.controller, run.samples, reference=run.reference, memory=run.memory,
         signals=run.signals, start=plant.reset(key),
     )  # fmt: skip
-    total = jnp.zeros_like(loop_rollout.ts)
-    if plant.motion.problem.method.balances:
-        total = jax.vmap(lambda x, t: energy(plant.system, x, t).total)(
-            loop_rollout.states, loop_rollout.ts
-        )
-    return loop_rollout, total
+    total_energy = lambda x, t: energy(plant.system, x, t).total
+    if not plant.motion.problem.method.balances:
+        return loop_rollout, jnp.zeros_like(loop_rollout.ts)
+    return loop_rollout, jax.vmap(total_energy)(loop_rollout.states, loop_rollout.ts)
 
 
 def _carried_out(run: _Loop, plant: Plant, key: Any) -> tuple[Any, float, float]:
@@ -452,62 +486,6 @@ def inspect_plant(plant: Plant) -> Plant:
     if formulation is method_formulation:
         return plant
     return plant.with_motions(lambda motion: motion.with_method(formulation=formulation))
-
-
-def _compare_steps(run: _Loop, plant: Plant, key: Any, first: Rollout) -> tuple[float, float]:
-    """Largest differences in position [m] and attitude [rad] from a run with steps half as long."""
-    if plant.motion.steps is None:
-        raise SettingError("check_steps halves fixed steps; this plant's steps are adaptive.")
-    # Fixed steps have no error estimate; a run with half the step tells what they cost.
-    finer = lambda motion: dataclasses.replace(motion, steps=2 * motion.steps)
-    (finer_rollout, _), *_ = _carried_out(run, plant.with_motions(finer), key)
-    rotation_vectors_between = jax.vmap(
-        jax.vmap(lambda p, q: to_rotation_vector(product(conjugate(p), q)))
-    )
-    rotation_vectors = rotation_vectors_between(
-        jnp.asarray(first.states.p), jnp.asarray(finer_rollout.states.p)
-    )
-    largest = lambda x: float(np.max(np.linalg.norm(np.asarray(x), axis=-1)))
-    return largest(first.states.r - finer_rollout.states.r), largest(rotation_vectors)
-
-
-def _certify_rollout(
-    plant: Plant,
-    loop_rollout: Rollout,
-    total: np.ndarray,
-    seconds: tuple[float, float],
-    difference: tuple[float | None, float | None],
-) -> tuple[LoopCertificate, str]:
-    reason = np.asarray(loop_rollout.reason)
-    # Only samples before the first failure count: residuals, steps and the time of the end are
-    # those of the last valid one.
-    valid = int(np.argmax(reason != 0)) if np.any(reason) else len(reason)
-    last_sample = max(valid - 1, 0)
-    failure = "" if valid == len(reason) else _describe_failure(plant, loop_rollout, valid)
-    errors: tuple[float | None, float | None] = (None, None)
-    if plant.motion.problem.method.balances:
-        work = loop_rollout.work[:valid]
-        # Energy of a loop is not constant; its change must equal the work of all inputs.
-        drift = total[:valid] - total[0] - work
-        errors = (
-            float(np.max(np.abs(drift), initial=0.0)),
-            relative_error(drift, total[:valid], work),
-        )
-    worst, t_end = loop_rollout.worst, float(loop_rollout.ts[last_sample])
-    return LoopCertificate(
-        result=LoopReason(int(reason[-1])).label if failure else "successful",
-        t_end=t_end,
-        **{f"{name}_violation": float(x[last_sample]) for name, x in vars(worst).items()},
-        energy_error=errors[0],
-        relative_energy_error=errors[1],
-        position_difference=difference[0],
-        angle_difference=difference[1],
-        steps=int(loop_rollout.counts.accepted[last_sample]),
-        rejected_steps=int(loop_rollout.counts.rejected[last_sample]),
-        compile_seconds=seconds[0],
-        run_seconds=seconds[1],
-        speed=float(loop_rollout.ts[-1] - loop_rollout.ts[0]) / seconds[1],
-    ), failure
 
 
 def _describe_failure(plant: Plant, loop_rollout: Rollout, at: int) -> str:

@@ -163,14 +163,15 @@ class Bench(eqx.Module):
             )
             size = len(instrument.sensor.components(system))
 
-            def spread(value: Any, label: str, size: int = size, owner: Any = instrument) -> Any:
+            def spread(
+                value: Any, label: str, size: int = size, name: str = instrument.name
+            ) -> Any:
                 if value is None:
                     return None
                 shape = () if np.ndim(value) == 0 else (size,)
-                quantity = f"The {label} of the sensor '{owner.name}'"
-                return jnp.broadcast_to(
-                    check_numbers(value, shape, quantity, "", SettingError), (size,)
-                )
+                quantity = f"The {label} of the sensor '{name}'"
+                numbers = check_numbers(value, shape, quantity, "", SettingError)
+                return jnp.broadcast_to(numbers, (size,))
 
             faults = tuple(
                 SensorFault(as_floats(at), as_floats(until), spread(bias, "step of the bias"))
@@ -203,56 +204,43 @@ class Bench(eqx.Module):
         return tuple(queues)
 
     def advance_queues(
-        self,
-        queues: tuple[Any, ...],
-        motion: SensedMotion,
-        system: System,
-        k: Int[Array, ""],
+        self, queues: tuple[Any, ...], motion: SensedMotion, system: System, k: Int[Array, ""],
         key: Array,
-    ) -> tuple[Any, ...]:
+    ) -> tuple[Any, ...]:  # fmt: skip
         """Queues one sample later: what is read at sample k comes in, the oldest goes out."""
         return _advance_queues(self, queues, motion, system, k, self._draw_noise(k, key))
 
     def oldest_readings(self, queues: tuple[Any, ...]) -> dict[str, Reading]:
         """Readings passed to the estimator at this sample, by the sensor's name."""
-        oldest_readings = [jax.tree.map(lambda x: x[0], queue) for queue in queues]
-        return {
-            instrument.name: reading
-            for instrument, reading in zip(self.instruments, oldest_readings, strict=True)
-        }
+        names = [instrument.name for instrument in self.instruments]
+        oldest = jax.tree.map(lambda x: x[0], queues)
+        return dict(zip(names, oldest, strict=True))
 
     def _read_values(
-        self,
-        sensed_motion: SensedMotion,
-        system: System,
-        k: Int[Array, ""],
-        noise: Float[Array, "i c"],
+        self, motion: SensedMotion, system: System, k: Int[Array, ""], noise: Float[Array, "i c"]
     ) -> list[Point]:
         readings, rows = [], iter(noise)
         for instrument in self.instruments:
-            value = instrument.sensor.read(sensed_motion)
+            value = instrument.sensor.read(motion)
             error = None if instrument.bias is None else jnp.asarray(instrument.bias)
             if instrument.noise is not None:
                 scale = jnp.asarray(instrument.noise)
                 white = scale * next(rows)[: scale.size]
                 error = white if error is None else error + white
-            present = [
-                (k >= jnp.asarray(fault.at) * self.rate)
-                & (k < jnp.asarray(fault.until) * self.rate)
-                for fault in instrument.faults
-            ]
-            for fault, is_present in zip(instrument.faults, present, strict=True):
-                if fault.bias is not None:
-                    step = jnp.where(is_present, jnp.asarray(fault.bias), 0.0)
-                    error = step if error is None else error + step
+            outages = []
+            for fault in instrument.faults:
+                is_present = k >= jnp.asarray(fault.at) * self.rate
+                is_present &= k < jnp.asarray(fault.until) * self.rate
+                if fault.bias is None:
+                    outages.append(is_present)
+                    continue
+                step = jnp.where(is_present, jnp.asarray(fault.bias), 0.0)
+                error = step if error is None else error + step
             if error is not None:
                 # Errors of an attitude are rotations, and are composed and not added.
                 value = instrument.sensor.space(system).retract(value, error)
-            for fault, is_present in zip(instrument.faults, present, strict=True):
-                if fault.bias is None:
-                    value = jax.tree.map(
-                        lambda x, lost=is_present: jnp.where(lost, jnp.nan, x), value
-                    )
+            for is_lost in outages:
+                value = jax.tree.map(lambda x, lost=is_lost: jnp.where(lost, jnp.nan, x), value)
             readings.append(value)
         return readings
 
@@ -271,21 +259,15 @@ class Bench(eqx.Module):
 
 @native
 def _advance_queues(
-    bench: Bench,
-    queues: tuple[Any, ...],
-    motion: SensedMotion,
-    system: System,
-    k: Int[Array, ""],
+    bench: Bench, queues: tuple[Any, ...], motion: SensedMotion, system: System, k: Int[Array, ""],
     noise: Float[Array, "i c"],
-) -> tuple[Any, ...]:
+) -> tuple[Any, ...]:  # fmt: skip
     values = bench._read_values(motion, system, k, noise)
     new_queues = []
     for queue, value, every in zip(queues, values, bench.every, strict=True):
         due = k % every == 0
-        last_value = jax.tree.map(lambda x: x[-1], queue.value)
-        current_value = jax.tree.map(
-            lambda new, old, due=due: jnp.where(due, new, old), value, last_value
-        )
+        latest = lambda new, x, due=due: jnp.where(due, new, x[-1])
         join = lambda x, new: jnp.concatenate([x[1:], new[None]])
-        new_queues.append(jax.tree.map(join, queue, Reading(current_value, due)))
+        reading = Reading(jax.tree.map(latest, value, queue.value), due)
+        new_queues.append(jax.tree.map(join, queue, reading))
     return tuple(new_queues)

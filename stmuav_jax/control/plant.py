@@ -27,7 +27,6 @@ from ..dynamics.formulations.base import Accelerations
 from ..dynamics.formulations.stabilisation import Unstabilised
 from ..dynamics.integration.adjoint import DiscreteAdjoint
 from ..dynamics.integration.problem import (
-    Counts,
     IntegrationState,
     Problem,
     at_internal,
@@ -94,11 +93,9 @@ class HeldMotion(eqx.Module):
             carry, _ = step_once(carry, 0)
         else:
             carry, _ = jax.lax.scan(step_once, carry, jnp.arange(steps))
-        accepted = now.counts.accepted + steps
-        counts = Counts(accepted, now.counts.rejected, now.counts.at_growth_limit)
-        return dataclasses.replace(
-            now, t=t1, y=carry[0], solver_state=carry[1], counts=counts, result=carry[2]
-        )
+        y, state, result = carry
+        counts = dataclasses.replace(now.counts, accepted=now.counts.accepted + steps)
+        return dataclasses.replace(now, t=t1, y=y, solver_state=state, counts=counts, result=result)
 
     def state(self, y: Float[Array, " n"]) -> tuple[State, Float[Array, " z"]]:
         """State of all bodies, and states of force elements."""
@@ -126,33 +123,6 @@ class HeldMotion(eqx.Module):
         # which is what makes a period cheap.
         system = self.inputs.applied(self.problem.model.system, values)
         return eqx.tree_at(lambda p: p.model.system, self.problem, system)
-
-
-def check_steps(steps: int | None) -> None:
-    """Raise `SettingError` unless the number of steps in a period is a whole number, or None."""
-    if steps is not None and (isinstance(steps, bool) or steps != int(steps) or steps < 1):
-        raise SettingError(
-            f"The number of steps in a period must be a whole number from 1, or None for steps that "
-            f"the method's tolerances choose, but it is {steps}."
-        )
-
-
-def usable_method(method: Method | None, steps: int | None) -> Method:
-    """Method for the steps of a plant; nothing bounds steps of a fixed length for derivatives."""
-    if method is None:
-        solver: Any = diffrax.Dopri8() if steps is None else RungeKutta4()
-        return usable_method(Method(solver=solver), steps)
-    if method.event is not None or method.jump_ts is not None:
-        raise SettingError("A plant's method can have neither an event nor times of jumps.")
-    adjoint = method.adjoint
-    if isinstance(adjoint, DiscreteAdjoint):
-        # The discrete adjoint records steps in arrays of a known length, which a loop over samples does not
-        # have.
-        adjoint = diffrax.RecursiveCheckpointAdjoint()
-    # The bound on steps for derivatives acts on the control of step sizes, which fixed steps do
-    # not have.
-    step_control = "state" if steps is not None else method.steps
-    return dataclasses.replace(method, adjoint=adjoint, steps=step_control)
 
 
 # Number that is folded into a key for the noise while standing; no sample of a run has it.
@@ -269,7 +239,11 @@ class Plant(eqx.Module):
             raise SettingError(
                 f"The control rate must be positive and finite, but it is {rate} Hz."
             )
-        check_steps(steps)
+        if steps is not None and (isinstance(steps, bool) or steps != int(steps) or steps < 1):
+            raise SettingError(
+                f"The number of steps in a period must be a whole number from 1, or None for steps that "
+                f"the method's tolerances choose, but it is {steps}."
+            )
         self.rate = float(rate)
         # Delays in whole periods leave the inputs constant within a period, so that steps need no break in
         # between.
@@ -279,18 +253,25 @@ class Plant(eqx.Module):
         plant_inputs = inputs_of(system, inputs)
         if not len(plant_inputs):
             raise SettingError("The system has no inputs that a controller could set.")
-        if before is None:
-            self.before = plant_inputs.values(system)
-        else:
-            quantity = "The vector of the inputs before the first command"
-            self.before = check_numbers(before, (len(plant_inputs),), quantity, "")
+        before = plant_inputs.values(system) if before is None else before
+        quantity = "The vector of the inputs before the first command"
+        self.before = check_numbers(before, (len(plant_inputs),), quantity, "")
+        if method is None:
+            method = Method(solver=diffrax.Dopri8() if steps is None else RungeKutta4())
+        if method.event is not None or method.jump_ts is not None:
+            raise SettingError("A plant's method can have neither an event nor times of jumps.")
+        if isinstance(method.adjoint, DiscreteAdjoint):
+            # The discrete adjoint records steps in arrays of a known length, which a loop over samples does not
+            # have.
+            adjoint = diffrax.RecursiveCheckpointAdjoint()
+            method = dataclasses.replace(method, adjoint=adjoint)
+        if steps is not None:
+            # The bound on steps for derivatives acts on the control of step sizes, which fixed steps do
+            # not have.
+            method = dataclasses.replace(method, steps="state")
         # The system is prepared once, and a period only exchanges the inputs' numbers.
         prepared = lambda system: HeldMotion(
-            prepare_problem(
-                plant_inputs.applied(system, self.before), usable_method(method, steps)
-            ),
-            plant_inputs,
-            steps,
+            prepare_problem(plant_inputs.applied(system, self.before), method), plant_inputs, steps
         )
         self.motion = prepared(system)
         self.starts = tuple(math.ceil(at * rate * (1 - 1e-12)) for at, _ in changes)
@@ -309,7 +290,11 @@ class Plant(eqx.Module):
             )
         self.stood = whole_periods(standing, rate, "The time of standing")
         if self.stood:
-            _check_standing(self.bench, self.state0)
+            if not self.bench.instruments:
+                raise SettingError(
+                    "'standing' must be 0 for a plant without sensors, because it has no readings to align with."
+                )
+            _check_rest(self.state0)
         self.estimator, self.observe = estimator, observe
         self.memory = jax.tree.map(jnp.asarray, memory)
 
@@ -352,9 +337,8 @@ class Plant(eqx.Module):
         """
         key = jax.random.key(0) if key is None else key
         t = jnp.asarray(t0, dtype=float)
-        motion = begin_integration(
-            self.motion.problem, t, self.state0 if state0 is None else state0
-        )
+        start = self.state0 if state0 is None else state0
+        motion = begin_integration(self.motion.problem, t, start)
         state, internal = self.motion.state(motion.y)
         # The first sample is complete, with readings and an estimate: a controller acts at t = 0,
         # and not one period later.
@@ -365,7 +349,7 @@ class Plant(eqx.Module):
         if self.stood:
             assert sensed_motion is not None
             if state0 is not None:
-                _check_standing(self.bench, state0)
+                _check_rest(state0)
             queues, estimate, memory = self._after_standing(t, state, internal, sensed_motion, key)
             readings = self.bench.oldest_readings(queues)
         else:
@@ -443,12 +427,7 @@ class Plant(eqx.Module):
         return jax.lax.scan(sample_once, (queues, blank, self.memory), ks)[0]
 
     def _sense_motion(
-        self,
-        motion: HeldMotion,
-        t: Array,
-        state: State,
-        internal: Array,
-        held_inputs: Float[Array, " m"],
+        self, motion: HeldMotion, t: Array, state: State, internal: Array, held_inputs: Array
     ) -> SensedMotion | None:
         """Motion for the sensors; accelerations are those just before the next command acts."""
         if not self.bench.instruments:
@@ -482,15 +461,8 @@ class Plant(eqx.Module):
         return (state if self.observe is None else self.observe(t, state, internal)), memory
 
 
-def _check_standing(bench: Bench, start: State) -> None:
-    """Raise `SettingError` for a plant that cannot stand before its first sample.
-
-    A traced start is not checked.
-    """
-    if not bench.instruments:
-        raise SettingError(
-            "'standing' must be 0 for a plant without sensors, because it has no readings to align with."
-        )
+def _check_rest(start: State) -> None:
+    """Raise `SettingError` for a start that moves before its first sample; a traced one is not checked."""
     if not has_values(start.v, start.omega):
         return
     # NumPy's, which stays concrete where something else is traced
@@ -504,10 +476,11 @@ def _check_standing(bench: Bench, start: State) -> None:
 
 def same_kind(after: Any, before: Any, subject: str) -> Any:
     """New memory as arrays of the old one's types; `SettingError` for another structure or shape."""
-    if jax.tree.structure(after) != jax.tree.structure(before):
+    old_structure, structure = jax.tree.structure(before), jax.tree.structure(after)
+    if structure != old_structure:
         raise SettingError(
-            f"{subject} must keep its structure from sample to sample: it was "
-            f"{jax.tree.structure(before)}, and {jax.tree.structure(after)} was returned."
+            f"{subject} must keep its structure from sample to sample: it was {old_structure}, and "
+            f"{structure} was returned."
         )
     for new, old in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
         if jnp.shape(new) != jnp.shape(old):

@@ -57,9 +57,7 @@ def held_matrices(A: np.ndarray, B: np.ndarray, period: float) -> tuple[np.ndarr
     Source: C. F. Van Loan, IEEE Trans. Automatic Control 23 (1978) 395-404.
     """
     n, m = B.shape
-    block = np.zeros((n + m, n + m))
-    block[:n, :n], block[:n, n:] = A, B
-    exponential = scipy.linalg.expm(block * period)
+    exponential = scipy.linalg.expm(np.block([[A, B], [np.zeros((m, n + m))]]) * period)
     return exponential[:n, :n], exponential[:n, n:]
 
 
@@ -79,7 +77,7 @@ def regulator(linear: Linear, Q: Numbers, R: Numbers, *, rate: float | None = No
     """
     A, B = linear.A, linear.B
     n, m = B.shape
-    Q, R = _check_weights(Q, n, "Q", least=0.0), _check_weights(R, m, "R", least=None)
+    Q, R = _check_weights(Q, n, "Q", "semidefinite"), _check_weights(R, m, "R", "definite")
     _check_modes(linear, B, "The inputs cannot stabilise", "they do not move it")
     # Q sees what its square root sees
     _check_modes(linear, Q, "The weights Q do not determine", "they do not see it", transposed=True)
@@ -92,41 +90,36 @@ def regulator(linear: Linear, Q: Numbers, R: Numbers, *, rate: float | None = No
         solve = scipy.linalg.solve_discrete_are
     try:
         S = solve(A, B, Q, R)
+        if rate is None:
+            K = np.linalg.solve(R, B.T @ S)
+        else:
+            K = np.linalg.solve(R + B.T @ S @ B, B.T @ S @ A)
+        if not np.all(np.isfinite(K)):
+            raise ValueError("the gains are not finite")
+        poles = np.linalg.eigvals(A - B @ K)
+        # SciPy returns some matrices that are no stabilising solution without a word
+        growth = poles.real if rate is None else np.abs(poles) - 1
+        if np.max(growth) >= 0:
+            pole = poles[np.argmax(growth)]
+            raise ValueError(f"the closed loop of the solution has a pole at {pole:.4g}")
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise _riccati_error(str(error)) from error
-    if rate is None:
-        K = np.linalg.solve(R, B.T @ S)
-    else:
-        K = np.linalg.solve(R + B.T @ S @ B, B.T @ S @ A)
-    if not np.all(np.isfinite(K)):
-        raise _riccati_error("the gains are not finite")
-    poles = np.linalg.eigvals(A - B @ K)
-    # SciPy returns some matrices that are no stabilising solution without a word
-    growth = poles.real if rate is None else np.abs(poles) - 1
-    if np.max(growth) >= 0:
-        pole = poles[np.argmax(growth)]
-        raise _riccati_error(f"the closed loop of the solution has a pole at {pole:.4g}")
+        raise ModelError(
+            f"The Riccati equation of the regulator has no stabilising solution ({error}). Weights of "
+            "very different sizes can be the reason: scale errors by the sizes that they may have."
+        ) from error
     return Regulator(K, S, poles, rate)
 
 
-def _riccati_error(cause: str) -> ModelError:
-    return ModelError(
-        f"The Riccati equation of the regulator has no stabilising solution ({cause}). Weights of "
-        "very different sizes can be the reason: scale errors by the sizes that they may have."
-    )
-
-
-def _check_weights(weights: Numbers, size: int, name: str, *, least: float | None) -> np.ndarray:
-    """Weights as a symmetric matrix; positive definite, or with least=0 semidefinite."""
+def _check_weights(weights: Numbers, size: int, name: str, kind: str) -> np.ndarray:
+    """Weights as a symmetric matrix, positive "definite" or "semidefinite"."""
     shape = (size,) if np.ndim(weights) == 1 else (size, size)
     matrix = np.asarray(check_numbers(weights, shape, f"The weights {name} of the regulator", ""))
     matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
     if not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
         raise ModelError(f"The weights {name} of the regulator must be a symmetric matrix.")
     values = np.linalg.eigvalsh(matrix)
-    has_valid_sign = values[0] > 0 if least is None else values[0] >= -1e-12 * max(values[-1], 0.0)
-    if not has_valid_sign:
-        kind = "definite" if least is None else "semidefinite"
+    rounding = 1e-12 * max(values[-1], 0.0)
+    if not (values[0] > 0 if kind == "definite" else values[0] >= -rounding):
         raise ModelError(
             f"The weights {name} of the regulator must be positive {kind}, but the smallest "
             f"eigenvalue is {values[0]:.3g}."

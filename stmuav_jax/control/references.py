@@ -55,24 +55,18 @@ def follow_path(path: Callable[[Array], Any], heading: Callable[[Array], Any] | 
         heading: function of t to the yaw [rad]; by default zero.
     """
 
-    def rate_of(f: Callable[[Array], Any]) -> Callable[[Array], Any]:
-        return lambda t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
+    def derivatives(function: Callable[[Array], Any], count: int) -> list[Callable[[Array], Any]]:
+        """The function and its derivatives by t up to an order."""
+        result = [function]
+        for _ in range(count):
+            result.append(lambda t, f=result[-1]: jax.jvp(f, (t,), (jnp.ones_like(t),))[1])
+        return result
 
-    yaw = (lambda t: jnp.zeros_like(t)) if heading is None else heading
-    place = lambda t: jnp.asarray(path(t))
-    v = rate_of(place)
-    a = rate_of(v)
-    jerk = rate_of(a)
-    snap = rate_of(jerk)
-    turning = rate_of(yaw)
-
-    def waypoint_at(t: Array) -> Waypoint:
-        t = jnp.asarray(t, dtype=float)
-        return Waypoint(
-            place(t), v(t), a(t), jerk(t), snap(t), yaw(t), turning(t), rate_of(turning)(t)
-        )
-
-    return waypoint_at
+    functions = [
+        *derivatives(lambda t: jnp.asarray(path(t)), 4),
+        *derivatives(jnp.zeros_like if heading is None else heading, 2),
+    ]
+    return lambda t: Waypoint(*(function(jnp.asarray(t, dtype=float)) for function in functions))
 
 
 def quintic_share(s: Float[Array, ""], coefficients: Float[Array, " k"]) -> Float[Array, ""]:

@@ -67,13 +67,9 @@ _WITHIN, _HEAVY = 1e-3, 8.0
 
 
 def nees(
-    mean: Point,
-    factor: Float[Array, "n n *s"],
-    truth: Point,
-    space: AbstractSpace,
-    *,
+    mean: Point, factor: Float[Array, "n n *s"], truth: Point, space: AbstractSpace, *,
     only: slice | None = None,
-) -> Float[Array, "*s"]:
+) -> Float[Array, "*s"]:  # fmt: skip
     """Normalised estimation error squared, chi-squared with n degrees if the filter is consistent.
 
     A component that is known exactly contributes zero if it is correct, and infinity otherwise.
@@ -86,10 +82,9 @@ def nees(
         error = error[only]
         factor = triangularise_rows(jnp.swapaxes(factor[only], 0, 1))
     scaled = divide_lower(factor, error[:, None])[:, 0]
-    sizes = [
-        jnp.max(jnp.abs(leaf), axis=0) for leaf in jax.tree.leaves((mean, truth)) if leaf.shape[0]
-    ]
-    wrong = has_contradiction(factor, error, scaled, jnp.max(jnp.stack(sizes), axis=0))
+    leaves = [leaf for leaf in jax.tree.leaves((mean, truth)) if leaf.shape[0]]
+    size = jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), axis=0) for leaf in leaves]), axis=0)
+    wrong = has_contradiction(factor, error, scaled, size)
     return jnp.where(wrong, jnp.inf, jnp.sum(scaled**2, axis=0))
 
 
@@ -159,9 +154,8 @@ def inconsistent(filtered: Filtered, *, window: int = 50, level: float = 0.999) 
     count = np.sum(np.asarray(filtered.innovations.measured), axis=1)
     count = np.broadcast_to(count, nis.shape)
     # sums of the last entries: differences of running sums would not outlive an infinite one
-    latest = lambda a: np.stack(
-        [np.sum(a[max(k - window + 1, 0) : k + 1], axis=0) for k in range(len(a))]
-    )
+    parts = [slice(max(k - window + 1, 0), k + 1) for k in range(len(nis))]
+    latest = lambda a: np.stack([np.sum(a[part], axis=0) for part in parts])
     total, degrees = latest(nis), latest(count)
     limit = stats.chi2.ppf((1 + level) / 2, np.maximum(degrees, 1))
     return (degrees > 0) & ~(total <= limit)
@@ -278,36 +272,25 @@ def verdict(filtered: Filtered, **options: Any) -> Verdict:
         raise SettingError("verdict takes one record; use verdicts for a bank of filters.")
     as_bank = lambda tree: jax.tree.map(lambda a: np.asarray(a)[..., None], tree)
     innovations, ok = as_bank((filtered.innovations, filtered.ok))
-    return _judge_filter(innovations, ok, filtered, options)[0]
+    return judge_innovations(
+        innovations.normalised, innovations.measured, ok, filtered.dt, inputs=filtered.u,
+        predicted=innovations.predicted, **options,
+    )[0]  # fmt: skip
 
 
 def verdicts(filtered: Filtered, **options: Any) -> tuple[Verdict, ...]:
     """Verdicts on the filters of a bank, with the options of `verdict`."""
-    return _judge_filter(filtered.innovations, filtered.ok, filtered, options)
-
-
-def _judge_filter(
-    innovations: Any, ok: Any, filtered: Filtered, options: dict[str, Any]
-) -> tuple[Verdict, ...]:
+    innovations = filtered.innovations
     return judge_innovations(
-        innovations.normalised, innovations.measured, ok, filtered.dt, inputs=filtered.u,
+        innovations.normalised, innovations.measured, filtered.ok, filtered.dt, inputs=filtered.u,
         predicted=innovations.predicted, **options,
     )  # fmt: skip
 
 
 def judge_innovations(
-    normalised: Any,
-    measured: Any,
-    ok: Any,
-    dt: Any,
-    *,
-    inputs: Any = None,
-    predicted: Any = None,
-    settle: float | None = None,
-    level: float = 0.01,
-    window: int = 50,
-    names: tuple[str, ...] = (),
-) -> tuple[Verdict, ...]:
+    normalised: Any, measured: Any, ok: Any, dt: Any, *, inputs: Any = None, predicted: Any = None,
+    settle: float | None = None, level: float = 0.01, window: int = 50, names: tuple[str, ...] = (),
+) -> tuple[Verdict, ...]:  # fmt: skip
     """Verdicts from innovations alone.
 
     Args:
@@ -461,7 +444,10 @@ def _test_settled(
     of["means"] = np.sum(r, axis=0) / np.sqrt(np.maximum(count, 1))
     of["p bias"] = _p_values(np.sum(of["means"] ** 2, axis=0), np.sum(count > 0, axis=0))[1]
     # Half-period cosines are orthogonal and span slow changes without a choice of their phase.
-    of["p trend"] = _test_regression(r, settled_mask, _slow_cosines)
+    harmonics = np.arange(1, _COSINES + 1)
+    phases = lambda rows: np.pi * (np.arange(len(rows)) + 0.5) / max(len(rows), 1)
+    cosines = lambda rows, run: np.cos(np.outer(phases(rows), harmonics))
+    of["p trend"] = _test_regression(r, settled_mask, cosines)
     for name, tree in (("inputs", inputs), ("prediction", predicted)):
         of[f"p {name}"] = _test_regression(r, settled_mask, _centre_columns(tree))
     of["largest"], _, of["p outliers"] = _test_largest(r, settled_mask)
@@ -508,13 +494,6 @@ def _test_memory(r: np.ndarray, settled_mask: np.ndarray) -> dict[str, Any]:
             correlation_matrices = c / np.sqrt(np.maximum(pairs, 1))
             correlation = np.einsum("iis->s", correlation_matrices) / m
     return {"p memory": _p_values(total, degrees)[1], "memory": correlation}
-
-
-def _slow_cosines(rows: np.ndarray, run: int) -> np.ndarray:
-    """Slowest cosines over the settled part, the first of half a period."""
-    del run
-    phase = np.pi * (np.arange(len(rows)) + 0.5) / max(len(rows), 1)
-    return np.cos(np.outer(phase, np.arange(1, _COSINES + 1)))
 
 
 def _centre_columns(tree: Any) -> Callable[[np.ndarray, int], np.ndarray]:
@@ -589,11 +568,8 @@ def _decide_verdict(of: dict[str, Any], level: float, names: tuple[str, ...]) ->
     elif status == "inconsistent":
         name = lambda i: names[i] if i < len(names) else f"component {i}"
         sentences = " ".join([sentences, *_explain_findings(of, set(significant), name)])
-    number = lambda key: float(of[key])
-    return Verdict(
-        status, level, least, p_values, number("settled"), number("since"), number("high"),
-        number("low"), number("start"), number("size"), number("memory"), number("missing"), sentences,
-    )  # fmt: skip
+    keys = ("settled", "since", "high", "low", "start", "size", "memory", "missing")
+    return Verdict(status, level, least, p_values, *(float(of[key]) for key in keys), sentences)  # pyright: ignore[reportCallIssue]
 
 
 def _explain_findings(
@@ -604,7 +580,15 @@ def _explain_findings(
     lines = []
     # a start that is like the rest is no sign of a wrong prior
     if "start" in significant and not (wrong_size and 0.5 < of["start"] / of["size"] < 2):
-        lines.append(_explain_start(of, name))
+        width, place = ("wide", "nearer to") if of["start"] < 1 else ("narrow", "further from")
+        lines.append(
+            f"The first innovation of {name(int(of['first component']))} is {of['first size']:.3g} "
+            "of its stated deviations: the prior is too narrow, the start is further from the truth "
+            "than it says."
+            if of["first is largest"]
+            else f"In the first {of['first']:.3g} s the NIS is {of['start']:.3g} per measured number where 1 is "
+            f"expected: the prior is too {width}, the start is {place} the truth than it says."
+        )
     later = significant - {"start"}
     if not later:
         return [*lines, f"From {of['settled']:.3g} s on no test rejects the filter."]
@@ -643,32 +627,15 @@ def _explain_findings(
     return lines
 
 
-def _explain_start(of: dict[str, Any], name: Callable[[int], str]) -> str:
-    """Sentence about the prior."""
-    if of["first is largest"]:
-        return (
-            f"The first innovation of {name(int(of['first component']))} is {of['first size']:.3g} "
-            "of its stated deviations: the prior is too narrow, the start is further from the truth "
-            "than it says."
-        )
-    width, place = ("wide", "nearer to") if of["start"] < 1 else ("narrow", "further from")
-    return (
-        f"In the first {of['first']:.3g} s the NIS is {of['start']:.3g} per measured number where 1 is "
-        f"expected: the prior is too {width}, the start is {place} the truth than it says."
-    )
-
-
 def _explain_cause(of: dict[str, Any], significant: set[str], wrong_size: bool) -> str:
     """Sentence about the cause, by the size and the correlation of the innovations."""
-    size = "as large as"
+    size, sign = "as large as", 0
     if wrong_size:
         size = "smaller than" if of["size"] < 1 else "larger than"
-    drifts = [test for test in ("slow drift", "drift") if test in significant]
-    sign = 0
-    if drifts:
-        sign = 1 if of[drifts[0]] > 1 else -1
-    elif "memory" in significant:
-        sign = 1 if of["memory"] > 0 else -1
+    # the first of the tests of correlation that is significant, and its expected value
+    for test, expected in (("slow drift", 1), ("drift", 1), ("memory", 0)):
+        if not sign and test in significant:
+            sign = 1 if of[test] > expected else -1
     if size == "as large as" and not sign:
         return "Their sizes change along the record, or the noise is not Gaussian."
     correlation_text = "and white"

@@ -155,18 +155,21 @@ class GaussianFilter(AbstractFilter):
         # Process noise is added after the points have been propagated, so that sigma points are drawn anew
         # for the update: they then carry the effect of Q into the prediction of the reading.
         noise = model.step_noise(dt, prior.factor.ndim)
-        return Gaussian(
-            propagated.mean, _downdated_root(propagated.rows, noise, propagated.less, self.form)
-        )
+        rows, less = propagated.rows, propagated.less
+        if self.form == "covariance":
+            # The covariance form is kept for comparison: it squares the rows, and half of the digits of small
+            # variances are lost.
+            P = transposed_multiply(rows, rows) + outer_square(noise)
+            scale = jnp.stack([P[i, i] for i in range(P.shape[0])])
+            P = P if less is None else P - less[:, None] * less[None]
+            return Gaussian(propagated.mean, factor_semidefinite(P, scale))
+        noise_rows = jnp.swapaxes(noise, 0, 1)
+        noise_rows = jnp.broadcast_to(noise_rows, (*noise.shape[:2], *rows.shape[2:]))
+        L = triangularise_rows(jnp.concatenate([rows, noise_rows]))
+        return Gaussian(propagated.mean, L if less is None else downdate_factor(L, less))
 
     def update(
-        self,
-        prior: Gaussian,
-        y: Point,
-        sensor: Sensor,
-        u: Inputs = None,
-        *,
-        model: StateSpaceModel,
+        self, prior: Gaussian, y: Point, sensor: Sensor, u: Inputs = None, *, model: StateSpaceModel
     ) -> tuple[Gaussian, Innovation]:
         """State given a measurement, and its innovation.
 
@@ -177,24 +180,34 @@ class GaussianFilter(AbstractFilter):
             u: inputs of the sensor's function.
             model: model whose space the state belongs to.
         """
-        sensor_image = self.rule.transform(lambda x: sensor(x, u), prior, model.space, sensor.space)
-        error, present, size = _compute_innovation(y, sensor_image.mean, sensor)
+        image = self.rule.transform(lambda x: sensor(x, u), prior, model.space, sensor.space)
+        # Differences are taken in the sensor's own space: two angles of nearly a turn apart are close, and
+        # two quaternions of opposite sign are one attitude.
+        y = as_reading(sensor.space, y)
+        error = sensor.space.difference(y, image.mean)
+        # an infinite angle has no difference, and would pass for a missing one
+        error = jnp.where(jnp.any(jnp.isinf(y), axis=0)[None], jnp.inf, error)
+        # a NaN of the prediction does not pass for a missing measurement: the rows contain it too
+        present = ~jnp.isnan(error)
+        # largest measurement, for the rounding of an error that should be zero
+        size = jnp.max(jnp.where(jnp.isnan(y), 0.0, jnp.abs(y)), axis=0)
+        error = jnp.where(present, error, 0.0)
         # A missing component gets a row of zeros and a noise of its own: it changes nothing, and the arrays
-        # keep their shape for every pattern of missing readings.
-        rows, noise = _mask_missing(sensor_image.rows, sensor.noise, present)
-        sensor_image = sensor_image._replace(
-            rows=rows, less=None if sensor_image.less is None else sensor_image.less * present
-        )
-        if self.form == "square_root" and sensor_image.triangular and sensor_image.less is None:
-            move, factor, scaled, Ls = _scalar_by_scalar(
-                sensor_image, prior.factor, noise, error, size
-            )
+        # keep their shape for every pattern of missing readings. Unit noise in its place keeps the innovation's
+        # covariance regular and adds exactly zero to the log-likelihood's quadratic form.
+        noise = insert_axes(sensor.noise, image.rows.ndim, 2)
+        unit = insert_axes(jnp.eye(noise.shape[0], dtype=noise.dtype), image.rows.ndim, 2)
+        absent = jnp.where(present, 0.0, 1.0)
+        parts = [jnp.swapaxes(noise, 0, 1) * present[None], unit * absent[None]]
+        noise = jnp.concatenate(parts).astype(image.rows.dtype)
+        less = None if image.less is None else image.less * present
+        image = image._replace(rows=image.rows * present[None], less=less)
+        if self.form == "square_root" and image.triangular and less is None:
+            move, factor, scaled, Ls = _scalar_by_scalar(image, prior.factor, noise, error, size)
         else:
-            move, factor, scaled, Ls = _update_jointly(sensor_image, noise, error, size, self.form)
-        return (
-            Gaussian(model.space.retract(prior.mean, move), factor),
-            Innovation(error, scaled, Ls, present, sensor_image.mean),
-        )
+            move, factor, scaled, Ls = _update_jointly(image, noise, error, size, self.form)
+        after = Gaussian(model.space.retract(prior.mean, move), factor)
+        return after, Innovation(error, scaled, Ls, present, image.mean)
 
     def step(
         self, model: StateSpaceModel, before: Gaussian, y: Point, u: Inputs, dt: Any
@@ -205,47 +218,6 @@ class GaussianFilter(AbstractFilter):
 
 # The default filter.
 DEFAULT = GaussianFilter()
-
-
-def _downdated_root(rows: Array, noise: Array, less: Array | None, form: Form) -> Array:
-    """Root of rows^T rows + noise noise^T - less less^T."""
-    if form == "covariance":
-        # The covariance form is kept for comparison: it squares the rows, and half of the digits of small
-        # variances are lost.
-        P = transposed_multiply(rows, rows) + outer_square(noise)
-        scale = jnp.stack([P[i, i] for i in range(P.shape[0])])
-        return factor_semidefinite(P if less is None else P - less[:, None] * less[None], scale)
-    noise_rows = jnp.broadcast_to(jnp.swapaxes(noise, 0, 1), (*noise.shape[:2], *rows.shape[2:]))
-    L = triangularise_rows(jnp.concatenate([rows, noise_rows]))
-    return L if less is None else downdate_factor(L, less)
-
-
-def _compute_innovation(
-    y: Point, predicted: Point, sensor: Sensor
-) -> tuple[Float[Array, "m *s"], Bool[Array, "m *s"], Float[Array, "*s"]]:
-    """Measurement less its prediction, mask of components not missing, and largest measurement."""
-    # Differences are taken in the sensor's own space: two angles of nearly a turn apart are close, and
-    # two quaternions of opposite sign are one attitude.
-    y = as_reading(sensor.space, y)
-    error = sensor.space.difference(y, predicted)
-    # an infinite angle has no difference, and would pass for a missing one
-    error = jnp.where(jnp.any(jnp.isinf(y), axis=0)[None], jnp.inf, error)
-    # a NaN of the prediction does not pass for a missing measurement: the rows contain it too
-    present = ~jnp.isnan(error)
-    size = jnp.max(jnp.where(jnp.isnan(y), 0.0, jnp.abs(y)), axis=0)
-    return jnp.where(present, error, 0.0), present, size
-
-
-def _mask_missing(rows: Array, noise: Array, present: Array) -> tuple[Array, Array]:
-    """Rows of the measurement and of its noise, with missing components replaced."""
-    noise = insert_axes(noise, rows.ndim, 2)
-    unit = jnp.eye(noise.shape[0], dtype=noise.dtype)
-    unit = unit.reshape(*unit.shape, *(1,) * (rows.ndim - 2))
-    absent = jnp.where(present, 0.0, 1.0)
-    # Unit noise in the place of an absent component keeps the innovation's covariance regular and adds
-    # exactly zero to the log-likelihood's quadratic form.
-    parts = [jnp.swapaxes(noise, 0, 1) * present[None], unit * absent[None]]
-    return rows * present[None], jnp.concatenate(parts).astype(rows.dtype)
 
 
 def _scalar_by_scalar(
@@ -464,14 +436,9 @@ def kalman_filter(
 
 
 def _read_steps(
-    model: StateSpaceModel,
-    prior: Gaussian,
-    y: Array,
-    u: Inputs,
-    dt: Any,
-    t: Any,
+    model: StateSpaceModel, prior: Gaussian, y: Array, u: Inputs, dt: Any, t: Any,
     method: AbstractFilter,
-) -> Float[Array, " T"]:
+) -> Float[Array, " T"]:  # fmt: skip
     """Lengths of the steps of a record that fits model, prior and rule; refused as in `kalman_filter`."""
     check_prior(model, prior, method.rule)
     check_record(model, prior, y, u)
@@ -497,9 +464,7 @@ def compiled_once(function: Callable[..., Any]) -> Callable[..., Any]:
     return call_program
 
 
-@cache
-def _compile_program(function: Callable[..., Any]) -> Callable[..., Any]:
-    return outer_jit(function)
+_compile_program = cache(outer_jit)
 
 
 def _run_filter(
@@ -507,7 +472,7 @@ def _run_filter(
     prior: Gaussian,
     y: Array,
     u: Inputs,
-    steps: Float[Array, " T"],
+    steps: Array,
     method: AbstractFilter,
 ) -> tuple[Gaussian, Innovation, Bool[Array, "T *s"]]:
     """Estimates, innovations and flags of success after each step, for parts that fit."""
@@ -620,14 +585,9 @@ def filter_bank(
 
 
 def _in_groups(
-    model: StateSpaceModel,
-    priors: Gaussian,
-    y: Array,
-    u: Inputs,
-    steps: Array,
-    method: AbstractFilter,
-    group: int,
-) -> tuple[Gaussian, Innovation, Bool[Array, "T s"]]:
+    model: StateSpaceModel, priors: Gaussian, y: Array, u: Inputs, steps: Array,
+    method: AbstractFilter, group: int,
+) -> tuple[Gaussian, Innovation, Bool[Array, "T s"]]:  # fmt: skip
     """Run the bank, one group after the other."""
     count = y.shape[2]
     has_lanes = jax.tree.map(lambda a: jnp.ndim(a) == 3, u)

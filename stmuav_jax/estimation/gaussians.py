@@ -50,42 +50,30 @@ def triangularise_rows(rows: Float[Array, "r k *s"]) -> Root:
         # rows^T rows would.
         R = lapack.upper_factor(rows)
         return (jnp.where(jnp.diagonal(R) < 0, -1.0, 1.0)[:, None].astype(R.dtype) * R).T
-    return _assemble_triangle(_gram_schmidt(rows))
-
-
-def _gram_schmidt(rows: Float[Array, "r k *s"]) -> list[Float[Array, "_ *s"]]:
-    """Columns of L, from the diagonal down, by modified Gram-Schmidt.
-
-    Every pair of columns is one pass over numbers that stay in registers, which takes half the
-    time of updating all later columns at once.
-    """
     # Modified Gram-Schmidt, written out: for a bank each operation is one kernel over all its filters,
-    # while LAPACK would be called once for each.
-    columns_left = [rows[:, j] for j in range(rows.shape[1])]
-    columns = []
-    while columns_left:
-        first, *columns_left = columns_left
+    # while LAPACK would be called once for each. Every pair of columns is one pass over numbers that stay
+    # in registers, which takes half the time of updating all later columns at once.
+    remaining, columns = [rows[:, j] for j in range(k)], []
+    while remaining:
+        first, *remaining = remaining
         square = jnp.sum(first * first, axis=0)
         # a direction without variance: its column of L is zero
         positive = square > 0
         inverse = jnp.where(positive, 1 / jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
         inverse = jnp.where(jnp.isnan(square), jnp.nan, inverse)
         unit = first * inverse[None]
-        projections = [jnp.sum(other * unit, axis=0) for other in columns_left]
-        columns_left = [
-            other - c[None] * unit for other, c in zip(columns_left, projections, strict=True)
-        ]
+        projections = [jnp.sum(other * unit, axis=0) for other in remaining]
+        pairs = zip(remaining, projections, strict=True)
+        remaining = [other - c[None] * unit for other, c in pairs]
         columns.append(jnp.stack([square * inverse, *projections]))
-    return columns
+    return _assemble_triangle(columns)
 
 
 def _assemble_triangle(columns: list[Float[Array, "_ *s"]]) -> Root:
     """Lower triangular matrix from its columns, each from the diagonal down."""
     k = len(columns)
-    padded = [
-        jnp.concatenate([jnp.zeros((j, *c.shape[1:]), c.dtype), c]) if j else c
-        for j, c in enumerate(columns)
-    ]
+    above = lambda c: jnp.zeros((k - len(c), *c.shape[1:]), c.dtype)
+    padded = [c if len(c) == k else jnp.concatenate([above(c), c]) for c in columns]
     return jnp.stack(padded, axis=1) if k else jnp.zeros((0, 0))
 
 
@@ -257,50 +245,34 @@ def covariance_root(covariance: Numbers, name: str) -> Float[Array, "n n *s"]:
         return factor_semidefinite(jnp.asarray(covariance))
     entries = np.asarray(covariance)
     P = entries.astype(float)
-    check_covariance(P, name, epsilon=_machine_epsilon(entries))
-    # eigenvectors, not Cholesky: zero variances are allowed (states without process noise)
-    values, vectors = np.linalg.eigh(np.moveaxis(P, (0, 1), (-2, -1)))
-    rows = np.sqrt(np.maximum(values, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
-    R = np.linalg.qr(rows, mode="r")
-    signs = np.where(np.diagonal(R, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
-    L = np.moveaxis(np.swapaxes(signs[..., :, None] * R, -1, -2), (-2, -1), (0, 1))
-    return jnp.asarray(np.ascontiguousarray(L), dtype=_number_kind(entries))
-
-
-def _number_kind(entries: np.ndarray) -> np.dtype:
-    """Precision of the given numbers; integers count as double."""
-    return entries.dtype if np.issubdtype(entries.dtype, np.floating) else np.dtype(float)
-
-
-def _machine_epsilon(entries: np.ndarray) -> float:
-    """Relative precision of the given numbers."""
-    return float(np.finfo(_number_kind(entries).type).eps)
-
-
-def check_covariance(P: np.ndarray, name: str, *, epsilon: float = 2.3e-16) -> None:
-    """Raise `ModelError` unless P (n, n, *s) is a covariance, apart from round-off.
-
-    Raises:
-        ModelError: not square, not finite, not symmetric, or with a negative eigenvalue.
-    """
+    # integers count as double
+    is_float = np.issubdtype(entries.dtype, np.floating)
+    dtype = entries.dtype if is_float else np.dtype(float)
     if P.ndim < 2 or P.shape[0] != P.shape[1]:
         raise ModelError(f"{name} must be a square matrix, but its shape is {P.shape}.")
     if not np.all(np.isfinite(P)):
         raise ModelError(f"{name} must be finite, but it is {P.tolist()}.")
     P = np.moveaxis(P, (0, 1), (-2, -1))
     scale = max(float(np.max(np.abs(P))), np.finfo(float).tiny)
+    round_off = _ROUND_OFF * float(np.finfo(dtype.type).eps) * scale
     asymmetry = np.abs(P - np.swapaxes(P, -1, -2))
-    if np.max(asymmetry) > _ROUND_OFF * epsilon * scale:
-        i, j = np.unravel_index(
-            int(np.argmax(asymmetry.reshape(-1, *P.shape[-2:]).max(0))), P.shape[-2:]
-        )
+    if np.max(asymmetry) > round_off:
+        largest = asymmetry.reshape(-1, *P.shape[-2:]).max(0)
+        i, j = np.unravel_index(int(np.argmax(largest)), P.shape[-2:])
         raise ModelError(
             f"{name} must be symmetric, but entries ({i}, {j}) and ({j}, {i}) differ by "
             f"{np.max(asymmetry):.3g}."
         )
     least = np.linalg.eigvalsh((P + np.swapaxes(P, -1, -2)) / 2)
-    if np.min(least) < -_ROUND_OFF * epsilon * scale:
+    if np.min(least) < -round_off:
         raise ModelError(
             f"{name} must be positive semi-definite, but its smallest eigenvalue is "
             f"{np.min(least):.4g} (largest {np.max(least):.4g})."
         )
+    # eigenvectors, not Cholesky: zero variances are allowed (states without process noise)
+    values, vectors = np.linalg.eigh(P)
+    rows = np.sqrt(np.maximum(values, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
+    R = np.linalg.qr(rows, mode="r")
+    signs = np.where(np.diagonal(R, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    L = np.moveaxis(np.swapaxes(signs[..., :, None] * R, -1, -2), (-2, -1), (0, 1))
+    return jnp.asarray(np.ascontiguousarray(L), dtype=dtype)

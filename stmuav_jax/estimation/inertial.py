@@ -68,12 +68,9 @@ def _turn_matrix(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def strapdown(
-    x: Point,
-    turning: Float[Array, "3"],
-    force: Float[Array, "3"],
-    gravity: Float[Array, "3"],
+    x: Point, turning: Float[Array, "3"], force: Float[Array, "3"], gravity: Float[Array, "3"],
     h: Float[Array, ""],
-) -> tuple[Point, Float[Array, "15 15"]]:
+) -> tuple[Point, Float[Array, "15 15"]]:  # fmt: skip
     """Motion of a base over a step h [s] by readings of gyroscope and accelerometer.
 
     Returns:
@@ -90,16 +87,14 @@ def strapdown(
     back = rotation_matrix(half).T
     by_attitude = -R @ skew(felt) @ back
     unit, none = jnp.eye(3), jnp.zeros((3, 3))
-    errors = jnp.block(
-        [
-            [back @ back, none, none, -h * unit, none],
-            [h**2 / 2 * by_attitude, unit, h * unit, none, -(h**2) / 2 * R],
-            [h * by_attitude, none, unit, none, -h * R],
-            [none, none, none, unit, none],
-            [none, none, none, none, unit],
-        ]
-    )
-    return next_point, errors
+    errors = [
+        [back @ back, none, none, -h * unit, none],
+        [h**2 / 2 * by_attitude, unit, h * unit, none, -(h**2) / 2 * R],
+        [h * by_attitude, none, unit, none, -h * R],
+        [none, none, none, unit, none],
+        [none, none, none, none, unit],
+    ]
+    return next_point, jnp.block(errors)
 
 
 def predict_base(
@@ -129,13 +124,9 @@ def predict_base(
 
 
 def update_sequentially(
-    P: Float[Array, "n n"],
-    H: Float[Array, "m n"],
-    variance: Float[Array, " m"],
-    error: Float[Array, " m"],
-    fresh: Bool[Array, " m"],
-    move: Float[Array, " n"] | None = None,
-) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
+    P: Float[Array, "n n"], H: Float[Array, "m n"], variance: Float[Array, " m"],
+    error: Float[Array, " m"], fresh: Bool[Array, " m"], move: Float[Array, " n"] | None = None,
+) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:  # fmt: skip
     """Move of the mean, covariance and NIS after the fresh components, one after the other.
 
     Args:
@@ -176,14 +167,10 @@ class Gated(NamedTuple):
 
 
 def update_with_gate(
-    P: Float[Array, "n n"],
-    H: Sequence[Float[Array, "_ n"]],
-    variance: Sequence[Float[Array, " _"]],
-    error: Sequence[Float[Array, " _"]],
-    fresh: Bool[Array, " f"],
-    limits: Sequence[Float[Array, ""]],
+    P: Float[Array, "n n"], H: Sequence[Float[Array, "_ n"]], variance: Sequence[Float[Array, " _"]],
+    error: Sequence[Float[Array, " _"]], fresh: Bool[Array, " f"], limits: Sequence[Float[Array, ""]],
     streak: Int[Array, " f"],
-) -> Gated:
+) -> Gated:  # fmt: skip
     """Update by f readings, one after the other, each of which a gate may leave out.
 
     The innovation of a reading given those before has a squared Mahalanobis distance that is chi-squared;
@@ -192,20 +179,14 @@ def update_with_gate(
     """
     move, nis, count = jnp.zeros(P.shape[0]), jnp.zeros(()), jnp.zeros(())
     gated, streaks = [], []
-    for k, reading in enumerate(zip(H, variance, error, limits, strict=True)):
-        rows, noise, position_error, limit = reading
+    for k, (rows, noise, nu, limit) in enumerate(zip(H, variance, error, limits, strict=True)):
         new = jnp.broadcast_to(fresh[k], noise.shape)
-        move_after, P_after, distance = update_sequentially(
-            P, rows, noise, position_error, new, move
-        )
+        move_after, P_after, distance = update_sequentially(P, rows, noise, nu, new, move)
         # A distance of NaN counts as beyond the gate, hence the negated comparison.
         beyond = fresh[k] & ~(distance <= limit)
         refused = beyond & (streak[k] < MOST_GATED)
         streaks.append(jnp.where(fresh[k], jnp.where(beyond, streak[k] + 1, 0), streak[k]))
-        move, P = (
-            jnp.where(refused, old, new_value)
-            for old, new_value in ((move, move_after), (P, P_after))
-        )
+        move, P = jnp.where(refused, move, move_after), jnp.where(refused, P, P_after)
         nis = nis + jnp.where(refused, 0.0, distance)
         count = count + jnp.where(fresh[k] & ~refused, 1.0 * len(noise), 0.0)
         gated.append(refused)
@@ -235,19 +216,11 @@ def fix_rows(
 
 
 def update_by_fixes(
-    belief: Belief,
-    turning: Float[Array, "3"],
-    force: Float[Array, "3"],
-    gravity: Float[Array, "3"],
-    arm: Float[Array, "3"],
-    late: Float[Array, "2"],
-    variance: Float[Array, "6"],
-    limit: Float[Array, ""],
-    position: Float[Array, "3"],
-    attitude: Float[Array, "4"],
-    fresh: Bool[Array, "2"],
-    streak: Int[Array, "2"],
-) -> tuple[Belief, Gated]:
+    belief: Belief, turning: Float[Array, "3"], force: Float[Array, "3"], gravity: Float[Array, "3"],
+    arm: Float[Array, "3"], late: Float[Array, "2"], variance: Float[Array, "6"],
+    limit: Float[Array, ""], position: Float[Array, "3"], attitude: Float[Array, "4"],
+    fresh: Bool[Array, "2"], streak: Int[Array, "2"],
+) -> tuple[Belief, Gated]:  # fmt: skip
     """Belief after a position and an attitude fix, and what the gate did.
 
     Args:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..checks.errors import ModelError, SettingError
+from ..checks.errors import ModelError
 from ..checks.shapes import Numbers
 from ..math.space import AbstractSpace, Point, Vector
 from .gaussians import covariance_root
@@ -174,31 +174,13 @@ Step = Callable[[Float[Array, "n *s"], Any, Any], Float[Array, "n *s"]]
 _STAGES = ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0))
 
 
-class EulerStep(eqx.Module):
-    """Step of Euler's method; see `euler`."""
-
-    rates: Rates
-
-    def __call__(self, x: Array, u: Any, dt: Any) -> Array:
-        return x + dt * self.rates(x, u)
-
-
-class RungeKuttaStep(eqx.Module):
-    """Step of the classical fourth-order Runge-Kutta method; see `rk4`."""
-
-    rates: Rates
-    substeps: int = eqx.field(static=True)
-
-    def __call__(self, x: Array, u: Any, dt: Any) -> Array:
-        h = dt / self.substeps
-        for _ in range(self.substeps):
-            x = rk4_step(lambda x, _: self.rates(x, u), x, h)
-        return x
+def _step_euler(rates: Rates, x: Array, u: Any, dt: Any) -> Array:
+    return x + dt * rates(x, u)
 
 
 def euler(rates: Rates) -> Step:
     """Step x + dt rates(x, u) of Euler's method."""
-    return EulerStep(rates)
+    return eqx.Partial(_step_euler, rates)
 
 
 def rk4_step(
@@ -231,12 +213,10 @@ def rk4_step(
     return x + h / 6 * carry[1]
 
 
-def rk4(rates: Rates, substeps: int = 1) -> Step:
-    """Step of the classical fourth-order Runge-Kutta method, with inputs held over the step.
+def _step_runge_kutta(rates: Rates, x: Array, u: Any, dt: Any) -> Array:
+    return rk4_step(lambda x, _: rates(x, u), x, dt)
 
-    Raises:
-        SettingError: `substeps` is less than one.
-    """
-    if substeps < 1:
-        raise SettingError(f"rk4 needs at least one substep, not {substeps}.")
-    return RungeKuttaStep(rates, substeps)
+
+def rk4(rates: Rates) -> Step:
+    """Step of the classical fourth-order Runge-Kutta method, with inputs held over the step."""
+    return eqx.Partial(_step_runge_kutta, rates)

@@ -1,9 +1,9 @@
 """Observability of the state by measurements along a path, with an explanation.
 
 The rows of the observability matrix are the derivatives of the measurements, in units of their
-noise, with respect to the error of the first state, in units of the scales L_0 if these are given:
+noise, with respect to the error of the first state:
 
-    O = [R^-1/2 H_0; R^-1/2 H_1 F_1; R^-1/2 H_2 F_2 F_1; ...] L_0
+    O = [R^-1/2 H_0; R^-1/2 H_1 F_1; R^-1/2 H_2 F_2 F_1; ...]
 
 A direction v with O v = 0 changes no measurement, so no filter can estimate it.
 """
@@ -32,61 +32,48 @@ class Observability(NamedTuple):
     Attributes:
         singular_values: singular values (n,), in descending order.
         rank: number of singular values above the tolerance.
-        null_space: orthonormal basis of the scaled unobservable directions (n, n - rank).
+        null_space: orthonormal basis of the unobservable directions (n, n - rank).
         names: names of the state's error components.
-        scale: numbers by which these components were divided (n,).
     """
 
     singular_values: np.ndarray
     rank: int
     null_space: np.ndarray
     names: tuple[str, ...]
-    scale: np.ndarray
 
     def describe(self) -> str:
         """Sentences on the rank, the unobservable states and their unobservable combinations."""
-        n = len(self.names)
+        n, null = len(self.names), self.null_space
         if self.rank == n:
             return f"All {n} states are observable."
-        alone, combined = _separate_states(self.null_space)
         lines = [f"{self.rank} of {n} directions are observable."]
+        # Share of a state's axis in the null space, whose basis is orthonormal: 1 if it lies within.
+        alone = [i for i in range(n) if np.sum(null[i] ** 2) > 1 - 1e-6]
         if alone:
             listed = ", ".join(self.names[i] for i in alone)
             lines.append(f"Not observable at all: {listed}.")
-        for direction in combined.T:
-            lines.append(f"Not observable together: {self._format_sum(direction * self.scale)}.")
+        rest = null.copy()
+        rest[alone] = 0.0
+        directions, values, _ = np.linalg.svd(rest, full_matrices=False)
+        basis = directions[:, values > 1e-6]
+        # reduced echelon form: each direction has a component that the others do not have
+        for k in range(basis.shape[1]):
+            i, j = np.unravel_index(np.argmax(np.abs(basis[:, k:])), basis[:, k:].shape)
+            basis[:, [k, k + int(j)]] = basis[:, [k + int(j), k]]
+            basis[:, k] /= basis[i, k]
+            for other in range(basis.shape[1]):
+                if other != k:
+                    basis[:, other] -= basis[i, other] * basis[:, k]
+        for v in basis.T:
+            # A direction has neither length nor sign; the largest component is made one.
+            v = v / v[np.argmax(np.abs(v))]
+            parts = [
+                f"{'-' if c < 0 else '+'} {'' if abs(abs(c) - 1) < 1e-9 else f'{abs(c):.3g} '}{self.names[i]}"
+                for i, c in enumerate(v)
+                if abs(c) > _NAMED
+            ]
+            lines.append(f"Not observable together: {' '.join(parts).removeprefix('+ ')}.")
         return " ".join(lines)
-
-    def _format_sum(self, v: np.ndarray) -> str:
-        """Text of a direction as a sum of states, scaled to a largest component of one."""
-        # A direction has neither length nor sign; the largest component is made one.
-        v = v / v[np.argmax(np.abs(v))]
-        parts = [
-            f"{'-' if c < 0 else '+'} {'' if abs(abs(c) - 1) < 1e-9 else f'{abs(c):.3g} '}{self.names[i]}"
-            for i, c in enumerate(v)
-            if abs(c) > _NAMED
-        ]
-        return " ".join(parts).removeprefix("+ ")
-
-
-def _separate_states(null: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """States that are unobservable by themselves, and a reduced basis of the other directions."""
-    # Share of a state's axis in the null space, whose basis is orthonormal: 1 if it lies within.
-    inside = np.sum(null**2, axis=1)
-    alone = [i for i in range(len(null)) if inside[i] > 1 - 1e-6]
-    rest = null.copy()
-    rest[alone] = 0.0
-    directions, values, _ = np.linalg.svd(rest, full_matrices=False)
-    basis = directions[:, values > 1e-6]
-    # reduced echelon form: each direction has a component that the others do not have
-    for k in range(basis.shape[1]):
-        i, j = np.unravel_index(np.argmax(np.abs(basis[:, k:])), basis[:, k:].shape)
-        basis[:, [k, k + int(j)]] = basis[:, [k + int(j), k]]
-        basis[:, k] /= basis[i, k]
-        for other in range(basis.shape[1]):
-            if other != k:
-                basis[:, other] -= basis[i, other] * basis[:, k]
-    return alone, basis
 
 
 def observability_matrix(
@@ -131,15 +118,12 @@ def observability(
     u: Inputs = None,
     dt: Any,
     count: int,
-    scale: Any = None,
     tolerance: float = 1e-9,
 ) -> Observability:
     """Rank, singular values and null directions of the observability matrix along a path.
 
     Args:
         start, u, dt, count: as in `observability_matrix`.
-        scale: size of a notable error of each component (n,), so that the result does not depend
-            on units; ones by default.
         tolerance: fraction of the largest singular value below which others count as zero.
     """
     if isinstance(start, list | tuple) and not hasattr(start, "_fields"):
@@ -157,9 +141,6 @@ def observability(
     rows = compiled_once(observability_matrix)(
         model, start, u, jnp.asarray(dt, model.noise.dtype), count
     )
-    n = rows.shape[1]
-    size = np.ones(n) if scale is None else np.asarray(scale, dtype=float)
-    # In units of the scale, or else a change of units would change the rank.
-    _, values, right = np.linalg.svd(np.asarray(rows) * size, full_matrices=True)
+    _, values, right = np.linalg.svd(np.asarray(rows), full_matrices=True)
     rank = int(np.sum(values > tolerance * max(values[0], np.finfo(float).tiny)))
-    return Observability(values, rank, right[rank:].T, model.names, size)
+    return Observability(values, rank, right[rank:].T, model.names)

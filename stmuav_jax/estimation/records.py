@@ -49,9 +49,22 @@ def as_numbers(values: Any, subject: str) -> Array | np.ndarray:
         return array
     if array.dtype.kind in "iub":
         return array.astype(float)
-    numbers = np.empty(array.shape)
+    numbers = np.full(array.shape, np.nan)
     for index in np.ndindex(array.shape):
-        numbers[index] = _read_number(array[index], index, subject)
+        value = array[index]
+        if value is None or type(value).__name__ == "NAType":
+            continue
+        try:
+            if np.asarray(value).dtype.kind in "USmMc" or hasattr(value, "year"):
+                raise TypeError
+            numbers[index] = float(value)
+        except (TypeError, ValueError):
+            is_text = isinstance(value, str | bytes)
+            hint = " pandas.read_csv(..., decimal=',') reads decimal commas." if is_text else ""
+            place, entry = index[0] if len(index) == 1 else index, str(value) if is_text else value
+            raise ModelError(
+                f"{subject} must be numbers, but entry {place} is {entry!r}.{hint}"
+            ) from None
     return numbers
 
 
@@ -59,30 +72,12 @@ def _without_masks(values: Any) -> Any:
     """Array or nested list with NaN in the place of masked entries."""
     if isinstance(values, np.ma.MaskedArray):
         mask = np.ma.getmaskarray(values)
-        return (
-            np.where(mask, np.nan, np.where(mask, 0, values.data)) if np.any(mask) else values.data
-        )
+        if not np.any(mask):
+            return values.data
+        return np.where(mask, np.nan, np.where(mask, 0, values.data))
     if isinstance(values, list | tuple):
         return [_without_masks(part) for part in values]
     return values
-
-
-def _read_number(value: Any, index: tuple[int, ...], subject: str) -> float:
-    """Number of one entry of an array of objects, NaN for None and pandas' NA."""
-    if value is None or type(value).__name__ == "NAType":
-        return np.nan
-    if np.asarray(value).dtype.kind not in "USmMc" and not hasattr(value, "year"):
-        try:
-            return float(value)
-        except (TypeError, ValueError):
-            pass
-    text = isinstance(value, str | bytes)
-    hint = " pandas.read_csv(..., decimal=',') reads decimal commas." if text else ""
-    place, entry_text = (
-        index[0] if len(index) == 1 else index,
-        repr(str(value)) if text else repr(value),
-    )
-    raise ModelError(f"{subject} must be numbers, but entry {place} is {entry_text}.{hint}")
 
 
 def read_measurements(y: Any, dtype: Any) -> Array:
@@ -190,7 +185,25 @@ def step_lengths(dt: Any, t: Any, count: int, dtype: Any) -> Float[Array, " T"]:
         # checks them step by step.
         if not isinstance(times, np.ndarray):
             return jnp.diff(times).astype(dtype)
-        return jnp.asarray(_time_differences(times), dtype=dtype)
+        _check_finite(times, "The times")
+        steps = np.diff(times.astype(float))
+        if np.any(steps < 0):
+            k = int(np.argmax(steps < 0))
+            raise SettingError(
+                f"The times of a record must not decrease, but after t = {times[k]:g} s comes "
+                f"{times[k + 1]:g} s (number {k + 1})."
+            )
+        # Unix times in single precision resolve 128 s: their differences would be zero or 128 s, without any
+        # sign of it in the estimates.
+        resolution = float(np.spacing(np.max(np.abs(times))))
+        mean = float(np.mean(steps))
+        if resolution > (_RESOLUTION * mean if mean > 0 else _RESOLUTION):
+            raise SettingError(
+                f"The times' precision ({times.dtype}) is too coarse: at t = {np.max(times):.10g} s they "
+                f"resolve {resolution:.3g} s, and the mean step is {mean:.3g} s. Give them in double "
+                "precision (NumPy), or from the start of the record."
+            )
+        return jnp.asarray(steps, dtype=dtype)
     steps = as_seconds(dt, "dt") if has_values(dt) else jnp.asarray(dt)
     if steps.shape not in ((), (count,)):
         raise SettingError(f"dt must be a number or have shape ({count},), not {steps.shape}.")
@@ -244,29 +257,6 @@ def _check_finite(times: np.ndarray, subject: str) -> None:
             f"{subject} must be finite, but number {bad[0]} is {times[bad[0]]:g} ({bad.size} of {times.size} "
             "are not finite)."
         )
-
-
-def _time_differences(times: np.ndarray) -> np.ndarray:
-    """Steps between times, in double precision, refused as in `step_lengths`."""
-    _check_finite(times, "The times")
-    steps = np.diff(times.astype(float))
-    if np.any(steps < 0):
-        k = int(np.argmax(steps < 0))
-        raise SettingError(
-            f"The times of a record must not decrease, but after t = {times[k]:g} s comes "
-            f"{times[k + 1]:g} s (number {k + 1})."
-        )
-    # Unix times in single precision resolve 128 s: their differences would be zero or 128 s, without any
-    # sign of it in the estimates.
-    resolution = float(np.spacing(np.max(np.abs(times))))
-    mean = float(np.mean(steps))
-    if resolution > (_RESOLUTION * mean if mean > 0 else _RESOLUTION):
-        raise SettingError(
-            f"The times' precision ({times.dtype}) is too coarse: at t = {np.max(times):.10g} s they "
-            f"resolve {resolution:.3g} s, and the mean step is {mean:.3g} s. Give them in double "
-            "precision (NumPy), or from the start of the record."
-        )
-    return steps
 
 
 def check_steps(model: StateSpaceModel, steps: Any) -> None:
@@ -338,11 +328,8 @@ def check_record(model: StateSpaceModel, prior: Gaussian, y: Array, u: Inputs) -
     check_measurement(model, y.shape[1:])
     for leaf in jax.tree.leaves(u):
         input_shape = jnp.shape(leaf)
-        if (
-            len(input_shape) < 2
-            or input_shape[0] != y.shape[0]
-            or input_shape[2:] not in ((), lanes)
-        ):
+        is_long = len(input_shape) > 1 and input_shape[0] == y.shape[0]
+        if not is_long or input_shape[2:] not in ((), lanes):
             bank = f" or (T, k, {', '.join(map(str, lanes))})" if lanes else ""
             raise ModelError(
                 f"Inputs must have shape (T, k){bank} with T = {y.shape[0]} as the measurements, "

@@ -85,9 +85,8 @@ class AbstractRule(eqx.Module):
     ) -> Transformed:
         """Gaussian of function(x) for x from `prior`; the function takes stacks of points."""
 
-    @abstractmethod
     def check(self, n: int, dtype: jnp.dtype) -> None:
-        """Raise `SettingError` if the rule cannot be used in n dimensions and this precision."""
+        """Raise `SettingError` if the rule cannot be used in n dimensions and this precision; most can."""
 
 
 class AbstractPointRule(AbstractRule):
@@ -106,8 +105,25 @@ class AbstractPointRule(AbstractRule):
     def transform(
         self, function: Function, prior: Gaussian, source: AbstractSpace, target: AbstractSpace
     ) -> Transformed:
-        points = self.points(prior.factor.shape[0])
-        return _by_points(points, function, prior, source, target, means=self.means)
+        L = prior.factor
+        points = self.points(L.shape[0])
+        directions, weights, _ = points
+        n, q = L.shape[0], len(weights)
+        # Points along the columns of L need no product with a matrix of directions.
+        axial = q == n
+        if axial:
+            steps = L * float(directions[0, 0])
+        else:
+            D = jnp.asarray(directions.T, L.dtype).reshape(1, n, q, *(1,) * (L.ndim - 2))
+            steps = jnp.sum(L[:, :, None] * D, axis=1)
+        scale = _reduction_factor(function, prior, steps, source, target)
+        reduced = steps if scale is None else steps * scale
+        # All points go through the function in one call: a simulator compiles once for the stack.
+        moves = jnp.concatenate([jnp.zeros_like(L[:, :1]), reduced, -reduced], axis=1)
+        images = function(source.retract(expand_axis(prior.mean), moves))
+        mean, rows, less = _image_moments(images, points, target, self.means, scale)
+        inputs = L if axial else steps * _align_weights(np.sqrt(2 * weights), steps)
+        return Transformed(mean, rows, less, jnp.swapaxes(inputs, 0, 1), axial)
 
 
 class Unscented(AbstractPointRule):
@@ -147,9 +163,6 @@ class Cubature(AbstractPointRule):
 
     def points(self, n: int) -> Points:
         return Points(math.sqrt(n) * np.eye(n), np.full(n, 0.5 / n), 0.0)
-
-    def check(self, n: int, dtype: jnp.dtype) -> None:
-        """Accept every n and every precision."""
 
 
 class Cubature5(AbstractPointRule):
@@ -199,41 +212,6 @@ class Linearised(AbstractRule):
         rows = jax.vmap(derivative, in_axes=1)(prior.factor)
         return Transformed(centre, rows, None, jnp.swapaxes(prior.factor, 0, 1), True)
 
-    def check(self, n: int, dtype: jnp.dtype) -> None:
-        """Accept every n and every precision."""
-
-
-def _by_points(
-    points: Points,
-    function: Function,
-    prior: Gaussian,
-    source: AbstractSpace,
-    target: AbstractSpace,
-    *,
-    means: int,
-) -> Transformed:
-    """Transform a Gaussian by the function's values at sigma points."""
-    directions, weights, _ = points
-    L = prior.factor
-    n, q = L.shape[0], len(weights)
-    # Points along the columns of L need no product with a matrix of directions.
-    axial = q == n
-    lanes = (1,) * (L.ndim - 2)
-    if axial:
-        steps = L * float(directions[0, 0])
-    else:
-        D = jnp.asarray(directions.T, L.dtype).reshape(1, n, q, *lanes)
-        steps = jnp.sum(L[:, :, None] * D, axis=1)
-    scale = _reduction_factor(function, prior, steps, source, target)
-    reduced = steps if scale is None else steps * scale
-    # All points go through the function in one call: a simulator compiles once for the stack.
-    moves = jnp.concatenate([jnp.zeros_like(L[:, :1]), reduced, -reduced], axis=1)
-    images = function(source.retract(expand_axis(prior.mean), moves))
-    mean, rows, less = _image_moments(images, points, target, means, scale)
-    weight = np.sqrt(2 * weights)
-    inputs = jnp.swapaxes(L if axial else steps * _align_weights(weight, steps), 0, 1)
-    return Transformed(mean, rows, less, inputs, axial)
-
 
 def _reduction_factor(
     function: Function, prior: Gaussian, steps: Array, source: AbstractSpace, target: AbstractSpace
@@ -268,11 +246,7 @@ def _align_weights(values: np.ndarray, like: Array) -> Array:
 
 
 def _image_moments(
-    images: Point,
-    points: Points,
-    target: AbstractSpace,
-    means: int,
-    scale: Float[Array, "*s"] | None,
+    images: Point, points: Points, target: AbstractSpace, means: int, scale: Array | None
 ) -> tuple[Point, Array, Array | None]:
     """Mean, rows and subtracted square of the images (m, 1 + 2 q, *s).
 
@@ -284,7 +258,19 @@ def _image_moments(
     # Deviations are taken from the image of the centre, so that large values of a state cancel before
     # they are squared and weights of -95 multiply small numbers only.
     reference = jax.tree.map(lambda leaf: leaf[:, 0], images)
-    odd, even, delta, centre = _split_images(images, reference, weights, target, inverse)
+
+    def split(reference: Point) -> tuple[Array, Array, Array, Array]:
+        """Odd and even parts o_j, e_j (m, q, *s), delta, and the central error from a reference."""
+        q = len(weights)
+        a = target.difference(images, expand_axis(reference))
+        centre = a[:, :1]
+        plus, minus = a[:, 1 : q + 1] - centre, a[:, q + 1 :] - centre
+        odd, even = 0.5 * (plus - minus), 0.5 * (plus + minus)
+        weighted = even * _align_weights(2 * weights, even) * inverse**2
+        delta = jnp.sum(jnp.swapaxes(weighted, 0, 1), axis=0)
+        return odd, even, delta, centre[:, 0]
+
+    odd, even, delta, centre = split(reference)
     if target.is_flat:
         # the centre is the reference, and one round is exact
         reference = target.retract(reference, delta)
@@ -293,7 +279,7 @@ def _image_moments(
         # fixed point leave an error of the order of the deviations to the power of seven.
         for _ in range(means):
             reference = target.retract(reference, delta + centre)
-            odd, even, delta, centre = _split_images(images, reference, weights, target, inverse)
+            odd, even, delta, centre = split(reference)
     total = float(np.sum(2 * weights))
     weight = _align_weights(np.sqrt(2 * weights), odd) * inverse
     mean_even = delta[:, None] / (total * inverse**2)
@@ -307,21 +293,3 @@ def _image_moments(
     elif factor < -1e-14:
         less = delta * math.sqrt(-factor)
     return reference, jnp.swapaxes(jnp.concatenate(parts, axis=1), 0, 1), less
-
-
-def _split_images(
-    images: Point,
-    reference: Point,
-    weights: np.ndarray,
-    target: AbstractSpace,
-    inverse: Float[Array, "*s"] | float,
-) -> tuple[Array, Array, Array, Array]:
-    """Odd and even parts o_j, e_j (m, q, *s), delta, and the central error from a reference."""
-    q = len(weights)
-    a = target.difference(images, expand_axis(reference))
-    centre = a[:, :1]
-    plus, minus = a[:, 1 : q + 1] - centre, a[:, q + 1 :] - centre
-    odd, even = 0.5 * (plus - minus), 0.5 * (plus + minus)
-    weighted = even * _align_weights(2 * weights, even) * inverse**2
-    delta = jnp.sum(jnp.swapaxes(weighted, 0, 1), axis=0)
-    return odd, even, delta, centre[:, 0]

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from stmuav_jax.checks.errors import SettingError
 from stmuav_jax.estimation.consistency import (
     inconsistent,
 )
@@ -83,8 +82,6 @@ def test_orders_of_the_steps():
                 x = step(rate)(x, None, 1.0 / n)
             errors.append(abs(float(x[0]) - 0.5))
         assert abs(np.log2(errors[0] / errors[1]) - order) < 0.3
-    with pytest.raises(SettingError):
-        rk4(rate, 0)
 
 
 def test_what_can_be_observed():

@@ -1,1 +1,0 @@
-"""Commands on any mechanism: a scene by name, or a file with a model."""
