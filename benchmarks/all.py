@@ -34,8 +34,6 @@ BENCHMARKS: dict[str, tuple[str, ...]] = {
     **{f"suite_{name}": ("suite.py", "--only", name) for name in SUITE},
     **{name: (f"{name}.py",) for name in SCRIPTS},
 }
-# Results that no script measures any more: no page has their numbers, and their commits have the scripts.
-KEPT = {"suite_acceleration", "suite_scenes"}
 # Parts of a result that no script measures any more: their question is settled, and they stay as
 # they were measured (docs/validation.md names the commits of their scripts).
 FINISHED = {

@@ -55,8 +55,8 @@ Several = Annotated[tuple[Finite, ...], Tuples]
 Triples = Annotated[tuple[Triple, ...], Tuples]
 
 
-def _shape_type(kinds: Any, requirement: str) -> Any:
-    """Type of a value of one of some shapes, with its schema for editors; a message says what it must be."""
+def _shape_check(kinds: Any, requirement: str) -> AfterValidator:
+    """Check that a value is of one of some shapes; a message says what it must be."""
     # The error of a union lists why each of its shapes does not fit; one sentence on what would fit
     # is what the user needs.
     shape = pydantic.TypeAdapter(kinds)
@@ -67,14 +67,23 @@ def _shape_type(kinds: Any, requirement: str) -> Any:
         except pydantic.ValidationError:
             raise ValueError(f"must be {requirement}, but it is {format_value(value)}.") from None
 
-    schema = pydantic.WithJsonSchema(shape.json_schema())
-    return Annotated[Any, AfterValidator(check_shapes), schema]
+    return AfterValidator(check_shapes)
 
 
-Inertia = _shape_type(Triple | Rows, "three moments or three rows of three numbers")
-Value = _shape_type(Finite | Several | Triples, "finite numbers")
+def _shape_schema(kinds: Any) -> pydantic.WithJsonSchema:
+    """Schema for editors of values of one of some shapes."""
+    return pydantic.WithJsonSchema(pydantic.TypeAdapter(kinds).json_schema())
+
+
+_INERTIA, _VALUE, _SIZE = Triple | Rows, Finite | Several | Triples, Finite | Several
+Inertia = Annotated[
+    Any,
+    _shape_check(_INERTIA, "three moments or three rows of three numbers"),
+    _shape_schema(_INERTIA),
+]
+Value = Annotated[Any, _shape_check(_VALUE, "finite numbers"), _shape_schema(_VALUE)]
 # One number, or one for each component.
-Size = _shape_type(Finite | Several, "a number or a list of numbers")
+Size = Annotated[Any, _shape_check(_SIZE, "a number or a list of numbers"), _shape_schema(_SIZE)]
 
 
 def _check_format(value: int) -> int:

@@ -390,7 +390,7 @@ def _make_instruments(
     names = ("gyroscope", "accelerometer", "position", "attitude")
     kinds: dict[str, list[Any]] = {name: [SENSORS[name](body)] for name in names}
     joints = SLIDER_JOINTS if machine.bodies is not None else ()
-    joints = joints if chain is None else chain.joints
+    joints = joints if chain is None else chain.encoders
     kinds["encoders"] = [SENSORS["encoder"](joint) for joint in joints]
     if not joints and any(fault.sensor == "encoders" for fault in faults):
         raise SettingError("A fault of encoders needs a machine with joints.")

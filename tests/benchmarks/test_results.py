@@ -10,7 +10,7 @@ from shared import record
 
 def test_every_result_belongs_to_a_benchmark_that_all_runs():
     stored = {path.stem for path in record.RESULTS.glob("*.json")}
-    assert stored == set(everything.BENCHMARKS) | everything.KEPT
+    assert stored == set(everything.BENCHMARKS)
     scripts = {everything.FOLDER / script for script, *_ in everything.BENCHMARKS.values()}
     assert all(script.exists() for script in scripts)
 

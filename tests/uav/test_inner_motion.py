@@ -16,8 +16,8 @@ def test_a_chain_is_placed_where_it_was_read():
     state = moving(system)
     chain = JointChain(system)
     x, rates = chain.read(state)
-    assert set(chain.joints) == {"shoulder", "elbow"}
-    for name, value, rate in zip(chain.joints, x, rates, strict=True):
+    assert set(chain.names) == {"shoulder", "elbow"}
+    for name, value, rate in zip(chain.names, x, rates, strict=True):
         motion = stm.mechanics.joint_motion(system, state, name)
         assert float(value) == pytest.approx(float(motion.angle), abs=1e-12)
         assert float(rate) == pytest.approx(float(motion.angle_rate), abs=1e-12)
