@@ -423,7 +423,7 @@ def judge_fit(
     missing, spare = 1 - np.mean(fit.measured), int(np.sum(fit.measured)) - p
     expected = f"expected {interval[0]:.3g} to {interval[1]:.3g}"
     status: Status
-    if share[worst] > _AT_MINIMUM:
+    if not share[worst] <= _AT_MINIMUM:  # a step that is not a number is no minimum
         status, sentence = "failed", (
             f"Failed: the search is not at a minimum; a step of the linear model moves {labels[worst]} by "
             f"{share[worst]:.2g} of its deviations: values and deviations mean little."

@@ -531,7 +531,7 @@ class Misfit(eqx.Module):
             turning = np.concatenate([
                 part.angular if isinstance(part, CyclicVector) else np.zeros(part.size, bool)
                 for part in _list_spaces(self.readings)
-            ])  # fmt: skip
+            ]).astype(bool)  # fmt: skip
             if np.any(turning):
                 whole = jax.lax.stop_gradient(_count_turns(residuals, measured))
                 residuals = residuals + jnp.where(

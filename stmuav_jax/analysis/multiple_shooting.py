@@ -361,7 +361,7 @@ def make_shooting(
     method = Method(rtol=1e-9, atol=1e-9) if method is None else method
     method = replace(method, adjoint=diffrax.ForwardMode())
     start, *points = (guess(float(t)) for t in edges[:-1])
-    nodes = jax.tree.map(lambda x: as_floats(np.zeros((0, *x.shape))), start)
+    nodes = jax.tree.map(lambda x: as_floats(np.zeros((0, *np.shape(x)))), start)
     if points:
         nodes = jax.tree.map(lambda *x: stack_arrays(x), *points)
     return Shooting(

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pydantic
 
 from .errors import SettingError
 
@@ -78,6 +79,8 @@ def _feed_value(feed: Callable[[bytes], object], value: Any, visited: dict[int, 
     elif hasattr(value, "dtype") and hasattr(value, "__array__"):
         array = np.asarray(value)
         feed(f"{array.dtype} {array.shape}".encode() + array.tobytes())
+    elif isinstance(value, pydantic.BaseModel):
+        feed_all(type(value), value.model_dump())
     elif dataclasses.is_dataclass(value):
         feed_all(
             type(value), *(getattr(value, field.name, None) for field in dataclasses.fields(value))

@@ -111,6 +111,8 @@ _WORDS = {
 def _describe_error(error: Any, model: type[pydantic.BaseModel], subject: str) -> str:
     """Sentence that describes one of pydantic's errors."""
     kind, value, path = error["type"], error["input"], [x for x in error["loc"] if x != "[key]"]
+    if not path:
+        return f"{subject} {error['ctx']['error']}"
     *outer, last = path
     inner = ".".join(str(part)[:SHOWN] for part in outer)
     owner = f"'{inner}'" if inner else subject

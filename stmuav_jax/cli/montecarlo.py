@@ -57,7 +57,6 @@ def _make_study(command: Montecarlo) -> "Study":
     import jax
 
     from ..io.netcdf import load_parameters
-    from ..missions.ensemble import load_mission_study
     from ..studies.examples import READY, load_builtin_study
     from ..studies.study_file import load_study, make_study
     from ..uav.scenes.registry import SCENES
@@ -75,6 +74,8 @@ def _make_study(command: Montecarlo) -> "Study":
     settings = {"lanes": command.lanes, "devices": devices}
     try:
         if plain.get("kind") == "missions":
+            from ..missions.ensemble import load_mission_study
+
             if command.params is not None:
                 raise SettingError(
                     "A study of a mission has no --params: its file has the parameters."
@@ -101,15 +102,7 @@ def run_montecarlo(command: Montecarlo) -> int:
         raise SettingError(
             "The options --scheduler and --workers exclude each other: give one of them."
         )
-    from ..figures.study_data import (
-        analyse,
-        save_summary,
-        study_data,
-        summary_lines,
-        summary_table,
-    )
     from ..studies.schema import check_count
-    from ..studies.store import open_store
 
     for name in ("samples", "chunk", "workers"):
         if (value := getattr(command, name)) is not None:
@@ -120,6 +113,15 @@ def run_montecarlo(command: Montecarlo) -> int:
     out, paths = Console(), [folder / "study.zarr"]
     print_line(out, outcome.describe())
     if command.figures != "none" or not outcome.interrupted:
+        from ..figures.study_data import (
+            analyse,
+            save_summary,
+            study_data,
+            summary_lines,
+            summary_table,
+        )
+        from ..studies.store import open_store
+
         with open_store(folder / "study.zarr") as store:
             # A summary of damaged data would look like any other.
             store.verify()

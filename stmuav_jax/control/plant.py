@@ -253,9 +253,11 @@ class Plant(eqx.Module):
         plant_inputs = inputs_of(system, inputs)
         if not len(plant_inputs):
             raise SettingError("The system has no inputs that a controller could set.")
-        before = plant_inputs.values(system) if before is None else before
-        quantity = "The vector of the inputs before the first command"
-        self.before = check_numbers(before, (len(plant_inputs),), quantity, "")
+        if before is None:
+            self.before = plant_inputs.values(system)
+        else:
+            quantity = "The vector of the inputs before the first command"
+            self.before = check_numbers(before, (len(plant_inputs),), quantity, "")
         if method is None:
             method = Method(solver=diffrax.Dopri8() if steps is None else RungeKutta4())
         if method.event is not None or method.jump_ts is not None:

@@ -48,9 +48,9 @@ class JointLoads(eqx.Module):
         joints: names of the joints.
     """
 
-    ts: Float[Array, "*b k"]
-    force: Float[Array, "*b k joints 3"]
-    moment: Float[Array, "*b k joints 3"]
+    ts: Float[Array | np.ndarray, "*b k"]
+    force: Float[Array | np.ndarray, "*b k joints 3"]
+    moment: Float[Array | np.ndarray, "*b k joints 3"]
     joints: tuple[str, ...] = eqx.field(static=True)
 
     @property

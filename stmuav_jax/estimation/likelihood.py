@@ -109,9 +109,7 @@ def tune(
             than one, a measurement is infinite or an input not finite, or the filter cannot run
             with the start.
     """
-    # The search is over logarithms of variances: they stay positive, and one step means one factor at any
-    # size.
-    first, signs = _to_unknowns(start, signed, prior.factor.dtype)
+    signs = _sign_flags(signed, start)
     for leaf, either in zip(jax.tree.leaves(start), jax.tree.leaves(signs), strict=True):
         if not either and not np.all(np.asarray(leaf) > 0):
             raise SettingError(
@@ -121,6 +119,11 @@ def tune(
     if steps < 1:
         raise SettingError(f"At least one step is needed, not {steps}.")
     record = _read_record(model_of(start), prior, y, u, dt, t)
+    # The search is over logarithms of variances: they stay positive, and one step means one factor at any
+    # size.
+    first = _to_unknowns(
+        jax.tree.map(lambda leaf: jnp.asarray(leaf, prior.factor.dtype), start), signs
+    )
     flat, unravel = ravel_pytree(first)
     unknowns = lambda x: unravel(jnp.asarray(x, flat.dtype))
 
@@ -201,19 +204,21 @@ def _loss_and_slope(p: Any, *rest: Any) -> tuple[Float[Array, ""], Any]:
     return jax.value_and_grad(_negative_likelihood)(p, *rest)
 
 
-def _to_unknowns(values: Any, signed: Any, dtype: Any) -> tuple[Any, Any]:
-    """Unknowns of the search, logarithms of positive parameters, and flags of those of either sign."""
+def _sign_flags(signed: Any, values: Any) -> Any:
+    """Booleans by leaf of the parameters, True where they may have either sign."""
     if isinstance(signed, bool):
-        signed = jax.tree.map(lambda leaf: signed, values)
+        return jax.tree.map(lambda leaf: signed, values)
     if jax.tree.structure(signed) != jax.tree.structure(values):
         raise SettingError(
             "`signed` must be True, False, or have the structure of the parameters, "
             f"{jax.tree.structure(values)}, not {jax.tree.structure(signed)}."
         )
-    unknown = lambda leaf, either: (
-        jnp.asarray(leaf, dtype) if either else jnp.log(jnp.asarray(leaf, dtype))
-    )
-    return jax.tree.map(unknown, values, signed), signed
+    return signed
+
+
+def _to_unknowns(values: Any, signs: Any) -> Any:
+    """Unknowns of the search: logarithms of positive parameters, the others themselves."""
+    return jax.tree.map(lambda leaf, either: leaf if either else jnp.log(leaf), values, signs)
 
 
 def _to_parameters(p: Any, signs: Any) -> Any:
@@ -239,22 +244,13 @@ def standard_errors(
     (only a combination of them, such as a product), and where the curvature is not positive. The
     arguments are those of `tune`, with `values` at the optimum.
     """
-    p, signs = _to_unknowns(values, signed, prior.factor.dtype)
+    signs = _sign_flags(signed, values)
     record = _read_record(model_of(values), prior, y, u, dt, t)
+    p = _to_unknowns(
+        jax.tree.map(lambda leaf: jnp.asarray(leaf, prior.factor.dtype), values), signs
+    )
     H = np.asarray(compiled_once(_loss_curvature)(p, model_of, signs, prior, record, method))
-    deviations = np.full(len(H), np.nan)
-    if np.all(np.isfinite(H)):
-        # Curvatures in logarithms and in signed parameters differ by many orders; a unit diagonal makes them
-        # comparable.
-        scale = np.sqrt(np.abs(np.diag(H)))
-        scale = np.where(scale > 0, scale, 1.0)
-        curvatures, vectors = np.linalg.eigh(H / np.outer(scale, scale))
-        flat = curvatures <= _FLAT * max(curvatures[-1], 0.0)
-        inverse = np.where(flat, 0.0, 1 / np.where(flat, 1.0, curvatures))
-        # unknowns in a direction without positive curvature are not determined
-        determined = np.max(np.abs(vectors[:, flat]), axis=1, initial=0.0) < np.sqrt(_FLAT)
-        deviations = np.where(determined, np.sqrt(vectors**2 @ inverse) / scale, np.nan)
-    return ravel_pytree(p)[1](jnp.asarray(deviations, prior.factor.dtype))
+    return ravel_pytree(p)[1](jnp.asarray(_curvature_deviations(H), prior.factor.dtype))
 
 
 def _loss_curvature(
@@ -264,3 +260,18 @@ def _loss_curvature(
     flat, back = ravel_pytree(p)
     loss = lambda q: _negative_likelihood(back(q), model_of, signs, prior, record, method)
     return jax.jacfwd(jax.grad(loss))(flat)
+
+
+def _curvature_deviations(H: np.ndarray) -> np.ndarray:
+    """Roots of the diagonal of H^-1, NaN for unknowns in a direction without positive curvature."""
+    # Curvatures in logarithms and in signed parameters differ by many orders; a unit diagonal makes them
+    # comparable.
+    scale = np.sqrt(np.abs(np.diag(H)))
+    scale = np.where(scale > 0, scale, 1.0)
+    if not np.all(np.isfinite(H)):
+        return np.full(len(H), np.nan)
+    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
+    flat = values <= _FLAT * max(values[-1], 0.0)
+    inverse = np.where(flat, 0.0, 1 / np.where(flat, 1.0, values))
+    determined = np.max(np.abs(vectors[:, flat]), axis=1, initial=0.0) < np.sqrt(_FLAT)
+    return np.where(determined, np.sqrt(vectors**2 @ inverse) / scale, np.nan)

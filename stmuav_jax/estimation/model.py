@@ -180,7 +180,8 @@ def _step_euler(rates: Rates, x: Array, u: Any, dt: Any) -> Array:
 
 def euler(rates: Rates) -> Step:
     """Step x + dt rates(x, u) of Euler's method."""
-    return eqx.Partial(_step_euler, rates)
+    # JAX's, not Equinox's: the function is no leaf, so that a model of numbers alone is a pytree of arrays
+    return jax.tree_util.Partial(_step_euler, rates)
 
 
 def rk4_step(
@@ -219,4 +220,4 @@ def _step_runge_kutta(rates: Rates, x: Array, u: Any, dt: Any) -> Array:
 
 def rk4(rates: Rates) -> Step:
     """Step of the classical fourth-order Runge-Kutta method, with inputs held over the step."""
-    return eqx.Partial(_step_runge_kutta, rates)
+    return jax.tree_util.Partial(_step_runge_kutta, rates)

@@ -141,6 +141,7 @@ def observability(
     rows = compiled_once(observability_matrix)(
         model, start, u, jnp.asarray(dt, model.noise.dtype), count
     )
-    _, values, right = np.linalg.svd(np.asarray(rows), full_matrices=True)
+    # double precision: the tolerance lies below the round-off of single precision
+    _, values, right = np.linalg.svd(np.asarray(rows, dtype=float), full_matrices=True)
     rank = int(np.sum(values > tolerance * max(values[0], np.finfo(float).tiny)))
     return Observability(values, rank, right[rank:].T, model.names)

@@ -170,7 +170,8 @@ def consistency(study: CaseStudy) -> Figure:
         for ax, part in ((axes[row, 0], settled_mask), (axes[row, 1], ~settled_mask)):
             ax.axhspan(*mean_interval(degrees, seeds), color="0.8", label="consistent: 99.9 %")
             for name, estimates in study.estimates.items():
-                values = np.mean(estimates.nees if degrees == 5 else estimates.nis, axis=1)
+                statistic = estimates.nees if degrees == 5 else estimates.nis
+                values = np.mean(np.asarray(statistic), axis=1)
                 _plot_line(ax, t[part], values[part], name, linewidth=0.9)
         axes[row, 0].set_ylim(bottom=0.0)
         axes[row, 1].set_yscale("log")

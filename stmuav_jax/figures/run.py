@@ -17,7 +17,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..checks.errors import StateError
-from ..checks.numbers import as_jax
 from ..dynamics.loads import COMPONENTS, UNITS, JointLoads, envelope
 from ..dynamics.simulation import Scene
 from ..io.netcdf import write_atomically
@@ -278,9 +277,9 @@ def saved_loads(data: "xr.Dataset") -> JointLoads | None:
     # components along the columns of each frame
     # Bearings are sized in their own axes, and files hold loads in those of the world.
     in_joint_axes = lambda name: np.einsum("kjab,kja->kjb", frames, data[name].values)
-    force, moment = (as_jax(in_joint_axes(f"reaction_{part}")) for part in ("force", "moment"))
+    force, moment = (in_joint_axes(f"reaction_{part}") for part in ("force", "moment"))
     names = tuple(joint.name for joint in motion.joints)
-    return JointLoads(as_jax(motion.ts), force, moment, names)
+    return JointLoads(motion.ts, force, moment, names)
 
 
 def loads_figure(scene: Scene, loads: JointLoads) -> Figure:

@@ -25,7 +25,6 @@ def flight_figures(data: xr.Dataset) -> dict[str, Figure]:
             ("position error [m]", ("x", "y", "z"), values("position_error")),
             ("tilt error [degrees]", ("tilt error",), values("tilt_error")[:, None] / _DEGREE),
         ],
-        "rotors": [("rotor speed [rad/s]", labels_of("rotor"), values("rotor_speed"))],
     }
     margins = {
         label: 100 * np.nanmin(margin_history(data, name, limit), axis=1, initial=0.5)
@@ -33,8 +32,11 @@ def flight_figures(data: xr.Dataset) -> dict[str, Figure]:
         if f"lowest_{limit}" in data
     }
     if margins:
-        label = "smallest margin\n[% of the range]"
+        # a single curve has no legend
+        of = f" of the\n{next(iter(margins))}" if len(margins) == 1 else "\n"
+        label = f"smallest margin{of} [% of the range]"
         panels["margins"] = [(label, tuple(margins), np.stack([*margins.values()], axis=1))]
+    panels["rotors"] = [("rotor speed [rad/s]", labels_of("rotor"), values("rotor_speed"))]
     powers = np.stack([values("electric_power"), values("rotor_power")], axis=1)
     panels["power"] = [("power [W]", ("electrical", "of the rotors, mechanical"), powers)]
     if "state_of_charge" in data:

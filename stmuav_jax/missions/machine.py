@@ -305,7 +305,8 @@ def _speed_limits(mission_file: MissionFile, motors: RotorLimits | None) -> Roto
         if low is None or high is None:
             raise SettingError("Limits of the rotor speeds need 'lowest' and 'highest'.")
         return RotorLimits(low, high)
-    slowest, fastest = float(np.max(motors.lowest)), float(np.min(motors.highest))
+    slowest = float(np.max(np.asarray(motors.lowest)))
+    fastest = float(np.min(np.asarray(motors.highest)))
     # round-off of limits that are kept as squares
     for name, speed, beyond, motion in (
         ("lowest", low, low is not None and low < slowest * (1 - AT_MOTORS), f"no more slowly than {slowest:g}"),
@@ -603,7 +604,7 @@ def _add_faults(entries: MissionFile, machine: Machine, pilot: Any) -> MissionCo
     lost, share = np.moveaxis(np.array(rows), -1, 0)
     # A lost rotor stands still, which motors with a lowest speed could not.
     motors = getattr(only_rotors(machine.scene.system, "A mission"), "limits", None)
-    if np.any(np.isfinite(lost)) and motors is not None and float(np.max(motors.lowest)) > 0:
+    if np.any(np.isfinite(lost)) and motors is not None and np.max(np.asarray(motors.lowest)) > 0:
         raise SettingError(
             "A rotor that fails turns more slowly than the motors' lowest speed: give "
             "'options.motor = {lowest = 0.0}' (a model's motors 'lowest = 0.0'), and the controller's limit as "

@@ -138,7 +138,7 @@ def _compute_on_worker(
         address = distributed.get_worker().address
         raise SettingError(f"Worker {address} computes with {', '.join(unlike)}.")
     with jax.enable_x64(x64):
-        return _load_study(content, x64).compute(first, count)
+        return _load_study(content, x64).compute_in_parts(first, count)
 
 
 class _QuietWorker(distributed.WorkerPlugin):

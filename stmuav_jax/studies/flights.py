@@ -26,7 +26,7 @@ from ..math.compiler import compute_untraced
 from ..mechanics.state import State
 from .columns import Axis, Column
 from .disturbed_flights import AbstractFlights, digest_table, factor_columns
-from .schema import STEPS_OF_A_RUN, Failure, Flying, Integrating, Quantity
+from .schema import STEPS_OF_A_RUN, FailureEntry, Flying, Integrating, QuantityEntry
 from .signal import RunPoint, Signal, find_signal
 from .study import AbstractBatch, Study
 
@@ -60,7 +60,7 @@ class FlightEvaluation(AbstractBatch):
     """
 
     flights: AbstractFlights
-    quantities: Mapping[str, Quantity]
+    quantities: Mapping[str, QuantityEntry]
     t1: float = 1.0
     every: float | None = None
     method: Method = USUAL_METHOD
@@ -206,7 +206,7 @@ class FlightEvaluation(AbstractBatch):
         return Plan(make, times, 0.0, watch(True), watch(False), stops)
 
     @cached_property
-    def _watched(self) -> dict[str, Quantity]:
+    def _watched(self) -> dict[str, QuantityEntry]:
         """Quantities that are monitored between the kept times, those with rates first."""
         chosen = self.quantities.items()
         result = [(k, q) for k, q in chosen if q.take not in ("final", "path")]
@@ -254,7 +254,7 @@ class FlightEvaluation(AbstractBatch):
         }  # fmt: skip
 
 
-def _orient_signal(quantity: Quantity, g: Any) -> Any:
+def _orient_signal(quantity: QuantityEntry, g: Any) -> Any:
     """Monitored signal, whose maximum or rise above zero is the quantity."""
     if quantity.take == "smallest":
         return -g
@@ -267,7 +267,7 @@ def make_flight_study(
     evaluation: FlightEvaluation,
     factors: Mapping[str, Any],
     *,
-    failure: Failure | None = None,
+    failure: FailureEntry | None = None,
     **settings: Any,
 ) -> Study:
     """Study of simulated motions.

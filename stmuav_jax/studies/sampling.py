@@ -170,9 +170,11 @@ def _draw_random(sampling: Sampling, first: int, count: int) -> np.ndarray:
 
 def _draw_latin(sampling: Sampling, first: int, count: int) -> np.ndarray:
     size, d = sampling.stratum or 1, len(sampling.factors)
-    cubes = range(first // size, -(-(first + count) // size))
-    points = [np.empty((0, d)), *(_make_hypercube(sampling.seed, b, size, d) for b in cubes)]
-    return np.concatenate(points)[first % size :][:count]
+    points = [np.empty((0, d))]
+    for b in range(first // size, -(-(first + count) // size)):
+        rows = slice(max(first - b * size, 0), first + count - b * size)
+        points.append(_make_hypercube(sampling.seed, b, size, d)[rows])
+    return np.concatenate(points)
 
 
 @functools.lru_cache(maxsize=2)

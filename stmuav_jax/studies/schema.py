@@ -23,6 +23,7 @@ from ..checks.schema import (
     Tuples,
     format_value,
     quote_name,
+    validate_model,
 )
 from ..dynamics.choices import STEP_TOLERANCE, ExplicitSolverName
 from ..uav.scenes.registry import SCENES
@@ -86,18 +87,8 @@ Design = Literal["random", "latin", "sobol", "saltelli", "table"]
 Pair = tuple[str, str, Annotated[float, Field(gt=-1, lt=1)]]
 
 
-class Quantity(Entries):
-    """Quantity, a number or a history, that is stored for each run.
-
-    Attributes:
-        signal: name of a signal, see `stmuav_jax.studies.signal`.
-        take: "final" value; "largest", "smallest" over the run; "path": values every
-            `Study.every` seconds; "when_above", "when_below": time at which the signal first
-            crosses `level` [s], infinite if it never does.
-        level: level in the signal's unit, of a crossing alone.
-        stop: end the run when the signal crosses the level; final values are then those of that
-            step, and paths are NaN from there on.
-    """
+class QuantityEntry(Entries):
+    """Entry for a quantity that is stored for each run."""
 
     signal: str
     take: Take
@@ -110,7 +101,7 @@ class Quantity(Entries):
         return self.take.startswith("when_")
 
     @model_validator(mode="after")
-    def _check_crossing(self) -> "Quantity":
+    def _check_crossing(self) -> "QuantityEntry":
         if self.is_crossing != (self.level is not None):
             rule = "needs a level" if self.is_crossing else "has no level"
             raise ValueError(f"is wrong: '{self.take}' of signal {quote_name(self.signal)} {rule}.")
@@ -121,18 +112,49 @@ class Quantity(Entries):
         return self
 
 
-class Failure(Entries):
+class Quantity(QuantityEntry):
+    """Quantity, a number or a history, that is stored for each run.
+
+    Attributes:
+        signal: name of a signal, see `stmuav_jax.studies.signal`.
+        take: "final" value; "largest", "smallest" over the run; "path": values every
+            `Study.every` seconds; "when_above", "when_below": time at which the signal first
+            crosses `level` [s], infinite if it never does.
+        level: level in the signal's unit, of a crossing alone.
+        stop: end the run when the signal crosses the level; final values are then those of that
+            step, and paths are NaN from there on.
+
+    Raises:
+        SettingError: an unknown `take`, a level without a crossing or a crossing without one, `stop` without
+            a crossing, or a level that is not finite.
+    """
+
+    def __init__(self, **entries: Any) -> None:
+        super().__init__(**validate_model(QuantityEntry, entries, "A quantity").model_dump())
+
+
+class FailureEntry(Entries):
+    """Entry for the condition under which a completed run counts as a failure."""
+
+    quantity: str
+    above: Finite | None = None
+    below: Finite | None = None
+
+
+class Failure(FailureEntry):
     """Condition under which a completed run counts as a failure; reports give its probability.
 
     Attributes:
         quantity: name of one of the study's quantities, not a path.
         above, below: limits in the quantity's unit: a run above the one or below the other has
             failed. A crossing without limits is a failure if it happens at all.
+
+    Raises:
+        SettingError: a limit that is not finite.
     """
 
-    quantity: str
-    above: Finite | None = None
-    below: Finite | None = None
+    def __init__(self, **entries: Any) -> None:
+        super().__init__(**validate_model(FailureEntry, entries, "A failure").model_dump())
 
 
 class Drawing(Entries):
@@ -169,7 +191,7 @@ class FlightsFile(Drawing, Flying, Integrating):
     model: Annotated[Any, BeforeValidator(_check_model)] = None
     factors: Annotated[dict[str, Factor], Field(min_length=1, max_length=1000)]
     quantities: Annotated[
-        dict[Annotated[str, AfterValidator(_check_column)], Quantity], Field(max_length=1000)
+        dict[Annotated[str, AfterValidator(_check_column)], QuantityEntry], Field(max_length=1000)
     ]
     kind: Literal["flights"] = "flights"
     case: Annotated[int, Field(ge=1, le=100)] | None = None
@@ -180,7 +202,7 @@ class FlightsFile(Drawing, Flying, Integrating):
     drag: bool = False
     gusts: bool = False
     options: dict[str, Any] = Field(default_factory=dict)
-    failure: Failure | None = None
+    failure: FailureEntry | None = None
 
 
 class EstimationFile(Entries):

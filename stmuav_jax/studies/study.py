@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..checks.digest import digest_value
-from ..checks.errors import SettingError
+from ..checks.errors import SettingError, SimulationError
 from ..checks.schema import quote_name
 from ..math.compiler import compile_for_shapes
 from ..math.native.structure import find_structure
@@ -245,8 +245,8 @@ class Study:
                 of other versions; or the disk is full (written chunks are kept).
             SettingError: impossible settings, outcomes other than the declared columns, no scheduler at
                 the address, or a worker with other versions than the store's.
-            SimulationError: the scheduler was lost, or workers of the same chunk died repeatedly
-                (written chunks are kept).
+            SimulationError: not even a single sample fits in memory; or the scheduler was lost, or
+                workers of the same chunk died repeatedly (written chunks are kept).
         """
         target, begin = Path(store), time.monotonic()
         total = self.samples if samples is None else samples
@@ -259,7 +259,9 @@ class Study:
         with contextlib.ExitStack() as stack:
             stop = stack.enter_context(delayed_interrupt(note))
             compute: Callable[[Iterable[tuple[int, int]]], Iterable[tuple[int, Any]]]
-            compute = lambda pieces: ((first, self.compute(first, n)) for first, n in pieces)
+            compute = lambda pieces: (
+                (first, self.compute_in_parts(first, n)) for first, n in pieces
+            )
             versions = computing_versions
             if scheduler is not None or workers is not None:
                 from .cluster import WorkerPool
@@ -311,6 +313,30 @@ class Study:
         joined = dict(zip(names, values.T, strict=True))
         joined |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return {name: joined[name][skip].astype(c.dtype) for name, c in self.columns.items()}
+
+    def compute_in_parts(self, first: int, count: int) -> dict[str, np.ndarray]:
+        """Columns (count, ...) of samples, in halves where they do not fit in memory together.
+
+        Raises:
+            SimulationError: not even a single sample fits in memory.
+        """
+        try:
+            return self.compute(first, count)
+        except (MemoryError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            if count == 1:
+                raise SimulationError(
+                    f"Sample {first} alone does not fit in memory: let the function return smaller arrays."
+                ) from error
+        # Halving finds a size that fits after a few attempts, without an estimate of the memory that a
+        # program needs.
+        half = -(-count // 2)
+        if self.unit < count:
+            half = min(-(-half // self.unit) * self.unit, count - 1)
+        halves = (first, half), (first + half, count - half)
+        parts = [self.compute_in_parts(*piece) for piece in halves]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _on_all(
         self, values: np.ndarray, begin: int, ranges: list[tuple[int, int]]

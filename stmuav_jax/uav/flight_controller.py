@@ -437,7 +437,10 @@ class FlightController(eqx.Module):
         return self.rotors.thrusts(lower), self.rotors.thrusts(upper)
 
     def _allocate(self, wrench: Float[Array, "4"]) -> tuple[Float[Array, " k"], Array]:
-        """Squared speeds, or thrusts of rotors with curves, those of lost rotors zero; whether they give the wrench."""
+        """Squared speeds, or thrusts of rotors with curves, those of lost rotors zero.
+
+        With them whether they give the wrench; with lost rotors, whether they give thrust and tilt.
+        """
         if self.working is not None:
             places, count = jnp.array(self.working), self.wrenches.shape[1]
             lower, upper = (x[places] for x in self._bounds())

@@ -289,8 +289,8 @@ class MotionEstimator(eqx.Module):
             predicted,
         )  # fmt: skip
         updates, panel = [fixes], None
-        x, omega = base.mean, turning - base.mean["gyroscope_bias"]
         # The angular velocity is the gyroscope's less its bias: a state of its own would only delay it.
+        x, omega = base.mean, turning - base.mean["gyroscope_bias"]
         if memory.panel is None or self.inner is None:
             state = State(x["r"][None], x["p"][None], x["v"][None], omega[None])
         else:

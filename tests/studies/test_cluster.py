@@ -164,6 +164,16 @@ def test_double_precision_goes_along(tmp_path, outside):
 
 
 @pytest.mark.slow
+def test_a_lack_of_memory_on_a_worker_halves_its_chunks(tmp_path, outside):
+    path = tmp_path / "study.zarr"
+    work = Toy(seed=7, together=600, most=300, words="RESOURCE_EXHAUSTED: no room")
+    assert work.run(path, 3000, scheduler=outside.address).completed == 3000
+    assert open_store(path).chunk == 600
+    WORK.run(tmp_path / "here.zarr", 3000, chunk=600)
+    assert contents(path) == contents(tmp_path / "here.zarr")
+
+
+@pytest.mark.slow
 def test_a_work_that_fails(tmp_path, outside):
     """The workers' error is the user's; what was stored is kept."""
     work = Toy(seed=7, most=0, words="a bug")

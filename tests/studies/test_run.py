@@ -6,11 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from studies.toy import Toy, contents
 
-from stmuav_jax.checks.errors import SettingError
+from stmuav_jax.checks.errors import SettingError, SimulationError
 from stmuav_jax.io.netcdf import FileError
 from stmuav_jax.studies import StudyProgress, open_store
 
@@ -95,6 +96,30 @@ def test_extended_and_refused(tmp_path, whole):
         WORK.run(tmp_path / "other.zarr", 10, chunk=0)
     # all of these have let go of the store
     assert WORK.run(path, 1000, resume=True).computed == 0
+
+
+@pytest.mark.parametrize("words", ["", "RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes."])
+def test_chunks_that_do_not_fit_in_memory_are_halved(tmp_path, whole, words):
+    path = tmp_path / "study.zarr"
+    work = Toy(seed=7, most=40, words=words, together=20, log=str(tmp_path / "log"))
+    work.run(path, 1000, chunk=150)
+    assert contents(path) == whole
+    calls = [int(line.split()[2]) for line in (tmp_path / "log").read_text().splitlines()]
+    assert set(calls[:4]) == {150, 80, 40}
+    with pytest.raises(SimulationError, match="Sample 0 alone does not fit in memory"):
+        Toy(most=0, words="").run(tmp_path / "none.zarr", 100, chunk=10)
+
+
+def test_lack_of_memory_is_told_from_other_errors_of_jax(tmp_path):
+    """JAX itself, asked for 800 TB for more than 10 samples."""
+
+    class Large(Toy):
+        def compute(self, first, count):
+            if count > 10:
+                jnp.zeros(10**14).block_until_ready()
+            return Toy.compute(self, first, count)
+
+    assert Large().run(tmp_path / "study.zarr", 80, chunk=40).completed == 80
 
 
 def test_a_work_that_fails_keeps_what_was_done(tmp_path, whole):

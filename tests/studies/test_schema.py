@@ -11,7 +11,7 @@ import pytest
 from stmuav_jax.checks.errors import ModelError, SettingError
 from stmuav_jax.checks.schema import name_fault
 from stmuav_jax.io.netcdf import FileError
-from stmuav_jax.studies import disturbed_flights
+from stmuav_jax.studies import Quantity, disturbed_flights
 from stmuav_jax.studies.study_file import load_study, make_study
 from stmuav_jax.uav import make_scene
 
@@ -158,6 +158,25 @@ def test_words(change, words):
     with pytest.raises(SettingError) as caught:
         make_study(BASE | change)
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        ({"take": "finl"}, "'take' must be 'final'"),
+        (
+            {"take": "when_above"},
+            "A quantity is wrong: 'when_above' of signal 'tilt' needs a level",
+        ),
+        ({"take": "final", "stop": True}, "A quantity has 'stop', which needs take"),
+        ({"take": "final", "levl": 1.0}, "A quantity has no entry 'levl'. Did you mean 'level'"),
+    ],
+)
+def test_words_for_a_quantity_made_in_python(entries, words):
+    with pytest.raises(SettingError) as caught:
+        Quantity(signal="tilt", **entries)
+    assert words in str(caught.value)
+    assert Quantity(signal="tilt", take="when_above", level=0.5).is_crossing
 
 
 @pytest.mark.parametrize(

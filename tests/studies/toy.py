@@ -37,8 +37,8 @@ class Toy(Study):
     seed: int = 0
     more: int = 0  # further columns
     pause: float = 0.0  # seconds asleep for each call
-    most: int | None = None  # more at once fail
-    words: str = ""
+    most: int | None = None  # more at once do not fit in memory
+    words: str = "Out of memory"
     fall: tuple[int, str] | None = None  # sample whose process dies if this file is there
     together: int = 1
     log: str | None = None  # file that gets a line for each call
@@ -78,7 +78,7 @@ class Toy(Study):
                 threads = os.environ.get("NPROC", "0")
                 file.write(f"{os.getpid()} {first} {count} {threads}\n")
         if self.most is not None and count > self.most:
-            raise RuntimeError(self.words)
+            raise (MemoryError if self.words == "" else RuntimeError)(self.words)
         if self.fall is not None and first <= self.fall[0] < first + count:
             marker = Path(self.fall[1])
             if marker.exists():

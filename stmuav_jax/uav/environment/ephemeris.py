@@ -99,7 +99,8 @@ def _check_place(place: Place) -> None:
         ("latitude", place.latitude, 90),
         ("longitude", place.longitude, 360),
     ):
-        angle = max(np.ravel(value), key=abs)
+        angles = np.ravel(value)
+        angle = angles[np.argmax(np.abs(angles))] if angles.size else 0.0
         if abs(angle) > math.radians(most) + ROUNDING:
             raise SettingError(
                 f"The {name} must lie within -{most} and {most} degrees, but it is {np.degrees(angle):g} degrees. "

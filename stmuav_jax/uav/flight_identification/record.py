@@ -162,7 +162,8 @@ class FlightRecord(NamedTuple):
     def between(self, t0: float, t1: float) -> "FlightRecord":
         """Record from t0 to t1 [s]."""
         inside = (self.ts >= t0) & (self.ts <= t1)
-        return self._make(x[inside] if isinstance(x, np.ndarray) else x for x in self)
+        columns = (None if x is None else x[inside] for x in self[:5])
+        return FlightRecord(*columns, *self[5:])
 
 
 def compute_rotor_states(

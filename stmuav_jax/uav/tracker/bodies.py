@@ -475,7 +475,7 @@ def replace_numbers(parameters: Parameters, options: Mapping[str, object]) -> Pa
         for key, value in vars(option).items() if option is not None else ():
             if value is not None and (name := f"{group}.{key}") in parameters:
                 pair = np.shape(parameters.value(name)) == (2,) and shape_of(value) == ()
-                values[name] = jnp.stack([value, value]) if pair else value
+                values[name] = jnp.stack([as_floats(value)] * 2) if pair else value
     # Results carry the table with which they were computed, so that a run can be repeated from its file.
     return parameters.replaced(values)
 
