@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .stacked import dot_product
@@ -76,7 +77,7 @@ def sharp_sqrt(square: Float[Array, "*s"]) -> Float[Array, "*s"]:
     return jnp.where(zero, without_derivative(square, zero), safe_sqrt(square))
 
 
-def safe_norm(vectors: Float[Array, "..."], axis: int = 0) -> Float[Array, "..."]:
+def safe_norm(vectors: Float[Array | np.ndarray, "..."], axis: int = 0) -> Float[Array, "..."]:
     """Euclidean norm along an axis; its derivatives at zero are set to zero."""
     return safe_sqrt(jnp.sum(vectors * vectors, axis=axis))
 

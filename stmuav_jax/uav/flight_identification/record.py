@@ -162,8 +162,11 @@ class FlightRecord(NamedTuple):
     def between(self, t0: float, t1: float) -> "FlightRecord":
         """Record from t0 to t1 [s]."""
         inside = (self.ts >= t0) & (self.ts <= t1)
-        columns = (None if x is None else x[inside] for x in self[:5])
-        return FlightRecord(*columns, *self[5:])
+        voltage = None if self.voltage is None else self.voltage[inside]
+        return FlightRecord(
+            self.ts[inside], self.commands[inside], self.gyroscope[inside], self.accelerometer[inside],
+            voltage, self.cutoffs, self.resolution, self.filter_rate,
+        )  # fmt: skip
 
 
 def compute_rotor_states(
