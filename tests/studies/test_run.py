@@ -162,8 +162,10 @@ def test_killed_at_random_moments(tmp_path):
     assert contents(path) == contents(tmp_path / "unbroken.zarr")
 
 
+# A shell that starts the tests in the background has them ignore Ctrl-C, which processes inherit.
 INTERRUPTED = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.path.insert(0, {tests!r})
 from studies.toy import Toy
 show = lambda now: print(now.completed, now.note, flush=True)
