@@ -53,6 +53,11 @@ class History:
     failure: str
     stopped_at: float
 
+    @property
+    def ends(self) -> Array:
+        """Times at which the accepted steps end [s]."""
+        return np.cumsum(self.sizes)
+
     def summary(self) -> dict[str, Any]:
         """How far it came, why no farther, and in how many steps."""
         return {"reached": self.stopped_at, "failure": self.failure, "steps": len(self.sizes)}
