@@ -74,7 +74,7 @@ def state_at(data, k: int) -> stm.State:
 
 
 def flight() -> dict[str, float]:
-    """The mission "waypoints": its sketch, its errors, its moving page; returns its numbers."""
+    """The mission "waypoints": its sketch, its panel angles, its moving page; returns its numbers."""
     mission = stm.missions.load_mission("waypoints")
     flown = stm.missions.fly(mission)
     data = stm.missions.to_data(flown)
@@ -86,7 +86,6 @@ def flight() -> dict[str, float]:
             stm.draw(scene, state_at(data, k)), f"under control, {data.time.values[k]:.1f} s"
         ),
         "panel": curves["panel"],
-        "errors": curves["errors"],
     }
     stm.figures.save_figures(drawn, FIGURES / "flight", "png", dpi=90)
     # the page moves at 25 pictures a second
