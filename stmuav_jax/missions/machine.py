@@ -549,38 +549,50 @@ def check_faults(mission_file: MissionFile) -> None:
     """Raise `SettingError` for faults that contradict themselves or each other."""
     places: dict[str, FaultEntry] = {}
     for fault in sorted(mission_file.faults, key=lambda fault: fault.at):
-        of_sensor, until = fault.sensor is not None, np.inf if fault.until is None else fault.until
-        parts = [x for x in (fault.rotor, fault.slider, fault.sensor) if x is not None]
+        if sum(x is not None for x in (fault.rotor, fault.slider, fault.sensor)) != 1:
+            raise SettingError("A fault needs one of a rotor, a slider and a sensor.")
+        if fault.sensor is not None:
+            _check_sensor_fault(mission_file, fault)
+            continue
+        if fault.bias is not None or fault.until is not None:
+            raise SettingError(
+                "'bias' and 'until' are for faults of sensors: leave them out of a fault of a rotor or slider."
+            )
+        if fault.slider is not None and fault.share is not None:
+            raise SettingError("'share' is for faults of rotors: a jammed slider does not move.")
+        if fault.known and (fault.rotor is None or fault.share):
+            raise SettingError(
+                "A fault that is 'known' must be the loss of a rotor, without a share of its thrust: "
+                "the controller cannot compensate a jammed slider or a weak rotor."
+            )
         place = f"Rotor {fault.rotor}" if fault.rotor is not None else f"Slider {fault.slider}"
         # Faults of one part are looked at in the order of time: one after a final fault, or at the
         # same time, would silently have no effect.
-        before = None if of_sensor else places.get(place)
-        is_final = before is not None and (before.known or fault.slider is not None)
-        ending = "is jammed" if fault.slider is not None else "is lost"
-        for is_wrong, message in (
-            (len(parts) != 1, "A fault needs one of a rotor, a slider and a sensor."),
-            (of_sensor and mission_file.sensors is None,
-             "A fault of a sensor needs a mission with [sensors]."),
-            (of_sensor and (fault.known or fault.share is not None),
-             "'known' and 'share' are for faults of rotors: leave them out of a fault of a sensor."),
-            (of_sensor and until <= fault.at, "A fault of a sensor must end after it begins, but it lasts from "
-             f"{fault.at:g} to {until:g} s."),
-            (not of_sensor and (fault.bias is not None or fault.until is not None),
-             "'bias' and 'until' are for faults of sensors: leave them out of a fault of a rotor or slider."),
-            (fault.slider is not None and fault.share is not None,
-             "'share' is for faults of rotors: a jammed slider does not move."),
-            (fault.known and (fault.rotor is None or fault.share),
-             "A fault that is 'known' must be the loss of a rotor, without a share of its thrust: the controller "
-             "cannot compensate a jammed slider or a weak rotor."),
-            (before is not None and before.at == fault.at,
-             f"{place} has two faults at t = {fault.at:g} s: leave one of them out."),
-            (is_final, f"{place} {ending} from t = {before.at if before else 0.0:g} s on, so that its fault at t = "
-             f"{fault.at:g} s has no effect: leave one of them out."),
-        ):  # fmt: skip
-            if is_wrong:
-                raise SettingError(message)
-        if not of_sensor:
-            places[place] = fault
+        before = places.get(place)
+        if before is not None and before.at == fault.at:
+            raise SettingError(
+                f"{place} has two faults at t = {fault.at:g} s: leave one of them out."
+            )
+        if before is not None and (before.known or fault.slider is not None):
+            raise SettingError(
+                f"{place} {'is lost' if before.known else 'is jammed'} from t = {before.at:g} s on, so that "
+                f"its fault at t = {fault.at:g} s has no effect: leave one of them out."
+            )
+        places[place] = fault
+
+
+def _check_sensor_fault(entries: MissionFile, fault: FaultEntry) -> None:
+    """Raise `SettingError` for a fault of a sensor that the mission cannot have."""
+    if entries.sensors is None:
+        raise SettingError("A fault of a sensor needs a mission with [sensors].")
+    if fault.known or fault.share is not None:
+        raise SettingError(
+            "'known' and 'share' are for faults of rotors: leave them out of a fault of a sensor."
+        )
+    if fault.until is not None and fault.until <= fault.at:
+        raise SettingError(
+            f"A fault of a sensor must end after it begins, but it lasts from {fault.at:g} to {fault.until:g} s."
+        )
 
 
 def _add_faults(entries: MissionFile, machine: Machine, pilot: Any) -> MissionController:
