@@ -80,8 +80,8 @@ class DiscreteAdjoint(diffrax.AbstractAdjoint):
     `RecursiveCheckpointAdjoint` with `recorded_steps` checkpoints, which takes adaptive steps again.
 
     Attributes:
-        recorded_steps: number of step attempts recorded at a time; None for 1,024, or 4,096 checkpoints, divided
-            among the output times, at least 64 for each.
+        recorded_steps: step attempts of a window, whose slopes are in memory at a time, 64 by default; or number of
+            checkpoints, by default 4,096 divided among the output times, at least 64 for each.
 
     Raises:
         SettingError: `recorded_steps` is less than one.
@@ -111,10 +111,11 @@ class Method(eqx.Module):
             [m/s] and angular velocities [rad/s] alike.
         stabilisation: stabilisation of the constraints.
         first_step: length of the first step [s]; at most a hundredth of the run's time.
-        max_steps: accepted and rejected steps between two output times.
+        max_steps: accepted and rejected steps between two output times; in reverse mode by a `DiscreteAdjoint`
+            the record has room for at least as many to all of them together, and a run that takes more fails.
         adjoint: reverse-mode derivatives: any adjoint of diffrax, or the default, a
-            `DiscreteAdjoint`. An explicit method without events then records accepted steps with their slopes;
-            the backward pass of a longer run recomputes its steps window by window. Other methods use diffrax's
+            `DiscreteAdjoint`. An explicit method without events then records the times of accepted steps, and
+            the backward pass takes them again window by window. Other methods use diffrax's
             `RecursiveCheckpointAdjoint`, which repeats adaptive steps; round-off changes their sizes, so that
             gradients are less accurate.
         event: (t, state) -> a number whose change of sign ends the integration, at that

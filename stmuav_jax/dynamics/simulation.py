@@ -48,7 +48,7 @@ from .diagnostics import (
 from .evaluation import Snapshot, evaluate_accelerations, evaluate_snapshots
 from .formulations.base import AbstractModel, count_left_out
 from .formulations.independence import compare_clearance, find_extreme_bodies
-from .integration.advance import CHUNK, March, Trajectory, integrate_times, same_result
+from .integration.advance import CHUNK, March, Trajectory, integrate_path, same_result
 from .integration.problem import (
     MASSES_REFUSED,
     Problem,
@@ -210,7 +210,8 @@ def describe_result(system: System, path: Trajectory) -> str:
     reasons = {
         "successful": "successful",
         "event_occurred": "event occurred",
-        "max_steps_reached": "max_steps steps did not reach the next output time",
+        "max_steps_reached": "max_steps steps did not reach the next output time, or in reverse "
+        "mode the last one",
         "dt_min_reached": "the step size fell to round-off",
         "nonfinite": "the value of the event is not a number",
         "nonlinear_divergence": "the joints have come open",
@@ -252,7 +253,7 @@ def _integrate_path(problem: Problem, state0: State, ts: Float[Array, " k"]) -> 
     # span.
     problem = fit_first_step(problem, ts[-1] - ts[0])
     start = begin_integration(problem, ts[0], state0)
-    return _mark_unreached(problem, integrate_times(problem, start, ts)[1], ts)
+    return _mark_unreached(problem, integrate_path(problem, start, ts), ts)
 
 
 # An eager call does not compile again for a system of the same structure.

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from equinox.internal import nextafter, prevbefore
+from equinox.internal import prevbefore
 from jaxtyping import Array, Bool, Float
 
 from ...checks.numbers import as_floats
@@ -25,17 +25,16 @@ from ...math.newton import EventBisection
 from ...mechanics.state import State
 from ..formulations.base import Residuals
 from ..method import DiscreteAdjoint
-from .adjoint import RecordCapacity, capacity_of, integrate_recorded
+from .adjoint import diffrax_adjoint, integrate_recorded, is_recorded
+from .goals import Goals, Row, make_row, pass_goals
 from .problem import (
     Counts,
     IntegrationState,
     Problem,
     SegmentEnd,
     compiled_begin,
-    continue_from,
     read_end,
 )
-from .stepping import EVERY
 
 # A run starts at its event if the event function is zero within this many tolerances, in seconds,
 # after or before the start.
@@ -131,87 +130,63 @@ class Trajectory(eqx.Module):
     result: diffrax.RESULTS
 
 
-def _integrate_to(
-    problem: Problem,
-    carry: IntegrationState,
-    t1: Float[Array, ""],
-    adjoint: diffrax.AbstractAdjoint | RecordCapacity,
-) -> SegmentEnd:
-    """Integrate from the carry to t1 [s], or to an event before it."""
-    if isinstance(adjoint, RecordCapacity):
-        return integrate_recorded(problem, carry, t1, adjoint)
-    if problem.method.event is not None:
-        return to_event(problem, carry, t1, adjoint)
-    return read_end(problem.solve(carry, t1, adjoint))
-
-
 def integrate_times(
     problem: Problem, carry: IntegrationState, ts: Float[Array, " k"]
 ) -> tuple[IntegrationState, Trajectory]:
     """Integrate to each of the times ts [s] in turn; after a failure or an event, stay there."""
+    end, rows = _integrate_rows(problem, carry, ts)
+    return end, _make_trajectory(problem, end, rows)
+
+
+def integrate_path(problem: Problem, begin: IntegrationState, ts: Float[Array, " k"]) -> Trajectory:
+    """Trajectory at times ts [s], the first of which is that of the start."""
+    # the start takes no steps, nor a place in the record of them
+    end, rows = _integrate_rows(problem, begin, ts[1:])
+    first = jax.tree.map(lambda x, xs: jnp.asarray(x, xs.dtype)[None], make_row(begin), rows)
+    rows = jax.tree.map(lambda *parts: jnp.concatenate(parts), first, rows)
+    return _make_trajectory(problem, end, rows)
+
+
+def _integrate_rows(
+    problem: Problem, carry: IntegrationState, ts: Float[Array, " k"]
+) -> tuple[IntegrationState, Row]:
+    """End of an integration, and its rows at the output times [s]."""
     jumps = problem.method.jump_ts
     if jumps is None:
-        # the first output time is the start, which takes no steps
-        end, rows = _integrate_segments(problem, carry, ts, ts.shape[0] - 1)
-        return end, _make_trajectory(problem, end, rows)
+        return _integrate_goals(problem, carry, Goals(ts, None))
     # merge the times of jumps into the output times; outputs come first at equal times
     merged = jnp.concatenate([ts, jnp.asarray(jumps)])
     # Jumps are integrated to like output times, whose rows are dropped afterwards: steps then end
     # at both, in one loop.
     order = jnp.argsort(merged)
-    end, rows = _integrate_segments(
-        problem, carry, (merged[order], order >= ts.shape[0]), len(merged) - 1
-    )
+    goals = Goals(merged[order], order >= ts.shape[0])
+    end, rows = _integrate_goals(problem, carry, goals)
     rows = jax.tree.map(lambda x: x[jnp.argsort(order)[: ts.shape[0]]], rows)
     # an output time at a jump is reached just before it
-    times = jnp.where(rows[0] == prevbefore(ts), ts, rows[0])
-    return end, _make_trajectory(problem, end, (times, *rows[1:]))
+    return end, rows._replace(t=jnp.where(rows.t == prevbefore(ts), ts, rows.t))
 
 
-def _pass_jump(carry: IntegrationState, jump: Float[Array, ""]) -> IntegrationState:
-    """Carry right after a jump, if it has reached the jump."""
-    # The step before a jump ends at the last number before it and the next begins at the first
-    # after it: a force that compares t with the jump is then evaluated on the right side in every
-    # stage.
-    at = (carry.t == prevbefore(jump)) | (carry.t == jump)
-    at = at & (carry.result == diffrax.RESULTS.successful)
-    carry = eqx.tree_at(lambda c: c.t, carry, jnp.where(at, nextafter(jump), carry.t))
-    inner, worst, *modes = carry.solver_state
-    # the modes may differ after the jump and are computed again
-    modes = [now._replace(age=jnp.where(at, EVERY, now.age)) for now in modes]
-    return eqx.tree_at(lambda c: c.solver_state, carry, (inner, worst, *modes))
-
-
-def _integrate_segments(
-    problem: Problem, carry: IntegrationState, ts: Any, segments: int
-) -> tuple[IntegrationState, tuple[Any, ...]]:
-    """Integrate through times [s], or pairs of a time and True if it is that of a jump."""
+def _integrate_goals(
+    problem: Problem, carry: IntegrationState, goals: Goals
+) -> tuple[IntegrationState, Row]:
+    """Integrate through all goals, differentiable by the method's adjoint."""
     adjoint: Any = problem.method.adjoint
     if isinstance(adjoint, DiscreteAdjoint):
-        adjoint = capacity_of(adjoint, problem, segments)
-    jumps = problem.method.jump_ts
-    last = None if jumps is None else jnp.max(jnp.where(ts[1], -jnp.inf, ts[0]))
+        if is_recorded(problem):
+            return integrate_recorded(problem, carry, goals)
+        adjoint = diffrax_adjoint(adjoint, problem, len(goals.times))
 
-    def to_next(carry: IntegrationState, t1: Any) -> tuple[IntegrationState, Any]:
-        success = carry.result == diffrax.RESULTS.successful
-        goal, jumping = (t1, False) if jumps is None else t1
-        if jumps is not None:
-            t1 = jnp.where(jnp.any(goal == jumps), prevbefore(goal), goal)
-            # Jumps after the last output time are not gone to, and a time that was passed already
-            # is not gone back to.
-            t1 = jnp.where((jumping & (goal > last)) | (t1 < carry.t), carry.t, t1)
-        end = _integrate_to(problem, carry, jnp.where(success, t1, carry.t), adjoint)
-        after = continue_from(carry, end)
-        row = (after.t, after.y, after.counts, after.worst)
-        if jumps is not None:
-            after = jax.lax.cond(jumping, lambda: _pass_jump(after, goal), lambda: after)
-        return after, row
+    def integrate_to(carry: IntegrationState, t1: Any, _: None) -> tuple[SegmentEnd, None, None]:
+        if problem.method.event is not None:
+            return to_event(problem, carry, t1, adjoint), None, None
+        return read_end(problem.solve(carry, t1, adjoint)), None, None
 
-    return jax.lax.scan(to_next, carry, ts)
+    end, _, (rows, *_) = pass_goals(problem, carry, goals, integrate_to, None)
+    return end, rows
 
 
-def _make_trajectory(problem: Problem, end: IntegrationState, rows: tuple[Any, ...]) -> Trajectory:
-    """Trajectory from the rows (time, y, counts, residuals) at the output times."""
+def _make_trajectory(problem: Problem, end: IntegrationState, rows: Row) -> Trajectory:
+    """Trajectory from the rows at the output times."""
     times, ys, counts, worst = rows
     first = problem.n_state
     n = first + problem.n_internal

@@ -348,10 +348,17 @@ class Problem(eqx.Module):
         adjoint: diffrax.AbstractAdjoint,
         *,
         max_steps: int | None = None,
-        dense: bool = False,
+        keeps_times: bool = False,
         event: diffrax.Event | None = None,
     ) -> diffrax.Solution:
-        """Integrate from the carry to t1 [s], where the last step ends; `dense` keeps all steps."""
+        """Integrate from the carry to t1 [s], where the last step ends.
+
+        Args:
+            keeps_times: the solution's `ts` are those of the end and of the ends of all steps.
+        """
+        kept: Any = diffrax.SubSaveAt(t1=True)
+        if keeps_times:
+            kept = (kept, diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: None))
         return _diffeqsolve(
             self.term(),
             self.solver(),
@@ -360,7 +367,7 @@ class Problem(eqx.Module):
             None,
             carry.y,
             self.model,
-            saveat=diffrax.SaveAt(t1=True, dense=dense, solver_state=True, controller_state=True),
+            saveat=diffrax.SaveAt(subs=kept, solver_state=True, controller_state=True),
             stepsize_controller=self.controller(carry.step),
             adjoint=adjoint,
             max_steps=self.method.max_steps if max_steps is None else max_steps,
@@ -375,11 +382,10 @@ class Problem(eqx.Module):
 
 def read_end(solution: diffrax.Solution) -> SegmentEnd:
     """End of a solution by diffrax."""
-    assert solution.ts is not None
-    assert solution.ys is not None
+    t, y = (jax.tree.leaves(x)[0][0] for x in (solution.ts, solution.ys))
     steps = (solution.stats["num_accepted_steps"], solution.stats["num_rejected_steps"])
     states = (solution.solver_state, solution.controller_state)
-    return SegmentEnd(solution.ts[0], solution.ys[0], *states, *steps, solution.result)
+    return SegmentEnd(t, y, *states, *steps, solution.result)
 
 
 def continue_from(carry: IntegrationState, end: SegmentEnd) -> IntegrationState:

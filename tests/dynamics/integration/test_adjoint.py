@@ -1,4 +1,4 @@
-"""Reverse mode by kept steps: against diffrax's own, forward mode, and differences."""
+"""Reverse mode by recorded steps: against diffrax's own, forward mode, and differences."""
 
 from dataclasses import replace
 
@@ -10,8 +10,6 @@ import pytest
 from helpers import pendulum, swung
 
 import stmuav_jax as stm
-from stmuav_jax.dynamics.integration import adjoint as records
-from stmuav_jax.dynamics.integration.problem import prepare_problem
 
 KEEPING = stm.Method(rtol=1e-10, atol=1e-10)
 AHEAD = replace(KEEPING, adjoint=diffrax.ForwardMode())
@@ -79,22 +77,38 @@ def test_many_at_once():
 
 
 @pytest.mark.slow
-def test_pieces_of_few_windows(monkeypatch):
-    """Pieces integrated again on the way back: the same derivatives as those of all steps kept.
-
-    Pieces of two windows of two attempts; the flights of a batch have different numbers of them.
-    """
-    monkeypatch.setattr(records, "WINDOWS", 3)
-    monkeypatch.setattr(records, "ROOM", 0)
-    adjoint = stm.dynamics.DiscreteAdjoint(recorded_steps=2)
-    few = replace(KEEPING, adjoint=adjoint, max_steps=200)
-    assert records.capacity_of(adjoint, prepare_problem(pendulum(), few), 3) == (2, 3, 50)
+def test_windows_of_two_attempts():
+    """Flights of a batch, with different numbers of windows: the same derivatives as by long ones."""
+    few = replace(KEEPING, adjoint=stm.dynamics.DiscreteAdjoint(recorded_steps=2), max_steps=200)
     several = Q + jnp.linspace(0.0, 0.4, 2)[:, None]
     found = jax.jit(jax.vmap(jax.value_and_grad(lambda q: swing(q, few))))
     for q, value, gradient in zip(several, *found(several), strict=True):
         alone, expected = of_kept(q)
         assert value == pytest.approx(float(alone), rel=1e-9)
         np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.slow
+def test_more_steps_than_are_recorded():
+    """Forward mode allows `max_steps` to each output time, the record holds as many in all: it says so."""
+    ts = jnp.linspace(0.0, 3.0, 7)
+
+    def end(rate, most):
+        method = replace(KEEPING, max_steps=most, adjoint=stm.dynamics.DiscreteAdjoint(2))
+        system = pendulum()
+        found = stm.integrate(system, swung(system, 0.7, rate), ts, method)
+        return found.states.r[-1, 0, 0], found
+
+    found = end(1.0, 15)[1]
+    total = int(found.counts.accepted[-1] + found.counts.rejected[-1])
+    assert found.result == diffrax.RESULTS.successful
+    assert total > 2 * (15 // 2 + 1 + 6)  # the record's windows of two attempts
+    gradient, recorded = jax.grad(end, has_aux=True)(1.0, 15)
+    assert recorded.result == diffrax.RESULTS.max_steps_reached
+    assert np.isnan(gradient)
+    gradient, recorded = jax.grad(end, has_aux=True)(1.0, total)
+    assert recorded.result == diffrax.RESULTS.successful
+    assert np.isfinite(gradient)
 
 
 @pytest.mark.slow
