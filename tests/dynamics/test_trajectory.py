@@ -208,3 +208,55 @@ def test_a_welded_body_stays_where_it_is(formulation):
         np.testing.assert_allclose(states.r[-1], [[0.5, 0.0, 0.0]], atol=1e-12)
     weight = np.asarray(stm.dynamics.run_loads(result).force)[-1]
     np.testing.assert_allclose(weight, [[0.0, 0.0, 98.1]], atol=1e-9)
+
+
+def push(t):
+    """A moment that depends on time [N m], not evenly."""
+    return 0.8 * jnp.sin(3.0 * t) + t
+
+
+BACK = jnp.array([0.2, 0.5, 1.7])
+
+
+def there_and_back(rate, solver):
+    """States of a pushed pendulum at three times, and those on the way back from the last of them."""
+    system = pendulum(length=LENGTH, forces=(stm.JointEffort("hinge", push),))
+    method = stm.Method(solver=solver, rtol=1e-9, atol=1e-9)
+    ahead = stm.integrate(system, swung(system, 1.1, rate), BACK, method).states
+    end = jax.tree.map(lambda x: x[-1], ahead)
+    return ahead, stm.integrate(system, end, BACK[::-1], method).states
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [diffrax.Dopri8(), stm.dynamics.kvaerno5()])
+def test_a_motion_goes_back_in_time(solver):
+    """To where it came from, by forces that depend on time; so do derivatives in reverse mode."""
+
+    def last(rate):
+        ahead, back = there_and_back(rate, solver)
+        return back.omega[-1, 0, 1], (ahead, back)
+
+    slope, (ahead, back) = jax.jit(jax.grad(last, has_aux=True))(-0.3)
+    for a, b in zip(jax.tree.leaves(ahead), jax.tree.leaves(back), strict=True):
+        np.testing.assert_allclose(b[::-1], a, rtol=0, atol=2e-8)
+    assert slope == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_driver_goes_back_in_time():
+    """A joint with a prescribed motion stands where the motion was at that time."""
+    angle = lambda t: 0.5 * jnp.sin(3 * t) + 0.2 * t**2
+    free = pendulum(length=LENGTH)
+    hinge = free.joints[0]
+    low = stm.Body("low", 1.0, (0.02, 0.02, 0.01), position=(0, 0, -1.0))
+    knee = stm.revolute("knee", "bob", "low", point=(0, 0, -0.8), axis=(0, 1, 0))
+    bob = stm.Body("bob", 2.0, (0.02, 0.02, 0.01), position=(0, 0, -LENGTH))
+    motor = stm.drive("motor", hinge, angle, coordinate="angle")
+    system = stm.System([bob, low], [hinge, knee, motor], [stm.Gravity()])
+    method = stm.Method(rtol=1e-9, atol=1e-9)
+    start = stm.assemble(system, system.reference).state
+    ahead = stm.integrate(system, start, TS, method).states
+    back = stm.integrate(system, jax.tree.map(lambda x: x[-1], ahead), TS[::-1], method).states
+    np.testing.assert_allclose(
+        2 * jnp.atan2(back.p[:, 0, 2], back.p[:, 0, 0]), angle(TS[::-1]), atol=1e-9
+    )
+    np.testing.assert_allclose(back.r[::-1], ahead.r, atol=1e-8)

@@ -136,7 +136,7 @@ class Guard(eqx.Module):
             # In a step that fails anyway the matrix may not be finite, and then has no eigenvalues
             # to compute.
             values = lapack.compute_eigenvalues(jnp.where(jnp.all(jnp.isfinite(H)), H, 0.0))
-            decay = jnp.maximum(-values.real, 0.0) * (t - modes.start) / self.order
+            decay = jnp.maximum(-values.real, 0.0) * jnp.abs(t - modes.start) / self.order
             fastest = jnp.max(jnp.abs(values) * jnp.exp(-decay))
         else:
             fastest = spectral_radius(H)
@@ -309,6 +309,16 @@ class ProjectionLimit(eqx.Module):
         return jnp.where(displacement > 1, displacement * scale(end), error)
 
 
+def _undirected(terms: Any, t0: Any, t1: Any) -> tuple[Any, Any, Any]:
+    """Terms and times [s] of a step as they were given to diffrax.
+
+    Its own solvers count time forwards also where a motion goes back, with terms that turn the sign again;
+    forces, drivers and stages need the time itself.
+    """
+    direction = getattr(terms, "direction", None)
+    return (terms, t0, t1) if direction is None else (terms.term, t0 * direction, t1 * direction)
+
+
 class ProjectedSolver(diffrax.AbstractWrappedSolver):
     """Solver of diffrax with a projection after each step, and a record of the residuals.
 
@@ -383,6 +393,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         solver_state: Any,
         made_jump: Any,
     ) -> tuple[StateVector, Any, Any, Any, diffrax.RESULTS]:
+        terms, t0, t1 = _undirected(terms, t0, t1)
         inner, worst, *modes = solver_state
         # After a projection the solver's last evaluation belongs to a state that is no longer
         # there.
@@ -393,7 +404,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
             constants = jax.lax.stop_gradient(eqx.filter(args, eqx.is_inexact_array))
             constants = eqx.combine(constants, args)
             field = lambda t, y: terms.vf(t, y, constants)
-            modes = [self.guard.update_modes(field, t0, y0, t1 - t0, *modes)]
+            modes = [self.guard.update_modes(field, t0, y0, jnp.abs(t1 - t0), *modes)]
         y1, y_error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, jump
         )
