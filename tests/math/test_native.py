@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxpr_as_fun
 
 from stmuav_jax.math.native import llvm
 from stmuav_jax.math.native.graph import NotScalarError, make_graph
-from stmuav_jax.math.native.program import evaluate, native, use_native_code
+from stmuav_jax.math.native.program import Transpose, evaluate, native, use_native_code
 
 pytestmark = pytest.mark.skipif(not llvm.available(), reason="llvmlite is not installed")
 
@@ -101,6 +102,47 @@ def test_values_and_derivatives_are_those_of_xla(function):
         a = jax.jit(derivative(total(native(function))))(X)
         b = jax.jit(derivative(total(function)))(X)
         np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
+
+
+def test_a_transpose_follows_from_the_graph_of_the_derivative():
+    """Without tracing, with the numbers and the entries that are not finite of the traced transpose."""
+    known, table = jnp.asarray([0.0, 1.0, -2.0]), jnp.asarray([3.0, 0.5, 7.0, 1.5])
+
+    def function(place, x, y):
+        looked = table[jnp.clip(place, 0, 3)]
+        either = jnp.where(x > 0.5, x * y, looked * x - y)
+        return jnp.sum(either * known), (x / (1.0 + y**2), x[1] * looked)
+
+    def pull(x, y):
+        _, back = jax.vjp(partial(native(function), 2), x, y)
+        return back((1.5, (x, 0.3 * y[0])))
+
+    x, y = jnp.asarray([0.2, 0.6, 0.9]), jnp.asarray([1.1, -0.4, 0.3])
+    traced = jax.make_jaxpr(pull)(x, y)
+    (program,) = [
+        e.params["program"] for e in traced.eqns if isinstance(e.params.get("program"), Transpose)
+    ]
+    assert program.graph() is not None
+    assert "jaxpr" not in vars(program)  # nothing was traced for it
+    expected = jax.vjp(partial(function, 2), x, y)[1]((1.5, (x, 0.3 * y[0])))
+    np.testing.assert_allclose(jax.jit(pull)(x, y), expected, rtol=1e-14)
+    np.testing.assert_allclose(
+        program.evaluate(*_operands(traced, program, x, y)), expected, rtol=1e-14
+    )
+    for k in range(3):
+        bad = y.at[k].set(jnp.nan)
+        theirs = jax.vjp(partial(function, 2), x, bad)[1]((1.5, (x, 0.3 * bad[0])))
+        for a, b in zip(jax.jit(pull)(x, bad), theirs, strict=True):
+            assert np.all(np.isnan(a) | ~np.isnan(b))
+
+
+def _operands(traced, program, *args):
+    """Operands of the program within a traced function of these arguments."""
+    (place,) = [k for k, e in enumerate(traced.eqns) if e.params.get("program") is program]
+    before = traced.jaxpr.replace(
+        eqns=traced.eqns[:place], outvars=[v for v in traced.eqns[place].invars]
+    )
+    return jaxpr_as_fun(traced.replace(jaxpr=before))(*args)
 
 
 def test_a_rows_bits_do_not_depend_on_its_batch():

@@ -1105,6 +1105,18 @@ def make_graph(
     for aval in jaxpr.out_avals:
         if not is_scalar(aval):
             raise NotScalarError(f"a result of type {aval.dtype}")
+    return graph, add_dropped(graph, outputs, jaxpr.out_avals)
+
+
+@no_type_check
+def add_dropped(
+    graph: Graph, outputs: Sequence[np.ndarray], avals: Sequence[Any]
+) -> list[np.ndarray]:
+    """Outputs plus 0 times the inputs that were lost in products with 0; the graph is then complete.
+
+    Args:
+        avals: types of the outputs.
+    """
     live = set(graph.needed([n for out in outputs for n in out.ravel().tolist()]))
     leaves = [n for n in graph.needed(sorted(graph.dropped)) if graph.ops[n] == "input"]
     leaves = [n for n in leaves if graph.args[n][2] == "f"]
@@ -1117,7 +1129,7 @@ def make_graph(
         poison = sums[0]
         for other in sums[1:]:
             poison = graph.node("add", poison, other)
-        numbers = [np.dtype(a.dtype) == np.float64 for a in jaxpr.out_avals]
+        numbers = [np.dtype(a.dtype) == np.float64 for a in avals]
         outputs = [
             np.array(
                 [graph.node("add", n, poison) for n in out.ravel().tolist()], np.int64
@@ -1128,4 +1140,4 @@ def make_graph(
         ]
     # most of the memory, which only making it needs
     graph._known.clear()
-    return graph, outputs
+    return list(outputs)

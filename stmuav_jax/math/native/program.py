@@ -12,7 +12,7 @@ import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from functools import wraps
+from functools import cached_property, wraps
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,6 +27,7 @@ from jaxtyping import Array
 
 from . import llvm
 from .graph import NotScalarError, make_graph
+from .transposition import transpose_graph
 
 native_p = core.Primitive("native")
 native_p.multiple_results = True
@@ -53,7 +54,7 @@ class Program:
     Attributes:
         jaxpr: traced function, whose constants are known. groups: number of the argument to which each
             operand belongs. known_entries: entries of operands that machine code may rely on, those of the others
-            NaN; None where there are none. See `structure`.
+            NaN; None where there are none. See `structure`. inputs, outputs: shapes and types.
     """
 
     def __init__(
@@ -62,20 +63,17 @@ class Program:
         groups: Sequence[int] | None = None,
         known_entries: Sequence[np.ndarray | None] = (),
     ) -> None:
-        self.jaxpr, self.known_entries = jaxpr, known_entries
-        self.groups = tuple(groups or [0] * len(jaxpr.in_avals))
+        self.jaxpr = jaxpr
+        groups = groups or [0] * len(jaxpr.in_avals)
+        self._begin(jaxpr.in_avals, jaxpr.out_avals, groups, known_entries)
+
+    def _begin(self, inputs: Any, outputs: Any, groups: Sequence[int], known_entries: Any) -> None:
+        self.inputs, self.outputs, self.known_entries = inputs, outputs, known_entries
+        self.groups = tuple(groups)
         self._derived: dict[Any, Program] = {}
         self._lock = threading.RLock()
         self._graph: Any = None
         self._reason: str | None = None
-
-    @property
-    def inputs(self) -> Sequence[Any]:
-        return self.jaxpr.in_avals
-
-    @property
-    def outputs(self) -> Sequence[Any]:
-        return self.jaxpr.out_avals
 
     def evaluate(self, *args: Any) -> list[Any]:
         """The function itself."""
@@ -88,10 +86,13 @@ class Program:
             # attempt takes as long as a success.
             if self._graph is None and self._reason is None:
                 try:
-                    self._graph = make_graph(self.jaxpr, llvm.MOST_NODES, self.known_entries)
+                    self._graph = self._make_graph()
                 except NotScalarError as error:
                     self._reason = str(error)
             return self._graph
+
+    def _make_graph(self) -> Any:
+        return make_graph(self.jaxpr, llvm.MOST_NODES, self.known_entries)
 
     def write(
         self, shared: tuple[bool, ...], rows: int, loop: llvm.Loop | None = None
@@ -185,34 +186,74 @@ class Program:
         self, known_mask: tuple[bool, ...], cotangent_mask: tuple[bool, ...]
     ) -> "Program":
         """Program of (known arguments, cotangents of wanted results) for those of the unknown ones."""
-
-        def make() -> Program:
-            known_avals = [a for a, k in zip(self.inputs, known_mask, strict=True) if k]
-            unknown = [a for a, k in zip(self.inputs, known_mask, strict=True) if not k]
-            results = [a for a, w in zip(self.outputs, cotangent_mask, strict=True) if w]
-
-            def cotangents(*args: Any) -> list[Any]:
-                fixed, seeds = args[: len(known_avals)], iter(args[len(known_avals) :])
-
-                # JAX transposes only programs that are linear in the unknown operands; those that
-                # are known are closed over, and become inputs of the transposed program.
-                def linear(*moving: Any) -> list[Any]:
-                    values, moves = iter(fixed), iter(moving)
-                    whole = [next(values) if k else next(moves) for k in known_mask]
-                    return self.evaluate(*whole)
-
-                shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in unknown]
-                full = [
-                    next(seeds) if w else jnp.zeros(a.shape, a.dtype)
-                    for w, a in zip(cotangent_mask, self.outputs, strict=True)
-                ]
-                return list(jax.linear_transpose(linear, *shapes)(full))
-
-            groups = [g for g, k in zip(self.groups, known_mask, strict=True) if k]
-            groups += [max(self.groups, default=0) + 1] * len(results)
-            return Program(_trace(cotangents, [*known_avals, *results]), groups)
-
+        make = lambda: Transpose(self, known_mask, cotangent_mask)
         return self.derived(("back", known_mask, cotangent_mask), make)
+
+
+class Transpose(Program):
+    """Transpose of a program that is linear in its unknown operands, from whose graph its own follows.
+
+    Its function is traced only where it is asked for: by XLA, by further derivatives, and where the graph has
+    an operation that is not linear.
+
+    Attributes:
+        source: the program. known_mask: its operands that are known. cotangent_mask: its results whose
+            cotangents are operands.
+    """
+
+    def __init__(
+        self,
+        source: Program,
+        known_mask: tuple[bool, ...],
+        cotangent_mask: tuple[bool, ...],
+        known_entries: Sequence[np.ndarray | None] = (),
+    ) -> None:
+        self.source, self.known_mask, self.cotangent_mask = source, known_mask, cotangent_mask
+        pairs = list(zip(source.inputs, known_mask, strict=True))
+        known, unknown = ([a for a, k in pairs if k == is_known] for is_known in (True, False))
+        results = [a for a, w in zip(source.outputs, cotangent_mask, strict=True) if w]
+        groups = [g for g, k in zip(source.groups, known_mask, strict=True) if k]
+        groups += [max(source.groups, default=0) + 1] * len(results)
+        self._begin([*known, *results], unknown, groups, known_entries)
+
+    @cached_property
+    def jaxpr(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        whole = self.source.pull_back(self.known_mask, self.cotangent_mask)
+        return _trace(self._transpose, self.inputs) if whole is self else whole.jaxpr
+
+    def _transpose(self, *args: Any) -> list[Any]:
+        count = sum(self.known_mask)
+        fixed, seeds = args[:count], iter(args[count:])
+
+        # JAX transposes only programs that are linear in the unknown operands; those that
+        # are known are closed over, and become inputs of the transposed program.
+        def linear(*moving: Any) -> list[Any]:
+            values, moves = iter(fixed), iter(moving)
+            whole = [next(values) if k else next(moves) for k in self.known_mask]
+            return self.source.evaluate(*whole)
+
+        shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self.outputs]
+        full = [
+            next(seeds) if w else jnp.zeros(a.shape, a.dtype)
+            for w, a in zip(self.cotangent_mask, self.source.outputs, strict=True)
+        ]
+        return list(jax.linear_transpose(linear, *shapes)(full))
+
+    def fold(self, known_entries: Sequence[np.ndarray | None]) -> Program:
+        key = tuple(None if x is None else x.tobytes() for x in known_entries)
+        masks = self.known_mask, self.cotangent_mask
+        return self.derived(("known", key), lambda: Transpose(self.source, *masks, known_entries))
+
+    def _make_graph(self) -> Any:
+        program, masks = self.source.graph(), (self.known_mask, self.cotangent_mask)
+        if program is not None:
+            try:
+                return transpose_graph(
+                    program, *masks, self.inputs, self.outputs, llvm.MOST_NODES, self.known_entries
+                )
+            except NotScalarError:
+                pass
+        return super()._make_graph()
 
 
 class Recursion(Program):
