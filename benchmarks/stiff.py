@@ -112,7 +112,7 @@ class Runner:
         given = (*as_given(scene), jnp.asarray(ts), jnp.asarray(tol))
         if (solver, len(ts)) not in self.calls:
             run = trajectory(stm.Tree(), SOLVERS[solver]())
-            call, seconds = compiled(run, *given, clock=time.process_time)
+            call, seconds = compiled(run, *given, clock=time.process_time, jit=stm.math.quick_jit)
             self.calls[solver, len(ts)] = call
             self.compile_seconds.setdefault(solver, seconds)
         return lambda: self.calls[solver, len(ts)](*given)

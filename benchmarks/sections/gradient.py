@@ -93,7 +93,7 @@ def gradient(size: Size, others: list[Peer]) -> dict[str, Any]:
     base: dict[float, float] = {}
     for name, (of, wanted) in modes(scene, size).items():
         try:
-            program, seconds = compiled(of, zero, tight)
+            program, seconds = compiled(of, zero, tight, jit=stm.math.quick_jit)
         except Exception as error:
             rows.append({"mode": name, "failure": reason(error)})
             continue

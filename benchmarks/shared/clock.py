@@ -72,7 +72,10 @@ measure_processor = partial(measure, repeats=3, warm_up=0, budget=1.0, clock=tim
 
 
 def compiled(
-    function: Callable[..., Any], *arguments: Any, clock: Callable[[], float] = time.perf_counter
+    function: Callable[..., Any],
+    *arguments: Any,
+    clock: Callable[[], float] = time.perf_counter,
+    jit: Callable[..., Any] = stm.math.outer_jit,
 ) -> tuple[Any, float]:
     """The function compiled for arguments of these shapes, and the seconds for trace and all.
 
@@ -80,7 +83,7 @@ def compiled(
     """
     jax.clear_caches()
     start = clock()
-    call: Any = stm.math.outer_jit(function)
+    call: Any = jit(function)
     done = call.lower(*arguments).compile()
     return done, clock() - start
 

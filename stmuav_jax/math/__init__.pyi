@@ -4,6 +4,7 @@ from . import rotation as rotation
 from .compiler import (
     compiler_options as compiler_options,
     outer_jit as outer_jit,
+    quick_jit as quick_jit,
 )
 from .lapack import (
     inverse as inverse,

@@ -97,9 +97,10 @@ def outer_jit(function: Callable[..., Any]) -> Any:
 
 
 def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`outer_jit` with `compiler_options(quick=True)`, which are looked up at every call.
+    """`outer_jit` with `compiler_options(quick=True)`, for single flights and their gradients.
 
-    Within a transformation (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a
+    XLA compiles in less time, and what machine code computes runs as fast; batches that XLA computes itself
+    run more slowly. Within a transformation (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a
     larger program.
     """
     return _jit_with_options(function, quick=True)
