@@ -303,12 +303,12 @@ def _propagate_cotangents(
         jax.tree.map(jnp.zeros_like, arrays),
     )
     (by_y, by_t0, by_model), by_times = jax.lax.scan(back_way, begin, table, reverse=True)
-    none = jax.tree.map(lambda _: None, rest)
-    by_model = eqx.combine(by_model, none)
-    derivatives = _Start(
-        by_model, by_y, by_t0 if perturbed.t0 else None, by_times if perturbed.times else None
-    )  # pyright: ignore
-    return eqxi.nondifferentiable_backward(derivatives, msg=TWICE)
+    by_model = eqx.combine(by_model, jax.tree.map(lambda _: None, rest))
+    times: tuple[Any, Any] = (
+        by_t0 if perturbed.t0 else None,
+        by_times if perturbed.times else None,
+    )
+    return eqxi.nondifferentiable_backward(_Start(by_model, by_y, *times), msg=TWICE)
 
 
 def _through_windows(

@@ -62,9 +62,8 @@ def pass_goals(
     Returns:
         End, memory, and for each goal its row, the way to it, and its record.
     """
-    jumps = problem.method.jump_ts
-    is_jump = goals.is_jump
-    last = None if is_jump is None else jnp.max(jnp.where(is_jump, -jnp.inf, goals.times))
+    jumps, is_jump = problem.method.jump_ts, goals.is_jump
+    last = jnp.max(goals.times if is_jump is None else jnp.where(is_jump, -jnp.inf, goals.times))
 
     def to_next(at: tuple[IntegrationState, Any], goal: Goals) -> tuple[Any, Any]:
         carry, memory = at
