@@ -132,11 +132,10 @@ def _record_way(
         is_full = windows.number >= capacity
         windows = windows.with_window(now.y, end.accepted, ts)
         accepted, rejected = now.accepted + end.accepted, now.rejected + end.rejected
-        # Windows end where there is room, not where the run's own limit is: that is applied to the
-        # sum.
+        end = end._replace(accepted=accepted, rejected=rejected)
+        # Windows end where there is room, not where the run's own limit is: one beyond it does not count.
         over = is_full | (accepted + rejected > most)
-        result = diffrax.RESULTS.where(over, MORE, end.result)
-        end = end._replace(accepted=accepted, rejected=rejected, result=result)
+        end = _choose(over, now._replace(result=MORE), end)
         now = _choose(is_going, end, now)
         return is_going & (end.result == MORE) & ~over, now, windows
 
