@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -68,19 +68,30 @@ def differences(of: Callable[[Any], Any], count: int) -> tuple[np.ndarray, float
 Wanted = Callable[[np.ndarray], np.ndarray] | None
 
 
-def modes(scene: stm.Scene, size: Size) -> dict[str, tuple[Callable[..., Any], Wanted]]:
-    """Name -> (changes, tolerance) -> value, and what that is to be."""
+class Mode(NamedTuple):
+    """(changes, tolerance) -> value, what that is to be, and the number of flights at once."""
+
+    of: Callable[..., Any]
+    wanted: Wanted = None
+    flights: int = 1
+
+
+def modes(scene: stm.Scene, size: Size) -> dict[str, Mode]:
     n, end = size.parameters, size.gradient_horizon
     ahead = functional(scene, end, n, diffrax.ForwardMode(), 100_000)
     back = functional(scene, end, n, stm.dynamics.DiscreteAdjoint(), 100_000)
     height = lambda change, tolerance: back(change, tolerance)[2]
     one = jnp.ones(n)
     along = lambda change, tolerance: jax.jvp(lambda c: ahead(c, tolerance), (change,), (one,))[1]
+    batched = lambda of: jax.vmap(of, (0, None))
+    many, of_height = size.group, lambda exact: exact[2]
     return {
-        "simulation": (ahead, None),
-        "forward (jvp), one direction": (along, lambda exact: exact.sum(axis=1)),
-        "forward (jacfwd), all three components": (jax.jacfwd(ahead), lambda exact: exact),
-        "reverse (grad), height": (jax.grad(height), lambda exact: exact[2]),
+        "simulation": Mode(ahead),
+        "forward (jvp), one direction": Mode(along, lambda exact: exact.sum(axis=1)),
+        "forward (jacfwd), all three components": Mode(jax.jacfwd(ahead), lambda exact: exact),
+        "reverse (grad), height": Mode(jax.grad(height), of_height),
+        f"simulation, each of {many}": Mode(batched(ahead), None, many),
+        f"reverse (grad), height, each of {many}": Mode(batched(jax.grad(height)), of_height, many),
     }
 
 
@@ -91,33 +102,38 @@ def gradient(size: Size, others: list[Peer]) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     exact, own = np.zeros((3, size.parameters)), float("nan")
     base: dict[float, float] = {}
-    for name, (of, wanted) in modes(scene, size).items():
+    for name, (of, wanted, flights) in modes(scene, size).items():
+        at_start = zero if flights == 1 else jnp.zeros((flights, size.parameters))
+        jit = stm.math.quick_jit if flights == 1 else stm.math.outer_jit
         try:
-            program, seconds = compiled(of, zero, tight, jit=stm.math.quick_jit)
+            program, seconds = compiled(of, at_start, tight, jit=jit)
         except Exception as error:
             rows.append({"mode": name, "failure": reason(error)})
             continue
-        if wanted is None:
+        if name == "simulation":
             exact, own = differences(lambda c, p=program: p(c, tight), size.parameters)
         for tolerance in size.gradient_tolerances:
             at = jnp.asarray(tolerance)
             timing, value = measure(
-                lambda p=program, at=at: p(zero, at), repeats=size.repeats, budget=size.budget
+                lambda p=program, x=at_start, at=at: p(x, at),
+                repeats=size.repeats,
+                budget=size.budget,
             )
-            base.setdefault(tolerance, timing.median)
+            each, value = timing.median / flights, value if flights == 1 else value[0]
+            base.setdefault(tolerance, each)
             error = None
             if wanted is not None:
                 want = wanted(exact)
                 error = float(np.max(np.abs(value - want)) / np.max(np.abs(want)))
             row = {
                 "mode": name, "tolerance": tolerance, "seconds": timing.to_dict(),
-                "compile_seconds": seconds, "cost_in_simulations": timing.median / base[tolerance],
-                "error": error,
+                "flights": flights, "compile_seconds": seconds,
+                "cost_in_simulations": each / base[tolerance], "error": error,
                 "failure": "" if np.all(np.isfinite(value)) else "The gradient is not finite.",
             }  # fmt: skip
             rows.append(row)
             said = f"{row['cost_in_simulations']:.1f} simulations, error {row['error']}"
-            print(f"  {name} {tolerance:.0e}: {1e3 * timing.median:.1f} ms, {said}", flush=True)
+            print(f"  {name} {tolerance:.0e}: {1e3 * each:.2f} ms, {said}", flush=True)
     return {
         "what": "gradient of the panel's final position, uav_tracker case 2, tree, Dopri8",
         "horizon": size.gradient_horizon, "parameters": PARAMETERS, "count": size.parameters,
