@@ -312,8 +312,8 @@ class ProjectionLimit(eqx.Module):
 def _undirected(terms: Any, t0: Any, t1: Any) -> tuple[Any, Any, Any]:
     """Terms and times [s] of a step as they were given to diffrax.
 
-    Its own solvers count time forwards also where a motion goes back, with terms that turn the sign again;
-    forces, drivers and stages need the time itself.
+    diffrax counts time forwards also where a motion goes back, with terms that turn the sign again; forces,
+    drivers and stages need the time itself.
     """
     direction = getattr(terms, "direction", None)
     return (terms, t0, t1) if direction is None else (terms.term, t0 * direction, t1 * direction)
