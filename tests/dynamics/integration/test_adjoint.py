@@ -77,6 +77,27 @@ def test_many_at_once():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("jump", [0.4, 0.5])
+def test_by_the_time_of_a_jump(jump):
+    """A force that sets in on a slide, also at an output time: s = f (t - a)^2 / (2 m) from a on."""
+    body = stm.Body("cart", 2.0, (0.1, 0.1, 0.1))
+    slide = stm.translational("slide", "ground", "cart", point=(0, 0, 0), axis=(1, 0, 0))
+
+    def positions(a, times, force):
+        effort = stm.JointEffort("slide", lambda t: jnp.where(t < a, 0.0, force))
+        system = stm.System([body], [slide], [effort])
+        method = replace(KEEPING, jump_ts=jnp.stack([a]))
+        return stm.integrate(system, system.reference, times, method).states.r[:, 0, 0]
+
+    times, force = jnp.array([0.0, 0.5, 1.0]), 3.0
+    rows = jax.jit(jax.jacrev(positions, argnums=(0, 1, 2)))(jump, times, force)
+    since = np.maximum(np.asarray(times) - jump, 0.0)
+    np.testing.assert_allclose(rows[0], -force / 2 * since, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(rows[1], np.diag(force / 2 * since), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(rows[2], since**2 / 4, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
 def test_windows_of_two_attempts():
     """Flights of a batch, with different numbers of windows: the same derivatives as by long ones."""
     few = replace(KEEPING, adjoint=stm.dynamics.DiscreteAdjoint(recorded_steps=2), max_steps=200)
