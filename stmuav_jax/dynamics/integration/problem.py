@@ -356,9 +356,9 @@ class Problem(eqx.Module):
         Args:
             keeps_times: the solution's `ts` are those of the end and of the ends of all steps.
         """
-        kept: Any = diffrax.SubSaveAt(t1=True)
+        records: Any = diffrax.SubSaveAt(t1=True)
         if keeps_times:
-            kept = (kept, diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: None))
+            records = (records, diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: None))
         return _diffeqsolve(
             self.term(),
             self.solver(),
@@ -367,7 +367,7 @@ class Problem(eqx.Module):
             None,
             carry.y,
             self.model,
-            saveat=diffrax.SaveAt(subs=kept, solver_state=True, controller_state=True),
+            saveat=diffrax.SaveAt(subs=records, solver_state=True, controller_state=True),
             stepsize_controller=self.controller(carry.step),
             adjoint=adjoint,
             max_steps=self.method.max_steps if max_steps is None else max_steps,

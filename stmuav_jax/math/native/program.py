@@ -210,11 +210,11 @@ class Transpose(Program):
     ) -> None:
         self.source, self.known_mask, self.cotangent_mask = source, known_mask, cotangent_mask
         pairs = list(zip(source.inputs, known_mask, strict=True))
-        known, unknown = ([a for a, k in pairs if k == is_known] for is_known in (True, False))
+        fixed, moving = ([a for a, k in pairs if k == is_known] for is_known in (True, False))
         results = [a for a, w in zip(source.outputs, cotangent_mask, strict=True) if w]
         groups = [g for g, k in zip(source.groups, known_mask, strict=True) if k]
         groups += [max(source.groups, default=0) + 1] * len(results)
-        self._begin([*known, *results], unknown, groups, known_entries)
+        self._begin([*fixed, *results], moving, groups, known_entries)
 
     @cached_property
     def jaxpr(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -56,8 +56,8 @@ def transpose_graph(
             raise NotScalarError("a part that does not move")
 
     zero = graph.constant(0.0)
-    for result, given in zip(results, operands[sum(known_mask) :], strict=True):
-        for node, cotangent in zip(result, given, strict=True):
+    for result, seeds in zip(results, operands[sum(known_mask) :], strict=True):
+        for node, cotangent in zip(result, seeds, strict=True):
             add(node, cotangent)
     for node in reversed(order):
         op, args = source.ops[node], source.args[node]
@@ -98,8 +98,8 @@ def _copy_known(
     operands: Sequence[Sequence[int]],
 ) -> tuple[dict[int, int], set[int]]:
     """Nodes of a graph for those of another that do not move, and those of the other that do."""
-    known = [k for k, is_known in enumerate(known_mask) if is_known]
-    places = {k: place for place, k in enumerate(known)}
+    numbers = [k for k, is_known in enumerate(known_mask) if is_known]
+    places = {k: place for place, k in enumerate(numbers)}
     copies: dict[int, int] = {}
     linear: set[int] = set()
     for node in order:
