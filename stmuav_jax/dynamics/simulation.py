@@ -233,7 +233,7 @@ def _mark_unreached(problem: Problem, trajectory: Trajectory, ts: Float[Array, "
     is_successful = is_successful | (trajectory.result == diffrax.RESULTS.event_occurred)
     # Decisions on values have no derivative: without the stop JAX would trace derivatives of all
     # residuals for them.
-    missed = ~is_successful & (jax.lax.stop_gradient(trajectory.ts) < ts)
+    missed = ~is_successful & (jax.lax.stop_gradient(trajectory.ts) != ts)
     # a traced time may be no number: nothing was reached there or after
     missed = missed | (jnp.cumsum(jnp.isnan(ts)) > 0)
     open_mask = problem.is_open(jax.lax.stop_gradient(trajectory.worst))

@@ -242,11 +242,21 @@ def test_a_motion_goes_back_in_time(solver):
     assert slope == pytest.approx(1.0, abs=1e-6)
 
 
+def test_a_motion_that_stops_on_the_way_back_is_not_a_number():
+    """Nor is one that stops on the way ahead, see above."""
+    system = pendulum(length=LENGTH)
+    method = stm.Method(rtol=RTOL, atol=RTOL, max_steps=2)
+    found = stm.integrate(system, swung(system, 0.7, 4.0), TS[::-1], method)
+    assert found.result == diffrax.RESULTS.max_steps_reached
+    assert float(TS[1]) < float(found.ts[-1]) < float(TS[2])
+    assert np.all(np.isfinite(found.states.r[0]))
+    assert np.all(np.isnan(found.states.r[1:]))
+
+
 def test_a_driver_goes_back_in_time():
     """A joint with a prescribed motion stands where the motion was at that time."""
     angle = lambda t: 0.5 * jnp.sin(3 * t) + 0.2 * t**2
-    free = pendulum(length=LENGTH)
-    hinge = free.joints[0]
+    hinge = pendulum(length=LENGTH).joints[0]
     low = stm.Body("low", 1.0, (0.02, 0.02, 0.01), position=(0, 0, -1.0))
     knee = stm.revolute("knee", "bob", "low", point=(0, 0, -0.8), axis=(0, 1, 0))
     bob = stm.Body("bob", 2.0, (0.02, 0.02, 0.01), position=(0, 0, -LENGTH))
