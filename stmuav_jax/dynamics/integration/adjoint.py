@@ -32,14 +32,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..method import DiscreteAdjoint
-from .goals import Goals, Row, Way, pass_goals
+from .goals import Goals, Row, Way, pass_goals, reach_goals
 from .problem import IntegrationState, Problem, SegmentEnd, read_end
 from .solvers import NonDenseRungeKutta, butcher_coefficients
 
 MORE = diffrax.RESULTS.max_steps_reached
 
 # Step attempts of a window, whose slopes are some hundred numbers each.
-KEPT = 64
+WINDOW = 64
 # States that diffrax keeps, divided among the output times; where they are fewer than the steps, the path
 # back may differ.
 CHECKPOINTS = 4096
@@ -70,8 +70,8 @@ class Windows(NamedTuple):
     def empty(cls, problem: Problem, y: Float[Array, " k"], goals: int) -> "Windows":
         """Record for `max_steps` attempts on the way to all goals together."""
         adjoint: Any = problem.method.adjoint
-        n, most = adjoint.recorded_steps or KEPT, problem.method.max_steps
-        n = min(n, most)
+        most = problem.method.max_steps
+        n = min(adjoint.recorded_steps or WINDOW, most)
         # the last window on the way to each goal may hold few steps
         w = -(-most // n) + goals
         zeros = lambda *shape: jnp.zeros(shape, y.dtype)
@@ -139,10 +139,8 @@ def _record_way(
         now = _choose(is_going, end, now)
         return is_going & (end.result == MORE) & ~over, now, windows
 
-    success = diffrax.RESULTS.successful
-    now = SegmentEnd(
-        carry.t, carry.y, carry.solver_state, carry.controller_state, none, none, success
-    )
+    states = (carry.solver_state, carry.controller_state)
+    now = SegmentEnd(carry.t, carry.y, *states, none, none, diffrax.RESULTS.successful)
     begin = (jnp.asarray(True), now, windows)
     _, end, windows = jax.lax.while_loop(lambda at: eqxi.unvmap_any(at[0]), next_window, begin)
     return end, windows, windows.number
@@ -219,13 +217,8 @@ def _integrate_recorded(
     start: _Start, problem: Problem, memory: Any, is_jump: Bool[Array, " g"] | None
 ) -> tuple[IntegrationState, Row]:
     problem, carry = _restore_start(start, problem, memory)
-
-    def integrate_to(carry: IntegrationState, t1: Any, _: None) -> tuple[SegmentEnd, None, None]:
-        return read_end(problem.solve(carry, t1, diffrax.ForwardMode())), None, None
-
-    goals = Goals(start.times, is_jump)
-    end, _, (rows, *_) = pass_goals(problem, carry, goals, integrate_to, None)
-    return end, rows
+    integrate_to = lambda carry, t1: read_end(problem.solve(carry, t1, diffrax.ForwardMode()))
+    return reach_goals(problem, carry, Goals(start.times, is_jump), integrate_to)
 
 
 class _Record(NamedTuple):

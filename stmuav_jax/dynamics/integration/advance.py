@@ -26,7 +26,7 @@ from ...mechanics.state import State
 from ..formulations.base import Residuals
 from ..method import DiscreteAdjoint
 from .adjoint import diffrax_adjoint, integrate_recorded, is_recorded
-from .goals import Goals, Row, make_row, pass_goals
+from .goals import Goals, Row, make_row, reach_goals
 from .problem import (
     Counts,
     IntegrationState,
@@ -176,13 +176,11 @@ def _integrate_goals(
             return integrate_recorded(problem, carry, goals)
         adjoint = diffrax_adjoint(adjoint, problem, len(goals.times))
 
-    def integrate_to(carry: IntegrationState, t1: Any, _: None) -> tuple[SegmentEnd, None, None]:
-        if problem.method.event is not None:
-            return to_event(problem, carry, t1, adjoint), None, None
-        return read_end(problem.solve(carry, t1, adjoint)), None, None
-
-    end, _, (rows, *_) = pass_goals(problem, carry, goals, integrate_to, None)
-    return end, rows
+    if problem.method.event is not None:
+        integrate_to = lambda carry, t1: to_event(problem, carry, t1, adjoint)
+    else:
+        integrate_to = lambda carry, t1: read_end(problem.solve(carry, t1, adjoint))
+    return reach_goals(problem, carry, goals, integrate_to)
 
 
 def _make_trajectory(problem: Problem, end: IntegrationState, rows: Row) -> Trajectory:

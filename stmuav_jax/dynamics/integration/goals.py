@@ -85,6 +85,18 @@ def pass_goals(
     return end, memory, rows
 
 
+def reach_goals(
+    problem: Problem,
+    carry: IntegrationState,
+    goals: Goals,
+    integrate_to: Callable[[IntegrationState, Any], SegmentEnd],
+) -> tuple[IntegrationState, Row]:
+    """`pass_goals` without a record: end and rows."""
+    integrate = lambda carry, t1, _: (integrate_to(carry, t1), None, None)
+    end, _, (rows, *_) = pass_goals(problem, carry, goals, integrate, None)
+    return end, rows
+
+
 def _pass_jump(carry: IntegrationState, jump: Float[Array, ""]) -> IntegrationState:
     """Carry right after a jump, if it has reached the jump."""
     at = (carry.t == prevbefore(jump)) | (carry.t == jump)

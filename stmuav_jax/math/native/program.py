@@ -153,7 +153,10 @@ class Program:
     def fold(self, known_entries: Sequence[np.ndarray | None]) -> "Program":
         """Program for operands some of whose entries are known."""
         key = tuple(None if x is None else x.tobytes() for x in known_entries)
-        return self.derived(("known", key), lambda: Program(self.jaxpr, self.groups, known_entries))
+        return self.derived(("known", key), lambda: self._with_known(known_entries))
+
+    def _with_known(self, known_entries: Sequence[np.ndarray | None]) -> "Program":
+        return Program(self.jaxpr, self.groups, known_entries)
 
     def push_forward(self, tangent_mask: tuple[bool, ...]) -> "Program":
         """Program of (arguments, tangents of those that move) for the tangents of the results."""
@@ -239,10 +242,8 @@ class Transpose(Program):
         ]
         return list(jax.linear_transpose(linear, *shapes)(full))
 
-    def fold(self, known_entries: Sequence[np.ndarray | None]) -> Program:
-        key = tuple(None if x is None else x.tobytes() for x in known_entries)
-        masks = self.known_mask, self.cotangent_mask
-        return self.derived(("known", key), lambda: Transpose(self.source, *masks, known_entries))
+    def _with_known(self, known_entries: Sequence[np.ndarray | None]) -> Program:
+        return Transpose(self.source, self.known_mask, self.cotangent_mask, known_entries)
 
     def _make_graph(self) -> Any:
         program, masks = self.source.graph(), (self.known_mask, self.cotangent_mask)

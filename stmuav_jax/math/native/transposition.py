@@ -119,8 +119,12 @@ def _copy_known(
             linear.add(node)
         else:
             same = [copies[arg] for arg in args]
-            of = {"select": graph.select, "lookup": lambda *at: graph.node("lookup", *at)}
-            copies[node] = of[op](*same) if op in of else graph.apply(op, *same)
+            if op == "select":
+                copies[node] = graph.select(*same)
+            elif op == "lookup":
+                copies[node] = graph.node(op, *same)
+            else:
+                copies[node] = graph.apply(op, *same)
             if node in source.order_tests:
                 graph.order_tests.add(copies[node])
     return copies, linear
