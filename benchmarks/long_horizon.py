@@ -82,7 +82,7 @@ def integration(solver: diffrax.AbstractSolver, hold: str, redundant: bool) -> C
     def run(tol: Any, gain: Any, system: stm.System, state: stm.State, ts: Any) -> Path:
         held = stm.Projection() if hold == "projection" else stm.Baumgarte(gain, gain, gain)
         tree = stm.Tree(redundant=redundant)
-        found = trajectory(tree, solver, stabilisation=held)(system, state, ts, tol)
+        found = trajectory(tree, solver, steps=200_000, stabilisation=held)(system, state, ts, tol)
         # a run that stopped keeps its last time
         good = found.ts >= ts * (1 - 1e-12)
         of = jax.vmap(lambda state: stm.dynamics.energy(system, state, jnp.zeros(())))(found.states)

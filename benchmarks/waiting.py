@@ -44,9 +44,9 @@ BEFORE = {"view": "simulate", "view, report": "montecarlo"}
 
 
 def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
-    """Times [s] and peak memory [MB] of one run of the command line, and its exit code."""
+    """Times [s] and peak memory [MB] of one run of the command line, which must succeed."""
     given = words.format(out=out).split()
-    command = [sys.executable, "-m", "stmuav_jax.cli.main", *given]
+    command = [sys.executable, "-m", "stmuav_jax", *given]
     clock = time.perf_counter()
     process = subprocess.Popen(
         command,
@@ -56,11 +56,12 @@ def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
     )
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"`stmuav {' '.join(given)}` ended with exit code {process.returncode}.")
     return {
         "wall": time.perf_counter() - clock,
         "cpu": used.ru_utime + used.ru_stime,
         "memory": used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3),
-        "exit": process.returncode,
         **split(out),
     }
 

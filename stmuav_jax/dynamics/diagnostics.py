@@ -555,7 +555,7 @@ def inspect_start(
             constraints contradict each other, or the formulation allows for no dependent rows.
     """
     rows = prepare_rows(system)
-    batched_rows = rows_of(rows, jax.tree.map(lambda x: x[None], state), t)
+    batched_rows = rows_of(rows, jax.tree.map(lambda x: np.asarray(x)[None], state), t)
     start_rows = RowsAt(*(x[0] for x in batched_rows))
     check_loads(system, start_rows.finite_loads, t)
     limits = consistent_limits(system, rows, state, start_rows)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...checks.numbers import as_numpy, stack_arrays
+from ...checks.numbers import array_module, as_numpy, stack_arrays
 from ...mechanics.constraint import (
     ANGULAR,
     COUPLINGS,
@@ -176,19 +176,23 @@ class Constraints(eqx.Module):
         """Number of constraint rows m."""
         return len(self.owner)
 
-    def scales(self) -> Float[Array, "m *s"]:
+    def scales(self) -> Float[Array | np.ndarray, "m *s"]:
         """Factors that turn rows into lengths or angles: 1 / (2 l) for distances, else 1.
 
         The conversion holds near zero; rows that are cosines become angles [rad], see `angular`.
         """
-        if not self.groups:
-            return jnp.zeros((0,))
+        lengths = as_numpy([group.data.length for group in self.groups])
+        xp = array_module(lengths)
+        if not lengths:
+            return xp.zeros(0)
         # A distance row is a difference of squares: its derivative by the length is 2 l, which turns its
         # residual into a length.
-        lengths = [(g.kind, jnp.repeat(g.data.length, ROWS[g.kind], axis=0)) for g in self.groups]
-        return jnp.concatenate(
-            [0.5 / x if kind == "distance" else jnp.ones_like(x) for kind, x in lengths]
-        )
+        factors = [
+            0.5 / x if group.kind == "distance" else xp.ones_like(x)
+            for group, x in zip(self.groups, lengths, strict=True)
+        ]
+        rows = [ROWS[group.kind] for group in self.groups]
+        return xp.concatenate([xp.repeat(x, k, axis=0) for x, k in zip(factors, rows, strict=True)])
 
     @property
     def angular(self) -> np.ndarray:

@@ -533,11 +533,19 @@ def targets_in(jaxpr: Any) -> set[str]:
 
 
 class _Traced(NamedTuple):
-    """Program of a function, the arrays of its arguments that are operands, and what puts results together."""
+    """A function of arguments of one structure.
 
-    program: Program
+    Attributes:
+        program: None if all results are arguments.
+        used: the arrays of the arguments that are operands.
+        restore: result of the function from the program's results and the arrays.
+        jitted: the function of the arrays, as XLA compiles it.
+    """
+
+    program: Program | None
     used: list[int]
     restore: Callable[[Sequence[Any], Sequence[Any]], Any]
+    jitted: Callable[[Sequence[Any]], Any]
 
 
 # Structures of arguments for which a function keeps its program.
@@ -569,8 +577,8 @@ def native(
     jitted: Any = eqx.filter_jit(function)
     programs: OrderedDict[Any, _Traced | None] = OrderedDict()
 
-    def find(args: Any) -> tuple[_Traced, list[Any]] | None:
-        """Program and the arrays of the arguments; None where XLA compiles the function."""
+    def look_up(args: Any) -> tuple[_Traced, list[Any]] | None:
+        """What is kept for such arguments, and their arrays; None if nothing can be kept."""
         if not is_on():
             return None
         leaves, structure = jax.tree.flatten(args)
@@ -587,23 +595,31 @@ def native(
             owners = [k for k, arg in enumerate(args) for _ in jax.tree.leaves(arg)]
             groups = [owners[k] for k in places]
             entry = _make(function, structure, static, places, arrays, groups, keeps_unused)
-            if tables is not None and entry is not None:
+            if tables is not None and entry is not None and entry.program is not None:
                 body = evaluate_row.find((*args, *(table[0] for table in tables)))
-                program = body and Recursion(entry.program.jaxpr, groups, body[0].program, tables)
-                entry = program and entry._replace(program=program)
+                jaxpr = entry.program.jaxpr
+                program = body and Recursion(jaxpr, groups, body[0].program, tables)
+                entry = entry._replace(program=program)
             programs[key] = entry
             # A program holds its jaxpr, derivatives and graph. A process that makes many
             # structures, as a test suite does, would keep them all; the oldest go first.
             while len(programs) > MOST_PROGRAMS:
                 programs.popitem(last=False)
         entry = programs[key]
+        return entry and (entry, arrays)
+
+    def find(args: Any) -> tuple[_Traced, list[Any]] | None:
+        """Program and the arrays of the arguments; None where XLA compiles the function."""
+        match = look_up(args)
+        return match if match is not None and is_program(match[0]) else None
+
+    def is_program(entry: _Traced) -> bool:
         # XLA compiles it as it would without this module; the graph is tried here, so that what
         # has none is not wrapped in a primitive that hides it from XLA's fusion. Within another
         # function of the kind it becomes a part of that one's graph, or is traced again where that
         # one has none.
-        if entry is None or (not _tracing.depth and entry.program.graph() is None):
-            return None
-        return entry, arrays
+        program = entry.program
+        return program is not None and (_tracing.depth > 0 or program.graph() is not None)
 
     def can_be_found(args: Any) -> bool:
         """False for a function of the user's that is of a kind which no program is found by."""
@@ -612,16 +628,20 @@ def native(
 
     @wraps(function)
     def call(*args: Any) -> Any:
-        match = find(args)
+        match = look_up(args)
         if match is None:
             return jitted(*args) if not is_on() or can_be_found(args) else function(*args)
         entry, arrays = match
+        if not is_program(entry):
+            # What JAX keeps of it goes with the entry.
+            return entry.jitted(arrays)
         operands = [arrays[k] for k in entry.used]
         return entry.restore(native_p.bind(*operands, program=entry.program, lead=()), arrays)
 
     def has_code(*args: Any) -> bool:
         match = find(args)
-        return match is not None and match[0].program.graph() is not None
+        program = match and match[0].program
+        return program is not None and program.graph() is not None
 
     call.find, call.has_code = find, has_code  # pyright: ignore[reportAttributeAccessIssue]
     return call
@@ -713,8 +733,6 @@ def _make(
     arguments = {id(v): k for k, v in enumerate(jaxpr.jaxpr.invars)}
     origins = [arguments.get(id(v)) for v in jaxpr.jaxpr.outvars]
     computed_mask = [origin is None for origin in origins]
-    if not any(computed_mask):
-        return None
     # A model has some hundred numbers, of which a function may need a few: each operand takes time in every
     # transformation of JAX.
     needed, used = partial_eval.dce_jaxpr(jaxpr.jaxpr, computed_mask, instantiate=keeps_unused)
@@ -728,4 +746,12 @@ def _make(
             whole[k] = next(values_left) if origin is None else arrays[origin]
         return jax.tree.unflatten(tree, whole)
 
-    return _Traced(program, places_used, restore)
+    def run_jitted(arrays: Sequence[Any]) -> Any:
+        whole = list(rest)
+        for k, value in zip(traced, jitted(*arrays), strict=True):
+            whole[k] = value
+        return jax.tree.unflatten(tree, whole)
+
+    flat.__name__ = flat.__qualname__ = getattr(function, "__name__", "run")
+    jitted = jax.jit(flat)
+    return _Traced(program if any(computed_mask) else None, places_used, restore, run_jitted)
