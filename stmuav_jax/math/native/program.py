@@ -578,7 +578,7 @@ def native(
     programs: OrderedDict[Any, _Traced | None] = OrderedDict()
 
     def look_up(args: Any) -> tuple[_Traced, list[Any]] | None:
-        """What is kept for such arguments, and their arrays; None if nothing can be kept."""
+        """Entry for such arguments, and their arrays; None if none can be kept."""
         if not is_on():
             return None
         leaves, structure = jax.tree.flatten(args)
