@@ -26,7 +26,7 @@ import numpy as np
 from jax.extend.core import get_opaque_trace_state
 
 from ..math import exported
-from .native.program import is_on, targets_in
+from .native.program import is_native, is_on, targets_in
 from .native.structure import Structure, choose_structure, find_structure, rely_on
 
 Options = dict[str, str | bool | int | float]
@@ -186,7 +186,8 @@ def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     Args:
         function: function of positional arguments; arrays are traced, all else must be hashable.
     """
-    within: Any = eqx.filter_jit(function)
+    # Machine code is a single operation already; JAX would keep the program around it as long as the function.
+    within: Any = function if is_native(function) else eqx.filter_jit(function)
 
     @wraps(function)
     def call(*args: Any) -> Any:

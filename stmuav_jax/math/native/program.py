@@ -647,6 +647,11 @@ def native(
     return call
 
 
+def is_native(function: Callable[..., Any]) -> bool:
+    """True for a function made by `native`."""
+    return hasattr(function, "has_code")
+
+
 @native
 def evaluate(function: Callable[..., Any], *args: Any) -> Any:
     """Value of a function that is itself a pytree, such as a controller, by `native`."""
