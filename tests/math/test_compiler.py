@@ -21,6 +21,7 @@ from stmuav_jax.math.compiler import (
     memory_maps,
     remember_results,
 )
+from stmuav_jax.math.native.program import native
 
 traced: list[str] = []
 
@@ -141,6 +142,14 @@ def simulated(name, **settings):
     return stm.simulate(
         system, system.reference, method=method, ts=[0.0, 0.1], error_estimate=False, analysis=False
     ).states.r[-1, 0, 2]
+
+
+def test_machine_code_within_a_transformation_is_one_operation():
+    """JAX would keep a program around it for as long as the process lives, for every structure."""
+    doubled = kept_jit(native(lambda x: 2.0 * x))
+    equations = jax.make_jaxpr(jax.vmap(doubled))(np.eye(3)).eqns
+    assert [str(equation.primitive) for equation in equations] == ["native"]
+    np.testing.assert_array_equal(jax.vmap(doubled)(np.eye(3)), 2.0 * np.eye(3))
 
 
 @pytest.mark.slow
