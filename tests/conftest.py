@@ -4,6 +4,7 @@ import atexit
 import gc
 import itertools
 import os
+import pkgutil
 import shutil
 import sys
 import tempfile
@@ -56,8 +57,20 @@ def pytest_configure(config: pytest.Config) -> None:
     execute the same annotations.
     """
     if str(config.getoption("markexpr")).strip() != "slow":
-        install_import_hook("stmuav_jax", "beartype.beartype")
+        install_import_hook(annotated_modules(), "beartype.beartype")
     optimise(0)
+
+
+def annotated_modules() -> list[str]:
+    """All modules but those that make machine code, whose scalar graphs have no shapes."""
+    package = Path(__file__).parents[1] / "stmuav_jax"
+    folders = {"stmuav_jax": package, "stmuav_jax.math": package / "math"}
+    found = [
+        f"{at}.{module.name}"
+        for at, folder in folders.items()
+        for module in pkgutil.iter_modules([str(folder)])
+    ]
+    return [name for name in found if name not in ("stmuav_jax.math", "stmuav_jax.math.native")]
 
 
 def optimise(level: int) -> None:
