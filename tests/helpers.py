@@ -219,6 +219,12 @@ def four_bar(
     return stm.System(bodies, joints, forces, **more)
 
 
+@quick_jit
+def rows_of(model: Any, state: stm.State, t: Any = 0.0) -> Any:
+    """Constraint functions, targets and Jacobian of a prepared system in maximal coordinates."""
+    return model.constraints.equations(jnp.asarray(t), model.system.kinematics(state))
+
+
 def four_bar_state(system: stm.System, rate: float) -> stm.State:
     """The four-bar's reference posture, its crank turning at `rate` [rad/s]."""
     omega = np.zeros((3, 3))
@@ -226,9 +232,7 @@ def four_bar_state(system: stm.System, rate: float) -> stm.State:
     v = np.zeros((3, 3))
     v[0] = np.cross(omega[0], FOUR_BAR_POINTS[1] / 2)
     hold = system.reference
-    model = stm.Augmented().prepare(system)
-    eq = model.constraints.equations(jnp.zeros(()), system.kinematics(hold))
-    J = np.asarray(eq.matrix)
+    J = np.asarray(rows_of(stm.Augmented().prepare(system), hold).matrix)
     u0 = np.concatenate([v, omega], axis=1).reshape(-1)
     mine = np.zeros(18, dtype=bool)
     mine[:6] = True

@@ -11,10 +11,10 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from ...checks.errors import ModelError, StateError, closest_name, has_values
+from ...checks.numbers import array_module, as_jax, as_numpy
 from ...checks.shapes import Numbers
 from ...math import lapack
 from ...math.compiler import is_transformed, kept_jit
-from ...math.rotation import normalise
 from ...mechanics.joint import CATALOGUE, drive, free_coordinates
 from ...mechanics.joint_states import evaluate_coordinate
 from ...mechanics.state import State
@@ -80,19 +80,25 @@ def assemble(
     check_state(system, guess)
     _check_guess(system, guess)
     free = _free_coordinates(system, hold or {})
-    normal = State(guess.r, jax.vmap(normalise)(guess.p), guess.v, guess.omega)
+    p = as_numpy(guess.p)
+    p = as_jax(p / array_module(p).linalg.norm(p, axis=1, keepdims=True))
+    normal = State(guess.r, p, guess.v, guess.omega)
     # A held joint becomes a driven one, and the equations need no case for it.
     locked = _lock_joints(system, normal, hold_joints)
-    time = jnp.asarray(t, dtype=guess.r.dtype)
+    time = jnp.asarray(np.asarray(t) if has_values(t) else t, dtype=guess.r.dtype)
     start = normal if start is None else start
-    state, residuals = _solve(locked, time, normal, start, jnp.asarray(free), max_steps, tolerance)
-    worst = jnp.max(residuals, initial=0.0)
-    converged = jnp.isfinite(worst) & (worst <= tolerance)
-    displacement = jnp.max(
-        jnp.sqrt(jnp.sum((jax.lax.stop_gradient(state.r) - guess.r) ** 2, axis=1))
+    state, residuals = _solve(locked, time, normal, start, as_jax(free), max_steps, tolerance)
+    r, guessed_r, residuals = as_numpy((jax.lax.stop_gradient(state.r), guess.r, residuals))
+    xp = array_module(r, guessed_r, residuals)
+    worst = xp.max(residuals, initial=0.0)
+    displacement = xp.max(xp.sqrt(xp.sum((r - guessed_r) ** 2, axis=1)))
+    result = Assembly(
+        state,
+        as_jax(xp.asarray(xp.isfinite(worst) & (worst <= tolerance))),
+        as_jax(residuals[: len(system.joints)]),
+        as_jax(xp.asarray(displacement)),
     )
-    result = Assembly(state, converged, residuals[: len(system.joints)], displacement)
-    if throw and has_values(result) and not bool(converged):
+    if throw and has_values(result) and not bool(result.converged):
         names = [joint.name for joint in locked.joints]
         k = int(np.nanargmax(np.where(np.isfinite(residuals), residuals, np.inf)))
         raise StateError(
@@ -119,7 +125,7 @@ def _solve(
         # The method of Gauss and Newton needs no second derivatives, which take most of the time of
         # compiling.
         closing = close_loops(system, guess, start_posture, {}, {}, t, free, max_steps)
-        if bool(closing.is_nearest) and bool(jnp.all(closing.residuals <= tolerance)):
+        if bool(closing.is_nearest) and bool(np.all(np.asarray(closing.residuals) <= tolerance)):
             return closing.state, closing.residuals
     return _assemble_state(*arguments)
 

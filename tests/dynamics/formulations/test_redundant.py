@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FOUR_BAR_POINTS, four_bar, four_bar_state, relative_error, scene_of
+from helpers import FOUR_BAR_POINTS, four_bar, four_bar_state, relative_error, rows_of, scene_of
 
 import stmuav_jax as stm
 
@@ -49,7 +49,7 @@ def test_the_named_joints_own_the_dependent_rows(bars):
     system, _, state = bars
     model = stm.Augmented().prepare(system)
     owner = np.array(model.constraints.owner)
-    J = model.constraints.equations(jnp.zeros(()), system.kinematics(state)).matrix
+    J = rows_of(model, state).matrix
     for name in stm.dynamics.rank(system, state).redundant:
         others = owner != system.joint_index(name)
         assert np.linalg.matrix_rank(np.asarray(J)[others], tol=1e-9) == 15
@@ -59,9 +59,8 @@ def test_multipliers_have_minimum_norm(bars, solved):
     """lambda = (J W J^T)^+ (gamma - J W g), in NumPy from J, gamma and the loads."""
     system, _, state = bars
     model = stm.Augmented().prepare(system)
-    kin = system.kinematics(state)
-    eq = model.constraints.equations(jnp.zeros(()), kin)
-    load = model.load(jnp.zeros(()), kin)
+    eq = rows_of(model, state)
+    load = model.load(jnp.zeros(()), system.kinematics(state))
     J, gamma = np.asarray(eq.matrix), np.asarray(eq.gamma)
     W = np.zeros((18, 18))
     g = np.zeros(18)
