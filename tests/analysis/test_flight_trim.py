@@ -69,6 +69,7 @@ def test_hover_speeds(many):
     assert len(angles) == 22
 
 
+@pytest.mark.slow
 def test_rotors_with_curves_give_the_wrench_of_rotors_without(uav, start):
     """Thrusts of linear and quadratic parts, and speeds by the roots of the curve in closed form."""
     plain, (c, offset) = uav.rotors, (4e-3, -0.4)

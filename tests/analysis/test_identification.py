@@ -344,6 +344,7 @@ def test_a_search_that_has_not_arrived_says_so():
     assert "not at a minimum" in found.verdict.explanation
 
 
+@pytest.mark.slow
 def test_an_estimate_that_no_mechanism_has_is_said(by_encoder):
     """A pendulum whose angle grows where friction would take it down: a negative friction, by name."""
     start = np.array([1.0]), np.array([20.0])

@@ -246,6 +246,7 @@ def test_states_between_saved_times_are_as_accurate_as_on_them(run):
         stm.dynamics.states_at(rare, [0.2, 0.6])
 
 
+@pytest.mark.slow
 def test_loads_between_saved_times_of_a_planar_loop():
     """A four-bar of hinges, three of whose rows depend on others: stored rarely, and at every time."""
     system = four_bar()

@@ -143,9 +143,8 @@ def test_states_of_another_size_are_refused():
         stm.integrate(system, two, TS)
 
 
-@pytest.mark.parametrize(
-    "formulation", [stm.Tree(), pytest.param(stm.Augmented(), marks=pytest.mark.slow)], ids=str
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=str)
 def test_masses_that_are_none_are_flagged_and_leave_the_others_alone(formulation):
     """A batch over a mass with 0, -1 kg and NaN: no motion there, and the others to the last bit."""
     method = stm.Method(formulation=formulation, adjoint=diffrax.ForwardMode())
@@ -253,6 +252,7 @@ def test_a_motion_that_stops_on_the_way_back_is_not_a_number():
     assert np.all(np.isnan(found.states.r[1:]))
 
 
+@pytest.mark.slow
 def test_a_driver_goes_back_in_time():
     """A joint with a prescribed motion stands where the motion was at that time."""
     angle = lambda t: 0.5 * jnp.sin(3 * t) + 0.2 * t**2

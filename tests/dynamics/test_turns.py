@@ -114,11 +114,8 @@ def test_states_between_saved_times_and_files_keep_the_turns(run, tmp_path):
     np.testing.assert_allclose(saved["internal"][:, 0], exact, rtol=1e-9, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "formulation",
-    [stm.Tree(), pytest.param(stm.Augmented(), marks=pytest.mark.slow)],
-    ids=["tree", "augmented"],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("formulation", [stm.Tree(), stm.Augmented()], ids=["tree", "augmented"])
 def test_a_batch_of_starts_counts_its_own_turns(formulation):
     """`integrate` under vmap and jvp, from starts 0, 5 and 1,000 rad from the free angle."""
     method = sharp(formulation=formulation, solver=diffrax.Dopri8(), adjoint=diffrax.ForwardMode())

@@ -87,6 +87,7 @@ def test_another_process_gives_the_same_bits():
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_threads_do_not_disturb_each_other():
     masses = [0.5 + 0.1 * k for k in range(12)]
     alone = [bits(flown(mass)) for mass in masses]

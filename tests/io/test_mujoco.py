@@ -225,7 +225,8 @@ def test_a_urdf_without_its_meshes_is_checked_by_the_command_line(mujoco, tmp_pa
 
 
 @pytest.mark.parametrize(
-    "what", ["tree", pytest.param("loops", marks=pytest.mark.slow), "cart_pole"]
+    "what",
+    [*(pytest.param(what, marks=pytest.mark.slow) for what in ("tree", "loops")), "cart_pole"],
 )
 def test_what_is_saved_moves_alike_when_it_is_loaded(mujoco, tmp_path, what, tree):
     scene = tree

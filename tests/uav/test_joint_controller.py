@@ -102,7 +102,8 @@ def joint_accelerations(system, state):
     return np.asarray(jax.jvp(rate, (state,), (later,))[1]), found
 
 
-@pytest.mark.parametrize("closed", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("closed", [False, True])
 def test_computed_torque_gives_the_accelerations_that_it_asks_for(closed):
     """While the base flies anyhow, joint errors obey e'' + 2 d W e' + W^2 e = 0, also where a loop is closed."""
     system = machine(closed=closed)

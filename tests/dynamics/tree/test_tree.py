@@ -75,7 +75,9 @@ SYSTEMS = {
 }
 
 
-@pytest.fixture(scope="module", params=list(SYSTEMS))
+@pytest.fixture(
+    scope="module", params=["floating", pytest.param("on ground", marks=pytest.mark.slow)]
+)
 def both(request):
     """A random consistent state, its evaluations by maximal and by relative coordinates, and it back."""
     system = SYSTEMS[request.param]()

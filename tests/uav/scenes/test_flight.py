@@ -84,9 +84,8 @@ def test_the_gear_of_a_scene_stands_below_its_base():
     assert "gear.depth" in stm.make_scene("hexacopter", gear=stm.uav.Gear()).parameters
 
 
-@pytest.mark.parametrize(
-    "name", ["hexacopter", pytest.param("uav_tracker", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hexacopter", "uav_tracker"])
 def test_a_flight_in_gusts_keeps_its_balances(name, tmp_path):
     """All options: certificate, saved speeds, the same again from the same seed."""
     make = lambda: stm.make_scene(
