@@ -734,7 +734,7 @@ each:
 end:
   ret i64 %n
 }}
-define ptr @handler(ptr %frame) #0 {{
+define ptr @program(ptr %frame) #0 {{
   %extension.at = getelementptr i8, ptr %frame, i64 {_EXTENSIONS}
   %extension = load ptr, ptr %extension.at
   %none = icmp eq ptr %extension, null
@@ -823,8 +823,6 @@ _lock = threading.Lock()
 # names of the programs that XLA knows by their digests, and their object code
 _targets: dict[str, str] = {}
 objects: dict[str, bytes] = {}
-# engines own the code, which XLA may call for as long as the process lives
-_engines: list[Any] = []
 _bytes = 0
 
 
@@ -876,33 +874,38 @@ def register(code: Code) -> str:
         path = None if folder is None else folder / f"{digest}.o"
         content = None if path is None else _read(path)
         if content is None:
-            content = _compile(llvm, code.text, level)
+            content = _compile(llvm, code.text.replace("@program(", f"@{name}("), level)
             if path is not None:
                 _write(path, content)
-        _register(llvm, name, content)
+        _register(name, content)
         _targets[digest] = name
         return name
 
 
 def load(name: str, content: bytes) -> None:
     """Let XLA find the object code of a program that another process has made."""
-    llvm = _binding()
     with _lock:
         if name.removeprefix("stmuav_") not in _targets:
-            _register(llvm, name, content)
+            _register(name, content)
             _targets[name.removeprefix("stmuav_")] = name
 
 
-def _register(llvm: Any, name: str, content: bytes) -> None:
+@cache
+def _engine() -> Any:
+    """Owner of all code, which XLA may call for as long as the process lives."""
+    llvm = _binding()
+    return llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(llvm, 0))
+
+
+def _register(name: str, content: bytes) -> None:
     global _bytes
     # Code goes through an object file even where it was just compiled: the same bytes are kept on
     # disk, and are handed to other processes.
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(llvm, 0))
-    engine.add_object_file(llvm.ObjectFileRef.from_data(content))
+    engine = _engine()
+    engine.add_object_file(_binding().ObjectFileRef.from_data(content))
     engine.finalize_object()
-    address = engine.get_function_address("handler")
+    address = engine.get_function_address(name)
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
-    _engines.append(engine)
     objects[name] = content
     _bytes += len(content)
 
