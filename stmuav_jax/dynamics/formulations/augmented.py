@@ -98,6 +98,9 @@ class Augmented(AbstractFormulation):
         row_mask = None if row_mask is None else as_jax(row_mask)
         return dataclasses.replace(prepare_rows(system), row_mask=row_mask)
 
+    def vector_size(self, model: AugmentedModel) -> int:
+        return 13 * model.system.n_bodies
+
     def to_vector(self, model: AugmentedModel, state: State) -> Float[Array, " k"]:
         return jnp.concatenate([x.reshape(-1) for x in (state.r, state.p, state.v, state.omega)])
 

@@ -147,6 +147,10 @@ class AbstractFormulation(eqx.Module):
         """Flat vector x of the integrated variables."""
 
     @abstractmethod
+    def vector_size(self, model: Any) -> int:
+        """Number of entries of x."""
+
+    @abstractmethod
     def to_state(self, model: Any, x: Float[Array, " k"]) -> State:
         """State of all bodies at x."""
 

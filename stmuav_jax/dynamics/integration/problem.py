@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import inspect
 import types
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import diffrax
@@ -22,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...checks.errors import SettingError
 from ...checks.numbers import as_floats
-from ...math.compiler import MOST_PROGRAMS, kept_jit
+from ...math.compiler import kept_jit
 from ...math.native.program import native
 from ...mechanics.body import has_positive_masses
 from ...mechanics.internal import internal_count, internal_rates, internal_starts, with_internal
@@ -430,24 +429,8 @@ def prepare_problem(system: System, method: Method) -> Problem:
         lambda m: m.event, method, _as_arrays(method.event), is_leaf=lambda x: x is None
     )
     model = method.formulation.prepare(system)
-    n_state = _vector_size(method.formulation, model, system.reference)
+    n_state = method.formulation.vector_size(model)
     return Problem(model, method, system.floating, n_state, internal_count(system))
-
-
-def _vector_size(formulation: AbstractFormulation, model: AbstractModel, state: State) -> int:
-    """Number of entries of the formulation's vector.
-
-    It follows from structure and shapes, and tracing takes longer than a short run: once for each.
-    """
-    leaves, structure = jax.tree.flatten((formulation, model, state))
-    shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x
-    return _traced_size(structure, tuple(map(shape, leaves)))
-
-
-@lru_cache(maxsize=MOST_PROGRAMS)
-def _traced_size(structure: Any, leaves: tuple[Any, ...]) -> int:
-    formulation, model, state = jax.tree.unflatten(structure, leaves)
-    return eqx.filter_eval_shape(formulation.to_vector, model, state).shape[0]
 
 
 def fit_first_step(problem: Problem, span: Any) -> Problem:

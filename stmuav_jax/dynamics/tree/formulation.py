@@ -283,6 +283,10 @@ class Tree(AbstractFormulation):
         row_mask = None if row_mask is None else as_jax(row_mask)
         return TreeModel(system, parameters, group_constraints(system, joints=tree.cut), row_mask)
 
+    def vector_size(self, model: TreeModel) -> int:
+        tree = model.parameters.tree
+        return tree.n_positions + tree.n_velocities
+
     def to_vector(self, model: TreeModel, state: State) -> Float[Array, " k"]:
         return join_coordinates(read_coordinates(model.parameters, state))
 

@@ -94,6 +94,11 @@ class SpanningTree:
         """Number of the tree's velocities: its degrees of freedom with all loops open."""
         return 6 * self.floating + sum(len(s.motion.columns) for s in self.steps)
 
+    @property
+    def n_positions(self) -> int:
+        """Number of the tree's positions, with Euler parameters for rotations in space."""
+        return 7 * self.floating + sum(math.prod(s.motion.positions) for s in self.steps)
+
     def behind(self) -> list[tuple[int, float, set[int]]]:
         """Number, sign and bodies behind every joint of the tree; +1 from body i to j, else -1."""
         below: dict[int, set[int]] = {}

@@ -37,6 +37,9 @@ class NewtonEuler(AbstractFormulation):
     def prepare(self, system):
         return Bare(system)
 
+    def vector_size(self, model):
+        return 13 * model.system.n_bodies
+
     def to_vector(self, model, state):
         return jnp.concatenate([x.reshape(-1) for x in (state.r, state.p, state.v, state.omega)])
 

@@ -84,6 +84,7 @@ def both(request):
     rows, tree, t = stm.Augmented(), stm.Tree(), jnp.asarray(0.1)
     model, rng = tree.prepare(system), np.random.default_rng(3)
     x = jax.jit(lambda: tree.to_vector(model, system.reference))()
+    assert x.shape == (tree.vector_size(model),)
     move = rng.normal(size=x.shape)
     move[: -model.parameters.tree.n_velocities] *= 0.03
 
