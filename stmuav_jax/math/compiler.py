@@ -181,7 +181,7 @@ def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Programs are kept by function, structure, and shapes of the arguments, at most `MOST_PROGRAMS`
     of all functions together; the least recently used are released. Within a transformation
-    (`jit`, `grad`, `vmap`) it is `eqx.filter_jit(function)`, a part of a larger program.
+    (`jit`, `grad`, `vmap`) the function is a part of a larger program.
 
     Args:
         function: function of positional arguments; arrays are traced, all else must be hashable.

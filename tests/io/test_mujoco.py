@@ -226,7 +226,11 @@ def test_a_urdf_without_its_meshes_is_checked_by_the_command_line(mujoco, tmp_pa
 
 @pytest.mark.parametrize(
     "what",
-    [*(pytest.param(what, marks=pytest.mark.slow) for what in ("tree", "loops")), "cart_pole"],
+    [
+        "cart_pole",
+        pytest.param("tree", marks=pytest.mark.slow),
+        pytest.param("loops", marks=pytest.mark.slow),
+    ],
 )
 def test_what_is_saved_moves_alike_when_it_is_loaded(mujoco, tmp_path, what, tree):
     scene = tree

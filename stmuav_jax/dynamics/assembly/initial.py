@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from ...checks.errors import ModelError, StateError, closest_name, has_values
-from ...checks.numbers import array_module, as_jax, as_numpy
+from ...checks.numbers import array_module, as_floats, as_jax, as_numpy
 from ...checks.shapes import Numbers
 from ...math import lapack
 from ...math.compiler import is_transformed, kept_jit
@@ -85,13 +85,13 @@ def assemble(
     normal = State(guess.r, p, guess.v, guess.omega)
     # A held joint becomes a driven one, and the equations need no case for it.
     locked = _lock_joints(system, normal, hold_joints)
-    time = jnp.asarray(np.asarray(t) if has_values(t) else t, dtype=guess.r.dtype)
+    time = as_floats(t).astype(guess.r.dtype)
     start = normal if start is None else start
     state, residuals = _solve(locked, time, normal, start, as_jax(free), max_steps, tolerance)
     r, guessed_r, residuals = as_numpy((jax.lax.stop_gradient(state.r), guess.r, residuals))
     xp = array_module(r, guessed_r, residuals)
     worst = xp.max(residuals, initial=0.0)
-    displacement = xp.max(xp.sqrt(xp.sum((r - guessed_r) ** 2, axis=1)))
+    displacement = xp.max(xp.linalg.norm(r - guessed_r, axis=1))
     result = Assembly(
         state,
         as_jax(xp.asarray(xp.isfinite(worst) & (worst <= tolerance))),

@@ -443,7 +443,13 @@ def fit_first_step(problem: Problem, span: Any) -> Problem:
 
 def begin_integration(problem: Problem, t0: Float[Array, ""], state0: State) -> IntegrationState:
     """Initial carry of an integration at t0 [s]."""
-    x = problem.method.formulation.to_vector(problem.model, state0)
+    formulation = problem.method.formulation
+    x = formulation.to_vector(problem.model, state0)
+    if len(x) != problem.n_state:
+        raise SettingError(
+            f"The vector of {formulation} must have as many entries as its vector_size says, "
+            f"{problem.n_state}, but it has {len(x)}."
+        )
     extra = (7 if problem.floating else 1) if problem.method.balances else 0
     system = problem.model.system
     internal = [internal_starts(system, system.kinematics(state0))] if problem.n_internal else []

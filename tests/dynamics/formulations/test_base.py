@@ -115,3 +115,17 @@ def test_one_that_cannot_allow_for_dependent_rows_is_refused_where_there_are():
         stm.ModelError, match=r"have dependent constraint rows, which NewtonEuler does not support"
     ):
         stm.simulate(scene, method=method, ts=[0.0, 0.1], analysis=False)
+
+
+def test_a_vector_of_another_size_is_refused():
+    """Further entries would count as states of forces."""
+
+    class Short(NewtonEuler):
+        def vector_size(self, model):
+            return 12
+
+    system = stm.System([stm.Body("top", 0.4, (1e-3, 2e-3, 3e-3), free=True)])
+    with pytest.raises(stm.SettingError, match=r"vector_size says, 12, but it has 13"):
+        stm.integrate(
+            system, system.reference, jnp.array([0.0, 0.1]), stm.Method(formulation=Short())
+        )

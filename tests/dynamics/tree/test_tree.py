@@ -69,18 +69,16 @@ def zoo(*, floating=False):
     return stm.System(bodies, joints, [stm.Gravity(), wind])
 
 
-SYSTEMS = {
-    "on ground": zoo,
-    "floating": lambda: zoo(floating=True),
-}
-
-
 @pytest.fixture(
-    scope="module", params=["floating", pytest.param("on ground", marks=pytest.mark.slow)]
+    scope="module",
+    params=[
+        pytest.param(True, id="floating"),
+        pytest.param(False, id="on ground", marks=pytest.mark.slow),
+    ],
 )
 def both(request):
     """A random consistent state, its evaluations by maximal and by relative coordinates, and it back."""
-    system = SYSTEMS[request.param]()
+    system = zoo(floating=request.param)
     rows, tree, t = stm.Augmented(), stm.Tree(), jnp.asarray(0.1)
     model, rng = tree.prepare(system), np.random.default_rng(3)
     x = jax.jit(lambda: tree.to_vector(model, system.reference))()
