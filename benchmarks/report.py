@@ -40,6 +40,7 @@ OTHER_PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
 SHOWN = (
     "suite_work_precision", "suite_published", "suite_stiff", "suite_scaling", "suite_hexacopter", "montecarlo",
     "suite_batch", "suite_vector_steps", "suite_gradient", "estimation", "trims", "hard", "waiting", "compile_times",
+    "structures",
 )  # fmt: skip
 
 DEFAULT = "stmuav_jax, Dopri8"

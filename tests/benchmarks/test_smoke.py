@@ -30,6 +30,12 @@ def test_compile_times(run_script):
     assert row["equations"] > 500
 
 
+def test_structures(run_script):
+    (row,) = run_script("structures")["rows"]
+    assert row["structures"] == 2
+    assert min(row["megabytes"], row["cpu_seconds"]) > 1
+
+
 def test_batch_sizes(run_script):
     (row,) = run_script("batch_sizes")["rows"]
     assert row["size"] == 8

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import four_bar, four_bar_state
 from parallel_robots import slider_crank
 
 import stmuav_jax as stm
 from stmuav_jax.math.native import llvm
-from stmuav_jax.math.native.program import evaluate
+from stmuav_jax.math.native.program import evaluate, targets_in
 
 pytestmark = pytest.mark.skipif(not llvm.available(), reason="llvmlite is not installed")
 
@@ -30,6 +31,30 @@ def test_a_slider_crank_and_its_derivatives_are_those_by_xla(formulation, machin
         results.append(jax.value_and_grad(height, has_aux=True)(system.reference))
     for mine, others in zip(*(jax.tree.leaves(r) for r in results), strict=True):
         np.testing.assert_allclose(mine, others, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_equations_are_machine_code_beside_the_choice_of_rows_and_as_by_xla(machine_code):
+    """Derivative with rows that are selected in every step, and its gradient."""
+    system, formulation = four_bar(), stm.Tree(redundant=True)
+    model = formulation.prepare(system)
+    x = formulation.to_vector(model, four_bar_state(system, 3.0))
+
+    def rates(x):
+        return formulation.derivative(model, jnp.zeros(()), x, stm.Projection())[0]
+
+    def rates_and_gradient(x):
+        value, transpose = jax.vjp(rates, x)
+        return value, *transpose(jnp.ones_like(value))
+
+    results = []
+    for on in (False, True):
+        machine_code(on)
+        traced = jax.jit(lambda x: rates_and_gradient(x)).trace(x)
+        assert bool(targets_in(traced.jaxpr.jaxpr)) == on
+        results.append(traced.lower().compile()(x))
+    for mine, others in zip(*results, strict=True):
+        np.testing.assert_allclose(mine, others, rtol=0, atol=1e-11 * np.max(np.abs(others)))
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from ...math.derivative import held_constant
 from ...math.linalg import factor_cholesky, factor_saddle, independent_rows, solve_lower
+from ...math.native.program import native
 from ...math.rotation import cross, rotation_matrix
 from ...math.stacked import apply_matrix, apply_transposed, multiply_matrices
 from ...mechanics.body import GROUND
@@ -465,6 +466,27 @@ def bound_singular(
     return jnp.where(jnp.isfinite(square), 1 / jnp.sqrt(square), 0.0)
 
 
+@native
+def _bound_after(
+    model: TreeModel,
+    t: Float[Array, ""],
+    at: TreeCoordinates,
+    by: Float[Array, "k"],
+    row_mask: Bool[Array, " m"],
+) -> Float[Array, ""]:
+    """`bound_singular` after a displacement along the velocities."""
+    return bound_singular(model, rows_after(model, t, at, by), row_mask)
+
+
+@native
+def _products_after(
+    model: TreeModel, t: Float[Array, ""], at: TreeCoordinates, by: Float[Array, "k"]
+) -> Float[Array, "m m"]:
+    """Products J J^T of the rows without units after a displacement along the velocities."""
+    J = _scale_jacobian(model, rows_after(model, t, at, by))
+    return J @ J.T
+
+
 def step_rows(model: TreeModel, t: Float[Array, ""], at: TreeCoordinates) -> Bool[Array, " m"]:
     """Mask of the independent rows (m,) for a step that starts here.
 
@@ -474,8 +496,7 @@ def step_rows(model: TreeModel, t: Float[Array, ""], at: TreeCoordinates) -> Boo
     displacement = AHEAD * _scale_velocities(model, at.u)
 
     def independent_at(share: Float[Array, ""]) -> Bool[Array, " m"]:
-        J = _scale_jacobian(model, rows_after(model, t, at, share * displacement))
-        return independent_rows(J @ J.T, WEAK**2)
+        return independent_rows(_products_after(model, t, at, share * displacement), WEAK**2)
 
     start_mask, ahead_mask = jax.vmap(independent_at)(jnp.array([0.0, 1.0], at.u.dtype))
     return jnp.where(jnp.sum(start_mask) >= jnp.sum(ahead_mask), start_mask, ahead_mask)
@@ -489,7 +510,7 @@ def measure_nearness(model: TreeModel, t: Float[Array, ""], at: TreeCoordinates)
     step = way_along(model, at.u)
 
     def singular_value_at(place: Float[Array, ""]) -> Float[Array, ""]:
-        return bound_singular(model, rows_after(model, t, at, place * step), row_mask)
+        return _bound_after(model, t, at, place * step, row_mask)
 
     present_clearance = singular_value_at(jnp.zeros((), at.u.dtype))
 

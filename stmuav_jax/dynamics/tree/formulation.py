@@ -315,23 +315,14 @@ class Tree(AbstractFormulation):
         x: Float[Array, " k"],
         stabilisation: AbstractStabilisation,
     ) -> tuple[Float[Array, " k"], Flows]:
-        tree, scheme = model.parameters.tree, stabilisation
-        at = split_vector(tree, x)
-        solved = self._solve_coordinates(model, t, at, scheme)
-        u_rate, driven = solved.rate, _driver_power(solved)
         # Only a formulation that allows dependent rows pays for postures beside the present one.
         if self._may_interpolate(model):
-            u_rate, driven = self._solve_interpolated(model, t, x, scheme)
-        rate = with_unit_vectors(
-            tree, coordinate_rates(tree, at, u_rate), scheme.add_norm_feedback, at
-        )
-        load, placement = solved.loads, solved.placement
-        # Flows of energy and momentum are integrated beside the state, so that the balances of a run's
-        # accuracy report have the error of the integrator and not that of a quadrature afterwards.
-        moment = cross(placement.r, load.force) + apply_matrix(placement.R_wb, load.moment)
-        power = load.power if solved.rows is None else load.power + driven
-        flows = Flows(power, jnp.sum(load.force[:, :-1], 1), jnp.sum(moment[:, :-1], 1))
-        return join_coordinates(rate), flows
+            u_rate, driven = self._solve_interpolated(model, t, x, stabilisation)
+            return _find_derivative(model, t, x, u_rate, driven, stabilisation)
+        at = split_vector(model.parameters.tree, x)
+        solved = self._solve_coordinates(model, t, at, stabilisation)
+        motion = (solved.placement, solved.loads, solved.rate, _driver_power(solved))
+        return _join_derivative(model.parameters, at, *motion, stabilisation)
 
     def reactions(
         self, model: TreeModel, t: Float[Array, ""], state: State, result: Accelerations
@@ -410,13 +401,9 @@ class Tree(AbstractFormulation):
         singular = measure_nearness(model, t, at)
 
         def solve_displaced(by: Float[Array, " u"]) -> tuple[Float[Array, " u"], Float[Array, ""]]:
-            closed_there = lambda: close_loops(
-                model, t, retract_coordinates(model.parameters.tree, at, by), 3
-            )[0]
-            solution = self._solve_coordinates(
-                model, t, jax.lax.cond(singular.is_near, closed_there, lambda: at), stabilisation
-            )
-            return solution.rate, _driver_power(solution)
+            closed_there = lambda: _close_displaced(model, t, at, by, 3)[1]
+            posture = jax.lax.cond(singular.is_near, closed_there, lambda: at)
+            return _solve_posture(self, model, t, posture, stabilisation)
 
         return interpolate_posture(singular, way_along(model, at.u), solve_displaced, power=3)
 
@@ -439,8 +426,7 @@ class Tree(AbstractFormulation):
         # The interpolated quantity is the displacement to the constraints, which stays small and smooth
         # through a singular posture, unlike the coordinates themselves.
         def closure_change(by: Float[Array, " u"]) -> TreeCoordinates:
-            start = retract_coordinates(tree, at, by)
-            end, _ = close_loops(model, t, start, iterations)
+            start, end = _close_displaced(model, t, at, by, iterations)
             return jax.tree.map(jnp.subtract, end, start)
 
         moves = interpolate_posture(
@@ -464,6 +450,68 @@ def _driver_power(solution: Solved) -> Float[Array, "*s"]:
     """Power of the drivers among the loop closures [W]."""
     rows = solution.rows
     return jnp.zeros(()) if rows is None else jnp.sum(solution.multipliers * rows.target, axis=0)
+
+
+def _join_derivative(
+    parameters: TreeParameters,
+    at: TreeCoordinates,
+    placement: Placed,
+    load: Loads,
+    u_rate: Float[Array, " u"],
+    driven: Float[Array, ""],
+    stabilisation: AbstractStabilisation,
+) -> tuple[Float[Array, " k"], Flows]:
+    """Derivative of the vector and flows, from accelerations and the power of drivers."""
+    rates = coordinate_rates(parameters.tree, at, u_rate)
+    rates = with_unit_vectors(parameters.tree, rates, stabilisation.add_norm_feedback, at)
+    # Flows of energy and momentum are integrated beside the state, so that the balances of a run's
+    # accuracy report have the error of the integrator and not that of a quadrature afterwards.
+    moment = cross(placement.r, load.force) + apply_matrix(placement.R_wb, load.moment)
+    sums = (jnp.sum(x[:, :-1], axis=1) for x in (load.force, moment))
+    return join_coordinates(rates), Flows(load.power + driven, *sums)
+
+
+# The choice of rows and of postures is XLA's; the equations between them are machine code.
+@native
+def _find_derivative(
+    model: TreeModel,
+    t: Float[Array, ""],
+    x: Float[Array, " k"],
+    u_rate: Float[Array, " u"],
+    driven: Float[Array, ""],
+    stabilisation: AbstractStabilisation,
+) -> tuple[Float[Array, " k"], Flows]:
+    """`_join_derivative` of a vector, with its loads."""
+    at = split_vector(model.parameters.tree, x)
+    placement = in_world(model.parameters, at, compute_motion(model.parameters, at))
+    load = _sum_loads(model.system, t, placement)
+    return _join_derivative(model.parameters, at, placement, load, u_rate, driven, stabilisation)
+
+
+@native
+def _solve_posture(
+    formulation: Tree,
+    model: TreeModel,
+    t: Float[Array, ""],
+    at: TreeCoordinates,
+    stabilisation: AbstractStabilisation,
+) -> tuple[Float[Array, " u"], Float[Array, ""]]:
+    """Accelerations and the power of drivers by the rows of a step."""
+    solved = formulation._solve_coordinates(model, t, at, stabilisation)
+    return solved.rate, _driver_power(solved)
+
+
+@native
+def _close_displaced(
+    model: TreeModel,
+    t: Float[Array, ""],
+    at: TreeCoordinates,
+    by: Float[Array, " u"],
+    iterations: int,
+) -> tuple[TreeCoordinates, TreeCoordinates]:
+    """Coordinates after a displacement, before and after the loops are closed."""
+    start = retract_coordinates(model.parameters.tree, at, by)
+    return start, close_loops(model, t, start, iterations)[0]
 
 
 @kept_jit
