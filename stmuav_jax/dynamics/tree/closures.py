@@ -446,15 +446,13 @@ def _scale_jacobian(model: TreeModel, J: Float[Array, "m k"]) -> Float[Array, "m
     return jax.lax.stop_gradient(jnp.asarray(scale)[:, None] * J * _velocity_units(model))
 
 
-def bound_singular(
-    model: TreeModel, J: Float[Array, "m k"], row_mask: Bool[Array, " m"]
-) -> Float[Array, ""]:
-    """Lower bound, within a factor sqrt(m), of the smallest singular value of the kept rows.
+def bound_singular(J: Float[Array, "m k"], row_mask: Bool[Array, " m"]) -> Float[Array, ""]:
+    """Lower bound, within a factor sqrt(m), of the smallest singular value of the kept rows without units.
 
     The bound is 1 / |L^-1| in the Frobenius norm, with J J^T = L L^T; zero where the Cholesky
     factor does not exist.
     """
-    J = jnp.where(row_mask[:, None], _scale_jacobian(model, J), 0.0)
+    J = jnp.where(row_mask[:, None], J, 0.0)
     # A bound by the triangular factor costs one substitution; a singular value decomposition at every
     # right-hand side would cost more than the equations of motion.
     identity = jnp.eye(len(J), dtype=J.dtype)
@@ -466,25 +464,14 @@ def bound_singular(
     return jnp.where(jnp.isfinite(square), 1 / jnp.sqrt(square), 0.0)
 
 
+# Products and factors of the rows are left to LAPACK: as machine code they would take longer to compile than
+# most runs last.
 @native
-def _bound_after(
-    model: TreeModel,
-    t: Float[Array, ""],
-    at: TreeCoordinates,
-    by: Float[Array, "k"],
-    row_mask: Bool[Array, " m"],
-) -> Float[Array, ""]:
-    """`bound_singular` after a displacement along the velocities."""
-    return bound_singular(model, rows_after(model, t, at, by), row_mask)
-
-
-@native
-def _products_after(
+def _scaled_rows_after(
     model: TreeModel, t: Float[Array, ""], at: TreeCoordinates, by: Float[Array, "k"]
-) -> Float[Array, "m m"]:
-    """Products J J^T of the rows without units after a displacement along the velocities."""
-    J = _scale_jacobian(model, rows_after(model, t, at, by))
-    return J @ J.T
+) -> Float[Array, "m k"]:
+    """Rows without units after a displacement along the velocities."""
+    return _scale_jacobian(model, rows_after(model, t, at, by))
 
 
 def step_rows(model: TreeModel, t: Float[Array, ""], at: TreeCoordinates) -> Bool[Array, " m"]:
@@ -496,7 +483,8 @@ def step_rows(model: TreeModel, t: Float[Array, ""], at: TreeCoordinates) -> Boo
     displacement = AHEAD * _scale_velocities(model, at.u)
 
     def independent_at(share: Float[Array, ""]) -> Bool[Array, " m"]:
-        return independent_rows(_products_after(model, t, at, share * displacement), WEAK**2)
+        J = _scaled_rows_after(model, t, at, share * displacement)
+        return independent_rows(J @ J.T, WEAK**2)
 
     start_mask, ahead_mask = jax.vmap(independent_at)(jnp.array([0.0, 1.0], at.u.dtype))
     return jnp.where(jnp.sum(start_mask) >= jnp.sum(ahead_mask), start_mask, ahead_mask)
@@ -510,7 +498,7 @@ def measure_nearness(model: TreeModel, t: Float[Array, ""], at: TreeCoordinates)
     step = way_along(model, at.u)
 
     def singular_value_at(place: Float[Array, ""]) -> Float[Array, ""]:
-        return _bound_after(model, t, at, place * step, row_mask)
+        return bound_singular(_scaled_rows_after(model, t, at, place * step), row_mask)
 
     present_clearance = singular_value_at(jnp.zeros((), at.u.dtype))
 
