@@ -9,9 +9,14 @@ from pathlib import Path
 _ROOT = Path(__file__).parents[1]
 
 
+def _list_files() -> list[Path]:
+    """Source files of this package, and the files of its missions and studies."""
+    return sorted(path for path in _ROOT.rglob("*") if path.suffix in (".py", ".toml"))
+
+
 def _file_stamps() -> dict[Path, tuple[int, int]]:
-    """Time of change and size of each source file of this package."""
-    stats = {path: path.stat() for path in _ROOT.rglob("*.py")}
+    """Time of change and size of each of the files."""
+    stats = {path: path.stat() for path in _list_files()}
     return {path: (stat.st_mtime_ns, stat.st_size) for path, stat in stats.items()}
 
 
@@ -33,7 +38,7 @@ def source_digest() -> str:
             f"of the running code is unknown: start a new process."
         )
     digest = hashlib.sha256()
-    for path in sorted(_ROOT.rglob("*.py")):
+    for path in _list_files():
         content = path.read_bytes()
         digest.update(f"{path.relative_to(_ROOT).as_posix()}\0{len(content)}\0".encode() + content)
     return digest.hexdigest()[:16]

@@ -9,6 +9,7 @@ import hashlib
 import os
 import stat
 import sys
+import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Union
@@ -128,9 +129,18 @@ def _configure_cache(use_cache: bool) -> Path | None:
 
 # Commands that do the same if they are told the same: nothing that they find in a folder, such as an
 # earlier result that is resumed, decides what they compute.
-_REPEATABLE = ("simulate", "check", "trim")
+_REPEATABLE = ("simulate", "check", "trim", "fly")
 # Options that no program depends on.
 _FREE = ("out", "figures", "cache")
+
+
+def _digest_file(path: Path) -> str:
+    """Digest of a file, and of the model's file that it names if it is a mission."""
+    content = path.read_bytes()
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+        model = tomllib.loads(content.decode())["machine"]["model"]
+        content += (path.parent / model).read_bytes()
+    return hashlib.sha256(content).hexdigest()
 
 
 def _plain_options(value: Any) -> Any:
@@ -138,10 +148,10 @@ def _plain_options(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         fields = [field.name for field in dataclasses.fields(value) if field.name not in _FREE]
         return {field: _plain_options(getattr(value, field)) for field in fields}
-    if isinstance(value, Path) or (isinstance(value, str) and value.endswith(".toml")):
-        with contextlib.suppress(OSError):
-            path = Path(value)
-            return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+    if isinstance(value, Path | str):
+        with contextlib.suppress(OSError, ValueError):
+            if (path := Path(value)).is_file():
+                return _digest_file(path)
     return value if isinstance(value, str | int | float | bool | None) else repr(value)
 
 

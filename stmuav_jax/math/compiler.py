@@ -130,9 +130,12 @@ def _jit_with_options(function: Callable[..., Any], *, quick: bool) -> Callable[
     @wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
         _check_process()
-        transformed = is_transformed((args, keywords))
-        jitted = nested if transformed else outermost((args, keywords))
-        return jitted(*args, **keywords)
+        if is_transformed((args, keywords)):
+            return nested(*args, **keywords)
+        if quick and not keywords and _Command.programs is not None:
+            # found before it is traced, if the same command has run before
+            return cached_program(function, *args)(*args)
+        return outermost((args, keywords))(*args, **keywords)
 
     call.lower = lambda *args, **keywords: outermost((args, keywords)).lower(*args, **keywords)  # pyright: ignore
     return call

@@ -154,6 +154,8 @@ def _encode_tree(tree: Any) -> Any:
         return {"value": tree}
     if isinstance(tree, type):
         return {"class": _class_name(tree)}
+    if type(tree) is dict and all(isinstance(name, str) for name in tree):
+        return {"dict": {name: _encode_tree(part) for name, part in tree.items()}}
     if isinstance(tree, tuple):
         name = "" if type(tree) is tuple else _class_name(type(tree))
         return {"tuple": name, "parts": [_encode_tree(part) for part in tree]}
@@ -171,6 +173,8 @@ def _decode_tree(encoded: Mapping[str, Any]) -> Any:
         return encoded["value"]
     if "class" in encoded:
         return _class_named(encoded["class"])
+    if "dict" in encoded:
+        return {name: _decode_tree(part) for name, part in encoded["dict"].items()}
     if "tuple" in encoded:
         parts = map(_decode_tree, encoded["parts"])
         return _class_named(encoded["tuple"])(*parts) if encoded["tuple"] else tuple(parts)

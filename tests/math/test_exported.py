@@ -15,7 +15,8 @@ import xarray as xr
 from diffrax import RESULTS
 
 import stmuav_jax as stm
-from stmuav_jax.math.compiler import compile_for_shapes, keep_command_programs
+from stmuav_jax.cli.main import _plain_options
+from stmuav_jax.math.compiler import compile_for_shapes, keep_command_programs, quick_jit
 from stmuav_jax.math.exported import Programs
 
 pytest.importorskip("flatbuffers")
@@ -28,7 +29,9 @@ def outcome(x, name):
     traced.append(name)
     state = stm.State(2 * x, jnp.pad(x, ((0, 0), (0, 1))), jnp.linalg.inv(x + 1), -x)
     return (
-        {"no text": 1} if name == "dict" else (state, RESULTS.successful, (None, "words", 3, x @ x))
+        {1: "no text"}
+        if name == "dict"
+        else (state, RESULTS.successful, (None, "words", 3, x @ x), {"x": x})
     )
 
 
@@ -69,6 +72,26 @@ def test_the_same_command_traces_nothing_and_any_other_its_own(command, tmp_path
     keys.append(command(t1=1.0).next_key("outcome", (X, "a"), {"level": 1}))
     assert len({*keys}) == len(keys)
     assert command(t1=1.0).next_key("outcome", (X, "a"), {}) == keys[0]
+
+
+def test_a_command_keeps_functions_under_quick_jit_too(command):
+    for _ in range(2):
+        command(t1=1.0)
+        # a function of its own, as in a new process
+        run = quick_jit(lambda x, name: outcome(x, name))
+        np.testing.assert_array_equal(run(X, "a")[0].r, 2 * X)
+        np.testing.assert_array_equal(run(X, "a")[3]["x"], X)
+    assert traced == ["a"]
+
+
+def test_a_mission_is_its_file_and_that_of_its_model(tmp_path):
+    mission, model = tmp_path / "mission.toml", tmp_path / "model.toml"
+    mission.write_text('[machine]\nmodel = "model.toml"\n')
+    digests = {_plain_options(str(mission))}
+    for text in ("mass = 1.0", "mass = 2.0"):
+        model.write_text(text)
+        digests |= {_plain_options(str(mission)), _plain_options(mission)}
+    assert len(digests) == 3
 
 
 def test_what_has_no_text_or_is_damaged_is_compiled(command, tmp_path):

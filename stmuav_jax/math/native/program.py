@@ -520,9 +520,11 @@ def describe_code() -> str:
 
 
 def targets_in(jaxpr: Any) -> set[str]:
-    """Names of all machine code that a jaxpr calls on a CPU."""
+    """Names of all machine code that a jaxpr calls on a CPU, which is made."""
     names: set[str] = set()
-    for equation in jaxpr.eqns:
+    # what no result needs is not lowered either
+    needed, _ = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    for equation in needed.eqns:
         if equation.primitive is native_p and is_on():
             avals = [v.aval for v in equation.invars]
             name = _target(equation.params["program"], equation.params["lead"], avals)
