@@ -40,7 +40,7 @@ def chain(kinds: tuple[str, ...]) -> stm.System:
     return stm.System(bodies, joints, [stm.Gravity()])
 
 
-def held() -> float:
+def read_memory() -> float:
     """Memory of this process [MB], without what is swapped out."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
@@ -55,7 +55,7 @@ def record(number: int) -> Iterator[dict[str, Any]]:
         stm.simulate(system, system.reference, t1=0.02)
         if count % EVERY == 0 or count == number:
             spent = time.process_time()
-            rows.append({"structures": count, "megabytes": held(), "cpu_seconds": spent})
+            rows.append({"structures": count, "megabytes": read_memory(), "cpu_seconds": spent})
             print(rows[-1], flush=True)
     yield {"what": "memory of one process after simulations of so many structures", "rows": rows}
 

@@ -10,7 +10,7 @@ _ROOT = Path(__file__).parents[1]
 
 
 def _list_files() -> list[Path]:
-    """Source files of this package, and the files of its missions and studies."""
+    """Source files of this package and the files of its missions."""
     return sorted(path for path in _ROOT.rglob("*") if path.suffix in (".py", ".toml"))
 
 

@@ -144,14 +144,15 @@ def _digest_file(path: Path) -> str:
 
 
 def _plain_options(value: Any) -> Any:
-    """Plain data of options; of a file its content."""
+    """Plain data of options; of a file its name and the digest of its content."""
     if dataclasses.is_dataclass(value):
         fields = [field.name for field in dataclasses.fields(value) if field.name not in _FREE]
         return {field: _plain_options(getattr(value, field)) for field in fields}
     if isinstance(value, Path | str):
         with contextlib.suppress(OSError, ValueError):
             if (path := Path(value)).is_file():
-                return _digest_file(path)
+                # a name may be that of a scene too, beside which a file of this name lies
+                return f"{value} {_digest_file(path)}"
     return value if isinstance(value, str | int | float | bool | None) else repr(value)
 
 

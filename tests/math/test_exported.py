@@ -94,6 +94,13 @@ def test_a_mission_is_its_file_and_that_of_its_model(tmp_path):
     assert len(digests) == 3
 
 
+def test_files_named_like_scenes_do_not_make_these_equal(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("case-1", "case-2"):
+        (tmp_path / name).touch()
+    assert _plain_options("case-1") != _plain_options("case-2")
+
+
 def test_what_has_no_text_or_is_damaged_is_compiled(command, tmp_path):
     command()
     compile_for_shapes(outcome, X, "dict")(X, "dict")

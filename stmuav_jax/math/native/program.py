@@ -520,7 +520,7 @@ def describe_code() -> str:
 
 
 def targets_in(jaxpr: Any) -> set[str]:
-    """Names of all machine code that a jaxpr calls on a CPU, which is made."""
+    """Names of all machine code that a jaxpr calls on a CPU; what is missing of it is compiled."""
     names: set[str] = set()
     # what no result needs is not lowered either
     needed, _ = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
