@@ -18,10 +18,11 @@ from ..checks.numbers import check_numbers
 from ..checks.shapes import Numbers
 from ..dynamics.actuation import Actuation, compute_actuation
 from ..dynamics.formulations.independence import DEPENDENT
+from ..dynamics.statespace.selection import velocity_names
 from ..dynamics.statespace.tree import TreePoint, TreeSpace
 from ..math.compiler import kept_jit
 from ..mechanics.inputs import Inputs, inputs_of
-from ..mechanics.joint_states import coordinates_of, joint_motion
+from ..mechanics.joint_states import joint_motion
 from ..mechanics.state import State
 from ..mechanics.system import System
 
@@ -124,14 +125,7 @@ def survey(
                 f"{axis.tolist()} and {samples} samples."
             )
         axes.append(np.linspace(axis[0], axis[1], samples) if len(axis) == 2 else axis)
-        joint, _, coordinate = name.rpartition(".")
-        if joint not in [candidate.name for candidate in system.joints]:
-            raise SettingError(
-                f"A survey is over coordinates of joints, such as hinge.angle, and '{name}' is not one."
-            )
-        kind = system.joints[system.joint_index(joint)].kind
-        place = [label for label, _ in coordinates_of(kind)].index(coordinate)
-        starts.append(float(joint_motion(system, state, joint).coordinates[place]))
+        starts.append(_read_start(space, state, name))
     first, second = np.meshgrid(*axes, indexing="ij")
     steps = np.zeros((first.size, space.size))
     for place, values, start in zip(places, (first, second), starts, strict=True):
@@ -174,6 +168,25 @@ def survey(
         spread(_smallest_values(velocities[body])), inputs, body, float(postures.weight[0]),
         float(postures.size[0]),
     )  # fmt: skip
+
+
+def _read_start(space: TreeSpace, state: State, name: str) -> float:
+    """Value of a coordinate of the space [rad], [m] at the start of a survey."""
+    tree, joint = space.model.parameters.tree, name.rpartition(".")[0]
+    if joint not in tree.joints:
+        raise SettingError(
+            f"A survey is over coordinates of joints, such as hinge.angle, and '{name}' is not one."
+        )
+    number = tree.joints.index(joint)
+    if space.system.joints[number].kind == "spherical":
+        raise SettingError(
+            f"A survey is over angles and displacements of joints, and '{name}' is a part of a rotation vector."
+        )
+    of_joint = [label for label, _ in velocity_names(tree) if label.startswith(f"{joint}.")]
+    # the tree may pass a joint from body j to body i, which meets its motions in the opposite order
+    forward = next(link.forward for link in tree.links if link.joint == number)
+    place = (of_joint if forward else of_joint[::-1]).index(name)
+    return float(joint_motion(space.system, state, joint).coordinates[place])
 
 
 def _smallest_values(matrices: np.ndarray) -> np.ndarray:

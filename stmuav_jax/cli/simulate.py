@@ -1,10 +1,12 @@
 """`stmuav simulate`: one run of a scene, with its certificate, figures and loads."""
 
 import dataclasses
+import importlib
 import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.console import Console
@@ -176,7 +178,11 @@ def run_simulate(command: Any) -> int:
     from ..io.run_file import save, save_certificate
 
     settings: Settings = command.settings
-    run = run_scene(scene_of(command), settings)
+    scene = scene_of(command)
+    if settings.figures != "none":
+        # slow to import: it is done while the equations are compiled, which leaves Python free
+        Thread(target=importlib.import_module, args=("stmuav_jax.figures.run",)).start()
+    run = run_scene(scene, settings)
     clock = time.perf_counter()
     folder = results_folder(settings.out, run.scene.name)
     paths = [save(run, folder / "run.nc"), save_certificate(run, folder / "certificate.json")]

@@ -149,23 +149,25 @@ def _evaluate_balances(system: System, saved: Saved) -> Balances:
 
 @kept_jit
 def _evaluate_rows(model: AugmentedModel, saved: Saved) -> RowsAt:
-    def constraint_rows_at(at: Saved) -> RowsAt:
-        system, state = with_internal(model.system, at.internal), at.states
-        kin = system.kinematics(state)
-        eq = model.constraints.equations(at.ts, kin)
-        # Angles and lengths in one unit, so that one tolerance holds for all residuals.
-        scale = model.constraints.scales()
-        u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
-        loads = [force.load(at.ts, kin) for force in system.forces]
-        finite = [jnp.all(jnp.isfinite(x.force)) & jnp.all(jnp.isfinite(x.moment)) for x in loads]
-        finite_mask = jnp.stack(finite) if finite else jnp.zeros((0,), bool)
-        rate_residuals = scale * (eq.matrix @ u - eq.target)
-        # Loads are evaluated apart first: a message can name the force element that is not finite.
-        total = sum(loads, start=no_load(kin))
-        wrenches = jnp.concatenate([total.force, total.moment], axis=1)[:-1]
-        return RowsAt(scale * eq.value, rate_residuals, eq.matrix, eq.gamma, finite_mask, wrenches)
+    return jax.lax.map(lambda at: _get_rows(model, at), saved)
 
-    return jax.lax.map(constraint_rows_at, saved)
+
+@native
+def _get_rows(model: AugmentedModel, at: Saved) -> RowsAt:
+    system, state = with_internal(model.system, at.internal), at.states
+    kin = system.kinematics(state)
+    eq = model.constraints.equations(at.ts, kin)
+    # Angles and lengths in one unit, so that one tolerance holds for all residuals.
+    scale = model.constraints.scales()
+    u = jnp.concatenate([state.v, state.omega], axis=1).reshape(-1)
+    loads = [force.load(at.ts, kin) for force in system.forces]
+    finite = [jnp.all(jnp.isfinite(x.force)) & jnp.all(jnp.isfinite(x.moment)) for x in loads]
+    finite_mask = jnp.stack(finite) if finite else jnp.zeros((0,), bool)
+    rate_residuals = scale * (eq.matrix @ u - eq.target)
+    # Loads are evaluated apart first: a message can name the force element that is not finite.
+    total = sum(loads, start=no_load(kin))
+    wrenches = jnp.concatenate([total.force, total.moment], axis=1)[:-1]
+    return RowsAt(scale * eq.value, rate_residuals, eq.matrix, eq.gamma, finite_mask, wrenches)
 
 
 # One block size for the initial state and for all saved states: one compilation serves both.

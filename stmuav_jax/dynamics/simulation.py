@@ -257,7 +257,7 @@ def _integrate_path(problem: Problem, state0: State, ts: Float[Array, " k"]) -> 
 
 
 # An eager call does not compile again for a system of the same structure.
-_compiled_path = kept_jit(_integrate_path)
+_compiled_path = kept_jit(_integrate_path, optimised=True)
 
 
 # --- runs
@@ -389,7 +389,7 @@ def interpolate_states(run: Run, times: Numbers) -> tuple[State, np.ndarray]:
     return jax.tree.map(np.asarray, end_values)
 
 
-@kept_jit
+@functools.partial(kept_jit, optimised=True)
 def _end_states(
     problem: Problem, starts: tuple[State, Array], spans: Float[Array, "k 2"]
 ) -> tuple[State, Float[Array, "k m"]]:

@@ -6,6 +6,7 @@ fault. This package compiles its programs for systems of new structure by `kept_
 the most recently used programs and releases the others.
 """
 
+import contextlib
 import itertools
 import os
 import threading
@@ -26,6 +27,7 @@ import numpy as np
 from jax.extend.core import get_opaque_trace_state
 
 from ..math import exported
+from .native import llvm
 from .native.program import is_native, is_on, targets_in
 from .native.structure import Structure, choose_structure, find_structure, rely_on
 
@@ -179,7 +181,7 @@ def _read_setting() -> tuple[Hashable, ...]:
     return config.jax_enable_x64, config.jax_default_device, is_on()
 
 
-def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
+def kept_jit(function: Callable[..., Any], *, optimised: bool = False) -> Callable[..., Any]:
     """`eqx.filter_jit` of a function of arrays and structure, with a bounded number of programs.
 
     Programs are kept by function, structure, and shapes of the arguments, at most `MOST_PROGRAMS`
@@ -188,6 +190,7 @@ def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Args:
         function: function of positional arguments; arrays are traced, all else must be hashable.
+        optimised: see `cached_program`.
     """
     # Machine code is a single operation already; JAX would keep the program around it as long as the function.
     within: Any = function if is_native(function) else eqx.filter_jit(function)
@@ -196,7 +199,7 @@ def kept_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*args: Any) -> Any:
         if is_transformed(args):
             return within(*args)
-        return cached_program(function, *args)(*args)
+        return cached_program(function, *args, optimised=optimised)(*args)
 
     return call
 
@@ -221,12 +224,18 @@ def in_blocks(function: Callable[..., Any], size: int, *arguments: Any) -> Any:
     return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
 
 
-def cached_program(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
+def cached_program(
+    function: Callable[..., Any], *args: Any, optimised: bool = True
+) -> Callable[..., Any]:
     """Compiled program of a function for arguments of this structure, kept for later calls.
 
     The program accepts arguments of the same structure, shapes and data types. It is compiled with
     the quick options of `compiler_options`; `kept_jit` describes which programs are kept. Under
     `jax.disable_jit` it is the function itself.
+
+    Args:
+        optimised: machine code is optimised, which takes five times as long to compile and up to a third of
+            the time to run, for equations that are evaluated thousands of times.
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return function
@@ -244,7 +253,9 @@ def cached_program(function: Callable[..., Any], *args: Any) -> Callable[..., An
     check_maps()
     # Compiled outside of the lock, so that threads with other programs do not wait; the same program
     # compiled twice does no harm.
-    compiled = compile_for_shapes(function, *args, quick=True, structure=structure)
+    context = contextlib.nullcontext() if optimised else llvm.without_optimisation()
+    with context:
+        compiled = compile_for_shapes(function, *args, quick=True, structure=structure)
     with _lock:
         _programs[key] = compiled
         while len(_programs) > MOST_PROGRAMS:

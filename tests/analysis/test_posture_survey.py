@@ -111,3 +111,31 @@ def test_what_a_survey_refuses():
         stm.analysis.survey(five_bar(), ["A.angle", "B.angle"], [(-1, 1), (-1, 1)], body="e")
     with pytest.raises(stm.SettingError, match="two limits or a list of values"):
         stm.analysis.survey(five_bar(), ["A.angle", "B.angle"], [(-1,), (-1, 1)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ends", [("ground", "b"), ("b", "ground")])
+def test_start_of_a_survey_over_a_universal_joint(ends):
+    body = stm.Body("b", 1.0, np.diag([1e-3, 2e-3, 3e-3]), position=[0.3, 0.2, -0.4])
+    joint = stm.universal(
+        "U", *ends, point=[0.0, 0.0, 0.0], axis_i=[1.0, 0.0, 0.0], axis_j=[0.0, 1.0, 0.0]
+    )
+    system = stm.System([body], [joint], [stm.Gravity([0.0, 0.0, -G])])
+    survey = lambda start: stm.analysis.survey(
+        system, ["U.angle_1", "U.angle_2"], [(-0.6, 0.5), (-0.3, 0.9)], samples=3, state=start
+    )
+    space = stm.TreeSpace(system)
+    turned = space.retract(space.from_state(system.reference), jnp.array([0.4, -0.2, 0.0, 0.0]))
+    # the load of gravity on the joint depends on the posture, wherever the survey begins
+    found, same = survey(None).unbalanced, survey(space.to_state(turned)).unbalanced
+    np.testing.assert_allclose(same, found, rtol=1e-12)
+    assert np.ptp(found) > 0.1
+
+
+@pytest.mark.slow
+def test_survey_refuses_parts_of_a_rotation_vector():
+    body = stm.Body("b", 1.0, np.eye(3) * 1e-3, position=[0.3, 0.2, -0.4])
+    joint = stm.spherical("S", "ground", "b", point=[0.0, 0.0, 0.0])
+    system = stm.System([body], [joint], [stm.Gravity([0.0, 0.0, -G])])
+    with pytest.raises(stm.SettingError, match="part of a rotation vector"):
+        stm.analysis.survey(system, ["S.rotation_x", "S.rotation_y"], [(-1, 1), (-1, 1)])

@@ -21,6 +21,7 @@ from stmuav_jax.math.compiler import (
     memory_maps,
     remember_results,
 )
+from stmuav_jax.math.native import llvm
 from stmuav_jax.math.native.program import native
 
 traced: list[str] = []
@@ -102,6 +103,25 @@ def test_options_are_those_of_the_call(monkeypatch, jit):
         assert function(3.0) == 6.0
         counts.append(len(traced))
     assert counts == [1, 2, 2, 2]
+
+
+def test_machine_code_of_programs_that_run_seldom_is_not_optimised(
+    programs, optimised, monkeypatch
+):
+    levels, compile_code = [], llvm._compile
+    monkeypatch.setattr(llvm, "_object_folder", lambda: None)
+    monkeypatch.setattr(
+        llvm, "_compile", lambda *args: (levels.append(args[-1]), compile_code(*args))[1]
+    )
+
+    @native
+    def equations(x):
+        return jnp.sin(x) @ jnp.exp(x) / (1.25 + x[0] @ x[1]), jnp.cumsum(x, axis=1)
+
+    seldom, often = (kept_jit(lambda x: equations(x), optimised=on) for on in (False, True))
+    x = jnp.asarray(np.random.default_rng(0).standard_normal((3, 3)))
+    jax.tree.map(np.testing.assert_array_equal, seldom(x), often(x))
+    assert levels == [0, 1]
 
 
 def test_without_jit_functions_run_themselves(programs):

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 from ...checks.errors import ModelError, has_values
 from ...checks.numbers import array_module, as_jax, as_numpy, stack_arrays
 from ...math.compiler import compute_untraced, kept_jit, remember_results
+from ...math.native.program import native
 from ...mechanics.body import GROUND
 from ...mechanics.constraint import ROWS
 from ...mechanics.state import State, compute_kinematics
@@ -445,13 +446,17 @@ def _rows_at(
 ) -> tuple[Float[Array, "p m"], Float[Array, "p m k"]]:
     """Values and Jacobians of the rows at p postures, those of points in the axes of body i."""
 
-    def rows_of_state(state: State) -> tuple[Array, Array]:
-        kin = compute_kinematics(state, mass=jnp.ones(len(names)), com=com, names=names, joints=())
-        eq = rows.equations(jnp.zeros(()), kin)
-        R = jnp.moveaxis(kin.R_wb, 0, -1)
-        return turn_rows(rows, R, eq.value), turn_rows(rows, R, eq.matrix)
+    return jax.vmap(lambda state: _rows_of_state(names, com, rows, state))(states)
 
-    return jax.vmap(rows_of_state)(states)
+
+@native
+def _rows_of_state(
+    names: tuple[str, ...], com: Float[Array, "n 3"], rows: Constraints, state: State
+) -> tuple[Float[Array, " m"], Float[Array, "m k"]]:
+    kin = compute_kinematics(state, mass=jnp.ones(len(names)), com=com, names=names, joints=())
+    eq = rows.equations(jnp.zeros(()), kin)
+    R = jnp.moveaxis(kin.R_wb, 0, -1)
+    return turn_rows(rows, R, eq.value), turn_rows(rows, R, eq.matrix)
 
 
 def displace_postures(states: State, steps: Float[np.ndarray, "p k"]) -> State:

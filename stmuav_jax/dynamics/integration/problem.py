@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ...checks.errors import SettingError
+from ...checks.errors import SettingError, has_values
 from ...checks.numbers import as_floats
 from ...math.compiler import kept_jit
 from ...math.native.program import native
@@ -435,10 +435,12 @@ def prepare_problem(system: System, method: Method) -> Problem:
 
 def fit_first_step(problem: Problem, span: Any) -> Problem:
     """Problem whose first step is at most a hundredth of the run's time [s], in any unit of time."""
-    first = as_floats(problem.method.first_step)
-    share = jax.lax.stop_gradient(jnp.abs(span)) / 100
-    step = jnp.where((share > 0) & (share < first), share, first)
-    return eqx.tree_at(lambda problem: problem.method.first_step, problem, step)
+    first = problem.method.first_step
+    # numbers that are not traced pass through NumPy, which compiles nothing
+    module: Any = np if has_values(span, first) else jnp
+    share = module.abs(jax.lax.stop_gradient(span)) / 100
+    step = module.where((share > 0) & (share < first), share, first)
+    return eqx.tree_at(lambda problem: problem.method.first_step, problem, as_floats(step))
 
 
 def begin_integration(problem: Problem, t0: Float[Array, ""], state0: State) -> IntegrationState:

@@ -482,7 +482,7 @@ def _target(program: Program, lead: tuple[int, ...], avals: Sequence[Any]) -> st
             return None
 
     size = (rows > 1, rows >= llvm.vector_width())
-    return program.derived(("target", shared, size, llvm.settings), make)  # pyright: ignore
+    return program.derived(("target", shared, size, llvm.current_level()), make)  # pyright: ignore
 
 
 class _Switch:

@@ -29,6 +29,7 @@ from ...checks.numbers import as_floats, as_numpy
 from ...checks.schema import quantity
 from ...checks.shapes import Numbers
 from ...math.compiler import kept_jit, quick_jit
+from ...math.native.program import native
 from ...math.rotation import angular_velocity, product, rotation_matrix, turn_about
 from ...mechanics.body import Body
 from ...mechanics.joint import Joint, Motion, drive, revolute, spherical, translational, universal
@@ -262,6 +263,7 @@ def place_on_base(
 
 
 @kept_jit
+@native
 def _place_displaced(
     geometry: TrackerGeometry, angles: Float[Array, "2"], displacement: Float[Array, "3"]
 ) -> Placement:
