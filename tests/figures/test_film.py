@@ -34,6 +34,7 @@ def drawn_corners(data, t, size=SIZE):
     return np.asarray(axes.collections[0]._faces), axes
 
 
+@pytest.mark.slow
 def test_gif_has_its_frames_and_its_duration(short_run, tmp_path):
     shares = []
     path = film(
@@ -138,6 +139,7 @@ def test_frames_end_with_the_span():
     assert frame_times(saved, (0.0, 0.35), 10.0, 0.5) == pytest.approx(0.05 * np.arange(8))
 
 
+@pytest.mark.slow
 def test_mp4_has_its_frames(data, tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     path = film(data, tmp_path / "run.mp4", fps=25.0, speed=0.25, size=(320, 240))
