@@ -16,12 +16,24 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from types import UnionType
-from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    NamedTuple,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from ...checks.errors import SettingError, closest_name, nearest_names
 from ...checks.schema import option_from_plain, quantity_fields
-from ...dynamics.simulation import Scene
 from ...mechanics.parameters import Parameters
+
+if TYPE_CHECKING:
+    # takes half of the time in which the command line starts, and is not needed to name the scenes
+    from ...dynamics.simulation import Scene
 
 
 class SceneOption(NamedTuple):
@@ -49,7 +61,7 @@ class SceneOption(NamedTuple):
 
 
 @cache
-def _options_of(build: Callable[..., Scene]) -> dict[str, SceneOption]:
+def _options_of(build: Callable[..., "Scene"]) -> dict[str, SceneOption]:
     """Options of the function that builds a scene, by name."""
     # Options of the command line follow from the builder's signature and docstring: nothing is written
     # twice.
@@ -85,7 +97,7 @@ class RegisteredScene:
     t1: float
 
     @property
-    def build(self) -> Callable[..., Scene]:
+    def build(self) -> Callable[..., "Scene"]:
         """The function that builds the scene."""
         return getattr(import_module(self.module), self.module.rpartition(".")[2])
 
@@ -178,7 +190,7 @@ def options_from_plain(name: str, plain: Mapping[str, Any]) -> dict[str, Any]:
 
 def make_scene(
     name: str, case: int | None = None, parameters: Parameters | None = None, **options: Any
-) -> Scene:
+) -> "Scene":
     """Build a scene by name.
 
     Args:
