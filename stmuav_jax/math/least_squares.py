@@ -67,7 +67,7 @@ class CorrectedLevenbergMarquardt(eqx.Module):
 
     A search has converged when a step changes the values by less than `atol + rtol |values|` and the loss,
     which is a square, by less than `atol^2 + rtol loss`; or when a step gains nothing where the linear model
-    promises less than `rtol` of the loss in all.
+    promises less than `rtol` of the loss in all, or an undamped step that changes the values by less than that.
 
     Attributes:
         rtol, atol: relative and absolute tolerances of the values.
@@ -131,6 +131,10 @@ class CorrectedLevenbergMarquardt(eqx.Module):
         if not (is_accepted or flat):
             gradient_share = scipy.linalg.orth(J).T @ r
             flat = bool(gradient_share @ gradient_share <= self.rtol * before)
+            # Residuals that can be zero are all round-off in the end: then no step gains what the model promises,
+            # and the values are known as soon as the undamped step is within their tolerance.
+            undamped = np.linalg.lstsq(J, -r)[0]
+            flat |= bool(np.all(np.abs(undamped) <= self.atol + self.rtol * np.abs(x)))
         return Attempt(
             values=_unflatten_tree(values, x + best) if is_accepted else values,
             loss=after if is_accepted else loss,

@@ -133,6 +133,21 @@ def test_residuals_of_large_weights_have_round_off():
     np.testing.assert_allclose(losses, losses[0], rtol=1e-9)
 
 
+@pytest.mark.parametrize("offset", [0.0, 1e4, 1e5, 1e6])
+def test_residuals_that_can_be_zero_are_round_off_in_the_end(offset):
+    """No step gains what the model promises there, though the values are known long before."""
+
+    def residuals(x):
+        defects = (x[:4] ** 2 + offset) - (x[1:] + offset)
+        return [1e5 * defects, 1e5 * (x[0] - 1.01)]
+
+    start = jnp.linspace(1.5, 1.0, 5)
+    found = search(residuals, start, CorrectedLevenbergMarquardt(), patience=90)
+    assert found.reason is SearchReason.CONVERGED
+    assert found.steps < 12
+    np.testing.assert_allclose(found.values, 1.01**2.0 ** np.arange(5), rtol=1e-8)
+
+
 @pytest.mark.parametrize(("slope", "is_last"), [(1e-11, True), (1e-3, False)])
 def test_a_direction_that_changes_nothing_but_round_off(slope, is_last):
     """A step gains nothing at the minimum: the search ends unless a direction that matters has a gradient."""
