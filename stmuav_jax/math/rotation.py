@@ -194,5 +194,8 @@ def from_matrix_in(module: Any, A: Mat3Like) -> Float[Array | np.ndarray, "4"]:
     )
     # Each row of the table is a multiple of p; that of the largest component has no cancellation and no
     # division by zero.
-    k = module.argmax(squares)
-    return rows[k] / (2.0 * module.sqrt(squares[k]))
+    row, square = rows[0], squares[0]
+    for k in range(1, 4):
+        larger = squares[k] > square
+        row, square = module.where(larger, rows[k], row), module.where(larger, squares[k], square)
+    return row / (2.0 * module.sqrt(square))
