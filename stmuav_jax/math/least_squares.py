@@ -67,7 +67,8 @@ class CorrectedLevenbergMarquardt(eqx.Module):
 
     A search has converged when a step changes the values by less than `atol + rtol |values|` and the loss,
     which is a square, by less than `atol^2 + rtol loss`; or when a step gains nothing where the linear model
-    promises less than `rtol` of the loss in all, or an undamped step that changes the values by less than that.
+    promises less than `rtol` of the loss in all, or where an undamped step would change the values by less than
+    `atol + rtol |values|`.
 
     Attributes:
         rtol, atol: relative and absolute tolerances of the values.
@@ -129,11 +130,13 @@ class CorrectedLevenbergMarquardt(eqx.Module):
         # over directions that change the residuals by more than round-off).
         flat = predicted <= 4 * np.finfo(float).eps * before
         if not (is_accepted or flat):
-            gradient_share = scipy.linalg.orth(J).T @ r
+            U, sizes, Vt = scipy.linalg.svd(J, full_matrices=False)
+            counts = sizes > max(m, n) * np.finfo(float).eps * np.max(sizes, initial=0.0)
+            gradient_share = U[:, counts].T @ r
             flat = bool(gradient_share @ gradient_share <= self.rtol * before)
             # Residuals that can be zero are all round-off in the end: then no step gains what the model promises,
             # and the values are known as soon as the undamped step is within their tolerance.
-            undamped = np.linalg.lstsq(J, -r)[0]
+            undamped = Vt[counts].T @ (gradient_share / sizes[counts])
             flat |= bool(np.all(np.abs(undamped) <= self.atol + self.rtol * np.abs(x)))
         return Attempt(
             values=_unflatten_tree(values, x + best) if is_accepted else values,

@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ...checks.errors import SettingError, has_values
-from ...checks.numbers import as_floats
+from ...checks.errors import SettingError
+from ...checks.numbers import array_module, as_floats
 from ...math.compiler import kept_jit
 from ...math.native.program import native
 from ...mechanics.body import has_positive_masses
@@ -437,8 +437,8 @@ def fit_first_step(problem: Problem, span: Any) -> Problem:
     """Problem whose first step is at most a hundredth of the run's time [s], in any unit of time."""
     first = problem.method.first_step
     # numbers that are not traced pass through NumPy, which compiles nothing
-    module: Any = np if has_values(span, first) else jnp
-    share = module.abs(jax.lax.stop_gradient(span)) / 100
+    module = array_module(span, first)
+    share = module.abs(span if module is np else jax.lax.stop_gradient(span)) / 100
     step = module.where((share > 0) & (share < first), share, first)
     return eqx.tree_at(lambda problem: problem.method.first_step, problem, as_floats(step))
 

@@ -826,7 +826,7 @@ _in_haste = ContextVar("_in_haste", default=False)
 
 @contextlib.contextmanager
 def without_optimisation() -> Iterator[None]:
-    """Compile what is lowered within in a fifth of the time; it gives the same numbers, up to three times as slowly."""
+    """Compile machine code that is lowered within in less time; it has the same bits, and runs more slowly."""
     token = _in_haste.set(True)
     try:
         yield
