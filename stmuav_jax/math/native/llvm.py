@@ -32,9 +32,11 @@ import jax
 import numpy as np
 
 from .graph import LEAVES, Graph, NotScalarError
+from .schedule import Registers, Schedule
 
-# Operations of one LLVM function; time of compilation grows faster than in proportion beyond.
-CHUNK = 8000
+# Operations of one LLVM function: longer ones take more time to compile for each operation, shorter ones
+# store more numbers.
+CHUNK = 500
 # Operations up to which code is optimised; beyond, LLVM would take longer than the code is worth.
 MOST_OPTIMISED = 20_000
 # Operations above which a program is left to XLA, and bytes of code of all programs of a process.
@@ -91,6 +93,8 @@ class _Block:
 
     def __init__(self, width: int, names: "set[str]") -> None:
         self.width, self.lines, self.count, self.names = width, [], 0, names
+        self._addresses: dict[tuple[str, str, int], str] = {}
+        self._negatives: dict[str, str] = {}
         vector = lambda kind: kind if width == 1 else f"<{width} x {kind}>"
         self.real, self.truth, self.whole = vector("double"), vector("i1"), vector("i64")
         self.suffix = "f64" if width == 1 else f"v{width}f64"
@@ -99,6 +103,13 @@ class _Block:
         self.count += 1
         self.lines.append(f"  %v{self.count} = {expression}")
         return f"%v{self.count}"
+
+    def address(self, kind: str, start: str, entry: int) -> str:
+        """Address of an entry of an array."""
+        key = (kind, start, entry)
+        if key not in self._addresses:
+            self._addresses[key] = self.new(f"getelementptr {kind}, ptr {start}, i64 {entry}")
+        return self._addresses[key]
 
     def spread(self, kind: str, text: str) -> str:
         return text if self.width == 1 else "<" + ", ".join([f"{kind} {text}"] * self.width) + ">"
@@ -121,7 +132,9 @@ class _Block:
         return self.intrinsic("fma", a, b, c)
 
     def neg(self, a: str) -> str:
-        return self.new(f"fneg {self.real} {a}")
+        if a not in self._negatives:
+            self._negatives[a] = self.new(f"fneg {self.real} {a}")
+        return self._negatives[a]
 
     def select(self, condition: str, on_true: str, on_false: str, kind: str | None = None) -> str:
         kind = kind or self.real
@@ -201,14 +214,9 @@ class _Block:
 
 
 @no_type_check
-def _emit(
-    block: _Block, graph: Graph, node: int, names: dict[int, str], pairs: dict[int, tuple[str, str]]
-) -> str:
-    """Name of a node's value, after the instructions that make it."""
+def _emit(block: _Block, graph: Graph, node: int, a: Sequence[str]) -> str:
+    """Name of an operation's result, after the instructions that make it from those of its arguments."""
     op, args = graph.ops[node], graph.args[node]
-    if op == "constant":
-        return block.number(args[0])
-    a = [names[n] for n in args]
     if op == "fma":
         return block.fused(*a)
     if op in _ARITHMETIC:
@@ -226,11 +234,6 @@ def _emit(
         return block.select(a[0], a[2], a[1], kind)
     if op in ("max", "min"):
         return block.extreme(*a, largest=op == "max")
-    if op in ("sin", "cos"):
-        if args[0] not in pairs:
-            pairs[args[0]] = block.sine_and_cosine(a[0])
-        value = pairs[args[0]][op == "cos"]
-        return value
     if op == "sign":
         zero = block.number(0.0)
         below = block.select(block.compare("olt", a[0], zero), block.number(-1.0), a[0])
@@ -356,17 +359,17 @@ def write(
     # Fusion is decided here, in the graph, and not by LLVM's fast-math flags, which would choose
     # differently for one row and for a vector of rows: a row's bits would depend on its batch.
     graph, flat = fuse(graph, flat)
-    order = [n for n in range(len(graph.ops))]
     if places is not None:
-        for node in order:
+        for node in range(len(graph.ops)):
             if graph.ops[node] in ("input", "table") and graph.args[node][0] >= 0:
                 number, entry, kind = graph.args[node]
                 buffer, first = places[number]
                 graph.args[node] = (buffer, first + entry, kind)
-    operations = sum(graph.ops[n] not in LEAVES for n in order)
+    # The order is the same for both widths, and changes no bit.
+    schedule = Schedule(graph, flat)
     names: set[str] = set()
     parts = [
-        _functions(graph, order, flat, arguments, results, w, names) for w in sorted({1, width})
+        _functions(graph, schedule, flat, arguments, results, w, names) for w in sorted({1, width})
     ]
     if loop is None:
         body = _repeat_rows(arguments, results, width)
@@ -379,7 +382,7 @@ def write(
         "attributes #1 = { nounwind willreturn memory(none) }\n"
     )
     text = "\n".join([*sorted(names), *parts, handler, attributes])
-    return Code(text, operations)
+    return Code(text, len(schedule.steps))
 
 
 _TYPES = {"f8": "double", "b1": "i8", "i4": "i32", "i8": "i64"}
@@ -392,8 +395,7 @@ def _load(block: _Block, buffer: Buffer, number: int, entry: int) -> str:
 
     def load_lane(lane: int) -> str:
         start = f"%x{number}" if not lane or buffer.shared else f"%x{number}l{lane}"
-        at = block.new(f"getelementptr {kind}, ptr {start}, i64 {entry}")
-        return block.new(f"load {kind}, ptr {at}")
+        return block.new(f"load {kind}, ptr {block.address(kind, start, entry)}")
 
     if buffer.shared and block.width > 1:
         form, zeros = f"<{block.width} x {kind}>", f"<{block.width} x i32> zeroinitializer"
@@ -465,8 +467,7 @@ def _store(block: _Block, buffer: Buffer, number: int, entry: int, value: str) -
             value if block.width == 1 else block.new(f"extractelement {form} {value}, i64 {lane}")
         )
         start = f"%y{number}" if not lane else f"%y{number}l{lane}"
-        at = block.new(f"getelementptr {kind}, ptr {start}, i64 {entry}")
-        block.lines.append(f"  store {kind} {scalar}, ptr {at}")
+        block.lines.append(f"  store {kind} {scalar}, ptr {block.address(kind, start, entry)}")
 
 
 def _signature(arguments: Sequence[Buffer], results: Sequence[Buffer], *, typed: bool) -> str:
@@ -487,87 +488,96 @@ def _lanes(block: _Block, arguments: Sequence[Buffer], results: Sequence[Buffer]
                     block.lines.append(f"  %{letter}{number}l{lane} = {at}")
 
 
+@no_type_check
 def _functions(
-    graph: Graph, order: list[int], outputs: list[int], arguments: Sequence[Buffer],
+    graph: Graph, schedule: Schedule, outputs: list[int], arguments: Sequence[Buffer],
     results: Sequence[Buffer], width: int, names: "set[str]",
 ) -> str:  # fmt: skip
-    """Function of `width` evaluations, in parts that hand numbers on through memory if it is long."""
-    pieces = [order[k : k + CHUNK] for k in range(0, len(order), CHUNK)] or [[]]
-    piece_of = {n: k for k, piece in enumerate(pieces) for n in piece}
-    # The time of LLVM's register allocation grows faster than the length of a function. Long
-    # programs are cut; numbers that a later part needs go through memory, all others stay in
-    # registers.
-    handed: dict[int, int] = {}
-    for node in order:
-        if graph.ops[node] in LEAVES:
-            continue
-        for arg in graph.args[node]:
-            if piece_of[arg] != piece_of[node] and graph.ops[arg] not in LEAVES:
-                handed.setdefault(arg, len(handed))
+    """Function of `width` evaluations, in parts that hand numbers on through memory."""
     places_of_outputs: dict[int, list[tuple[int, int]]] = {}
-    place = 0
-    for number, buffer in enumerate(results):
-        for entry in range(buffer.size):
-            places_of_outputs.setdefault(outputs[place], []).append((number, entry))
-            place += 1
-    texts = []
+    entries = [(k, entry) for k, buffer in enumerate(results) for entry in range(buffer.size)]
+    for node, place in zip(outputs, entries, strict=True):
+        places_of_outputs.setdefault(node, []).append(place)
+    form_of = lambda node: block.truth if graph.is_truth[node] else block.real
+
+    def is_free(node: int) -> bool:
+        return graph.ops[node] == "input" and (width == 1 or arguments[graph.args[node][0]].shared)
+
+    def store(node: int, name: str, place: int) -> None:
+        at = block.address(block.real, "%memory", place)
+        block.lines.append(f"  store {form_of(node)} {name}, ptr {at}")
+
+    def find(node: int) -> str:
+        """Name of a node's number."""
+        op, args = graph.ops[node], graph.args[node]
+        if op == "constant":
+            return block.number(args[0])
+        if op == "neg":
+            return block.neg(find(args[0]))
+        if node not in registers.names:
+            if node in registers.places:
+                at = block.address(block.real, "%memory", registers.places[node])
+                name = block.new(f"load {form_of(node)}, ptr {at}")
+            else:
+                name = _load(block, arguments[args[0]], *args[:2])
+            registers.put(node, name)
+            return name
+        return registers.names[node]
+
+    def compute(node: int) -> dict[int, str]:
+        """Results of an operation; a sine and the cosine of the same angle come together."""
+        op, args = graph.ops[node], graph.args[node]
+        if op == "lookup":
+            return {node: _look_up(block, graph, arguments, args[1], find(args[0]))}
+        values = [find(n) for n in args]
+        if op not in ("sin", "cos"):
+            return {node: _emit(block, graph, node, values)}
+        both = zip(("sin", "cos"), block.sine_and_cosine(*values), strict=True)
+        return {twins[name, args[0]]: value for name, value in both if (name, args[0]) in twins}
+
+    def store_outputs(node: int, value: str) -> None:
+        for number, entry in places_of_outputs.get(node, ()):
+            if results[number].dtype == "b1" and not graph.is_truth[node]:
+                value = block.compare("une", value, block.number(0.0))
+            _store(block, results[number], number, entry, value)
+
+    steps = schedule.steps
+    twins = {
+        (graph.ops[n], graph.args[n][0]): n for n in steps if graph.ops[n] in ("sin", "cos")
+    }
+    registers = Registers(schedule, _registers() - _SPARE, is_free, store)
+    made: set[int] = set()
     signature = _signature(arguments, results, typed=True)
-    for k, piece in enumerate(pieces):
+    texts = []
+    for first in range(0, max(len(steps), 1), CHUNK):
         block = _Block(width, names)
         _lanes(block, arguments, results)
-        values: dict[int, str] = {}
-        pairs: dict[int, tuple[str, str]] = {}
-
-        def get(node: int, block: _Block = block, values: dict[int, str] = values) -> None:
-            if node in values:
-                return
-            op = graph.ops[node]
-            if op == "input":
-                number, entry, _ = graph.args[node]
-                values[node] = _load(block, arguments[number], number, entry)
-            elif op == "table":
-                values[node] = ""
-            elif op == "constant":
-                values[node] = block.number(graph.args[node][0])
-            else:
-                form = block.truth if graph.is_truth[node] else block.real
-                at = block.new(f"getelementptr {block.real}, ptr %memory, i64 {handed[node]}")
-                values[node] = block.new(f"load {form}, ptr {at}")
-
-        for node in piece:
-            if graph.ops[node] in LEAVES:
-                if node in places_of_outputs:
-                    get(node)
-            else:
-                for arg in graph.args[node]:
-                    get(arg)
-                if graph.ops[node] == "lookup":
-                    place, table = graph.args[node]
-                    values[node] = _look_up(block, graph, arguments, table, values[place])
-                else:
-                    values[node] = _emit(block, graph, node, values, pairs)
-                if node in handed:
-                    form = block.truth if graph.is_truth[node] else block.real
-                    at = block.new(f"getelementptr {block.real}, ptr %memory, i64 {handed[node]}")
-                    block.lines.append(f"  store {form} {values[node]}, ptr {at}")
-            # Outputs are stored as soon as they are known, which frees their registers.
-            for number, entry in places_of_outputs.get(node, ()):
-                value = values[node]
-                if results[number].dtype == "b1" and not graph.is_truth[node]:
-                    value = block.compare("une", value, block.number(0.0))
-                _store(block, results[number], number, entry, value)
+        if first == 0:
+            for node in places_of_outputs:
+                if graph.ops[node] in LEAVES:
+                    store_outputs(node, find(node))
+        for k, node in enumerate(steps[first : first + CHUNK], start=first):
+            if node not in made:
+                for result, value in compute(node).items():
+                    made.add(result)
+                    # Outputs are stored as soon as they are known, which frees their registers.
+                    store_outputs(result, value)
+                    registers.put(result, value)
+            registers.finish(k)
+        registers.leave()
         lines = "\n".join(block.lines)
         texts.append(
-            f"define internal void @part{width}_{k}({signature}, ptr %memory) noinline #0 {{\n{lines}\n  ret void\n}}\n"
+            f"define internal void @part{width}_{len(texts)}({signature}, ptr %memory) noinline #0 {{\n"
+            f"{lines}\n  ret void\n}}\n"
         )
     call = _signature(arguments, results, typed=False)
     real = "double" if width == 1 else f"<{width} x double>"
     body = "".join(
-        f"  call void @part{width}_{k}({call}, ptr %memory)\n" for k in range(len(pieces))
+        f"  call void @part{width}_{k}({call}, ptr %memory)\n" for k in range(len(texts))
     )
     texts.append(
         f"define internal void @rows{width}({signature}) #0 {{\n"
-        f"  %memory = alloca {real}, i64 {max(len(handed), 1)}\n{body}  ret void\n}}\n"
+        f"  %memory = alloca {real}, i64 {max(registers.size, 1)}\n{body}  ret void\n}}\n"
     )
     return "\n".join(texts)
 
@@ -803,6 +813,16 @@ def describe_target() -> tuple[str, ...]:
     features = llvm.get_host_cpu_features().flatten()
     interface = ".".join(map(str, API_VERSION))
     return version, interface, _triple(), llvm.get_host_cpu_name(), features
+
+
+# Registers for what is at hand only within an operation.
+_SPARE = 4
+
+
+def _registers() -> int:
+    """Registers of the processor for numbers in double precision."""
+    has_many = _features().get("avx512f") or "aarch64" in _triple() or "arm64" in _triple()
+    return 32 if has_many else 16
 
 
 def vector_width() -> int:
