@@ -321,14 +321,16 @@ def fuse(graph: Graph, outputs: Sequence[int]) -> tuple[Graph, list[int]]:
 
 @dataclass(frozen=True)
 class Loop:
-    """Passes of a program, each of which makes a row of one array that it reads.
+    """Passes of a program, each of which makes a row of an array and reads a weighted sum of its rows.
 
     Attributes:
-        rows: argument that is the array; the result begins as it. tables: arguments by number, and their
-            values in each pass.
+        rows: argument that is the sum, and is the array where XLA calls; the result begins as it.
+        weights: weights of the rows in each pass (s, s). tables: arguments by number, and their values
+            in each pass.
     """
 
     rows: int
+    weights: np.ndarray
     tables: dict[int, np.ndarray]
 
 
@@ -375,6 +377,7 @@ def write(
         body = _repeat_rows(arguments, results, width)
     else:
         names.update(_tables(loop))
+        parts.append(_sum_rows(results[0].size, loop.weights, names))
         body = _repeat_passes(arguments, results, loop)
     handler = _handler(body)
     attributes = (
@@ -605,33 +608,60 @@ def _find_buffers(arguments: Sequence[int], results: int) -> list[str]:
     return lines
 
 
+@no_type_check
+def _sum_rows(size: int, weights: np.ndarray, names: "set[str]") -> str:
+    """Function that adds the rows of an array times the weights of a pass, term by term."""
+    width = min(2 ** int(math.log2(size)), vector_width())
+    block = _Block(width, names)
+    # in whole vectors, of which the last overlaps the one before
+    starts = [*range(0, size - width, width), size - width]
+    totals: dict[int, str] = {}
+    for j in range(len(weights)):
+        weight = block.new(f"load double, ptr {block.address('double', '%weights', j)}")
+        weight = block.join("double", [weight] * width)
+        for start in starts:
+            at = block.address("double", "%rows", j * size + start)
+            row = block.new(f"load {block.real}, ptr {at}, align 8")
+            if j == 0:
+                totals[start] = block.op("fmul", weight, row)
+            else:
+                totals[start] = block.fused(weight, row, totals[start])
+    for start, total in totals.items():
+        at = block.address("double", "%total", start)
+        block.lines.append(f"  store {block.real} {total}, ptr {at}, align 8")
+    lines = "\n".join(block.lines)
+    return (
+        f"define internal void @sum(ptr %weights, ptr %rows, ptr %total) noinline #0 {{\n"
+        f"{lines}\n  ret void\n}}\n"
+    )
+
+
 def _repeat_passes(arguments: Sequence[Buffer], results: Sequence[Buffer], loop: Loop) -> str:
     """Instructions that go through the passes of a loop."""
     (row,) = results
-    count = len(next(iter(loop.tables.values())))
+    count = len(loop.weights)
     numbers = [k for k in range(len(arguments)) if k not in loop.tables]
     lines = _find_buffers(numbers, 1)
-    args = []
-    for k in range(len(arguments)):
-        if k in loop.tables:
-            args.append(f"ptr %x{k}.row")
-            continue
-        # what has been made so far is read from the result
-        args.append("ptr %y0.base" if k == loop.rows else f"ptr %x{k}.base")
+    names = {k: f"%x{k}.base" for k in numbers} | {k: f"%x{k}.row" for k in loop.tables}
+    names[loop.rows] = "%total"
+    args = ", ".join(f"ptr {names[k]}" for k in range(len(arguments)))
     at_row = "\n".join(
         f"  %x{k}.row = getelementptr [{arguments[k].size} x double], ptr @table{k}, i64 %pass"
         for k in loop.tables
     )
-    load, total = "\n".join(lines), 8 * arguments[loop.rows].size
+    load, total = "\n".join(lines), 8 * count * row.size
     return f"""
 {load}
   %row = alloca double, i64 {row.size}
+  %total = alloca double, i64 {row.size}
   call void @llvm.memcpy.p0.p0.i64(ptr %y0.base, ptr %x{loop.rows}.base, i64 {total}, i1 false)
   br label %again
 again:
   %pass = phi i64 [0, %run], [%pass.next, %again]
+  %weights = getelementptr [{count} x double], ptr @weights, i64 %pass
+  call void @sum(ptr %weights, ptr %y0.base, ptr %total)
 {at_row}
-  call void @rows1({", ".join(args)}, ptr %row)
+  call void @rows1({args}, ptr %row)
   %into = getelementptr [{row.size} x double], ptr %y0.base, i64 %pass
   call void @llvm.memcpy.p0.p0.i64(ptr %into, ptr %row, i64 {8 * row.size}, i1 false)
   %pass.next = add i64 %pass, 1
@@ -645,10 +675,11 @@ done:
 def _tables(loop: Loop) -> list[str]:
     """Constants of a loop, and the declaration of what copies its rows."""
     lines = ["declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)"]
-    for k, table in loop.tables.items():
+    tables = {"weights": loop.weights} | {f"table{k}": table for k, table in loop.tables.items()}
+    for name, table in tables.items():
         values = np.ravel(np.asarray(table, float)).tolist()
         numbers = ", ".join(f"double {_bits(value)}" for value in values)
-        lines.append(f"@table{k} = private constant [{len(values)} x double] [{numbers}]")
+        lines.append(f"@{name} = private constant [{len(values)} x double] [{numbers}]")
     return lines
 
 

@@ -263,7 +263,8 @@ class Recursion(Program):
     Machine code has the loop, too. A batch, and derivatives, are those of the loop itself.
 
     Attributes:
-        body: one pass; its last operands are rows of the tables.
+        body: one pass; its last operands are the weighted sum of the rows so far, which takes the place of
+            the last operand, and rows of all tables but the first. tables: the tables, first the weights.
     """
 
     def __init__(
@@ -277,8 +278,7 @@ class Recursion(Program):
 
     def fold_loop(self, known_entries: Sequence[np.ndarray | None], jaxpr: Any) -> "Recursion":
         """Loop for operands some of whose entries are known, with the traced loop for batches."""
-        # the last operand begins as zeros and is filled by the passes
-        body = self.body.fold([*known_entries[:-1], *[None] * (1 + len(self.tables))])
+        body = self.body.fold([*known_entries[:-1], *[None] * len(self.tables)])
         return Recursion(jaxpr, self.groups, body, self.tables)
 
     def layout(self, shared: tuple[bool, ...], rows: int) -> Layout:
@@ -291,12 +291,13 @@ class Recursion(Program):
         del shared, rows, loop
         alone, first = (False,) * len(self.body.inputs), len(self.inputs)
         buffers = {k: number for k, (number, _) in self.body.layout(alone, 1).places.items()}
+        weights, *others = self.tables
         tables = {
-            buffers[first + k]: table for k, table in enumerate(self.tables) if first + k in buffers
+            buffers[first + k]: table for k, table in enumerate(others) if first + k in buffers
         }
-        if first - 1 not in buffers or not tables:
+        if first - 1 not in buffers:
             raise NotScalarError("a loop whose passes do not depend on each other")
-        return self.body.write(alone, 1, llvm.Loop(buffers[first - 1], tables))
+        return self.body.write(alone, 1, llvm.Loop(buffers[first - 1], weights, tables))
 
 
 def _zero_tangent(aval: Any) -> Any:
@@ -571,11 +572,11 @@ def native(
             x (s, k) of zeros that is the last argument. Batches of it are left to XLA.
         keeps_unused: arrays that the function does not use are operands too, as a loop and its passes need.
     """
-    evaluate_row: Any = None
+    evaluate_pass: Any = None
     if tables is not None:
         keeps_unused = True
-        evaluate_row = native(_sum_rows(function, len(tables)), keeps_unused=True)
-        function = _make_loop(function, evaluate_row, tables)
+        evaluate_pass = native(function, keeps_unused=True)
+        function = _make_loop(function, evaluate_pass, tables)
     jitted: Any = eqx.filter_jit(function)
     programs: OrderedDict[Any, _Traced | None] = OrderedDict()
 
@@ -598,7 +599,7 @@ def native(
             groups = [owners[k] for k in places]
             entry = _make(function, structure, static, places, arrays, groups, keeps_unused)
             if tables is not None and entry is not None and entry.program is not None:
-                body = evaluate_row.find((*args, *(table[0] for table in tables)))
+                body = evaluate_pass.find(_first_pass(args, tables))
                 jaxpr = entry.program.jaxpr
                 program = body and Recursion(jaxpr, groups, body[0].program, tables)
                 entry = entry._replace(program=program)
@@ -660,19 +661,14 @@ def evaluate(function: Callable[..., Any], *args: Any) -> Any:
     return function(*args)
 
 
-def _sum_rows(function: Callable[..., Any], count: int) -> Callable[..., Any]:
-    """Pass of a loop, of all its rows x and a row of each of `count` tables."""
-
-    def evaluate_row(*args: Any) -> Array:
-        *first, x = args[:-count]
-        weights, *others = args[-count:]
-        return function(*first, jnp.sum(weights[:, None] * x, axis=0), *others)
-
-    return evaluate_row
+def _first_pass(args: Any, tables: Sequence[np.ndarray]) -> Any:
+    """Arguments of a pass of a loop that has these arguments."""
+    *first, x = args
+    return (*first, np.zeros(x.shape[1:], x.dtype), *(table[0] for table in tables[1:]))
 
 
 def _make_loop(
-    function: Callable[..., Any], evaluate_row: Any, tables: Sequence[np.ndarray]
+    function: Callable[..., Any], evaluate_pass: Any, tables: Sequence[np.ndarray]
 ) -> Callable[..., Any]:
     """Loop over rows of tables in which a function makes one row after the other."""
     weights, *others = tables
@@ -681,11 +677,11 @@ def _make_loop(
         *first, x = args
         # Machine code is compiled once however often it is called, and a batch need not copy all rows to
         # change one. XLA would compile a copy of the function for every pass.
-        if not evaluate_row.has_code(*args, *(table[0] for table in tables)):
+        if not evaluate_pass.has_code(*_first_pass(args, tables)):
 
             def add_row(x: Array, at: tuple[Any, ...]) -> tuple[Array, None]:
-                number, *row = at
-                value = evaluate_row(*first, x, *row)
+                number, row, *rest = at
+                value = evaluate_pass(*first, jnp.sum(row[:, None] * x, axis=0), *rest)
                 return jax.lax.dynamic_update_index_in_dim(x, value, number, 0), None
 
             # JAX remembers a NumPy array by its identity, with the precision that it once had
