@@ -1,10 +1,10 @@
 """Machine code of a scalar program: LLVM's intermediate representation, compiled by llvmlite.
 
-A program becomes two straight-line functions, one for a single evaluation and one for as many as the
-processor's vectors hold, and a handler that XLA calls. Both do the same operations in the same order,
-with sums of products fused where the graph says so and nowhere else, and sines and cosines by
-polynomials that are part of the program. So a row's bits do not depend on the batch around it: a batch
-is done in whole blocks, of which the last overlaps the one before, and smaller ones row by row.
+A program becomes straight-line functions for a single evaluation, or for as many as the processor's
+vectors hold, and a handler that XLA calls. Both do the same operations in the same order, with sums of
+products fused where the graph says so and nowhere else, and sines and cosines by polynomials that are
+part of the program. So a row's bits do not depend on the batch around it: a batch is done in whole
+blocks, of which the last overlaps the one before, and batches smaller than a block row by row.
 
 The handler reads XLA's call frame (xla/ffi/api/c_api.h, version 0.3) and says so when it is
 registered; XLA refuses it where its own version differs.
@@ -354,6 +354,7 @@ def write(
     """Program of a graph for buffers of these kinds.
 
     Args:
+        width: rows that are done at once; batches have as many or more.
         places: buffer and first entry there of each operand; by default each has its own.
         loop: loop around the program, for a width of 1.
     """
@@ -367,12 +368,9 @@ def write(
                 number, entry, kind = graph.args[node]
                 buffer, first = places[number]
                 graph.args[node] = (buffer, first + entry, kind)
-    # The order is the same for both widths, and changes no bit.
     schedule = Schedule(graph, flat)
     names: set[str] = set()
-    parts = [
-        _functions(graph, schedule, flat, arguments, results, w, names) for w in sorted({1, width})
-    ]
+    parts = [_functions(graph, schedule, flat, arguments, results, width, names)]
     if loop is None:
         body = _repeat_rows(arguments, results, width)
     else:
@@ -687,67 +685,46 @@ def _repeat_rows(arguments: Sequence[Buffer], results: Sequence[Buffer], width: 
     """Instructions that go through the rows of a batch."""
     lines = _find_buffers(range(len(arguments)), len(results))
     # XLA gives sizes and not counts of rows: dimensions of a batch may be several, and their
-    # product is what is needed.
-    # the number of rows is that of the first result with entries
+    # product is what is needed, that of the first result with entries.
     first = next(k for k, b in enumerate(results) if b.size)
     lines += [
         f"  %entries = call i64 @entries(ptr %y{first}.buffer)",
         f"  %rows = sdiv i64 %entries, {results[first].size}",
     ]
 
-    def call(w: int, row: str) -> str:
+    def call(row: str) -> str:
         offsets, args = [], []
         for letter, buffers in (("x", arguments), ("y", results)):
             for k, buffer in enumerate(buffers):
                 name = f"%{letter}{k}.base"
                 if not buffer.shared:
-                    offset = f"%{letter}{k}.o{w}"
+                    offset = f"%{letter}{k}.offset"
                     offsets.append(f"  {offset} = mul i64 {row}, {buffer.size}")
-                    name = f"%{letter}{k}.p{w}"
+                    name = f"%{letter}{k}.at"
                     kind = _TYPES[buffer.dtype]
                     offsets.append(
                         f"  {name} = getelementptr {kind}, ptr %{letter}{k}.base, i64 {offset}"
                     )
                 args.append(f"ptr {name}")
-        offsets.append(f"  call void @rows{w}({', '.join(args)})")
+        offsets.append(f"  call void @rows{width}({', '.join(args)})")
         return "\n".join(offsets)
 
     load = "\n".join(lines)
-    # Batches are done in whole vectors. The last one is moved back to end with the batch and does
-    # some rows twice, with equal bits, instead of a remainder row by row, whose instructions would
-    # take longer and could round differently.
-    blocks = (
-        f"""  %many = icmp sge i64 %rows, {width}
-  br i1 %many, label %start, label %singly
-start:
+    # Batches are done in whole vectors, of which they fill one at least. The last one is moved back to end
+    # with the batch and does some rows twice, with equal bits, instead of a remainder row by row, whose
+    # instructions would take longer and could round differently.
+    return f"""
+{load}
   %last = sub i64 %rows, {width}
   br label %block
 block:
-  %at = phi i64 [0, %start], [%next, %again]
+  %at = phi i64 [0, %run], [%next, %block]
   %ahead = icmp sgt i64 %at, %last
   %row = select i1 %ahead, i64 %last, i64 %at
-{call(width, "%row")}
+{call("%row")}
   %next = add i64 %at, {width}
   %more = icmp slt i64 %next, %rows
-  br i1 %more, label %again, label %done
-again:
-  br label %block
-"""
-        if width > 1
-        else "  br label %singly\n"
-    )
-    return f"""
-{load}
-{blocks}singly:
-  br label %single
-single:
-  %one = phi i64 [0, %singly], [%one.next, %do]
-  %left = icmp slt i64 %one, %rows
-  br i1 %left, label %do, label %done
-do:
-{call(1, "%one")}
-  %one.next = add i64 %one, 1
-  br label %single
+  br i1 %more, label %block, label %done
 done:
   ret ptr null
 """
@@ -910,7 +887,7 @@ def _is_taken() -> bool:
     # itself.
     graph = Graph(100)
     node = graph.apply("add", graph.node("input", 0, 0, "f"), graph.constant(1.0))
-    rows = np.arange(3.0)[:, None]
+    rows = np.arange(1.0 + vector_width())[:, None]
     try:
         code = write(
             graph, [np.array([node])], [Buffer(1, "f8")], [Buffer(1, "f8")], vector_width()
