@@ -375,10 +375,25 @@ def test_results_that_are_arguments_are_passed_on():
 A, C = np.tril(np.arange(1.0, 17.0).reshape(4, 4), -1) / 40, np.linspace(0.0, 1.0, 4)
 
 
-@partial(native, tables=(A, C))
-def stages(scale, t, y, total, node):
-    """Rows of a Runge-Kutta step."""
+def stage(scale, t, y, total, node):
+    """Row of a Runge-Kutta step."""
     return jnp.sin(scale["a"] * (y + total)) + (t + node) * scale["b"]
+
+
+stages = native(stage, tables=(A, C))
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 19])
+def test_rows_of_loops_are_added_term_by_term(size):
+    """In vectors that overlap, with the bits of one operation after the other."""
+    y = jnp.asarray(np.random.default_rng(size).normal(size=size))
+    scale = {"a": jnp.asarray(1.3), "b": y}
+    found = np.asarray(jax.jit(stages)(scale, 0.3, y, jnp.zeros((4, size))))
+    one = native(lambda x, w: jnp.sum(w[:, None] * x, axis=0))
+    row = native(lambda scale, y, total, node: stage(scale, 0.3, y, total, node))
+    for k in range(4):
+        total = jax.jit(one)(np.where(np.arange(4)[:, None] < k, found, 0.0), A[k])
+        np.testing.assert_array_equal(found[k], jax.jit(row)(scale, y, total, C[k]))
 
 
 def test_loops_are_one_call():

@@ -543,9 +543,7 @@ def _functions(
             _store(block, results[number], number, entry, value)
 
     steps = schedule.steps
-    twins = {
-        (graph.ops[n], graph.args[n][0]): n for n in steps if graph.ops[n] in ("sin", "cos")
-    }
+    twins = {(graph.ops[n], graph.args[n][0]): n for n in steps if graph.ops[n] in ("sin", "cos")}
     registers = Registers(schedule, _registers() - _SPARE, is_free, store)
     made: set[int] = set()
     signature = _signature(arguments, results, typed=True)
