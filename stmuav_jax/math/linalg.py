@@ -1,10 +1,12 @@
 """Linear solvers of constrained dynamics, for small full matrices, symmetric or general."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..checks.shapes import Matrix, Vector
@@ -173,48 +175,86 @@ class Saddle(eqx.Module):
     """Factorisation of the equations M x - J^T y = f, J x = g, with M symmetric positive definite.
 
     Attributes:
-        lower: Cholesky factor L of M with its unknowns in reverse. Y: columns L^-1 J^T (k, m), zero for rows left out.
+        lower: Cholesky factor L of M with its unknowns in this order.
+        Y: columns L^-1 J^T (k, m), zero for rows left out.
         factor: factorisation of Y^T Y = J M^-1 J^T.
+        order: unknowns in the order in which they are eliminated.
     """
 
     lower: Matrix
     Y: Matrix
     factor: Factor | MinimumNorm | Proximal
+    order: tuple[int, ...] = eqx.field(static=True)
 
     def solve(self, f: Vector, g: Vector) -> tuple[Vector, Vector]:
         """Solution x (k,) and y (m,); g has to be zero for rows left out, whose y then is zero."""
-        rest = solve_lower(self.lower, f[::-1, None])[:, 0]
+        rest = solve_lower(self.lower, _reorder(f, self.order)[:, None])[:, 0]
         if len(g):
             g = self.factor.solve(g - jnp.sum(self.Y * rest[:, None], axis=0))
             rest = rest + jnp.sum(self.Y * g[None], axis=1)
-        return solve_lower(self.lower, rest[:, None], transpose=True)[::-1, 0], g
+        x = solve_lower(self.lower, rest[:, None], transpose=True)[:, 0]
+        return _reorder(x, np.argsort(self.order)), g
 
     def share_multipliers(self, J: Matrix, y: Vector) -> Vector:
         """Multipliers of minimum norm in all rows J with the effect of those y of the rows held."""
-        return share_multipliers(self.Y.T @ solve_lower(self.lower, J[:, ::-1].T), self.factor, y)
+        Y = solve_lower(self.lower, _reorder(J.T, self.order))
+        return share_multipliers(self.Y.T @ Y, self.factor, y)
 
     def right_inverse(self) -> Matrix:
         """Right inverse G = M^-1 J^T (J M^-1 J^T)^-1 (k, m): x = G b solves J x = b with minimum x^T M x."""
-        return solve_lower(self.lower, self.factor.solve(self.Y.T).T, transpose=True)[::-1]
+        columns = solve_lower(self.lower, self.factor.solve(self.Y.T).T, transpose=True)
+        return _reorder(columns, np.argsort(self.order))
+
+
+def _reorder(x: Float[Array, "k *n"], order: Sequence[int] | np.ndarray) -> Float[Array, "k *n"]:
+    """Rows of an array in another order."""
+    if list(order) == list(range(len(order)))[::-1]:
+        return x[::-1]
+    return x.at[np.array(order)].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def count_products(
+    couples: Bool[np.ndarray, "k k"], touches: Bool[np.ndarray, "k m"], order: Sequence[int]
+) -> int:
+    """Number of products in which `factor_saddle` eliminates the unknowns in this order.
+
+    Args:
+        couples: entries of M that are not zero. touches: those of J^T.
+    """
+    M, Y = couples[np.ix_(order, order)], touches[list(order)]
+    total = 0
+    for k in range(len(order)):
+        below, across = M[k + 1 :, k].copy(), int(Y[k].sum())
+        count = int(below.sum())
+        # the row of the factor, what it changes below, its share of Y^T Y, and of two solutions
+        total += count + count * (count + 1) // 2 + count * across
+        total += across * (across + 1) // 2 + 2 * (count + across)
+        M[k + 1 :, k + 1 :] |= np.outer(below, below)
+        Y[k + 1 :] |= np.outer(below, Y[k])
+    return total
 
 
 def factor_saddle(
-    M: Matrix, J: Matrix, *, redundant: Redundant, row_mask: Bool[Array, " m"] | None = None
-) -> Saddle:
+    M: Matrix, J: Matrix, *, redundant: Redundant, row_mask: Bool[Array, " m"] | None = None,
+    order: Sequence[int] | None = None,
+) -> Saddle:  # fmt: skip
     """Factorise the equations of a `Saddle`, without the rows of J that `row_mask` leaves out.
 
-    If rows of J are dependent, `redundant` determines the choice of y; x does not depend on it. Unknowns are
-    eliminated from the last to the first: in the mass matrix of a tree that is numbered outwards, no zero
-    between two branches fills in. Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 6.5.
+    If rows of J are dependent, `redundant` determines the choice of y; x does not depend on it.
+
+    Args:
+        order: unknowns in the order in which they are eliminated; by default from the last to the first.
     """
-    L = factor_cholesky(M[::-1, ::-1])
+    order = tuple(range(len(M)))[::-1] if order is None else tuple(order)
+    L = factor_cholesky(_reorder(_reorder(M, order).T, order))
     if not J.shape[0]:
-        return Saddle(L, J.T, Factor(jnp.zeros((0, 0), L.dtype)))
-    Y = solve_lower(L, J[:, ::-1].T)
+        return Saddle(L, J.T, Factor(jnp.zeros((0, 0), L.dtype)), order)
+    Y = solve_lower(L, _reorder(J.T, order))
     Y = Y if row_mask is None else jnp.where(row_mask[None], Y, 0.0)
     S = Y.T @ Y
     if row_mask is not None:
         S = S + jnp.diag(1.0 - row_mask)
     if redundant == "fast":
-        return Saddle(L, Y, factor_proximal(S))
-    return Saddle(L, Y, factor_minimum_norm(S) if redundant else Factor(factor_cholesky(S)))
+        return Saddle(L, Y, factor_proximal(S), order)
+    factor = factor_minimum_norm(S) if redundant else Factor(factor_cholesky(S))
+    return Saddle(L, Y, factor, order)

@@ -10,6 +10,7 @@ from helpers import central
 from stmuav_jax.math import linalg
 from stmuav_jax.math.linalg import (
     Factor,
+    count_products,
     factor_cholesky,
     factor_minimum_norm,
     factor_proximal,
@@ -106,6 +107,33 @@ def test_saddle(rng, redundant):
     expected = np.linalg.lstsq(K, np.concatenate([f, g]), rcond=1e-11)[0]
     np.testing.assert_allclose(x, expected[:N], rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(J.T @ y, J.T @ expected[N:], rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("redundant", [False, "fast"])
+def test_solutions_do_not_depend_on_the_order_of_elimination(rng, redundant):
+    sizes = ((3, N), N, 3)
+    J, f, g = (jnp.asarray(rng.normal(size=size)) for size in sizes)
+    M = jnp.asarray(definite(rng))
+    saddles = [
+        factor_saddle(M, J, redundant=redundant, order=order)
+        for order in (None, rng.permutation(N).tolist())
+    ]
+    results = [(*s.solve(f, g), s.right_inverse(), s.share_multipliers(J, g)) for s in saddles]
+    for ours, theirs in zip(*results, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-10)
+
+
+def test_products_of_an_elimination():
+    """An arrow of five unknowns and a row in its tip, by hand for both ends first."""
+    couples = np.eye(5, dtype=bool)
+    couples[0], couples[:, 0] = True, True
+    touches = np.zeros((5, 1), bool)
+    touches[0] = True
+    # each of the four others: factor 1, change 1, two solutions 2; the tip: row 1, two solutions 2
+    assert count_products(couples, touches, range(5)[::-1]) == 4 * 4 + 3
+    # tip first: all is full
+    full = sum(c + c * (c + 1) // 2 + c + 1 + 2 * (c + 1) for c in range(5))
+    assert count_products(couples, touches, range(5)) == full
 
 
 @pytest.mark.parametrize("redundant", [False, "fast"])

@@ -20,7 +20,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ...math.derivative import held_constant
-from ...math.linalg import factor_cholesky, factor_saddle, independent_rows, solve_lower
+from ...math.linalg import (
+    count_products,
+    factor_cholesky,
+    factor_saddle,
+    independent_rows,
+    solve_lower,
+)
 from ...math.native.program import native
 from ...math.rotation import cross, rotation_matrix
 from ...math.stacked import apply_matrix, apply_transposed, multiply_matrices
@@ -291,6 +297,7 @@ def _closing_inverse(
         all_columns(tree, J),
         redundant="fast" if model.step_rows is not None else False,
         row_mask=model.active_rows,
+        order=choose_order(tree, model.constraints),
     )
     return saddle.right_inverse()[6 * tree.floating :]
 
@@ -309,6 +316,31 @@ def all_columns(tree: SpanningTree, J: Float[Array, "m k"]) -> Float[Array, "m l
     if not tree.floating:
         return J
     return jnp.concatenate([jnp.zeros((J.shape[0], 6, *J.shape[2:]), J.dtype), J], axis=1)
+
+
+def choose_order(tree: SpanningTree, constraints: Constraints) -> tuple[int, ...]:
+    """Order in which the unknowns of `mass_matrix` are eliminated: of two the one with fewer products.
+
+    From the last to the first, no zero between two branches fills in. A floating base that is eliminated first
+    fills in all of them; in exchange its rows of zeros in J^T have no part in anything that follows.
+
+    Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 6.5, for the first.
+    """
+    n = tree.n_velocities
+    outermost = tuple(range(n))[::-1]
+    if not tree.floating or not constraints.groups:
+        return outermost
+    frame, supported = motion_columns(tree).frame, find_supported(tree)
+    above = supported[np.ix_(frame, frame)]
+    couples = np.ones((n, n), bool)
+    couples[6:, 6:] = above | above.T
+    # the mass of the whole machine, the same in all directions
+    couples[3:6, 3:6] = np.eye(3, dtype=bool)
+    touches = np.zeros((n, len(row_bodies(constraints)[0])), bool)
+    for frames in row_frames(tree, constraints):
+        touches[6:] |= supported[np.ix_(frame, frames)]
+    base_first = (*range(6)[::-1], *range(6, n))
+    return min((outermost, base_first), key=lambda order: count_products(couples, touches, order))
 
 
 def _carry_derivatives(at: TreeCoordinates, to: TreeCoordinates) -> TreeCoordinates:

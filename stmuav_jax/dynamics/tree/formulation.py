@@ -49,6 +49,7 @@ from .closures import (
     Rows,
     TreeModel,
     all_columns,
+    choose_order,
     close_loops,
     closure_rows,
     compute_residuals,
@@ -157,16 +158,16 @@ def forward_dynamics(
         load: wrenches on the frames, see `wrenches_by_frame`.
         rows: constraint rows of the loop closures; None without any.
     """
-    saddle, h, gamma = _factor_equations(parameters, moving, load, rows)
+    saddle, h, gamma = _factor_equations(parameters, constraints, moving, load, rows)
     return saddle.solve(-h, gamma)
 
 
 @forward_dynamics.def_jvp
 def _forward_dynamics_jvp(primals: Any, tangents: Any) -> tuple[Solution, Solution]:
-    parameters, _, moving, load, rows = primals
+    parameters, constraints, moving, load, rows = primals
     # The derivative is not taken through the factorisation: the tangents of the residuals M x + h - J^T y
     # and gamma - J x cost one pass over the tree, and the factors that solve for them exist already.
-    saddle, h, gamma = _factor_equations(parameters, moving, load, rows)
+    saddle, h, gamma = _factor_equations(parameters, constraints, moving, load, rows)
     x, y = saddle.solve(-h, gamma)
     residual = lambda *setting: inverse_dynamics_residual(*setting, x, y)  # pyright: ignore[reportCallIssue]
     _, (h_dot, gamma_dot) = directional_derivative(residual, primals, tangents)
@@ -175,6 +176,7 @@ def _forward_dynamics_jvp(primals: Any, tangents: Any) -> tuple[Solution, Soluti
 
 def _factor_equations(
     parameters: TreeParameters,
+    constraints: Constraints,
     moving: TreeMotion,
     load: Float[Array, "6 F"],
     rows: Rows | None,
@@ -188,7 +190,8 @@ def _factor_equations(
         (moving.S[:0], h[:0], None) if rows is None else (rows.J, rows.gamma, rows.row_mask)
     )
     M, J = mass_matrix(tree, moving.S, total), all_columns(tree, J)
-    return factor_saddle(M, J, redundant=redundant, row_mask=row_mask), h, gamma
+    order = choose_order(tree, constraints)
+    return factor_saddle(M, J, redundant=redundant, row_mask=row_mask, order=order), h, gamma
 
 
 def inverse_dynamics_residual(
@@ -371,7 +374,9 @@ class Tree(AbstractFormulation):
             )
             return Solved(moving, placement, rows, load, rate, multipliers)
         choice = self.redundant and ("minimum norm" if shared else "fast")
-        saddle, h, gamma = _factor_equations(model.parameters, moving, wrench, rows, choice)
+        saddle, h, gamma = _factor_equations(
+            model.parameters, model.constraints, moving, wrench, rows, choice
+        )
         rate, multipliers = saddle.solve(-h, gamma)
         if shared and every is not None:
             multipliers = saddle.share_multipliers(all_columns(tree, every.J), multipliers)

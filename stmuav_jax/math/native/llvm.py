@@ -545,7 +545,7 @@ def _functions(
     steps = schedule.steps
     twins = {(graph.ops[n], graph.args[n][0]): n for n in steps if graph.ops[n] in ("sin", "cos")}
     registers = Registers(schedule, _registers() - _SPARE, is_free, store)
-    made: set[int] = set()
+    computed: set[int] = set()
     signature = _signature(arguments, results, typed=True)
     texts = []
     for first in range(0, max(len(steps), 1), CHUNK):
@@ -556,9 +556,9 @@ def _functions(
                 if graph.ops[node] in LEAVES:
                     store_outputs(node, find(node))
         for k, node in enumerate(steps[first : first + CHUNK], start=first):
-            if node not in made:
+            if node not in computed:
                 for result, value in compute(node).items():
-                    made.add(result)
+                    computed.add(result)
                     # Outputs are stored as soon as they are known, which frees their registers.
                     store_outputs(result, value)
                     registers.put(result, value)

@@ -39,8 +39,8 @@ class Schedule:
 
     def __init__(self, graph: Graph, outputs: Sequence[int]) -> None:
         self._graph = graph
-        wanted = set(outputs)
-        is_step = lambda n: graph.ops[n] not in LEAVES and (graph.ops[n] != "neg" or n in wanted)
+        results = set(outputs)
+        is_step = lambda n: graph.ops[n] not in LEAVES and (graph.ops[n] != "neg" or n in results)
         steps = [n for n in range(len(graph.ops)) if is_step(n)]
         order = _arrange(graph, steps, [self._find_reads(node) for node in steps])
         self.steps = [steps[k] for k in order]
@@ -48,13 +48,13 @@ class Schedule:
 
     def _find_reads(self, node: int) -> list[int]:
         ops, args = self._graph.ops, self._graph.args
-        found: list[int] = []
+        nodes: list[int] = []
         for arg in args[node]:
             while ops[arg] == "neg":
                 arg = args[arg][0]
-            if ops[arg] not in ("constant", "table") and arg not in found:
-                found.append(arg)
-        return found
+            if ops[arg] not in ("constant", "table") and arg not in nodes:
+                nodes.append(arg)
+        return nodes
 
 
 @no_type_check

@@ -15,6 +15,8 @@ from helpers import (
 
 import stmuav_jax as stm
 from stmuav_jax.dynamics.formulations.stabilisation import Unstabilised
+from stmuav_jax.dynamics.tree import formulation
+from stmuav_jax.dynamics.tree.closures import choose_order
 
 X, Y, Z = np.eye(3)
 SAME = 1e-11  # round-off of two formulations, relative to the largest entry
@@ -215,3 +217,50 @@ def test_a_mechanism_on_ground_far_from_the_origin():
         off = np.max(np.abs(far.states.r - foot - near.states.r))
         assert off < 1e-10 + 4 * np.spacing(2 * distance)
         assert far.certificate.accepted_steps == near.certificate.accepted_steps
+
+
+def make_star(arms, rods):
+    """A floating base with arms of rods, the ends of two of which a bar joins."""
+    size = (0.1, 0.1, 0.1)
+    way = [np.array([np.cos(a), np.sin(a), 0.0]) for a in 2 * np.pi * np.arange(arms) / arms]
+    bodies, joints = [stm.Body("base", 2.0, size, free=True)], []
+    for a, along in enumerate(way):
+        for k in range(rods):
+            name, before = f"rod {a} {k}", f"rod {a} {k - 1}" if k else "base"
+            bodies.append(stm.Body(name, 1.0, size, position=(k + 0.5) * along))
+            axis = (Y, Z)[k % 2]
+            joints.append(stm.revolute(f"hinge {a} {k}", before, name, point=k * along, axis=axis))
+    bodies.append(stm.Body("bar", 1.0, size, position=rods * (way[0] + way[1]) / 2))
+    for a in (0, 1):
+        end = f"rod {a} {rods - 1}"
+        joints.append(stm.spherical(f"end {a}", end, "bar", point=rods * way[a]))
+    return stm.System(bodies, joints, [stm.Gravity()])
+
+
+def test_the_base_is_eliminated_first_where_that_takes_fewer_products():
+    """In a machine whose loops take part in most of its joints, not in one of many branches."""
+    for system, base_first in (
+        (stm.make_scene("uav_tracker", 2).system, True), (make_star(4, 3), False),
+        (stm.make_scene("tracker", 1).system, False),
+    ):  # fmt: skip
+        model = stm.Tree().prepare(system)
+        order = choose_order(model.parameters.tree, model.constraints)
+        assert sorted(order) == list(range(model.parameters.tree.n_velocities))
+        assert (set(order[:6]) == set(range(6))) == base_first
+        assert base_first or order == tuple(sorted(order))[::-1]
+
+
+@pytest.mark.slow
+def test_accelerations_do_not_depend_on_the_order_of_elimination(monkeypatch):
+    scene = stm.make_scene("uav_tracker", 2)
+
+    def evaluate():
+        found = stm.dynamics.evaluate(scene.system, scene.state0, formulation=stm.Tree())
+        return found.accelerations, found.reactions
+
+    first = jax.jit(evaluate)()
+    outermost = lambda tree, constraints: tuple(range(tree.n_velocities))[::-1]
+    monkeypatch.setattr(formulation, "choose_order", outermost)
+    other = jax.jit(lambda: evaluate())()
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(other), strict=True):
+        assert relative_error(a, b) < 1e-10
