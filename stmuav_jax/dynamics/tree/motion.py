@@ -122,21 +122,31 @@ def composite_inertia(
     """Composite inertias, and bias wrenches under loads on the frames (`wrenches_by_frame`)."""
     tree, E = parameters.tree, moving.pose.E
     c = moving.pose.o + apply_matrix(E, parameters.centre)
-    tensor = multiply_matrices(multiply_matrices(E, parameters.inertia), jnp.swapaxes(E, 0, 1))
-    turning, f = _bias_of_frames(parameters, moving, c, tensor)
+    row, column = _UPPER
+    turned = pick_entries(multiply_matrices(E, parameters.inertia), row, 0)
+    tensor = jnp.sum(turned * pick_entries(E, column, 0), axis=1)
+    turning, f = _bias_of_frames(parameters, moving, c, _fill_symmetric(tensor))
     # First moments and tensors about the common origin simply add along the tree, so that composite
     # inertias are one backward sum without transformations between frames (R. Featherstone 2008, ch.
     # 6.2).
     mc = parameters.mass[None] * c
     x, y, z = mc * c
-    square = align_axes(np.eye(3), 2 + x.ndim) * (x + y + z)[None, None]
-    about = tensor + square - mc[:, None] * c[None]
+    square = align_axes(1.0 * (row == column), 1 + x.ndim) * (x + y + z)[None]
+    about = tensor + square - pick_entries(mc, row, 0) * pick_entries(c, column, 0)
     # All quantities that are summed towards the root go through one pass: the depth of the tree is paid
     # once.
-    rows = [mc, about.reshape(9, *x.shape), turning - load[:3], f - load[3:]]
-    total = backward_pass(tree, jnp.concatenate(rows))
-    tensors = total[3:12].reshape(3, 3, *total.shape[1:])
-    return Inertia(parameters.subtree_mass, total[:3], tensors, total[12:])
+    total = backward_pass(tree, jnp.concatenate([mc, about, turning - load[:3], f - load[3:]]))
+    return Inertia(parameters.subtree_mass, total[:3], _fill_symmetric(total[3:9]), total[9:])
+
+
+# Rows and columns of the entries of a symmetric matrix that are computed, and their places in the matrix.
+_UPPER = np.triu_indices(3)
+_PLACES = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
+
+
+def _fill_symmetric(entries: Float[Array, "6 *s"]) -> Float[Array, "3 3 *s"]:
+    """Symmetric matrices from the entries on and above the diagonal."""
+    return pick_entries(entries, _PLACES, 0).reshape(3, 3, *entries.shape[1:])
 
 
 def wrenches_by_frame(

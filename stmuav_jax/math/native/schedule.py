@@ -25,7 +25,7 @@ from .graph import LEAVES, Graph
 _LATENCY = {"div": 13, "sqrt": 20, "sin": 60, "cos": 60}
 _SUM = 4
 # Cycles in which a processor begins one operation, as measured on programs of mechanisms.
-_CYCLES = 0.6
+_CYCLES = 0.8
 
 
 @no_type_check
