@@ -123,8 +123,8 @@ def composite_inertia(
     tree, E = parameters.tree, moving.pose.E
     c = moving.pose.o + apply_matrix(E, parameters.centre)
     row, column = _UPPER
-    turned = pick_entries(multiply_matrices(E, parameters.inertia), row, 0)
-    tensor = jnp.sum(turned * pick_entries(E, column, 0), axis=1)
+    rotated_rows = pick_entries(multiply_matrices(E, parameters.inertia), row, 0)
+    tensor = jnp.sum(rotated_rows * pick_entries(E, column, 0), axis=1)
     turning, f = _bias_of_frames(parameters, moving, c, _fill_symmetric(tensor))
     # First moments and tensors about the common origin simply add along the tree, so that composite
     # inertias are one backward sum without transformations between frames (R. Featherstone 2008, ch.
