@@ -4,8 +4,8 @@
 
 uav_tracker case 2 by spanning-tree coordinates: right-hand side, projection, and flights of one second
 at 1e-9 by lanes. Both kinds of code are measured in one process, in seconds of the processor; states are
-of a motion near the start, flights agree to their tolerance. The processor's limit is the time of as many
-fused multiplications and additions that need no table or order. The figure stands in docs/theory.md.
+of a motion near the start, flights agree to their tolerance. For comparison, the time of as many
+fused multiplications and additions in short chains. The figure stands in docs/theory.md.
 """
 
 import math
@@ -121,7 +121,7 @@ def evaluated(
     return {"us_per_state": best, "compile_seconds": seconds, "last": np.asarray(last)}
 
 
-# Numbers of a state in the measurement of a processor's limit, and operations in a row, each of which waits for
+# Numbers of a state in the program of short chains, and operations in a row, each of which waits for
 # the one before. They are so few that a processor, which looks a few hundred operations ahead, finds enough
 # that wait for nothing.
 _NUMBERS, _PASSES = 16, 4
@@ -137,7 +137,7 @@ def multiply_and_add(factor: jax.Array, chains: int, x: jax.Array) -> jax.Array:
 
 
 def measure_limit(operations: int, lanes: int, size: Size) -> float:
-    """Microseconds per state of this many operations at the rate of a processor's arithmetic units."""
+    """Microseconds per state of a program of this many operations in short chains."""
     chains = operations // (_NUMBERS * (_PASSES + 2))
     function = lambda factor, x: multiply_and_add(factor, chains, x)
     starts = jnp.ones((lanes, _NUMBERS))
