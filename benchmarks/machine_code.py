@@ -136,7 +136,7 @@ def multiply_and_add(factor: jax.Array, chains: int, x: jax.Array) -> jax.Array:
     return jnp.sum(y, axis=0)
 
 
-def measure_limit(operations: int, lanes: int, size: Size) -> float:
+def measure_chains(operations: int, lanes: int, size: Size) -> float:
     """Microseconds per state of a program of this many operations in short chains."""
     chains = operations // (_NUMBERS * (_PASSES + 2))
     function = lambda factor, x: multiply_and_add(factor, chains, x)
@@ -183,7 +183,7 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
     }  # fmt: skip
     left = content["operations"]["right-hand side"]["left"]
     content["limit"] = [
-        {"lanes": lanes, "us_per_state": measure_limit(left, lanes, size)} for lanes in size.lanes
+        {"lanes": lanes, "us_per_state": measure_chains(left, lanes, size)} for lanes in size.lanes
     ]
     for name, function in made.items():
         for lanes in size.lanes:

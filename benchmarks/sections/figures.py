@@ -88,8 +88,8 @@ def draw_machine_code(record: Row) -> Figure:
     lanes = [row["lanes"] for row in rows]
     for key, label in (("xla", "XLA"), ("machine_code", "machine code")):
         right.loglog(lanes, [row[key]["us_per_state"] for row in rows], "o-", label=label)
-    limits = [row["us_per_state"] for row in record["limit"]]
-    right.loglog(lanes, limits, "k--", label="as many in short chains")
+    chains = [row["us_per_state"] for row in record["limit"]]
+    right.loglog(lanes, chains, "k--", label="as many in short chains")
     right.set_xticks(lanes, [str(k) for k in lanes])
     right.set_xticks([], minor=True)
     right.set_xlabel("states at once")

@@ -276,6 +276,17 @@ def test_code_for_other_processors_can_be_made():
         assert len(machine.emit_object(module)) > 1000
 
 
+def test_one_known_number_is_a_truth_value_and_a_number():
+    """The same zero as results of three kinds, whichever comes first."""
+    kinds = (bool, bool, float, int, bool)
+    function = lambda x: (*(jnp.zeros(2, kind) for kind in kinds), jnp.sin(x))
+    *zeros, sine = jax.jit(native(function))(X[0])
+    for found, kind in zip(zeros, kinds, strict=True):
+        np.testing.assert_array_equal(found, jnp.zeros(2, kind))
+        assert found.dtype == jnp.zeros(2, kind).dtype
+    np.testing.assert_allclose(sine, np.sin(X[0]), rtol=1e-15)
+
+
 def test_truth_values_and_integers():
     """Choices between known and computed truth values, their order, and sums of integers."""
 

@@ -116,6 +116,16 @@ class Inertia(NamedTuple):
     wrench: Float[Array, "6 f *s"]
 
 
+# Rows and columns of the entries of a symmetric matrix that are computed, and their places in the matrix.
+_UPPER = np.triu_indices(3)
+_PLACES = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
+
+
+def _fill_symmetric(entries: Float[Array, "6 *s"]) -> Float[Array, "3 3 *s"]:
+    """Symmetric matrices from the entries on and above the diagonal."""
+    return pick_entries(entries, _PLACES, 0).reshape(3, 3, *entries.shape[1:])
+
+
 def composite_inertia(
     parameters: TreeParameters, moving: TreeMotion, load: Float[Array, "6 F *s"]
 ) -> Inertia:
@@ -137,16 +147,6 @@ def composite_inertia(
     # once.
     total = backward_pass(tree, jnp.concatenate([mc, about, turning - load[:3], f - load[3:]]))
     return Inertia(parameters.subtree_mass, total[:3], _fill_symmetric(total[3:9]), total[9:])
-
-
-# Rows and columns of the entries of a symmetric matrix that are computed, and their places in the matrix.
-_UPPER = np.triu_indices(3)
-_PLACES = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
-
-
-def _fill_symmetric(entries: Float[Array, "6 *s"]) -> Float[Array, "3 3 *s"]:
-    """Symmetric matrices from the entries on and above the diagonal."""
-    return pick_entries(entries, _PLACES, 0).reshape(3, 3, *entries.shape[1:])
 
 
 def wrenches_by_frame(

@@ -152,6 +152,14 @@ class _Block:
             vector = self.new(f"insertelement {form} {vector}, {kind} {lane}, i64 {k}")
         return vector
 
+    def repeat(self, kind: str, value: str) -> str:
+        """Vector of one value in all lanes, or the value."""
+        if self.width == 1:
+            return value
+        form, zeros = f"<{self.width} x {kind}>", f"<{self.width} x i32> zeroinitializer"
+        vector = self.new(f"insertelement {form} poison, {kind} {value}, i64 0")
+        return self.new(f"shufflevector {form} {vector}, {form} poison, {zeros}")
+
     def library(self, name: str, *args: str) -> str:
         """Function of the C library, number by number."""
         arguments = ", ".join(["double"] * len(args))
@@ -399,9 +407,7 @@ def _load(block: _Block, buffer: Buffer, number: int, entry: int) -> str:
         return block.new(f"load {kind}, ptr {block.address(kind, start, entry)}")
 
     if buffer.shared and block.width > 1:
-        form, zeros = f"<{block.width} x {kind}>", f"<{block.width} x i32> zeroinitializer"
-        vector = block.new(f"insertelement {form} poison, {kind} {load_lane(0)}, i64 0")
-        vector = block.new(f"shufflevector {form} {vector}, {form} poison, {zeros}")
+        vector = block.repeat(kind, load_lane(0))
     else:
         vector = block.join(kind, [load_lane(k) for k in range(block.width)])
     return _read_as_number(block, buffer.dtype, vector)
@@ -538,9 +544,9 @@ def _functions(
 
     def store_outputs(node: int, value: str) -> None:
         for number, entry in places_of_outputs.get(node, ()):
-            if results[number].dtype == "b1" and not graph.is_truth[node]:
-                value = block.compare("une", value, block.number(0.0))
-            _store(block, results[number], number, entry, value)
+            is_number = results[number].dtype == "b1" and not graph.is_truth[node]
+            output = block.compare("une", value, block.number(0.0)) if is_number else value
+            _store(block, results[number], number, entry, output)
 
     steps = schedule.steps
     twins = {(graph.ops[n], graph.args[n][0]): n for n in steps if graph.ops[n] in ("sin", "cos")}
@@ -614,7 +620,7 @@ def _sum_rows(size: int, weights: np.ndarray, names: "set[str]") -> str:
     totals: dict[int, str] = {}
     for j in range(len(weights)):
         weight = block.new(f"load double, ptr {block.address('double', '%weights', j)}")
-        weight = block.join("double", [weight] * width)
+        weight = block.repeat("double", weight)
         for start in starts:
             at = block.address("double", "%rows", j * size + start)
             row = block.new(f"load {block.real}, ptr {at}, align 8")

@@ -38,23 +38,24 @@ class Schedule:
     """
 
     def __init__(self, graph: Graph, outputs: Sequence[int]) -> None:
-        self._graph = graph
         results = set(outputs)
         is_step = lambda n: graph.ops[n] not in LEAVES and (graph.ops[n] != "neg" or n in results)
         steps = [n for n in range(len(graph.ops)) if is_step(n)]
-        order = _arrange(graph, steps, [self._find_reads(node) for node in steps])
+        reads = [_find_reads(graph, node) for node in steps]
+        order = _arrange(graph, steps, reads)
         self.steps = [steps[k] for k in order]
-        self.reads = [self._find_reads(node) for node in self.steps]
+        self.reads = [reads[k] for k in order]
 
-    def _find_reads(self, node: int) -> list[int]:
-        ops, args = self._graph.ops, self._graph.args
-        nodes: list[int] = []
-        for arg in args[node]:
-            while ops[arg] == "neg":
-                arg = args[arg][0]
-            if ops[arg] not in ("constant", "table") and arg not in nodes:
-                nodes.append(arg)
-        return nodes
+
+@no_type_check
+def _find_reads(graph: Graph, node: int) -> list[int]:
+    nodes: list[int] = []
+    for arg in graph.args[node]:
+        while graph.ops[arg] == "neg":
+            arg = graph.args[arg][0]
+        if graph.ops[arg] not in ("constant", "table") and arg not in nodes:
+            nodes.append(arg)
+    return nodes
 
 
 @no_type_check
@@ -122,42 +123,33 @@ class Registers:
         for k in range(len(schedule.reads) - 1, -1, -1):
             for node in schedule.reads[k]:
                 self._readers.setdefault(node, []).append(k)
-        # the next one for numbers in registers
-        self._next: dict[int, int] = {}
 
     def put(self, node: int, name: str) -> None:
         """Remember the name of a number, if it is to be read."""
         if node in self._readers:
-            self.names[node], self._next[node] = name, self._readers[node][-1]
+            self.names[node] = name
 
     def finish(self, k: int) -> None:
         """Forget what no operation after number k reads, and store what has no room."""
         for node in self._schedule.reads[k]:
-            readers = self._readers[node]
-            readers.pop()
-            if readers:
-                if node in self._next:
-                    self._next[node] = readers[-1]
+            self._readers[node].pop()
+            if self._readers[node]:
                 continue
             del self._readers[node]
-            self._drop(node)
+            self.names.pop(node, None)
             # the same few places again and again are near at hand
             if node in self.places:
                 self._unused.append(self.places.pop(node))
         while len(self.names) > self._most:
-            last = max(self._next, key=self._next.__getitem__)
+            last = max(self.names, key=lambda node: self._readers[node][-1])
             self._keep(last)
-            self._drop(last)
+            del self.names[last]
 
     def leave(self) -> None:
         """Store all numbers, at the end of a function that others follow."""
-        for node in list(self.names):
+        for node in self.names:
             self._keep(node)
-            self._drop(node)
-
-    def _drop(self, node: int) -> None:
-        self.names.pop(node, None)
-        self._next.pop(node, None)
+        self.names.clear()
 
     def _keep(self, node: int) -> None:
         if self._is_free(node) or node in self.places:
