@@ -4,20 +4,23 @@ Two states of a checkout have one version number, so results that are to be cont
 """
 
 import hashlib
+import os
+from functools import cache
 from pathlib import Path
 
 _ROOT = Path(__file__).parents[1]
 
 
-def _list_files() -> list[Path]:
-    """Source files of this package and the files of its missions."""
-    return sorted(path for path in _ROOT.rglob("*") if path.suffix in (".py", ".toml"))
-
-
-def _file_stamps() -> dict[Path, tuple[int, int]]:
-    """Time of change and size of each of the files."""
-    stats = {path: path.stat() for path in _list_files()}
-    return {path: (stat.st_mtime_ns, stat.st_size) for path, stat in stats.items()}
+def _file_stamps() -> dict[str, tuple[int, int]]:
+    """Time of change and size of each source file of this package and of each file of its missions."""
+    stamps = {}
+    for folder, _, names in os.walk(_ROOT):
+        for name in names:
+            if name.endswith((".py", ".toml")):
+                path = os.path.join(folder, name)
+                stat = os.stat(path)
+                stamps[path] = stat.st_mtime_ns, stat.st_size
+    return stamps
 
 
 _STAMPS_AT_IMPORT = _file_stamps()
@@ -37,8 +40,13 @@ def source_digest() -> str:
             f"{min(changed)[0]} was changed after this process imported stmuav_jax, so that the version "
             f"of the running code is unknown: start a new process."
         )
+    return _digest_content()
+
+
+@cache
+def _digest_content() -> str:
     digest = hashlib.sha256()
-    for path in _list_files():
+    for path in sorted(Path(path) for path in _STAMPS_AT_IMPORT):
         content = path.read_bytes()
         digest.update(f"{path.relative_to(_ROOT).as_posix()}\0{len(content)}\0".encode() + content)
     return digest.hexdigest()[:16]

@@ -10,7 +10,7 @@ import os
 import stat
 import sys
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Union
 
@@ -127,20 +127,43 @@ def _configure_cache(use_cache: bool) -> Path | None:
     return folder
 
 
-# Commands that do the same if they are told the same: nothing that they find in a folder, such as an
-# earlier result that is resumed, decides what they compute.
-_REPEATABLE = ("simulate", "check", "trim", "fly")
 # Options that no program depends on.
 _FREE = ("out", "figures", "cache")
 
 
-def _digest_file(path: Path) -> str:
-    """Digest of a file, and of the model's file that it names if it is a mission."""
+def _is_repeatable(name: str, options: Any) -> bool:
+    """True for a command that does the same if it is told the same, so that its programs can be kept.
+
+    Of a folder's content, such as the run of `view` or a search to resume, and of files that a robot's file names,
+    its words say nothing.
+    """
+    is_robot = str(getattr(options, "scene", "")).endswith((".xml", ".mjcf", ".urdf"))
+    resumes = getattr(getattr(options, "settings", options), "resume", False)
+    return name != "view" and not is_robot and not resumes
+
+
+def _digest_file(path: Path, readers: tuple[Path, ...] = ()) -> str:
+    """Digest of a file and of the files that it names if it is TOML, as a mission names its model.
+
+    Args:
+        readers: files that led to this one, which are not read again.
+    """
     content = path.read_bytes()
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        model = tomllib.loads(content.decode())["machine"]["model"]
-        content += (path.parent / model).read_bytes()
+    with contextlib.suppress(OSError, ValueError):
+        for text in _texts_in(tomllib.loads(content.decode())):
+            for named in (path.parent / text, Path(text)):
+                if os.path.isfile(named) and named not in (*readers, path):
+                    content += _digest_file(named, (*readers, path)).encode()
     return hashlib.sha256(content).hexdigest()
+
+
+def _texts_in(plain: Any) -> Iterator[str]:
+    """Every text in plain data."""
+    if isinstance(plain, str):
+        yield plain
+    elif isinstance(plain, dict | list):
+        for part in plain.values() if isinstance(plain, dict) else plain:
+            yield from _texts_in(part)
 
 
 def _plain_options(value: Any) -> Any:
@@ -182,9 +205,7 @@ def _run_command(name: str, options: Any, keep_programs: bool) -> int:
     """Run one command; its exit code."""
     command = COMMANDS[name]
     folder = _configure_cache(options.cache) if hasattr(options, "cache") else None
-    # a robot's file may name other files, which are not looked for
-    is_robot = str(getattr(options, "scene", "")).endswith((".xml", ".urdf"))
-    if keep_programs and folder is not None and name in _REPEATABLE and not is_robot:
+    if keep_programs and folder is not None and _is_repeatable(name, options):
         data = {"command": name, "options": _plain_options(options)}
         from ..math.compiler import keep_command_programs
         from ..math.exported import Programs

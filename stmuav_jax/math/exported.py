@@ -156,6 +156,8 @@ def _encode_tree(tree: Any) -> Any:
         return {"class": _class_name(tree)}
     if type(tree) is dict and all(isinstance(name, str) for name in tree):
         return {"dict": {name: _encode_tree(part) for name, part in tree.items()}}
+    if type(tree) is list:
+        return {"list": [_encode_tree(part) for part in tree]}
     if isinstance(tree, tuple):
         name = "" if type(tree) is tuple else _class_name(type(tree))
         return {"tuple": name, "parts": [_encode_tree(part) for part in tree]}
@@ -175,6 +177,8 @@ def _decode_tree(encoded: Mapping[str, Any]) -> Any:
         return _class_named(encoded["class"])
     if "dict" in encoded:
         return {name: _decode_tree(part) for name, part in encoded["dict"].items()}
+    if "list" in encoded:
+        return [_decode_tree(part) for part in encoded["list"]]
     if "tuple" in encoded:
         parts = map(_decode_tree, encoded["parts"])
         return _class_named(encoded["tuple"])(*parts) if encoded["tuple"] else tuple(parts)

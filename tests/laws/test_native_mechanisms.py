@@ -1,16 +1,18 @@
 """Machine code of random mechanisms against XLA's: values and derivatives."""
 
 import itertools
+import operator
 import os
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
-from test_random_mechanisms import Structure, built, structures
+from test_random_mechanisms import Link, Structure, built, structures
 
 import stmuav_jax as stm
 from stmuav_jax.math.compiler import compiler_options
@@ -50,8 +52,45 @@ def apart(results: Any, expected: Any) -> float:
     return max(float(np.max(np.abs(a - b)) / max(np.max(np.abs(b)), 1.0)) for a, b in pairs)
 
 
-def differences(structure: Structure, seed: int) -> tuple[float, float, float]:
-    """Of the accelerations of one mechanism, their jvp and their vjp."""
+# Operations of the equations of mechanisms, in exact arithmetic.
+EXACT: dict[str, Any] = {
+    "add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv, "neg": operator.neg,
+    "sqrt": mpmath.sqrt, "sin": mpmath.sin, "cos": mpmath.cos, "atan2": mpmath.atan2, "abs": abs, "max": max,
+    "min": min, "lt": operator.lt, "le": operator.le, "gt": operator.gt, "ge": operator.ge, "eq": operator.eq,
+    "ne": operator.ne, "and": lambda a, b: bool(a) and bool(b), "or": lambda a, b: bool(a) or bool(b),
+    "not": operator.not_, "select": lambda condition, on_false, on_true: on_true if condition else on_false,
+}  # fmt: skip
+
+
+def by_exact_arithmetic(program: Program, *args: np.ndarray) -> list[np.ndarray]:
+    """Results of a program's operations with 60 digits each, rounded at the end."""
+    graph, outputs = program.graph()
+    flat, values = [np.ravel(x) for x in args], {}
+    with mpmath.workdps(60):
+        for node in graph.needed([n for out in outputs for n in out.ravel().tolist()]):
+            op, arguments = graph.ops[node], graph.args[node]
+            if op == "constant":
+                values[node] = mpmath.mpf(arguments[0])
+            elif op == "input":
+                values[node] = mpmath.mpf(float(flat[arguments[0]][arguments[1]]))
+            else:
+                values[node] = EXACT[op](*(values[n] for n in arguments))
+        return [np.reshape([float(values[n]) for n in out.ravel()], out.shape) for out in outputs]
+
+
+def check_against_xla(program: Program, bound: float, *args: np.ndarray) -> None:
+    results, expected = run(program, None, *args), by_xla(program, *args)
+    if apart(results, expected) > bound:
+        # Equations with nearly dependent rows lose more digits than that whoever evaluates them: exact
+        # arithmetic says how many, and machine code may lose as many as XLA.
+        exact = by_exact_arithmetic(program, *args)
+        lost = apart(expected, exact)
+        assert apart(results, exact) <= 3 * lost
+        assert lost <= 1e-10
+
+
+def check_mechanism(structure: Structure, seed: int) -> None:
+    """Accelerations of one mechanism, their jvp and their vjp."""
     system, velocity = built(structure, seed)
     formulation, rest = stm.Tree(), system.reference
     model = formulation.prepare(system)
@@ -67,18 +106,17 @@ def differences(structure: Structure, seed: int) -> tuple[float, float, float]:
     program, (x, mass) = program_of(rates, x, masses(model))
     forward = program.push_forward((True, True))
     back = forward.pull_back((True, True, False, False), (True,))
-    moves = rng.normal(size=x.shape), rng.normal(size=mass.shape)
+    check_against_xla(program, 1e-12, x, mass)
+    check_against_xla(
+        forward, 1e-11, x, mass, rng.normal(size=x.shape), rng.normal(size=mass.shape)
+    )
     # a pull-back is the transpose of all columns, which the push-forward gives in one batch
     unit = np.eye(len(x) + len(mass))
     axes = (None, None, 0, 0)
     (columns,) = run(forward, axes, x, mass, unit[:, : len(x)], unit[:, len(x) :])
     seed_vector = rng.normal(size=columns.shape[1])
     pulled = np.concatenate(run(back, None, x, mass, seed_vector))
-    return (
-        apart(run(program, None, x, mass), by_xla(program, x, mass)),
-        apart(run(forward, None, x, mass, *moves), by_xla(forward, x, mass, *moves)),
-        apart([pulled], [columns @ seed_vector]),
-    )  # fmt: skip
+    assert apart([pulled], [columns @ seed_vector]) <= 1e-11
 
 
 # The suite takes a few; the variable asks for more, which are others than those of the suite.
@@ -92,9 +130,13 @@ tried = itertools.count(1)
 )  # fmt: skip
 @given(structures(), st.integers(0, 99))
 def test_random_mechanisms(structure: Structure, seed: int):
-    value, forward, back = differences(structure, seed)
-    assert value <= 1e-12
-    assert max(forward, back) <= 1e-11
+    check_mechanism(structure, seed)
     if next(tried) % 12 == 0:
         # hundreds of mechanisms in one test would fill the memory
         jax.clear_caches()
+
+
+def test_a_loop_whose_rows_nearly_depend_on_each_other():
+    """Machine code and XLA differ by 3e-12 here, and both from exact arithmetic by half of that."""
+    links = Link("spherical", -1, 0), Link("screw", -1, 1), Link("spherical", 0, 1)
+    check_mechanism(Structure(bodies=2, links=links, floating=False), 1)

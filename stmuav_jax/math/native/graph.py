@@ -14,6 +14,7 @@ inputs behind them to its outputs, so that NaN and infinities come through.
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, no_type_check
 
 import numpy as np
@@ -47,6 +48,9 @@ _NUMPY: dict[str, Callable[..., Any]] = {
 }  # fmt: skip
 
 
+# Operations with rules of their own, which are methods of the graph.
+_ARITHMETIC = ("add", "sub", "mul", "div", "neg")
+
 # Nodes without arguments that are nodes.
 LEAVES = ("input", "constant", "table")
 
@@ -65,6 +69,7 @@ class Graph:
     Attributes:
         ops, args: operation and arguments (nodes) of each node; an input's arguments are its operand
             and its place in it, a constant's is its value.
+        values: known number of each node; None where it is computed.
         is_truth: whether the value of each node is a truth value; known ones are numbers.
         dropped: nodes x of products 0 * x that were taken for 0.
         tables: known arrays that are read by a computed index.
@@ -74,6 +79,7 @@ class Graph:
     def __init__(self, most_nodes: int) -> None:
         self.ops: list[str] = []
         self.args: list[tuple[Any, ...]] = []
+        self.values: list[float | None] = []
         self.is_truth: list[bool] = []
         self.dropped: set[int] = set()
         self.tables: list[np.ndarray] = []
@@ -98,6 +104,7 @@ class Graph:
     def append(self, op: str, args: tuple[Any, ...]) -> None:
         self.ops.append(op)
         self.args.append(args)
+        self.values.append(args[0] if op == "constant" else None)
         if op in ("select", "lookup"):
             self.is_truth.append(self.is_truth[args[1]])
         else:
@@ -125,16 +132,12 @@ class Graph:
             self.append("constant", (value,))
         return number
 
-    def value(self, node: int) -> float | None:
-        """Known number of a node; None where it is computed."""
-        return self.args[node][0] if self.ops[node] == "constant" else None
-
     # A negation is moved outwards, out of products and into sums, where it turns an addition into
     # a subtraction and costs nothing; two of them cancel on the way.
     # Each operation on nodes; the order of two arguments that commute is that of their numbers.
 
     def add(self, a: int, b: int) -> int:
-        u, v = self.value(a), self.value(b)
+        u, v = self.values[a], self.values[b]
         if u is not None and v is not None:
             return self.constant(u + v)
         if u == 0.0:
@@ -148,7 +151,7 @@ class Graph:
         return self.node("add", *sorted((a, b)))
 
     def sub(self, a: int, b: int) -> int:
-        u, v = self.value(a), self.value(b)
+        u, v = self.values[a], self.values[b]
         if u is not None and v is not None:
             return self.constant(u - v)
         if u == 0.0:
@@ -162,7 +165,7 @@ class Graph:
         return self.node("sub", a, b)
 
     def neg(self, a: int) -> int:
-        value = self.value(a)
+        value = self.values[a]
         if value is not None:
             return self.constant(-value)
         if self.ops[a] == "neg":
@@ -172,7 +175,7 @@ class Graph:
         return self.node("neg", a)
 
     def mul(self, a: int, b: int) -> int:
-        u, v = self.value(a), self.value(b)
+        u, v = self.values[a], self.values[b]
         if u is not None and v is not None:
             return self.constant(u * v)
         if u is not None:
@@ -195,7 +198,7 @@ class Graph:
         return self.neg(product) if negative else product
 
     def div(self, a: int, b: int) -> int:
-        u, v = self.value(a), self.value(b)
+        u, v = self.values[a], self.values[b]
         if u is not None and v is not None:
             with np.errstate(all="ignore"):
                 return self.constant(float(np.divide(u, v)))
@@ -208,7 +211,7 @@ class Graph:
         return self.node("div", a, b) if u == 1.0 else self.mul(a, self.div(self.constant(1.0), b))
 
     def select(self, condition: int, on_false: int, on_true: int) -> int:
-        truth = self.value(condition)
+        truth = self.values[condition]
         if truth is not None:
             return on_true if truth else on_false
         # Both branches of a choice are computed, as they are by XLA: only a choice between equal
@@ -219,14 +222,14 @@ class Graph:
             # One of the two truth values is known: c ? 1 : x is c or x, c ? 0 : x is not c and x.
             if self.is_truth[on_true]:
                 condition, on_false, on_true = self.logical_not(condition), on_true, on_false
-            if self.value(on_true):
+            if self.values[on_true]:
                 return self.logical("or", condition, on_false)
             return self.logical("and", self.logical_not(condition), on_false)
         return self.node("select", condition, on_false, on_true)
 
     def logical(self, op: str, a: int, b: int) -> int:
         """And, or, and exclusive or of two truth values."""
-        u, v = self.value(a), self.value(b)
+        u, v = self.values[a], self.values[b]
         if u is not None:
             a, b, u, v = b, a, v, u
         if v is None:
@@ -238,16 +241,19 @@ class Graph:
         return b if (op == "and") != bool(v) else a
 
     def logical_not(self, a: int) -> int:
-        value = self.value(a)
+        value = self.values[a]
         if value is not None:
             return self.constant(float(not value))
         return self.args[a][0] if self.ops[a] == "not" else self.node("not", a)
 
+    def operation(self, op: str) -> Callable[..., int]:
+        """Function of nodes for the node of this operation on them."""
+        return getattr(self, op) if op in _ARITHMETIC else partial(self.apply, op)
+
     def apply(self, op: str, *args: int) -> int:
         """Any operation by its name."""
-        special = getattr(self, op, None)
-        if special is not None and op in ("add", "sub", "mul", "div", "neg"):
-            return special(*args)
+        if op in _ARITHMETIC:
+            return getattr(self, op)(*args)
         if op in ("and", "or", "xor"):
             return self.logical(op, *args)
         if op == "not":
@@ -255,7 +261,7 @@ class Graph:
         if op in ("eq", "ne") and any(self.is_truth[a] for a in args):
             other = self.logical("xor", *args)
             return other if op == "ne" else self.logical_not(other)
-        values = [self.value(a) for a in args]
+        values = [self.values[a] for a in args]
         if None not in values:
             with np.errstate(all="ignore"):
                 return self.constant(float(_NUMPY[op](*values)))
@@ -282,7 +288,7 @@ class Graph:
             return n
         condition, on_false, on_true = self.args[n]
         is_test = self.ops[condition] == "ne" and len(set(self.args[condition])) == 1
-        value = self.value(on_true)
+        value = self.values[on_true]
         return on_false if is_test and value is not None and value != value else n
 
     def sees_nan(self, live: set[int]) -> bool:
@@ -294,22 +300,24 @@ class Graph:
 
     def needed(self, outputs: Sequence[int]) -> list[int]:
         """Nodes that the outputs need, each after its arguments, depth first."""
+        ops, args = self.ops, self.args
         order: list[int] = []
-        finished: set[int] = set()
+        seen = bytearray(len(ops))
         for output in outputs:
             # A stack of its own instead of recursion: chains of sums are longer than Python's
-            # limit of calls.
-            stack = [(output, False)]
+            # limit of calls. A node that waits for its arguments stands there as its complement.
+            stack = [output]
             while stack:
-                node, opened = stack.pop()
-                if node in finished:
-                    continue
-                if opened or self.ops[node] in LEAVES:
-                    finished.add(node)
-                    order.append(node)
-                    continue
-                stack.append((node, True))
-                stack += [(arg, False) for arg in reversed(self.args[node]) if arg not in finished]
+                node = stack.pop()
+                if node < 0:
+                    order.append(~node)
+                elif not seen[node]:
+                    seen[node] = True
+                    if ops[node] in LEAVES:
+                        order.append(node)
+                    else:
+                        stack.append(~node)
+                        stack += [arg for arg in reversed(args[node]) if not seen[arg]]
         return order
 
 
@@ -428,9 +436,7 @@ class _Translator:
         # Python goes through the entries: arrays here have a few entries, and a program is made
         # once for a structure.
         arrays = np.broadcast_arrays(*(self.ids(x) for x in inputs))
-        flat = zip(*(a.ravel().tolist() for a in arrays), strict=True)
-        apply = self.graph.apply
-        result = [apply(op, *args) for args in flat]
+        result = list(map(self.graph.operation(op), *(a.ravel().tolist() for a in arrays)))
         return Nodes(np.array(result, dtype=np.int64).reshape(arrays[0].shape))
 
     def _select_n(self, params: Any, condition: Any, *cases: Any) -> Any:
@@ -459,7 +465,7 @@ class _Translator:
             return self.truth(x)
         if params["old_dtype"].kind == "b":
             unit, zero = self.graph.constant(1.0), self.graph.constant(0.0)
-            is_known = lambda n: self.graph.value(n) is not None
+            is_known = lambda n: self.graph.values[n] is not None
             flat = [
                 n if is_known(n) else self.graph.select(n, zero, unit)
                 for n in x.ids.ravel().tolist()
@@ -705,7 +711,7 @@ class _Translator:
 
     def known_index(self, index: Any) -> np.ndarray:
         if isinstance(index, Nodes):
-            values = [self.graph.value(n) for n in index.ids.ravel().tolist()]
+            values = [self.graph.values[n] for n in index.ids.ravel().tolist()]
             if None in values:
                 raise NotScalarError("an index that is computed")
             index = np.array(values).reshape(index.shape)
@@ -724,7 +730,7 @@ class _Translator:
         """Nodes of a window of an array that starts at these nodes, moved so that it lies within."""
         graph, limits = self.graph, [n - m for n, m in zip(x.shape, sizes, strict=True)]
         limited = [self.limit_place(s, limit) for s, limit in zip(starts, limits, strict=True)]
-        values = [graph.value(s) for s in limited]
+        values = [graph.values[s] for s in limited]
         begin = [0 if k is None else int(k) for k in values]
         moving = [d for d, k in enumerate(values) if k is None]
         table = self.find_table(x) if moving else None
@@ -797,7 +803,7 @@ class _Translator:
         is_known = not isinstance(x, Nodes) and not isinstance(update, Nodes)
         array, part = (x, update) if is_known else (self.ids(x), self.ids(update))
         limits = [n - m for n, m in zip(array.shape, part.shape, strict=True)]
-        values = [self.graph.value(int(self.ids(s))) for s in starts]
+        values = [self.graph.values[int(self.ids(s))] for s in starts]
         moving = [
             d
             for d, (v, limit) in enumerate(zip(values, limits, strict=True))
@@ -935,7 +941,7 @@ class _Translator:
     def _cond(self, params: Any, index: Any, *inputs: Any) -> list[Any]:
         branches = params["branches"]
         run = lambda b: self.run(b.jaxpr, [np.asarray(c) for c in b.consts], inputs)
-        is_known = index if not isinstance(index, Nodes) else self.graph.value(int(index.ids))
+        is_known = index if not isinstance(index, Nodes) else self.graph.values[int(index.ids)]
         if is_known is not None:
             return run(branches[min(max(int(is_known), 0), len(branches) - 1)])
         if len(branches) != 2:

@@ -280,7 +280,7 @@ def fuse(graph: Graph, outputs: Sequence[int]) -> tuple[Graph, list[int]]:
     # Vectors that are divided by one number are multiplied by its inverse (`Graph.div`); where it has one
     # use only, a division is as fast, and rounded once.
     def is_inverse(n: int) -> bool:
-        return graph.ops[n] == "div" and graph.value(graph.args[n][0]) == 1.0 and uses[n] == 1
+        return graph.ops[n] == "div" and graph.values[graph.args[n][0]] == 1.0 and uses[n] == 1
 
     quotients: dict[int, int] = {}
     for node in order:
@@ -795,10 +795,11 @@ def _binding() -> Any:
     llvm.initialize_native_asmprinter()
     # LLVM finds symbols of the process; functions of the C library that no loaded module uses have
     # to be named to it.
-    for name in _LIBRARY:
-        if llvm.address_of_symbol(name) is None:
-            library = ctypes.CDLL(ctypes.util.find_library("m") or None)
-            llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
+    missing = [name for name in _LIBRARY if llvm.address_of_symbol(name) is None]
+    # looked for once: on Linux each search starts a process
+    library = ctypes.CDLL(ctypes.util.find_library("m") or None) if missing else None
+    for name in missing:
+        llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
     return llvm
 
 

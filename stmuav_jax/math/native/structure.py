@@ -312,7 +312,7 @@ def _read_nodes(graph: Graph, nodes: np.ndarray, aval: Any) -> Known:
     """Values of nodes that are known numbers."""
     if np.dtype(aval.dtype) != np.float64:
         return None
-    values = [graph.value(n) for n in nodes.ravel().tolist()]
+    values = [graph.values[n] for n in nodes.ravel().tolist()]
     if all(value is None for value in values):
         return None
     return np.array([np.nan if v is None else v for v in values]).reshape(nodes.shape)

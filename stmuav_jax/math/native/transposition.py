@@ -52,7 +52,7 @@ def transpose_graph(
         if node in linear:
             before = cotangents.get(node)
             cotangents[node] = cotangent if before is None else graph.add(before, cotangent)
-        elif graph.value(copies[node]) != 0.0:
+        elif graph.values[copies[node]] != 0.0:
             raise NotScalarError("a part that does not move")
 
     zero = graph.constant(0.0)

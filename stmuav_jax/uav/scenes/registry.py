@@ -1,8 +1,9 @@
 """The scenes by name, for the command line, for studies and for those who loop over them.
 
-A scene is one file with a function, and one line here. Its cases, parameters and options are those of the
-function's signature. An option is a keyword-only argument whose annotation begins with what text can give: a
-Literal, float, int, bool, str, or a dataclass whose fields are made by `quantity`. So
+A scene is one file with a function, and one line here. Its parameters and options are those of the function's
+signature; the line repeats the cases, so that a list of the scenes imports none of them. An option is a
+keyword-only argument whose annotation begins with what text can give: a Literal, float, int, bool, str, or a
+dataclass whose fields are made by `quantity`. So
 
     def swing(parameters=PART_I, *, length: float = 1.0, drag: Drag | None = None) -> Scene
 
@@ -89,22 +90,19 @@ class RegisteredScene:
     Attributes:
         module: dotted name of the module whose function of the same last name builds the scene.
         summary: one line. source: in the report. t1: end of the scene [s].
+        cases: cases of the report, as in the function's signature; empty where there is one only.
     """
 
     module: str
     summary: str
     source: str
     t1: float
+    cases: tuple[int, ...] = ()
 
     @property
     def build(self) -> Callable[..., "Scene"]:
         """The function that builds the scene."""
         return getattr(import_module(self.module), self.module.rpartition(".")[2])
-
-    @property
-    def cases(self) -> tuple[int, ...]:
-        """Cases of the report, empty where there is one only."""
-        return get_args(get_type_hints(self.build).get("case"))
 
     @property
     def default_case(self) -> int | None:
@@ -129,13 +127,13 @@ SCENES: dict[str, RegisteredScene] = {
         f"{_HERE}.spin", "a body on a ball joint, with a closed form", "Part I, 4.3", 5.0
     ),
     "tracker": RegisteredScene(
-        f"{_HERE}.tracker", "the tracker on fixed ground", "Part I, ch. 5", 2.0
+        f"{_HERE}.tracker", "the tracker on fixed ground", "Part I, ch. 5", 2.0, (1, 2, 3)
     ),
     "hexacopter": RegisteredScene(
         f"{_HERE}.hexacopter", "one free body, six rotors", "Part II, 5.1", 2.0
     ),
     "uav_tracker": RegisteredScene(
-        f"{_HERE}.uav_tracker", "hexacopter with tracker", "Part II, 5.2", 2.0
+        f"{_HERE}.uav_tracker", "hexacopter with tracker", "Part II, 5.2", 2.0, (1, 2, 3)
     ),
 }
 

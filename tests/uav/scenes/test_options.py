@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+from typing import get_args, get_type_hints
 
 import equinox as eqx
 import jax
@@ -39,7 +40,7 @@ def test_what_is_read_from_the_source_is_the_signature(name):
         assert option.description
         assert option.is_group or option.choices
     assert entry.parameters is own["parameters"].default
-    assert (entry.default_case is not None) == ("case" in own)
+    assert entry.cases == get_args(get_type_hints(entry.build).get("case"))
     if "case" in own:
         assert entry.default_case == own["case"].default
         assert entry.default_case in entry.cases
