@@ -168,7 +168,9 @@ def _check_process() -> None:
 def _argument_form(args: Any) -> tuple[Hashable, ...]:
     """Structure of arguments, kinds of their leaves and settings of JAX, on which a program depends."""
     leaves, structure = jax.tree.flatten(args)
-    return structure, _read_setting(), tuple(map(_leaf_key, leaves))
+    # JAX puts arrays there whose device it chooses itself
+    device: Any = jax.config.jax_default_device or jax.devices()[0]  # pyright: ignore[reportAttributeAccessIssue]
+    return structure, _read_setting(), tuple(_leaf_key(leaf, {device}) for leaf in leaves)
 
 
 def _read_setting() -> tuple[Hashable, ...]:
@@ -351,11 +353,12 @@ def _is_array_or_shape(leaf: Any) -> bool:
     return eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct)
 
 
-def _leaf_key(leaf: Any) -> Hashable:
-    """Key of an argument's leaf: shape, data type and device of an array, any other leaf itself."""
+def _leaf_key(leaf: Any, default: set[Any]) -> Hashable:
+    """Key of an argument's leaf: shape, data type and device (unless default) of an array, any other leaf itself."""
     if not eqx.is_array(leaf):
         return type(leaf), leaf
     where = leaf.sharding if getattr(leaf, "committed", False) else None
+    where = None if where is None or where.device_set == default else where
     return leaf.shape, str(leaf.dtype), getattr(leaf, "weak_type", False), where
 
 

@@ -53,6 +53,8 @@ def test_programs_are_kept_by_structure_and_shape(programs):
         np.testing.assert_allclose(found, np.sin(np.eye(3)) @ np.eye(3) * len(name))
         assert rest == (name, 2.0)
     kept(np.ones((3, 3)), "a")
+    # on the device that JAX chooses itself
+    kept(jax.device_put(X, jax.devices()[0]), "a")
     assert traced == ["a", "bb"]
     kept(jnp.ones((2, 2)), "a")
     kept(X.astype(jnp.float32), "a")

@@ -94,6 +94,17 @@ def test_a_mission_is_its_file_and_that_of_its_model(tmp_path):
     assert len(digests) == 3
 
 
+def test_a_study_of_a_mission_is_their_files_and_that_of_the_model(tmp_path):
+    study, mission, model = (tmp_path / f"{name}.toml" for name in ("study", "mission", "model"))
+    study.write_text(f'mission = "mission.toml"\nother = ["study.toml", "{"x" * 500}"]\n')
+    mission.write_text('[machine]\nmodel = "model.toml"\n')
+    digests = set()
+    for text in ("mass = 1.0", "mass = 2.0"):
+        model.write_text(text)
+        digests.add(_plain_options(study))
+    assert len(digests) == 2
+
+
 def test_files_named_like_scenes_do_not_make_these_equal(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("case-1", "case-2"):

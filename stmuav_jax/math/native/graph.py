@@ -862,7 +862,9 @@ class _Translator:
         return self.ids(self._select_n({}, is_inside, value, Nodes(window)))
 
     def _gather(self, params: Any, x: Any, index: Any) -> Any:
-        if isinstance(index, Nodes) and None in map(self.graph.value, index.ids.ravel().tolist()):
+        if isinstance(index, Nodes) and any(
+            self.graph.values[n] is None for n in index.ids.ravel().tolist()
+        ):
             return self._gather_computed(params, x, index)
         is_known, index = not isinstance(x, Nodes), self.known_index(index)
         array = x if is_known else x.ids

@@ -29,7 +29,7 @@ from ...estimation.gaussians import Gaussian, gaussian, triangularise_rows
 from ...estimation.model import StateSpaceModel
 from ...estimation.sigma import Unscented
 from ...estimation.smoother import Smoothed, smooth
-from ...math.compiler import outer_jit
+from ...math.compiler import quick_jit
 from ...math.rotation import product, turn_about
 from ...math.space import Vector
 from ...mechanics.parameters import Parameters
@@ -237,7 +237,7 @@ def estimate_case(record: CaseRecord, tuning: FilterTuning, *, smoothed: bool = 
     return _estimate_record(y, record.u, record.step, truth, tuning, smoothed)
 
 
-@outer_jit
+@quick_jit
 def _estimate_record(
     y: Array, u: Array, dt: Array, truth: Array, tuning: FilterTuning, smoothed: bool
 ) -> Estimates:

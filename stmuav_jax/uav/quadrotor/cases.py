@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from ...checks.errors import SettingError
 from ...estimation.model import rk4_step
-from ...math.compiler import outer_jit
+from ...math.compiler import quick_jit
 from ...math.rotation import from_rotation_vector, product
 from ...mechanics.parameters import Parameters
 from .model import PART_III, Quadrotor, state_rates, thrust_moment, turn_attitude
@@ -170,7 +170,7 @@ def simulate_case(
     return CaseRecord(jnp.asarray(t), u, p, omega, offset, y, case)
 
 
-@outer_jit
+@quick_jit
 def _simulate_case(
     moves: bool, t: Array, u: Array, keys: Array, table: dict, equations: Quadrotor, world: World
 ) -> Any:
