@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 
 from ..math import lapack
 from ..math.compiler import kept_jit
+from ..math.native.program import native
 from ..math.space import Point
 from ..mechanics.body import GROUND
 from ..mechanics.inputs import Inputs
@@ -112,13 +113,7 @@ def compute_actuation(
     rows = jnp.concatenate([states.v, states.omega], axis=2).reshape(1 + dof, -1)
     columns = rows[1:] - rows[:1]
 
-    def total_wrenches(values: Float[Array, " m"]) -> Float[Array, " k"]:
-        system = inputs.applied(space.system, values)
-        if isinstance(x, TreePoint) and x.internal.shape[0]:
-            system = with_internal(system, x.internal)
-        total = total_load(system.forces, time, system.kinematics(state))
-        return jnp.concatenate([total.force, total.moment], axis=1)[:-1].reshape(-1)
-
+    total_wrenches = lambda values: _total_wrenches(space, x, inputs, values, time, state)
     weight, size = mechanism_weight(space.system), mechanism_size(space.system, state)
     metric = jnp.tile(
         jnp.repeat(jnp.stack([jnp.ones_like(size), size]), 3), len(space.system.names)
@@ -136,6 +131,18 @@ def compute_actuation(
         size,
         scales,
     )
+
+
+@native
+def _total_wrenches(
+    space: AbstractStateSpace, x: Point, inputs: Inputs, values: Array, t: Array, state: State
+) -> Float[Array, " k"]:
+    """Forces and moments on all bodies (6 n,), with the inputs at these values."""
+    system = inputs.applied(space.system, values)
+    if isinstance(x, TreePoint) and x.internal.shape[0]:
+        system = with_internal(system, x.internal)
+    total = total_load(system.forces, t, system.kinematics(state))
+    return jnp.concatenate([total.force, total.moment], axis=1)[:-1].reshape(-1)
 
 
 @kept_jit

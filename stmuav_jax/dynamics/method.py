@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from ..checks.errors import SettingError, StateError, has_values, nearest_names
 from ..checks.shapes import Numbers
 from ..math.compiler import kept_jit
+from ..math.native.program import native
 from ..mechanics.state import State
 from ..mechanics.system import System, check_state
 from .choices import FIRST_STEP, STEP_TOLERANCE, STEPS_ALLOWED
@@ -229,7 +230,12 @@ def _evaluate_jacobian(
     formulation: AbstractFormulation, model: Any, state: State, t: Float[Array, ""]
 ) -> Float[Array, "k k"]:
     x = formulation.to_vector(model, state)
-    return jax.jacfwd(lambda x: formulation.derivative(model, t, x, Unstabilised())[0])(x)
+    return jax.jacfwd(lambda x: _get_rates(formulation, model, t, x))(x)
+
+
+@native
+def _get_rates(formulation: AbstractFormulation, model: Any, t: Any, x: Any) -> Any:
+    return formulation.derivative(model, t, x, Unstabilised())[0]
 
 
 def choose_solver(
