@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..checks.shapes import Matrix, Vector
 from ..math import lapack
+from .stacked import gather_entries
 
 # Weight w of the proximal term relative to rows of unit size, and number of iterations. The error
 # that remains along a singular value s is (w / (w + s))^steps. In a singular posture of a mechanism
@@ -210,7 +211,7 @@ def _reorder(x: Float[Array, "k *n"], order: Sequence[int] | np.ndarray) -> Floa
     """Rows of an array in another order."""
     if list(order) == list(range(len(order)))[::-1]:
         return x[::-1]
-    return x.at[np.array(order)].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    return gather_entries(x, order)
 
 
 def count_products(

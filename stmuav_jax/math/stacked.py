@@ -5,6 +5,8 @@ components are written out, so that they fuse with the operations before and aft
 over the last axes; the call of a library's product of 3x3 matrices costs more than its arithmetic.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -50,3 +52,12 @@ def sum_columns(rows: Float[Array, "w k *s"], table: np.ndarray) -> Float[Array,
     """Sums of columns, weighted by a constant table (k, f)."""
     weights = table.astype(float).reshape(1, *table.shape, *(1,) * (rows.ndim - 2))
     return jnp.sum(rows[:, :, None] * weights, axis=1)
+
+
+def gather_entries(
+    table: Float[Array, "..."], places: np.ndarray | Sequence[int], axis: int = 0
+) -> Float[Array, "..."]:
+    """Entries of a table at known places along an axis, none of which is negative or beyond its end."""
+    return table.at[(slice(None),) * axis + (np.asarray(places, int),)].get(
+        mode="promise_in_bounds", wrap_negative_indices=False
+    )

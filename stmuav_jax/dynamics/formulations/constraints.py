@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...checks.numbers import array_module, as_numpy, stack_arrays
+from ...math.stacked import gather_entries
 from ...mechanics.constraint import (
     ANGULAR,
     COUPLINGS,
@@ -89,15 +90,10 @@ class ConstraintGroup(eqx.Module):
 
 def at_bodies(sides: BodyKinematics, index: Sequence[int]) -> BodyKinematics:
     """Kinematics of the bodies with the given indices."""
-    places = np.array(index)
-    pick = lambda x, axis: (
-        x.at[(slice(None),) * axis + (places,)]
-        .get(mode="promise_in_bounds", wrap_negative_indices=False)
-    )  # fmt: skip
     r, v, omega_w, velocity = (
-        pick(x, 1) for x in (sides.r, sides.v, sides.omega_w, sides.velocity)
+        gather_entries(x, index, 1) for x in (sides.r, sides.v, sides.omega_w, sides.velocity)
     )
-    return BodyKinematics(r, v, pick(sides.R_wb, 2), omega_w, velocity)
+    return BodyKinematics(r, v, gather_entries(sides.R_wb, index, 2), omega_w, velocity)
 
 
 def kinematic_sides(kin: Kinematics) -> BodyKinematics:

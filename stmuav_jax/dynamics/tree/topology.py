@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...checks.errors import ModelError, nearest_names
+from ...math.stacked import gather_entries
 from ...mechanics.body import GROUND
 from ...mechanics.joint import CATALOGUE, Freedom
 from ...mechanics.motions import SPHERICAL, TRANSLATION, AbstractRelativeMotion
@@ -376,19 +377,13 @@ def pick_entries(table: Float[Array, "..."], index: np.ndarray, axis: int) -> Fl
     if index.ndim == 1 and np.array_equal(index, np.arange(table.shape[axis])):
         return table
     if index.ndim != 1:
-        return _gather_entries(table, index, axis)
+        return gather_entries(table, index, axis)
     return _pick_constant(tuple(map(int, index)), axis, table)
-
-
-def _gather_entries(table: Array, index: np.ndarray, axis: int) -> Array:
-    return table.at[(slice(None),) * axis + (index,)].get(
-        mode="promise_in_bounds", wrap_negative_indices=False
-    )
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _pick_constant(index: tuple[int, ...], axis: int, table: Array) -> Array:
-    return _gather_entries(table, np.array(index, int), axis)
+    return gather_entries(table, index, axis)
 
 
 @_pick_constant.defjvp
