@@ -50,9 +50,11 @@ def one(words: str, cache: Path, out: Path) -> dict[str, Any]:
     given = words.format(out=out).split()
     command = [sys.executable, "-m", "stmuav_jax", *given]
     clock = time.perf_counter()
+    # Python keeps its bytecode, as it does of an installed package.
+    ambient = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     process = subprocess.Popen(
         command,
-        env={**os.environ, "XDG_CACHE_HOME": str(cache)},
+        env={**ambient, "XDG_CACHE_HOME": str(cache)},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
