@@ -229,7 +229,7 @@ def test_without_it_the_function_is_compiled_by_xla():
 
 def test_equal_programs_are_compiled_once_and_called_from_any_thread():
     before = len(llvm._targets)
-    functions = [jax.jit(native(lambda x: jnp.sin(x) @ x.T)) for _ in range(4)]
+    functions = [jax.jit(native(lambda x: jnp.sin(x) @ x.T)) for _ in range(16)]
     results: list = []
     work = lambda f: results.extend(np.asarray(f(X)) for _ in range(20))
     threads = [threading.Thread(target=work, args=(f,)) for f in functions]
@@ -238,7 +238,7 @@ def test_equal_programs_are_compiled_once_and_called_from_any_thread():
     for thread in threads:
         thread.join()
     assert all((r == results[0]).all() for r in results)
-    assert len(results) == 80
+    assert len(results) == 320
     assert len(llvm._targets) - before == 1
 
 

@@ -804,8 +804,9 @@ def _binding() -> Any:
 
 
 @cache
-def _features() -> dict[str, bool]:
-    return dict(_binding().get_host_cpu_features())
+def _features() -> Any:
+    """What the processor can do, by LLVM's names."""
+    return _binding().get_host_cpu_features()
 
 
 def has_fused() -> bool:
@@ -823,7 +824,7 @@ def describe_target() -> tuple[str, ...]:
     """Versions of LLVM and of XLA's interface, and the processor: object code is valid for these alone."""
     llvm = _binding()
     version = ".".join(map(str, llvm.llvm_version_info))
-    features = llvm.get_host_cpu_features().flatten()
+    features = _features().flatten()
     interface = ".".join(map(str, API_VERSION))
     return version, interface, _triple(), llvm.get_host_cpu_name(), features
 
@@ -965,7 +966,7 @@ def _register(name: str, content: bytes) -> None:
 
 def _machine(llvm: Any, level: int) -> Any:
     return llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=level,
+        cpu=llvm.get_host_cpu_name(), features=_features().flatten(), opt=level,
         jit=True, codemodel="jitdefault",
     )  # fmt: skip
 
