@@ -114,11 +114,11 @@ class Method(eqx.Module):
         first_step: length of the first step [s]; at most a hundredth of the run's time.
         max_steps: accepted and rejected steps between two output times; in reverse mode by a `DiscreteAdjoint`
             the record has room for at least as many to all of them together, and a run that takes more fails.
-        adjoint: reverse-mode derivatives: any adjoint of diffrax, or the default, a
-            `DiscreteAdjoint`. An explicit method without events then records the times of accepted steps, and
-            the backward pass takes them again window by window. Other methods use diffrax's
-            `RecursiveCheckpointAdjoint`, which repeats adaptive steps; round-off changes their sizes, so that
-            gradients are less accurate.
+        adjoint: how a run is differentiated: the default, a `DiscreteAdjoint`, in reverse mode; diffrax's
+            `ForwardMode`, `DirectAdjoint` (both modes) or `RecursiveCheckpointAdjoint`. An explicit method
+            without events then records the times of accepted steps, and the backward pass takes them again
+            window by window. Other methods use diffrax's `RecursiveCheckpointAdjoint`, which repeats adaptive
+            steps; round-off changes their sizes, so that gradients are less accurate.
         event: (t, state) -> a number whose change of sign ends the integration, at that
             time; or a boolean, which ends it after the first step that makes it true. A run
             that starts where the number is zero starts after that event. An `equinox.Module`
@@ -139,8 +139,8 @@ class Method(eqx.Module):
 
     Raises:
         SettingError: a formulation, solver or stabilisation is a text, a class, or an object of
-            another kind; or a tolerance, a step or a number of steps is out of range. Numbers
-            that JAX traces are not checked.
+            another kind; an adjoint is one that runs do not support; or a tolerance, a step or a number of
+            steps is out of range. Numbers that JAX traces are not checked.
     """
 
     formulation: AbstractFormulation = eqx.field(
@@ -168,6 +168,12 @@ class Method(eqx.Module):
         if not isinstance(self.max_steps, int) or self.max_steps < 1:
             raise SettingError(
                 f"max_steps must be a whole number of at least 1, but it is {self.max_steps}."
+            )
+        if isinstance(self.adjoint, diffrax.BacksolveAdjoint | diffrax.ImplicitAdjoint):
+            raise SettingError(
+                f"A run cannot be differentiated with adjoint={type(self.adjoint).__name__}(): use the default, "
+                "DiscreteAdjoint(), or diffrax.RecursiveCheckpointAdjoint() in reverse mode, diffrax.ForwardMode() in "
+                "forward mode, or diffrax.DirectAdjoint()."
             )
         if not has_values(self.rtol, self.atol, self.first_step, self.max_step):
             return

@@ -1,7 +1,8 @@
-"""Every word for a part of a `Method` builds one that a `Method` takes."""
+"""Every word for a part of a `Method` builds one that a `Method` takes; others are refused by name."""
 
 from typing import get_args
 
+import diffrax
 import jax
 import pytest
 
@@ -32,3 +33,15 @@ def test_traced_tolerances_are_taken_as_they_are():
     assert jax.eval_shape(lambda rtol: stm.Method(rtol=rtol).rtol, 1e-30).shape == ()
     with pytest.raises(stm.SettingError, match="rtol must be finite and at least 1e-15"):
         stm.Method(rtol=1e-30)
+
+
+@pytest.mark.parametrize("adjoint", [diffrax.BacksolveAdjoint(), diffrax.ImplicitAdjoint()])
+def test_adjoints_that_no_run_supports_are_refused_by_name(adjoint):
+    with pytest.raises(stm.SettingError, match=rf"{type(adjoint).__name__}\(\): use the default"):
+        stm.Method(adjoint=adjoint)
+    for supported in (
+        diffrax.ForwardMode(),
+        diffrax.DirectAdjoint(),
+        diffrax.RecursiveCheckpointAdjoint(),
+    ):
+        assert stm.Method(adjoint=supported).adjoint == supported

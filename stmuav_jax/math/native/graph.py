@@ -302,7 +302,7 @@ class Graph:
         """Nodes that the outputs need, each after its arguments, depth first."""
         ops, args = self.ops, self.args
         order: list[int] = []
-        seen = bytearray(len(ops))
+        visited = bytearray(len(ops))
         for output in outputs:
             # A stack of its own instead of recursion: chains of sums are longer than Python's
             # limit of calls. A node that waits for its arguments stands there as its complement.
@@ -311,13 +311,13 @@ class Graph:
                 node = stack.pop()
                 if node < 0:
                     order.append(~node)
-                elif not seen[node]:
-                    seen[node] = True
+                elif not visited[node]:
+                    visited[node] = True
                     if ops[node] in LEAVES:
                         order.append(node)
                     else:
                         stack.append(~node)
-                        stack += [arg for arg in reversed(args[node]) if not seen[arg]]
+                        stack += [arg for arg in reversed(args[node]) if not visited[arg]]
         return order
 
 

@@ -805,7 +805,7 @@ def _binding() -> Any:
 
 @cache
 def _features() -> Any:
-    """What the processor can do, by LLVM's names."""
+    """Features of the processor, by LLVM's names."""
     return _binding().get_host_cpu_features()
 
 
