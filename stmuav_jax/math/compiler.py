@@ -169,8 +169,8 @@ def _argument_form(args: Any) -> tuple[Hashable, ...]:
     """Structure of arguments, kinds of their leaves and settings of JAX, on which a program depends."""
     leaves, structure = jax.tree.flatten(args)
     # JAX puts arrays there whose device it chooses itself
-    device: Any = jax.config.jax_default_device or jax.devices()[0]  # pyright: ignore[reportAttributeAccessIssue]
-    return structure, _read_setting(), tuple(_leaf_key(leaf, {device}) for leaf in leaves)
+    default: Any = {jax.config.jax_default_device or jax.devices()[0]}  # pyright: ignore[reportAttributeAccessIssue]
+    return structure, _read_setting(), tuple(_leaf_key(leaf, default) for leaf in leaves)
 
 
 def _read_setting() -> tuple[Hashable, ...]:
