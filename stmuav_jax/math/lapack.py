@@ -1,4 +1,4 @@
-"""Factorisations by LAPACK that never wait for each other.
+"""Factorisations by LAPACK that never wait for each other, and small systems without it.
 
 On a CPU, JAX spreads LAPACK's calls for a large batch of matrices over the threads of a pool, and the
 call itself waits on a thread of the same pool until they have ended. Where as many such calls run at
@@ -24,6 +24,7 @@ import lineax as lx
 from jaxtyping import Array, Complex, Float
 
 from ..checks.shapes import Matrix, Vector
+from .native.program import native
 
 # Operations of a block, by the counts below. JAX spreads batches from 200,000 on.
 _MOST_WORK = 100_000
@@ -124,11 +125,17 @@ def compute_eigenvalues(A: Array) -> Complex[Array, "*s n"]:
     return jnp.linalg.eigvals(A)
 
 
-def solve(A: Matrix, b: Float[Array, "n *r"]) -> Float[Array, "n *r"]:
-    """Solution x of A x = b for a general square matrix, by LU factorisation with pivots.
+# Matrices up to this size are solved without LAPACK: a call of it takes longer than their operations, and
+# straight code becomes a part of the machine code around it.
+_SMALL = 12
 
-    Derivatives of any order, in both modes, follow from A x = b. A singular matrix gives numbers that
-    are not finite, and raises no error.
+
+def solve(A: Matrix, b: Float[Array, "n *r"]) -> Float[Array, "n *r"]:
+    """Solution x of A x = b for a general square matrix.
+
+    Small systems are solved by Householder reflections of the rows scaled to unit size, large ones by LU
+    factorisation with pivots. Derivatives of any order, in both modes, follow from A x = b. A singular
+    matrix gives numbers that are not finite or very large, and raises no error.
 
     Args:
         A: matrix (n, n). b: right-hand side (n,), or several of them as columns (n, r).
@@ -136,12 +143,51 @@ def solve(A: Matrix, b: Float[Array, "n *r"]) -> Float[Array, "n *r"]:
     Returns:
         Solution of the shape of b.
     """
-    lu, _, order = _factor_lu(jax.lax.stop_gradient(A))
-    forward_solve = lambda _, b: _solve_factored(lu, order, b)
-    transpose_solve = lambda _, b: _solve_transposed(lu, order, b)
+    constant = jax.lax.stop_gradient(A)
     columns = b[:, None] if b.ndim == 1 else b
+    if len(A) <= _SMALL:
+        forward_solve = lambda _, b: _solve_by_reflections(constant, b)
+        transpose_solve = lambda _, b: _solve_by_reflections(constant.T, b)
+    else:
+        lu, _, order = _factor_lu(constant)
+        forward_solve = lambda _, b: _solve_factored(lu, order, b)
+        transpose_solve = lambda _, b: _solve_transposed(lu, order, b)
     x = jax.lax.custom_linear_solve(lambda x: A @ x, columns, forward_solve, transpose_solve)
     return x[:, 0] if b.ndim == 1 else x
+
+
+def _solve_by_reflections(A: Matrix, b: Matrix) -> Matrix:
+    # Rows of different units, cosines beside metres, would lose digits: reflections mix them.
+    scale = 1 / jnp.sqrt(jnp.sum(A * A, axis=1, keepdims=True))
+    return _reflect_columns(scale * A, scale * b)
+
+
+@native
+def _reflect_columns(A: Matrix, B: Matrix) -> Matrix:
+    """Matrix X (n, r) of the least |A X - B| for A (m, n) of rank n, as straight code without pivots.
+
+    Source: G. H. Golub, C. F. Van Loan, Matrix Computations (2013), sec. 5.2 and 5.3.
+    """
+    m, n = A.shape
+    rows, zero = jnp.arange(m), jnp.zeros((), A.dtype)
+
+    def reflect(rest: Matrix, k: Array) -> tuple[Matrix, Array]:
+        # v is the rest of a column less its image, a multiple of a unit vector; of both signs the one that
+        # cancels no digits. |v|^2 = -2 image v_k.
+        column = jnp.where(rows >= k, rest[:, k], zero)
+        image = jnp.where(column[k] >= 0, -1.0, 1.0) * jnp.sqrt(jnp.sum(column * column))
+        v = jnp.where(rows == k, column - image, column)
+        return rest + v[:, None] * (v @ rest / (image * v[k])), image
+
+    def substitute(X: Matrix, at: tuple[Array, Array, Array]) -> tuple[Matrix, None]:
+        k, row, diagonal = at
+        right = jnp.where(jnp.arange(n) > k, row[:n], zero)
+        return X.at[k].set((row[n:] - right @ X) / diagonal), None
+
+    # loops, which machine code unrolls, and of which XLA compiles one pass
+    rest, images = jax.lax.scan(reflect, jnp.concatenate([A, B], axis=1), jnp.arange(n))
+    parts = (jnp.arange(n), rest[:n], images)
+    return jax.lax.scan(substitute, jnp.zeros_like(B[:n]), parts, reverse=True)[0]
 
 
 _unit_lower = partial(
@@ -220,6 +266,22 @@ def pseudoinverse(A: Matrix, rcond: float) -> Matrix:
     Derivatives exist where the rank stays the same. Source: G. H. Golub, V. Pereyra, The
     differentiation of pseudo-inverses, SIAM Journal on Numerical Analysis 10 (1973), eq. 4.12.
     """
+    if max(A.shape) > _SMALL or 0 in A.shape:
+        return _invert_values(A, rcond)
+    is_tall = A.shape[0] >= A.shape[1]
+    tall = A if is_tall else A.T
+    P = _reflect_columns(tall, jnp.eye(len(tall), dtype=A.dtype))
+    P = P if is_tall else P.T
+    # The product of the norms is the condition number, or up to min(m, n) times it: where it is small, all
+    # singular values count. A loop that ends before its first pass, and no choice: of a stack, both cases
+    # of a choice would be computed. XLA would take what does not change out of a loop.
+    is_regular = jnp.linalg.norm(A) * jnp.linalg.norm(P) * rcond < 0.1
+    by_values = lambda now: (_invert_values(now[0].T, rcond), jnp.array(True))
+    start = (jnp.where(is_regular, P, A.T), is_regular)
+    return jax.lax.while_loop(lambda now: ~now[1], by_values, start)[0]
+
+
+def _invert_values(A: Matrix, rcond: float) -> Matrix:
     U, values, V_t = factor_svd(A)
     counts = values > rcond * jnp.max(values, initial=0.0)
     shares = jnp.where(counts, 1 / jnp.where(counts, values, 1.0), 0.0)

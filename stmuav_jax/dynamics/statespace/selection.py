@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ...checks.errors import ModelError
 from ...math.compiler import kept_jit
@@ -75,63 +75,77 @@ def signs_of(tree: SpanningTree) -> list[float]:
     return signs
 
 
-# The independent coordinates are followed in parts of at most `_LONGEST` [rad], [m], with
-# `_STEPS_EACH` steps of Newton's method each, so that it stays on its branch; at most `_MOST_PARTS`
-# are gone. From there at most `_MOST_STEPS` more are made: steps below `_ROUND_OFF` that no longer
-# halve end it.
-_LONGEST, _STEPS_EACH, _MOST_PARTS = 0.1, 3, 1000
-_MOST_STEPS, _ROUND_OFF = 30, 1e-8
+# The independent coordinates are followed in parts of at most `_LONGEST` [rad], [m], with `_STEPS_EACH`
+# steps of Newton's method each, so that it stays on its branch; at most `_MOST_PARTS` are gone. From
+# there as many steps at once are made up to `_MOST_MORE` times. A step below `_ROUND_OFF` is the last
+# but for those of `refine_closing`, which square what is left.
+_LONGEST, _STEPS_EACH, _MOST_PARTS, _MOST_MORE = 0.1, 3, 1000, 10
+_ROUND_OFF = 1e-8
 
 Step = Callable[[TreeCoordinates], tuple[TreeCoordinates, Float[Array, ""]]]
 
 
-def closed_from(
-    tree: SpanningTree, at: TreeCoordinates, displacement: Float[Array, " n"], step: Step
-) -> tuple[TreeCoordinates, Bool[Array, ""]]:
-    """Coordinates with closed loops, and whether Newton's method has come to rest there.
-
-    Derivatives of the first and second order are those of the implicit function.
+def search_closed(
+    at: TreeCoordinates,
+    displacement: Float[Array, " n"],
+    approach: Callable[[TreeCoordinates, Float[Array, " n"]], tuple[TreeCoordinates, Array]],
+) -> TreeCoordinates:
+    """Coordinates with closed loops, without derivatives; NaN where they are too far away.
 
     Args:
-        at: target independent coordinates; dependent ones as they last were.
-        displacement: how far the independent ones have moved since (n,), in the tree's velocities.
-        step: Newton's, of the dependent coordinates; and its largest component.
+        at: independent coordinates and dependent ones before the displacement.
+        displacement: how far the independent ones are to move (n,), in the tree's velocities.
+        approach: `approach_closed` for a part of the displacement.
     """
-    constant = jax.lax.stop_gradient
-    displacement = constant(displacement)
     # The independent coordinates are approached in short parts: Newton's method from far away may land on
     # another branch of the mechanism.
     parts = jnp.ceil(jnp.max(jnp.abs(displacement), initial=0.0) / _LONGEST)
     part = displacement / jnp.maximum(parts, 1.0)
     # farther away, and where the distance is no number, nothing is followed and nothing found
     is_near = parts <= _MOST_PARTS
-    on_the_way = jnp.where(is_near, _STEPS_EACH * parts, 0.0)
 
     def is_unfinished(carry: Any) -> Array:
-        _, size, before, k = carry
-        stalled = (size < _ROUND_OFF) & ~(size < 0.5 * before)
-        unfinished = (size > 0) & ~stalled & (k < on_the_way + _MOST_STEPS)
-        return is_near & ((k < on_the_way) | unfinished)
+        _, size, k = carry
+        unfinished = (size >= _ROUND_OFF) & (k < parts + _MOST_MORE)
+        return is_near & ((k < parts) | unfinished)
 
-    def step_once(carry: Any) -> Any:
-        now, size, _, k = carry
-        onwards = (k < on_the_way) & (jnp.mod(k, _STEPS_EACH) == 0)
-        after, new = step(retract_coordinates(tree, now, jnp.where(onwards, part, 0.0)))
-        return after, new, size, k + 1
+    def go_on(carry: Any) -> Any:
+        now, _, k = carry
+        return *approach(now, jnp.where(k < parts, part, 0.0)), k + 1
 
-    start = retract_coordinates(tree, constant(at), -displacement)
     # with the axes of a stack from the first on: JAX goes through the loop until they do not change
     endless, none = parts + jnp.inf, 0.0 * parts
-    closed_coordinates = jax.lax.while_loop(
-        is_unfinished, step_once, (start, endless, endless, none)
-    )[0]
-    # the values found, with the derivatives of the given ones; of two steps more, the
-    # derivatives are right up to the third
+    closed = jax.lax.while_loop(is_unfinished, go_on, (at, endless, none))[0]
+    mark = jnp.where(is_near, 1.0, jnp.nan)
+    return closed._replace(q=tuple(mark * q for q in closed.q))
+
+
+def approach_closed(
+    tree: SpanningTree, at: TreeCoordinates, part: Float[Array, " n"], step: Step
+) -> tuple[TreeCoordinates, Float[Array, ""]]:
+    """Coordinates after a part of the way and some steps of Newton's method; size of the last."""
+    start = retract_coordinates(tree, at, part)
+    at, sizes = jax.lax.scan(lambda now, _: step(now), start, length=_STEPS_EACH)
+    return at, sizes[-1]
+
+
+def refine_closing(at: TreeCoordinates, posture: TreeCoordinates, step: Step) -> TreeCoordinates:
+    """Coordinates with closed loops, with derivatives up to the third of the implicit function.
+
+    They are NaN where Newton's method has not come to rest.
+
+    Args:
+        at: independent coordinates, which have the derivatives. posture: result of `search_closed`.
+        step: Newton's, of the dependent coordinates; and its largest component.
+    """
+    constant = jax.lax.stop_gradient
     # The search has no derivative. The two steps that follow carry it, each of which doubles the order up
     # to which it is right.
-    at = jax.tree.map(lambda a, b: b + (a - constant(a)), at, constant(closed_coordinates))
+    at = jax.tree.map(lambda a, b: b + (a - constant(a)), at, constant(posture))
     at, sizes = jax.lax.scan(lambda now, _: step(now), at, length=2)
-    return at, is_near & (constant(sizes[-1]) <= _ROUND_OFF)
+    # loops that do not close at these coordinates have no motion
+    mark = jnp.where(constant(sizes[-1]) <= _ROUND_OFF, 1.0, jnp.nan)
+    return at._replace(q=tuple(mark * q for q in at.q))
 
 
 # Loops count as closed if their residuals, cosines or lengths over the longest arm, are below this.

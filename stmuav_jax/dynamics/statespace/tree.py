@@ -26,6 +26,8 @@ from jaxtyping import Array, Float
 from ...checks.errors import ModelError, SettingError, has_values, named_places
 from ...math import lapack
 from ...math.compiler import kept_jit
+from ...math.derivative import held_constant
+from ...math.linalg import Factor, factor_cholesky
 from ...math.native.program import native
 from ...math.rotation import (
     conjugate,
@@ -64,9 +66,11 @@ from .base import AbstractStateSpace, Time
 from .selection import (
     BASE,
     Selection,
+    approach_closed,
     choose_velocities,
-    closed_from,
     compiled_read,
+    refine_closing,
+    search_closed,
     signs_of,
     velocity_names,
 )
@@ -408,24 +412,45 @@ class TreeSpace(AbstractStateSpace):
             by = lapack.solve(J[:, dependent], right_sides)
             N = N.at[b + dependent, b:].set(-by[:, :-1])
             c = c.at[b + dependent].set(by[:, -1])
-        free_accelerations = lapack.solve(N.T @ M @ N, -N.T @ (h + M @ c))
-        return N @ free_accelerations + c
+        factor = Factor(factor_cholesky(N.T @ M @ N))
+        return N @ factor.solve(-N.T @ (h + M @ c)) + c
 
     def _selection_places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Selection as arrays of indices."""
         return tuple(np.array(part, dtype=int) for part in self.selection)  # pyright: ignore
 
-    def closed(self, x: TreePoint, t: Time = 0.0) -> TreeCoordinates:
+    def _search(self, x: TreePoint, t: Float[Array, ""]) -> TreeCoordinates:
+        """Coordinates of the tree with closed loops, as constants without derivatives."""
+        at = self._open_coordinates(x)
+        if not self.selection.rows:
+            return at
+        # the equations of the loops have no forces: a search depends on geometry and time alone
+        constants = held_constant((self, at, x.displacement, t))
+        return _search_closed(*constants)
+
+    def _closed(
+        self, x: TreePoint, posture: TreeCoordinates, t: Float[Array, ""]
+    ) -> TreeCoordinates:
         """All coordinates and velocities of the tree, with the dependent ones from the loops."""
         if not self.selection.rows:
             return self._open_coordinates(x)
-        at = self._close_coordinates(x, t)
-        target, J = self._loop_rows(at, t, target=True)
-        J_d = J[:, self._selection_places()[1]]
+        at = self._closed_positions(x, posture, t)
+        _, target, J = self._loop_rows(at, t)
         # The open velocities have zeros for the dependent ones, so that the residual of the rate
         # equations gives these at once: they are linear.
-        by = lapack.solve(J_d, target - J @ at.u)
-        return at._replace(u=at.u.at[self._selection_places()[1]].add(by))
+        dependent = self._selection_places()[1]
+        by = lapack.solve(J[:, dependent], target - J @ at.u)
+        return at._replace(u=at.u.at[dependent].add(by))
+
+    def _closed_positions(
+        self, x: TreePoint, posture: TreeCoordinates, t: Float[Array, ""]
+    ) -> TreeCoordinates:
+        """Coordinates with the dependent ones by Newton's method; the others stay unchanged."""
+        if not self.selection.rows:
+            return self._open_coordinates(x)
+        return refine_closing(
+            self._open_coordinates(x), posture, lambda now: self._newton_step(now, t)
+        )
 
     def _open_coordinates(self, x: TreePoint) -> TreeCoordinates:
         """Coordinates of the tree as stored in the point, with zero dependent velocities."""
@@ -436,31 +461,24 @@ class TreeSpace(AbstractStateSpace):
             *base, self._group_positions(x.q), *speed, self._spread_velocities(x.u)
         )
 
-    def _close_coordinates(self, x: TreePoint, t: Time) -> TreeCoordinates:
-        """Coordinates with the dependent ones by Newton's method; the others stay unchanged."""
-        tree, dependent = self.model.parameters.tree, self._selection_places()[1]
+    def _newton_step(
+        self, now: TreeCoordinates, t: Float[Array, ""]
+    ) -> tuple[TreeCoordinates, Array]:
+        """Coordinates after a step of Newton's method, and its largest component."""
+        dependent = self._selection_places()[1]
+        value, _, J = self._loop_rows(now, t)
+        by = lapack.solve(J[:, dependent], value)
+        # Newton moves the dependent coordinates alone: the independent ones are what the point
+        # says, and a least-squares step would change them.
+        full = jnp.zeros(J.shape[1], J.dtype).at[dependent].set(-by)
+        return retract_coordinates(self.model.parameters.tree, now, full), jnp.max(jnp.abs(by))
 
-        def newton_step(now: TreeCoordinates) -> tuple[TreeCoordinates, Array]:
-            value, J = self._loop_rows(now, t)
-            by = lapack.solve(J[:, dependent], value)
-            # Newton moves the dependent coordinates alone: the independent ones are what the point
-            # says, and a least-squares step would change them.
-            full = jnp.zeros(J.shape[1], J.dtype).at[dependent].set(-by)
-            return retract_coordinates(tree, now, full), jnp.max(jnp.abs(by))
-
-        at, is_converged = closed_from(
-            tree, self._open_coordinates(x), self._spread_velocities(x.displacement), newton_step
-        )
-        # loops that do not close at these coordinates have no motion
-        mark = jnp.where(is_converged, 1.0, jnp.nan)
-        return at._replace(q=tuple(mark * q for q in at.q))
-
-    def _loop_rows(
-        self, at: TreeCoordinates, t: Time, *, target: bool = False
-    ) -> tuple[Array, Array]:
-        """Residuals or targets, and J, of the rows that determine the dependent velocities."""
-        value, rate, J = _evaluate_rows(self, at, jnp.asarray(t, at.u.dtype))
-        return rate if target else value, J
+    def _loop_rows(self, at: TreeCoordinates, t: Float[Array, ""]) -> tuple[Array, Array, Array]:
+        """Residuals, targets and J of the rows that determine the dependent velocities."""
+        parameters = self.model.parameters
+        rows = closure_rows(parameters, self.model.constraints, t, compute_motion(parameters, at))
+        row_indices = self._selection_places()[2]
+        return rows.value[row_indices], rows.target[row_indices], rows.J[row_indices]
 
     def _spread_velocities(self, independent_values: Float[Array, "k *s"]) -> Float[Array, "n *s"]:
         """Velocities of the tree's steps from the independent ones, with the others zero."""
@@ -489,27 +507,17 @@ def _as_arrays(x: TreePoint, t: Time) -> tuple[TreePoint, Array]:
 
 @kept_jit
 def _compute_state(space: TreeSpace, x: TreePoint, t: Float[Array, ""]) -> State:
-    return Tree().to_state(space.model, join_coordinates(space.closed(x, t)))
+    return _read_state(space, x, space._search(x, t), t)
 
 
 @kept_jit
 def _close_loops(space: TreeSpace, x: TreePoint, t: Float[Array, ""]) -> TreePoint:
-    parameters = space.model.parameters
-    coordinates = space._close_coordinates(x, t)
-    z = space._internal_states(coordinates.q, x.internal)
-    if len(space.counted) < int(np.sum(~actuator_mask(space.system))):
-        # the angle of a loop-closing hinge is no coordinate: its turns are counted from here to there
-        placement = in_world(parameters, coordinates, compute_motion(parameters, coordinates))
-        z = internal_starts(
-            with_internal(space.system, z), make_kinematics(space.system, placement)
-        )
-    q = space._single_positions(coordinates.q)
-    return x._replace(q=q, internal=z, displacement=jnp.zeros_like(x.displacement))
+    return _settle_point(space, x, space._search(x, t), t)
 
 
 @kept_jit
 def _compute_conditioning(space: TreeSpace, x: TreePoint, t: Float[Array, ""]) -> Float[Array, ""]:
-    _, J = space._loop_rows(space._close_coordinates(x, t), t)
+    J = _evaluate_columns(space, x, space._search(x, t), t)
     values = lapack.singular_values(J[:, space._selection_places()[1]])
     # Relative to the whole Jacobian, not to its dependent columns: those may be small all
     # together, near a posture where the choice fails.
@@ -521,7 +529,69 @@ def _compute_rates(
     space: TreeSpace, x: TreePoint, t: Float[Array, ""], system: System
 ) -> Float[Array, " size"]:
     """Rates of `TreeSpace.rates`, with the forces of a system."""
-    coordinates = space.closed(x, t)
+    return _evaluate_rates(space, x, space._search(x, t), t, system)
+
+
+# Machine code: a part of the search for closed loops, and all that follows it.
+
+
+def _search_closed(
+    space: TreeSpace, at: TreeCoordinates, displacement: Float[Array, " k"], t: Float[Array, ""]
+) -> TreeCoordinates:
+    tree, distance = space.model.parameters.tree, space._spread_velocities(displacement)
+    start = retract_coordinates(tree, at, -distance)
+    return search_closed(start, distance, lambda now, part: _approach_closed(space, now, part, t))
+
+
+@native
+def _approach_closed(
+    space: TreeSpace, at: TreeCoordinates, part: Float[Array, " n"], t: Float[Array, ""]
+) -> Any:
+    tree = space.model.parameters.tree
+    return approach_closed(tree, at, part, lambda now: space._newton_step(now, t))
+
+
+@native
+def _read_state(
+    space: TreeSpace, x: TreePoint, posture: TreeCoordinates, t: Float[Array, ""]
+) -> State:
+    return Tree().to_state(space.model, join_coordinates(space._closed(x, posture, t)))
+
+
+@native
+def _settle_point(
+    space: TreeSpace, x: TreePoint, posture: TreeCoordinates, t: Float[Array, ""]
+) -> TreePoint:
+    parameters = space.model.parameters
+    coordinates = space._closed_positions(x, posture, t)
+    z = space._internal_states(coordinates.q, x.internal)
+    if len(space.counted) < int(np.sum(~actuator_mask(space.system))):
+        # the angle of a loop-closing hinge is no coordinate: its turns are counted from here to there
+        placement = in_world(parameters, coordinates, compute_motion(parameters, coordinates))
+        z = internal_starts(
+            with_internal(space.system, z), make_kinematics(space.system, placement)
+        )
+    q = space._single_positions(coordinates.q)
+    return x._replace(q=q, internal=z, displacement=jnp.zeros_like(x.displacement))
+
+
+@native
+def _evaluate_columns(
+    space: TreeSpace, x: TreePoint, posture: TreeCoordinates, t: Float[Array, ""]
+) -> Float[Array, "k n"]:
+    """Columns J of the rows that determine the dependent velocities."""
+    return space._loop_rows(space._closed_positions(x, posture, t), t)[2]
+
+
+@native
+def _evaluate_rates(
+    space: TreeSpace,
+    x: TreePoint,
+    posture: TreeCoordinates,
+    t: Float[Array, ""],
+    system: System,
+) -> Float[Array, " size"]:
+    coordinates = space._closed(x, posture, t)
     terms = _evaluate_terms(space, coordinates, x.internal, t, system)
     rate = space._project_accelerations(terms)
     b = 6 * space.model.parameters.tree.floating
@@ -545,18 +615,6 @@ def _subtract_points(space: TreeSpace, y: TreePoint, x: TreePoint) -> Float[Arra
     return space._subtract_points(y, x)
 
 
-@native
-def _evaluate_rows(
-    space: TreeSpace, at: TreeCoordinates, t: Float[Array, ""]
-) -> tuple[Array, Array, Array]:
-    """Residuals, targets and J of the rows that determine the dependent velocities."""
-    parameters = space.model.parameters
-    rows = closure_rows(parameters, space.model.constraints, t, compute_motion(parameters, at))
-    row_indices = space._selection_places()[2]
-    return rows.value[row_indices], rows.target[row_indices], rows.J[row_indices]
-
-
-@native
 def _evaluate_terms(
     space: TreeSpace,
     at: TreeCoordinates,

@@ -952,6 +952,15 @@ class _Translator:
         pairs = zip(run(branches[0]), run(branches[1]), strict=True)
         return [self._select_n({}, truth, a, b) for a, b in pairs]
 
+    def _custom_linear_solve(self, params: Any, *inputs: Any) -> list[Any]:
+        counts, solver = params["const_lengths"], params["jaxprs"].solve
+        first = counts.matvec + counts.vecmat
+        right_sides = inputs[sum(counts) :]
+        constants = [np.asarray(c) for c in solver.consts]
+        return self.run(
+            solver.jaxpr, constants, [*inputs[first : first + counts.solve], *right_sides]
+        )
+
     def _platform_index(self, params: Any) -> Any:
         # what is chosen by the platform, and this program is for CPUs
         platforms = params["platforms"]
