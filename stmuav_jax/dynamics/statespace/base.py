@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from ...checks.errors import StateError, has_values, named_places
 from ...math.derivative import value_and_jacobian
+from ...math.native.program import native
 from ...math.space import AbstractSpace, Point
 from ...mechanics.state import State
 from ...mechanics.system import System
@@ -125,6 +126,7 @@ def motion_rates(
     return _separation_rate(space, x, v, rates, jnp.zeros_like(v))
 
 
+@native
 def _separation_rate(
     space: AbstractStateSpace,
     x: Point,

@@ -15,6 +15,7 @@ Source: R. A. Wehage, E. J. Haug, J. Mechanical Design 104 (1982) 247-255 (parti
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -26,7 +27,6 @@ from jaxtyping import Array, Float
 from ...checks.errors import ModelError, SettingError, has_values, named_places
 from ...math import lapack
 from ...math.compiler import kept_jit
-from ...math.derivative import held_constant
 from ...math.linalg import Factor, factor_cholesky
 from ...math.native.program import native
 from ...math.rotation import (
@@ -420,13 +420,8 @@ class TreeSpace(AbstractStateSpace):
         return tuple(np.array(part, dtype=int) for part in self.selection)  # pyright: ignore
 
     def _search(self, x: TreePoint, t: Float[Array, ""]) -> TreeCoordinates:
-        """Coordinates of the tree with closed loops, as constants without derivatives."""
-        at = self._open_coordinates(x)
-        if not self.selection.rows:
-            return at
-        # the equations of the loops have no forces: a search depends on geometry and time alone
-        constants = held_constant((self, at, x.displacement, t))
-        return _search_closed(*constants)
+        """Coordinates of the tree with closed loops, without derivatives."""
+        return _search_closed(self, x, t) if self.selection.rows else self._open_coordinates(x)
 
     def _closed(
         self, x: TreePoint, posture: TreeCoordinates, t: Float[Array, ""]
@@ -535,12 +530,20 @@ def _compute_rates(
 # Machine code: a part of the search for closed loops, and all that follows it.
 
 
-def _search_closed(
-    space: TreeSpace, at: TreeCoordinates, displacement: Float[Array, " k"], t: Float[Array, ""]
-) -> TreeCoordinates:
-    tree, distance = space.model.parameters.tree, space._spread_velocities(displacement)
-    start = retract_coordinates(tree, at, -distance)
+@eqx.filter_custom_jvp
+def _search_closed(space: TreeSpace, x: TreePoint, t: Float[Array, ""]) -> TreeCoordinates:
+    distance = space._spread_velocities(x.displacement)
+    start = retract_coordinates(space.model.parameters.tree, space._open_coordinates(x), -distance)
     return search_closed(start, distance, lambda now, part: _approach_closed(space, now, part, t))
+
+
+@_search_closed.def_jvp
+def _search_jvp(primals: Any, tangents: Any) -> tuple[TreeCoordinates, TreeCoordinates]:
+    # without this rule a loop's derivative would be computed, and left unused
+    del tangents
+    posture = _search_closed(*primals)
+    zero = partial(jax.custom_derivatives.zero_from_primal, symbolic_zeros=True)
+    return posture, jax.tree.map(zero, posture)
 
 
 @native
