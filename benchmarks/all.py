@@ -22,8 +22,8 @@ from shared.record import ROOT, has_code_of, make_parser
 FOLDER = Path(__file__).parent
 SCRIPTS = (
     "stiff", "hard", "long_horizon", "trims", "singular", "errors", "estimation", "waiting",
-    "failure", "compile_times", "structures", "montecarlo", "batch_sizes", "machine_code", "missions",
-    "flight_logs",
+    "failure", "compile_times", "structures", "montecarlo", "batch_sizes", "machine_code", "mechanisms",
+    "missions", "flight_logs",
 )  # fmt: skip
 # Sections of suite.py, in the order of running.
 SUITE = (

@@ -104,7 +104,8 @@ def evaluated(
 ) -> dict[str, Any]:
     """Microseconds per state of evaluations in a row, seconds to compile, and the last values."""
     one = len(starts) == 1
-    passes = max(1, size.passes // len(starts))
+    # a call itself takes time, that of a hundred evaluations of a small mechanism
+    passes = max(size.passes // 10, size.passes // len(starts), 1)
 
     def chain(start: jax.Array) -> Any:
         value = lambda x: function(model, x)

@@ -39,14 +39,19 @@ class Size:
 QUICK = Size(orientations=6, peer=1, group=2, repeats=1)
 
 
-def ours(size: Size, uav: stm.uav.Uav, angles: Any) -> dict[str, Any]:
-    """All trims in one compiled call."""
+def trim_all(uav: stm.uav.Uav, angles: Any, group: int) -> tuple[Any, ...]:
+    """Reason, residual, number of steps and inputs of the trims at all angles, `group` at a time."""
 
-    def one(a: Any) -> tuple[Any, ...]:
+    def trim_at(a: Any) -> tuple[Any, ...]:
         trim = stm.uav.trim_flight(uav, stm.analysis.hover(a), throw=False)
         return trim.reason, trim.residual, trim.steps, trim.values
 
-    many = stm.math.outer_jit(lambda a: jax.lax.map(one, a, batch_size=size.group))
+    return jax.lax.map(trim_at, angles, batch_size=group)
+
+
+def ours(size: Size, uav: stm.uav.Uav, angles: Any) -> dict[str, Any]:
+    """All trims in one compiled call."""
+    many = stm.math.outer_jit(lambda a: trim_all(uav, a, size.group))
     started = time.perf_counter()
     found = jax.block_until_ready(many(angles))
     first = time.perf_counter() - started

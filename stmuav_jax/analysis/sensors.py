@@ -285,16 +285,8 @@ def sensed_motion_at(
         state = space.to_state(x, t)
         none = jnp.full_like(state.v, jnp.nan)
         return SensedMotion(system.kinematics(state), state.p, none, none, gravity_of(system))
-    # Accelerations of bodies are not part of a state space; they are the rates of the bodies'
-    # velocities along its motion, so that one derivative of the placement gives them for any
-    # mechanism.
-    rates = space.rates(x, t, system)
-    time, zero = jnp.asarray(t, rates.dtype), jnp.zeros((), rates.dtype)
-    # The tangent of the point's motion; the state's derivative along it holds the accelerations of all
-    # bodies.
-    onwards = jax.jvp(lambda s: space.retract(x, s * rates), (zero,), (jnp.ones_like(zero),))[1]
-    state, slope = jax.jvp(space.to_state, (x, time), (onwards, jnp.ones_like(time)))
-    return SensedMotion(system.kinematics(state), state.p, slope.v, slope.omega, gravity_of(system))
+    state, rate = space.state_and_rate(x, t, system)
+    return SensedMotion(system.kinematics(state), state.p, rate.v, rate.omega, gravity_of(system))
 
 
 def sensed_motion_along(run: Run) -> SensedMotion:

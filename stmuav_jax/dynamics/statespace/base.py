@@ -50,6 +50,16 @@ class AbstractStateSpace(AbstractSpace):
         """Positions and velocities of all bodies (n, .), on the constraints at time t [s]."""
 
     @abstractmethod
+    def state_and_rate(
+        self, x: Point, t: Time = 0.0, system: System | None = None
+    ) -> tuple[State, State]:
+        """State of all bodies as `to_state`, and its rate along the motion, with the accelerations.
+
+        Args:
+            system: mechanism with other forces; see `Inputs.applied`.
+        """
+
+    @abstractmethod
     def from_state(self, state: State, internal: Float[Array, " m"] | None = None) -> Point:
         """Point that belongs to a state of all bodies on the joints.
 

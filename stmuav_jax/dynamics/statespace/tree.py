@@ -370,6 +370,13 @@ class TreeSpace(AbstractStateSpace):
     def to_state(self, x: TreePoint, t: Time = 0.0) -> State:
         return _compute_state(self, *_as_arrays(x, t))
 
+    def state_and_rate(
+        self, x: TreePoint, t: Time = 0.0, system: System | None = None
+    ) -> tuple[State, State]:
+        return _compute_state_and_rate(
+            self, *_as_arrays(x, t), self.system if system is None else system
+        )
+
     def with_closed_loops(self, x: TreePoint, t: Time = 0.0) -> TreePoint:
         if not self.selection.rows:
             return x._replace(
@@ -385,8 +392,7 @@ class TreeSpace(AbstractStateSpace):
     def rates(
         self, x: TreePoint, t: Time = 0.0, system: System | None = None
     ) -> Float[Array, " size"]:
-        forces_of = self.system if system is None else system
-        return _compute_rates(self, *_as_arrays(x, t), forces_of)
+        return _compute_rates(self, *_as_arrays(x, t), self.system if system is None else system)
 
     def _project_accelerations(self, terms: _Terms) -> Float[Array, " l"]:
         """Accelerations du/dt of all velocities, the base's first, projected to the free motions.
@@ -527,6 +533,13 @@ def _compute_rates(
     return _evaluate_rates(space, x, space._search(x, t), t, system)
 
 
+@kept_jit
+def _compute_state_and_rate(
+    space: TreeSpace, x: TreePoint, t: Float[Array, ""], system: System
+) -> tuple[State, State]:
+    return _evaluate_state_and_rate(space, x, space._search(x, t), t, system)
+
+
 # Machine code: a part of the search for closed loops, and all that follows it.
 
 
@@ -606,6 +619,23 @@ def _evaluate_rates(
     if x.internal.shape[0]:
         parts.append(terms.internal_rates[space._actuator_places()])
     return jnp.concatenate(parts)
+
+
+@native
+def _evaluate_state_and_rate(
+    space: TreeSpace,
+    x: TreePoint,
+    posture: TreeCoordinates,
+    t: Float[Array, ""],
+    system: System,
+) -> tuple[State, State]:
+    rates = _evaluate_rates(space, x, posture, t, system)
+    # The tangent of the point's motion; the state's derivative along it holds the accelerations of all
+    # bodies.
+    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
+    onwards = jax.jvp(lambda s: space.retract(x, s * rates), (zero,), (one,))[1]
+    state_of = lambda x, t: _read_state(space, x, posture, t)
+    return jax.jvp(state_of, (x, t), (onwards, one))
 
 
 @native
