@@ -177,7 +177,7 @@ def _reflect_columns(A: Matrix, B: Matrix) -> Matrix:
         column = jnp.where(rows >= k, rest[:, k], zero)
         image = jnp.where(column[k] >= 0, -1.0, 1.0) * jnp.sqrt(jnp.sum(column * column))
         v = jnp.where(rows == k, column - image, column)
-        return rest + v[:, None] * (v @ rest / (image * v[k])), image
+        return rest + jnp.outer(v, v @ rest * (1 / (image * v[k]))), image
 
     def substitute(X: Matrix, at: tuple[Array, Array, Array]) -> tuple[Matrix, None]:
         k, row, diagonal = at

@@ -88,6 +88,37 @@ def test_a_singular_matrix_is_not_solved():
     np.testing.assert_array_equal(lapack.pseudoinverse(jnp.zeros((3, 2)), 1e-9), np.zeros((2, 3)))
 
 
+@pytest.mark.parametrize("size", [1, 2, 12, 13])
+def test_systems_whose_rows_have_other_units_and_no_leading_entries(size):
+    """Solutions to their condition, which scaling of rows leaves as it is; the largest is LAPACK's."""
+    rng = np.random.default_rng(size)
+    A = rng.standard_normal((size, size)) + 2 * np.eye(size)[::-1]
+    A[0, 0] = 0.0 if size > 1 else 3.0
+    units = 10.0 ** rng.integers(-9, 9, size)
+    b = rng.standard_normal((size, 2))
+    solved = jax.jit(lapack.solve)(units[:, None] * A, units[:, None] * b)
+    bound = 10 * np.finfo(float).eps * np.linalg.cond(A)
+    exact = np.linalg.solve(A, b)
+    assert np.max(np.abs(solved - exact)) < bound * np.max(np.abs(exact))
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (3, 5), (5, 3)])
+def test_pseudoinverses_of_a_stack_in_which_some_matrices_have_dependent_rows(shape):
+    """Each is NumPy's, and that of the matrix alone; NaN stays in its place."""
+    stack = np.random.default_rng(3).standard_normal((6, *shape))
+    stack[1, :, 0] = 2 * stack[1, :, 1]
+    stack[2, 0] = stack[2, 1]
+    stack[3] = 0.0
+    stack[4, 0, 0] = np.nan
+    invert = lambda A: lapack.pseudoinverse(A, 1e-12)
+    together = np.asarray(jax.jit(jax.vmap(invert))(stack))
+    alone = np.stack([jax.jit(invert)(A) for A in stack])
+    exact = np.stack([np.linalg.pinv(A, rcond=1e-12) for A in np.delete(stack, 4, 0)])
+    np.testing.assert_allclose(np.delete(together, 4, 0), exact, atol=1e-13)
+    np.testing.assert_allclose(alone, together, atol=1e-13)
+    assert np.isnan(together[4]).all()
+
+
 def test_a_solver_of_lineax_takes_dependent_rows():
     """The solution of minimum norm, forwards and transposed, as SciPy's least squares."""
     import lineax as lx

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
+from stmuav_jax.math import lapack
 from stmuav_jax.math.native import llvm
 from stmuav_jax.math.native.graph import NotScalarError, make_graph
 from stmuav_jax.math.native.program import Transpose, evaluate, native, use_native_code
@@ -56,12 +57,15 @@ def indexed(x):
 
 
 def solved(x):
-    """Linear solves by Cholesky's and triangular factors."""
+    """Linear solves by Cholesky's and triangular factors, and of a general matrix."""
     matrix = jnp.asarray(SPD) + jnp.outer(x[0], x[0])
     factor = jnp.linalg.cholesky(matrix)
     inner = jax.scipy.linalg.solve_triangular(factor, x.T, lower=True)
-    return jax.scipy.linalg.solve_triangular(factor.T, inner), jax.scipy.linalg.cho_solve(
-        (factor, True), x[1]
+    general = matrix + jnp.asarray([[0.0, 2.0, 0.0], [0.0, 0.0, -1.0], [1.5, 0.0, 0.0]])
+    return (
+        jax.scipy.linalg.solve_triangular(factor.T, inner),
+        jax.scipy.linalg.cho_solve((factor, True), x[1]),
+        lapack.solve(general, x.T),
     )
 
 
