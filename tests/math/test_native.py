@@ -65,7 +65,7 @@ def solved(x):
     return (
         jax.scipy.linalg.solve_triangular(factor.T, inner),
         jax.scipy.linalg.cho_solve((factor, True), x[1]),
-        lapack.solve(general, x.T),
+        lapack.solve(general, jnp.asarray(x.T)),
     )
 
 
