@@ -46,6 +46,7 @@ from .gaussians import (
     downdate_factor,
     factor_semidefinite,
     has_contradiction,
+    in_lanes,
     outer_square,
     reduce_root,
     triangularise_rows,
@@ -203,7 +204,9 @@ class GaussianFilter(AbstractFilter):
         less = None if image.less is None else image.less * present
         image = image._replace(rows=image.rows * present[None], less=less)
         if self.form == "square_root" and image.triangular and less is None:
-            move, factor, scaled, Ls = _scalar_by_scalar(image, prior.factor, noise, error, size)
+            move, factor, scaled, Ls = _scalar_by_scalar(
+                prior.factor, image.rows, noise, error, size
+            )
         else:
             move, factor, scaled, Ls = _update_jointly(image, noise, error, size, self.form)
         after = Gaussian(model.space.retract(prior.mean, move), factor)
@@ -220,8 +223,9 @@ class GaussianFilter(AbstractFilter):
 DEFAULT = GaussianFilter()
 
 
+@in_lanes
 def _scalar_by_scalar(
-    sensor_image: Transformed, L: Array, noise: Array, error: Array, size: Array
+    L: Array, rows: Array, noise: Array, error: Array, size: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Update by one scalar measurement after the other, for triangular rows of the state.
 
@@ -230,6 +234,7 @@ def _scalar_by_scalar(
     D^2, which may be zero: each has a row of A = U^-1 H L and an error.
 
     Args:
+        L: root of the state's covariance. rows: image of the sensor, the first n of them by the state's columns.
         size: largest measurement (*s), for the rounding of an error that should be zero.
 
     Returns:
@@ -238,8 +243,8 @@ def _scalar_by_scalar(
     n, m = L.shape[0], error.shape[0]
     # The triangular root is split into unit columns and a diagonal, because scalar updates need
     # independent noise and have to survive a reading without any.
-    Le = triangularise_rows(jnp.concatenate([sensor_image.rows[n:], noise]))
-    right = jnp.concatenate([jnp.swapaxes(sensor_image.rows[:n], 0, 1), error[:, None]], axis=1)
+    Le = triangularise_rows(jnp.concatenate([rows[n:], noise]))
+    right = jnp.concatenate([jnp.swapaxes(rows[:n], 0, 1), error[:, None]], axis=1)
     D = jnp.stack([Le[i, i] for i in range(m)])
     unit = jnp.eye(m, dtype=Le.dtype).reshape(m, m, *(1,) * (Le.ndim - 2))
     # a column of Le whose diagonal is zero is zero

@@ -14,6 +14,10 @@ Source: N. A. Carlson, Fast triangular formulation of the square root filter, AI
 of Numerical Algorithms (2002), theorem 19.13.
 """
 
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,7 +27,7 @@ from jaxtyping import Array, Bool, Float
 from ..checks.errors import ModelError, check_finite, has_values
 from ..checks.shapes import Numbers
 from ..math import lapack, linalg
-from ..math.native.program import is_on
+from ..math.native.program import is_on, native
 from ..math.space import Point, Vector
 from ..math.stacked import multiply_matrices
 
@@ -32,9 +36,28 @@ Root = Float[Array, "k k *s"]
 # Round-off in a pivot of a covariance, and of its root, that should be zero, in units of epsilon.
 _ROUND_OFF, _ROUND_OFF_OF_ROOT = 100, 20
 
-# Number of columns up to which written-out code is faster than LAPACK for a single matrix, compiled
-# by XLA and as machine code of its own.
-_FEW, _FEW_NATIVE = 3, 16
+# Columns up to which written-out code is faster than LAPACK for a single matrix, compiled by XLA; products
+# of rows and squared columns up to which it is machine code of its own.
+_FEW, _FEW_PRODUCTS = 3, 20_000
+
+
+def in_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Function of arrays of one filter or of a bank, of which the first is a matrix for each filter.
+
+    Machine code takes the filters of a bank one by one, in the lanes of the processor's vectors; compiled by
+    XLA, each operation is one over all of them.
+    """
+    compiled: Any = native(function)
+
+    @wraps(function)
+    def call(*args: Array) -> Any:
+        if args[0].ndim == 2:
+            return compiled(*args)
+        if args[0].ndim > 3 or not compiled.has_code(*(a[..., 0] for a in args)):
+            return function(*args)
+        return jax.vmap(compiled, in_axes=-1, out_axes=-1)(*args)
+
+    return call
 
 
 def triangularise_rows(rows: Float[Array, "r k *s"]) -> Root:
@@ -43,17 +66,24 @@ def triangularise_rows(rows: Float[Array, "r k *s"]) -> Root:
     The rows are never squared, so parts of L that are small compared with others keep their digits.
     """
     r, k = rows.shape[:2]
-    if rows.ndim == 2 and k > (_FEW_NATIVE if is_on() else _FEW):
-        if r < k:
-            rows = jnp.concatenate([rows, jnp.zeros((k - r, k), rows.dtype)])
-        # Householder's QR factorisation does not square the condition of the rows, as the Cholesky factor of
-        # rows^T rows would.
-        R = lapack.upper_factor(rows)
-        return (jnp.where(jnp.diagonal(R) < 0, -1.0, 1.0)[:, None].astype(R.dtype) * R).T
+    is_small = is_on() and r * k * k <= _FEW_PRODUCTS
+    if is_small:
+        return _orthogonalise_in_lanes(rows)
+    if rows.ndim > 2 or k <= _FEW:
+        return _orthogonalise_columns(rows)
+    if r < k:
+        rows = jnp.concatenate([rows, jnp.zeros((k - r, k), rows.dtype)])
+    # Householder's QR factorisation does not square the condition of the rows, as the Cholesky factor of
+    # rows^T rows would.
+    R = lapack.upper_factor(rows)
+    return (jnp.where(jnp.diagonal(R) < 0, -1.0, 1.0)[:, None].astype(R.dtype) * R).T
+
+
+def _orthogonalise_columns(rows: Float[Array, "r k *s"]) -> Root:
     # Modified Gram-Schmidt, written out: for a bank each operation is one kernel over all its filters,
     # while LAPACK would be called once for each. Every pair of columns is one pass over numbers that stay
     # in registers, which takes half the time of updating all later columns at once.
-    remaining, columns = [rows[:, j] for j in range(k)], []
+    remaining, columns = [rows[:, j] for j in range(rows.shape[1])], []
     while remaining:
         first, *remaining = remaining
         square = jnp.sum(first * first, axis=0)
@@ -67,6 +97,9 @@ def triangularise_rows(rows: Float[Array, "r k *s"]) -> Root:
         remaining = [other - c[None] * unit for other, c in pairs]
         columns.append(jnp.stack([square * inverse, *projections]))
     return _assemble_triangle(columns)
+
+
+_orthogonalise_in_lanes = in_lanes(_orthogonalise_columns)
 
 
 def _assemble_triangle(columns: list[Float[Array, "_ *s"]]) -> Root:

@@ -632,10 +632,10 @@ def _evaluate_state_and_rate(
     rates = _evaluate_rates(space, x, posture, t, system)
     # The tangent of the point's motion; the state's derivative along it holds the accelerations of all
     # bodies.
-    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    onwards = jax.jvp(lambda s: space.retract(x, s * rates), (zero,), (one,))[1]
+    unit, zero = jnp.ones_like(t), jnp.zeros_like(t)
+    onwards = jax.jvp(lambda s: space.retract(x, s * rates), (zero,), (unit,))[1]
     state_of = lambda x, t: _read_state(space, x, posture, t)
-    return jax.jvp(state_of, (x, t), (onwards, one))
+    return jax.jvp(state_of, (x, t), (onwards, unit))
 
 
 @native
