@@ -436,7 +436,7 @@ class TreeSpace(AbstractStateSpace):
         if not self.selection.rows:
             return self._open_coordinates(x)
         at = self._closed_positions(x, posture, t)
-        _, target, J = self._loop_rows(at, t)
+        _, target, J = _evaluate_rows(self, at, t)
         # The open velocities have zeros for the dependent ones, so that the residual of the rate
         # equations gives these at once: they are linear.
         dependent = self._selection_places()[1]
@@ -467,19 +467,12 @@ class TreeSpace(AbstractStateSpace):
     ) -> tuple[TreeCoordinates, Array]:
         """Coordinates after a step of Newton's method, and its largest component."""
         dependent = self._selection_places()[1]
-        value, _, J = self._loop_rows(now, t)
+        value, _, J = _evaluate_rows(self, now, t)
         by = lapack.solve(J[:, dependent], value)
         # Newton moves the dependent coordinates alone: the independent ones are what the point
         # says, and a least-squares step would change them.
         full = jnp.zeros(J.shape[1], J.dtype).at[dependent].set(-by)
         return retract_coordinates(self.model.parameters.tree, now, full), jnp.max(jnp.abs(by))
-
-    def _loop_rows(self, at: TreeCoordinates, t: Float[Array, ""]) -> tuple[Array, Array, Array]:
-        """Residuals, targets and J of the rows that determine the dependent velocities."""
-        parameters = self.model.parameters
-        rows = closure_rows(parameters, self.model.constraints, t, compute_motion(parameters, at))
-        row_indices = self._selection_places()[2]
-        return rows.value[row_indices], rows.target[row_indices], rows.J[row_indices]
 
     def _spread_velocities(self, independent_values: Float[Array, "k *s"]) -> Float[Array, "n *s"]:
         """Velocities of the tree's steps from the independent ones, with the others zero."""
@@ -560,6 +553,18 @@ def _search_jvp(primals: Any, tangents: Any) -> tuple[TreeCoordinates, TreeCoord
 
 
 @native
+def _evaluate_rows(
+    space: TreeSpace, at: TreeCoordinates, t: Float[Array, ""]
+) -> tuple[Array, Array, Array]:
+    """Residuals, targets and J of the rows that determine the dependent velocities."""
+    # a function of its own, as it is traced once for all places where it is a part of others
+    parameters = space.model.parameters
+    rows = closure_rows(parameters, space.model.constraints, t, compute_motion(parameters, at))
+    row_indices = space._selection_places()[2]
+    return rows.value[row_indices], rows.target[row_indices], rows.J[row_indices]
+
+
+@native
 def _approach_closed(
     space: TreeSpace, at: TreeCoordinates, part: Float[Array, " n"], t: Float[Array, ""]
 ) -> Any:
@@ -596,7 +601,7 @@ def _evaluate_columns(
     space: TreeSpace, x: TreePoint, posture: TreeCoordinates, t: Float[Array, ""]
 ) -> Float[Array, "k n"]:
     """Columns J of the rows that determine the dependent velocities."""
-    return space._loop_rows(space._closed_positions(x, posture, t), t)[2]
+    return _evaluate_rows(space, space._closed_positions(x, posture, t), t)[2]
 
 
 @native
