@@ -135,7 +135,7 @@ def solve(A: Matrix, b: Float[Array, "n *r"]) -> Float[Array, "n *r"]:
 
     Small systems are solved by Householder reflections of the rows scaled to unit size, large ones by LU
     factorisation with pivots. Derivatives of any order, in both modes, follow from A x = b. A singular
-    matrix gives numbers that are not finite or very large, and raises no error.
+    matrix gives numbers that are not finite, or very large where round-off hides it, and raises no error.
 
     Args:
         A: matrix (n, n). b: right-hand side (n,), or several of them as columns (n, r).
@@ -166,16 +166,23 @@ def _solve_by_reflections(A: Matrix, b: Matrix) -> Matrix:
 def _reflect_columns(A: Matrix, B: Matrix) -> Matrix:
     """Matrix X (n, r) of the least |A X - B| for A (m, n) of rank n, as straight code without pivots.
 
+    It is not finite where a column of A depends on those before it within round-off.
+
     Source: G. H. Golub, C. F. Van Loan, Matrix Computations (2013), sec. 5.2 and 5.3.
     """
     m, n = A.shape
     rows, zero = jnp.arange(m), jnp.zeros((), A.dtype)
+    round_off = (2 * m * jnp.finfo(A.dtype).eps) ** 2
 
-    def reflect(rest: Matrix, k: Array) -> tuple[Matrix, Array]:
+    def reflect(rest: Matrix, at: tuple[Array, Array]) -> tuple[Matrix, Array]:
         # v is the rest of a column less its image, a multiple of a unit vector; of both signs the one that
-        # cancels no digits. |v|^2 = -2 image v_k.
+        # cancels no digits. |v|^2 = -2 image v_k. Of a column that depends on those before it, only
+        # round-off is left: an image of zero makes the result infinite or NaN.
+        k, whole = at
         column = jnp.where(rows >= k, rest[:, k], zero)
-        image = jnp.where(column[k] >= 0, -1.0, 1.0) * jnp.sqrt(jnp.sum(column * column))
+        square = jnp.sum(column * column)
+        length = jnp.where(square <= round_off * whole, zero, jnp.sqrt(square))
+        image = jnp.where(column[k] >= 0, -length, length)
         v = jnp.where(rows == k, column - image, column)
         return rest + jnp.outer(v, v @ rest * (1 / (image * v[k]))), image
 
@@ -185,7 +192,8 @@ def _reflect_columns(A: Matrix, B: Matrix) -> Matrix:
         return X.at[k].set((row[n:] - right @ X) / diagonal), None
 
     # loops, which machine code unrolls, and of which XLA compiles one pass
-    rest, images = jax.lax.scan(reflect, jnp.concatenate([A, B], axis=1), jnp.arange(n))
+    columns = (jnp.arange(n), jnp.sum(A * A, axis=0))
+    rest, images = jax.lax.scan(reflect, jnp.concatenate([A, B], axis=1), columns)
     parts = (jnp.arange(n), rest[:n], images)
     return jax.lax.scan(substitute, jnp.zeros_like(B[:n]), parts, reverse=True)[0]
 
@@ -259,7 +267,7 @@ def _values_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Vector
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def pseudoinverse(A: Matrix, rcond: float) -> Matrix:
-    """Moore-Penrose inverse (n, m) of a matrix (m, n).
+    """Moore-Penrose inverse (n, m) of a matrix (m, n), of a small one of full rank by reflections.
 
     Singular values up to `rcond` times the largest count as zero.
 

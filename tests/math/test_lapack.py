@@ -84,6 +84,12 @@ def test_a_stack_in_blocks_is_that_of_numpy():
 
 def test_a_singular_matrix_is_not_solved():
     assert not np.isfinite(lapack.solve(jnp.zeros((3, 3)), jnp.ones(3))).any()
+    for size in (2, 3, 8):
+        A = np.random.default_rng(size).standard_normal((size, size)) * 10.0 ** np.arange(size)
+        for singular in (np.vstack([A[:-1], 2 * A[:1]]), np.hstack([A[:, :-1], A[:, :1]])):
+            assert not np.isfinite(lapack.solve(jnp.asarray(singular), jnp.ones(size))).any()
+        # columns of other units are no columns that depend on others
+        assert np.isfinite(lapack.solve(jnp.asarray(A), jnp.ones(size))).all()
     assert lapack.sign_of_determinant(jnp.zeros((3, 3))) == 0
     np.testing.assert_array_equal(lapack.pseudoinverse(jnp.zeros((3, 2)), 1e-9), np.zeros((2, 3)))
 
