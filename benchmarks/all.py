@@ -22,7 +22,7 @@ from shared.record import ROOT, has_code_of, make_parser
 FOLDER = Path(__file__).parent
 SCRIPTS = (
     "stiff", "hard", "long_horizon", "trims", "singular", "errors", "estimation", "waiting",
-    "failure", "compile_times", "structures", "montecarlo", "batch_sizes", "machine_code", "mechanisms",
+    "failure", "compile_times", "structures", "montecarlo", "batch_sizes", "machine_code", "by_mechanism",
     "missions", "flight_logs",
 )  # fmt: skip
 # Sections of suite.py, in the order of running.

@@ -380,7 +380,7 @@ TABLES: dict[str, tuple[str, Callable[[Row], str]]] = {
     "long times": ("long_horizon", tabulate_long_times),
     "chains": ("singular", tabulate_chains),
     "machine code": ("machine_code", MACROS.machine_code),
-    "mechanisms": ("mechanisms", MACROS.mechanisms),
+    "by mechanism": ("by_mechanism", MACROS.by_mechanism),
     "error estimates": ("errors", MACROS.error_estimates),
     "second runs": ("errors", MACROS.second_runs),
     "batch sizes": ("batch_sizes", MACROS.batch_sizes),

@@ -51,8 +51,8 @@ def test_a_platform_in_the_plane_of_its_base_is_a_direct_singularity():
         assert set(words.split(" hardly hold")[0].split(", ")) >= LEGS
         assert {"S0", "S1", "S2"} <= set(words.split("of the joints ")[1].split(", "))
         moved = float(warning.value.split()[4])
-        # turns of the legs of 0.2 m by the height, to within the extrapolation
-        assert moved <= 3 * height / (BASE - TOP)
+        # turns of the legs of 0.2 m by the height, to within the extrapolation and an angle's round-off
+        assert moved <= 3 * height / (BASE - TOP) + np.finfo(float).eps
     system = three_rps(1e-6)
     space = stm.TreeSpace(system)
     trim = stm.trim(space, at=space.from_state(system.reference))

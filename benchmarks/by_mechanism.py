@@ -1,6 +1,6 @@
 """Machine code against XLA's for several mechanisms, for a filter on the simulator, and for trims.
 
-    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 taskset -c 1 python benchmarks/mechanisms.py
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 taskset -c 1 python benchmarks/by_mechanism.py
 
 Right-hand sides by spanning-tree coordinates, singly and in a batch; the filter estimates motion and mass
 of the panel of the UAV with its tracker from a gyroscope, an accelerometer and the sliders' encoders, alone
@@ -223,4 +223,4 @@ def record(size: Size) -> Iterator[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    benchmark("mechanisms", __doc__, record, (Size(), QUICK))
+    benchmark("by_mechanism", __doc__, record, (Size(), QUICK))
