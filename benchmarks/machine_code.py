@@ -40,7 +40,7 @@ from stmuav_jax.math.native.structure import find_structure, read_structure
 
 @dataclass(frozen=True)
 class Size:
-    """lanes: states at once; passes: evaluations in a row; flights, their lanes, and settings."""
+    """lanes: states at once; passes: evaluations in a row, of batches a tenth; flights, their lanes, settings."""
 
     lanes: tuple[int, ...] = (1, 4, 16, 64, 1024)
     passes: int = 1000

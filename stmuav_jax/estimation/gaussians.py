@@ -66,8 +66,7 @@ def triangularise_rows(rows: Float[Array, "r k *s"]) -> Root:
     The rows are never squared, so parts of L that are small compared with others keep their digits.
     """
     r, k = rows.shape[:2]
-    is_small = is_on() and r * k * k <= _FEW_PRODUCTS
-    if is_small:
+    if is_on() and r * k * k <= _FEW_PRODUCTS:
         return _orthogonalise_in_lanes(rows)
     if rows.ndim > 2 or k <= _FEW:
         return _orthogonalise_columns(rows)
